@@ -1,0 +1,43 @@
+"""Errors that a person is expected to read: what came, what is allowed, what to try."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class DiffCloudError(Exception):
+    """Base of every error raised on purpose; commands print its message and exit with status 1."""
+
+
+class MeshError(DiffCloudError):
+    """A mesh that cannot be simulated (degenerate, non-manifold, or an index out of range)."""
+
+
+class SceneError(DiffCloudError):
+    """A scene or scenario description that is wrong or asks for something unsupported."""
+
+
+class EpisodeError(DiffCloudError):
+    """A recorded episode or a cloud file that is damaged, empty, or of the wrong shape."""
+
+
+class ConfigError(DiffCloudError):
+    """A parameter file or command option that is wrong."""
+
+
+class DivergedError(DiffCloudError):
+    """A rollout left the numbers: says which step, which batch entries, which parameters."""
+
+    def __init__(self, step: int, entries: list[int], reason: str, parameters: str = "") -> None:
+        self.step, self.entries, self.reason, self.parameters = step, entries, reason, parameters
+        where = f" with {parameters}" if parameters else ""
+        super().__init__(
+            f"The simulation diverged at step {step}, batch entries {entries}{where}: {reason}. "
+            "Try a smaller time step (more frame_steps), parameters nearer the basis material, "
+            "a stiffer material, or a softer contact."
+        )
+
+
+def unknown_name(kind: str, name: object, allowed: Iterable[object]) -> str:
+    """The message for a name that is not in a closed set."""
+    return f"Unknown {kind} {name!r}. Allowed: {', '.join(sorted(map(str, allowed)))}."

@@ -1,0 +1,1 @@
+"""Files: reading what may be damaged or hostile, writing so that a crash leaves nothing half-written."""

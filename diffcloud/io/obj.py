@@ -1,0 +1,167 @@
+"""Wavefront OBJ with ARCSim's meaning: `v` is a node, `vt` a material-space vert (PHYSICS: mesh reading)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from diffcloud.errors import MeshError
+from diffcloud.io.files import write_text
+from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
+
+_IGNORED = {"#", "mtllib", "usemtl", "o", "g", "s", "vn", "l"}
+
+
+@dataclass
+class _ObjFile:
+    nodes: list[list[float]] = field(default_factory=list)
+    verts: list[list[float]] = field(default_factory=list)
+    polygons: list[list[tuple[int, int]]] = field(default_factory=list)
+    """Corners (node, vert), vert -1 where the file gives none; indices from 0."""
+
+
+def read_cloth(path: Path) -> ClothMesh:
+    """Read a cloth: nodes from `v`, rest shape from `vt`, seams kept (a node may own several verts).
+
+    A corner without `vt` takes the node's first vert, or a new one at (x, y) of the node.
+
+    Raises:
+        MeshError: an unreadable line, an index out of range, or a mesh that cannot be simulated.
+    """
+    obj = _parse(path)
+    verts = list(obj.verts)
+    node_of_vert = np.full(len(verts), -1, dtype=np.int64)
+    first_vert: dict[int, int] = {}
+    for node, vert in (corner for polygon in obj.polygons for corner in polygon):
+        if vert >= 0:
+            if node_of_vert[vert] not in (-1, node):
+                raise MeshError(
+                    f"{path}: vt {vert + 1} is shared by nodes {node_of_vert[vert] + 1} and {node + 1}; "
+                    "a material-space vert belongs to one node."
+                )
+            node_of_vert[vert] = node
+            first_vert.setdefault(node, vert)
+    owners = node_of_vert.tolist()
+    faces = []
+    for polygon in obj.polygons:
+        corners = []
+        for node, vert in polygon:
+            if vert < 0 and node not in first_vert:
+                first_vert[node] = len(verts)
+                verts.append(obj.nodes[node][:2])
+                owners.append(node)
+            corners.append(vert if vert >= 0 else first_vert[node])
+        faces += _fan(corners, np.array([obj.nodes[node] for node, _ in polygon]))
+    used = np.array(owners, dtype=np.int64) >= 0
+    renumber = np.cumsum(used) - 1
+    try:
+        return ClothMesh(
+            nodes=np.array(obj.nodes, dtype=np.float64).reshape(-1, 3),
+            verts=np.array(verts, dtype=np.float64).reshape(-1, 2)[used],
+            vert_node=np.array(owners, dtype=np.int64)[used],
+            face_verts=renumber[np.array(faces, dtype=np.int64).reshape(-1, 3)],
+        )
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
+
+
+def read_surface(path: Path) -> SurfaceMesh:
+    """Read an obstacle: nodes and triangles, material space ignored.
+
+    Raises:
+        MeshError: an unreadable line, an index out of range, or no faces.
+    """
+    obj = _parse(path)
+    faces = []
+    for polygon in obj.polygons:
+        corners = [node for node, _ in polygon]
+        faces += _fan(corners, np.array([obj.nodes[node] for node in corners]))
+    if not faces:
+        raise MeshError(f"{path}: the mesh has no faces.")
+    return SurfaceMesh(nodes=np.array(obj.nodes, dtype=np.float64), faces=np.array(faces, dtype=np.int64))
+
+
+def write_cloth(path: Path, mesh: ClothMesh, nodes: np.ndarray | None = None) -> None:
+    """Write a cloth with its material space; `nodes` [V, 3] replaces the initial positions. Floats keep all digits."""
+    positions = mesh.nodes if nodes is None else nodes
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in np.asarray(positions, dtype=np.float64).tolist()]
+    lines += [f"vt {u!r} {v!r}" for u, v in mesh.verts.tolist()]
+    corners = np.stack([mesh.faces, mesh.face_verts], axis=-1) + 1
+    lines += ["f " + " ".join(f"{node}/{vert}" for node, vert in face) for face in corners.tolist()]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def write_surface(path: Path, mesh: SurfaceMesh) -> None:
+    """Write a triangle mesh without material space. Floats keep all digits."""
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.nodes.tolist()]
+    lines += ["f " + " ".join(str(node) for node in face) for face in (mesh.faces + 1).tolist()]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def _parse(path: Path) -> _ObjFile:
+    obj = _ObjFile()
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise MeshError(f"No such mesh: {path}.") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise MeshError(f"{path} is not a readable OBJ text file: {error}.") from error
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words or words[0] in _IGNORED or words[0].startswith("#"):
+            continue
+        try:
+            if words[0] == "v":
+                obj.nodes.append([float(word) for word in words[1:4]])
+                if len(obj.nodes[-1]) != 3:
+                    raise ValueError("a node has three coordinates")
+            elif words[0] == "vt":
+                obj.verts.append([float(word) for word in words[1:3]])
+                if len(obj.verts[-1]) != 2:
+                    raise ValueError("a material-space vert has two coordinates")
+            elif words[0] == "f":
+                obj.polygons.append([_corner(word) for word in words[1:]])
+                if len(obj.polygons[-1]) < 3:
+                    raise ValueError("a face has at least three corners")
+            else:
+                raise ValueError(f"unsupported keyword {words[0]!r}")
+        except ValueError as error:
+            raise MeshError(f"{path}, line {number}: {error}.") from error
+    for polygon in obj.polygons:
+        for node, vert in polygon:
+            if not 0 <= node < len(obj.nodes) or vert >= len(obj.verts):
+                raise MeshError(
+                    f"{path}: a face refers to v {node + 1} / vt {vert + 1}, but the file has {len(obj.nodes)} v and "
+                    f"{len(obj.verts)} vt."
+                )
+    return obj
+
+
+def _corner(word: str) -> tuple[int, int]:
+    parts = word.split("/")
+    node = int(parts[0])
+    vert = int(parts[1]) if len(parts) > 1 and parts[1] else 0
+    if node < 1 or vert < 0:
+        raise ValueError(f"index {word!r}: indices start at 1, relative ones are not supported")
+    return node - 1, vert - 1
+
+
+def _fan(corners: list[int], positions: np.ndarray) -> list[list[int]]:
+    """Triangulate a polygon from the corner whose fan has the largest smallest angle; the first wins ties."""
+    count = len(corners)
+    if count == 3:
+        return [corners]
+    fans = [[[s, (s + k) % count, (s + k + 1) % count] for k in range(1, count - 1)] for s in range(count)]
+    quality = [min(_smallest_angle(positions[triangle]) for triangle in fan) for fan in fans]
+    best = next(s for s in range(count) if quality[s] >= max(quality) - 1e-9)
+    return [[corners[index] for index in triangle] for triangle in fans[best]]
+
+
+def _smallest_angle(triangle: np.ndarray) -> float:
+    forward = np.roll(triangle, -1, axis=0) - triangle
+    backward = np.roll(triangle, 1, axis=0) - triangle
+    scale = np.linalg.norm(forward, axis=1) * np.linalg.norm(backward, axis=1)
+    cosine = (forward * backward).sum(axis=1) / np.maximum(scale, 1e-300)
+    return float(np.arccos(np.clip(cosine, -1, 1)).min())

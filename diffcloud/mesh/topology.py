@@ -1,0 +1,188 @@
+"""Meshes and their connectivity.
+
+A *node* is a world-space point, a *vert* a material-space point; a node on a seam owns several verts
+(ARCSim's distinction, Narain et al. 2012). Faces index verts, and verts point to nodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import MeshError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_MISSING = -1
+_SMALLEST_AREA = 1e-14
+"""Relative to the squared extent of the material space: below it a face has no shape."""
+
+
+@dataclass(frozen=True)
+class Hinges:
+    """Edges between two faces, as the bending energy needs them. H hinges, two sides each."""
+
+    nodes: IntArray
+    """[H, 4]: the edge (n0, n1), then the opposite node in the face of slot 0 and of slot 1."""
+    faces: IntArray
+    """[H, 2]: slot 0 traverses the edge n0 -> n1, slot 1 traverses it n1 -> n0."""
+    length: FloatArray
+    """[H] material-space length, mean of both sides [m]."""
+    angle: FloatArray
+    """[H, 2] direction of the edge in material space on each side [rad]."""
+
+
+@dataclass(frozen=True)
+class SurfaceMesh:
+    """A plain triangle mesh in world space: obstacles, and anything that is only looked at."""
+
+    nodes: FloatArray
+    """[V, 3] positions [m]."""
+    faces: IntArray
+    """[F, 3] node indices, counter-clockwise seen from outside."""
+
+    def plane(self) -> tuple[FloatArray, float] | None:
+        """(unit normal [3], offset) if all nodes lie in one plane normal . x = offset, else None."""
+        corner = self.nodes[self.faces]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).sum(axis=0)
+        length = np.linalg.norm(normal)
+        extent = float(np.ptp(self.nodes, axis=0).max())
+        if length <= _SMALLEST_AREA * extent**2:
+            return None
+        normal = normal / length
+        heights = self.nodes @ normal
+        return (normal, float(heights.mean())) if np.ptp(heights) <= 1e-6 * extent else None
+
+
+@dataclass(frozen=True)
+class ClothMesh:
+    """A cloth: world-space nodes, material-space verts, and the faces between them.
+
+    Raises:
+        MeshError: an index out of range, a face without area or with a repeated node, a face whose material
+            space is turned over, or an edge with more than two faces.
+    """
+
+    nodes: FloatArray
+    """[V, 3] initial positions [m]."""
+    verts: FloatArray
+    """[U, 2] material-space positions [m]."""
+    vert_node: IntArray
+    """[U] the node that owns each vert."""
+    face_verts: IntArray
+    """[F, 3] verts of each face."""
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.nodes).all() or not np.isfinite(self.verts).all():
+            raise MeshError("The mesh holds NaN or infinite coordinates; export it again from its source.")
+        if len(self.face_verts) == 0:
+            raise MeshError("The mesh has no faces; a cloth needs at least one triangle.")
+        for name, index, count in (
+            ("face", self.face_verts, len(self.verts)),
+            ("vert", self.vert_node, len(self.nodes)),
+        ):
+            if index.min() < 0 or index.max() >= count:
+                raise MeshError(f"A {name} refers to index {int(index.max())} of {count}; indices run from 0.")
+        self._refuse_degenerate_faces()
+        self._refuse_crowded_edges()
+
+    @cached_property
+    def faces(self) -> IntArray:
+        """[F, 3] node indices of each face."""
+        return self.vert_node[self.face_verts]
+
+    @cached_property
+    def material_edges(self) -> FloatArray:
+        """[F, 2, 2] Dm: columns are the two material-space edges that leave corner 0 [m]."""
+        u = self.verts[self.face_verts]
+        return np.stack([u[:, 1] - u[:, 0], u[:, 2] - u[:, 0]], axis=-1)
+
+    @cached_property
+    def face_area(self) -> FloatArray:
+        """[F] material-space area [m²]."""
+        return 0.5 * np.linalg.det(self.material_edges)
+
+    @cached_property
+    def node_area(self) -> FloatArray:
+        """[V] a third of the material-space area of the faces around each node [m²]."""
+        return np.bincount(self.faces.ravel(), np.repeat(self.face_area / 3, 3), minlength=len(self.nodes))
+
+    @cached_property
+    def edges(self) -> tuple[IntArray, IntArray]:
+        """(edges [E, 2], faces [E, 2]): edges in face order, and the face in each slot, -1 where none.
+
+        An edge runs as the first face that uses it does. Slot 0 holds the face that traverses it forwards, slot 1
+        the one that traverses it backwards. Where two faces traverse it the same way the later one takes the slot
+        and the edge counts as boundary, as in ARCSim (the published band mesh has two such edges).
+        """
+        half = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        key = np.sort(half, axis=1)
+        _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
+        order = np.argsort(first)
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(order))
+        edge_of_half = rank[inverse.ravel()]
+        edges = half[np.sort(first)]
+        slot = (half[:, 0] != edges[edge_of_half, 0]).astype(np.int64)
+        faces = np.full((len(edges), 2), _MISSING, dtype=np.int64)
+        faces[edge_of_half, slot] = np.repeat(np.arange(len(self.faces)), 3)
+        return edges, faces
+
+    @cached_property
+    def hinges(self) -> Hinges:
+        """Every edge that has a face on both sides."""
+        edges, faces = self.edges
+        inner = (faces != _MISSING).all(axis=1)
+        edge, pair = edges[inner], faces[inner]
+        opposite = np.stack([_opposite_node(self.faces[pair[:, side]], edge) for side in (0, 1)], axis=1)
+        along = np.stack([self._material_edge(pair[:, side], edge) for side in (0, 1)], axis=1)
+        return Hinges(
+            nodes=np.concatenate([edge, opposite], axis=1),
+            faces=pair,
+            length=np.linalg.norm(along, axis=-1).mean(axis=1),
+            angle=np.arctan2(along[..., 1], along[..., 0]),
+        )
+
+    def _material_edge(self, face: IntArray, edge: IntArray) -> FloatArray:
+        """[H, 2] u(n1) - u(n0) in the material space of the given face of each edge."""
+        corners, verts = self.faces[face], self.face_verts[face]
+        start = verts[np.arange(len(face)), np.argmax(corners == edge[:, :1], axis=1)]
+        end = verts[np.arange(len(face)), np.argmax(corners == edge[:, 1:], axis=1)]
+        return self.verts[end] - self.verts[start]
+
+    def _refuse_degenerate_faces(self) -> None:
+        repeated = np.flatnonzero((self.faces == np.roll(self.faces, 1, axis=1)).any(axis=1))
+        if len(repeated):
+            raise MeshError(f"Face {repeated[0]} uses a node twice ({self.faces[repeated[0]].tolist()}); remove it.")
+        smallest = _SMALLEST_AREA * float(np.ptp(self.verts, axis=0).max()) ** 2
+        flat = np.flatnonzero(np.abs(self.face_area) <= smallest)
+        if len(flat):
+            raise MeshError(
+                f"Face {flat[0]} has no area in material space (vt); the rest shape of a cloth comes from there. "
+                "Unwrap the mesh again."
+            )
+        turned = np.flatnonzero(self.face_area < 0)
+        if len(turned):
+            raise MeshError(
+                f"{len(turned)} faces are turned over in material space (first: face {turned[0]}, area "
+                f"{self.face_area[turned[0]]:.3g}); their corners must run counter-clockwise in vt. Flip them."
+            )
+
+    def _refuse_crowded_edges(self) -> None:
+        half = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges, count = np.unique(half, axis=0, return_counts=True)
+        if count.max() > 2:
+            worst = edges[count.argmax()].tolist()
+            raise MeshError(
+                f"The edge between nodes {worst[0]} and {worst[1]} belongs to {count.max()} faces; a cloth is a manifold, "
+                "where an edge has one or two. Split the mesh there."
+            )
+
+
+def _opposite_node(corners: IntArray, edge: IntArray) -> IntArray:
+    """[H] the corner of each face that is not on the edge."""
+    return corners.sum(axis=1) - edge.sum(axis=1)

@@ -1,0 +1,62 @@
+"""A scene in the project's own terms, before it becomes tensors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+
+from diffcloud.mesh.topology import ClothMesh
+from diffcloud.sim.build import Surrounding, build_system
+from diffcloud.sim.energies import Handles
+from diffcloud.sim.materials import Material
+from diffcloud.sim.simulate import init
+from diffcloud.sim.state import State, System
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One cloth, what holds it, and what surrounds it. Lengths in the scene's own unit."""
+
+    mesh: ClothMesh
+    material: Material
+    handles: Handles
+    frame_time: float
+    """[s]"""
+    frame_steps: int = 1
+    end_time: float = math.inf
+    """[s]"""
+    surrounding: Surrounding = field(default_factory=Surrounding)
+    mass_material: Material | None = None
+    """Gives the node masses where it differs from `material` (see `load.load_scene`)."""
+    newton_iterations: int = 1
+
+    @property
+    def time_step(self) -> float:
+        """[s]"""
+        return self.frame_time / self.frame_steps
+
+    @property
+    def default_frames(self) -> int | None:
+        """Frames until `end_time`, counted as ARCSim does: the step that reaches it is the last."""
+        if math.isinf(self.end_time):
+            return None
+        return math.ceil(math.ceil(self.end_time / self.time_step - 1e-9) / self.frame_steps)
+
+    def build(
+        self, *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"
+    ) -> tuple[System, State]:
+        """(System, State at time zero with batch 1)."""
+        system = build_system(
+            self.mesh,
+            self.material,
+            time_step=self.time_step,
+            handles=self.handles,
+            surrounding=self.surrounding,
+            mass_material=self.mass_material,
+            newton_iterations=self.newton_iterations,
+            dtype=dtype,
+            device=device,
+        )
+        return system, init(system)

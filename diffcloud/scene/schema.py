@@ -1,0 +1,129 @@
+"""The ARCSim/DiffSim scene format. Fields are refused by name when unknown or unsupported, never ignored.
+
+Defaults are ARCSim's. The block `diffcloud` is this project's own addition, for what ARCSim cannot say.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from diffcloud.errors import DiffCloudError
+
+Vector = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Switch = Literal[
+    "proximity", "physics", "strainlimiting", "collision", "remeshing", "separation", "popfilter", "plasticity"
+]
+
+
+class Checked(BaseModel):
+    """A block of a file: frozen, every field known."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class TransformBlock(Checked):
+    translate: Vector = (0.0, 0.0, 0.0)
+    scale: NonNegative = 1.0
+    rotate: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)
+    """Degrees, then the axis."""
+
+
+class MaterialBlock(Checked):
+    data: str
+    density_mult: Positive = 1.0
+    stretching_mult: Positive = 1.0
+    bending_mult: Positive = 1.0
+    thicken: Positive = 1.0
+    damping: NonNegative = 0.0
+
+
+class ClothBlock(Checked):
+    mesh: str
+    transform: TransformBlock = TransformBlock()
+    materials: Annotated[list[MaterialBlock], Field(min_length=1, max_length=1)]
+    remeshing: dict[str, Any] | None = None
+    """Accepted, and without effect, while remeshing is disabled."""
+
+
+class KeyframeBlock(Checked):
+    time: float
+    transform: TransformBlock = TransformBlock()
+    velocity: TransformBlock | None = None
+
+
+class HandleBlock(Checked):
+    type: Literal["node"] = "node"
+    nodes: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
+    motion: Annotated[int, Field(ge=0)] | None = None
+    start_time: float = 0.0
+    end_time: float = Field(default=math.inf, allow_inf_nan=True)
+    fade_time: NonNegative = 0.0
+
+
+class ObstacleBlock(Checked):
+    mesh: str
+    transform: TransformBlock = TransformBlock()
+    movable: Literal[0, 1, False, True] = 1
+
+
+class WindBlock(Checked):
+    density: NonNegative = 1.0
+    velocity: Vector = (0.0, 0.0, 0.0)
+    drag: NonNegative = 0.0
+
+
+class MagicBlock(Checked):
+    handle_stiffness: Positive = 1e3
+    collision_stiffness: NonNegative = 1e9
+    repulsion_thickness: Positive = 1e-3
+    projection_thickness: Positive | None = None
+    """Default: a tenth of the repulsion thickness."""
+    edge_flip_threshold: Positive = 1e-2
+    """Of remeshing; without effect while that is disabled."""
+    rib_stiffening: Positive = 1.0
+    """Of remeshing's side effects; only 1 is supported."""
+
+
+class ExtensionBlock(Checked):
+    """What ARCSim cannot say."""
+
+    hard_handles: bool = False
+    newton_iterations: Annotated[int, Field(ge=1)] = 1
+    damping: NonNegative | None = None
+
+
+class SceneFile(Checked):
+    frame_time: Positive
+    frame_steps: Annotated[int, Field(ge=1)] = 1
+    end_time: float = Field(default=math.inf, gt=0, allow_inf_nan=True)
+    end_frame: Annotated[int, Field(ge=1)] | None = None
+    cloths: Annotated[list[ClothBlock], Field(min_length=1, max_length=1)]
+    motions: list[Annotated[list[KeyframeBlock], Field(min_length=1)]] = []
+    handles: list[HandleBlock] = []
+    obstacles: list[ObstacleBlock] = []
+    gravity: Vector = (0.0, 0.0, 0.0)
+    wind: WindBlock = WindBlock()
+    friction: NonNegative = 0.6
+    obs_friction: NonNegative = 0.3
+    disable: list[Switch] = []
+    magic: MagicBlock = MagicBlock()
+    diffcloud: ExtensionBlock = ExtensionBlock()
+
+
+def explain(source: object, error: ValidationError, kind: type[DiffCloudError]) -> DiffCloudError:
+    """A validation error in one message: each field with its path, what came, and what is allowed."""
+    faults = []
+    for fault in error.errors():
+        place = ".".join(str(part) for part in fault["loc"]) or "(the whole)"
+        got = repr(fault["input"])
+        shown = got if len(got) <= 60 else got[:57] + "..."
+        if fault["type"] == "extra_forbidden":
+            faults.append(f"{place}: unknown or unsupported field (value {shown})")
+        else:
+            faults.append(f"{place}: {fault['msg']} (got {shown})")
+    return kind(f"{source}: " + "; ".join(faults) + ".")

@@ -1,0 +1,101 @@
+"""Write a scene as ARCSim/DiffSim JSON with its meshes and material; loading it gives the same System."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from diffcloud.errors import SceneError
+from diffcloud.io.files import write_json
+from diffcloud.io.obj import write_cloth, write_surface
+from diffcloud.scene.description import Scene
+from diffcloud.sim.materials import Material
+from diffcloud.sim.motion import Motion
+
+
+def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
+    """Write `conf/<name>.json`, `meshes/<name>/*.obj` and `materials/<name>.json` below `folder`.
+
+    Returns:
+        The path of the scene file.
+
+    Raises:
+        SceneError: masses that come from another material than the tables (the published experiments' reload), which
+            the format cannot say.
+    """
+    folder = Path(folder)
+    if scene.mass_material is not None:
+        raise SceneError("A scene whose masses come from another material cannot be written as ARCSim JSON.")
+    cloth, material = f"meshes/{name}/cloth.obj", f"materials/{name}.json"
+    write_cloth(folder / cloth, scene.mesh)
+    write_json(folder / material, _material(scene.material))
+    obstacles = []
+    for index, obstacle in enumerate(scene.surrounding.obstacles):
+        mesh = f"meshes/{name}/obstacle{index}.obj"
+        write_surface(folder / mesh, obstacle)
+        obstacles.append({"mesh": mesh, "movable": 0})
+
+    motions: list[Motion] = []
+    handles: list[dict[str, Any]] = []
+    for handle in scene.handles.handles:
+        block: dict[str, Any] = {"nodes": [handle.node], "start_time": handle.start, "fade_time": handle.fade}
+        if math.isfinite(handle.end):
+            block["end_time"] = handle.end
+        if handle.motion is not None:
+            if handle.motion not in motions:
+                motions.append(handle.motion)
+            block["motion"] = motions.index(handle.motion)
+        handles.append(block)
+
+    around = scene.surrounding
+    data: dict[str, Any] = {
+        "frame_time": scene.frame_time,
+        "frame_steps": scene.frame_steps,
+        "cloths": [{"mesh": cloth, "materials": [{"data": material, "damping": scene.material.damping}]}],
+        "motions": [_motion(motion) for motion in motions],
+        "handles": handles,
+        "obstacles": obstacles,
+        "gravity": list(around.gravity),
+        "wind": {"density": around.air_density, "velocity": list(around.wind), "drag": around.air_drag},
+        "friction": around.friction_cloth,
+        "obs_friction": around.friction_obstacle,
+        "disable": ["remeshing"] + ([] if around.proximity else ["proximity"]),
+        "magic": {
+            "handle_stiffness": scene.handles.stiffness,
+            "collision_stiffness": around.contact.stiffness,
+            "repulsion_thickness": around.contact.repulsion_thickness,
+            "projection_thickness": around.contact.projection_thickness,
+        },
+        "diffcloud": {"hard_handles": scene.handles.hard, "newton_iterations": scene.newton_iterations},
+    }
+    if math.isfinite(scene.end_time):
+        data["end_time"] = scene.end_time
+    path = folder / "conf" / f"{name}.json"
+    write_json(path, data)
+    return path
+
+
+def _material(material: Material) -> dict[str, Any]:
+    return {
+        "density": material.density,
+        "stretching": material.stretching.tolist(),
+        "bending": material.bending.tolist(),
+    }
+
+
+def _motion(motion: Motion) -> list[dict[str, Any]]:
+    keys = []
+    for key in motion.keyframes:
+        w, x, y, z = key.quaternion
+        angle = 2 * math.degrees(math.atan2(math.hypot(x, y, z), w))
+        block: dict[str, Any] = {
+            "time": key.time,
+            "transform": {"translate": list(key.translation), "scale": key.scale, "rotate": [angle, x, y, z]},
+        }
+        if key.velocity is not None:
+            if any(key.velocity[4:]):
+                raise SceneError("A keyframe velocity with rotation cannot be written as ARCSim JSON.")
+            block["velocity"] = {"translate": list(key.velocity[:3]), "scale": key.velocity[3]}
+        keys.append(block)
+    return keys

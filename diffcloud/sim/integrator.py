@@ -1,0 +1,206 @@
+"""One implicit step, as an equation for the velocity change u.
+
+    r(u) = m u - Δt f(u) = 0,   v = v₀ + u,   x = x₀ + Δt v
+
+    f = F(y) - H(y) (x - y + β v) + m g + f_air(x₀, v₀) - strength k_h (x - x*) + contact
+
+with y the point of linearisation. With y = x₀ the equation is linear: one linearised backward-Euler step, exactly
+ARCSim's, and ∂r/∂u is the assembled matrix. With y = x (Newton) it is backward Euler itself. β is stiffness-proportional
+damping. Hard handles replace the rows of their nodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffcloud.sim.contact import HalfSpaceContact
+from diffcloud.sim.energies.base import Geometry, Linearisation, geometry
+from diffcloud.sim.linear_solve import Factor
+from diffcloud.sim.properties import Properties
+from diffcloud.sim.state import System
+
+_NEWTON_TOLERANCE = 1e-12
+"""Relative to the largest velocity of the step."""
+_NEWTON_ACCEPTED = 1e-6
+"""A step that stops short of the tolerance is still accepted below this."""
+_HALVINGS = 6
+
+
+class NewtonStallError(ArithmeticError):
+    """Newton's method did not converge. `entries` lists the batch entries."""
+
+    def __init__(self, entries: list[int], change: float) -> None:
+        self.entries = entries
+        super().__init__(f"Newton's method stalled with a relative change of {change:.1e}")
+
+
+@dataclass(frozen=True)
+class StepStart:
+    """The inputs of one step."""
+
+    positions: Tensor
+    """[B, V, 3] [m]"""
+    velocities: Tensor
+    """[B, V, 3] [m/s]"""
+    targets: Tensor
+    """[B, H, 3] of the active handles [m]."""
+    properties: Properties
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """As the arguments of `StepProblem.solve` and `residual`."""
+        return (self.positions, self.velocities, self.targets, *self.properties.tensors())
+
+
+@dataclass(frozen=True)
+class StepTerms:
+    """All forces at the point of linearisation."""
+
+    geometry: Geometry
+    energies: tuple[Linearisation, ...]
+    contact: HalfSpaceContact | None
+
+
+@dataclass(frozen=True)
+class StepProblem:
+    """The equation of one step. Inputs: positions, velocities [B, V, 3], targets [B, H, 3], *properties."""
+
+    system: System
+    strength: Tensor
+    """[H] of each handle in this step."""
+    handle_nodes: Tensor
+    """[H] node of each handle."""
+    held: Tensor | None
+    """bool [V] nodes prescribed by hard handles; None if there are none."""
+
+    @property
+    def exact(self) -> bool:
+        return self.system.newton_iterations == 1
+
+    def residual(
+        self, u: Tensor, positions: Tensor, velocities: Tensor, targets: Tensor, *properties: Tensor
+    ) -> Tensor:
+        """r [B, V, 3] [N·s]."""
+        start = StepStart(positions, velocities, targets, Properties(*properties))
+        return self._residual(u, start, self._linearise(start, self._point(u, start)))
+
+    def solve(
+        self, positions: Tensor, velocities: Tensor, targets: Tensor, *properties: Tensor
+    ) -> tuple[Tensor, Factor]:
+        """u [B, V, 3] [m/s] and the factor of the (last) step matrix.
+
+        Raises:
+            NotPositiveDefiniteError, NewtonStallError: name the batch entries.
+        """
+        start = StepStart(positions, velocities, targets, Properties(*properties))
+        u = torch.zeros_like(velocities)
+        change = torch.full_like(velocities[:, 0, 0], torch.inf)
+        for _ in range(self.system.newton_iterations):
+            terms = self._linearise(start, self._point(u, start))
+            factor = self._factorise(start, terms)
+            residual = self._residual(u, start, terms)
+            direction = -factor.solve(residual)
+            if self.exact:
+                return direction, factor
+            u = self._backtrack(u, direction, residual, start)
+            largest = (velocities + self.prescribe(u, start)).abs().amax((1, 2))
+            change = direction.abs().amax((1, 2)) / (largest + 1e-9)
+            if bool((change <= _NEWTON_TOLERANCE).all()):
+                break
+        if not bool((change <= _NEWTON_ACCEPTED).all()):
+            raise NewtonStallError((~(change <= _NEWTON_ACCEPTED)).nonzero().flatten().tolist(), float(change.max()))
+        return u, factor
+
+    def prescribe(self, u: Tensor, start: StepStart) -> Tensor:
+        """u with the velocity change of hard-held nodes filled in."""
+        if self.held is None:
+            return u
+        wanted = start.positions.index_copy(1, self.handle_nodes, start.targets.expand(len(u), -1, -1))
+        change = (wanted - start.positions) / self.system.time_step - start.velocities
+        return torch.where(self.held[:, None], change, u)
+
+    def _point(self, u: Tensor, start: StepStart) -> Tensor:
+        """The point of linearisation [B, V, 3]."""
+        if self.exact:
+            return start.positions
+        return start.positions + self.system.time_step * (start.velocities + self.prescribe(u, start))
+
+    def _linearise(self, start: StepStart, positions: Tensor) -> StepTerms:
+        system, values = self.system, start.properties
+        shape = geometry(system.stretching.elements, positions)
+        contact = None
+        if system.halfspaces is not None:
+            contact = system.halfspaces.at(
+                positions,
+                start.positions,
+                start.velocities,
+                values.node_mass,
+                values.friction_obstacle,
+                system.time_step,
+            )
+        return StepTerms(
+            shape,
+            tuple(energy.at(shape, values) for energy in (system.stretching, system.bending)),
+            contact,
+        )
+
+    def _residual(self, u: Tensor, start: StepStart, terms: StepTerms) -> Tensor:
+        system, dt, values = self.system, self.system.time_step, start.properties
+        change = self.prescribe(u, start)
+        velocity = start.velocities + change
+        mass = values.node_mass[..., None]
+        step = dt * velocity
+        shape = terms.geometry
+        if not self.exact:
+            step = step + (start.positions - shape.positions)
+            shape = geometry(system.stretching.elements, start.positions)
+        displacement = step + values.damping[:, None, None] * velocity
+
+        force = mass * system.gravity + system.air.forces(shape, start.velocities, values)
+        for energy in terms.energies:
+            force = force + energy.forces(displacement)
+        if terms.contact is not None:
+            force = force + terms.contact.forces(step, velocity)
+        if self.held is None and len(self.handle_nodes):
+            offset = start.targets - (start.positions + dt * velocity)[:, self.handle_nodes]
+            pull = (system.handles.stiffness * self.strength)[:, None] * offset
+            index = self.handle_nodes.view(1, -1, 1).expand_as(pull)
+            force = force.scatter_add(1, index, pull)
+        residual = mass * change - dt * force
+        return residual if self.held is None else torch.where(self.held[:, None], mass * u, residual)
+
+    def _factorise(self, start: StepStart, terms: StepTerms) -> Factor:
+        """The step matrix m + Δt (Δt + β) H + handles + contact."""
+        system, dt, values = self.system, self.system.time_step, start.properties
+        weight = values.node_mass
+        identity = torch.eye(3, dtype=weight.dtype, device=weight.device)
+        if self.held is None and len(self.handle_nodes):
+            spring = (dt**2 * system.handles.stiffness * self.strength).expand(len(weight), -1)
+            weight = weight.scatter_add(1, self.handle_nodes.expand(len(weight), -1), spring)
+        diagonal = weight[..., None, None] * identity
+        if terms.contact is not None:
+            diagonal = diagonal + terms.contact.blocks(dt)
+        scale = (dt * (dt + values.damping))[:, None, None, None]
+        blocks = [scale * energy.hessian() for energy in terms.energies]
+        if self.held is not None:
+            diagonal = torch.where(self.held[:, None, None], values.node_mass[..., None, None] * identity, diagonal)
+            free = (~self.held).to(weight.dtype)
+            for index, energy in enumerate((system.stretching, system.bending)):
+                corner = free[energy.elements.nodes].repeat_interleave(3, dim=1)  # [E, 3n]
+                blocks[index] = blocks[index] * (corner[:, :, None] * corner[:, None, :])
+        return system.pattern.factorise(diagonal, blocks)
+
+    def _backtrack(self, u: Tensor, direction: Tensor, residual: Tensor, start: StepStart) -> Tensor:
+        """u + α direction, with α halved per batch entry while the residual grows."""
+        before = residual.square().sum((1, 2))
+        alpha = torch.ones_like(before)
+        for _ in range(_HALVINGS):
+            candidate = u + alpha[:, None, None] * direction
+            trial = self._residual(candidate, start, self._linearise(start, self._point(candidate, start)))
+            worse = trial.square().sum((1, 2)) > before * (1 + 1e-9) + 1e-300
+            if not bool(worse.any()):
+                break
+            alpha = torch.where(worse, 0.5 * alpha, alpha)
+        return u + alpha[:, None, None] * direction

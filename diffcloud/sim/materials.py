@@ -1,0 +1,181 @@
+"""Cloth materials: the data-driven tables of Wang, O'Brien and Ramamoorthi (2011) as ARCSim stores them.
+
+`stretching` [6, 4]: columns are the coefficients (k0: uu, k1: uu-vv coupling, k2: vv, k3: shear). Row 0 holds them at
+zero strain, rows 1..5 at the reference strain for stretch directions 0, 22.5, 45, 67.5, 90 degrees from u. ARCSim
+doubles each entry, so a constant table entry S gives a stretching stiffness of 2 S [N/m] (force per width per strain).
+
+`bending` [3, 5]: rows are edge directions 0, 45, 90 degrees in material space, columns are curvature bins. An entry k_b
+[N·m] enters the hinge energy k_b l² θ² / (8 (a0 + a1)). On a grid of right triangles with side h that bends about a grid
+axis, only the edges along that axis turn, by θ = κ h, once per area h²; with l = h and a0 + a1 = h² the energy per area
+is k_b κ² / 8 = B κ² / 2. So **the bending stiffness per width is B = k_b / 4** (a test derives it again from the heavy
+elastica).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import ConfigError, SceneError, unknown_name
+from diffcloud.io.files import read_json
+
+TABLE_ENTRY_TO_STRETCHING = 2.0
+"""Stretching stiffness [N/m] per table entry (ARCSim doubles the table when it samples it)."""
+TABLE_ENTRY_TO_BENDING = 0.25
+"""Bending stiffness per width B [N·m] per table entry, on a regular grid bent about an axis."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """One fabric. Tables as described in the module's docstring."""
+
+    name: str
+    density: float
+    """[kg/m²]"""
+    stretching: NDArray[np.float64]
+    """[6, 4] [N/m], half of the stiffness."""
+    bending: NDArray[np.float64]
+    """[3, 5] [N·m]"""
+    damping: float = 0.0
+    """Stiffness-proportional damping [s]."""
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        for name, table, shape in (("stretching", self.stretching, (6, 4)), ("bending", self.bending, (3, 5))):
+            if table.shape != shape or not np.isfinite(table).all():
+                raise SceneError(
+                    f"Material {self.name!r}: the {name} table must hold {shape[0]} x {shape[1]} finite numbers, "
+                    f"got shape {table.shape}."
+                )
+        if not self.density > 0 or not self.damping >= 0:
+            raise SceneError(
+                f"Material {self.name!r}: density must be positive and damping not negative, "
+                f"got {self.density} kg/m² and {self.damping} s."
+            )
+
+    def scaled(self, *, density: float = 1.0, stretching: float = 1.0, bending: float = 1.0) -> Material:
+        """The same material with its tables multiplied."""
+        return replace(
+            self,
+            density=self.density * density,
+            stretching=self.stretching * stretching,
+            bending=self.bending * bending,
+        )
+
+    @property
+    def resting_stretching_stiffness(self) -> float:
+        """Mean of k0 and k2 at zero strain [N/m]: what a multiplier of 1 means in SI."""
+        return TABLE_ENTRY_TO_STRETCHING * float(self.stretching[0, [0, 2]].mean())
+
+    @property
+    def resting_bending_stiffness(self) -> float:
+        """Mean of the flat-state bending column, as a stiffness per width B [N·m]."""
+        return TABLE_ENTRY_TO_BENDING * float(self.bending[:, 0].mean())
+
+
+def isotropic(
+    name: str,
+    *,
+    density: float,
+    stretching: float,
+    bending: float,
+    shear: float | None = None,
+    stiffening: float = 1.0,
+    damping: float = 0.0,
+    source: str = "",
+) -> Material:
+    """A material from SI numbers that a data sheet or a hand test gives.
+
+    Args:
+        density: [kg/m²].
+        stretching: force per width per strain at rest [N/m].
+        bending: bending stiffness per width B [N·m] (ASTM D1388: density · g · (overhang / 2)³).
+        shear: shear coefficient k3 [N/m]; default as an isotropic sheet without Poisson effect, equal to `stretching`
+            (energy k3 E01² per area).
+        stiffening: factor on the stretching coefficients at the reference strain of the tables.
+        damping: [s].
+    """
+    shear = stretching if shear is None else shear
+    row = np.array([stretching, 0.0, stretching, shear]) / TABLE_ENTRY_TO_STRETCHING
+    table = np.vstack([row, np.tile(row * stiffening, (5, 1))])
+    return Material(
+        name=name,
+        density=density,
+        stretching=table,
+        bending=np.full((3, 5), bending / TABLE_ENTRY_TO_BENDING),
+        damping=damping,
+        source=source,
+    )
+
+
+_BASIS_SOURCE = (
+    "chosen, not measured: soft enough that the whole box [0.1, 10]² of multipliers moves a hand-sized cloth by more "
+    "than a depth camera's noise (docs/scenarios.md); most real fabrics lie at its stiff edge"
+)
+_KES_SOURCE = (
+    "order of magnitude from published KES-F / ASTM D1388 ranges for this kind of fabric (e.g. Kawabata, The "
+    "Standardization and Analysis of Hand Evaluation, 1980); measure your own before you rely on it"
+)
+
+_PRESETS = {
+    material.name: material
+    for material in (
+        isotropic(
+            "basis-knit",
+            density=0.2,
+            stretching=4.0,
+            shear=2.0,
+            bending=4e-6,
+            stiffening=3.0,
+            damping=0.0,
+            source=_BASIS_SOURCE,
+        ),
+        isotropic("jersey-knit", density=0.16, stretching=60.0, shear=30.0, bending=3e-6, source=_KES_SOURCE),
+        isotropic("cotton-shirting", density=0.12, stretching=800.0, shear=60.0, bending=8e-6, source=_KES_SOURCE),
+        isotropic("silk", density=0.06, stretching=700.0, shear=20.0, bending=2e-6, source=_KES_SOURCE),
+        isotropic("denim", density=0.4, stretching=2500.0, shear=250.0, bending=8e-5, source=_KES_SOURCE),
+        isotropic("paper-towel", density=0.045, stretching=1500.0, shear=700.0, bending=4e-5, source=_KES_SOURCE),
+    )
+}
+
+
+def presets() -> tuple[str, ...]:
+    """Names of the built-in materials."""
+    return tuple(_PRESETS)
+
+
+def preset(name: str) -> Material:
+    """A built-in material by name.
+
+    Raises:
+        ConfigError: no such preset; the message lists them.
+    """
+    if name not in _PRESETS:
+        raise ConfigError(unknown_name("material", name, _PRESETS) + " Or give the path of an ARCSim material JSON.")
+    return _PRESETS[name]
+
+
+def read_material(path: Path) -> Material:
+    """Read an ARCSim material file: density, stretching 6 x 4, bending 3 x 5.
+
+    Raises:
+        SceneError: the file is missing, lacks a field, has one too many, or a table of the wrong shape.
+    """
+    data = read_json(path, error=SceneError)
+    expected = {"density", "stretching", "bending"}
+    if not isinstance(data, dict) or set(data) != expected:
+        got = sorted(data) if isinstance(data, dict) else type(data).__name__
+        raise SceneError(f"{path}: a material has the fields {sorted(expected)}, got {got}.")
+    try:
+        return Material(
+            name=Path(path).stem,
+            density=float(data["density"]),
+            stretching=np.array(data["stretching"], dtype=np.float64),
+            bending=np.array(data["bending"], dtype=np.float64),
+            source=Path(path).name,
+        )
+    except (TypeError, ValueError) as error:
+        raise SceneError(f"{path}: the tables must be rectangular lists of numbers ({error}).") from error

@@ -1,0 +1,137 @@
+"""Physical quantities of a batch of simulations, and the named parameters that move them.
+
+A *property* is a tensor the physics reads, such as the mass of each node. A *parameter* is a number a person fits, such
+as the mass multiplier. This module is the only place that maps one to the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from diffcloud.errors import ConfigError, unknown_name
+
+
+@dataclass(frozen=True)
+class Properties:
+    """Physical quantities with a leading batch axis [B, ...]; every one is differentiable."""
+
+    node_mass: Tensor
+    """[B, V] [kg]"""
+    stretching: Tensor
+    """[B, F] multiplier on the stretching table of each face [-]."""
+    bending: Tensor
+    """[B, H] multiplier on the bending table of each hinge [-]."""
+    damping: Tensor
+    """[B] stiffness-proportional damping [s]."""
+    air_density: Tensor
+    """[B] of the quadratic normal drag [kg/m³]."""
+    air_drag: Tensor
+    """[B] of the linear tangential drag [kg/(m²·s)]."""
+    friction_obstacle: Tensor
+    """[B] Coulomb coefficient between cloth and obstacles [-]."""
+    friction_cloth: Tensor
+    """[B] Coulomb coefficient between cloths [-]."""
+
+    @property
+    def batch(self) -> int:
+        return len(self.damping)
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """The fields in order."""
+        return tuple(getattr(self, field.name) for field in fields(self))
+
+    def repeated(self, count: int) -> Properties:
+        """The whole batch `count` times over, copies outermost: [count · B, ...]."""
+        return Properties(*(tensor.repeat(count, *[1] * (tensor.dim() - 1)) for tensor in self.tensors()))
+
+
+Kind = Literal["multiplier", "absolute"]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What a named parameter is and how a person reads it."""
+
+    name: str
+    kind: Kind
+    unit: str
+    """Of the physical value: what the multiplier times its basis is measured in."""
+    bounds: tuple[float, float]
+    meaning: str
+
+
+PARAMETERS: dict[str, Parameter] = {
+    parameter.name: parameter
+    for parameter in (
+        Parameter("stretch", "multiplier", "N/m", (0.1, 10.0), "times the stretching table"),
+        Parameter("mass", "multiplier", "kg/m²", (0.1, 10.0), "times the node masses (of a named node set)"),
+        Parameter("density", "multiplier", "kg/m²", (0.1, 10.0), "times all node masses"),
+        Parameter("bending", "multiplier", "N·m", (0.1, 10.0), "times the bending table"),
+        Parameter("drag", "multiplier", "kg/m³", (0.1, 10.0), "times the air density and the tangential drag"),
+        Parameter("damping", "absolute", "s", (0.0, 0.1), "stiffness-proportional damping"),
+        Parameter("friction_obstacle", "absolute", "-", (0.0, 1.5), "Coulomb friction between cloth and obstacles"),
+        Parameter("friction_cloth", "absolute", "-", (0.0, 1.5), "Coulomb friction between cloths"),
+    )
+}
+"""Every fit parameter by name. The paper fits stretch and mass in [0.1, 10]."""
+
+
+def scaled_properties(
+    base: Properties,
+    values: Mapping[str, Tensor],
+    *,
+    faces: Tensor,
+    node_sets: Mapping[str, Tensor] | None = None,
+) -> Properties:
+    """Properties of a batch of parameter sets.
+
+    Args:
+        base: the basis material, batch 1.
+        values: name -> [B] values (multipliers or absolute, see `PARAMETERS`); all of one length.
+        faces: [F, 3] node indices, to spread a node set's multiplier over faces.
+        node_sets: parameter name -> bool [V]; `mass` and `stretch` act on those nodes only (the published experiments
+            multiply the mass of a part of the nodes). A face takes the mean multiplier of its corners.
+
+    Raises:
+        ConfigError: an unknown parameter, a node set for a parameter that takes none, or values of different lengths.
+    """
+    node_sets = node_sets or {}
+    for name in values:
+        if name not in PARAMETERS:
+            raise ConfigError(unknown_name("parameter", name, PARAMETERS))
+    for name in node_sets:
+        if name not in ("mass", "stretch"):
+            raise ConfigError(f"A node set for {name!r} is not supported; node sets act on mass and stretch.")
+    lengths = {len(value) for value in values.values()} or {1}
+    if len(lengths) > 1:
+        raise ConfigError(f"Parameters have different batch lengths: {sorted(lengths)}.")
+    batch = lengths.pop()
+    base = base.repeated(batch) if base.batch != batch else base
+    one = base.damping.new_ones(batch)
+
+    def get(name: str) -> Tensor:
+        return values.get(name, one)
+
+    def over_nodes(name: str) -> Tensor:  # [B, V] or [B, 1]
+        value = get(name)[:, None]
+        return value if name not in node_sets else torch.where(node_sets[name], value, 1.0)
+
+    stretch = over_nodes("stretch")
+    if stretch.shape[1] > 1:
+        stretch = stretch[:, faces].mean(-1)
+    return replace(
+        base,
+        node_mass=base.node_mass * over_nodes("mass") * get("density")[:, None],
+        stretching=base.stretching * stretch,
+        bending=base.bending * get("bending")[:, None],
+        damping=values.get("damping", base.damping),
+        air_density=base.air_density * get("drag"),
+        air_drag=base.air_drag * get("drag"),
+        friction_obstacle=values.get("friction_obstacle", base.friction_obstacle),
+        friction_cloth=values.get("friction_cloth", base.friction_cloth),
+    )

@@ -1,0 +1,156 @@
+"""The simulation: init, step, rollout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffcloud.errors import DivergedError
+from diffcloud.sim.adjoint import implicit_solve
+from diffcloud.sim.energies.handles import HandleSchedule, follow_track
+from diffcloud.sim.integrator import NewtonStallError, StepProblem, StepStart
+from diffcloud.sim.linear_solve import NotPositiveDefiniteError
+from diffcloud.sim.properties import Properties
+from diffcloud.sim.state import State, System
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A batch of trajectories."""
+
+    positions: Tensor
+    """[B, S + 1, V, 3] after 0, 1, ... S steps [m]."""
+    times: Tensor
+    """[S + 1] [s]"""
+
+    def at(self, times: Tensor) -> Tensor:
+        """[B, T, V, 3] positions at times [T], linear between steps."""
+        place = (times / self.times[1]).clamp(0, len(self.times) - 1)
+        nearest = place.round()
+        place = torch.where((place - nearest).abs() < 1e-6, nearest, place)
+        low = place.floor().long().clamp(max=len(self.times) - 2)
+        fraction = (place - low)[:, None, None]
+        return self.positions[:, low] * (1 - fraction) + self.positions[:, low + 1] * fraction
+
+
+def init(
+    system: System, batch: int = 1, *, positions: Tensor | None = None, velocities: Tensor | None = None
+) -> State:
+    """The state at time zero.
+
+    Args:
+        batch: B, the number of parameter sets.
+        positions, velocities: [B or 1, V, 3] instead of the mesh's own positions and rest.
+    """
+    if positions is None:
+        positions = torch.as_tensor(system.mesh.nodes, dtype=system.dtype, device=system.device)[None]
+    positions = positions.expand(batch, -1, -1)
+    velocities = torch.zeros_like(positions) if velocities is None else velocities.expand(batch, -1, -1)
+    return State(positions, velocities, anchors=positions[:, system.handles.nodes])
+
+
+def step(system: System, properties: Properties, schedule: HandleSchedule, state: State, *, copies: int = 1) -> State:
+    """One time step of every cloth in the batch.
+
+    Args:
+        schedule: handles over the run; its translation is [B or 1, S, H, 3].
+        copies: see `adjoint.implicit_solve`.
+
+    Raises:
+        DivergedError: names the step and the batch entries.
+    """
+    state = _take_anchors(system, schedule, state)
+    problem, targets = _problem(system, schedule, state)
+    start = StepStart(state.positions, state.velocities, targets.expand(properties.batch, -1, -1), properties)
+    try:
+        change = implicit_solve(problem, *start.tensors(), copies=copies)
+    except (NotPositiveDefiniteError, NewtonStallError) as error:
+        raise DivergedError(state.step + 1, error.entries, str(error)) from error
+    velocities = state.velocities + problem.prescribe(change, start)
+    positions = state.positions + system.time_step * velocities
+    if system.halfspaces is not None:
+        projected = system.halfspaces.project(positions)
+        velocities = velocities + (projected - positions) / system.time_step
+        positions = projected
+    _refuse_divergence(positions, state.step + 1)
+    return State(positions, velocities, state.anchors, state.step + 1)
+
+
+def rollout(
+    system: System,
+    steps: int,
+    *,
+    properties: Properties | None = None,
+    state: State | None = None,
+    track: Tensor | None = None,
+    copies: int = 1,
+    progress: Callable[[int], None] | None = None,
+) -> Rollout:
+    """Simulate `steps` steps.
+
+    Args:
+        properties: of a batch of parameter sets; default the basis material, batch 1.
+        state: where to begin; default rest.
+        track: [B or 1, S, 3] displacement of the gripper since the start at the end of each step [m]; then the moving
+            handles follow it instead of the scene's own motion.
+        copies: see `adjoint.implicit_solve`.
+        progress: called with the number of finished steps.
+
+    Raises:
+        DivergedError: names the step and the batch entries.
+    """
+    properties = system.properties if properties is None else properties
+    times = np.cumsum(np.full(steps, system.time_step))  # repeated addition, as the reference accumulates time
+    if track is not None:
+        system = replace(system, handles=system.handles.following_track())
+    schedule = system.handles.schedule(times, dtype=system.dtype, device=system.device)
+    if track is not None:
+        schedule = follow_track(system.handles, schedule, track)
+    if state is None:
+        state = init(system, properties.batch)
+    elif state.anchors.shape[1] != len(system.handles.nodes):
+        state = replace(state, anchors=state.positions[:, system.handles.nodes])
+    positions = [state.positions]
+    for finished in range(steps):
+        state = step(system, properties, schedule, state, copies=copies)
+        positions.append(state.positions)
+        if progress is not None:
+            progress(finished + 1)
+    all_times = torch.as_tensor(np.concatenate([[0.0], times]), dtype=system.dtype, device=system.device)
+    return Rollout(torch.stack(positions, dim=1), all_times)
+
+
+def _take_anchors(system: System, schedule: HandleSchedule, state: State) -> State:
+    """Anchors of the handles that become active in this step: the node's position, back through the motion."""
+    starting = np.flatnonzero(schedule.first_step == state.step)
+    if not len(starting):
+        return state
+    held = state.positions[:, [system.handles.nodes[index] for index in starting]]
+    linear, translation = schedule.linear[state.step, starting], schedule.translation[:, state.step, starting]
+    anchors = torch.linalg.solve(linear, (held - translation)[..., None]).squeeze(-1)
+    index = torch.as_tensor(starting, device=anchors.device)
+    return replace(state, anchors=state.anchors.index_copy(1, index, anchors))
+
+
+def _problem(system: System, schedule: HandleSchedule, state: State) -> tuple[StepProblem, Tensor]:
+    """The equation of this step, and the targets [B, H, 3] of its active handles."""
+    targets = schedule.translation[:, state.step] + (schedule.linear[state.step] @ state.anchors[..., None]).squeeze(-1)
+    nodes = torch.tensor(system.handles.nodes, dtype=torch.long, device=system.device)
+    strength, held = schedule.strength[state.step], None
+    if system.handles.hard:
+        active = np.flatnonzero(schedule.active[state.step])
+        if len(active) < len(nodes):
+            nodes, targets, strength = nodes[active], targets[:, active], strength[active]
+        held = torch.zeros(len(system.mesh.nodes), dtype=torch.bool, device=system.device)
+        held[nodes] = True
+    return StepProblem(system, strength, nodes, held), targets
+
+
+def _refuse_divergence(positions: Tensor, step: int) -> None:
+    if not bool(torch.isfinite(positions.detach().sum())):
+        entries = (~torch.isfinite(positions).all(-1).all(-1)).nonzero().flatten().tolist()
+        raise DivergedError(step, entries, "positions are not finite")
