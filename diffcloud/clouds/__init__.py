@@ -1,0 +1,7 @@
+"""Point clouds: sampling from meshes, nearest neighbours, losses."""
+
+from diffcloud.clouds.losses import chamfer, one_sided_chamfer
+from diffcloud.clouds.neighbours import NeighbourIndex, brute_force_neighbours
+from diffcloud.clouds.sampling import SurfaceSampler
+
+__all__ = ["NeighbourIndex", "SurfaceSampler", "brute_force_neighbours", "chamfer", "one_sided_chamfer"]

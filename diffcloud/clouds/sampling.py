@@ -1,0 +1,89 @@
+"""Differentiable point sampling on triangle meshes (paper, section III-B).
+
+A point is x = u p1 + v p2 + w p3 on a face drawn with probability proportional to its world-space area, so its
+derivative by the corners is exactly (u, v, w). The random numbers are drawn once, when the sampler is made (common random
+numbers): the loss is then a deterministic function of the node positions. Face choice follows the areas but is not
+differentiated, as in the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffcloud.errors import ConfigError
+
+_TINY = 1e-30
+
+
+@dataclass(frozen=True)
+class SurfaceSampler:
+    """Draws N points on the surface of a mesh."""
+
+    faces: Tensor
+    """[F, 3] node indices of the faces that may be sampled."""
+    weights: Tensor | None
+    """[F] extra weight on each face's area (visibility, say); None for one."""
+    choice: Tensor
+    """[N] in [0, 1): picks the face, stratified so that each face gets its share."""
+    barycentric: Tensor
+    """[N, 3] (u, v, w), uniform on the triangle."""
+
+    @staticmethod
+    def build(
+        faces: Tensor,
+        points: int,
+        *,
+        generator: torch.Generator,
+        subset: Tensor | None = None,
+        weights: Tensor | None = None,
+        dtype: torch.dtype = torch.float64,
+    ) -> SurfaceSampler:
+        """Draw the random numbers.
+
+        Args:
+            faces: [F, 3] node indices.
+            points: N.
+            generator: of the random numbers (on the CPU).
+            subset: indices of the faces that may be sampled (the paper's occlusion heuristic); None for all.
+            weights: [F] non-negative, on top of the area.
+
+        Raises:
+            ConfigError: no points, no faces, an index out of range, or weights that are negative or all zero.
+        """
+        if points < 1:
+            raise ConfigError(f"At least one point must be sampled, got {points}.")
+        if subset is not None:
+            if len(subset) == 0 or int(subset.min()) < 0 or int(subset.max()) >= len(faces):
+                raise ConfigError(f"The face subset must hold indices in 0..{len(faces) - 1}, and at least one.")
+            faces = faces[subset]
+            weights = None if weights is None else weights[subset]
+        if weights is not None and not (bool((weights >= 0).all()) and float(weights.sum()) > 0):
+            raise ConfigError("Face weights must not be negative, and at least one must be positive.")
+        device = faces.device
+        stratum = torch.arange(points, dtype=dtype)
+        choice = (stratum + torch.rand(points, dtype=dtype, generator=generator)) / points
+        r1, r2 = torch.rand(2, points, dtype=dtype, generator=generator)
+        root = r1.sqrt()
+        barycentric = torch.stack([1 - root, root * (1 - r2), root * r2], dim=-1)
+        return SurfaceSampler(faces, weights, choice.to(device), barycentric.to(device))
+
+    def sample(self, positions: Tensor) -> Tensor:
+        """[..., V, 3] node positions -> [..., N, 3] points."""
+        lead = positions.shape[:-2]
+        flat = positions.reshape(-1, *positions.shape[-2:])
+        with torch.no_grad():
+            corner = flat[:, self.faces]
+            area = torch.linalg.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
+            area = area.square().sum(-1).sqrt().clamp(min=_TINY)
+            if self.weights is not None:
+                area = area * self.weights
+            cumulative = area.cumsum(-1)
+            choice = self.choice * cumulative[:, -1:]
+            face = torch.searchsorted(cumulative, choice, right=True).clamp(max=len(self.faces) - 1)  # [B, N]
+            nodes = self.faces[face].flatten(1)  # [B, 3N]
+        chosen = flat.gather(1, nodes[..., None].expand(-1, -1, 3)).unflatten(1, (-1, 3))
+        points = (self.barycentric[:, None] @ chosen).squeeze(-2)
+        return points.reshape(*lead, *points.shape[-2:])

@@ -1,0 +1,178 @@
+"""The loss of parameter sets: simulate, sample, one-sided Chamfer to the recorded clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+from torch import Tensor
+
+from diffcloud.clouds.losses import one_sided_chamfer
+from diffcloud.clouds.neighbours import NeighbourIndex
+from diffcloud.clouds.sampling import SurfaceSampler
+from diffcloud.errors import EpisodeError
+from diffcloud.io.episodes import Episode
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.properties import scaled_properties
+from diffcloud.sim.simulate import Rollout, rollout
+
+_CHUNK = 16
+"""Parameter sets simulated together: about where a batch of 49-node cloths leaves a core's cache."""
+
+
+@dataclass(frozen=True)
+class _Target:
+    """One episode's clouds in the loss."""
+
+    times: Tensor
+    """[L] of the loss frames [s]."""
+    clouds: tuple[NeighbourIndex, ...]
+    centre: Tensor
+    """[3] about which the yaw of the offset turns."""
+    track: Tensor | None
+    """[1, S, 3] displacement of the gripper."""
+
+
+class Objective:
+    """Losses of a batch of parameter sets on one or several episodes of one scenario."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        episodes: Sequence[Episode],
+        *,
+        frames: Sequence[int] | None = None,
+        points: int | None = None,
+        seed: int = 0,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """
+        Args:
+            episodes: one, or several for a joint fit; their losses are averaged.
+            frames: loss frames instead of the scenario's; negative ones count from the end.
+            points: sampled per frame instead of the scenario's.
+            seed: of the common random numbers.
+
+        Raises:
+            EpisodeError: a loss frame that an episode lacks, or one after the end of the simulation.
+        """
+        self.scenario = scenario
+        self.system, _ = scenario.scene.build(dtype=dtype, device=device)
+        self.frames = tuple(scenario.loss_frames if frames is None else frames)
+        self.point_count = points or scenario.points
+        self.node_sets = {}
+        for name, nodes in scenario.node_sets.items():
+            mask = torch.zeros(len(self.system.mesh.nodes), dtype=torch.bool, device=device)
+            mask[torch.as_tensor(nodes, device=device)] = True
+            self.node_sets[name] = mask
+        self.reseed(seed)
+        self._targets = [self._target(episode) for episode in episodes]
+        last = max(float(target.times.max()) for target in self._targets)
+        self._steps = min(int(np.ceil(last / self.system.time_step - 1e-6)), scenario.steps)
+
+    def reseed(self, seed: int) -> None:
+        """Draw the common random numbers anew."""
+        subset = self.scenario.loss_faces
+        self.sampler = SurfaceSampler.build(
+            self.system.stretching.elements.nodes,
+            self.point_count,
+            generator=torch.Generator().manual_seed(seed),
+            subset=None if subset is None else torch.as_tensor(subset, device=self.system.device),
+            dtype=self.system.dtype,
+        )
+
+    def __call__(
+        self, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor] | None = None
+    ) -> Tensor:
+        """Losses [B] in squared length units of the scene, differentiable.
+
+        Args:
+            parameters: name -> [B].
+            offset: name -> [B] rigid offset of the target (see `parameters.NUISANCE`).
+
+        Raises:
+            DivergedError: names step and batch entries.
+        """
+        batch = len(next(iter(parameters.values()))) if parameters else 1
+        losses = []
+        for begin in range(0, batch, _CHUNK):  # chunks that fit the cache; nothing inside loops over the batch
+            part = {name: value[begin : begin + _CHUNK] for name, value in parameters.items()}
+            shift = {name: value[begin : begin + _CHUNK] for name, value in (offset or {}).items()}
+            terms = [self._loss(target, part, shift) for target in self._targets]
+            losses.append(torch.stack(terms).mean(0))
+        return torch.cat(losses)
+
+    def simulate(self, parameters: Mapping[str, Tensor], *, episode: int = 0, steps: int | None = None) -> Rollout:
+        """The rollout of parameter sets with an episode's gripper track, by default over the whole scenario."""
+        steps = self.scenario.steps if steps is None else steps
+        properties = scaled_properties(
+            self.system.properties,
+            parameters,
+            faces=self.system.stretching.elements.nodes,
+            node_sets={name: mask for name, mask in self.node_sets.items() if name in parameters},
+        )
+        track = self._targets[episode].track
+        track = None if track is None else track[:, :steps]
+        return rollout(self.system, steps, properties=properties, track=track)
+
+    def _loss(self, target: _Target, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor]) -> Tensor:
+        episode = self._targets.index(target)
+        run = self.simulate(parameters, episode=episode, steps=self._steps)
+        points = self.sampler.sample(run.at(target.times))  # [B, L, N, 3]
+        if offset:
+            points = _undo_offset(points, target.centre, offset)
+        terms = [one_sided_chamfer(points[:, index], cloud) for index, cloud in enumerate(target.clouds)]
+        return torch.stack(terms).mean(0)
+
+    def _target(self, episode: Episode) -> _Target:
+        system = self.system
+        times, clouds = [], []
+        for frame in self.frames:
+            cloud = episode.frame(frame)
+            times.append(episode.times[frame])
+            clouds.append(NeighbourIndex(torch.as_tensor(cloud, dtype=system.dtype, device=system.device)))
+        end = self.scenario.steps * system.time_step
+        if max(times) > end + 0.5 * self.scenario.scene.frame_time:
+            raise EpisodeError(
+                f"A loss frame lies at {max(times):.3f} s, but scenario {self.scenario.name} simulates only {end:.3f} s. "
+                "Use a scenario with more frames, or another loss frame."
+            )
+        track = None
+        if episode.gripper is not None:
+            track = torch.as_tensor(
+                track_displacement(episode, self.scenario.steps, system.time_step),
+                dtype=system.dtype,
+                device=system.device,
+            )[None]
+        centre = torch.cat([cloud.points for cloud in clouds]).mean(0)
+        return _Target(torch.as_tensor(np.array(times), dtype=system.dtype, device=system.device), tuple(clouds), centre, track)
+
+
+def track_displacement(episode: Episode, steps: int, time_step: float) -> np.ndarray:
+    """[S, 3] displacement of the gripper since time zero at the end of each step [m].
+
+    A cubic spline through the recorded positions, constant after the last. Recorded positions begin with the motion: a
+    track whose first frame is later than time zero is held at its first position until then.
+    """
+    assert episode.gripper is not None
+    if len(episode.times) < 2:
+        return np.zeros((steps, 3))
+    times, positions = episode.times, episode.gripper
+    at = np.clip(np.cumsum(np.full(steps, time_step)), times[0], times[-1])
+    return np.asarray(CubicSpline(times, positions)(at) - positions[0])
+
+
+def _undo_offset(points: Tensor, centre: Tensor, offset: Mapping[str, Tensor]) -> Tensor:
+    """Move the simulated points by the inverse of the target's offset; the target's search tree stays as it is."""
+    zero = torch.zeros_like(next(iter(offset.values())))
+    shift = torch.stack([offset.get(name, zero) for name in ("offset_x", "offset_y", "offset_z")], dim=-1)
+    yaw = offset.get("offset_yaw", zero)
+    cos, sin, one = yaw.cos(), yaw.sin(), torch.ones_like(yaw)
+    # the target turns by yaw about its centre, then shifts; row vectors times this matrix turn back
+    turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
+    local = points - (centre + shift)[:, None, None]
+    return local @ turn[:, None] + centre

@@ -1,0 +1,143 @@
+"""What is fitted: bounded variables behind a sigmoid (paper, section III-C).
+
+    linear (the paper):  w = lo + (hi - lo) σ(s)
+    logarithmic:         w = lo (hi / lo)^σ(s)
+
+On the published clouds the better minima often lie at multipliers of 0.1 to 0.5, which a start at the middle of the linear
+scale hardly reaches; extra starts therefore use the logarithmic scale where the lower bound is positive.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.stats import qmc
+from torch import Tensor
+
+from diffcloud.errors import ConfigError, unknown_name
+from diffcloud.sim.properties import PARAMETERS
+
+NUISANCE = {
+    "offset_x": "m",
+    "offset_y": "m",
+    "offset_z": "m",
+    "offset_yaw": "rad",
+}
+"""Rigid offset of the target cloud, fitted along to absorb calibration error; not a property of the cloth."""
+_EDGE = 1e-6
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One fitted number."""
+
+    name: str
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+            raise ConfigError(
+                f"Bounds of {self.name!r} must be finite and in order (low < high), got [{self.low}, {self.high}]."
+            )
+
+
+@dataclass(frozen=True)
+class FitSpace:
+    """The fitted variables, and parameters known beforehand."""
+
+    variables: tuple[Variable, ...]
+    fixed: Mapping[str, float]
+
+    @staticmethod
+    def build(
+        names: Sequence[str],
+        *,
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+        fixed: Mapping[str, float] | None = None,
+        offset: bool = False,
+        offset_range: tuple[float, float] = (0.02, 0.1),
+    ) -> FitSpace:
+        """
+        Args:
+            names: parameters to fit.
+            bounds: overrides of each parameter's own bounds.
+            fixed: parameters with a known value (a weighed cloth: mass).
+            offset: fit a rigid offset of the target along, within ± offset_range (length unit, rad).
+
+        Raises:
+            ConfigError: an unknown, repeated or doubly given parameter, or bounds out of order.
+        """
+        fixed, bounds = dict(fixed or {}), dict(bounds or {})
+        for name in (*names, *fixed, *bounds):
+            if name not in PARAMETERS:
+                raise ConfigError(unknown_name("parameter", name, PARAMETERS))
+        if len(set(names)) < len(names):
+            raise ConfigError(f"A parameter is listed twice: {', '.join(names)}.")
+        both = sorted(set(names) & set(fixed))
+        variables = [Variable(n, *bounds.get(n, PARAMETERS[n].bounds)) for n in names if n not in both]
+        if offset:
+            ranges = dict(zip(NUISANCE, (*[offset_range[0]] * 3, offset_range[1]), strict=True))
+            variables += [Variable(name, -ranges[name], ranges[name]) for name in NUISANCE]
+        if not variables:
+            raise ConfigError("Nothing is left to fit: every listed parameter is fixed.")
+        return FitSpace(tuple(variables), fixed)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(variable.name for variable in self.variables)
+
+    def values(self, unbounded: Tensor, logarithmic: Tensor) -> Tensor:
+        """[B, k] unbounded variables -> [B, k] values; `logarithmic` bool [B] picks the scale of each start."""
+        low, high = self._bounds(unbounded)
+        fraction = torch.sigmoid(unbounded)
+        safe = torch.where(low > 0, low, 1.0)
+        ratio = torch.where(low > 0, high / safe, 1.0)
+        return torch.where(logarithmic[:, None] & (low > 0), safe * ratio**fraction, low + (high - low) * fraction)
+
+    def unbounded(self, values: Tensor, logarithmic: Tensor) -> Tensor:
+        """The inverse of `values`; values on or beyond a bound are brought just inside."""
+        low, high = self._bounds(values)
+        linear = (values - low) / (high - low)
+        safe = torch.where(low > 0, low, 1.0)
+        logs = (values.clamp(min=_EDGE) / safe).log() / torch.where(low > 0, high / safe, math.e).log()
+        fraction = torch.where(logarithmic[:, None] & (low > 0), logs, linear)
+        return torch.logit(fraction.clamp(_EDGE, 1 - _EDGE))
+
+    def starts(self, count: int, *, seed: int, first: Mapping[str, float] | None = None) -> tuple[Tensor, Tensor]:
+        """Initial values [count, k] and which scale each start uses, bool [count].
+
+        The first start is the middle of the range on the paper's linear scale, or `first` where given; the others are
+        spread over the box log-uniformly by a scrambled Sobol sequence.
+        """
+        low = np.array([variable.low for variable in self.variables])
+        high = np.array([variable.high for variable in self.variables])
+        middle = 0.5 * (low + high)
+        for index, name in enumerate(self.names):
+            if first and name in first:
+                middle[index] = np.clip(first[name], low[index], high[index])
+        values = np.repeat(middle[None], count, axis=0)
+        if count > 1:
+            sobol = qmc.Sobol(len(low), seed=seed).random_base2(math.ceil(math.log2(count)))[: count - 1]
+            safe = np.where(low > 0, low, 1.0)
+            logs = safe * np.where(low > 0, high / safe, 1.0) ** sobol
+            values[1:] = np.where(low > 0, logs, low + (high - low) * sobol)
+            nuisance = [index for index, name in enumerate(self.names) if name in NUISANCE]
+            values[1:, nuisance] = 0.0
+        return torch.as_tensor(values), torch.arange(count) > 0
+
+    def split(self, values: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """[B, k] -> (parameters of the simulator incl. the fixed ones, offset of the target), name -> [B]."""
+        columns = dict(zip(self.names, values.unbind(-1), strict=True))
+        offset = {name: columns.pop(name) for name in NUISANCE if name in columns}
+        fixed = {name: torch.full_like(values[:, 0], value) for name, value in self.fixed.items()}
+        return {**columns, **fixed}, offset
+
+    def _bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        low = [variable.low for variable in self.variables]
+        high = [variable.high for variable in self.variables]
+        return torch.tensor(low).to(like), torch.tensor(high).to(like)

@@ -1,0 +1,193 @@
+"""A finished fit, as a person reads it and as files keep it."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+import diffcloud
+from diffcloud.errors import ConfigError
+from diffcloud.fit.objective import Objective
+from diffcloud.fit.optimise import AdamSettings, FitOutcome
+from diffcloud.fit.parameters import NUISANCE, FitSpace
+from diffcloud.io.files import atomic_path, read_json, write_json
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.properties import PARAMETERS
+
+_SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What `write_fit` stores."""
+
+    summary: dict[str, Any]
+    """The JSON file."""
+    positions: NDArray[np.float64]
+    """[T + 1, V, 3] fitted nodes at each frame, in the scene's unit."""
+    start_positions: NDArray[np.float64]
+    """[T + 1, V, 3] nodes at the first start's parameters."""
+    faces: NDArray[np.int64]
+    """[F, 3]"""
+    times: NDArray[np.float64]
+    """[T + 1] [s]"""
+
+
+def physical_values(scenario: Scenario, values: Mapping[str, float]) -> dict[str, dict[str, Any]]:
+    """Each parameter with what it means: multiplier, physical value and unit (SI if the scene is)."""
+    material, around = scenario.scene.material, scenario.scene.surrounding
+    density = (scenario.scene.mass_material or material).density
+    basis = {
+        "stretch": material.resting_stretching_stiffness,
+        "bending": material.resting_bending_stiffness,
+        "mass": density,
+        "density": density,
+        "drag": around.air_density,
+    }
+    described: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        if name in NUISANCE:
+            described[name] = {"value": value, "unit": NUISANCE[name], "physical": value, "physical_unit": NUISANCE[name]}
+            continue
+        parameter = PARAMETERS[name]
+        multiplier = parameter.kind == "multiplier"
+        described[name] = {
+            "value": value,
+            "unit": "x basis" if multiplier else parameter.unit,
+            "physical": value * basis[name] if multiplier else value,
+            "physical_unit": parameter.unit,
+            "meaning": parameter.meaning,
+        }
+    return described
+
+
+def describe_fit(
+    objective: Objective,
+    space: FitSpace,
+    settings: AdamSettings,
+    outcome: FitOutcome,
+    *,
+    episodes: list[str],
+    resampled_seeds: int = 4,
+) -> FitResult:
+    """Simulate the result and put everything together.
+
+    `loss` is on the fit's own random points; `loss_resampled` is the mean over fresh draws, which the fit could not adapt
+    to.
+    """
+    scenario = objective.scenario
+    all_values = {**outcome.values, **space.fixed}
+    bounds = {variable.name: [variable.low, variable.high] for variable in space.variables}
+    parameters = physical_values(scenario, all_values)
+    for name, entry in parameters.items():
+        entry |= {"fixed": name in space.fixed, "bounds": bounds.get(name)}
+        if name in bounds:
+            low, high = bounds[name]
+            entry["at_bound"] = bool(min(outcome.values[name] - low, high - outcome.values[name]) < 0.01 * (high - low))
+
+    def batch(values: Mapping[str, float]) -> dict[str, torch.Tensor]:
+        like = objective.system.gravity
+        return {name: torch.tensor([value], dtype=like.dtype, device=like.device) for name, value in values.items()}
+
+    def split(values: Mapping[str, float]) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+        tensors = batch(values)
+        return (
+            {name: value for name, value in tensors.items() if name not in NUISANCE},
+            {name: value for name, value in tensors.items() if name in NUISANCE},
+        )
+
+    history = outcome.history
+    start_values = dict(zip(history.names, history.values[0][0].tolist(), strict=True)) | dict(space.fixed)
+    with torch.no_grad():
+        frame_steps = scenario.scene.frame_steps
+        run = objective.simulate(split(all_values)[0])
+        start = objective.simulate(split(start_values)[0])
+        resampled = []
+        for seed in range(1, resampled_seeds + 1):
+            objective.reseed(settings.seed + 10_000 + seed)
+            resampled.append(float(objective(*split(all_values))[0]))
+        objective.reseed(settings.seed)
+    unit = scenario.length_unit_m
+    summary = {
+        "schema": _SCHEMA,
+        "scenario": scenario.name,
+        "episodes": episodes,
+        "optimizer": "adam",
+        "loss": outcome.loss,
+        "loss_start": outcome.loss_start,
+        "loss_resampled": float(np.mean(resampled)),
+        "loss_unit": "squared length unit, mean over simulated points",
+        "rms_mm": 1e3 * unit * outcome.loss**0.5,
+        "length_unit_m": unit,
+        "iterations": outcome.iterations,
+        "evaluations": outcome.evaluations,
+        "seconds": outcome.seconds,
+        "stop_reason": outcome.stop_reason,
+        "parameters": parameters,
+        "start": start_values,
+        "best_start": outcome.best_start,
+        "settings": {
+            "learning_rate": settings.learning_rate,
+            "iterations": settings.iterations,
+            "threshold": settings.threshold,
+            "starts": settings.starts,
+            "seed": settings.seed,
+            "resample": settings.resample,
+            "points": objective.point_count,
+            "frames": list(objective.frames),
+        },
+        "history": {
+            "names": list(history.names),
+            "loss": [[_finite(value) for value in row.tolist()] for row in history.losses],
+            "values": [row.tolist() for row in history.values],
+            "gradient_norm": [row.norm(dim=-1).tolist() for row in history.gradients],
+        },
+        "failures": list(outcome.failures),
+        "versions": {"diffcloud": diffcloud.__version__, "torch": torch.__version__, "python": platform.python_version()},
+    }
+    return FitResult(
+        summary=summary,
+        positions=run.positions[0, ::frame_steps].cpu().numpy(),
+        start_positions=start.positions[0, ::frame_steps].cpu().numpy(),
+        faces=objective.system.mesh.faces,
+        times=run.times[::frame_steps].cpu().numpy(),
+    )
+
+
+def write_fit(folder: Path, name: str, result: FitResult) -> Path:
+    """Write `<name>.npz` (trajectory) and then `<name>.json`; returns the latter."""
+    folder = Path(folder)
+    with atomic_path(folder / f"{name}.npz") as temporary:
+        np.savez_compressed(
+            temporary,
+            nodes=result.positions,
+            start_nodes=result.start_positions,
+            faces=result.faces,
+            times=result.times,
+        )
+    path = folder / f"{name}.json"
+    write_json(path, result.summary)
+    return path
+
+
+def read_fit(path: Path) -> dict[str, Any]:
+    """The JSON summary of a fit.
+
+    Raises:
+        ConfigError: missing, damaged, or not a fit.
+    """
+    summary = read_json(path, error=ConfigError)
+    if not isinstance(summary, dict) or "parameters" not in summary or "loss" not in summary:
+        raise ConfigError(f"{path} is not a fit written by `diffcloud fit`: it lacks `parameters` or `loss`.")
+    return summary
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

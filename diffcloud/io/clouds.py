@@ -1,0 +1,98 @@
+"""Cloud files of other tools: NPY, PLY, XYZ, PCD.
+
+PLY goes through trimesh and PCD through open3d, which is imported only when a PCD file is met.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import EpisodeError
+from diffcloud.io.pickles import load_npy
+
+FORMATS = (".npy", ".ply", ".xyz", ".pcd")
+
+
+def read_cloud(path: Path) -> NDArray[np.float32]:
+    """[N, 3] points of one file; colours, normals and further columns are left out.
+
+    Raises:
+        EpisodeError: missing, damaged, empty, of the wrong shape, or with NaN/Inf points.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise EpisodeError(f"No such cloud: {path}.")
+    readers = {".npy": load_npy, ".ply": _read_ply, ".xyz": _read_xyz, ".pcd": _read_pcd}
+    if path.suffix.lower() not in readers:
+        raise EpisodeError(f"{path}: unknown cloud format; allowed are {', '.join(FORMATS)}.")
+    points = np.asarray(readers[path.suffix.lower()](path))
+    if points.dtype.kind not in "fiu":
+        raise EpisodeError(f"{path} holds {points.dtype} values; a cloud holds numbers.")
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise EpisodeError(f"{path} has shape {list(points.shape)}; a cloud has shape [points, 3].")
+    if len(points) == 0:
+        raise EpisodeError(f"{path} is an empty cloud.")
+    if not np.isfinite(points).all():
+        count = int((~np.isfinite(points).all(axis=1)).sum())
+        raise EpisodeError(f"{path} holds {count} NaN or infinite points; remove them first.")
+    return points.astype(np.float32)
+
+
+def write_ply(path: Path, vertices: NDArray[Any], faces: NDArray[Any] | None = None) -> None:
+    """Write a cloud [N, 3] or a mesh as binary PLY, atomically."""
+    import trimesh
+
+    from diffcloud.io.files import atomic_path
+
+    shape = trimesh.PointCloud(vertices) if faces is None else trimesh.Trimesh(vertices, faces, process=False)
+    with atomic_path(Path(path)) as temporary:
+        temporary.write_bytes(shape.export(file_type="ply"))
+
+
+def _read_ply(path: Path) -> NDArray[Any]:
+    import trimesh
+
+    try:
+        loaded = trimesh.load(path, process=False)
+    except Exception as error:  # trimesh raises many kinds on damaged files
+        raise EpisodeError(f"{path} is not a readable PLY file: {error}.") from error
+    return np.asarray(getattr(loaded, "vertices", np.zeros((0, 3))))
+
+
+def _read_xyz(path: Path) -> NDArray[Any]:
+    try:
+        table = np.loadtxt(path, ndmin=2)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise EpisodeError(f"{path} is not a readable XYZ file (three or more numbers a line): {error}.") from error
+    return table[:, :3]
+
+
+def _read_pcd(path: Path) -> NDArray[Any]:
+    open3d = import_open3d()
+    cloud = open3d.io.read_point_cloud(str(path), remove_nan_points=False, remove_infinite_points=False)
+    return np.asarray(cloud.points)
+
+
+def import_open3d() -> Any:
+    """open3d, with libusb found where the system has none.
+
+    Raises:
+        EpisodeError: open3d cannot be imported; says what to install.
+    """
+    try:
+        import libusb_package
+
+        # open3d links to libusb-1.0, which a bare machine lacks; the wheel's own copy serves when loaded first
+        ctypes.CDLL(str(libusb_package.get_library_path()), ctypes.RTLD_GLOBAL)
+        import open3d
+    except (ImportError, OSError) as error:
+        raise EpisodeError(
+            f"open3d cannot be imported ({error}). On Debian: apt-get install libgl1 libegl1 libx11-6 libudev1 libgomp1. "
+            "Or convert PCD files to PLY."
+        ) from error
+    return open3d

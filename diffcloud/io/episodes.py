@@ -1,0 +1,166 @@
+"""Episodes: recorded point clouds over time, as one `.npz` without pickles (DESIGN: data contracts).
+
+Fields: `points` float32 [P, 3] of all frames joined, `offsets` int64 [T+1], `times` [T] since the start [s], optional
+`gripper` [T, 3], optional per-point `camera` uint8, `pixel` uint16 [P, 2], `sigma` float32 [P] [m], and `meta`, a JSON
+string. All in the frame and length unit of the scenario's scene.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import EpisodeError
+from diffcloud.io.files import atomic_path
+
+_OPTIONAL = {"gripper", "camera", "pixel", "sigma"}
+_REQUIRED = {"points", "offsets", "times", "meta"}
+_LARGEST_BYTES = 4 * 2**30
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A recorded episode.
+
+    Raises:
+        EpisodeError: a wrong shape, an empty frame, NaN/Inf points, or times that do not increase.
+    """
+
+    points: NDArray[np.float32]
+    """[P, 3] of all frames joined."""
+    offsets: NDArray[np.int64]
+    """[T + 1] frame t holds points[offsets[t]:offsets[t + 1]]."""
+    times: NDArray[np.float64]
+    """[T] since the start of the motion [s]."""
+    gripper: NDArray[np.float64] | None = None
+    """[T, 3] tool position; None: the scene's own motion drives the handles."""
+    camera: NDArray[np.uint8] | None = None
+    """[P] which camera saw the point."""
+    pixel: NDArray[np.uint16] | None = None
+    """[P, 2] (column, row)."""
+    sigma: NDArray[np.float32] | None = None
+    """[P] standard deviation of the depth [m]."""
+    meta: Mapping[str, Any] = field(default_factory=dict)
+    """scenario, fabric, category, repeat, truth, published predictions, quality figures."""
+
+    def __post_init__(self) -> None:
+        points, offsets, times = self.points, self.offsets, self.times
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise EpisodeError(f"points must have shape [points, 3], got {list(points.shape)}.")
+        count = len(times)
+        if count < 1 or offsets.shape != (count + 1,) or offsets[0] != 0 or offsets[-1] != len(points):
+            raise EpisodeError(
+                f"offsets must be {count + 1} numbers from 0 to {len(points)} for {count} frames, got shape "
+                f"{list(offsets.shape)}."
+            )
+        empty = np.flatnonzero(np.diff(offsets) <= 0)
+        if len(empty):
+            raise EpisodeError(f"Frame {empty[0]} is empty; every frame needs at least one point.")
+        if not np.isfinite(points).all():
+            bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+            frame = int(np.searchsorted(offsets, bad, side="right")) - 1
+            raise EpisodeError(f"Frame {frame} holds NaN or infinite points; remove them when you import.")
+        if not np.isfinite(times).all() or (np.diff(times) <= 0).any() or times[0] < 0:
+            raise EpisodeError("times must increase from 0 or later; sort the frames and remove repeats.")
+        for name, width in (("camera", ()), ("pixel", (2,)), ("sigma", ())):
+            value = getattr(self, name)
+            if value is not None and value.shape != (len(points), *width):
+                raise EpisodeError(f"{name} must have shape {[len(points), *width]}, got {list(value.shape)}.")
+        if self.gripper is not None and (self.gripper.shape != (count, 3) or not np.isfinite(self.gripper).all()):
+            raise EpisodeError(f"gripper must be {count} finite positions [frames, 3], got {list(self.gripper.shape)}.")
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.times)
+
+    def frame(self, index: int) -> NDArray[np.float32]:
+        """[N, 3] points of one frame; negative indices count from the end.
+
+        Raises:
+            EpisodeError: no such frame.
+        """
+        position = index + self.frame_count if index < 0 else index
+        if not 0 <= position < self.frame_count:
+            raise EpisodeError(
+                f"Frame {index} is missing: the episode has {self.frame_count} frames. Record the whole motion, or choose "
+                "another loss frame."
+            )
+        return self.points[self.offsets[position] : self.offsets[position + 1]]
+
+    @staticmethod
+    def from_frames(
+        frames: Sequence[NDArray[np.floating[Any]]],
+        times: NDArray[np.float64],
+        *,
+        gripper: NDArray[np.float64] | None = None,
+        meta: Mapping[str, Any] | None = None,
+    ) -> Episode:
+        """Join clouds [N_t, 3]."""
+        for index, frame in enumerate(frames):
+            if frame.ndim != 2 or frame.shape[1] != 3:
+                raise EpisodeError(f"Frame {index} must have shape [points, 3], got {list(frame.shape)}.")
+        if not frames:
+            raise EpisodeError("An episode needs at least one frame.")
+        return Episode(
+            points=np.concatenate(frames).astype(np.float32),
+            offsets=np.cumsum([0, *(len(frame) for frame in frames)], dtype=np.int64),
+            times=np.asarray(times, dtype=np.float64),
+            gripper=gripper,
+            meta=dict(meta or {}),
+        )
+
+
+def write_episode(path: Path, episode: Episode) -> None:
+    """Write atomically; the same episode gives the same bytes."""
+    arrays: dict[str, Any] = {"points": episode.points, "offsets": episode.offsets, "times": episode.times}
+    arrays |= {name: getattr(episode, name) for name in sorted(_OPTIONAL) if getattr(episode, name) is not None}
+    arrays["meta"] = np.array(json.dumps(dict(episode.meta), sort_keys=True, allow_nan=False))
+    with atomic_path(Path(path)) as temporary:
+        np.savez_compressed(temporary, allow_pickle=False, **arrays)
+
+
+def read_episode(path: Path) -> Episode:
+    """Read and check an episode.
+
+    Raises:
+        EpisodeError: missing, damaged, not an episode, or wrong inside; names the file and the field.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise EpisodeError(f"No such episode: {path}.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(info.file_size for info in archive.infolist())
+        if size > _LARGEST_BYTES:
+            raise EpisodeError(f"{path} unpacks to {size} bytes; at most {_LARGEST_BYTES} are read.")
+        with np.load(path, allow_pickle=False) as archive:
+            names = set(archive.files)
+            if not names >= _REQUIRED or not names <= _REQUIRED | _OPTIONAL:
+                raise EpisodeError(
+                    f"{path} has the fields {sorted(names)}; an episode has {sorted(_REQUIRED)} and may have "
+                    f"{sorted(_OPTIONAL)}."
+                )
+            arrays = {name: archive[name] for name in names}
+        meta = json.loads(str(arrays.pop("meta")))
+    except EpisodeError:
+        raise
+    except (zipfile.BadZipFile, ValueError, OSError, KeyError, EOFError) as error:
+        raise EpisodeError(f"{path} is not a readable episode: {error}.") from error
+    kinds = {"points": np.float32, "offsets": np.int64, "times": np.float64, "gripper": np.float64}
+    kinds |= {"camera": np.uint8, "pixel": np.uint16, "sigma": np.float32}
+    try:
+        converted = {name: array.astype(kinds[name], casting="same_kind") for name, array in arrays.items()}
+        if not isinstance(meta, dict):
+            raise EpisodeError(f"meta must be a JSON object, got {type(meta).__name__}.")
+        return Episode(**converted, meta=meta)
+    except TypeError as error:
+        raise EpisodeError(f"{path}: a field has the wrong type: {error}.") from error
+    except EpisodeError as error:
+        raise EpisodeError(f"{path}: {error}") from error
