@@ -17,9 +17,7 @@ _CHUNK_BYTES = 256 * 2**20
 def brute_force_neighbours(queries: Tensor, targets: Tensor) -> Tensor:
     """[Q, 3], [P, 3] -> [Q] index of the nearest target; memory bounded by chunks."""
     rows = max(1, _CHUNK_BYTES // (targets.element_size() * 3 * len(targets)))
-    return torch.cat(
-        [(chunk[:, None] - targets).square().sum(-1).argmin(1) for chunk in queries.detach().split(rows)]
-    )
+    return torch.cat([(chunk[:, None] - targets).square().sum(-1).argmin(1) for chunk in queries.detach().split(rows)])
 
 
 class NeighbourIndex:

@@ -16,7 +16,6 @@ from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import EpisodeError
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim.properties import scaled_properties
 from diffcloud.sim.simulate import Rollout, rollout
 
 _CHUNK = 16
@@ -64,11 +63,6 @@ class Objective:
         self.system, _ = scenario.scene.build(dtype=dtype, device=device)
         self.frames = tuple(scenario.loss_frames if frames is None else frames)
         self.point_count = points or scenario.points
-        self.node_sets = {}
-        for name, nodes in scenario.node_sets.items():
-            mask = torch.zeros(len(self.system.mesh.nodes), dtype=torch.bool, device=device)
-            mask[torch.as_tensor(nodes, device=device)] = True
-            self.node_sets[name] = mask
         self.reseed(seed)
         self._targets = [self._target(episode) for episode in episodes]
         last = max(float(target.times.max()) for target in self._targets)
@@ -85,9 +79,7 @@ class Objective:
             dtype=self.system.dtype,
         )
 
-    def __call__(
-        self, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor] | None = None
-    ) -> Tensor:
+    def __call__(self, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor] | None = None) -> Tensor:
         """Losses [B] in squared length units of the scene, differentiable.
 
         Args:
@@ -109,12 +101,7 @@ class Objective:
     def simulate(self, parameters: Mapping[str, Tensor], *, episode: int = 0, steps: int | None = None) -> Rollout:
         """The rollout of parameter sets with an episode's gripper track, by default over the whole scenario."""
         steps = self.scenario.steps if steps is None else steps
-        properties = scaled_properties(
-            self.system.properties,
-            parameters,
-            faces=self.system.stretching.elements.nodes,
-            node_sets={name: mask for name, mask in self.node_sets.items() if name in parameters},
-        )
+        properties = self.scenario.properties(self.system, parameters)
         track = self._targets[episode].track
         track = None if track is None else track[:, :steps]
         return rollout(self.system, steps, properties=properties, track=track)
@@ -149,7 +136,9 @@ class Objective:
                 device=system.device,
             )[None]
         centre = torch.cat([cloud.points for cloud in clouds]).mean(0)
-        return _Target(torch.as_tensor(np.array(times), dtype=system.dtype, device=system.device), tuple(clouds), centre, track)
+        return _Target(
+            torch.as_tensor(np.array(times), dtype=system.dtype, device=system.device), tuple(clouds), centre, track
+        )
 
 
 def track_displacement(episode: Episode, steps: int, time_step: float) -> np.ndarray:

@@ -140,6 +140,8 @@ def describe_fit(
             "starts": settings.starts,
             "seed": settings.seed,
             "resample": settings.resample,
+            "smoothing": settings.smoothing,
+            "copies": settings.copies if settings.smoothing else 0,
             "points": objective.point_count,
             "frames": list(objective.frames),
         },

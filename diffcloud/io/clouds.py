@@ -51,7 +51,7 @@ def write_ply(path: Path, vertices: NDArray[Any], faces: NDArray[Any] | None = N
 
     shape = trimesh.PointCloud(vertices) if faces is None else trimesh.Trimesh(vertices, faces, process=False)
     with atomic_path(Path(path)) as temporary:
-        temporary.write_bytes(shape.export(file_type="ply"))
+        temporary.write_bytes(bytes(shape.export(file_type="ply")))
 
 
 def _read_ply(path: Path) -> NDArray[Any]:

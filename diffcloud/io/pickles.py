@@ -6,6 +6,7 @@ other, so that a file cannot run code.
 
 from __future__ import annotations
 
+import importlib
 import io
 import pickle
 from pathlib import Path
@@ -25,9 +26,7 @@ _ALLOWED = {
     ("collections", "OrderedDict"): dict,
 }
 _RECONSTRUCT = {
-    (module, name)
-    for module in ("numpy.core.multiarray", "numpy._core.multiarray")
-    for name in ("_reconstruct", "scalar")
+    (module, name) for module in ("numpy.core.multiarray", "numpy._core.multiarray") for name in ("_reconstruct", "scalar")
 }
 
 
@@ -36,7 +35,7 @@ class _PlainUnpickler(pickle.Unpickler):
         if (module, name) in _ALLOWED:
             return _ALLOWED[module, name]
         if (module, name) in _RECONSTRUCT:
-            return getattr(np._core.multiarray, name)
+            return getattr(importlib.import_module("numpy._core.multiarray"), name)
         raise EpisodeError(f"refers to {module}.{name}; only plain containers, numbers and numpy arrays are read")
 
 

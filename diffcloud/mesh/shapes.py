@@ -8,9 +8,7 @@ from diffcloud.errors import MeshError
 from diffcloud.mesh.topology import ClothMesh
 
 
-def grid_cloth(
-    rows: int, columns: int, height: float, width: float, *, alternate_diagonals: bool = False
-) -> ClothMesh:
+def grid_cloth(rows: int, columns: int, height: float, width: float, *, alternate_diagonals: bool = False) -> ClothMesh:
     """A flat rectangular cloth in the plane z = 0, centred on the origin, rest shape equal to its world shape.
 
     Node (i, j) has index i·columns + j; i runs along +y (and material v), j along +x (and material u).

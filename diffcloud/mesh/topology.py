@@ -109,7 +109,7 @@ class ClothMesh:
     @cached_property
     def node_area(self) -> FloatArray:
         """[V] a third of the material-space area of the faces around each node [m²]."""
-        return np.bincount(self.faces.ravel(), np.repeat(self.face_area / 3, 3), minlength=len(self.nodes))
+        return np.bincount(self.faces.ravel(), np.repeat(self.face_area / 3, 3), len(self.nodes)).astype(np.float64)
 
     @cached_property
     def edges(self) -> tuple[IntArray, IntArray]:

@@ -44,9 +44,7 @@ class Scene:
             return None
         return math.ceil(math.ceil(self.end_time / self.time_step - 1e-9) / self.frame_steps)
 
-    def build(
-        self, *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"
-    ) -> tuple[System, State]:
+    def build(self, *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> tuple[System, State]:
         """(System, State at time zero with batch 1)."""
         system = build_system(
             self.mesh,

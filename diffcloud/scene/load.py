@@ -18,7 +18,7 @@ from diffcloud.sim.build import Surrounding
 from diffcloud.sim.contact import ContactSettings
 from diffcloud.sim.energies import Handles
 from diffcloud.sim.energies.handles import Handle
-from diffcloud.sim.materials import Material, read_material
+from diffcloud.sim.materials import read_material
 from diffcloud.sim.motion import Keyframe, Motion, axis_angle_quaternion
 
 _SUPPORTED_SWITCHES = {"remeshing", "proximity", "strainlimiting", "separation", "popfilter", "plasticity"}

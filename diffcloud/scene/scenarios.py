@@ -7,15 +7,17 @@ starts from a built-in and changes what differs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+import torch
 import yaml
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
+from torch import Tensor
 
 from diffcloud.errors import ConfigError, SceneError, unknown_name
 from diffcloud.mesh.shapes import grid_cloth
@@ -29,6 +31,8 @@ from diffcloud.sim.energies import Handles
 from diffcloud.sim.energies.handles import Handle
 from diffcloud.sim.materials import Material, preset, read_material
 from diffcloud.sim.motion import Keyframe, Motion
+from diffcloud.sim.properties import Properties, scaled_properties
+from diffcloud.sim.state import System
 
 PAPER_THRESHOLD = 5e-4
 """Stop below this one-sided Chamfer loss, in squared length units of the release (paper, section IV-F)."""
@@ -66,6 +70,23 @@ class Scenario:
     def steps(self) -> int:
         return self.frames * self.scene.frame_steps
 
+    @property
+    def grasped(self) -> list[int]:
+        """Nodes that a moving handle holds."""
+        return [handle.node for handle in self.scene.handles.handles if handle.motion is not None]
+
+    def properties(self, system: System, values: Mapping[str, Tensor]) -> Properties:
+        """Physical quantities of parameter sets, name -> [B], with the scenario's node sets applied.
+
+        Raises:
+            ConfigError: an unknown parameter.
+        """
+        sets = {}
+        for name in values.keys() & self.node_sets.keys():
+            sets[name] = torch.zeros(len(system.mesh.nodes), dtype=torch.bool, device=system.device)
+            sets[name][torch.as_tensor(self.node_sets[name], device=system.device)] = True
+        return scaled_properties(system.properties, values, faces=system.stretching.elements.nodes, node_sets=sets)
+
 
 class GridScenario(Checked):
     """A rectangular cloth over a table: everything a person may change in a YAML file (SI units)."""
@@ -84,9 +105,9 @@ class GridScenario(Checked):
     """Height of the cloth over the table at the start."""
     material: str = "basis-knit"
     """A preset, or the path of an ARCSim material JSON."""
-    grasped: list[str | int]
+    grasped: tuple[str | int, ...]
     """Nodes that the gripper moves: corner names (left/right_bottom/top of the unrotated cloth) or indices."""
-    held: list[str | int] = []
+    held: tuple[str | int, ...] = ()
     """Nodes that stay where they are."""
     path: Annotated[list[tuple[float, float, float, float]], Field(min_length=2)]
     """Keyframes (time s, dx, dy, dz m) of the gripper's displacement, in the world's axes."""
@@ -95,7 +116,7 @@ class GridScenario(Checked):
     steps_per_frame: Annotated[int, Field(ge=1)] = 4
     newton_iterations: Annotated[int, Field(ge=1)] = 1
     soft_handles: bool = False
-    loss_frames: list[int] = [-1]
+    loss_frames: tuple[int, ...] = (-1,)
     loss_surface: Literal["all", "grasped_half"] = "all"
     points: Annotated[int, Field(ge=1)] = 3500
     learning_rate: Positive = 0.2
@@ -112,16 +133,16 @@ _SIDE = 0.2625
 _LIFT = GridScenario(
     name="lift",
     size_m=(_SIDE, _SIDE),
-    grasped=["right_top"],
+    grasped=("right_top",),
     path=[(0.0, 0.0, 0.0, 0.0), (2.5, 0.0, -0.14, 0.40)],
 )
 _FOLD = GridScenario(
     name="fold",
     size_m=(_SIDE, _SIDE),
-    grasped=["left_bottom"],
-    held=["right_top"],
+    grasped=("left_bottom",),
+    held=("right_top",),
     path=[(0.0, 0.0, 0.0, 0.0), (1.25, 0.0, 0.12, 0.26), (2.5, 0.0, 0.28, 0.08)],
-    loss_frames=[15],
+    loss_frames=(15,),
     loss_surface="grasped_half",
 )
 _BUILT_IN = {"lift": _LIFT, "fold": _FOLD}
@@ -148,9 +169,7 @@ def _numbers(text: str) -> tuple[int, ...]:
 
 
 _RELEASE = {
-    "release_lift": _Release(
-        25, 24, 3500, 0.2, 0.0, 1, _numbers("5,9-11,17,21-23,27,28,33,35-37,39,43,45-48")
-    ),
+    "release_lift": _Release(25, 24, 3500, 0.2, 0.0, 1, _numbers("5,9-11,17,21-23,27,28,33,35-37,39,43,45-48")),
     "release_fold": _Release(
         25,
         14,
@@ -161,9 +180,7 @@ _RELEASE = {
         _numbers("9-11,21,22,36,37,43,45-48"),
         _numbers("1,2,8-13,16,19,22-30,34,35,37,38,44-49,52,55,58-66,70,71"),
     ),
-    "release_hang": _Release(
-        15, 10, 3500, 0.3, PAPER_THRESHOLD, 0, _numbers("38-40,42,43,47,49,51,54-65,67,68")
-    ),
+    "release_hang": _Release(15, 10, 3500, 0.3, PAPER_THRESHOLD, 0, _numbers("38-40,42,43,47,49,51,54-65,67,68")),
     "release_band": _Release(25, 24, 5500, 0.4, PAPER_THRESHOLD, 0),
 }
 
@@ -183,7 +200,9 @@ def load_scenario(name: str | Path | None, scene: Path | None = None) -> Scenari
     """
     if name is None:
         if scene is None:
-            raise ConfigError(f"Give --scenario (one of {', '.join(SCENARIO_NAMES)}, or a YAML file), or --scene FILE.json.")
+            raise ConfigError(
+                f"Give --scenario (one of {', '.join(SCENARIO_NAMES)}, or a YAML file), or --scene FILE.json."
+            )
         loaded = load_scene(scene)
         frames = loaded.default_frames or 25
         return Scenario(Path(scene).stem, loaded, frames, loss_frames=(-1,))
@@ -199,6 +218,17 @@ def load_scenario(name: str | Path | None, scene: Path | None = None) -> Scenari
     if Path(text).suffix in (".yaml", ".yml"):
         return grid_scenario(read_grid_scenario(Path(text)))
     raise ConfigError(unknown_name("scenario", text, SCENARIO_NAMES) + " Or give the path of a YAML file.")
+
+
+def built_in(name: str) -> GridScenario:
+    """The options of a built-in scenario, to vary.
+
+    Raises:
+        ConfigError: no such built-in.
+    """
+    if name not in _BUILT_IN:
+        raise ConfigError(unknown_name("built-in scenario", name, _BUILT_IN))
+    return _BUILT_IN[name]
 
 
 def read_grid_scenario(path: Path) -> GridScenario:
@@ -262,7 +292,7 @@ def grid_scenario(options: GridScenario) -> Scenario:
     )
     frames = {frame if frame >= 0 else options.frames + 1 + frame for frame in options.loss_frames}
     if not frames or min(frames) < 0 or max(frames) > options.frames:
-        raise SceneError(f"Scenario {options.name}: loss_frames {options.loss_frames} leave 0..{options.frames}.")
+        raise SceneError(f"Scenario {options.name}: loss_frames {list(options.loss_frames)} leave 0..{options.frames}.")
     return Scenario(
         name=options.name,
         scene=scene,
@@ -274,7 +304,7 @@ def grid_scenario(options: GridScenario) -> Scenario:
     )
 
 
-def _named_nodes(options: GridScenario, names: list[str | int]) -> list[int]:
+def _named_nodes(options: GridScenario, names: Sequence[str | int]) -> list[int]:
     columns, rows = options.nodes
     corners = {
         "left_bottom": 0,

@@ -38,8 +38,10 @@ class Factor(Protocol):
 class ImplicitProblem(Protocol):
     """An equation r(u, *inputs) = 0 for u."""
 
-    exact: bool
-    """Whether the factor is ∂r/∂u (and symmetric), not an approximation."""
+    @property
+    def exact(self) -> bool:
+        """Whether the factor is ∂r/∂u (and symmetric), not an approximation."""
+        ...
 
     def solve(self, *inputs: Tensor) -> tuple[Tensor, Factor]:
         """u and a factor; called without gradients."""
@@ -59,7 +61,7 @@ def implicit_solve(problem: ImplicitProblem, *inputs: Tensor, copies: int = 1) -
     # duals exist only inside a level; asking for its number avoids unpacking every input of an ordinary step
     if forward_ad._current_level >= 0:
         return _with_tangent(problem, inputs, copies)
-    return _Implicit.apply(problem, *inputs)  # type: ignore[no-untyped-call, no-any-return]
+    return _Implicit.apply(problem, *inputs)
 
 
 class _Implicit(torch.autograd.Function):
@@ -106,7 +108,7 @@ def _with_tangent(problem: ImplicitProblem, inputs: tuple[Tensor, ...], copies: 
 
             def product(vector: Tensor) -> Tensor:
                 out = problem.residual(forward_ad.make_dual(u, vector.contiguous()), *primals)
-                return forward_ad.unpack_dual(out).tangent  # type: ignore[return-value]
+                return forward_ad.unpack_dual(out).tangent
 
             tangent = gmres(product, factor.solve, -change, tangent)
         return forward_ad.make_dual(u, tangent.contiguous())

@@ -102,9 +102,7 @@ def build_system(
     )
 
 
-def _halfspaces(
-    mesh: ClothMesh, surrounding: Surrounding, dtype: torch.dtype, device: torch.device
-) -> HalfSpaces | None:
+def _halfspaces(mesh: ClothMesh, surrounding: Surrounding, dtype: torch.dtype, device: torch.device) -> HalfSpaces | None:
     """Planar obstacles as half-spaces, on the side where most of the cloth starts."""
     planes = [plane for plane in (obstacle.plane() for obstacle in surrounding.obstacles) if plane is not None]
     if not planes:

@@ -11,6 +11,7 @@ damping. Hard handles replace the rows of their nodes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -50,8 +51,13 @@ class StepStart:
     properties: Properties
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """As the arguments of `StepProblem.solve` and `residual`."""
+        """As the inputs of a `StepProblem`; `of` reads them back."""
         return (self.positions, self.velocities, self.targets, *self.properties.tensors())
+
+    @staticmethod
+    def of(inputs: Sequence[Tensor]) -> StepStart:
+        positions, velocities, targets, *properties = inputs
+        return StepStart(positions, velocities, targets, Properties(*properties))
 
 
 @dataclass(frozen=True)
@@ -79,24 +85,20 @@ class StepProblem:
     def exact(self) -> bool:
         return self.system.newton_iterations == 1
 
-    def residual(
-        self, u: Tensor, positions: Tensor, velocities: Tensor, targets: Tensor, *properties: Tensor
-    ) -> Tensor:
+    def residual(self, u: Tensor, *inputs: Tensor) -> Tensor:
         """r [B, V, 3] [N·s]."""
-        start = StepStart(positions, velocities, targets, Properties(*properties))
+        start = StepStart.of(inputs)
         return self._residual(u, start, self._linearise(start, self._point(u, start)))
 
-    def solve(
-        self, positions: Tensor, velocities: Tensor, targets: Tensor, *properties: Tensor
-    ) -> tuple[Tensor, Factor]:
+    def solve(self, *inputs: Tensor) -> tuple[Tensor, Factor]:
         """u [B, V, 3] [m/s] and the factor of the (last) step matrix.
 
         Raises:
             NotPositiveDefiniteError, NewtonStallError: name the batch entries.
         """
-        start = StepStart(positions, velocities, targets, Properties(*properties))
-        u = torch.zeros_like(velocities)
-        change = torch.full_like(velocities[:, 0, 0], torch.inf)
+        start = StepStart.of(inputs)
+        u = torch.zeros_like(start.velocities)
+        change = torch.full_like(u[:, 0, 0], torch.inf)
         for _ in range(self.system.newton_iterations):
             terms = self._linearise(start, self._point(u, start))
             factor = self._factorise(start, terms)
@@ -105,7 +107,7 @@ class StepProblem:
             if self.exact:
                 return direction, factor
             u = self._backtrack(u, direction, residual, start)
-            largest = (velocities + self.prescribe(u, start)).abs().amax((1, 2))
+            largest = (start.velocities + self.prescribe(u, start)).abs().amax((1, 2))
             change = direction.abs().amax((1, 2)) / (largest + 1e-9)
             if bool((change <= _NEWTON_TOLERANCE).all()):
                 break
@@ -187,8 +189,8 @@ class StepProblem:
         if self.held is not None:
             diagonal = torch.where(self.held[:, None, None], values.node_mass[..., None, None] * identity, diagonal)
             free = (~self.held).to(weight.dtype)
-            for index, energy in enumerate((system.stretching, system.bending)):
-                corner = free[energy.elements.nodes].repeat_interleave(3, dim=1)  # [E, 3n]
+            for index, elements in enumerate((system.stretching.elements, system.bending.elements)):
+                corner = free[elements.nodes].repeat_interleave(3, dim=1)  # [E, 3n]
                 blocks[index] = blocks[index] * (corner[:, :, None] * corner[:, None, :])
         return system.pattern.factorise(diagonal, blocks)
 

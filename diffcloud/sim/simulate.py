@@ -37,9 +37,7 @@ class Rollout:
         return self.positions[:, low] * (1 - fraction) + self.positions[:, low + 1] * fraction
 
 
-def init(
-    system: System, batch: int = 1, *, positions: Tensor | None = None, velocities: Tensor | None = None
-) -> State:
+def init(system: System, batch: int = 1, *, positions: Tensor | None = None, velocities: Tensor | None = None) -> State:
     """The state at time zero.
 
     Args:

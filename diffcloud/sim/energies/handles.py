@@ -95,7 +95,9 @@ class Handles:
         """
         moving = {handle.node for handle in self.handles if handle.motion is not None}
         if not moving:
-            raise SceneError("A gripper track was given, but no handle of this scene moves; give the grasped node a motion.")
+            raise SceneError(
+                "A gripper track was given, but no handle of this scene moves; give the grasped node a motion."
+            )
         kept = tuple(h for h in self.handles if h.motion is not None or h.node not in moving)
         return replace(self, handles=kept)
 

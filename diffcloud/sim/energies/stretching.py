@@ -52,7 +52,7 @@ class Stretching:
     @staticmethod
     def build(mesh: ClothMesh, material: Material, *, dtype: torch.dtype, device: torch.device) -> Stretching:
         """Precompute rest shapes and the table of a cloth."""
-        inverse = np.linalg.inv(mesh.material_edges)
+        inverse = np.linalg.inv(mesh.material_edges).astype(np.float64)
         weights = np.stack([-inverse.sum(axis=1), inverse[:, 0], inverse[:, 1]], axis=1)  # [F, corner, direction]
         expanded = np.einsum("fca,xy->fcxay", weights, np.eye(3)).reshape(-1, 9, 6)
 

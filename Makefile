@@ -1,0 +1,47 @@
+# make repro, make test and make acceptance create .venv and install what they need; the second time that is quick.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+export PATH := $(CURDIR)/$(BIN):$(PATH)
+
+.PHONY: venv repro test test-slow lint format bench acceptance clean
+
+venv: $(STAMP)
+
+# torch first and pinned: an unpinned one brings gigabytes of CUDA builds
+$(STAMP): pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+	touch $@
+
+repro: venv
+	dvc repro
+
+test: lint
+	python -m pytest
+
+test-slow: venv
+	python -m pytest -m slow
+
+lint: venv
+	ruff check .
+	ruff format --check .
+	mypy
+
+format: venv
+	ruff format .
+	ruff check --fix .
+
+bench: venv
+	diffcloud bench
+
+# RELEASE: the folder of the published data that holds lift_real_pcls/ and conf/.
+# REFERENCE: a folder of recorded reference trajectories, if you have one.
+acceptance: venv
+	@test -n "$(RELEASE)" || { echo "Usage: make acceptance RELEASE=DIR [REFERENCE=DIR]"; exit 2; }
+	diffcloud acceptance --release "$(RELEASE)" $(if $(REFERENCE),--reference "$(REFERENCE)") --out docs/results
+
+clean:
+	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

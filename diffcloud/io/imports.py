@@ -1,0 +1,164 @@
+"""Importing recordings of others as episodes: the published data, and folders of cloud files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from diffcloud.errors import EpisodeError
+from diffcloud.io.clouds import FORMATS, read_cloud
+from diffcloud.io.episodes import Episode
+from diffcloud.io.pickles import load_npy
+
+RELEASE_FRAME_TIME = 0.04
+"""Time step of the published scenes [s]."""
+RELEASE_FOLDERS = {
+    "lift": ("lift_real_pcls", 1),
+    "fold": ("fold_real_pcls", 1),
+    "band": ("band_sim_pcls", 0),
+    "hang": ("hang_sim_pcls", 0),
+}
+"""Scenario -> folder, and the step whose state file 0 is compared with. Real recordings: file j meets the state after
+j + 1 steps, as in the published scripts. Simulated ones were written starting with the initial state, so file j is the
+state after j steps; the published scripts compare them one step off."""
+ASSUMED_CATEGORIES = {
+    "polka": "highly deformable",
+    "navy": "medium",
+    "tan": "medium",
+    "redblack": "shape retaining",
+    "paper": "shape retaining",
+}
+"""The paper names the categories, not which fabric is in which: this is our reading of its text and figures."""
+_MODELS = ("mlp", "pointnet2", "meteornet")
+
+
+def release_episodes(folder: Path) -> Iterator[tuple[str, str, Episode]]:
+    """(scenario, name, episode) of every recording in the published layout.
+
+    Args:
+        folder: holds `lift_real_pcls/` and its siblings; those that exist are read.
+
+    Raises:
+        EpisodeError: none of them is there, or a file is damaged.
+    """
+    folder = Path(folder)
+    found = {name: folder / sub for name, (sub, _) in RELEASE_FOLDERS.items() if (folder / sub).is_dir()}
+    if not found:
+        expected = ", ".join(sub for sub, _ in RELEASE_FOLDERS.values())
+        raise EpisodeError(f"{folder} holds none of {expected}; give the folder of the published data that does.")
+    for scenario, source in found.items():
+        predictions = {model: _table(source / f"preds_{model}.npy") for model in _MODELS}
+        truth = _table(source / "gt.npy")
+        for episode in sorted(path for path in source.iterdir() if path.is_dir()):
+            meta: dict[str, Any] = {"scenario": f"release_{scenario}", "source": "published data"}
+            meta |= _fabric(episode.name, scenario)
+            meta["predictions"] = {
+                model: _pair(table[episode.name]) for model, table in predictions.items() if episode.name in table
+            }
+            if episode.name in truth:
+                meta["truth"] = _pair(truth[episode.name])
+            frames = [read_cloud(path) for path in _numbered(episode, (".npy",))]
+            times = RELEASE_FRAME_TIME * (np.arange(len(frames), dtype=np.float64) + RELEASE_FOLDERS[scenario][1])
+            yield f"release_{scenario}", episode.name, Episode.from_frames(frames, times, meta=meta)
+
+
+def cloud_folder(
+    folder: Path, *, gripper: Path | None = None, rate_hz: float | None = None, meta: dict[str, Any] | None = None
+) -> Episode:
+    """An episode from a folder of numbered clouds, one file a frame.
+
+    Args:
+        folder: files `<anything><number>.(npy|ply|xyz|pcd)`, numbers without gaps, in metres in the scene's frame.
+        gripper: CSV with columns x, y, z [m] and optionally t_s [s]; one row a frame.
+        rate_hz: frame rate where the CSV has no t_s.
+
+    Raises:
+        EpisodeError: no clouds, a gap in the numbers, a bad cloud, or a CSV that does not match.
+    """
+    paths = _numbered(Path(folder), FORMATS)
+    frames = [read_cloud(path) for path in paths]
+    times: NDArray[np.float64] | None = None
+    track: NDArray[np.float64] | None = None
+    if gripper is not None:
+        table = _read_csv(Path(gripper))
+        missing = [name for name in ("x", "y", "z") if name not in table.columns]
+        if missing:
+            raise EpisodeError(f"{gripper}: columns {missing} are missing; it has {list(table.columns)}.")
+        if len(table) != len(frames):
+            raise EpisodeError(f"{gripper} has {len(table)} rows for {len(frames)} clouds; give one row a frame.")
+        track = table[["x", "y", "z"]].to_numpy(np.float64)
+        extent = float(np.ptp(track, axis=0).max())
+        if extent > 20:
+            raise EpisodeError(f"{gripper}: the gripper moves by {extent:.0f}; positions are metres, not millimetres.")
+        if "t_s" in table.columns:
+            times = table["t_s"].to_numpy(np.float64)
+            times = times - times[0]
+    if times is None:
+        if rate_hz is None or rate_hz <= 0:
+            raise EpisodeError("Frame times are unknown: give --rate-hz, or a gripper CSV with a t_s column.")
+        times = np.arange(len(frames)) / rate_hz
+    return Episode.from_frames(frames, times, gripper=track, meta={"source": "clouds", **(meta or {})})
+
+
+def _read_csv(path: Path) -> pd.DataFrame:
+    try:
+        table = pd.read_csv(path)
+        return table.astype(float)
+    except FileNotFoundError as error:
+        raise EpisodeError(f"No such gripper file: {path}.") from error
+    except (OSError, ValueError) as error:
+        raise EpisodeError(f"{path} is not a CSV of numbers: {error}.") from error
+
+
+def _numbered(folder: Path, formats: tuple[str, ...]) -> list[Path]:
+    if not folder.is_dir():
+        raise EpisodeError(f"No such folder of clouds: {folder}.")
+    numbers: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        match = re.search(r"(\d+)$", path.stem)
+        if path.suffix.lower() not in formats or match is None:
+            continue
+        number = int(match.group(1))
+        if number in numbers:
+            raise EpisodeError(f"{folder}: {numbers[number].name} and {path.name} are both frame {number}.")
+        numbers[number] = path
+    if not numbers:
+        raise EpisodeError(f"{folder} holds no numbered clouds ({', '.join(formats)}), such as 000.ply, 001.ply.")
+    first, last = min(numbers), max(numbers)
+    gaps = [number for number in range(first, last + 1) if number not in numbers]
+    if gaps:
+        raise EpisodeError(
+            f"{folder}: frames {gaps[:10]} are missing between {first} and {last}; renumber or record again."
+        )
+    return [numbers[number] for number in sorted(numbers)]
+
+
+def _table(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        return {}
+    value = load_npy(path)
+    if not isinstance(value, dict):
+        raise EpisodeError(f"{path} must hold a dictionary of episodes, got {type(value).__name__}.")
+    return {str(key): entry for key, entry in value.items()}
+
+
+def _pair(value: Any) -> dict[str, float]:
+    pair = np.asarray(value, dtype=np.float64).reshape(-1)
+    if pair.shape != (2,) or not np.isfinite(pair).all():
+        raise EpisodeError(f"A published parameter pair must be two finite numbers (stretch, mass), got {value!r}.")
+    return {"stretch": float(pair[0]), "mass": float(pair[1])}
+
+
+def _fabric(name: str, scenario: str) -> dict[str, Any]:
+    match = re.fullmatch(rf"{scenario}_([a-z]+?)(\d*)", name)
+    if match is None:
+        return {}
+    fabric = match.group(1)
+    known = {"category": ASSUMED_CATEGORIES[fabric], "category_assumed": True} if fabric in ASSUMED_CATEGORIES else {}
+    return {"fabric": fabric, "repeat": int(match.group(2) or 1), **known}

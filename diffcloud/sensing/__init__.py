@@ -1,0 +1,7 @@
+"""Depth cameras and what their clouds need before a fit."""
+
+from diffcloud.sensing.depth_camera import DepthCamera, default_cameras
+from diffcloud.sensing.filters import FilterReport, clean_frame
+from diffcloud.sensing.recorder import record
+
+__all__ = ["DepthCamera", "FilterReport", "clean_frame", "default_cameras", "record"]

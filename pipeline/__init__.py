@@ -1,0 +1,1 @@
+"""Commands: read, call one core function, write. No mathematics here."""

@@ -1,0 +1,46 @@
+"""The `diffcloud` command."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from diffcloud.errors import DiffCloudError
+from pipeline import acceptance, bench, evaluate, fit, importing, report, rollout
+from pipeline.console import errors
+from pipeline.episodes import episodes
+from pipeline.preprocess import preprocess
+from pipeline.visibility import visibility
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Find the simulator parameters of a real cloth from the point clouds of its motion.",
+)
+app.add_typer(importing.app, name="import")
+app.add_typer(evaluate.app, name="evaluate")
+app.command()(episodes)
+app.command()(preprocess)
+app.command()(fit.fit)
+app.command()(report.report)
+app.command()(rollout.rollout)
+app.command()(visibility)
+app.command()(bench.bench)
+app.command()(acceptance.acceptance)
+
+
+def main() -> None:
+    """Run, and turn the project's own errors into a message and exit status 1."""
+    try:
+        app()
+    except DiffCloudError as error:
+        errors.print(f"[bold red]Error:[/] {str(error).replace('[', chr(92) + '[')}", soft_wrap=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        errors.print("Interrupted.")
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""`diffcloud bench`: seconds per episode, over batch sizes and mesh sizes, in one run."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import typer
+from rich.table import Table
+
+from diffcloud.fit.benchmark import Timing, time_episode
+from diffcloud.scene.scenarios import GridScenario, Scenario, built_in, grid_scenario
+from pipeline.console import JsonFlag, finish, progress_bar, show
+from pipeline.scenario_options import SceneFile, choose_scenario
+
+_BATCHES = (1, 16, 64)
+_SIDES = (7, 16, 32)
+
+
+def bench(
+    scene: SceneFile = None,
+    repeats: Annotated[int, typer.Option(min=1, help="The fastest of these counts.")] = 3,
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    json: JsonFlag = False,
+) -> None:
+    """Time lift episodes; with --scene the published lift too (25 steps)."""
+    timings = run_benchmarks(scene, repeats=repeats, device=device)
+    show(benchmark_table(timings), json)
+    finish({"threads": torch.get_num_threads(), "device": device, "timings": timings}, json)
+
+
+def run_benchmarks(scene: Path | None, *, repeats: int, device: str) -> list[dict[str, Any]]:
+    """All timings in one run; machines are noisy, so compare within it."""
+    lift = choose_scenario("lift")
+    jobs: list[tuple[str, Scenario, int]] = [("lift", lift, batch) for batch in _BATCHES]
+    jobs += [("lift, 25 steps", _short(built_in("lift")), batch) for batch in _BATCHES]
+    if scene is not None:
+        published = choose_scenario("release_lift", scene)
+        jobs += [("release_lift", published, batch) for batch in _BATCHES]
+    for side in _SIDES:
+        jobs.append((f"lift {side} x {side}, 25 steps", _short(_finer(side)), 1))
+    timings = []
+    with progress_bar("bench", len(jobs)) as update:
+        for index, (name, scenario, batch) in enumerate(jobs):
+            update(index, f"{name}, batch {batch}")
+            timings.append(
+                {"scenario": name, **asdict(time_episode(scenario, batch=batch, repeats=repeats, device=device))}
+            )
+    return timings
+
+
+def benchmark_table(timings: list[dict[str, Any]]) -> Table:
+    table = Table("scenario", "nodes", "steps", "batch", "forward s", "forward + backward s", "per episode s")
+    for entry in timings:
+        timing = Timing(**{key: value for key, value in entry.items() if key != "scenario"})
+        table.add_row(
+            entry["scenario"],
+            str(timing.nodes),
+            str(timing.steps),
+            str(timing.batch),
+            f"{timing.forward:.3f}",
+            f"{timing.forward_backward:.3f}",
+            f"{timing.forward_backward / timing.batch:.3f}",
+        )
+    return table
+
+
+def _finer(side: int) -> GridScenario:
+    return built_in("lift").model_copy(update={"nodes": (side, side)})
+
+
+def _short(options: GridScenario) -> Scenario:
+    """25 steps, as many as the published episodes have."""
+    scenario = grid_scenario(options.model_copy(update={"steps_per_frame": 1, "rate_hz": 25.0, "frames": 25}))
+    return replace(scenario, loss_frames=(-1,))

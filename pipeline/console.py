@@ -1,0 +1,94 @@
+"""What every command shares: progress on standard error, one JSON object at the end of standard output."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from diffcloud.errors import ConfigError
+
+errors = Console(stderr=True, highlight=False)
+output = Console(highlight=False)
+
+JsonFlag = Annotated[bool, typer.Option("--json", help="End standard output with one JSON object.")]
+ParamsFile = Annotated[
+    Path | None, typer.Option("--params", help="YAML with a section for this stage; options given here win.")
+]
+
+
+def finish(result: dict[str, Any], as_json: bool) -> None:
+    """Print the machine-readable result, if asked."""
+    if as_json:
+        sys.stdout.write(json.dumps(result, allow_nan=False) + "\n")
+        sys.stdout.flush()
+
+
+def show(table: Table, as_json: bool) -> None:
+    """Print a table; with --json to standard error, so that standard output stays clean."""
+    (errors if as_json else output).print(table)
+
+
+def warn(message: str) -> None:
+    errors.print(f"[yellow]Warning:[/] {message}", soft_wrap=True)
+
+
+@contextmanager
+def progress_bar(label: str, total: int) -> Iterator[Callable[[int, str], None]]:
+    """A bar on standard error; call with (done, text)."""
+    columns = (
+        TextColumn("[bold]{task.description}"),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[text]}"),
+    )
+    with Progress(*columns, console=errors, transient=True) as progress:
+        task = progress.add_task(label, total=total, text="")
+
+        def update(done: int, text: str = "") -> None:
+            progress.update(task, completed=done, text=text)
+
+        yield update
+
+
+def assignments(items: list[str] | None, option: str) -> dict[str, float]:
+    """["stretch=0.5", ...] -> {"stretch": 0.5}."""
+    values: dict[str, float] = {}
+    for item in items or []:
+        name, _, text = item.partition("=")
+        try:
+            values[name.strip()] = float(text)
+        except ValueError as error:
+            raise ConfigError(f"{option} takes NAME=NUMBER, got {item!r}.") from error
+    return values
+
+
+def episode_files(paths: list[Path]) -> list[Path]:
+    """Episode files; a folder stands for every `.npz` in it, sorted.
+
+    Raises:
+        ConfigError: a folder without episodes, or two episodes of one name.
+    """
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            inside = sorted(path.glob("*.npz"))
+            if not inside:
+                raise ConfigError(f"{path} holds no episodes (*.npz).")
+            files += inside
+        else:
+            files.append(path)
+    names = [path.stem for path in files]
+    doubled = sorted({name for name in names if names.count(name) > 1})
+    if doubled:
+        raise ConfigError(f"Two episodes have the same name ({', '.join(doubled)}); results are stored by name.")
+    return files

@@ -1,0 +1,70 @@
+"""`diffcloud report`: one self-contained page about all fits."""
+
+from __future__ import annotations
+
+import platform
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import pandas as pd
+import torch
+import typer
+
+import diffcloud
+from diffcloud.errors import ConfigError
+from diffcloud.fit import read_fit
+from diffcloud.io.episodes import read_episode
+from diffcloud.io.files import write_text
+from diffcloud.report import EpisodeEntry, build_page
+from pipeline.config import load_config
+from pipeline.console import JsonFlag, ParamsFile, errors, finish
+
+
+def report(
+    out: Annotated[Path, typer.Option(help="HTML file.")] = Path("reports/index.html"),
+    fits: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.json and .npz.")] = Path("data/fits"),
+    episodes: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.npz.")] = Path("data/episodes"),
+    tables: Annotated[Path, typer.Option(help="Folder written by `diffcloud evaluate`.")] = Path("reports/tables"),
+    params: ParamsFile = None,
+    json: JsonFlag = False,
+) -> None:
+    """Write the report page."""
+    config = load_config(params)
+    table = tables / "fits.csv"
+    if not table.is_file():
+        raise ConfigError(f"No such table: {table}; run `diffcloud evaluate` first.")
+    entries = []
+    for row in pd.read_csv(table).to_dict("records"):
+        scenario, name = str(row["scenario"]), str(row["episode"])
+        fit = read_fit(fits / scenario / f"{name}.json")
+        known = {str(key): value for key, value in row.items() if not (isinstance(value, float) and np.isnan(value))}
+        known.setdefault("rms_other_frames_mm", float("nan"))
+        with np.load(fits / scenario / f"{name}.npz", allow_pickle=False) as run:
+            entries.append(
+                EpisodeEntry(
+                    scenario=scenario,
+                    name=name,
+                    row=known,
+                    fit=fit,
+                    episode=read_episode(episodes / scenario / f"{fit['episodes'][0]}.npz"),
+                    nodes=run["nodes"],
+                    start_nodes=run["start_nodes"],
+                    faces=run["faces"],
+                    times=run["times"],
+                )
+            )
+    environment = {
+        "commands": "diffcloud episodes, preprocess, fit, evaluate, report (dvc.yaml)",
+        "parameters": "params.yaml" if params is None else str(params),
+        "seed of the fits": str(config.fit.seed),
+        "diffcloud": diffcloud.__version__,
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
+    page = build_page(
+        entries, title=config.report.title, overlay_points=config.report.overlay_points, environment=environment
+    )
+    write_text(out, page)
+    errors.print(f"Wrote {out} ({len(page) / 1e6:.1f} MB).")
+    finish({"out": str(out), "episodes": len(entries), "bytes": len(page.encode())}, json)

@@ -1,0 +1,86 @@
+"""`diffcloud rollout`: simulate a scenario, a scene, or a fit, and export the motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import typer
+
+from diffcloud.errors import ConfigError, DivergedError
+from diffcloud.fit.objective import track_displacement
+from diffcloud.fit.parameters import NUISANCE
+from diffcloud.fit.result import read_fit
+from diffcloud.io.clouds import write_ply
+from diffcloud.io.episodes import read_episode
+from diffcloud.io.files import atomic_path
+from diffcloud.io.obj import write_cloth
+from diffcloud.sim.simulate import rollout as simulate
+from pipeline.console import JsonFlag, assignments, errors, finish, progress_bar
+from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, limits
+
+
+def rollout(
+    out: Annotated[Path, typer.Option(help="NPZ: nodes [T+1, V, 3], faces [F, 3], times [T+1].")],
+    scenario: ScenarioName = None,
+    scene: SceneFile = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="PARAMETER=VALUE, repeatable.")] = None,
+    fit: Annotated[Path | None, typer.Option(help="JSON of a fit whose parameters are used.")] = None,
+    episode: Annotated[Path | None, typer.Option(help="Episode whose gripper track moves the handles.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Frames to simulate.")] = None,
+    obj: Annotated[Path | None, typer.Option(help="Folder for one OBJ a frame.")] = None,
+    ply: Annotated[Path | None, typer.Option(help="Folder for one PLY mesh a frame.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Simulate and export a motion."""
+    chosen = choose_scenario(scenario, scene)
+    values: dict[str, float] = {}
+    if fit is not None:
+        fitted = read_fit(fit)["parameters"]
+        values |= {name: float(entry["value"]) for name, entry in fitted.items() if name not in NUISANCE}
+    values |= assignments(set_, "--set")
+    if any(not np.isfinite(value) for value in values.values()):
+        raise ConfigError(f"Parameters must be finite numbers, got {values}.")
+    frames = frames or chosen.frames
+    steps = frames * chosen.scene.frame_steps
+    system, _ = chosen.scene.build()
+    properties = chosen.properties(
+        system, {name: torch.tensor([value], dtype=system.dtype) for name, value in values.items()}
+    )
+    track = None
+    if episode is not None:
+        recorded = read_episode(episode)
+        if recorded.gripper is None:
+            raise ConfigError(f"{episode} has no gripper track; leave --episode out to use the scene's own motion.")
+        track = torch.as_tensor(track_displacement(recorded, steps, system.time_step))[None]
+    with progress_bar("simulating", steps) as update, torch.no_grad():
+        try:
+            run = simulate(system, steps, properties=properties, track=track, progress=lambda done: update(done, ""))
+        except DivergedError as error:
+            shown = ", ".join(f"{name}={value:g}" for name, value in values.items()) or "the basis material"
+            raise DivergedError(error.step, error.entries, error.reason, shown) from error
+    nodes = run.positions[0, :: chosen.scene.frame_steps].numpy()
+    times = run.times[:: chosen.scene.frame_steps].numpy()
+    with atomic_path(out) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, nodes=nodes, faces=system.mesh.faces, times=times)
+    for folder, suffix in ((obj, "obj"), (ply, "ply")):
+        for index, frame in enumerate(nodes if folder is not None else []):
+            path = Path(str(folder)) / f"{index:03d}.{suffix}"
+            if suffix == "obj":
+                write_cloth(path, system.mesh, frame)
+            else:
+                write_ply(path, frame, system.mesh.faces)
+    errors.print(f"Wrote {len(nodes)} frames of {nodes.shape[1]} nodes to {out}.")
+    finish(
+        {
+            "out": str(out),
+            "frames": frames,
+            "nodes": nodes.shape[1],
+            "parameters": values,
+            "length_unit_m": chosen.length_unit_m,
+            "warnings": limits(chosen),
+        },
+        json,
+    )

@@ -1,0 +1,47 @@
+"""Options that choose a scenario, shared by several commands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from diffcloud.scene.scenarios import SCENARIO_NAMES, Scenario, load_scenario
+from pipeline.console import warn
+
+OWN_SCENARIOS = Path("raw/scenes")
+"""A person's own scenario files, found by name."""
+
+ScenarioName = Annotated[
+    str | None,
+    typer.Option("--scenario", help=f"{', '.join(SCENARIO_NAMES)}, a YAML file, or the name of one in {OWN_SCENARIOS}."),
+]
+SceneFile = Annotated[Path | None, typer.Option("--scene", help="ARCSim scene JSON.")]
+
+
+def choose_scenario(name: str | None, scene: Path | None = None) -> Scenario:
+    """Load a scenario and say what of its scene is not simulated."""
+    if name is not None and name not in SCENARIO_NAMES and (OWN_SCENARIOS / f"{name}.yaml").is_file():
+        name = str(OWN_SCENARIOS / f"{name}.yaml")
+    scenario = load_scenario(name, scene)
+    for message in limits(scenario):
+        warn(message)
+    return scenario
+
+
+def limits(scenario: Scenario) -> list[str]:
+    """What the scene asks for and the contact model lacks."""
+    obstacles = scenario.scene.surrounding.obstacles
+    meshes = [index for index, obstacle in enumerate(obstacles) if obstacle.plane() is None]
+    if not meshes:
+        return []
+    return [
+        f"Obstacles {meshes} of {scenario.name} are not planar. Contact is simulated with planes only: the cloth passes "
+        "through these, and results are valid until the first such contact."
+    ]
+
+
+def loss_unit(scenario: Scenario) -> Mapping[str, Any]:
+    return {"length_unit_m": scenario.length_unit_m}

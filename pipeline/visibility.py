@@ -1,0 +1,43 @@
+"""`diffcloud visibility`: how much a motion shows of the parameters, against a camera's noise."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from diffcloud.fit.visibility import visibility_map
+from pipeline.console import JsonFlag, finish, output, show
+from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
+
+
+def visibility(
+    scenario: ScenarioName = None,
+    scene: SceneFile = None,
+    noise_mm: Annotated[float, typer.Option(help="Differences above this count as visible.")] = 4.0,
+    size: Annotated[int, typer.Option(min=2, help="Grid points per parameter.")] = 5,
+    linear: Annotated[bool, typer.Option(help="Linear instead of logarithmic spacing.")] = False,
+    json: JsonFlag = False,
+) -> None:
+    """Map of stretch x mass: RMS node distance [mm] between neighbours at the loss frame."""
+    chosen = choose_scenario(scenario, scene)
+    found = visibility_map(chosen, size=size, linear=linear)
+    for name, distances in (("stretch", found.along_stretch_mm), ("mass", found.along_mass_mm)):
+        rows, columns = (found.grid[1:], found.grid) if name == "stretch" else (found.grid, found.grid[1:])
+        table = Table(f"step in {name}; stretch \\ mass", *(f"{value:.3g}" for value in columns))
+        for value, row in zip(rows, distances, strict=True):
+            table.add_row(f"{value:.3g}", *(f"{d:.1f}" if d > noise_mm else f"[dim]{d:.1f}[/]" for d in row))
+        show(table, json)
+    fraction = found.visible_fraction(noise_mm)
+    if not json:
+        output.print(f"{100 * fraction:.0f} % of neighbouring pairs differ by more than {noise_mm} mm.")
+    finish(
+        {
+            "visible_fraction": fraction,
+            "grid": found.grid.tolist(),
+            "along_stretch_mm": found.along_stretch_mm.tolist(),
+            "along_mass_mm": found.along_mass_mm.tolist(),
+        },
+        json,
+    )
