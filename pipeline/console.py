@@ -16,8 +16,17 @@ from rich.table import Table
 
 from diffcloud.errors import ConfigError
 
-errors = Console(stderr=True, highlight=False)
-output = Console(highlight=False)
+_PLAIN_WIDTH = 140
+"""Columns where the output is a file or a log: tables keep their headings."""
+
+
+def _console(*, stderr: bool) -> Console:
+    console = Console(stderr=stderr, highlight=False)
+    return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=_PLAIN_WIDTH)
+
+
+errors = _console(stderr=True)
+output = _console(stderr=False)
 
 JsonFlag = Annotated[bool, typer.Option("--json", help="End standard output with one JSON object.")]
 ParamsFile = Annotated[
@@ -51,7 +60,7 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[int, str], None]]
         TimeRemainingColumn(),
         TextColumn("{task.fields[text]}"),
     )
-    with Progress(*columns, console=errors, transient=True) as progress:
+    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
         task = progress.add_task(label, total=total, text="")
 
         def update(done: int, text: str = "") -> None:

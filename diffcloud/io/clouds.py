@@ -50,8 +50,8 @@ def write_ply(path: Path, vertices: NDArray[Any], faces: NDArray[Any] | None = N
     from diffcloud.io.files import atomic_path
 
     shape = trimesh.PointCloud(vertices) if faces is None else trimesh.Trimesh(vertices, faces, process=False)
-    with atomic_path(Path(path)) as temporary:
-        temporary.write_bytes(bytes(shape.export(file_type="ply")))
+    with atomic_path(Path(path)) as temporary, temporary.open("wb") as stream:
+        shape.export(stream, file_type="ply")
 
 
 def _read_ply(path: Path) -> NDArray[Any]:

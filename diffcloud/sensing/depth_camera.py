@@ -62,9 +62,9 @@ class DepthCamera:
         centre = np.array([(self.width - 1) / 2, (self.height - 1) / 2])
         pixel = np.rint(local[:, :2] / local[:, 2:] * self.focal_px + centre).astype(int)
         inside = ((pixel >= 0) & (pixel < [self.width, self.height])).all(axis=1)
-        depth = np.full(self.width * self.height, np.inf)
-        np.minimum.at(depth, (pixel[:, 1] * self.width + pixel[:, 0])[inside], local[inside, 2])
-        depth = depth.reshape(self.height, self.width)
+        nearest = np.full(self.width * self.height, np.inf)
+        np.minimum.at(nearest, (pixel[:, 1] * self.width + pixel[:, 0])[inside], local[inside, 2])
+        depth = nearest.reshape(self.height, self.width)
 
         seen = np.isfinite(depth)
         padded = np.pad(seen, 1)

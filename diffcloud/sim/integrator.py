@@ -70,6 +70,24 @@ class StepTerms:
 
 
 @dataclass(frozen=True)
+class Held:
+    """Nodes prescribed by hard handles."""
+
+    mask: Tensor
+    """bool [V, 1]"""
+    free_blocks: tuple[Tensor, ...]
+    """Per energy [E, 3n, 3n]: 1 where row and column are free, else 0."""
+
+    @staticmethod
+    def build(system: System, nodes: Tensor) -> Held:
+        mask = torch.zeros(len(system.mesh.nodes), 1, dtype=torch.bool, device=system.device)
+        mask[nodes] = True
+        free = (~mask[:, 0]).to(system.dtype)
+        corners = [free[e.elements.nodes].repeat_interleave(3, dim=1) for e in (system.stretching, system.bending)]
+        return Held(mask, tuple(corner[:, :, None] * corner[:, None, :] for corner in corners))
+
+
+@dataclass(frozen=True)
 class StepProblem:
     """The equation of one step. Inputs: positions, velocities [B, V, 3], targets [B, H, 3], *properties."""
 
@@ -78,8 +96,8 @@ class StepProblem:
     """[H] of each handle in this step."""
     handle_nodes: Tensor
     """[H] node of each handle."""
-    held: Tensor | None
-    """bool [V] nodes prescribed by hard handles; None if there are none."""
+    held: Held | None
+    """None if no hard handle is active."""
 
     @property
     def exact(self) -> bool:
@@ -121,7 +139,7 @@ class StepProblem:
             return u
         wanted = start.positions.index_copy(1, self.handle_nodes, start.targets.expand(len(u), -1, -1))
         change = (wanted - start.positions) / self.system.time_step - start.velocities
-        return torch.where(self.held[:, None], change, u)
+        return torch.where(self.held.mask, change, u)
 
     def _point(self, u: Tensor, start: StepStart) -> Tensor:
         """The point of linearisation [B, V, 3]."""
@@ -171,7 +189,7 @@ class StepProblem:
             index = self.handle_nodes.view(1, -1, 1).expand_as(pull)
             force = force.scatter_add(1, index, pull)
         residual = mass * change - dt * force
-        return residual if self.held is None else torch.where(self.held[:, None], mass * u, residual)
+        return residual if self.held is None else torch.where(self.held.mask, mass * u, residual)
 
     def _factorise(self, start: StepStart, terms: StepTerms) -> Factor:
         """The step matrix m + Δt (Δt + β) H + handles + contact."""
@@ -187,11 +205,9 @@ class StepProblem:
         scale = (dt * (dt + values.damping))[:, None, None, None]
         blocks = [scale * energy.hessian() for energy in terms.energies]
         if self.held is not None:
-            diagonal = torch.where(self.held[:, None, None], values.node_mass[..., None, None] * identity, diagonal)
-            free = (~self.held).to(weight.dtype)
-            for index, elements in enumerate((system.stretching.elements, system.bending.elements)):
-                corner = free[elements.nodes].repeat_interleave(3, dim=1)  # [E, 3n]
-                blocks[index] = blocks[index] * (corner[:, :, None] * corner[:, None, :])
+            own = values.node_mass[..., None, None] * identity
+            diagonal = torch.where(self.held.mask[..., None], own, diagonal)
+            blocks = [block * free for block, free in zip(blocks, self.held.free_blocks, strict=True)]
         return system.pattern.factorise(diagonal, blocks)
 
     def _backtrack(self, u: Tensor, direction: Tensor, residual: Tensor, start: StepStart) -> Tensor:

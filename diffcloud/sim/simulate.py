@@ -12,7 +12,7 @@ from torch import Tensor
 from diffcloud.errors import DivergedError
 from diffcloud.sim.adjoint import implicit_solve
 from diffcloud.sim.energies.handles import HandleSchedule, follow_track
-from diffcloud.sim.integrator import NewtonStallError, StepProblem, StepStart
+from diffcloud.sim.integrator import Held, NewtonStallError, StepProblem, StepStart
 from diffcloud.sim.linear_solve import NotPositiveDefiniteError
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.state import State, System
@@ -136,16 +136,21 @@ def _take_anchors(system: System, schedule: HandleSchedule, state: State) -> Sta
 
 def _problem(system: System, schedule: HandleSchedule, state: State) -> tuple[StepProblem, Tensor]:
     """The equation of this step, and the targets [B, H, 3] of its active handles."""
+    active = schedule.active[state.step]
+    nodes, held = _held(system, schedule, tuple(np.flatnonzero(active)))
     targets = schedule.translation[:, state.step] + (schedule.linear[state.step] @ state.anchors[..., None]).squeeze(-1)
-    nodes = torch.tensor(system.handles.nodes, dtype=torch.long, device=system.device)
-    strength, held = schedule.strength[state.step], None
-    if system.handles.hard:
-        active = np.flatnonzero(schedule.active[state.step])
-        if len(active) < len(nodes):
-            nodes, targets, strength = nodes[active], targets[:, active], strength[active]
-        held = torch.zeros(len(system.mesh.nodes), dtype=torch.bool, device=system.device)
-        held[nodes] = True
+    strength = schedule.strength[state.step]
+    if len(nodes) < len(active):
+        targets, strength = targets[:, active], strength[active]
     return StepProblem(system, strength, nodes, held), targets
+
+
+def _held(system: System, schedule: HandleSchedule, active: tuple[int, ...]) -> tuple[Tensor, Held | None]:
+    """Nodes of the active handles, and what hard ones prescribe; made once per set of active handles."""
+    if active not in schedule.cache:
+        nodes = torch.tensor([system.handles.nodes[i] for i in active], dtype=torch.long, device=system.device)
+        schedule.cache[active] = nodes, Held.build(system, nodes) if system.handles.hard and active else None
+    return schedule.cache[active]
 
 
 def _refuse_divergence(positions: Tensor, step: int) -> None:

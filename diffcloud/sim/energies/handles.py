@@ -9,7 +9,8 @@ The published scenes put a static and a moving soft handle on the same node, whi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -48,6 +49,8 @@ class HandleSchedule:
     """[S, H] where the strength is not zero."""
     first_step: NDArray[np.int64]
     """[H] the step index (from 0) that takes the anchor; S where none does."""
+    cache: dict[Any, Any] = field(default_factory=dict, compare=False)
+    """What the integrator derives from a set of active handles, kept for the steps of this run."""
 
 
 @dataclass(frozen=True)
