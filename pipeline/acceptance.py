@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +14,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
 from diffcloud.io.files import write_text
 from diffcloud.io.imports import release_episodes
+from diffcloud.scene.scenarios import load_scenario
 from diffcloud.sim.simulate import rollout
 from pipeline.bench import run_benchmarks
 from pipeline.config import DEFAULT_SMOOTHING
@@ -69,8 +69,7 @@ class _Fit:
 
 def _real_fits(release: Path, starts: int) -> str:
     fits: list[_Fit] = []
-    with tempfile.TemporaryDirectory():
-        episodes = [item for item in release_episodes(release) if item[0] in ("release_lift", "release_fold")]
+    episodes = [item for item in release_episodes(release) if item[0] in ("release_lift", "release_fold")]
     with progress_bar("real fits", len(episodes)) as update:
         for index, (name, label, episode) in enumerate(episodes):
             update(index, label)
@@ -154,7 +153,7 @@ def _trajectories(release: Path, reference: Path) -> str:
     rows = []
     for path in sorted(reference.glob("*_s*_m*.npz")):
         name = "release_" + path.name.split("_")[0]
-        scenario = choose_scenario(name, _scene(release, name))
+        scenario = load_scenario(name, _scene(release, name))  # its limits are said in the table's caption
         system, _ = scenario.scene.build()
         with np.load(path, allow_pickle=False) as run:
             nodes = run["verts"]

@@ -40,7 +40,7 @@ def time_episode(scenario: Scenario, *, batch: int, repeats: int = 3, device: st
             loss = run.positions[:, -1].square().mean()
         if backward:
             loss.backward()
-        float(loss)  # waits for a GPU
+        float(loss.detach())  # waits for a GPU
         return time.perf_counter() - begin
 
     once(True)

@@ -111,7 +111,7 @@ class Objective:
         run = self.simulate(parameters, episode=episode, steps=self._steps)
         points = self.sampler.sample(run.at(target.times))  # [B, L, N, 3]
         if offset:
-            points = _undo_offset(points, target.centre, offset)
+            points = _displaced(points, target.centre, offset)
         terms = [one_sided_chamfer(points[:, index], cloud) for index, cloud in enumerate(target.clouds)]
         return torch.stack(terms).mean(0)
 
@@ -155,13 +155,14 @@ def track_displacement(episode: Episode, steps: int, time_step: float) -> np.nda
     return np.asarray(CubicSpline(times, positions)(at) - positions[0])
 
 
-def _undo_offset(points: Tensor, centre: Tensor, offset: Mapping[str, Tensor]) -> Tensor:
-    """Move the simulated points by the inverse of the target's offset; the target's search tree stays as it is."""
+def _displaced(points: Tensor, centre: Tensor, offset: Mapping[str, Tensor]) -> Tensor:
+    """Displace the simulated points as the recorded cloud is displaced; so the target's search tree stays as it is.
+
+    Turned by the yaw about the target's centre, then shifted.
+    """
     zero = torch.zeros_like(next(iter(offset.values())))
     shift = torch.stack([offset.get(name, zero) for name in ("offset_x", "offset_y", "offset_z")], dim=-1)
     yaw = offset.get("offset_yaw", zero)
     cos, sin, one = yaw.cos(), yaw.sin(), torch.ones_like(yaw)
-    # the target turns by yaw about its centre, then shifts; row vectors times this matrix turn back
-    turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
-    local = points - (centre + shift)[:, None, None]
-    return local @ turn[:, None] + centre
+    turn = torch.stack([cos, sin, zero, -sin, cos, zero, zero, zero, one], dim=-1).unflatten(-1, (3, 3))  # for row vectors
+    return (points - centre) @ turn[:, None] + (centre + shift)[:, None, None]

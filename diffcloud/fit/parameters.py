@@ -140,4 +140,4 @@ class FitSpace:
     def _bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
         low = [variable.low for variable in self.variables]
         high = [variable.high for variable in self.variables]
-        return torch.tensor(low).to(like), torch.tensor(high).to(like)
+        return like.new_tensor(low), like.new_tensor(high)

@@ -4,7 +4,8 @@ Repulsion (ARCSim, thickness τ): C = n · x - offset - τ, violation c = max(-C
 the node's material area; force K c²/(2 τ) along n, stiffness K c/τ.
 
 Friction (lagged: normal force and sliding direction of the start of the step): γ = min(μ f_n / |v_t|, m / Δt), force
--γ P v with P = I - n nᵀ, implicit in v. The second branch stops the node within the step: sticking.
+-γ P v with P = I - n nᵀ, implicit in v. The second branch is sticking: it halves the sliding velocity in each
+step, so a node on an incline of angle α creeps at g sin(α) Δt, which vanishes with the step.
 
 Projection: a node whose candidate position is behind the plane is put at the projection thickness above it. For a single
 static plane this is the exact solution of the impact-zone problem (nodes do not couple), and inelastic.

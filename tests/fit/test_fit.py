@@ -1,0 +1,242 @@
+"""Fits: the bounded space, recovery of known parameters, offsets, joint fits, interruption, divergence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from diffcloud.errors import ConfigError, DivergedError, EpisodeError
+from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
+from diffcloud.fit.objective import track_displacement
+from diffcloud.fit.result import describe_fit, read_fit, write_fit
+from diffcloud.fit.visibility import visibility_map
+from diffcloud.io.episodes import Episode
+from diffcloud.scene import load_scenario
+from diffcloud.sim import rollout
+from tests.conftest import small_lift
+
+
+def clouds_of(scenario, *, points=800, seed=5, gripper=True, shift=(0, 0, 0), yaw=0.0, **truth):
+    """A noise-free episode of known parameters, sampled with its own random points."""
+    from diffcloud.clouds import SurfaceSampler
+
+    system, _ = scenario.scene.build()
+    values = {name: torch.tensor([value], dtype=torch.float64) for name, value in truth.items()}
+    run = rollout(system, scenario.steps, properties=scenario.properties(system, values))
+    nodes = run.positions[0, :: scenario.scene.frame_steps]
+    generator = torch.Generator().manual_seed(seed)
+    sampler = SurfaceSampler.build(system.stretching.elements.nodes, points, generator=generator)
+    frames = sampler.sample(nodes).numpy()
+    if yaw or any(shift):
+        middle = frames[-1].mean(0)
+        turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+        frames = (frames - middle) @ turn.T + middle + np.array(shift)
+    times = run.times[:: scenario.scene.frame_steps].numpy()
+    track = nodes[:, scenario.grasped].mean(1).numpy() if gripper else None
+    return Episode.from_frames(list(frames), times, gripper=track, meta={"truth": truth})
+
+
+GENTLE = {"frames": 12, "steps_per_frame": 2, "path": [(0, 0, 0, 0), (1.2, 0, -0.1, 0.3)], "points": 600}
+"""A slow lift, whose loss is smooth."""
+
+
+class TestSpace:
+    @pytest.mark.parametrize("logarithmic", [False, True])
+    def test_values_and_unbounded_are_inverse(self, logarithmic):
+        space = FitSpace.build(["stretch", "damping"])
+        scale = torch.tensor([logarithmic] * 3)
+        values = torch.tensor([[0.2, 0.01], [5.05, 0.05], [9.0, 0.09]], dtype=torch.float64)
+        torch.testing.assert_close(space.values(space.unbounded(values, scale), scale), values)
+
+    def test_zero_is_the_middle_of_the_papers_scale(self):
+        space = FitSpace.build(["stretch", "mass"])
+        starts, logarithmic = space.starts(1, seed=0)
+        assert starts.tolist() == [[5.05, 5.05]]
+        assert space.unbounded(starts, logarithmic).abs().max() < 1e-12
+
+    def test_extra_starts_spread_logarithmically_inside_the_box(self):
+        starts, logarithmic = FitSpace.build(["stretch", "mass"]).starts(33, seed=0)
+        assert logarithmic.tolist() == [False] + [True] * 32
+        assert ((starts >= 0.1) & (starts <= 10)).all()
+        assert 13 <= int((starts[1:, 0] < 1.0).sum()) <= 19  # half of them below the geometric middle
+
+    def test_fixed_and_first_values(self):
+        space = FitSpace.build(["stretch", "mass"], fixed={"mass": 1.2})
+        assert space.names == ("stretch",)
+        parameters, offset = space.split(torch.tensor([[3.0]]).double())
+        assert parameters["mass"].tolist() == [1.2]
+        assert not offset
+        assert space.starts(1, seed=0, first={"stretch": 2.0})[0].tolist() == [[2.0]]
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"names": ["strech"]}, "Unknown parameter 'strech'. Allowed: .*stretch"),
+            ({"names": ["stretch", "stretch"]}, "twice"),
+            ({"names": ["stretch"], "bounds": {"stretch": (2.0, 1.0)}}, r"in order \(low < high\), got \[2.0, 1.0\]"),
+            ({"names": ["mass"], "fixed": {"mass": 1.0}}, "Nothing is left"),
+        ],
+    )
+    def test_bad_spaces(self, options, message):
+        with pytest.raises(ConfigError, match=message):
+            FitSpace.build(**options)
+
+
+class TestRecovery:
+    def test_the_ratio_is_recovered_from_a_start_far_away(self):
+        scenario = small_lift(**GENTLE)
+        episode = clouds_of(scenario, stretch=0.8, mass=1.5)
+        space = FitSpace.build(["stretch"], fixed={"mass": 1.5})
+        outcome = fit_adam(Objective(scenario, [episode]), space, AdamSettings(iterations=40))
+        assert outcome.loss < 0.25 * outcome.loss_start
+        assert outcome.values["stretch"] == pytest.approx(0.8, rel=0.1)
+
+    def test_smoothed_gradients_find_the_valley_of_a_rough_loss(self):
+        """A jerky lift has a bumpy loss: the exact gradient stays near its start, the smoothed one arrives."""
+        scenario = small_lift(path=[(0, 0, 0, 0), (0.5, 0, -0.05, 0.3)], points=600)
+        objective = Objective(scenario, [clouds_of(scenario, stretch=0.8, mass=1.5)])
+        space = FitSpace.build(["stretch"], fixed={"mass": 1.5})
+        exact = fit_adam(objective, space, AdamSettings(iterations=40))
+        smoothed = fit_adam(objective, space, AdamSettings(iterations=40, smoothing=0.5))
+        assert smoothed.values["stretch"] == pytest.approx(0.8, rel=0.1)
+        assert smoothed.loss < 0.2 * exact.loss
+
+    def test_a_known_mass_in_other_units_fixes_the_scale(self):
+        """Halving the given mass halves the fitted stretch: the clouds only know the ratio."""
+        scenario = small_lift(**GENTLE, air_density=0.0)
+        episode = clouds_of(scenario, stretch=0.8, mass=1.5)
+        found = []
+        for mass in (1.5, 0.75):
+            space = FitSpace.build(["stretch"], fixed={"mass": mass})
+            found.append(fit_adam(Objective(scenario, [episode]), space, AdamSettings(iterations=40)).values["stretch"])
+        assert found[0] / found[1] == pytest.approx(2.0, rel=0.15)
+
+    def test_offset_of_the_target_is_found_along(self):
+        scenario = small_lift(points=600)
+        episode = clouds_of(scenario, stretch=1.0, mass=1.0, shift=(0.008, -0.005, 0.0), yaw=0.03)
+        space = FitSpace.build(["stretch"], fixed={"mass": 1.0}, offset=True)
+        outcome = fit_adam(Objective(scenario, [episode]), space, AdamSettings(iterations=60, init={"stretch": 1.0}))
+        assert outcome.values["offset_x"] == pytest.approx(0.008, abs=0.002)
+        assert outcome.values["offset_y"] == pytest.approx(-0.005, abs=0.002)
+        assert outcome.loss < 0.2 * outcome.loss_start
+
+    def test_joint_loss_is_the_mean_of_the_episodes(self):
+        scenario = small_lift()
+        episodes = [clouds_of(scenario, stretch=s, mass=1.0) for s in (0.5, 2.0)]
+        values = {"stretch": torch.tensor([1.0, 3.0]).double()}
+        alone = [Objective(scenario, [episode])(values) for episode in episodes]
+        torch.testing.assert_close(Objective(scenario, episodes)(values), torch.stack(alone).mean(0))
+
+    def test_truth_has_the_lowest_loss(self):
+        scenario = small_lift(points=600, path=[(0, 0, 0, 0), (0.5, 0, -0.05, 0.3)])
+        objective = Objective(scenario, [clouds_of(scenario, stretch=1.0, mass=1.0)])
+        stretch = torch.tensor([0.5, 0.8, 1.0, 1.25, 2.0]).double()
+        assert int(objective({"stretch": stretch}).argmin()) == 2
+
+
+class TestRun:
+    @pytest.fixture
+    def scenario(self):
+        return small_lift()
+
+    @pytest.fixture
+    def objective(self, scenario):
+        return Objective(scenario, [clouds_of(scenario, stretch=0.6, mass=1.0)])
+
+    def test_same_seed_same_result_and_best_iterate_kept(self, scenario, objective):
+        space = FitSpace.build(["stretch", "mass"])
+        settings = AdamSettings(iterations=6, smoothing=0.3, starts=2)
+        first, second = (fit_adam(objective, space, settings) for _ in range(2))
+        assert first.values == second.values
+        assert first.loss == second.loss
+        assert first.loss <= min(float(losses.min()) for losses in first.history.losses)
+        assert first.evaluations == 7 * 2 * 9
+
+    def test_threshold_stops(self, objective):
+        outcome = fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings(threshold=1.0))
+        assert outcome.stop_reason == "threshold"
+        assert outcome.iterations == 0
+
+    def test_ctrl_c_leaves_the_best_so_far(self, objective):
+        def interrupt(progress):
+            if progress.iteration == 2:
+                raise KeyboardInterrupt
+
+        outcome = fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings(), progress=interrupt)
+        assert outcome.stop_reason == "interrupted"
+        assert outcome.iterations == 2
+        assert np.isfinite(outcome.loss)
+
+    def test_a_start_that_diverges_is_dropped_and_named(self, scenario, objective, monkeypatch):
+        real = Objective.__call__
+
+        def fragile(self, parameters, offset=None):
+            bad = (parameters["stretch"] > 5.0).nonzero().flatten().tolist()
+            if bad:
+                raise DivergedError(3, bad, "test")
+            return real(self, parameters, offset)
+
+        monkeypatch.setattr(Objective, "__call__", fragile)
+        outcome = fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings(starts=4, iterations=3))
+        assert outcome.values["stretch"] <= 5.0
+        assert any("start 0 (stretch=5.05)" in failure for failure in outcome.failures)
+        with pytest.raises(DivergedError, match=r"stretch=5\.05"):
+            fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings())
+
+    def test_result_files(self, scenario, objective, tmp_path):
+        space = FitSpace.build(["stretch"], fixed={"mass": 1.2})
+        settings = AdamSettings(iterations=2)
+        outcome = fit_adam(objective, space, settings)
+        path = write_fit(tmp_path, "e", describe_fit(objective, space, settings, outcome, episodes=["e"]))
+        summary = read_fit(path)
+        stretch = summary["parameters"]["stretch"]
+        assert stretch["physical"] == pytest.approx(4.0 * stretch["value"])
+        assert stretch["physical_unit"] == "N/m"
+        assert summary["parameters"]["mass"] | {"meaning": ""} == {
+            "value": 1.2,
+            "unit": "x basis",
+            "physical": pytest.approx(0.24),
+            "physical_unit": "kg/m²",
+            "meaning": "",
+            "fixed": True,
+            "bounds": None,
+        }
+        with np.load(tmp_path / "e.npz") as run:
+            assert run["nodes"].shape == (scenario.frames + 1, 25, 3)
+
+    def test_frames_that_the_episode_lacks(self, scenario):
+        episode = clouds_of(scenario, stretch=1.0)
+        with pytest.raises(EpisodeError, match="Frame 24 is missing"):
+            Objective(scenario, [episode], frames=[24])
+
+    def test_frames_after_the_end_of_the_simulation(self, scenario):
+        late = clouds_of(small_lift(frames=9), stretch=1.0)
+        with pytest.raises(EpisodeError, match="simulates only"):
+            Objective(scenario, [late])
+
+
+def test_a_track_drives_the_handle_as_the_scenes_motion_does():
+    """With and without the recorded track the same episode gives nearly the same motion."""
+    scenario = small_lift()
+    values = {"stretch": torch.tensor([0.7]).double()}
+    with_track = Objective(scenario, [clouds_of(scenario, stretch=0.7)]).simulate(values)
+    without = Objective(scenario, [clouds_of(scenario, stretch=0.7, gripper=False)]).simulate(values)
+    assert (with_track.positions - without.positions).abs().max() < 3e-3
+    assert (with_track.positions - without.positions).abs().max() > 0
+
+
+def test_track_is_held_after_its_end():
+    times = np.array([0.0, 0.1, 0.2])
+    episode = Episode.from_frames([np.zeros((1, 3))] * 3, times, gripper=np.outer(times, [1.0, 0, 2.0]))
+    moved = track_displacement(episode, 6, 0.05)
+    np.testing.assert_allclose(moved[:, 0], [0.05, 0.1, 0.15, 0.2, 0.2, 0.2], atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("linear", [False, True])
+@pytest.mark.parametrize("name", ["lift", "fold"])
+def test_the_box_of_parameters_is_visible_at_camera_noise(name, linear):
+    """At least 80 % of neighbouring pairs of a 5 x 5 grid differ by more than 4 mm RMS at the loss frame."""
+    found = visibility_map(load_scenario(name), size=5, linear=linear)
+    assert found.visible_fraction(4.0) >= 0.8

@@ -1,0 +1,144 @@
+"""Gradients of whole episodes in float64: reverse against forward mode against central differences.
+
+Every parameter, the gripper's path, and the initial positions and velocities; a lift of 25 frames (100 steps) without and
+with table contact. The step of the central difference is swept and the best value taken: far steps see curvature and
+contact events, near ones rounding.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from diffcloud.scene.scenarios import built_in, grid_scenario
+from tests.conftest import small_lift
+from tests.sim.directional import SCALARS, STEPS, Episode, directions
+
+FREE_FALL_GAP = 5.0
+"""Over a table that is out of reach."""
+
+
+def lift_episode(gap: float, **changes: object) -> Episode:
+    scenario = grid_scenario(built_in("lift").model_copy(update={"gap_m": gap, **changes}))
+    return Episode.build(scenario, scenario.steps)
+
+
+def compare(episode: Episode, chosen: dict, steps: tuple[float, ...] = STEPS) -> dict[str, tuple[float, float, float]]:
+    """name -> (value, relative error of forward against reverse, best relative error of central differences)."""
+    listed = list(chosen.values())
+    reverse, forward, central = episode.reverse(listed), episode.forward(listed), episode.central(listed, steps)
+    found = {}
+    for name, r, f, differences in zip(chosen, reverse, forward, central, strict=True):
+        scale = max(abs(r), 1e-300)
+        found[name] = (r, abs(f - r) / scale, min(abs(c - r) / scale for c in differences))
+        print(f"{name:18s} {r:+.6e}  forward {found[name][1]:.1e}  central {found[name][2]:.1e}")
+    return found
+
+
+@pytest.mark.slow
+def test_without_contact():
+    episode = lift_episode(FREE_FALL_GAP)
+    found = compare(episode, directions(episode))
+    value, _, _ = found.pop("friction_obstacle")
+    assert value == 0.0  # nothing is touched, so friction cannot matter
+    for name, (value, forward, central) in found.items():
+        assert value != 0.0, name
+        assert forward <= 1e-10, name
+        assert central <= 1e-5, name
+
+
+@pytest.mark.slow
+def test_with_table_contact():
+    episode = lift_episode(0.002)
+    found = compare(episode, directions(episode, per_field=7))
+    for name, (value, forward, _) in found.items():
+        assert value != 0.0, name
+        assert forward <= 1e-10, name
+    good = [central <= 1e-4 for _, _, central in found.values()]
+    assert sum(good) >= 0.95 * len(good), {name: entry for name, entry in found.items() if entry[2] > 1e-4}
+
+
+@pytest.mark.parametrize("gap", [FREE_FALL_GAP, 0.002])
+def test_short_episodes(gap):
+    """The same on a small cloth over a few steps, for every run of the tests."""
+    episode = Episode.build(small_lift(gap_m=gap), 10)
+    found = compare(episode, directions(episode, per_field=1))
+    # nothing slides yet: free fall has no friction, and a sticking node's does not depend on the coefficient
+    assert abs(found.pop("friction_obstacle")[0]) < 1e-10
+    for name, (value, forward, central) in found.items():
+        assert value != 0.0, name
+        assert forward <= 1e-10, name
+        assert central <= 1e-5, name
+
+
+def test_one_step():
+    episode = Episode.build(small_lift(), 1)
+    found = compare(episode, directions(episode, per_field=1))
+    assert abs(found.pop("friction_obstacle")[0]) < 1e-10  # nothing slides
+    assert found.pop("drag")[0] == 0.0  # nothing has moved yet
+    for name, (_, forward, central) in found.items():
+        assert forward <= 1e-11, name
+        assert central <= 1e-6, name
+
+
+def test_converged_newton_steps():
+    """The exact Jacobian differs from the Gauss-Newton matrix, so the adjoint goes through GMRES."""
+    episode = Episode.build(small_lift(gap_m=FREE_FALL_GAP, nodes=(4, 4)), 3, newton_iterations=60)
+    found = compare(episode, directions(episode, per_field=1), steps=STEPS[2:])
+    del found["friction_obstacle"]
+    for name, (value, forward, central) in found.items():
+        assert value != 0.0, name
+        assert forward <= 1e-9, name
+        assert central <= 1e-5, name
+
+
+def test_soft_handles():
+    episode = Episode.build(small_lift(soft_handles=True), 6)
+    found = compare(episode, directions(episode, per_field=1))
+    del found["friction_obstacle"]  # nothing slides
+    for name, (_, forward, central) in found.items():
+        assert forward <= 1e-10, name
+        assert central <= 1e-5, name
+
+
+@pytest.mark.parametrize("parameter", ["stretch", "mass"])
+def test_node_sets(parameter):
+    """A multiplier on some nodes has the gradient that a central difference finds."""
+    from dataclasses import replace
+
+    scenario = small_lift()
+    scenario = replace(scenario, node_sets={parameter: torch.arange(10).numpy()})
+    system, _ = scenario.scene.build()
+
+    def loss(value: torch.Tensor) -> torch.Tensor:
+        from diffcloud.sim import rollout
+
+        run = rollout(system, 6, properties=scenario.properties(system, {parameter: value}))
+        return run.positions[:, -1].square().sum((1, 2))
+
+    value = torch.tensor([1.7], dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(loss(value).sum(), value)
+    h = 1e-5
+    with torch.no_grad():
+        plus, minus = loss(torch.tensor([1.7 + h, 1.7 - h], dtype=torch.float64))
+    assert float(gradient) == pytest.approx(float(plus - minus) / (2 * h), rel=1e-5)
+    assert float(gradient) != 0.0
+
+
+def test_gradients_stay_finite_where_formulas_degenerate():
+    """A cloth at rest, flat, unstretched, touching nothing: norms and angles are at their singular points."""
+    scenario = small_lift()
+    episode = Episode.build(scenario, 3)
+    inputs = {name: value.requires_grad_(True) for name, value in episode.base().items()}
+    inputs["positions"] = torch.as_tensor(episode.system.mesh.nodes)[None].requires_grad_(True)
+    with torch.no_grad():
+        inputs["positions"][:, 3] = inputs["positions"][:, 4]  # a collapsed edge
+    found = torch.autograd.grad(episode.run(inputs).sum(), list(inputs.values()))
+    assert all(torch.isfinite(gradient).all() for gradient in found)
+
+
+def test_scalars_cover_every_parameter():
+    from diffcloud.sim import PARAMETERS
+
+    # friction between cloths waits for cloth-cloth contact; it has no effect yet
+    assert set(SCALARS) | {"friction_cloth"} == set(PARAMETERS)

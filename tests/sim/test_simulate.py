@@ -1,0 +1,231 @@
+"""Steps and rollouts: closed forms, batches, handles, contact, and failures that say what failed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from diffcloud.errors import DivergedError, SceneError
+from diffcloud.mesh import SurfaceMesh, grid_cloth
+from diffcloud.sim import Rollout, init, rollout
+from diffcloud.sim.build import Surrounding, build_system
+from diffcloud.sim.contact import ContactSettings
+from diffcloud.sim.energies import Handles
+from diffcloud.sim.energies.handles import Handle
+from diffcloud.sim.materials import isotropic
+from diffcloud.sim.motion import Keyframe, Motion
+from tests.conftest import small_lift
+
+MATERIAL = isotropic("test", density=0.2, stretching=50.0, bending=1e-5, shear=20.0)
+G = 9.81
+
+
+def cloth_system(
+    handles=(), *, hard=True, dt=0.01, height=1.0, obstacles=(), friction=0.3, damping=0.0, air=0.0, **options
+):
+    mesh = grid_cloth(5, 5, 0.2, 0.2)
+    mesh = replace(mesh, nodes=mesh.nodes + [0, 0, height])
+    surrounding = Surrounding(
+        gravity=options.pop("gravity", (0.0, 0.0, -G)),
+        air_density=air,
+        obstacles=obstacles,
+        friction_obstacle=friction,
+        contact=ContactSettings(1e5, 2e-3, 2e-4),
+    )
+    return build_system(
+        mesh,
+        replace(MATERIAL, damping=damping),
+        time_step=dt,
+        handles=Handles(tuple(handles), hard=hard),
+        surrounding=surrounding,
+        **options,
+    )
+
+
+def table(tilt=0.0):
+    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 5
+    corners[:, 2] = corners[:, 0] * np.tan(tilt)
+    return SurfaceMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def test_free_fall_is_exactly_backward_euler():
+    system = cloth_system()
+    run = rollout(system, 20)
+    steps = np.arange(21)
+    drop = G * 0.01**2 * steps * (steps + 1) / 2
+    np.testing.assert_allclose(run.positions[0, :, :, 2].numpy(), np.repeat((1.0 - drop)[:, None], 25, 1), atol=1e-12)
+
+
+def test_free_flight_conserves_momentum_and_loses_energy_only(rng):
+    system = cloth_system(gravity=(0.0, 0.0, 0.0), dt=0.002)
+    positions = init(system).positions * torch.tensor([1.05, 0.97, 1.0], dtype=torch.float64)
+    velocities = torch.as_tensor(0.1 * rng.normal(size=(1, 25, 3)))
+    run = rollout(system, 100, state=init(system, positions=positions, velocities=velocities))
+    mass = system.properties.node_mass[0, :, None]
+    moved = (run.positions[0, 1:] - run.positions[0, :-1]) / system.time_step
+    momentum = (mass * moved).sum(1)
+    np.testing.assert_allclose(momentum, momentum[:1].repeat(100, 1), atol=1e-12)
+    kinetic = 0.5 * (mass * moved.square()).sum((1, 2))
+    centre = 0.5 * (momentum[0] ** 2).sum() / mass.sum()
+    assert kinetic[-1] < kinetic[0]
+    assert kinetic[-1] > centre
+
+
+@pytest.mark.parametrize("newton", [1, 30])
+def test_the_step_solves_its_equation(newton):
+    """The residual of the returned velocity change is rounding."""
+    from diffcloud.sim.integrator import StepStart
+    from diffcloud.sim.simulate import _problem
+
+    system = cloth_system([Handle(0)], hard=False, newton_iterations=newton)
+    schedule = system.handles.schedule(np.array([0.01]), dtype=torch.float64, device=torch.device("cpu"))
+    state = init(system, positions=init(system).positions * 1.02)
+    problem, targets = _problem(system, schedule, state)
+    start = StepStart(state.positions, state.velocities, targets, system.properties)
+    u, _ = problem.solve(*start.tensors())
+    weight = float(system.properties.node_mass.max()) * G * system.time_step
+    assert problem.residual(u, *start.tensors()).abs().max() < (1e-9 if newton == 1 else 1e-7) * weight
+
+
+def test_newton_converges_to_first_order_in_the_time_step():
+    """Halving the step of backward Euler halves its error against a fine solution."""
+
+    def tip(steps, newton=30):
+        system = cloth_system([Handle(0), Handle(4)], dt=0.08 / steps, newton_iterations=newton)
+        return rollout(system, steps).positions[0, -1]
+
+    exact = tip(512, newton=1)
+    errors = [float((tip(steps) - exact).norm()) for steps in (8, 16, 32)]
+    assert 1.6 < errors[0] / errors[1] < 2.4
+    assert 1.6 < errors[1] / errors[2] < 2.4
+
+
+def test_a_batch_is_as_its_entries_alone():
+    scenario = small_lift()
+    system, _ = scenario.scene.build()
+    values = {"stretch": torch.tensor([0.5, 1.0, 4.0]).double(), "mass": torch.tensor([2.0, 1.0, 0.3]).double()}
+    together = rollout(system, 8, properties=scenario.properties(system, values)).positions
+    for entry in range(3):
+        one = {name: value[entry : entry + 1] for name, value in values.items()}
+        alone = rollout(system, 8, properties=scenario.properties(system, one)).positions
+        torch.testing.assert_close(together[entry], alone[0], rtol=1e-9, atol=1e-11)
+
+
+def test_dtype_follows_the_system():
+    system, _ = small_lift().scene.build(dtype=torch.float32)
+    assert rollout(system, 4).positions.dtype == torch.float32
+
+
+class TestHandles:
+    def test_hard_handles_are_met_exactly_and_soft_ones_lag(self):
+        motion = Motion((Keyframe(0.0), Keyframe(0.1, (0.0, 0.0, 0.05))))
+        target = motion.at(np.cumsum(np.full(10, 0.01)))[1][:, 2]
+        target = 1.0 + target - target[0]  # the anchor is taken at the end of the first step
+        hard = rollout(cloth_system([Handle(7, motion)]), 10).positions[0, 1:, 7, 2].numpy()
+        np.testing.assert_allclose(hard, target, atol=1e-12)
+        soft = rollout(cloth_system([Handle(7, motion)], hard=False), 10).positions[0, 1:, 7, 2].numpy()
+        assert 1e-6 < np.abs(soft - target).max() < 1e-2
+
+    def test_two_soft_handles_hold_the_midpoint(self):
+        motion = Motion((Keyframe(0.0), Keyframe(0.05, (0.0, 0.0, 0.02))))
+        both = cloth_system([Handle(12), Handle(12, motion)], hard=False, gravity=(0, 0, 0), air=0.0)
+        height = rollout(both, 200).positions[0, -1, 12, 2]
+        # the moving handle takes its anchor at the end of the first step, when it has already moved a little
+        first = motion.at(np.array([0.01]))[1][0, 2]
+        assert float(height) == pytest.approx(1.0 + (0.02 - first) / 2, abs=1e-6)
+
+    def test_two_hard_handles_on_a_node_are_refused(self):
+        with pytest.raises(SceneError, match="hold one node"):
+            cloth_system([Handle(3), Handle(3)])
+
+    def test_a_handle_lets_go(self):
+        run = rollout(cloth_system([Handle(12, end=0.05)]), 12)
+        height = run.positions[0, :, 12, 2]
+        assert (height[:6] == 1.0).all()
+        assert height[-1] < 1.0
+
+    def test_a_node_that_does_not_exist(self):
+        with pytest.raises(SceneError, match=r"node 25, but the cloth has nodes 0\.\.24"):
+            cloth_system([Handle(25)])
+
+    def test_a_recorded_track_moves_the_grasped_node(self):
+        scenario = small_lift()
+        system, _ = scenario.scene.build()
+        track = torch.zeros(1, 10, 3, dtype=torch.float64)
+        track[0, :, 2] = torch.linspace(0.01, 0.1, 10, dtype=torch.float64)
+        node = scenario.grasped[0]
+        run = rollout(system, 10, track=track)
+        torch.testing.assert_close(run.positions[0, 1:, node], run.positions[0, :1, node] + track[0])
+
+    def test_a_track_without_a_moving_handle(self):
+        with pytest.raises(SceneError, match="no handle of this scene moves"):
+            rollout(cloth_system([Handle(0)]), 2, track=torch.zeros(1, 2, 3, dtype=torch.float64))
+
+
+class TestHalfSpace:
+    def test_nothing_ends_a_step_below_the_table(self):
+        system = cloth_system(height=0.02, obstacles=(table(),))
+        assert rollout(system, 100).positions[..., 2].min() >= 0.0
+
+    def test_a_resting_cloth_is_carried_by_the_repulsion(self):
+        """At rest the normal forces carry the weight: K c²/(2 τ) = m g for each node."""
+        system = cloth_system(height=0.002, obstacles=(table(),), dt=0.005)
+        heights = rollout(system, 400).positions[0, -1, :, 2].numpy()
+        area = system.mesh.node_area
+        violation = np.maximum(0.002 - heights, 0.0)
+        carried = (1e5 * area * violation**2 / (2 * 0.002)).sum()
+        assert carried == pytest.approx(0.2 * 0.04 * G, rel=0.02)
+
+    @pytest.mark.parametrize(("friction", "slides"), [(0.5, False), (0.1, True)])
+    def test_cloth_on_an_incline_sticks_or_slides_as_coulomb_says(self, friction, slides):
+        tilt = np.arctan(0.3)
+        system = cloth_system(height=0.0, obstacles=(table(tilt),), friction=friction, dt=0.002)
+        normal = np.array([-np.sin(tilt), 0, np.cos(tilt)])
+        turn = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
+        flat = system.mesh.nodes - [0, 0, 0]
+        # start where the repulsion already carries the weight
+        depth = np.sqrt(2 * 0.002 * system.mesh.node_area * 0.2 * G * np.cos(tilt) / (1e5 * system.mesh.node_area))
+        positions = torch.as_tensor(flat @ turn + normal * (0.002 - depth)[:, None])[None]
+        run = rollout(system, 300, state=init(system, positions=positions))
+        downhill = np.array([-np.cos(tilt), 0, -np.sin(tilt)])
+        moved = ((run.positions[0] - run.positions[0, :1]).numpy() @ downhill).mean(1)
+        time = 0.6
+        if slides:
+            # the contact force breathes a little, so this is not exact
+            expected = 0.5 * G * (np.sin(tilt) - friction * np.cos(tilt)) * time**2
+            assert moved[-1] == pytest.approx(expected, rel=0.02)
+        else:
+            # the lagged scheme halves a sticking node's velocity in each step, which leaves a creep of g sin(α) Δt
+            assert 0 <= moved[-1] <= 1.05 * G * np.sin(tilt) * system.time_step * time
+
+    def test_projection_and_repulsion_know_their_side(self):
+        ceiling = SurfaceMesh(table().nodes + [0, 0, 2.0], table().faces)
+        system = cloth_system(obstacles=(ceiling,), height=1.99, gravity=(0.0, 0.0, G))
+        assert rollout(system, 100).positions[..., 2].max() <= 2.0
+
+
+class TestDivergence:
+    def test_names_step_entries_and_advice(self):
+        scenario = small_lift()
+        system, _ = scenario.scene.build()
+        stretch = torch.tensor([1.0, float("nan"), 1.0]).double()
+        with pytest.raises(DivergedError, match=r"step 1, batch entries \[1\].*smaller time step") as caught:
+            rollout(system, 3, properties=scenario.properties(system, {"stretch": stretch}))
+        assert caught.value.entries == [1]
+
+    def test_positions_that_leave_the_numbers(self):
+        system = cloth_system()
+        velocities = torch.zeros(2, 25, 3, dtype=torch.float64)
+        velocities[1] = 1e308
+        state = init(system, 2, velocities=velocities)
+        with pytest.raises(DivergedError, match=r"entries \[1\]"):
+            rollout(system, 3, properties=system.properties.repeated(2), state=state)
+
+
+def test_interpolation_between_steps():
+    run = Rollout(torch.arange(4.0).double().view(1, 4, 1, 1).expand(1, 4, 2, 3), torch.arange(4).double() * 0.1)
+    at = run.at(torch.tensor([0.0, 0.05, 0.2, 0.3, 9.0]).double())
+    assert at[0, :, 0, 0].tolist() == pytest.approx([0, 0.5, 2, 3, 3])
