@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +17,7 @@ from diffcloud.io.imports import release_episodes
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.sim.simulate import rollout
 from pipeline.bench import run_benchmarks
-from pipeline.config import DEFAULT_SMOOTHING
+from pipeline.config import FitConfig
 from pipeline.console import errors, output, progress_bar, warn
 from pipeline.scenario_options import choose_scenario
 
@@ -69,6 +69,7 @@ class _Fit:
 
 def _real_fits(release: Path, starts: int) -> str:
     fits: list[_Fit] = []
+    smoothing = FitConfig().smoothing
     episodes = [item for item in release_episodes(release) if item[0] in ("release_lift", "release_fold")]
     with progress_bar("real fits", len(episodes)) as update:
         for index, (name, label, episode) in enumerate(episodes):
@@ -76,10 +77,10 @@ def _real_fits(release: Path, starts: int) -> str:
             scenario = choose_scenario(name, _scene(release, name))
             objective = Objective(scenario, [episode])
             space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
-            single = fit_adam(
-                objective, space, AdamSettings(learning_rate=scenario.learning_rate, smoothing=DEFAULT_SMOOTHING)
+            single = fit_adam(objective, space, AdamSettings(learning_rate=scenario.learning_rate, smoothing=smoothing))
+            many = fit_adam(
+                objective, space, AdamSettings(learning_rate=scenario.learning_rate, starts=starts, smoothing=smoothing)
             )
-            many = fit_adam(objective, space, AdamSettings(learning_rate=scenario.learning_rate, starts=starts))
             published = episode.meta["predictions"]
             values = {
                 key: torch.tensor([np.clip(pair[key], 0.1, 10.0) for pair in published.values()]) for key in space.names
@@ -126,8 +127,8 @@ def _fit_report(fits: list[_Fit], starts: int) -> str:
         "# Fits of the published real clouds",
         "",
         "One-sided Chamfer loss in squared release units, 3,500 points, paper's frames and settings (50 Adam iterations, "
-        "learning rate 0.2, bounds [0.1, 10], start at the middle). `1 start` averages the gradient over eight perturbed "
-        f"copies (`--smoothing {DEFAULT_SMOOTHING}`); `{starts} starts` does not. The last columns are the losses of the "
+        "learning rate 0.2, bounds [0.1, 10], start at the middle). The first start averages its gradient over eight "
+        f"perturbed copies (`--smoothing {FitConfig().smoothing}`, the default). The last columns are the losses of the "
         "published predictions, clipped to the bounds, under the same simulator, metric and points.",
         "",
         *_markdown(head, rows),

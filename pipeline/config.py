@@ -13,7 +13,6 @@ from diffcloud.scene.schema import NonNegative, Positive, explain
 
 Count = Annotated[int, Field(ge=1)]
 Bounds = tuple[float, float]
-DEFAULT_SMOOTHING = 0.5
 
 
 def _check_bounds(name: str, bounds: Bounds) -> None:
@@ -69,9 +68,9 @@ class FitConfig(Section):
     learning_rate: Positive | None = None
     """The scenario's own if not given."""
     starts: Count = 1
-    smoothing: NonNegative | None = None
-    """Standard deviation, on the sigmoid's axis, of the perturbed copies whose gradients are averaged; 0: none. If not
-    given: 0.5 for a single start; 0 for several, which search widely by themselves."""
+    smoothing: NonNegative = 0.5
+    """Standard deviation, on the sigmoid's axis, of the first start's perturbed copies, whose gradients are averaged; 0:
+    the plain gradient, as the paper has it."""
     threshold: NonNegative | None = None
     points: Count | None = None
     frames: list[int] | None = None
@@ -85,12 +84,6 @@ class FitConfig(Section):
         for name, pair in self.bounds.items():
             _check_bounds(f"bounds.{name}", pair)
         return self
-
-    @property
-    def chosen_smoothing(self) -> float:
-        if self.smoothing is not None:
-            return self.smoothing
-        return DEFAULT_SMOOTHING if self.starts == 1 else 0.0
 
 
 class EvaluateConfig(Section):

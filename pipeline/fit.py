@@ -90,7 +90,7 @@ def fit(
         starts=settings.starts,
         seed=settings.seed,
         resample=settings.resample,
-        smoothing=settings.chosen_smoothing,
+        smoothing=settings.smoothing,
         init=first,
     )
     table = Table("episode", "start", "final", "rms mm", *space.names, "iterations", "seconds", "stopped by")
@@ -115,6 +115,7 @@ _SHOWN = ("loss", "loss_start", "loss_resampled", "iterations", "seconds", "stop
 
 
 def _run(name: str, objective: Objective, space: FitSpace, adam: AdamSettings) -> FitOutcome:
+    errors.print(f"Fitting {name} ...")
     with progress_bar(name, adam.iterations) as update:
 
         def show_progress(progress: Progress) -> None:

@@ -18,7 +18,7 @@ from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import Rollout, rollout
 
-_CHUNK = 16
+_CHUNK = 20
 """Parameter sets simulated together: about where a batch of 49-node cloths leaves a core's cache."""
 
 

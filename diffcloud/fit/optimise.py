@@ -30,15 +30,16 @@ class AdamSettings:
     resample: bool = False
     """Draw new points in each iteration (the published scripts do) instead of common random numbers."""
     smoothing: float = 0.0
-    """Standard deviation of perturbed copies on the unbounded axis, whose gradients are averaged; 0: none.
+    """Standard deviation of perturbed copies of the first start on the unbounded axis; 0: none.
 
     After contact the loss is rough, and its exact derivative is right in the small and often useless in the large. The
     mean gradient over a few perturbed copies estimates the slope of the smoothed loss (randomised smoothing; Suh et al.
     2022, "Do differentiable simulators give better policy gradients?"). The copies are simulated as one batch, and they
-    are iterates like any other: each is a parameter set whose loss has been measured.
+    are iterates like any other: each is a parameter set whose loss has been measured. Further starts go without: they
+    search widely by their number.
     """
     copies: int = 8
-    """Perturbed copies per start, in antithetic pairs; even."""
+    """Perturbed copies of the first start, in antithetic pairs; even."""
     init: Mapping[str, float] = field(default_factory=dict)
     """Values of the first start; the middle of the range where not given."""
 
@@ -119,38 +120,37 @@ def fit_adam(
         for iteration in range(settings.iterations + 1):
             if settings.resample and iteration:
                 objective.reseed(settings.seed + iteration)
-            noise = _perturbations(unbounded, settings, generator)  # [C, B, k], the first zero
+            owner, noise = _trials(settings, unbounded, generator)
             optimiser.zero_grad()
             while True:
-                chosen = alive.nonzero().flatten()
-                values = space.values((unbounded + noise)[:, chosen].flatten(0, 1), logarithmic[chosen].repeat(len(noise)))
+                owner, noise = owner[alive[owner]], noise[alive[owner]]
+                values = space.values(unbounded[owner] + noise, logarithmic[owner])
                 try:
                     evaluations += len(values)
-                    found = objective(*space.split(values)).unflatten(0, (len(noise), len(chosen)))
-                    found.mean(0).sum().backward()
+                    found = objective(*space.split(values))
+                    share = 1.0 / torch.bincount(owner, minlength=settings.starts)[owner]
+                    (share * found).sum().backward()
                     break
                 except DivergedError as error:
-                    entries = sorted({entry % len(chosen) for entry in error.entries})
-                    described = [_describe(space, values[entry]) for entry in entries]
-                    failures += [
-                        f"start {int(chosen[e])} {text}: {error}" for e, text in zip(entries, described, strict=True)
-                    ]
-                    alive[chosen[entries]] = False
+                    lost = sorted({int(owner[entry]) for entry in error.entries})
+                    worst = {int(owner[entry]): _describe(space, values[entry]) for entry in error.entries}
+                    failures += [f"start {start} {worst[start]}: {error}" for start in lost]
+                    alive[lost] = False
                     if not bool(alive.any()):
-                        raise DivergedError(error.step, error.entries, error.reason, described[-1]) from error
-            values = values.detach().unflatten(0, found.shape)
+                        raise DivergedError(error.step, error.entries, error.reason, worst[lost[0]]) from error
+            found, values = found.detach(), values.detach()
+            unperturbed = (noise == 0).all(-1)
             losses = torch.full((settings.starts,), float("inf"), dtype=dtype, device=device)
-            losses[chosen] = found.detach()[0]
+            losses[owner[unperturbed]] = found[unperturbed]
             centre = torch.full_like(start_values, float("nan"))
-            centre[chosen] = values[0]
+            centre[owner[unperturbed]] = values[unperturbed]
             assert unbounded.grad is not None
             history.losses.append(losses)
             history.values.append(centre)
             history.gradients.append(unbounded.grad.clone())
-            lowest = int(found.detach().argmin())
-            copy, start = divmod(lowest, len(chosen))
-            if float(found[copy, start].detach()) < best.loss:
-                best = _Best(float(found[copy, start].detach()), int(chosen[start]), values[copy, start])
+            lowest = int(found.argmin())
+            if float(found[lowest]) < best.loss:
+                best = _Best(float(found[lowest]), int(owner[lowest]), values[lowest])
             if progress is not None:
                 named = dict(zip(space.names, best.values.tolist(), strict=True))
                 progress(Progress(iteration, float(losses.min()), best.loss, named))
@@ -185,13 +185,13 @@ class _Best:
     """[k]"""
 
 
-def _perturbations(unbounded: Tensor, settings: AdamSettings, generator: torch.Generator) -> Tensor:
-    """[1 + copies, B, k]: zero, then antithetic pairs."""
-    zero = torch.zeros(1, *unbounded.shape)
-    if settings.smoothing == 0:
-        return zero.to(unbounded)
-    half = settings.smoothing * torch.randn(settings.copies // 2, *unbounded.shape, generator=generator)
-    return torch.cat([zero, half, -half]).to(unbounded)
+def _trials(settings: AdamSettings, unbounded: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """What is simulated in one iteration: the start that each trial belongs to [E], and its perturbation [E, k]."""
+    starts, variables = unbounded.shape
+    half = settings.smoothing * torch.randn(settings.copies // 2, variables, generator=generator)
+    copies = torch.cat([half, -half]) if settings.smoothing else half[:0]
+    owner = torch.cat([torch.arange(starts), torch.zeros(len(copies), dtype=torch.long)])
+    return owner.to(unbounded.device), torch.cat([torch.zeros(starts, variables), copies]).to(unbounded)
 
 
 def _describe(space: FitSpace, values: Tensor) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -50,25 +51,21 @@ def build_page(
 
     rng = np.random.default_rng(seed)
     data = [_entry_data(entry, overlay_points, rng) for entry in entries]
-    replacements = {
-        "{{title}}": html.escape(title),
-        "{{summary}}": _summary(entries),
-        "{{parameter_heads}}": "".join(f"<th>{html.escape(name)}</th>" for name in _parameter_names(entries)),
-        "{{rows}}": "".join(_table_row(index, entry, _parameter_names(entries)) for index, entry in enumerate(entries)),
-        "{{failures}}": _failures(entries),
-        "{{environment}}": "".join(
-            f"<tr><td>{html.escape(key)}</td><td>{html.escape(value)}</td></tr>" for key, value in environment.items()
-        ),
-        "{{data}}": _script_json(data),
-        "{{plotly}}": get_plotlyjs(),
+    names = _parameter_names(entries)
+    lines = (f"<tr><td>{html.escape(key)}</td><td>{html.escape(value)}</td></tr>" for key, value in environment.items())
+    parts = {
+        "title": html.escape(title),
+        "summary": _summary(entries),
+        "parameter_heads": "".join(f"<th>{html.escape(name)}</th>" for name in names),
+        "rows": "".join(_table_row(index, entry, names) for index, entry in enumerate(entries)),
+        "failures": _failures(entries),
+        "environment": "".join(lines),
+        "data": _script_json(data),
+        "plotly": get_plotlyjs(),
     }
-    page = files("diffcloud.report").joinpath("template.html").read_text(encoding="utf-8")
-    for key, value in replacements.items():
-        head, found, tail = page.partition(key)
-        if not found:
-            raise AssertionError(f"template.html lacks {key}")
-        page = head + value + tail
-    return page
+    template = files("diffcloud.report").joinpath("template.html").read_text(encoding="utf-8")
+    # one pass, so that what is put in is never searched for further places
+    return re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place.group(1)], template)
 
 
 def _entry_data(entry: EpisodeEntry, overlay_points: int, rng: np.random.Generator) -> dict[str, Any]:

@@ -6,8 +6,8 @@ doubles each entry, so a constant table entry S gives a stretching stiffness of 
 
 `bending` [3, 5]: rows are edge directions 0, 45, 90 degrees in material space, columns are curvature bins. An entry k_b
 [N·m] enters the hinge energy k_b l² θ² / (8 (a0 + a1)). What that means as a bending stiffness per width B depends on
-the mesh, as with every hinge model. Take a grid of right triangles with side h and the surface z = (a x² + 2 b x y + c y²)/2:
-edges along y turn by (a - b) h, along x by (c - b) h, diagonals by √2 b h, so the energy per area is
+the mesh, as with every hinge model. Take a grid of right triangles with side h and z = (a x² + 2 b x y + c y²)/2: edges
+along y turn by (a - b) h, along x by (c - b) h, diagonals by √2 b h, so the energy per area is
 
     k_b/2 · [(a - b)²/4 + (c - b)²/4 + b²].
 

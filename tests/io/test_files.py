@@ -21,21 +21,25 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
+def write_half(target, error):
+    with atomic_path(target) as temporary:
+        temporary.write_text("half of the n")
+        raise error
+
+
 class TestAtomicWrites:
     def test_an_interrupted_write_keeps_the_former_file(self, tmp_path):
         target = tmp_path / "a.txt"
         write_text(target, "old")
-        with pytest.raises(KeyboardInterrupt), atomic_path(target) as temporary:
-            temporary.write_text("half of the n")
-            raise KeyboardInterrupt
+        with pytest.raises(KeyboardInterrupt):
+            write_half(target, KeyboardInterrupt())
         assert target.read_text() == "old"
         assert names(tmp_path) == ["a.txt"]
 
     def test_a_full_disk_is_a_clear_error_and_leaves_nothing(self, tmp_path):
         target = tmp_path / "a.txt"
-        with pytest.raises(DiffCloudError, match=r"Cannot write .*a\.txt: No space left"), atomic_path(target) as temporary:
-            temporary.write_text("half")
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        with pytest.raises(DiffCloudError, match=r"Cannot write .*a\.txt: No space left"):
+            write_half(target, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
         assert names(tmp_path) == []
 
     def test_episode_writing_on_a_full_disk(self, tmp_path, monkeypatch):

@@ -23,11 +23,9 @@ MATERIAL = isotropic("test", density=0.2, stretching=50.0, bending=1e-5, shear=2
 G = 9.81
 
 
-def cloth_system(
-    handles=(), *, hard=True, dt=0.01, height=1.0, obstacles=(), friction=0.3, damping=0.0, air=0.0, **options
-):
+def cloth_system(handles=(), *, hard=True, dt=0.01, height=1.0, obstacles=(), friction=0.3, air=0.0, **options):
     mesh = grid_cloth(5, 5, 0.2, 0.2)
-    mesh = replace(mesh, nodes=mesh.nodes + [0, 0, height])
+    mesh = replace(mesh, nodes=mesh.nodes + np.array([0, 0, height]))
     surrounding = Surrounding(
         gravity=options.pop("gravity", (0.0, 0.0, -G)),
         air_density=air,
@@ -37,7 +35,7 @@ def cloth_system(
     )
     return build_system(
         mesh,
-        replace(MATERIAL, damping=damping),
+        MATERIAL,
         time_step=dt,
         handles=Handles(tuple(handles), hard=hard),
         surrounding=surrounding,
@@ -185,7 +183,7 @@ class TestHalfSpace:
         system = cloth_system(height=0.0, obstacles=(table(tilt),), friction=friction, dt=0.002)
         normal = np.array([-np.sin(tilt), 0, np.cos(tilt)])
         turn = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
-        flat = system.mesh.nodes - [0, 0, 0]
+        flat = system.mesh.nodes
         # start where the repulsion already carries the weight
         depth = np.sqrt(2 * 0.002 * system.mesh.node_area * 0.2 * G * np.cos(tilt) / (1e5 * system.mesh.node_area))
         positions = torch.as_tensor(flat @ turn + normal * (0.002 - depth)[:, None])[None]
@@ -202,7 +200,7 @@ class TestHalfSpace:
             assert 0 <= moved[-1] <= 1.05 * G * np.sin(tilt) * system.time_step * time
 
     def test_projection_and_repulsion_know_their_side(self):
-        ceiling = SurfaceMesh(table().nodes + [0, 0, 2.0], table().faces)
+        ceiling = SurfaceMesh(table().nodes + np.array([0, 0, 2.0]), table().faces)
         system = cloth_system(obstacles=(ceiling,), height=1.99, gravity=(0.0, 0.0, G))
         assert rollout(system, 100).positions[..., 2].max() <= 2.0
 

@@ -1,0 +1,211 @@
+"""Commands as a person runs them: outputs, --json, exit status, bad input that leaves nothing behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from diffcloud.io.episodes import Episode, read_episode, write_episode
+from diffcloud.io.obj import read_cloth
+from tests.conftest import small_lift
+from tests.fit.test_fit import clouds_of
+
+DIFFCLOUD = [sys.executable, "-m", "pipeline.app"]
+ROOT = Path(__file__).parents[2]
+SMALL = {
+    "base": "lift",
+    "nodes": [5, 5],
+    "frames": 5,
+    "steps_per_frame": 2,
+    "points": 200,
+    "path": [[0, 0, 0, 0], [0.5, 0, -0.05, 0.15]],
+}
+
+
+def run(*arguments: object, cwd: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([*DIFFCLOUD, *map(str, arguments)], cwd=cwd, env=env, capture_output=True, text=True, timeout=120)
+    assert done.returncode == code, f"status {done.returncode}\n{done.stdout}\n{done.stderr}"
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def result(done: subprocess.CompletedProcess[str]) -> dict:
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+@pytest.fixture
+def work(tmp_path):
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(SMALL))
+    write_episode(tmp_path / "e1.npz", clouds_of(small_lift(), stretch=0.7, mass=1.0))
+    return tmp_path
+
+
+def test_rollout_writes_the_contract_and_exports(work):
+    done = run(
+        "rollout", "--scenario", "small.yaml", "--set", "stretch=0.5", "--set", "mass=5", "--frames", 3, "--out", "run.npz",
+        "--obj", "obj", "--ply", "ply", "--json", cwd=work,
+    )  # fmt: skip
+    with np.load(work / "run.npz") as data:
+        assert data["nodes"].shape == (4, 25, 3)
+        assert data["nodes"].dtype == np.float64
+        assert data["faces"].dtype == np.int64
+        assert data["times"].tolist() == pytest.approx([0, 0.1, 0.2, 0.3])
+        last = data["nodes"][-1]
+    assert result(done)["parameters"] == {"stretch": 0.5, "mass": 5.0}
+    np.testing.assert_array_equal(read_cloth(work / "obj" / "003.obj").nodes, last)
+    assert len(list((work / "ply").iterdir())) == 4
+
+
+def test_fit_then_replay_and_measure(work):
+    done = run(
+        "fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 3, "--starts", 2, "--fix", "mass=1.0", "--json",
+        "e1.npz", cwd=work,
+    )  # fmt: skip
+    summary = json.loads((work / "fits" / "e1.json").read_text())
+    assert result(done)["fits"]["e1"]["loss"] == summary["loss"]
+    assert {"loss", "loss_start", "iterations", "seconds", "stop_reason", "parameters"} <= set(summary)
+    assert {"value", "unit"} <= set(summary["parameters"]["stretch"])
+    value = summary["parameters"]["stretch"]["value"]
+    measured = run(
+        "evaluate", "loss", "--scenario", "small.yaml", "--set", f"stretch={value!r}", "--set", "mass=1.0", "--json",
+        "e1.npz", cwd=work,
+    )  # fmt: skip
+    assert result(measured)["loss"] == pytest.approx(summary["loss"], rel=1e-9)  # same metric, same points
+    run("rollout", "--scenario", "small.yaml", "--fit", "fits/e1.json", "--episode", "e1.npz", "--out", "r.npz", cwd=work)
+    with np.load(work / "r.npz") as replay, np.load(work / "fits" / "e1.npz") as fitted:
+        np.testing.assert_allclose(replay["nodes"], fitted["nodes"], atol=1e-12)
+
+
+def test_joint_fit_gives_one_result(work):
+    write_episode(work / "e2.npz", clouds_of(small_lift(), stretch=1.4, mass=1.0))
+    run("fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 1, "--joint", "e1.npz", "e2.npz", cwd=work)
+    assert json.loads((work / "fits" / "joint.json").read_text())["episodes"] == ["e1", "e2"]
+    assert sorted(path.name for path in (work / "fits").iterdir()) == ["joint.json", "joint.npz"]
+
+
+def test_interrupted_fit_leaves_the_best_so_far(work):
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [*DIFFCLOUD, "fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", "100000", "e1.npz"]
+    process = subprocess.Popen(command, cwd=work, env=env, stderr=subprocess.PIPE, text=True)
+    assert "Fitting e1" in process.stderr.readline()
+    time.sleep(3)  # an iteration takes milliseconds
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "best so far" in errors
+    summary = json.loads((work / "fits" / "e1.json").read_text())
+    assert summary["stop_reason"] == "interrupted"
+    assert summary["loss"] <= summary["loss_start"]
+
+
+def test_import_own_clouds_end_to_end(work):
+    (work / "clouds").mkdir()
+    episode = read_episode(work / "e1.npz")
+    for index in range(episode.frame_count):
+        np.savetxt(work / "clouds" / f"frame_{index:03d}.xyz", episode.frame(index))
+    rows = np.column_stack([episode.times, episode.gripper])
+    np.savetxt(work / "gripper.csv", rows, delimiter=",", header="t_s,x,y,z", comments="")
+    run("import", "clouds", "clouds", "--gripper", "gripper.csv", "--out", "own.npz", cwd=work)
+    again = read_episode(work / "own.npz")
+    np.testing.assert_allclose(again.points, episode.points, atol=1e-6)
+    run("fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 1, "own.npz", cwd=work)
+
+
+def test_stages_run_in_a_row_and_the_page_is_whole(work):
+    (work / "raw" / "scenes").mkdir(parents=True)
+    (work / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump(SMALL))
+    params = {"scenarios": ["small"], "episodes": {"per_scenario": 1}, "fit": {"iterations": 2}, "evaluate": {"draws": 1}}
+    (work / "params.yaml").write_text(yaml.safe_dump(params))
+    run("episodes", "--params", "params.yaml", "--out", "data/recorded", cwd=work)
+    run("preprocess", "--params", "params.yaml", "--out", "data/episodes", "data/recorded", cwd=work)
+    run(
+        "fit", "--params", "params.yaml", "--scenario", "small", "--out", "data/fits/small", "data/episodes/small", cwd=work
+    )
+    run("evaluate", "--params", "params.yaml", cwd=work)
+    run("report", "--params", "params.yaml", cwd=work)
+    metrics = json.loads((work / "reports" / "metrics.json").read_text())
+    assert set(metrics["scenarios"]["small"]) == {"loss_start", "loss", "rms_mm", "rms_other_frames_mm"}
+    page = (work / "reports" / "index.html").read_text()
+    assert "small_hidden1" in page
+    head, *scripts = page.split("<script>")
+    for own in (head, scripts[-1]):  # what lies between is plotly
+        assert "{{" not in own
+        assert "http" not in own
+    first = (work / "reports" / "metrics.json").read_bytes()
+    run("evaluate", "--params", "params.yaml", cwd=work)
+    assert (work / "reports" / "metrics.json").read_bytes() == first
+
+
+def test_synthetic_episodes_are_the_same_bytes_for_the_same_seed(work):
+    (work / "raw" / "scenes").mkdir(parents=True)
+    (work / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump(SMALL))
+    (work / "p.yaml").write_text(yaml.safe_dump({"scenarios": ["small"], "episodes": {"per_scenario": 1}}))
+    for out in ("a", "b"):
+        run("episodes", "--params", "p.yaml", "--out", out, cwd=work)
+    name = "small/small_hidden1.npz"
+    assert (work / "a" / name).read_bytes() == (work / "b" / name).read_bytes()
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("params", "message"),
+        [
+            ({"fit": {"iteration": 3}}, "fit.iteration: unknown or unsupported field"),
+            ({"fit": {"bounds": {"stretch": [5, 1]}}}, "must be in order (low < high), got [5.0, 1.0]"),
+            ({"episodes": {"hidden_range": [3, 1]}}, "hidden_range must be in order"),
+            ({"fits": {}}, "fits: unknown or unsupported field"),
+            ({"fit": {"optimizer": "lbfgs"}}, "fit.optimizer"),
+        ],
+    )
+    def test_parameter_files(self, work, params, message):
+        (work / "params.yaml").write_text(yaml.safe_dump(params))
+        done = run(
+            "fit", "--params", "params.yaml", "--scenario", "small.yaml", "--out", "fits", "e1.npz", cwd=work, code=1
+        )
+        assert message in done.stderr.replace("\n", " ")
+        assert not (work / "fits").exists()
+
+    def test_a_damaged_last_episode_costs_nothing(self, work):
+        (work / "e2.npz").write_bytes(b"nothing")
+        done = run("fit", "--scenario", "small.yaml", "--out", "fits", "e1.npz", "e2.npz", cwd=work, code=1)
+        assert "e2.npz is not a readable episode" in done.stderr
+        assert not (work / "fits").exists()
+
+    def test_an_episode_that_is_too_short(self, work):
+        short = Episode.from_frames([np.zeros((3, 3))] * 2, np.array([0.0, 0.1]))
+        write_episode(work / "short.npz", short)
+        done = run("fit", "--scenario", "small.yaml", "--out", "f", "--frame", 5, "short.npz", cwd=work, code=1)
+        assert "Frame 5 is missing: the episode has 2 frames" in done.stderr
+
+    def test_unknown_names_and_numbers(self, work):
+        for arguments, message in (
+            (("--scenario", "lfit"), "Unknown scenario 'lfit'"),
+            (("--scenario", "small.yaml", "--set", "weight=3"), "Unknown parameter 'weight'"),
+            (("--scenario", "small.yaml", "--set", "mass=heavy"), "takes NAME=NUMBER"),
+            (("--scenario", "small.yaml", "--set", "mass=nan"), "finite"),
+            (("--scene", "none.json"), "No such file"),
+        ):
+            done = run("rollout", *arguments, "--out", "r.npz", cwd=work, code=1)
+            assert message in done.stderr
+            assert not (work / "r.npz").exists()
+
+    def test_a_diverged_rollout_names_step_and_parameters(self, work):
+        done = run("rollout", "--scenario", "small.yaml", "--set", "stretch=-1e9", "--out", "r.npz", cwd=work, code=1)
+        assert "diverged at step" in done.stderr
+        assert "stretch=-1e+09" in done.stderr
+        assert not (work / "r.npz").exists()
+
+    def test_a_disk_that_cannot_be_written(self, work):
+        (work / "file").write_text("")
+        done = run("rollout", "--scenario", "small.yaml", "--out", "file/r.npz", cwd=work, code=1)
+        assert "Cannot write" in done.stderr

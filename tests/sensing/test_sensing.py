@@ -1,0 +1,82 @@
+"""The depth camera sees what it should; filters remove what they should."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from diffcloud.errors import EpisodeError
+from diffcloud.sensing import DepthCamera, clean_frame, default_cameras
+
+
+@pytest.fixture
+def camera():
+    return DepthCamera.looking_at("c", (0.3, -0.4, 0.8), (0.0, 0.0, 0.0))
+
+
+def sheet(height, size, count, rng):
+    return np.column_stack([rng.uniform(-size, size, (count, 2)), np.full(count, height)])
+
+
+def test_the_pose_is_a_right_handed_frame_that_looks_at_its_target(camera):
+    rotation = camera.T_world_camera[:3, :3]
+    np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    local = rotation.T @ (np.zeros(3) - camera.T_world_camera[:3, 3])
+    np.testing.assert_allclose(local[:2], 0.0, atol=1e-12)
+    assert local[2] > 0
+
+
+def test_noise_free_points_lie_on_the_surface(camera, rng):
+    sharp = replace(camera, subpixel_px=1e-9, depth_scale_m=1e-9)
+    points, pixels, _ = sharp.see(sheet(0.0, 0.1, 60_000, rng), rng)
+    inner = np.abs(points[:, :2]).max(axis=1) < 0.09
+    # a pixel's centre and the sample that filled it differ by up to half a pixel on a tilted surface
+    assert np.abs(points[inner, 2]).max() < 0.5 / camera.focal_px * 1.5
+    assert (pixels[:, 0] < camera.width).all()
+    assert (pixels[:, 1] < camera.height).all()
+
+
+def test_what_lies_behind_is_not_seen(camera, rng):
+    both = np.concatenate([sheet(0.0, 0.05, 40_000, rng), sheet(-0.1, 0.05, 40_000, rng)])
+    overhead = DepthCamera.looking_at("o", (0.0, 0.0, 0.8), (0.0, 0.0, 0.0))
+    points, _, _ = overhead.see(both, rng)
+    assert (points[:, 2] > -0.02).mean() > 0.97
+
+
+def test_noise_grows_with_the_square_of_the_distance(rng):
+    spread = []
+    for distance in (0.6, 1.2):
+        overhead = DepthCamera.looking_at("o", (0.0, 0.0, distance), (0.0, 0.0, 0.0))
+        points, _, sigma = overhead.see(sheet(0.0, 0.08, 80_000, rng), rng)
+        inner = np.abs(points[:, :2]).max(axis=1) < 0.07
+        spread.append(points[inner, 2].std())
+        assert spread[-1] == pytest.approx(float(np.median(sigma)), rel=0.25)
+    assert spread[1] / spread[0] == pytest.approx(4.0, rel=0.25)
+
+
+def test_default_cameras_are_an_overhead_and_a_side_view():
+    overhead, side = default_cameras((0.0, 0.0, 0.1))
+    assert overhead.T_world_camera[2, 3] > side.T_world_camera[2, 3]
+
+
+class TestFilters:
+    def test_outliers_go_and_the_sheet_stays(self, rng):
+        cloud = np.concatenate([sheet(0.0, 0.1, 2000, rng), rng.uniform(0.3, 0.6, (20, 3))]).astype(np.float32)
+        keep, report = clean_frame(cloud, rng=rng)
+        assert (keep < 2000).all()
+        assert len(keep) > 1900
+        assert (report.recorded, report.kept) == (2020, len(keep))
+
+    def test_crop_and_limit(self, rng):
+        cloud = sheet(0.0, 0.1, 2000, rng).astype(np.float32)
+        keep, report = clean_frame(cloud, crop=((0, -1, -1), (1, 1, 1)), neighbours=0, limit=100, rng=rng)
+        assert (cloud[keep, 0] >= 0).all()
+        assert len(np.unique(keep)) == 100  # without repetition
+        assert report.cropped == (cloud[:, 0] >= 0).sum()
+
+    def test_a_crop_that_leaves_nothing_shows_both_boxes(self, rng):
+        with pytest.raises(EpisodeError, match=r"No point lies in the crop box.*the cloud spans"):
+            clean_frame(sheet(0.0, 0.1, 50, rng).astype(np.float32), crop=((5, 5, 5), (6, 6, 6)), rng=rng)

@@ -1,0 +1,122 @@
+"""Imports run one way, stages depend on what they import, parameters and their documentation agree."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+ALLOWED = {
+    "mesh": set(),
+    "io": {"mesh"},
+    "sim": {"mesh", "io"},
+    "scene": {"mesh", "io", "sim"},
+    "clouds": {"mesh"},
+    "fit": {"mesh", "io", "sim", "scene", "clouds"},
+    "sensing": {"mesh", "io", "clouds"},
+    "report": {"mesh", "io", "sim", "scene", "clouds", "fit", "sensing"},
+}
+"""Sub-package -> the sub-packages it may import; all may import errors."""
+
+
+def imported(path: Path) -> set[str]:
+    """Modules that a file imports, dotted."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module)
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def packages(path: Path) -> set[str]:
+    """Sub-packages of diffcloud that a file imports."""
+    return {name.split(".")[1] for name in imported(path) if name.startswith("diffcloud.") and name.count(".") >= 1}
+
+
+@pytest.mark.parametrize("package", ALLOWED)
+def test_imports_run_one_way(package):
+    for path in (ROOT / "diffcloud" / package).rglob("*.py"):
+        extra = (packages(path) & ALLOWED.keys()) - ALLOWED[package] - {package}
+        assert not extra, f"{path.relative_to(ROOT)} imports {sorted(extra)}"
+        assert not any(name.split(".")[0] == "pipeline" for name in imported(path)), path
+
+
+def test_every_package_is_in_the_table():
+    found = {path.name for path in (ROOT / "diffcloud").iterdir() if (path / "__init__.py").is_file()}
+    assert found == set(ALLOWED)
+
+
+def test_physics_has_no_torch_in_mesh_and_no_cloth_in_adjoint():
+    for path in (ROOT / "diffcloud" / "mesh").rglob("*.py"):
+        assert not any(name.split(".")[0] == "torch" for name in imported(path)), path
+    assert not any(name.startswith("diffcloud") for name in imported(ROOT / "diffcloud" / "sim" / "adjoint.py"))
+
+
+def needed_packages(stage: str) -> set[str]:
+    """Sub-packages a stage's command reaches, through whatever those import."""
+    seen: set[str] = set()
+    todo = packages(ROOT / "pipeline" / f"{stage}.py") & ALLOWED.keys()
+    if "scenario_options" in (ROOT / "pipeline" / f"{stage}.py").read_text(encoding="utf-8"):
+        todo |= {"scene"}
+    while todo:
+        package = todo.pop()
+        seen.add(package)
+        for path in (ROOT / "diffcloud" / package).rglob("*.py"):
+            todo |= (packages(path) & ALLOWED.keys()) - seen
+    return seen
+
+
+def stages() -> dict:
+    return yaml.safe_load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
+
+
+@pytest.mark.parametrize("stage", ["episodes", "preprocess", "fit", "evaluate", "report"])
+def test_stage_dependencies_are_the_imports(stage):
+    listed = {Path(dep).name for dep in stages()[stage]["deps"] if dep.startswith("diffcloud/") and not dep.endswith(".py")}
+    assert listed == needed_packages(stage)
+    assert f"pipeline/{stage}.py" in stages()[stage]["deps"]
+
+
+def test_stage_parameters_are_sections_of_the_configuration():
+    from pipeline.config import Config
+
+    written = yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8"))
+    assert set(written) == set(Config.model_fields)
+    used = {name for stage in stages().values() for name in stage.get("params", [])}
+    assert used | {"scenarios"} == set(Config.model_fields)
+    Config.model_validate(written)
+
+
+def test_every_stage_command_exists():
+    from typer.main import get_command
+
+    from pipeline.app import app
+
+    commands = get_command(app).commands
+    for stage in stages().values():
+        words = stage["cmd"].split()
+        assert words[0] == "diffcloud"
+        assert words[1] in commands
+        options = {option for parameter in commands[words[1]].params for option in parameter.opts}
+        assert {word for word in words if word.startswith("--")} <= options
+
+
+def test_public_lists_name_what_exists():
+    import importlib
+
+    for package in ALLOWED:
+        module = importlib.import_module(f"diffcloud.{package}")
+        for name in getattr(module, "__all__", []):
+            assert hasattr(module, name), f"{package}.{name}"
+
+
+def test_dvc_does_not_phone_home():
+    config = (ROOT / ".dvc" / "config").read_text(encoding="utf-8")
+    assert "analytics = false" in config
+    assert "check_update = false" in config
