@@ -77,10 +77,9 @@ def _real_fits(release: Path, starts: int) -> str:
             scenario = choose_scenario(name, _scene(release, name))
             objective = Objective(scenario, [episode])
             space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
-            single = fit_adam(objective, space, AdamSettings(learning_rate=scenario.learning_rate, smoothing=smoothing))
-            many = fit_adam(
-                objective, space, AdamSettings(learning_rate=scenario.learning_rate, starts=starts, smoothing=smoothing)
-            )
+            settings = AdamSettings(learning_rate=scenario.learning_rate, smoothing=smoothing)
+            single = fit_adam(objective, space, settings)
+            many = fit_adam(objective, space, replace(settings, starts=starts))
             published = episode.meta["predictions"]
             values = {
                 key: torch.tensor([np.clip(pair[key], 0.1, 10.0) for pair in published.values()]) for key in space.names

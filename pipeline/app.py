@@ -35,7 +35,7 @@ app.command()(acceptance.acceptance)
 def main() -> None:
     """Run, and turn the project's own errors into a message and exit status 1."""
     # A step is a chain of small operations: a second thread gains nothing (measured), and beside another busy process its
-    # spinning costs tenfold. Cores are better spent on several episodes at once (fit --jobs).
+    # spinning costs tenfold. OMP_NUM_THREADS overrides.
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)
     try:
