@@ -11,6 +11,9 @@ import torch
 
 from diffcloud.scene.scenarios import Scenario, built_in, grid_scenario
 
+if "OMP_NUM_THREADS" not in os.environ:
+    torch.set_num_threads(1)  # as the commands do: beside another busy process spinning threads cost tenfold
+
 
 @pytest.fixture
 def generator() -> torch.Generator:
