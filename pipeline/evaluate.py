@@ -18,7 +18,7 @@ from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import write_json, write_text
 from pipeline.config import load_config
 from pipeline.console import JsonFlag, ParamsFile, assignments, errors, finish, output, progress_bar
-from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, loss_unit
+from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 
 app = typer.Typer(help="Measure parameters and fits.")
 
@@ -44,7 +44,7 @@ def loss(
         found = float(objective(tensors, nuisance)[0])
     if not json:
         output.print(f"{found:.6e}")
-    finish({"loss": found, "parameters": values, **loss_unit(chosen)}, json)
+    finish({"loss": found, "parameters": values, "length_unit_m": chosen.length_unit_m}, json)
 
 
 @app.callback(invoke_without_command=True)

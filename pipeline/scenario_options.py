@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -41,7 +40,3 @@ def limits(scenario: Scenario) -> list[str]:
         f"Obstacles {meshes} of {scenario.name} are not planar. Contact is simulated with planes only: the cloth passes "
         "through these, and results are valid until the first such contact."
     ]
-
-
-def loss_unit(scenario: Scenario) -> Mapping[str, Any]:
-    return {"length_unit_m": scenario.length_unit_m}

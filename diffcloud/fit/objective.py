@@ -94,7 +94,7 @@ class Objective:
         for begin in range(0, batch, _CHUNK):  # chunks that fit the cache; nothing inside loops over the batch
             part = {name: value[begin : begin + _CHUNK] for name, value in parameters.items()}
             shift = {name: value[begin : begin + _CHUNK] for name, value in (offset or {}).items()}
-            terms = [self._loss(target, part, shift) for target in self._targets]
+            terms = [self._loss(index, part, shift) for index in range(len(self._targets))]
             losses.append(torch.stack(terms).mean(0))
         return torch.cat(losses)
 
@@ -106,8 +106,8 @@ class Objective:
         track = None if track is None else track[:, :steps]
         return rollout(self.system, steps, properties=properties, track=track)
 
-    def _loss(self, target: _Target, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor]) -> Tensor:
-        episode = self._targets.index(target)
+    def _loss(self, episode: int, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor]) -> Tensor:
+        target = self._targets[episode]
         run = self.simulate(parameters, episode=episode, steps=self._steps)
         points = self.sampler.sample(run.at(target.times))  # [B, L, N, 3]
         if offset:

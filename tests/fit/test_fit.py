@@ -129,8 +129,9 @@ class TestRecovery:
         scenario = small_lift()
         episodes = [clouds_of(scenario, stretch=s, mass=1.0) for s in (0.5, 2.0)]
         values = {"stretch": torch.tensor([1.0, 3.0]).double()}
-        alone = [Objective(scenario, [episode])(values) for episode in episodes]
-        torch.testing.assert_close(Objective(scenario, episodes)(values), torch.stack(alone).mean(0))
+        alone = [Objective(scenario, [episode], frames=[2, 5])(values) for episode in episodes]
+        together = Objective(scenario, episodes, frames=[2, 5])(values)
+        torch.testing.assert_close(together, torch.stack(alone).mean(0))
 
     def test_truth_has_the_lowest_loss(self):
         scenario = small_lift(points=600, path=[(0, 0, 0, 0), (0.5, 0, -0.05, 0.3)])
