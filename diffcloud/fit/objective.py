@@ -13,7 +13,7 @@ from torch import Tensor
 from diffcloud.clouds.losses import one_sided_chamfer
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
-from diffcloud.errors import EpisodeError
+from diffcloud.errors import DivergedError, EpisodeError
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import Rollout, rollout
@@ -94,7 +94,11 @@ class Objective:
         for begin in range(0, batch, _CHUNK):  # chunks that fit the cache; nothing inside loops over the batch
             part = {name: value[begin : begin + _CHUNK] for name, value in parameters.items()}
             shift = {name: value[begin : begin + _CHUNK] for name, value in (offset or {}).items()}
-            terms = [self._loss(index, part, shift) for index in range(len(self._targets))]
+            try:
+                terms = [self._loss(index, part, shift) for index in range(len(self._targets))]
+            except DivergedError as error:
+                entries = [begin + entry for entry in error.entries]
+                raise DivergedError(error.step, entries, error.reason, error.parameters) from error
             losses.append(torch.stack(terms).mean(0))
         return torch.cat(losses)
 

@@ -74,8 +74,10 @@ class FitOutcome:
 
     values: dict[str, float]
     loss: float
+    start: dict[str, float]
+    """Initial values of the first start that did not diverge at once."""
     loss_start: float
-    """Of the first start, before the first update."""
+    """Its loss before the first update."""
     best_start: int
     iterations: int
     """Updates done."""
@@ -132,12 +134,15 @@ def fit_adam(
                     (share * found).sum().backward()
                     break
                 except DivergedError as error:
-                    lost = sorted({int(owner[entry]) for entry in error.entries})
-                    worst = {int(owner[entry]): _describe(space, values[entry]) for entry in error.entries}
-                    failures += [f"start {start} {worst[start]}: {error}" for start in lost]
-                    alive[lost] = False
+                    lost = torch.zeros(len(owner), dtype=torch.bool, device=device)
+                    lost[error.entries] = True
+                    for entry in (lost & (noise == 0).all(-1)).nonzero().flatten().tolist():
+                        alive[owner[entry]] = False  # the start itself; a lost copy costs only this iteration's share
+                        failures.append(f"start {int(owner[entry])} {_describe(space, values[entry])}: {error}")
                     if not bool(alive.any()):
-                        raise DivergedError(error.step, error.entries, error.reason, worst[lost[0]]) from error
+                        described = _describe(space, values[error.entries[0]])
+                        raise DivergedError(error.step, error.entries, error.reason, described) from error
+                    owner, noise = owner[~lost], noise[~lost]
             found, values = found.detach(), values.detach()
             unperturbed = (noise == 0).all(-1)
             losses = torch.full((settings.starts,), float("inf"), dtype=dtype, device=device)
@@ -163,10 +168,12 @@ def fit_adam(
         if not history.losses:
             raise
         reason = "interrupted"
+    first = int(torch.isfinite(history.losses[0]).nonzero()[0])
     return FitOutcome(
         values=dict(zip(space.names, best.values.tolist(), strict=True)),
         loss=best.loss,
-        loss_start=float(history.losses[0][0]),
+        start=dict(zip(space.names, history.values[0][first].tolist(), strict=True)),
+        loss_start=float(history.losses[0][first]),
         best_start=best.start,
         iterations=len(history.losses) - 1,
         evaluations=evaluations,

@@ -104,7 +104,7 @@ def describe_fit(
         )
 
     history = outcome.history
-    start_values = dict(zip(history.names, history.values[0][0].tolist(), strict=True)) | dict(space.fixed)
+    start_values = outcome.start | dict(space.fixed)
     with torch.no_grad():
         frame_steps = scenario.scene.frame_steps
         run = objective.simulate(split(all_values)[0])
@@ -148,8 +148,8 @@ def describe_fit(
         "history": {
             "names": list(history.names),
             "loss": [[_finite(value) for value in row.tolist()] for row in history.losses],
-            "values": [row.tolist() for row in history.values],
-            "gradient_norm": [row.norm(dim=-1).tolist() for row in history.gradients],
+            "values": [[[_finite(value) for value in start] for start in row.tolist()] for row in history.values],
+            "gradient_norm": [[_finite(value) for value in row.norm(dim=-1).tolist()] for row in history.gradients],
         },
         "failures": list(outcome.failures),
         "versions": {"diffcloud": diffcloud.__version__, "torch": torch.__version__, "python": platform.python_version()},

@@ -173,7 +173,7 @@ class TestRun:
         assert outcome.iterations == 2
         assert np.isfinite(outcome.loss)
 
-    def test_a_start_that_diverges_is_dropped_and_named(self, scenario, objective, monkeypatch):
+    def test_a_start_that_diverges_is_dropped_and_named(self, objective, monkeypatch, tmp_path):
         real = Objective.__call__
 
         def fragile(self, parameters, offset=None):
@@ -183,11 +183,36 @@ class TestRun:
             return real(self, parameters, offset)
 
         monkeypatch.setattr(Objective, "__call__", fragile)
-        outcome = fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings(starts=4, iterations=3))
+        space, settings = FitSpace.build(["stretch"]), AdamSettings(starts=4, iterations=3, smoothing=0.3)
+        outcome = fit_adam(objective, space, settings)
         assert outcome.values["stretch"] <= 5.0
+        assert outcome.start["stretch"] <= 5.0
+        path = write_fit(tmp_path, "e", describe_fit(objective, space, settings, outcome, episodes=["e"]))
+        assert read_fit(path)["failures"]
         assert any("start 0 (stretch=5.05)" in failure for failure in outcome.failures)
         with pytest.raises(DivergedError, match=r"stretch=5\.05"):
             fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings())
+
+    def test_a_copy_that_diverges_does_not_cost_its_start(self, objective, monkeypatch):
+        real = Objective.__call__
+
+        def fragile(self, parameters, offset=None):
+            bad = (parameters["stretch"] > 5.5).nonzero().flatten().tolist()
+            if bad:
+                raise DivergedError(3, bad, "test")
+            return real(self, parameters, offset)
+
+        monkeypatch.setattr(Objective, "__call__", fragile)
+        outcome = fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings(iterations=1, smoothing=0.5))
+        assert outcome.start["stretch"] == pytest.approx(5.05)
+        assert not outcome.failures
+
+    def test_divergence_beyond_the_first_chunk_names_the_right_entry(self, objective):
+        stretch = torch.ones(25, dtype=torch.float64)
+        stretch[23] = float("nan")
+        with pytest.raises(DivergedError) as caught:
+            objective({"stretch": stretch})
+        assert caught.value.entries == [23]
 
     def test_result_files(self, scenario, objective, tmp_path):
         space = FitSpace.build(["stretch"], fixed={"mass": 1.2})
