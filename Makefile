@@ -38,7 +38,8 @@ bench: venv
 	diffcloud bench
 
 # RELEASE: the folder of the published data that holds lift_real_pcls/ and conf/.
-# REFERENCE: a folder of recorded reference trajectories, if you have one.
+# REFERENCE: a folder of recorded reference trajectories; by default `diffsim` beside the published data, if it is there.
+REFERENCE ?= $(wildcard $(RELEASE)/../../diffsim)
 acceptance: venv
 	@test -n "$(RELEASE)" || { echo "Usage: make acceptance RELEASE=DIR [REFERENCE=DIR]"; exit 2; }
 	diffcloud acceptance --release "$(RELEASE)" $(if $(REFERENCE),--reference "$(REFERENCE)") --out docs/results

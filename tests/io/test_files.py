@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from diffcloud.errors import DiffCloudError, EpisodeError
-from diffcloud.io.clouds import read_cloud, write_ply
+from diffcloud.io.clouds import import_open3d, read_cloud, write_ply
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import atomic_path, read_json, write_json, write_text
 from diffcloud.io.pickles import load_npy
@@ -172,8 +172,13 @@ class TestClouds:
             "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 50\nHEIGHT 1\nPOINTS 50\nDATA ascii\n"
         )
         (tmp_path / "a.pcd").write_text(header + "\n".join(" ".join(map(str, p)) for p in points) + "\n")
-        for suffix in ("npy", "ply", "xyz", "pcd"):
+        for suffix in ("npy", "ply", "xyz"):
             np.testing.assert_allclose(read_cloud(tmp_path / f"a.{suffix}"), points, atol=1e-6, err_msg=suffix)
+        try:
+            import_open3d()
+        except EpisodeError as error:  # a bare machine lacks system libraries of open3d; CI installs them
+            pytest.skip(f"PCD was not read: {error}")
+        np.testing.assert_allclose(read_cloud(tmp_path / "a.pcd"), points, atol=1e-6)
 
     @pytest.mark.parametrize(
         ("array", "message"),
