@@ -199,7 +199,7 @@ def _speed(timings: list[dict[str, Any]]) -> str:
         for entry in timings
     ]
     head = ["scenario", "nodes", "steps", "batch", "forward s", "forward + backward s", "per episode s"]
-    note = f"Seconds, fastest of three, {torch.get_num_threads()} threads, all in one run (`diffcloud bench`)."
+    note = f"Seconds, fastest of three, {torch.get_num_threads()} thread(s), all in one run (`diffcloud bench`)."
     return "\n".join(["# Speed", "", note, "", *_markdown(head, rows), ""])
 
 
