@@ -16,7 +16,7 @@ from diffcloud.io.files import write_text
 from diffcloud.io.imports import release_episodes
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.sim.simulate import rollout
-from pipeline.bench import run_benchmarks
+from pipeline.bench import HEAD, benchmark_rows, run_benchmarks
 from pipeline.config import FitConfig
 from pipeline.console import errors, output, progress_bar, warn
 from pipeline.scenario_options import choose_scenario
@@ -188,19 +188,8 @@ def _trajectories(release: Path, reference: Path) -> str:
 
 
 def _speed(timings: list[dict[str, Any]]) -> str:
-    rows = [
-        [
-            entry["scenario"],
-            *(str(entry[key]) for key in ("nodes", "steps", "batch")),
-            f"{entry['forward']:.3f}",
-            f"{entry['forward_backward']:.3f}",
-            f"{entry['forward_backward'] / entry['batch']:.3f}",
-        ]
-        for entry in timings
-    ]
-    head = ["scenario", "nodes", "steps", "batch", "forward s", "forward + backward s", "per episode s"]
     note = f"Seconds, fastest of three, {torch.get_num_threads()} thread(s), all in one run (`diffcloud bench`)."
-    return "\n".join(["# Speed", "", note, "", *_markdown(head, rows), ""])
+    return "\n".join(["# Speed", "", note, "", *_markdown(list(HEAD), benchmark_rows(timings)), ""])
 
 
 def _markdown(head: list[str], rows: list[list[str]]) -> list[str]:

@@ -10,13 +10,14 @@ import torch
 import typer
 from rich.table import Table
 
-from diffcloud.fit.benchmark import Timing, time_episode
+from diffcloud.fit.benchmark import time_episode
 from diffcloud.scene.scenarios import GridScenario, Scenario, built_in, grid_scenario
 from pipeline.console import JsonFlag, finish, progress_bar, show
 from pipeline.scenario_options import SceneFile, choose_scenario
 
 _BATCHES = (1, 16, 64)
 _SIDES = (7, 16, 32)
+HEAD = ("scenario", "nodes", "steps", "batch", "forward s", "forward + backward s", "per episode s")
 
 
 def bench(
@@ -52,19 +53,24 @@ def run_benchmarks(scene: Path | None, *, repeats: int, device: str) -> list[dic
 
 
 def benchmark_table(timings: list[dict[str, Any]]) -> Table:
-    table = Table("scenario", "nodes", "steps", "batch", "forward s", "forward + backward s", "per episode s")
-    for entry in timings:
-        timing = Timing(**{key: value for key, value in entry.items() if key != "scenario"})
-        table.add_row(
-            entry["scenario"],
-            str(timing.nodes),
-            str(timing.steps),
-            str(timing.batch),
-            f"{timing.forward:.3f}",
-            f"{timing.forward_backward:.3f}",
-            f"{timing.forward_backward / timing.batch:.3f}",
-        )
+    table = Table(*HEAD)
+    for row in benchmark_rows(timings):
+        table.add_row(*row)
     return table
+
+
+def benchmark_rows(timings: list[dict[str, Any]]) -> list[list[str]]:
+    """The cells under `HEAD`, one row a timing."""
+    return [
+        [
+            entry["scenario"],
+            *(str(entry[key]) for key in ("nodes", "steps", "batch")),
+            f"{entry['forward']:.3f}",
+            f"{entry['forward_backward']:.3f}",
+            f"{entry['forward_backward'] / entry['batch']:.3f}",
+        ]
+        for entry in timings
+    ]
 
 
 def _finer(side: int) -> GridScenario:

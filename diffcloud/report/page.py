@@ -94,7 +94,6 @@ def _entry_data(entry: EpisodeEntry, overlay_points: int, rng: np.random.Generat
         "faces": entry.faces.T.tolist(),
         "lossFrame": min(entry.fit["settings"]["frames"][0] % count, len(frames) - 1),
         "loss": [float(f"{value:.4g}") for value in best],
-        "starts": [[None if v is None else float(f"{v:.4g}") for v in row] for row in history["loss"]],
     }
 
 
