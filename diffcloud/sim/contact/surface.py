@@ -1,0 +1,135 @@
+"""Everything that can touch: points, edges and faces of the cloth and of all obstacles, in one numbering of points.
+
+Points 0..V-1 are the cloth's nodes; those of the obstacles follow, obstacle by obstacle. An *owner* is 0 for the cloth
+(one mesh may hold several cloths) and 1, 2, ... for the obstacles.
+
+Edges and points of an obstacle where the surface is flat or concave are left out: nothing straight can meet them before
+it meets a face, a point or another edge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
+
+_FLAT = 1e-6
+"""Sine of the dihedral angle below which an obstacle's edge counts as flat."""
+
+
+@dataclass(frozen=True)
+class ContactSurface:
+    """Points, edges and faces that can touch."""
+
+    cloth_points: int
+    """V"""
+    point_count: int
+    """N = V + points of all obstacles."""
+    points: Tensor
+    """[P] points that take part in point-face pairs."""
+    edges: Tensor
+    """[E, 2] points."""
+    faces: Tensor
+    """[F, 3] points."""
+    owner: Tensor
+    """[N] of each point."""
+    point_area: Tensor
+    """[P] a third of the area of the faces around [m²]; the cloth's in material space, as everywhere."""
+    edge_area: Tensor
+    """[E] [m²]"""
+    face_area: Tensor
+    """[F] [m²]"""
+    movable: Tensor
+    """bool [owners]: the cloth, and bodies that contact can move."""
+
+    @staticmethod
+    def build(
+        cloth: ClothMesh,
+        obstacles: Sequence[SurfaceMesh],
+        *,
+        movable: Sequence[bool] | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> ContactSurface:
+        """Join a cloth and its obstacles.
+
+        Args:
+            movable: of each obstacle; default none.
+        """
+        movable = [False] * len(obstacles) if movable is None else list(movable)
+        points = [np.arange(len(cloth.nodes))]
+        edges, faces = [cloth.edges[0]], [cloth.faces]
+        edge_area = [_spread(cloth.edges[1], cloth.face_area)]
+        face_area, point_area = [cloth.face_area], [cloth.node_area]
+        owner = [np.zeros(len(cloth.nodes), dtype=np.int64)]
+        count = len(cloth.nodes)
+        for index, mesh in enumerate(obstacles):
+            corner = mesh.nodes[mesh.faces]
+            area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+            sharp, sharp_faces = _sharp_edges(mesh)
+            used = np.unique(sharp)
+            per_point = np.bincount(mesh.faces.ravel(), np.repeat(area / 3, 3), len(mesh.nodes))
+            points.append(used + count)
+            point_area.append(per_point[used])
+            edges.append(sharp + count)
+            edge_area.append(_spread(sharp_faces, area))
+            faces.append(mesh.faces + count)
+            face_area.append(area)
+            owner.append(np.full(len(mesh.nodes), index + 1))
+            count += len(mesh.nodes)
+
+        def index_tensor(parts: list[NDArray[np.int64]]) -> Tensor:
+            return torch.as_tensor(np.concatenate(parts), dtype=torch.long, device=device)
+
+        def area_tensor(parts: list[NDArray[np.float64]]) -> Tensor:
+            return torch.as_tensor(np.concatenate(parts), dtype=dtype, device=device)
+
+        return ContactSurface(
+            cloth_points=len(cloth.nodes),
+            point_count=count,
+            points=index_tensor(points),
+            edges=index_tensor(edges),
+            faces=index_tensor(faces),
+            owner=index_tensor(owner),
+            point_area=area_tensor(point_area),
+            edge_area=area_tensor(edge_area),
+            face_area=area_tensor(face_area),
+            movable=torch.tensor([True, *movable], device=device),
+        )
+
+
+def _spread(edge_faces: NDArray[np.int64], face_area: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[E] a third of the area of the faces at each edge; a missing face (-1) has none."""
+    padded = np.append(face_area, 0.0)
+    return np.asarray(padded[edge_faces].sum(axis=1) / 3)
+
+
+def _sharp_edges(mesh: SurfaceMesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(edges [E, 2], faces [E, 2] with -1 where none) of an obstacle that are convex, or border one face only."""
+    half = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    face = np.repeat(np.arange(len(mesh.faces)), 3)
+    edges, inverse, count = np.unique(np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(inverse.ravel(), kind="stable")
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    sides = np.full((len(edges), 2), -1)
+    sides[:, 0] = face[order[first]]
+    paired = count == 2
+    sides[paired, 1] = face[order[first[paired] + 1]]
+
+    corner = mesh.nodes[mesh.faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    opposite = mesh.faces[sides[:, 1]].sum(axis=1) - edges.sum(axis=1)  # meaningless where unpaired
+    arm = mesh.nodes[np.where(paired, opposite, 0)] - mesh.nodes[edges[:, 0]]
+    height = np.einsum("ij,ij->i", arm, normal[sides[:, 0]]) / np.maximum(np.linalg.norm(arm, axis=1), 1e-300)
+    same_way = np.zeros(len(edges), dtype=bool)  # inconsistent orientation tells nothing about convexity: keep
+    pair = order[first[paired]], order[first[paired] + 1]
+    same_way[paired] = half[pair[0], 0] == half[pair[1], 0]
+    keep = ~paired | same_way | (height < -_FLAT)
+    return edges[keep], sides[keep]
