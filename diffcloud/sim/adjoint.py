@@ -30,8 +30,8 @@ _ITERATIONS = 60
 class Factor(Protocol):
     """A factorised symmetric matrix: J, or an approximation of it."""
 
-    def solve(self, right: Tensor) -> Tensor:
-        """[K · B, ...] -> [K · B, ...]."""
+    def solve(self, right: Tensor, *, transposed: bool = False) -> Tensor:
+        """[K · B, ...] -> [K · B, ...], with the matrix or its transpose."""
         ...
 
 
@@ -43,8 +43,12 @@ class ImplicitProblem(Protocol):
         """Whether the factor is ∂r/∂u (and symmetric), not an approximation."""
         ...
 
-    def solve(self, *inputs: Tensor) -> tuple[Tensor, Factor]:
-        """u and a factor; called without gradients."""
+    def solve(self, *inputs: Tensor) -> tuple[Tensor, Factor | None]:
+        """u and a factor, if the solve made one that derivatives can use; called without gradients."""
+        ...
+
+    def factorise(self, u: Tensor, *inputs: Tensor) -> Factor:
+        """The factor at a solution, where `solve` gave none."""
         ...
 
     def residual(self, u: Tensor, *inputs: Tensor) -> Tensor:
@@ -82,14 +86,15 @@ class _Implicit(torch.autograd.Function):
         with torch.enable_grad():
             unknown = u.detach().requires_grad_(not problem.exact)
             residual = problem.residual(unknown, *inputs)
-            adjoint = ctx.factor.solve(gradient)
+            factor = ctx.factor if ctx.factor is not None else problem.factorise(u, *(i.detach() for i in inputs))
+            adjoint = factor.solve(gradient, transposed=True)
             if not problem.exact:
 
                 def transposed(vector: Tensor) -> Tensor:
                     (product,) = torch.autograd.grad(residual, unknown, vector, retain_graph=True)
                     return product
 
-                adjoint = gmres(transposed, ctx.factor.solve, gradient, adjoint)
+                adjoint = gmres(transposed, factor.solve, gradient, adjoint)
             found = iter(torch.autograd.grad(residual, chosen, -adjoint, allow_unused=True))
         return (None, *(next(found) if want else None for want in wanted))
 
@@ -98,7 +103,10 @@ def _with_tangent(problem: ImplicitProblem, inputs: tuple[Tensor, ...], copies: 
     primals = [forward_ad.unpack_dual(i).primal for i in inputs]
     batch = len(primals[0]) // copies
     with torch.no_grad():
-        u, factor = problem.solve(*(primal[:batch] for primal in primals))
+        first = [primal[:batch] for primal in primals]
+        u, factor = problem.solve(*first)
+        if factor is None:
+            factor = problem.factorise(u, *first)
         u = u.repeat(copies, *[1] * (u.dim() - 1))
         change = forward_ad.unpack_dual(problem.residual(u, *inputs)).tangent
         if change is None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -12,11 +13,19 @@ from numpy.typing import NDArray
 from diffcloud.errors import SceneError
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.sim.contact import ContactSettings, HalfSpaces
+from diffcloud.sim.contact.barrier import Barrier
+from diffcloud.sim.contact.smooth import PlaneContacts, SmoothContact
+from diffcloud.sim.contact.surface import ContactSurface
+from diffcloud.sim.elements import Elements
 from diffcloud.sim.energies import Air, Bending, Handles, Stretching
-from diffcloud.sim.linear_solve import pattern
+from diffcloud.sim.linear_solve import GeneralPattern, pattern
 from diffcloud.sim.materials import Material
 from diffcloud.sim.properties import Properties
-from diffcloud.sim.state import System
+from diffcloud.sim.rigid import Bodies, RigidBody
+from diffcloud.sim.scenery import MovingObstacle, Scenery
+from diffcloud.sim.state import Apart, ImplicitSetup, System
+
+Integrator = Literal["implicit", "linearised"]
 
 
 @dataclass(frozen=True)
@@ -37,6 +46,9 @@ class Surrounding:
     proximity: bool = True
     """Whether planes repel and rub (off: only projection)."""
     obstacles: tuple[SurfaceMesh, ...] = ()
+    """Static ones."""
+    moving: tuple[MovingObstacle, ...] = ()
+    bodies: tuple[RigidBody, ...] = ()
 
 
 def build_system(
@@ -48,6 +60,7 @@ def build_system(
     surrounding: Surrounding | None = None,
     mass_material: Material | None = None,
     newton_iterations: int = 1,
+    integrator: Integrator = "linearised",
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> System:
@@ -57,6 +70,7 @@ def build_system(
         time_step: [s].
         mass_material: material whose density gives the node masses, where it differs from `material` (the published
             experiments reload their tables after the masses were computed).
+        integrator: "implicit" for the converged step with smooth contact and rigid bodies, "linearised" for ARCSim's.
         newton_iterations: 1 for one linearised step (ARCSim), more for a converged implicit step.
 
     Raises:
@@ -85,20 +99,75 @@ def build_system(
         air_drag=tensor([surrounding.air_drag]),
         friction_obstacle=tensor([surrounding.friction_obstacle]),
         friction_cloth=tensor([surrounding.friction_cloth]),
+        body_mass=torch.zeros(1, 0, dtype=dtype, device=device),
     )
+    if integrator == "linearised" and (surrounding.moving or surrounding.bodies):
+        raise SceneError("Moving obstacles and rigid bodies need the implicit integrator.")
+    air = Air(stretching.elements, stretching.area, tensor(surrounding.wind))
+    setup = None
+    if integrator == "implicit":
+        setup = _implicit(mesh, surrounding, stretching, bending, air)
+        properties = replace(properties, body_mass=setup.bodies.mass[None])
     return System(
         mesh=mesh,
         time_step=time_step,
         gravity=tensor(surrounding.gravity),
         stretching=stretching,
         bending=bending,
-        air=Air(stretching.elements, stretching.area, tensor(surrounding.wind)),
+        air=air,
         handles=handles,
         halfspaces=_halfspaces(mesh, surrounding, dtype, device),
-        obstacles=surrounding.obstacles,
+        obstacles=(
+            *surrounding.obstacles,
+            *(obstacle.mesh for obstacle in surrounding.moving),
+            *(body.mesh for body in surrounding.bodies),
+        ),
         properties=properties,
         pattern=pattern(len(mesh.nodes), [mesh.faces, mesh.hinges.nodes], device),
         newton_iterations=newton_iterations,
+        implicit=setup,
+    )
+
+
+def _implicit(
+    mesh: ClothMesh, surrounding: Surrounding, stretching: Stretching, bending: Bending, air: Air
+) -> ImplicitSetup:
+    dtype, device = stretching.area.dtype, stretching.area.device
+    bodies = Bodies.build(surrounding.bodies, dtype=dtype, device=device)
+    static = [obstacle for obstacle in surrounding.obstacles if obstacle.plane() is None]
+    obstacles = [*static, *(o.mesh for o in surrounding.moving), *(b.mesh for b in surrounding.bodies)]
+    scenery = Scenery.build(static, surrounding.moving)
+    settings = surrounding.contact
+    surface = ContactSurface.build(
+        mesh,
+        obstacles,
+        movable=[False] * (len(obstacles) - len(bodies)) + [True] * len(bodies),
+        dtype=dtype,
+        device=device,
+    )
+    half = _halfspaces(mesh, surrounding, dtype, device)
+    planes = None
+    if half is not None:
+        body_points = surface.points >= len(mesh.nodes) + len(scenery.fixed)
+        own = (surface.points < len(mesh.nodes)) | body_points
+        planes = PlaneContacts(half.normals, half.offsets, surface.points[own], surface.point_area[own])
+    faces, hinges = stretching.elements.apart(), bending.elements.apart()
+    pair = torch.stack([hinges.nodes[:, [0, 1, 2]], hinges.nodes[:, [1, 0, 3]]], dim=1).flatten(0, 1)
+    apart = Apart(
+        stretching=replace(stretching, elements=faces),
+        air=replace(air, elements=faces),
+        bending=replace(bending, elements=hinges, faces=torch.arange(len(pair), device=device)),
+        hinge_faces=Elements(pair, hinges.node_count),
+    )
+    return ImplicitSetup(
+        contact=SmoothContact(
+            Barrier(settings.stiffness, settings.repulsion_thickness, settings.sticking_speed), surface, planes
+        ),
+        bodies=bodies,
+        scenery=scenery,
+        moves=surface.movable[surface.owner],
+        apart=apart,
+        pattern=GeneralPattern.build(len(mesh.nodes) + 2 * len(bodies), [mesh.faces, mesh.hinges.nodes], device),
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 _TINY = 1e-30
@@ -31,6 +32,12 @@ class Elements:
         flat = values.reshape(len(values), -1, values.shape[-1])
         index = self.nodes.view(1, -1, 1).expand_as(flat)
         return flat.new_zeros(len(flat), self.node_count, flat.shape[-1]).scatter_add(1, index, flat)
+
+    def apart(self) -> Elements:
+        """The same elements with corners of their own, as if nothing were shared: [E, n] counts up."""
+        count, corners = self.nodes.shape
+        own = torch.arange(count * corners, device=self.nodes.device).view(count, corners)
+        return Elements(own, count * corners)
 
 
 def safe_norm(vector: Tensor) -> Tensor:

@@ -14,8 +14,9 @@ from typing import Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 _DENSE_NODES = 200
@@ -30,11 +31,19 @@ class NotPositiveDefiniteError(ArithmeticError):
         super().__init__(f"step matrix is not positive definite in batch entries {entries}")
 
 
+class SingularMatrixError(ArithmeticError):
+    """A Jacobian could not be factorised. `entries` lists the batch entries."""
+
+    def __init__(self, entries: list[int]) -> None:
+        self.entries = entries
+        super().__init__(f"the step's Jacobian is singular in batch entries {entries}")
+
+
 class Factor(Protocol):
     """A factorised matrix."""
 
-    def solve(self, right: Tensor) -> Tensor:
-        """[K · B, V, 3] -> [K · B, V, 3] for any whole K: the batch may be repeated, copies outermost."""
+    def solve(self, right: Tensor, *, transposed: bool = False) -> Tensor:
+        """[K · B, V, 3] -> [K · B, V, 3] with the matrix or its transpose, for any whole K (copies outermost)."""
         ...
 
 
@@ -89,7 +98,7 @@ class DenseFactor:
 
     lower: Tensor
 
-    def solve(self, right: Tensor) -> Tensor:
+    def solve(self, right: Tensor, *, transposed: bool = False) -> Tensor:
         columns = _copies_as_columns(right, len(self.lower))
         return _columns_as_copies(torch.cholesky_solve(columns, self.lower), right)
 
@@ -163,7 +172,7 @@ class BlockTridiagonalFactor:
     coupling: list[Tensor]
     """N - 1 of [B, width, width]: L[i+1, i]."""
 
-    def solve(self, right: Tensor) -> Tensor:
+    def solve(self, right: Tensor, *, transposed: bool = False) -> Tensor:
         pattern = self.pattern
         columns = _copies_as_columns(right[:, pattern.order], len(self.lower[0]))
         padded = torch.nn.functional.pad(columns, (0, 0, 0, pattern.block_count * pattern.width - columns.shape[1]))
@@ -208,3 +217,106 @@ def _copies_as_columns(right: Tensor, batch: int) -> Tensor:
 def _columns_as_copies(solution: Tensor, like: Tensor) -> Tensor:
     """[B, 3V, K] -> [K · B, V, 3]."""
     return solution.permute(2, 0, 1).reshape(like.shape)
+
+
+@dataclass(frozen=True)
+class Couplings:
+    """3 x 3 blocks between any two nodes, on top of a pattern: contacts."""
+
+    entry: Tensor
+    """[K] batch entry."""
+    row: Tensor
+    """[K] node."""
+    column: Tensor
+    """[K] node."""
+    values: Tensor
+    """[K, 3, 3]"""
+
+
+@dataclass(frozen=True)
+class GeneralPattern:
+    """Matrices without symmetry over the nodes of a mesh, with couplings wherever contact puts them.
+
+    Dense LU for small meshes; sparse LU (SuperLU, one batch entry after the other) beyond.
+    """
+
+    node_count: int
+    rows: Tensor
+    """Row of each number of the diagonal and of the blocks."""
+    columns: Tensor
+
+    @staticmethod
+    def build(node_count: int, groups: Sequence[NDArray[np.int64]], device: torch.device) -> GeneralPattern:
+        rows, columns = _entries(node_count, groups)
+        return GeneralPattern(node_count, torch.as_tensor(rows, device=device), torch.as_tensor(columns, device=device))
+
+    def factorise(self, diagonal: Tensor, blocks: Sequence[Tensor], couplings: Sequence[Couplings]) -> Factor:
+        """Assemble and factorise; arguments as for `MatrixPattern`, and blocks between any nodes.
+
+        Raises:
+            SingularMatrixError: names the batch entries.
+        """
+        batch, size = len(diagonal), 3 * self.node_count
+        values = torch.cat([diagonal.flatten(1), *(block.flatten(1) for block in blocks)], dim=1)
+        axis = torch.arange(3, device=values.device)
+        extra = [
+            (
+                c.entry.repeat_interleave(9),
+                (3 * c.row[:, None, None] + axis[:, None]).expand(-1, 3, 3).flatten(),
+                (3 * c.column[:, None, None] + axis).expand(-1, 3, 3).flatten(),
+                c.values.flatten(),
+            )
+            for c in couplings
+        ]
+        if self.node_count <= _DENSE_NODES:
+            flat = values.new_zeros(batch, size * size)
+            flat.scatter_add_(1, (self.rows * size + self.columns).expand(batch, -1), values)
+            flat = flat.view(-1)
+            for entry, row, column, value in extra:
+                flat.index_add_(0, (entry * size + row) * size + column, value)
+            lu, pivots, info = torch.linalg.lu_factor_ex(flat.view(batch, size, size))
+            if bool(info.any()):
+                raise SingularMatrixError(info.nonzero().flatten().tolist())
+            return DenseLU(lu, pivots)
+        factors = []
+        for index in range(batch):
+            rows, columns, numbers = [self.rows], [self.columns], [values[index]]
+            for entry, row, column, value in extra:
+                own = entry == index
+                rows.append(row[own])
+                columns.append(column[own])
+                numbers.append(value[own])
+            triplets = (
+                torch.cat(numbers).cpu().numpy(),
+                (torch.cat(rows).cpu().numpy(), torch.cat(columns).cpu().numpy()),
+            )
+            try:
+                factors.append(splu(csc_matrix(coo_matrix(triplets, shape=(size, size)))))
+            except RuntimeError as error:
+                raise SingularMatrixError([index]) from error
+        return SparseLU(factors)
+
+
+@dataclass(frozen=True)
+class DenseLU:
+    """LU factors [B, 3V, 3V] and pivots."""
+
+    lu: Tensor
+    pivots: Tensor
+
+    def solve(self, right: Tensor, *, transposed: bool = False) -> Tensor:
+        columns = _copies_as_columns(right, len(self.lu)).contiguous()
+        return _columns_as_copies(torch.linalg.lu_solve(self.lu, self.pivots, columns, adjoint=transposed), right)
+
+
+@dataclass(frozen=True)
+class SparseLU:
+    """SuperLU factors, one for each batch entry."""
+
+    factors: list[SuperLU]
+
+    def solve(self, right: Tensor, *, transposed: bool = False) -> Tensor:
+        columns = _copies_as_columns(right, len(self.factors)).cpu().numpy()
+        trans = "T" if transposed else "N"
+        solved = [factor.solve(np.ascontiguousarray(own), trans) for factor, own in zip(self.factors, columns, strict=True)]
+        return _columns_as_copies(torch.as_tensor(np.stack(solved), dtype=right.dtype, device=right.device), right)

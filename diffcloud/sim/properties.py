@@ -36,6 +36,8 @@ class Properties:
     """[B] Coulomb coefficient between cloth and obstacles [-]."""
     friction_cloth: Tensor
     """[B] Coulomb coefficient between cloths [-]."""
+    body_mass: Tensor
+    """[B, N] of the rigid bodies [kg]; their inertia scales with it."""
 
     @property
     def batch(self) -> int:
@@ -74,6 +76,7 @@ PARAMETERS: dict[str, Parameter] = {
         Parameter("bending", "multiplier", "N·m", (0.1, 10.0), "times the bending table"),
         Parameter("drag", "multiplier", "kg/m³", (0.1, 10.0), "times the air density and the tangential drag"),
         Parameter("damping", "absolute", "s", (0.0, 0.1), "stiffness-proportional damping"),
+        Parameter("body_mass", "multiplier", "kg", (0.1, 10.0), "times the mass of all rigid bodies"),
         Parameter("friction_obstacle", "absolute", "-", (0.0, 1.5), "Coulomb friction between cloth and obstacles"),
         Parameter("friction_cloth", "absolute", "-", (0.0, 1.5), "Coulomb friction between cloths"),
     )
@@ -132,6 +135,7 @@ def scaled_properties(
         damping=values.get("damping", base.damping),
         air_density=base.air_density * get("drag"),
         air_drag=base.air_drag * get("drag"),
+        body_mass=base.body_mass * get("body_mass")[:, None],
         friction_obstacle=values.get("friction_obstacle", base.friction_obstacle),
         friction_cloth=values.get("friction_cloth", base.friction_cloth),
     )

@@ -12,10 +12,15 @@ from torch import Tensor
 from diffcloud.errors import DivergedError
 from diffcloud.sim.adjoint import implicit_solve
 from diffcloud.sim.energies.handles import HandleSchedule, follow_track
+from diffcloud.sim.implicit import ImplicitStart, ImplicitStep, StuckError
 from diffcloud.sim.integrator import Held, NewtonStallError, StepProblem, StepStart
-from diffcloud.sim.linear_solve import NotPositiveDefiniteError
+from diffcloud.sim.linear_solve import NotPositiveDefiniteError, SingularMatrixError
 from diffcloud.sim.properties import Properties
-from diffcloud.sim.state import State, System
+from diffcloud.sim.rigid import BodyState
+from diffcloud.sim.state import ImplicitSetup, State, System
+
+_DEEPEST = 5
+"""A step that does not converge is halved up to this many times."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +31,8 @@ class Rollout:
     """[B, S + 1, V, 3] after 0, 1, ... S steps [m]."""
     times: Tensor
     """[S + 1] [s]"""
+    bodies: BodyState | None = None
+    """Of rigid bodies, its fields stacked [B, S + 1, N, ...]."""
 
     def at(self, times: Tensor) -> Tensor:
         """[B, T, V, 3] positions at times [T], linear between steps."""
@@ -48,7 +55,10 @@ def init(system: System, batch: int = 1, *, positions: Tensor | None = None, vel
         positions = torch.as_tensor(system.mesh.nodes, dtype=system.dtype, device=system.device)[None]
     positions = positions.expand(batch, -1, -1)
     velocities = torch.zeros_like(positions) if velocities is None else velocities.expand(batch, -1, -1)
-    return State(positions, velocities, anchors=positions[:, system.handles.nodes])
+    bodies = None
+    if system.implicit is not None:
+        bodies = BodyState(*(t.expand(batch, *t.shape[1:]) for t in system.implicit.bodies.start.tensors()))
+    return State(positions, velocities, anchors=positions[:, system.handles.nodes], bodies=bodies)
 
 
 def step(system: System, properties: Properties, schedule: HandleSchedule, state: State, *, copies: int = 1) -> State:
@@ -62,6 +72,8 @@ def step(system: System, properties: Properties, schedule: HandleSchedule, state
         DivergedError: names the step and the batch entries.
     """
     state = _take_anchors(system, schedule, state)
+    if system.implicit is not None:
+        return _implicit_step(system, system.implicit, properties, schedule, state, copies)
     problem, targets = _problem(system, schedule, state)
     start = StepStart(state.positions, state.velocities, targets.expand(properties.batch, -1, -1), properties)
     try:
@@ -76,6 +88,81 @@ def step(system: System, properties: Properties, schedule: HandleSchedule, state
         positions = projected
     _refuse_divergence(positions, state.step + 1)
     return State(positions, velocities, state.anchors, state.step + 1)
+
+
+def _implicit_step(
+    system: System, setup: ImplicitSetup, properties: Properties, schedule: HandleSchedule, state: State, copies: int
+) -> State:
+    active = torch.as_tensor(schedule.active[state.step], device=system.device)
+    targets = schedule.translation[:, state.step] + (schedule.linear[state.step] @ state.anchors[..., None]).squeeze(-1)
+    nodes = torch.tensor(system.handles.nodes, dtype=torch.long, device=system.device)[active]
+    times = np.array([state.step, state.step + 1]) * system.time_step
+    before, after = setup.scenery.at(times, dtype=system.dtype, device=system.device)
+    problem = ImplicitStep(system, setup, schedule.strength[state.step][active], nodes, (before, after))
+    assert state.bodies is not None
+    start = ImplicitStart(
+        state.positions,
+        state.velocities,
+        targets[:, active].expand(properties.batch, -1, -1),
+        state.bodies,
+        properties,
+    )
+    positions, velocities, bodies = _advance(problem, start, copies, state.step + 1)
+    _refuse_divergence(positions, state.step + 1)
+    return State(positions, velocities, state.anchors, state.step + 1, bodies)
+
+
+def _advance(
+    problem: ImplicitStep, start: ImplicitStart, copies: int, step: int, depth: int = 0
+) -> tuple[Tensor, Tensor, BodyState]:
+    """Positions and velocities of the cloth, and the bodies, after one step; entries that fail take two half steps."""
+    try:
+        return problem.advanced(implicit_solve(problem, *start.tensors(), copies=copies), start)
+    except (StuckError, SingularMatrixError) as error:
+        if depth == _DEEPEST:
+            values = {
+                name: getattr(start.properties, name)[error.entries[0]].mean().item()
+                for name in ("stretching", "node_mass")
+            }
+            advice = (
+                f"{error}; {2**depth} sub-steps did not help (mean stretching multiplier {values['stretching']:.3g}, mean "
+                f"node mass {values['node_mass']:.3g} kg). Try a smaller time step, a thicker or stiffer contact, or "
+                "slower handles"
+            )
+            raise DivergedError(step, error.entries, advice) from error
+        failed = error.entries
+    batch = len(start.positions) // copies
+    rest = [entry for entry in range(batch) if entry not in set(failed)]
+    parts = []
+    if rest:
+        chosen = _entries(rest, batch, copies, start.positions.device)
+        parts.append((chosen, _advance(problem.fresh(), start.only(chosen), copies, step, depth)))
+    chosen = _entries(failed, batch, copies, start.positions.device)
+    try:
+        parts.append((chosen, _halves(problem, start.only(chosen), copies, step, depth)))
+    except DivergedError as error:
+        raise DivergedError(step, [failed[entry] for entry in error.entries], error.reason) from error
+    order = torch.cat([chosen for chosen, _ in parts]).argsort()
+    positions, velocities = (torch.cat([part[field] for _, part in parts])[order] for field in (0, 1))
+    bodies = BodyState(*(torch.cat(columns)[order] for columns in zip(*(p[2].tensors() for _, p in parts), strict=True)))
+    return positions, velocities, bodies
+
+
+def _halves(
+    problem: ImplicitStep, start: ImplicitStart, copies: int, step: int, depth: int
+) -> tuple[Tensor, Tensor, BodyState]:
+    first, second = problem.halves()
+    held = start.positions[:, problem.handle_nodes]
+    middle = replace(start, targets=0.5 * (held + start.targets)) if problem.system.handles.hard else start
+    positions, velocities, bodies = _advance(first, middle, copies, step, depth + 1)
+    start = replace(start, positions=positions, velocities=velocities, bodies=bodies)
+    return _advance(second, start, copies, step, depth + 1)
+
+
+def _entries(entries: list[int], batch: int, copies: int, device: torch.device) -> Tensor:
+    """Rows of batch entries in K copies of a batch."""
+    chosen = torch.tensor(entries, device=device)
+    return (torch.arange(copies, device=device)[:, None] * batch + chosen).flatten()
 
 
 def rollout(
@@ -112,14 +199,21 @@ def rollout(
         state = init(system, properties.batch)
     elif state.anchors.shape[1] != len(system.handles.nodes):
         state = replace(state, anchors=state.positions[:, system.handles.nodes])
-    positions = [state.positions]
+    if state.bodies is None and system.implicit is not None:
+        state = replace(state, bodies=init(system, len(state.positions)).bodies)
+    positions, poses = [state.positions], [state.bodies]
     for finished in range(steps):
         state = step(system, properties, schedule, state, copies=copies)
         positions.append(state.positions)
+        poses.append(state.bodies)
         if progress is not None:
             progress(finished + 1)
     all_times = torch.as_tensor(np.concatenate([[0.0], times]), dtype=system.dtype, device=system.device)
-    return Rollout(torch.stack(positions, dim=1), all_times)
+    bodies = None
+    if poses[0] is not None and poses[0].centre.shape[1]:
+        columns = zip(*(pose.tensors() for pose in poses if pose is not None), strict=True)
+        bodies = BodyState(*(torch.stack(column, dim=1) for column in columns))
+    return Rollout(torch.stack(positions, dim=1), all_times, bodies)
 
 
 def _take_anchors(system: System, schedule: HandleSchedule, state: State) -> State:

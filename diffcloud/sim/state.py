@@ -9,9 +9,38 @@ from torch import Tensor
 
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.sim.contact import HalfSpaces
+from diffcloud.sim.contact.smooth import SmoothContact
+from diffcloud.sim.elements import Elements
 from diffcloud.sim.energies import Air, Bending, Handles, Stretching
-from diffcloud.sim.linear_solve import MatrixPattern
+from diffcloud.sim.linear_solve import GeneralPattern, MatrixPattern
 from diffcloud.sim.properties import Properties
+from diffcloud.sim.rigid.bodies import Bodies, BodyState
+from diffcloud.sim.scenery import Scenery
+
+
+@dataclass(frozen=True)
+class Apart:
+    """The elements with corners of their own, to differentiate each on its own."""
+
+    stretching: Stretching
+    air: Air
+    bending: Bending
+    hinge_faces: Elements
+    """[2 H, 3] both faces of each hinge."""
+
+
+@dataclass(frozen=True)
+class ImplicitSetup:
+    """What the converged implicit step needs beyond the linearised one."""
+
+    contact: SmoothContact | None
+    """None where there is nothing to touch."""
+    bodies: Bodies
+    scenery: Scenery
+    moves: Tensor
+    """bool [N] of cloth nodes, obstacle points and body points: those that contact can move."""
+    apart: Apart
+    pattern: GeneralPattern
 
 
 @dataclass(frozen=True)
@@ -35,6 +64,8 @@ class System:
     pattern: MatrixPattern
     newton_iterations: int = 1
     """1: one linearised step, as ARCSim does. More: Newton until the implicit step has converged."""
+    implicit: ImplicitSetup | None = None
+    """For the converged implicit step with smooth contact; None: the linearised step."""
 
     @property
     def dtype(self) -> torch.dtype:
@@ -56,3 +87,5 @@ class State:
     anchors: Tensor
     """[B, H, 3] handle anchors; meaningless until the handle becomes active [m]."""
     step: int = 0
+    bodies: BodyState | None = None
+    """Of the rigid bodies; None: where they start."""

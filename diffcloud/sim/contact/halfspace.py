@@ -36,6 +36,8 @@ class ContactSettings:
     """τ [m]"""
     projection_thickness: float = 1e-4
     """[m]"""
+    sticking_speed: float = 1e-3
+    """v_s of smooth contact: what sticks creeps slower than this [m/s]."""
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,12 @@ class ContactSurface:
     """[E] [m²]"""
     face_area: Tensor
     """[F] [m²]"""
+    typical_face_area: Tensor
+    """[owners] mean over the faces of each [m²]."""
+    edge_share: Tensor
+    """[F, 3] what each face takes off for its edges 01, 12, 20: a half where two faces meet (see `barrier`)."""
+    corner_share: Tensor
+    """[F, 3] what each face adds for its corners: one over the faces around an inner point."""
     movable: Tensor
     """bool [owners]: the cloth, and bodies that contact can move."""
 
@@ -68,12 +74,13 @@ class ContactSurface:
         edge_area = [_spread(cloth.edges[1], cloth.face_area)]
         face_area, point_area = [cloth.face_area], [cloth.node_area]
         owner = [np.zeros(len(cloth.nodes), dtype=np.int64)]
+        shares = [_shares(cloth.faces, len(cloth.nodes))]
         count = len(cloth.nodes)
         for index, mesh in enumerate(obstacles):
             corner = mesh.nodes[mesh.faces]
             area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
             sharp, sharp_faces = _sharp_edges(mesh)
-            used = np.unique(sharp)
+            used = np.unique(sharp).astype(np.int64)
             per_point = np.bincount(mesh.faces.ravel(), np.repeat(area / 3, 3), len(mesh.nodes))
             points.append(used + count)
             point_area.append(per_point[used])
@@ -81,7 +88,8 @@ class ContactSurface:
             edge_area.append(_spread(sharp_faces, area))
             faces.append(mesh.faces + count)
             face_area.append(area)
-            owner.append(np.full(len(mesh.nodes), index + 1))
+            shares.append(_shares(mesh.faces, len(mesh.nodes)))
+            owner.append(np.full(len(mesh.nodes), index + 1, dtype=np.int64))
             count += len(mesh.nodes)
 
         def index_tensor(parts: list[NDArray[np.int64]]) -> Tensor:
@@ -100,6 +108,9 @@ class ContactSurface:
             point_area=area_tensor(point_area),
             edge_area=area_tensor(edge_area),
             face_area=area_tensor(face_area),
+            typical_face_area=torch.tensor([area.mean() for area in face_area], dtype=dtype, device=device),
+            edge_share=area_tensor([edge for edge, _ in shares]),
+            corner_share=area_tensor([corner for _, corner in shares]),
             movable=torch.tensor([True, *movable], device=device),
         )
 
@@ -108,6 +119,17 @@ def _spread(edge_faces: NDArray[np.int64], face_area: NDArray[np.float64]) -> ND
     """[E] a third of the area of the faces at each edge; a missing face (-1) has none."""
     padded = np.append(face_area, 0.0)
     return np.asarray(padded[edge_faces].sum(axis=1) / 3)
+
+
+def _shares(faces: NDArray[np.int64], point_count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """([F, 3], [F, 3]): a half at inner edges, and one over the number of faces at inner points, else zero."""
+    half = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+    edges, inverse, count = np.unique(half, axis=0, return_inverse=True, return_counts=True)
+    inner_edge = (count == 2)[inverse.ravel()].reshape(-1, 3)
+    around = np.bincount(faces.ravel(), minlength=point_count)
+    on_border = np.zeros(point_count, dtype=bool)
+    on_border[edges[count != 2]] = True
+    return 0.5 * inner_edge, np.where(on_border, 0.0, 1.0 / np.maximum(around, 1))[faces]
 
 
 def _sharp_edges(mesh: SurfaceMesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -1,0 +1,490 @@
+"""One converged implicit step with smooth contact and rigid bodies: backward Euler, solved by Newton's method.
+
+The unknown u [B, D, 3] holds the velocity changes of the V cloth nodes, then of each body's centre and its rotation:
+D = V + 2 N. The equations are the balances of momentum over the step (see `rigid.bodies` for the bodies'):
+
+    r(u) = m u - Δt [ F(x₁) - β H(x₁) v₁ + m g + f_air(x₁, v₁) - strength k_h (x₁ - x*) + f_contact(x₀, x₁) ] = 0
+
+with x₁ = x₀ + Δt v₁ and v₁ = v₀ + u. Hard handles replace their nodes' rows by u = (x* - x₀)/Δt - v₀.
+
+Newton's matrix is the exact Jacobian, assembled from elements (each differentiated on its own, in forward mode), so the
+last steps converge quadratically and the same matrix gives exact derivatives of the step. Each Newton step is shortened
+until the straight path of all points is free of collisions, so nothing ever passes through anything. Prescribed motion
+(hard handles, moving obstacles) takes part in this: it advances with the Newton steps and arrives when they are full.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from diffcloud.sim.contact.smooth import ContactBlocks, Near
+from diffcloud.sim.energies.base import Geometry, geometry
+from diffcloud.sim.jacobian import element_jacobian
+from diffcloud.sim.linear_solve import Couplings, Factor
+from diffcloud.sim.properties import Properties
+from diffcloud.sim.rigid.bodies import BodyState
+from diffcloud.sim.rigid.rotation import left_jacobian, rotation, skew
+from diffcloud.sim.state import ImplicitSetup, System
+
+_TOLERANCE = 1e-10
+"""Change of velocity, relative to the step's largest velocity, at which Newton's method has converged."""
+_ROUNDING = 1e-7
+"""Below this relative change a step that no longer shrinks has reached the arithmetic's precision."""
+_ITERATIONS = 60
+_HALVINGS = 8
+_SLOWEST = 1e-1
+"""Velocities below this are at rest for the tolerance [m/s]."""
+_CLOSE = 1e-2
+"""Below this relative change the exact Jacobian takes over from its positive semidefinite part."""
+_REUSE = 1e-4
+"""A relative change below this is followed by one correction with the same matrix instead of a new one."""
+_ROOM = 0.5
+"""First guess of how far points leave their predicted path, as part of the thickness and of the path."""
+
+
+class StuckError(ArithmeticError):
+    """Newton's method did not converge. `entries` lists the batch entries; the message names the closest pair."""
+
+    def __init__(self, entries: list[int], change: float, pair: str) -> None:
+        self.entries = entries
+        super().__init__(f"the implicit step did not converge (relative change {change:.1e}; closest: {pair})")
+
+
+@dataclass(frozen=True)
+class ImplicitStart:
+    """The inputs of one step."""
+
+    positions: Tensor
+    """[B, V, 3] [m]"""
+    velocities: Tensor
+    """[B, V, 3] [m/s]"""
+    targets: Tensor
+    """[B, H, 3] of the active handles [m]."""
+    bodies: BodyState
+    properties: Properties
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """As the inputs of an `ImplicitStep`; `of` reads them back."""
+        return (self.positions, self.velocities, self.targets, *self.bodies.tensors(), *self.properties.tensors())
+
+    def only(self, entries: Tensor) -> ImplicitStart:
+        """The rows `entries` of the batch."""
+        return ImplicitStart.of([tensor[entries] for tensor in self.tensors()])
+
+    @staticmethod
+    def of(inputs: Sequence[Tensor]) -> ImplicitStart:
+        positions, velocities, targets, *rest = inputs
+        return ImplicitStart(positions, velocities, targets, BodyState(*rest[:4]), Properties(*rest[4:]))
+
+
+@dataclass
+class Memory:
+    """What `solve` found and derivatives need."""
+
+    near: Near = field(default_factory=lambda: Near((), None))
+    """Pairs near each other in the solution."""
+    batch: int = 1
+
+
+@dataclass(frozen=True)
+class ImplicitStep:
+    """The equation of one step; inputs are `ImplicitStart.tensors`."""
+
+    system: System
+    setup: ImplicitSetup
+    strength: Tensor
+    """[H] of each handle in this step."""
+    handle_nodes: Tensor
+    """[H] node of each handle."""
+    scenery: tuple[Tensor, Tensor]
+    """[O, 3] points of static and moving obstacles at both ends of the step [m]."""
+    memory: Memory = field(default_factory=lambda: Memory(), compare=False)
+
+    def fresh(self) -> ImplicitStep:
+        """The same step for another batch."""
+        return replace(self, memory=Memory())
+
+    def halves(self) -> tuple[ImplicitStep, ImplicitStep]:
+        """Two steps of half the length; obstacles go straight."""
+        system = replace(self.system, time_step=0.5 * self.system.time_step)
+        before, after = self.scenery
+        middle = 0.5 * (before + after)
+        return (
+            replace(self, system=system, scenery=(before, middle), memory=Memory()),
+            replace(self, system=system, scenery=(middle, after), memory=Memory()),
+        )
+
+    def advanced(self, u: Tensor, start: ImplicitStart) -> tuple[Tensor, Tensor, BodyState]:
+        """Positions and velocities [B, V, 3] of the cloth, and the bodies, after the step u."""
+        velocities = start.velocities + u[:, : start.positions.shape[1]]
+        if self.system.handles.hard and len(self.handle_nodes):
+            # what a held node does is known: its derivatives need no detour over the solve
+            wanted = (start.targets - start.positions[:, self.handle_nodes]) / self.system.time_step
+            velocities = velocities.index_copy(1, self.handle_nodes, wanted)
+        bodies = self._moved(u, start) if len(self.setup.bodies) else start.bodies
+        return start.positions + self.system.time_step * velocities, velocities, bodies
+
+    @property
+    def exact(self) -> bool:
+        return True
+
+    # --- what the adjoint asks for -----------------------------------------------------------------------------------
+
+    def residual(self, u: Tensor, *inputs: Tensor) -> Tensor:
+        """r [B, D, 3] [N·s, and N·m·s for rotations]."""
+        start = ImplicitStart.of(inputs)
+        near = self.memory.near.repeated(len(u) // self.memory.batch, self.memory.batch)
+        return self._residual(u, start, near, self.scenery[1])
+
+    def solve(self, *inputs: Tensor) -> tuple[Tensor, None]:
+        """u; its exact factor is made by `factorise` when derivatives need it.
+
+        Raises:
+            StuckError, SingularMatrixError: name the batch entries.
+        """
+        u, near = self._newton(ImplicitStart.of(inputs))
+        self.memory.near, self.memory.batch = near, len(u)
+        return u, None
+
+    def factorise(self, u: Tensor, *inputs: Tensor) -> Factor:
+        """The exact ∂r/∂u."""
+        return self._jacobian(u, ImplicitStart.of(inputs), self.memory.near, self.scenery[1])
+
+    # --- Newton ------------------------------------------------------------------------------------------------------
+
+    def _newton(self, start: ImplicitStart) -> tuple[Tensor, Near]:
+        contact = self.setup.contact
+        zero = self._initial_velocities(start)
+        batch = len(zero)
+        scenery = self.scenery[0].expand(batch, -1, -1)
+        begin = self._points(-zero, start, scenery)  # every point where the step starts
+        room = _Room(self, begin, self._points(torch.zeros_like(zero), start, self.scenery[1]))
+
+        # first guess: velocities go on, as far as nothing is in the way
+        everything = torch.ones(batch, dtype=torch.bool, device=zero.device)
+        u, scenery, points = self._towards(-zero, zero, scenery, begin, start, room, everything.to(zero.dtype))
+        residual = self._residual(u, start, room.near, scenery)
+        active = everything
+        change = torch.full((batch,), torch.inf, dtype=u.dtype, device=u.device)
+        factor: Factor | None = None
+        exact = False
+        for _ in range(_ITERATIONS):
+            if factor is None:
+                factor = self._jacobian(u, start, room.near, scenery, exact=exact)
+            direction = -factor.solve(residual)
+            speed = (zero + u).abs().amax((1, 2)).clamp(min=_SLOWEST)
+            before, change = change, torch.where(active, direction.abs().amax((1, 2)) / speed, change)
+            # shorten the step until it is free of collisions and the residual falls, as the matrix measures it
+            alpha = active.to(u.dtype)
+            merit = -(residual * direction).sum((1, 2))
+            for _ in range(_HALVINGS):
+                trial, moved, end = self._towards(u, direction, scenery, points, start, room, alpha)
+                remaining = self._residual(trial, start, room.near, moved)
+                if bool((change[active] < _REUSE).all()):
+                    break
+                left = (remaining * factor.solve(remaining)).sum((1, 2))
+                worse = ~(left <= merit * (1 - 1e-3 * alpha)) & active
+                if not bool(worse.any()):
+                    break
+                alpha = torch.where(worse, 0.5 * (trial - u).abs().amax((1, 2)) / direction.abs().amax((1, 2)), alpha)
+            u, scenery, points, residual = trial, moved, end, remaining
+            arrived = (scenery == self.scenery[1]).flatten(1).all(1)
+            settled = (change < _TOLERANCE) | ((change < _ROUNDING) & (change > 0.3 * before))
+            active = active & ~(settled & arrived)
+            if not bool(active.any()):
+                return u, room.near
+            close = bool((change[active] < _CLOSE).all())
+            if not (close and exact and float(change[active].max()) < _REUSE):
+                factor = None
+            exact = close
+        entries = active.nonzero().flatten().tolist()
+        pair = "none" if contact is None else contact.closest(room.near, points)[1][entries[0]]
+        raise StuckError(entries, float(change[active].max()), pair)
+
+    def _towards(
+        self,
+        u: Tensor,
+        direction: Tensor,
+        scenery: Tensor,
+        points: Tensor,
+        start: ImplicitStart,
+        room: _Room,
+        alpha: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """u + α direction, the scenery as far, and the points there, with the longest α [B] that has no collision."""
+        contact = self.setup.contact
+        final = self.scenery[1]
+        for halving in range(_HALVINGS + 1):
+            trial = u + alpha[:, None, None] * direction
+            moved = torch.where((alpha == 1)[:, None, None], final, scenery + alpha[:, None, None] * (final - scenery))
+            end = self._points(trial, start, moved)
+            if contact is None:
+                break
+            room.cover(end)
+            fraction = contact.safe_fraction(room.near, points, end)
+            if bool((fraction == 1).all()):
+                break
+            # what is straight in u is not quite straight in space where bodies turn: look again at the shorter step
+            alpha = alpha * torch.where(fraction < 1, fraction * (0.9 if halving else 1.0), 1.0)
+        return trial, moved, end
+
+    # --- forces ------------------------------------------------------------------------------------------------------
+
+    def _initial_velocities(self, start: ImplicitStart) -> Tensor:
+        """[B, D, 3]: of the cloth, then of each body and its rotation."""
+        return torch.cat([start.velocities, *_interleave(start.bodies.velocity, start.bodies.angular_velocity)], dim=1)
+
+    def _points(self, u: Tensor, start: ImplicitStart, scenery: Tensor) -> Tensor:
+        """[B, N, 3] where cloth nodes, obstacles and body points are at the end of the step."""
+        nodes = len(start.positions[0])
+        cloth = start.positions + self.system.time_step * (start.velocities + u[:, :nodes])
+        parts = [cloth, scenery.expand(len(u), -1, -1)]
+        if len(self.setup.bodies):
+            parts.append(self.setup.bodies.places(self._moved(u, start)))
+        return torch.cat(parts, dim=1)
+
+    def _moved(self, u: Tensor, start: ImplicitStart) -> BodyState:
+        changes = u[:, len(start.positions[0]) :].unflatten(1, (-1, 2))
+        velocity = start.bodies.velocity + changes[:, :, 0]
+        turning = start.bodies.angular_velocity + changes[:, :, 1]
+        return self.setup.bodies.moved(start.bodies, velocity, turning, self.system.time_step)
+
+    def _start_points(self, start: ImplicitStart) -> Tensor:
+        parts = [start.positions, self.scenery[0].expand(len(start.positions), -1, -1)]
+        if len(self.setup.bodies):
+            parts.append(self.setup.bodies.places(start.bodies))
+        return torch.cat(parts, dim=1)
+
+    def _residual(self, u: Tensor, start: ImplicitStart, near: Near, scenery: Tensor) -> Tensor:
+        system, setup, dt, values = self.system, self.setup, self.system.time_step, start.properties
+        nodes = start.positions.shape[1]
+        change = u[:, :nodes]
+        velocity = start.velocities + change
+        positions = start.positions + dt * velocity
+        mass = values.node_mass[..., None]
+        shape = geometry(system.stretching.elements, positions)
+        force = mass * system.gravity + system.air.forces(shape, velocity, values)
+        for energy in (system.stretching, system.bending):
+            force = force + energy.at(shape, values).forces(values.damping[:, None, None] * velocity)
+        if len(self.handle_nodes) and not system.handles.hard:
+            offset = start.targets - positions[:, self.handle_nodes]
+            pull = (system.handles.stiffness * self.strength)[:, None] * offset
+            index = self.handle_nodes.view(1, -1, 1).expand_as(pull)
+            force = force.scatter_add(1, index, pull)
+        touch = None
+        if setup.contact is not None:
+            end = self._points(u, start, scenery)
+            touch = setup.contact.forces(
+                near, self._start_points(start), end, values.friction_obstacle, values.friction_cloth, dt
+            )
+            force = force + touch[:, :nodes]
+        residual = mass * change - dt * force
+        if len(self.handle_nodes) and system.handles.hard:
+            wanted = (start.targets - start.positions[:, self.handle_nodes]) / dt - start.velocities[:, self.handle_nodes]
+            rows = mass[:, self.handle_nodes] * (change[:, self.handle_nodes] - wanted)
+            residual = residual.index_copy(1, self.handle_nodes, rows)
+        if not len(setup.bodies):
+            return residual
+        return torch.cat([residual, self._body_residual(u, start, touch)], dim=1)
+
+    def _body_residual(self, u: Tensor, start: ImplicitStart, touch: Tensor | None) -> Tensor:
+        system, dt, bodies = self.system, self.system.time_step, self.setup.bodies
+        mass = start.properties.body_mass
+        moved = self._moved(u, start)
+        force = mass[..., None] * system.gravity
+        torque = torch.zeros_like(force)
+        if touch is not None:
+            push = touch[:, -len(bodies.points) :]
+            force = force.index_add(1, bodies.body, push)
+            torque = torque.index_add(1, bodies.body, torch.linalg.cross(bodies.arms(moved.orientation), push))
+        linear = mass[..., None] * (moved.velocity - start.bodies.velocity) - dt * force
+        before = bodies.angular_momentum(mass, start.bodies.orientation, start.bodies.angular_velocity)
+        after = bodies.angular_momentum(mass, moved.orientation, moved.angular_velocity)
+        return torch.cat(_interleave(linear, after - before - dt * torque), dim=1)
+
+    # --- Jacobian ----------------------------------------------------------------------------------------------------
+
+    def _jacobian(self, u: Tensor, start: ImplicitStart, near: Near, scenery: Tensor, *, exact: bool = True) -> Factor:
+        """∂r/∂u; not `exact`: a positive definite matrix near it, for steps from afar."""
+        system, setup, dt, values = self.system, self.setup, self.system.time_step, start.properties
+        batch, nodes = len(u), start.positions.shape[1]
+        hard = system.handles.hard and len(self.handle_nodes) > 0
+        weight = values.node_mass
+        if len(self.handle_nodes) and not hard:
+            spring = (dt**2 * system.handles.stiffness * self.strength).expand(batch, -1)
+            weight = weight.scatter_add(1, self.handle_nodes.expand(batch, -1), spring)
+        identity = torch.eye(3, dtype=u.dtype, device=u.device)
+        diagonal = weight[..., None, None] * identity
+        if exact:
+            blocks = [self._face_blocks(u, start), self._hinge_blocks(u, start)]
+        else:
+            shape = geometry(system.stretching.elements, start.positions + dt * (start.velocities + u[:, :nodes]))
+            scale = (dt * (dt + values.damping))[:, None, None, None]
+            blocks = [scale * energy.at(shape, values).hessian() for energy in (system.stretching, system.bending)]
+        couplings: list[Couplings] = []
+        if len(setup.bodies):
+            diagonal = torch.cat([diagonal, self._body_inertia(u, start)], dim=1)
+        if setup.contact is not None:
+            end = self._points(u, start, scenery)
+            begin = self._start_points(start)
+            arguments = (near, begin, end, values.friction_obstacle, values.friction_cloth, dt)
+            found = setup.contact.blocks(*arguments, exact=exact)
+            if len(setup.bodies):
+                turning = self._turning(u, start)
+                couplings = [c for block in found for c in self._couple(block, turning, nodes)]
+                if found and exact:
+                    touch = setup.contact.forces(*arguments)[:, -len(setup.bodies.points) :]
+                    diagonal = diagonal + self._swing(touch, turning, diagonal)
+            else:
+                couplings = [
+                    Couplings(block.entry[own], block.row[own], block.column[own], -(dt**2) * block.values[own])
+                    for block in found
+                    for own in [(block.row < nodes) & (block.column < nodes)]
+                ]
+        if hard:  # the row of a held node says only what its own change is
+            free = torch.ones(diagonal.shape[1], dtype=u.dtype, device=u.device)
+            free[self.handle_nodes] = 0.0
+            own = values.node_mass[:, self.handle_nodes][..., None, None] * identity
+            diagonal = diagonal.index_copy(1, self.handle_nodes, own)
+            blocks = [
+                block * free[energy.elements.nodes].repeat_interleave(3, dim=1)[..., None]
+                for block, energy in zip(blocks, (system.stretching, system.bending), strict=True)
+            ]
+            couplings = [replace(c, values=c.values * free[c.row][:, None, None]) for c in couplings]
+        return setup.pattern.factorise(diagonal, blocks, couplings)
+
+    def _face_blocks(self, u: Tensor, start: ImplicitStart) -> Tensor:
+        """[B, F, 9, 9]: stretching and air."""
+        system, setup, dt = self.system, self.setup, self.system.time_step
+        stretching, air = setup.apart.stretching, setup.apart.air
+        corners = system.stretching.elements
+        first, before = (corners.gather(field).flatten(1, 2) for field in (start.positions, start.velocities))
+        change = corners.gather(u[:, : corners.node_count])
+
+        def force(local: Tensor, copies: int) -> Tensor:
+            values = start.properties.repeated(copies)
+            velocity = before.repeat(copies, 1, 1) + local.flatten(1).view(len(local), -1, 3)
+            shape = geometry(stretching.elements, first.repeat(copies, 1, 1) + dt * velocity)
+            damped = values.damping[:, None, None] * velocity
+            total = stretching.at(shape, values).forces(damped) + air.forces(shape, velocity, values)
+            return total.view_as(local)
+
+        return -dt * element_jacobian(force, change.flatten(2), 9)
+
+    def _hinge_blocks(self, u: Tensor, start: ImplicitStart) -> Tensor:
+        """[B, H, 12, 12]: bending."""
+        system, setup, dt = self.system, self.setup, self.system.time_step
+        bending = setup.apart.bending
+        corners = system.bending.elements
+        first, before = (corners.gather(field).flatten(1, 2) for field in (start.positions, start.velocities))
+        change = corners.gather(u[:, : corners.node_count])
+
+        def force(local: Tensor, copies: int) -> Tensor:
+            values = start.properties.repeated(copies)
+            velocity = before.repeat(copies, 1, 1) + local.flatten(1).view(len(local), -1, 3)
+            shape: Geometry = geometry(setup.apart.hinge_faces, first.repeat(copies, 1, 1) + dt * velocity)
+            return bending.at(shape, values).forces(values.damping[:, None, None] * velocity).view_as(local)
+
+        return -dt * element_jacobian(force, change.flatten(2), 12)
+
+    def _body_inertia(self, u: Tensor, start: ImplicitStart) -> Tensor:
+        """[B, 2 N, 3, 3]: mass, and the derivative of the angular momentum by the angular velocity."""
+        bodies, dt = self.setup.bodies, self.system.time_step
+        mass = start.properties.body_mass
+        turning = start.bodies.angular_velocity + u[:, start.positions.shape[1] :].unflatten(1, (-1, 2))[:, :, 1]
+
+        def momentum(omega: Tensor, copies: int) -> Tensor:
+            turned = rotation(dt * omega) @ start.bodies.orientation.repeat(copies, 1, 1, 1)
+            return bodies.angular_momentum(mass.repeat(copies, 1), turned, omega)
+
+        angular = element_jacobian(momentum, turning, 3)
+        linear = mass[..., None, None] * torch.eye(3, dtype=u.dtype, device=u.device)
+        return torch.stack([linear, angular], dim=2).flatten(1, 2)
+
+    def _turning(self, u: Tensor, start: ImplicitStart) -> tuple[Tensor, Tensor]:
+        """(arms [B, P, 3], d point / d angular velocity [B, P, 3, 3] [m·s]) of the bodies' points."""
+        bodies, dt = self.setup.bodies, self.system.time_step
+        moved = self._moved(u, start)
+        arms = bodies.arms(moved.orientation)
+        return arms, -dt * skew(arms) @ left_jacobian(dt * moved.angular_velocity)[:, bodies.body]
+
+    def _couple(self, block: ContactBlocks, turning: tuple[Tensor, Tensor], nodes: int) -> list[Couplings]:
+        """Contact between points as couplings between degrees of freedom."""
+        dt = self.system.time_step
+        arms, swing = turning
+        first_body_point = nodes + self.scenery[0].shape[0]
+        found = []
+        for row_turns in (False, True):
+            for column_turns in (False, True):
+                own = (block.row >= first_body_point) if row_turns else _moves(block.row, nodes, first_body_point)
+                own = own & (
+                    (block.column >= first_body_point) if column_turns else _moves(block.column, nodes, first_body_point)
+                )
+                entry, row, column, values = block.entry[own], block.row[own], block.column[own], block.values[own]
+                values = values @ swing[entry, column - first_body_point] if column_turns else values * dt
+                if row_turns:
+                    values = skew(arms[entry, row - first_body_point]) @ values
+                found.append(
+                    Couplings(
+                        entry,
+                        self._freedom(row, row_turns, nodes, first_body_point),
+                        self._freedom(column, column_turns, nodes, first_body_point),
+                        -dt * values,
+                    )
+                )
+        return found
+
+    def _freedom(self, point: Tensor, turns: bool, nodes: int, first_body_point: int) -> Tensor:
+        """Degree of freedom of each point: its own, or its body's centre or rotation."""
+        body = self.setup.bodies.body[(point - first_body_point).clamp(min=0)]
+        return torch.where(point < nodes, point, nodes + 2 * body + int(turns))
+
+    def _swing(self, touch: Tensor, turning: tuple[Tensor, Tensor], like: Tensor) -> Tensor:
+        """The moment of a force changes as its arm turns: -Δt d(arm)/dω x f, on the rotations' diagonal blocks."""
+        bodies, dt = self.setup.bodies, self.system.time_step
+        values = dt * (skew(touch) @ turning[1])  # -(dt) (d arm) x f = dt f x d arm
+        first = like.shape[1] - 2 * len(bodies)
+        return torch.zeros_like(like).index_add(1, first + 2 * bodies.body + 1, values)
+
+
+def _moves(point: Tensor, nodes: int, first_body_point: int) -> Tensor:
+    return (point < nodes) | (point >= first_body_point)
+
+
+def _interleave(first: Tensor, second: Tensor) -> list[Tensor]:
+    """[B, N, 3] and [B, N, 3] -> one [B, 2 N, 3]."""
+    return [torch.stack([first, second], dim=2).flatten(1, 2)]
+
+
+class _Room:
+    """Pairs near each other while all points stay within a distance of the path from `begin` to `predicted`."""
+
+    def __init__(self, step: ImplicitStep, begin: Tensor, predicted: Tensor) -> None:
+        self.contact = step.setup.contact
+        self.low, self.high = torch.minimum(begin, predicted), torch.maximum(begin, predicted)
+        self.places = (begin, predicted)
+        self.held: Tensor | None = None
+        if step.system.handles.hard and len(step.handle_nodes):
+            self.held = ~step.setup.moves
+            self.held[step.handle_nodes] = True
+        self.near = Near((), self.held)
+        if self.contact is None or self.contact.surface is None:
+            self.size = float("inf")
+            return
+        path = float((self.high - self.low).max())
+        self.size = _ROOM * (self.contact.barrier.thickness + 0.2 * path)
+        self.near = self.contact.near(self.places, 2 * self.size, self.held)
+
+    def cover(self, points: Tensor) -> None:
+        """Make sure that the list holds all pairs that may touch on the way to `points`."""
+        if self.size == float("inf"):
+            return
+        beyond = float(torch.maximum(self.low - points, points - self.high).max())
+        if beyond > self.size:
+            assert self.contact is not None
+            self.size = 2 * beyond
+            self.near = self.contact.near(self.places, 2 * self.size, self.held)

@@ -1,0 +1,51 @@
+"""Obstacles that nothing can push: static ones, and those that follow a motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloud.mesh.topology import SurfaceMesh
+from diffcloud.sim.motion import Motion
+
+
+@dataclass(frozen=True)
+class MovingObstacle:
+    """An obstacle that follows keyframes, whatever it meets."""
+
+    mesh: SurfaceMesh
+    """At the motion's identity [m]."""
+    motion: Motion
+
+
+@dataclass(frozen=True)
+class Scenery:
+    """The points of all static and all moving obstacles, in this order."""
+
+    fixed: NDArray[np.float64]
+    """[O, 3] [m]; of the moving ones, before their motion."""
+    moving: tuple[tuple[slice, Motion], ...] = field(default=())
+
+    @staticmethod
+    def build(static: Sequence[SurfaceMesh], moving: Sequence[MovingObstacle]) -> Scenery:
+        parts = [mesh.nodes for mesh in static] + [obstacle.mesh.nodes for obstacle in moving]
+        ends = np.cumsum([0, *(len(part) for part in parts)])[len(static) :]
+        slices = [slice(int(a), int(b)) for a, b in pairwise(ends)]
+        return Scenery(
+            np.concatenate([*parts, np.zeros((0, 3))]),
+            tuple((place, obstacle.motion) for place, obstacle in zip(slices, moving, strict=True)),
+        )
+
+    def at(self, times: NDArray[np.float64], *, dtype: torch.dtype, device: torch.device) -> Tensor:
+        """[T, O, 3] at times [T] [s]."""
+        points = np.broadcast_to(self.fixed, (len(times), *self.fixed.shape)).copy()
+        for place, motion in self.moving:
+            linear, translation = motion.at(times)
+            points[:, place] = np.einsum("tij,oj->toi", linear, self.fixed[place]) + translation[:, None]
+        return torch.as_tensor(points, dtype=dtype, device=device)
