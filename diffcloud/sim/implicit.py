@@ -38,7 +38,7 @@ _ITERATIONS = 60
 _HALVINGS = 8
 _SLOWEST = 1e-1
 """Velocities below this are at rest for the tolerance [m/s]."""
-_CLOSE = 1e-2
+_CLOSE = 0.5
 """Below this relative change the exact Jacobian takes over from its positive semidefinite part."""
 _REUSE = 1e-4
 """A relative change below this is followed by one correction with the same matrix instead of a new one."""
@@ -178,29 +178,32 @@ class ImplicitStep:
             direction = -factor.solve(residual)
             speed = (zero + u).abs().amax((1, 2)).clamp(min=_SLOWEST)
             before, change = change, torch.where(active, direction.abs().amax((1, 2)) / speed, change)
-            # shorten the step until it is free of collisions and the residual falls, as the matrix measures it
+            # shorten the step until it is free of collisions and the next correction is smaller (Deuflhard's test)
             alpha = active.to(u.dtype)
-            merit = -(residual * direction).sum((1, 2))
+            length = direction.square().sum((1, 2))
+            shortened = False
             for _ in range(_HALVINGS):
                 trial, moved, end = self._towards(u, direction, scenery, points, start, room, alpha)
                 remaining = self._residual(trial, start, room.near, moved)
                 if bool((change[active] < _REUSE).all()):
                     break
-                left = (remaining * factor.solve(remaining)).sum((1, 2))
-                worse = ~(left <= merit * (1 - 1e-3 * alpha)) & active
+                left = factor.solve(remaining).square().sum((1, 2))
+                worse = ~(left <= length * (1 - 0.25 * alpha)) & active
                 if not bool(worse.any()):
                     break
+                shortened = True
                 alpha = torch.where(worse, 0.5 * (trial - u).abs().amax((1, 2)) / direction.abs().amax((1, 2)), alpha)
             u, scenery, points, residual = trial, moved, end, remaining
             arrived = (scenery == self.scenery[1]).flatten(1).all(1)
-            settled = (change < _TOLERANCE) | ((change < _ROUNDING) & (change > 0.3 * before))
+            expected = torch.where(before.isfinite(), change * (change / before).clamp(max=1.0), change)
+            settled = (expected < _TOLERANCE) | ((change < _ROUNDING) & (change > 0.3 * before))
             active = active & ~(settled & arrived)
             if not bool(active.any()):
                 return u, room.near
-            close = bool((change[active] < _CLOSE).all())
-            if not (close and exact and float(change[active].max()) < _REUSE):
+            largest = float(change[active].max())
+            if not (exact and largest < _REUSE):
                 factor = None
-            exact = close
+            exact = largest < _CLOSE and not shortened
         entries = active.nonzero().flatten().tolist()
         pair = "none" if contact is None else contact.closest(room.near, points)[1][entries[0]]
         raise StuckError(entries, float(change[active].max()), pair)
