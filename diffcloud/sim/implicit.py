@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from diffcloud.sim.contact.smooth import ContactBlocks, Near
+from diffcloud.sim.contact.smooth import ContactBlocks, Measured, Near
 from diffcloud.sim.energies.base import Geometry, geometry
 from diffcloud.sim.jacobian import element_jacobian
 from diffcloud.sim.linear_solve import Couplings, Factor
@@ -138,7 +138,8 @@ class ImplicitStep:
         """r [B, D, 3] [N·s, and N·m·s for rotations]."""
         start = ImplicitStart.of(inputs)
         near = self.memory.near.repeated(len(u) // self.memory.batch, self.memory.batch)
-        return self._residual(u, start, near, self.scenery[1])
+        points = self._points(u, start, self.scenery[1])
+        return self._residual(u, start, self._measure(near, points), points)
 
     def solve(self, *inputs: Tensor) -> tuple[Tensor, None]:
         """u; its exact factor is made by `factorise` when derivatives need it.
@@ -152,7 +153,9 @@ class ImplicitStep:
 
     def factorise(self, u: Tensor, *inputs: Tensor) -> Factor:
         """The exact ∂r/∂u."""
-        return self._jacobian(u, ImplicitStart.of(inputs), self.memory.near, self.scenery[1])
+        start = ImplicitStart.of(inputs)
+        points = self._points(u, start, self.scenery[1])
+        return self._jacobian(u, start, self._measure(self.memory.near, points), points)
 
     # --- Newton ------------------------------------------------------------------------------------------------------
 
@@ -166,25 +169,26 @@ class ImplicitStep:
 
         # first guess: velocities go on, as far as nothing is in the way
         everything = torch.ones(batch, dtype=torch.bool, device=zero.device)
-        u, scenery, points = self._towards(-zero, zero, scenery, begin, start, room, everything.to(zero.dtype))
-        residual = self._residual(u, start, room.near, scenery)
+        here = _Place(-zero, scenery, begin, self._measure(room.near, begin))
+        here = self._towards(here, zero, start, room, everything.to(zero.dtype))
+        residual = self._residual(here.u, start, here.measured, here.points)
         active = everything
-        change = torch.full((batch,), torch.inf, dtype=u.dtype, device=u.device)
+        change = torch.full((batch,), torch.inf, dtype=zero.dtype, device=zero.device)
         factor: Factor | None = None
         exact = False
         for _ in range(_ITERATIONS):
             if factor is None:
-                factor = self._jacobian(u, start, room.near, scenery, exact=exact)
+                factor = self._jacobian(here.u, start, here.measured, here.points, exact=exact)
             direction = -factor.solve(residual)
-            speed = (zero + u).abs().amax((1, 2)).clamp(min=_SLOWEST)
+            speed = (zero + here.u).abs().amax((1, 2)).clamp(min=_SLOWEST)
             before, change = change, torch.where(active, direction.abs().amax((1, 2)) / speed, change)
             # shorten the step until it is free of collisions and the next correction is smaller (Deuflhard's test)
-            alpha = active.to(u.dtype)
+            alpha = active.to(zero.dtype)
             length = direction.square().sum((1, 2))
             shortened = False
             for _ in range(_HALVINGS):
-                trial, moved, end = self._towards(u, direction, scenery, points, start, room, alpha)
-                remaining = self._residual(trial, start, room.near, moved)
+                trial = self._towards(here, direction, start, room, alpha)
+                remaining = self._residual(trial.u, start, trial.measured, trial.points)
                 if bool((change[active] < _REUSE).all()):
                     break
                 left = factor.solve(remaining).square().sum((1, 2))
@@ -192,48 +196,46 @@ class ImplicitStep:
                 if not bool(worse.any()):
                     break
                 shortened = True
-                alpha = torch.where(worse, 0.5 * (trial - u).abs().amax((1, 2)) / direction.abs().amax((1, 2)), alpha)
-            u, scenery, points, residual = trial, moved, end, remaining
-            arrived = (scenery == self.scenery[1]).flatten(1).all(1)
+                gone = (trial.u - here.u).abs().amax((1, 2)) / direction.abs().amax((1, 2))
+                alpha = torch.where(worse, 0.5 * gone, alpha)
+            here, residual = trial, remaining
+            arrived = (here.scenery == self.scenery[1]).flatten(1).all(1)
             expected = torch.where(before.isfinite(), change * (change / before).clamp(max=1.0), change)
             settled = (expected < _TOLERANCE) | ((change < _ROUNDING) & (change > 0.3 * before))
             active = active & ~(settled & arrived)
             if not bool(active.any()):
-                return u, room.near
+                return here.u, room.near
             largest = float(change[active].max())
             if not (exact and largest < _REUSE):
                 factor = None
             exact = largest < _CLOSE and not shortened
         entries = active.nonzero().flatten().tolist()
-        pair = "none" if contact is None else contact.closest(room.near, points)[1][entries[0]]
+        pair = "none" if contact is None else contact.closest(here.measured, here.points)[1][entries[0]]
         raise StuckError(entries, float(change[active].max()), pair)
 
-    def _towards(
-        self,
-        u: Tensor,
-        direction: Tensor,
-        scenery: Tensor,
-        points: Tensor,
-        start: ImplicitStart,
-        room: _Room,
-        alpha: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """u + α direction, the scenery as far, and the points there, with the longest α [B] that has no collision."""
+    def _towards(self, here: _Place, direction: Tensor, start: ImplicitStart, room: _Room, alpha: Tensor) -> _Place:
+        """`here` + α direction with the longest α up to the given [B] that has no collision on the way."""
         contact = self.setup.contact
         final = self.scenery[1]
         for halving in range(_HALVINGS + 1):
-            trial = u + alpha[:, None, None] * direction
-            moved = torch.where((alpha == 1)[:, None, None], final, scenery + alpha[:, None, None] * (final - scenery))
-            end = self._points(trial, start, moved)
+            step = alpha[:, None, None]
+            u = here.u + step * direction
+            scenery = torch.where(step == 1, final, here.scenery + step * (final - here.scenery))
+            points = self._points(u, start, scenery)
             if contact is None:
                 break
-            room.cover(end)
-            fraction = contact.safe_fraction(room.near, points, end)
+            if room.cover(points):
+                here = replace(here, measured=contact.measure(room.near, here.points))
+            fraction = contact.safe_fraction(here.measured, here.points, points)
             if bool((fraction == 1).all()):
                 break
             # what is straight in u is not quite straight in space where bodies turn: look again at the shorter step
             alpha = alpha * torch.where(fraction < 1, fraction * (0.9 if halving else 1.0), 1.0)
-        return trial, moved, end
+        return _Place(u, scenery, points, self._measure(room.near, points))
+
+    def _measure(self, near: Near, points: Tensor) -> Measured:
+        contact = self.setup.contact
+        return Measured(near, (), ()) if contact is None else contact.measure(near, points)
 
     # --- forces ------------------------------------------------------------------------------------------------------
 
@@ -262,7 +264,7 @@ class ImplicitStep:
             parts.append(self.setup.bodies.places(start.bodies))
         return torch.cat(parts, dim=1)
 
-    def _residual(self, u: Tensor, start: ImplicitStart, near: Near, scenery: Tensor) -> Tensor:
+    def _residual(self, u: Tensor, start: ImplicitStart, measured: Measured, end: Tensor) -> Tensor:
         system, setup, dt, values = self.system, self.setup, self.system.time_step, start.properties
         nodes = start.positions.shape[1]
         change = u[:, :nodes]
@@ -280,9 +282,8 @@ class ImplicitStep:
             force = force.scatter_add(1, index, pull)
         touch = None
         if setup.contact is not None:
-            end = self._points(u, start, scenery)
             touch = setup.contact.forces(
-                near, self._start_points(start), end, values.friction_obstacle, values.friction_cloth, dt
+                measured, self._start_points(start), end, values.friction_obstacle, values.friction_cloth, dt
             )
             force = force + touch[:, :nodes]
         residual = mass * change - dt * force
@@ -311,7 +312,7 @@ class ImplicitStep:
 
     # --- Jacobian ----------------------------------------------------------------------------------------------------
 
-    def _jacobian(self, u: Tensor, start: ImplicitStart, near: Near, scenery: Tensor, *, exact: bool = True) -> Factor:
+    def _jacobian(self, u: Tensor, start: ImplicitStart, measured: Measured, end: Tensor, *, exact: bool = True) -> Factor:
         """∂r/∂u; not `exact`: a positive definite matrix near it, for steps from afar."""
         system, setup, dt, values = self.system, self.setup, self.system.time_step, start.properties
         batch, nodes = len(u), start.positions.shape[1]
@@ -332,9 +333,8 @@ class ImplicitStep:
         if len(setup.bodies):
             diagonal = torch.cat([diagonal, self._body_inertia(u, start)], dim=1)
         if setup.contact is not None:
-            end = self._points(u, start, scenery)
             begin = self._start_points(start)
-            arguments = (near, begin, end, values.friction_obstacle, values.friction_cloth, dt)
+            arguments = (measured, begin, end, values.friction_obstacle, values.friction_cloth, dt)
             found = setup.contact.blocks(*arguments, exact=exact)
             if len(setup.bodies):
                 turning = self._turning(u, start)
@@ -463,6 +463,19 @@ def _interleave(first: Tensor, second: Tensor) -> list[Tensor]:
     return [torch.stack([first, second], dim=2).flatten(1, 2)]
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Where Newton's method is."""
+
+    u: Tensor
+    """[B, D, 3]"""
+    scenery: Tensor
+    """[B, O, 3] how far obstacles have come."""
+    points: Tensor
+    """[B, N, 3]"""
+    measured: Measured
+
+
 class _Room:
     """Pairs near each other while all points stay within a distance of the path from `begin` to `predicted`."""
 
@@ -482,12 +495,14 @@ class _Room:
         self.size = _ROOM * (self.contact.barrier.thickness + 0.2 * path)
         self.near = self.contact.near(self.places, 2 * self.size, self.held)
 
-    def cover(self, points: Tensor) -> None:
-        """Make sure that the list holds all pairs that may touch on the way to `points`."""
+    def cover(self, points: Tensor) -> bool:
+        """Make sure that the list holds all pairs that may touch on the way to `points`; whether it had to grow."""
         if self.size == float("inf"):
-            return
+            return False
         beyond = float(torch.maximum(self.low - points, points - self.high).max())
-        if beyond > self.size:
-            assert self.contact is not None
-            self.size = 2 * beyond
-            self.near = self.contact.near(self.places, 2 * self.size, self.held)
+        if beyond <= self.size:
+            return False
+        assert self.contact is not None
+        self.size = 2 * beyond
+        self.near = self.contact.near(self.places, 2 * self.size, self.held)
+        return True

@@ -53,6 +53,17 @@ class Near:
 
 
 @dataclass(frozen=True)
+class Measured:
+    """Pairs near each other at one configuration."""
+
+    near: Near
+    distances: tuple[Tensor, ...]
+    """Of each list of `near` [m]."""
+    touching: tuple[Pairs, ...]
+    """Those closer than the thickness."""
+
+
+@dataclass(frozen=True)
 class ContactBlocks:
     """d forces / d positions of end-of-step points, as 3 x 3 blocks."""
 
@@ -91,8 +102,22 @@ class SmoothContact:
                 lists.append(pairs)
         return Near(tuple(lists), held)
 
+    def measure(self, near: Near, points: Tensor) -> Measured:
+        """Distances of all pairs at `points` [B, N, 3]; they are not differentiable, forces are."""
+        points = points.detach()
+        distances = tuple(pair_distance(pairs.kind, pairs.gather(points)) for pairs in near.lists)
+        closest = [(d < self.barrier.thickness).nonzero().flatten() for d in distances]
+        touching = tuple(pairs.where(index) for pairs, index in zip(near.lists, closest, strict=True) if len(index))
+        return Measured(near, distances, touching)
+
     def forces(
-        self, near: Near, start: Tensor, end: Tensor, friction_obstacle: Tensor, friction_cloth: Tensor, time_step: float
+        self,
+        measured: Measured,
+        start: Tensor,
+        end: Tensor,
+        friction_obstacle: Tensor,
+        friction_cloth: Tensor,
+        time_step: float,
     ) -> Tensor:
         """[B, N, 3] on the points [N].
 
@@ -105,7 +130,7 @@ class SmoothContact:
             planes = self.planes
             pushed = self._plane_forces(start[:, planes.points], end[:, planes.points], friction_obstacle, time_step)
             total = total.index_add(1, planes.points, pushed)
-        for pairs in self._touching(near, end):
+        for pairs in measured.touching:
             coefficient = self._coefficient(pairs, friction_obstacle, friction_cloth)
             forces = self._pair_forces(pairs, pairs.gather(start), pairs.gather(end), coefficient, time_step)
             index = (pairs.entry[:, None] * end.shape[1] + pairs.points).flatten()
@@ -114,7 +139,7 @@ class SmoothContact:
 
     def blocks(
         self,
-        near: Near,
+        measured: Measured,
         start: Tensor,
         end: Tensor,
         friction_obstacle: Tensor,
@@ -140,7 +165,7 @@ class SmoothContact:
                 values = element_jacobian(push, at, 3)[entry, point]
                 values = values if exact else _resisting(values)
                 found.append(ContactBlocks(entry, planes.points[point], planes.points[point], values))
-        for pairs in self._touching(near, end):
+        for pairs in measured.touching:
             coefficient = self._coefficient(pairs, friction_obstacle, friction_cloth)
             first, last = pairs.gather(start), pairs.gather(end)
 
@@ -166,8 +191,14 @@ class SmoothContact:
             )
         return found
 
-    def safe_fraction(self, near: Near, start: Tensor, end: Tensor) -> Tensor:
-        """[B] in (0, 1]: how far all points of an entry may go straight from `start` to `end` without touching."""
+    def safe_fraction(self, measured: Measured, start: Tensor, end: Tensor) -> Tensor:
+        """[B] in (0, 1]: how far all points of an entry may go straight from `start` to `end` without touching.
+
+        Args:
+            measured: at `start`.
+            start, end: [B, N, 3] [m].
+        """
+        near = measured.near
         allowed = start.new_ones(len(start))
         if self.planes is not None:
             before, after = self.planes.gap(start), self.planes.gap(end)
@@ -176,13 +207,12 @@ class SmoothContact:
                 through &= ~near.held[self.planes.points][:, None]
             closing = (before - after).clamp(min=1e-300)
             allowed = torch.where(through, (1 - _LEFT) * before / closing, 1.0).flatten(1).amin(1)
-        for pairs in near.lists:
-            first = pairs.gather(start)
-            fraction = safe_fraction(pairs.kind, first, pairs.gather(end), pair_distance(pairs.kind, first))
+        for pairs, distance in zip(near.lists, measured.distances, strict=True):
+            fraction = safe_fraction(pairs.kind, pairs.gather(start), pairs.gather(end), distance)
             allowed = allowed.scatter_reduce(0, pairs.entry, fraction, "amin")
         return allowed
 
-    def closest(self, near: Near, positions: Tensor) -> tuple[Tensor, list[str]]:
+    def closest(self, measured: Measured, positions: Tensor) -> tuple[Tensor, list[str]]:
         """([B] smallest distance of the batch's entries [m], what it is between), infinite where nothing is near."""
         smallest = positions.new_full((len(positions),), torch.inf)
         names = ["nothing"] * len(positions)
@@ -191,8 +221,7 @@ class SmoothContact:
             smallest, where = gap.min(1)
             count = len(self.planes.offsets)
             names = [f"point {int(self.planes.points[w // count])} and half-space {int(w % count)}" for w in where]
-        for pairs in near.lists:
-            distance = pair_distance(pairs.kind, pairs.gather(positions))
+        for pairs, distance in zip(measured.near.lists, measured.distances, strict=True):
             for entry in range(len(positions)):  # for reports and errors only
                 own = (pairs.entry == entry).nonzero().flatten()
                 if len(own) and float(distance[own].min()) < float(smallest[entry]):
@@ -201,27 +230,18 @@ class SmoothContact:
                     names[entry] = f"{pairs.kind.replace('_', '-')} pair of points {pairs.points[least].tolist()}"
         return smallest, names
 
-    def energy(self, near: Near, positions: Tensor) -> Tensor:
+    def energy(self, measured: Measured, positions: Tensor) -> Tensor:
         """[B] potential of the barrier [J]."""
         total = positions.new_zeros(len(positions))
         if self.planes is not None:
             total = (self.barrier.energy(self.planes.gap(positions)) * self.planes.area[:, None]).sum((1, 2))
-        for pairs in self._touching(near, positions):
+        for pairs in measured.touching:
             corners = pairs.gather(positions)
             weights, share = self._places(pairs, corners)
             distance = safe_norm(weights @ corners)
             energy = (share * self.barrier.energy(distance)).sum(1)
             total = total.index_add(0, pairs.entry, energy)
         return total
-
-    def _touching(self, near: Near, positions: Tensor) -> list[Pairs]:
-        found = []
-        for pairs in near.lists:
-            close = pair_distance(pairs.kind, pairs.gather(positions.detach())) < self.barrier.thickness
-            index = close.nonzero().flatten()
-            if len(index):
-                found.append(pairs.where(index))
-        return found
 
     def _plane_forces(self, start: Tensor, end: Tensor, coefficient: Tensor, time_step: float) -> Tensor:
         """[B, Q, 3] on the planes' points."""
