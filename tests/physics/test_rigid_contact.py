@@ -1,0 +1,148 @@
+"""Rigid bodies and contact against closed-form answers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from diffcloud.mesh.shapes import grid_cloth
+from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
+from diffcloud.sim.build import Surrounding, build_system
+from diffcloud.sim.contact import ContactSettings
+from diffcloud.sim.energies import Handles
+from diffcloud.sim.energies.handles import Handle
+from diffcloud.sim.materials import isotropic
+from diffcloud.sim.rigid import RigidBody
+from diffcloud.sim.simulate import init, rollout
+
+FABRIC = isotropic("test-fabric", density=0.2, stretching=200.0, shear=80.0, bending=1e-5, source="test")
+GROUND = SurfaceMesh(
+    np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+)
+
+
+def box(size, centre=(0.0, 0.0, 0.0)) -> SurfaceMesh:
+    solid = trimesh.creation.box(size)
+    return SurfaceMesh(np.array(solid.vertices) + centre, np.array(solid.faces))
+
+
+def bystander(height: float = 5.0) -> tuple[ClothMesh, Handles]:
+    """A small cloth, held far away: a scene has one."""
+    cloth = grid_cloth(2, 2, 0.1, 0.1)
+    cloth = ClothMesh(cloth.nodes + [0, 0, height], cloth.verts, cloth.vert_node, cloth.face_verts)
+    return cloth, Handles(tuple(Handle(node) for node in range(4)), hard=True)
+
+
+def system_of(bodies, *, gravity, friction=0.3, obstacles=(GROUND,), time_step=0.01, contact=None, cloth=None, handles=None):
+    if cloth is None:
+        cloth, handles = bystander()
+    return build_system(
+        cloth,
+        FABRIC,
+        time_step=time_step,
+        handles=handles,
+        integrator="implicit",
+        surrounding=Surrounding(
+            gravity=gravity,
+            air_density=0.0,
+            friction_obstacle=friction,
+            contact=contact or ContactSettings(1e6, 1e-3, 1e-4, sticking_speed=1e-4),
+            obstacles=obstacles,
+            bodies=tuple(bodies),
+        ),
+    )
+
+
+def test_block_on_an_incline_sticks_or_slides():
+    # an incline of angle a is level ground with gravity turned by a
+    friction, g = 0.4, 9.81
+    for angle in (math.atan(friction) - 0.03, math.atan(friction) + 0.03, math.radians(35)):
+        gravity = (g * math.sin(angle), 0.0, -g * math.cos(angle))
+        block = RigidBody(box((0.2, 0.2, 0.05), (0, 0, 0.0259)), density=500.0)
+        run = rollout(system_of([block], gravity=gravity, friction=friction), 80)
+        velocity = run.bodies.velocity[0, :, 0, 0]
+        expected = g * (math.sin(angle) - friction * math.cos(angle))
+        if expected < 0:
+            assert abs(float(velocity[-1])) < 1e-4  # the sticking speed
+        else:
+            assert float(velocity[-1] - velocity[30]) / (50 * 0.01) == pytest.approx(expected, rel=0.02)
+
+
+def test_a_stack_of_two_boxes_rests():
+    lower = RigidBody(box((0.2, 0.2, 0.1), (0, 0, 0.0509)), density=300.0)
+    upper = RigidBody(box((0.1, 0.1, 0.1), (0.01, 0.02, 0.1519)), density=600.0)
+    run = rollout(system_of([lower, upper], gravity=(0, 0, -9.81)), 150)
+    assert float(run.bodies.velocity[0, -1].abs().max()) < 1e-5
+    assert float(run.bodies.angular_velocity[0, -1].abs().max()) < 1e-4
+    height = run.bodies.centre[0, -1, :, 2]
+    assert 0.05 < float(height[0]) < 0.051
+    assert 0.1 < float(height[1] - height[0]) < 0.101
+
+
+def test_a_spinning_body_keeps_its_angular_momentum():
+    body = RigidBody(box((0.1, 0.2, 0.4), (0, 0, 1.0)), velocity=(0.3, 0, 0), angular_velocity=(3.0, 0.2, 5.0))
+    system = system_of([body], gravity=(0, 0, 0), obstacles=())
+    run = rollout(system, 200)
+    bodies = system.implicit.bodies
+    momentum = torch.stack(
+        [
+            bodies.angular_momentum(bodies.mass[None], run.bodies.orientation[:, k], run.bodies.angular_velocity[:, k])[0, 0]
+            for k in range(201)
+        ]
+    )
+    assert float((momentum - momentum[0]).abs().max() / momentum[0].norm()) < 1e-9
+    assert float((run.bodies.orientation[0, -1, 0] @ run.bodies.orientation[0, -1, 0].T - torch.eye(3)).abs().max()) < 1e-10
+
+
+def momenta(system, run, step):
+    """Linear and angular momentum of cloth and bodies together."""
+    bodies = system.implicit.bodies
+    mass = system.properties.node_mass[0, :, None]
+    dt = system.time_step
+    position = run.positions[0, step]
+    velocity = (run.positions[0, step + 1] - position) / dt
+    centre, moving = run.bodies.centre[0, step], run.bodies.velocity[0, step + 1]
+    body_mass = bodies.mass[:, None]
+    linear = (mass * velocity).sum(0) + (body_mass * moving).sum(0)
+    spin = bodies.angular_momentum(
+        bodies.mass[None], run.bodies.orientation[:, step + 1], run.bodies.angular_velocity[:, step + 1]
+    )[0]
+    angular = (
+        torch.linalg.cross(position, mass * velocity).sum(0)
+        + torch.linalg.cross(centre, body_mass * moving).sum(0)
+        + spin.sum(0)
+    )
+    return linear, angular
+
+
+def test_colliding_bodies_and_cloth_conserve_momentum():
+    flat = grid_cloth(5, 5, 0.3, 0.3)
+    cloth = ClothMesh(flat.nodes + [0.0, 0.0, 0.004], flat.verts, flat.vert_node, flat.face_verts)
+    turned = trimesh.transformations.rotation_matrix(0.5, [1, 0.3, 0.2])[:3, :3]
+    first = box((0.1, 0.1, 0.1))
+    first = SurfaceMesh(first.nodes @ turned.T + [0.03, 0.02, -0.1], first.faces)
+    second = SurfaceMesh(box((0.08, 0.1, 0.12)).nodes + [0.05, 0.03, 0.1], first.faces)
+    bodies = [
+        RigidBody(first, mass=0.05, velocity=(0, 0, 0.6)),
+        RigidBody(second, mass=0.03, velocity=(0, 0, -0.7), angular_velocity=(1.0, 0, 0)),
+    ]
+    system = system_of(
+        bodies,
+        gravity=(0, 0, 0),
+        obstacles=(),
+        friction=float(__import__("os").environ.get("FR","0.3")),
+        time_step=float(__import__("os").environ.get("DT","5e-4")),
+        contact=ContactSettings(1e5, float(__import__("os").environ.get("TH","4e-3")), 1e-4),
+        cloth=cloth,
+        handles=Handles(()),
+    )
+    run = rollout(system, int(0.15/system.time_step))
+    before, after = momenta(system, run, 0), momenta(system, run, len(run.times) - 3)
+    assert float((run.positions[0, -1] - run.positions[0, 0]).norm(dim=-1).max()) > 0.01  # it was hit
+    scale = 0.05 * 0.6
+    assert float((after[0] - before[0]).abs().max()) / scale < 1e-8
+    assert float((after[1] - before[1]).abs().max()) / (scale * 0.1) < 1e-4
