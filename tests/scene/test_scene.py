@@ -118,7 +118,7 @@ def assert_same(a, b, path="system"):
         assert a == b, path
 
 
-@pytest.mark.parametrize("source", ["file", "lift", "fold"])
+@pytest.mark.parametrize("source", ["file", "lift", "fold", "band_stretch", "vest_hang"])
 def test_a_written_scene_loads_to_the_same_system(folder, tmp_path, source):
     scene = load_scene(write(folder, scene_data())) if source == "file" else load_scenario(source).scene
     again = load_scene(write_scene(scene, tmp_path / "written"))
@@ -189,7 +189,8 @@ def test_damaged_scene_files(folder):
 
 class TestScenarios:
     def test_names(self):
-        assert SCENARIO_NAMES == ("lift", "fold", "release_lift", "release_fold", "release_hang", "release_band")
+        assert SCENARIO_NAMES[:4] == ("lift", "fold", "band_stretch", "vest_hang")
+        assert SCENARIO_NAMES[4:] == ("release_lift", "release_fold", "release_hang", "release_band")
         with pytest.raises(ConfigError, match=r"Unknown scenario 'lfit'. Allowed: .*lift"):
             load_scenario("lfit")
         with pytest.raises(ConfigError, match="needs --scene"):
