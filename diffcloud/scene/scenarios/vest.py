@@ -15,6 +15,9 @@ from diffcloud.scene.scenarios.release import PAPER_THRESHOLD, RELEASE_UNIT_M
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.scene.schema import Positive
 
+_CLEARANCE = 0.015
+"""Least distance between the shoulder and the hook at the start [m]: below it the straps converge on the hook."""
+
 
 class VestScenario(ScenarioOptions):
     """An open vest over a horizontal hook that reaches through an arm hole: everything a YAML file may change.
@@ -31,10 +34,10 @@ class VestScenario(ScenarioOptions):
     center_m: tuple[float, float] = (0.0, 0.0)
     """Where the vest's middle is."""
     hem_height_m: float = 0.3
-    hook_radius_m: Positive = 0.008
+    hook_radius_m: Positive = 0.007
     hook_length_m: Positive = 0.2
     hook_sides: Annotated[int, Field(ge=3)] = 16
-    hook_drop_m: Positive = 0.045
+    hook_drop_m: Positive = 0.05
     """Of the hook's axis below the shoulder."""
     hook_reach_m: Positive = 0.026
     """How far the hook reaches under the shoulder, from its arm end."""
@@ -42,7 +45,7 @@ class VestScenario(ScenarioOptions):
 
 VEST_HANG = VestScenario(
     name="vest_hang",
-    path=[(0.0, 0.0, 0.0, 0.0), (1.2, -0.02, 0.0, -0.06)],
+    path=[(0.0, 0.0, 0.0, 0.0), (1.2, -0.02, 0.0, -0.065)],
     frames=15,
     steps_per_frame=3,
     loss_frames=(10,),
@@ -68,6 +71,11 @@ def vest_scenario(options: VestScenario) -> Scenario:
         raise SceneError(
             f"Scenario {options.name}: the hook reaches {options.hook_reach_m} m under a shoulder of "
             f"{shoulder[0] - mesh.nodes[neck, 0]:.4g} m, as far as the held node; make hook_reach_m smaller."
+        )
+    if options.hook_drop_m < options.hook_radius_m + _CLEARANCE:
+        raise SceneError(
+            f"Scenario {options.name}: the hook starts {options.hook_drop_m} m below the shoulder; its radius of "
+            f"{options.hook_radius_m} m needs {options.hook_radius_m + _CLEARANCE:.4g} m at least."
         )
     height = float(shoulder[2] - options.hook_drop_m)
     y = options.center_m[1]
