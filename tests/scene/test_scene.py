@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -256,6 +256,14 @@ class TestScenarios:
         assert end[2] < top  # the shoulder's other end then lies on the hook
         assert end[0] < hook[:, 0].min() - 0.01  # beyond its tip
 
+    def test_bodies_to_draw_are_all_but_the_tables(self):
+        scene = load_scenario("band_stretch").scene
+        pole, _ = scene.surrounding.obstacles
+        twice = replace(scene, surrounding=replace(scene.surrounding, obstacles=(pole, pole)))
+        np.testing.assert_array_equal(scene.bodies.faces, pole.faces)
+        np.testing.assert_array_equal(twice.bodies.nodes[twice.bodies.faces[-1]], pole.nodes[pole.faces[-1]])
+        assert len(load_scenario("lift").scene.bodies.faces) == 0
+
     def test_own_band_and_vest(self, tmp_path):
         (tmp_path / "b.yaml").write_text("base: band_stretch\npole: round\ncircumference_m: 1.0\nnodes: [30, 2]\n")
         band = load_scenario(tmp_path / "b.yaml")
@@ -269,8 +277,8 @@ class TestScenarios:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("base: band_stretch\npole_offset_m: [0.0, 0.2]\n", "the pole reaches .* m from the band's middle"),
-            ("base: band_stretch\ngrasped_columns: 30\n", "30 grasped columns, but the band has 28"),
+            ("base: band_stretch\npole_offset_m: [0.0, 0.3]\n", "the pole reaches .* m from the band's middle"),
+            ("base: band_stretch\ngrasped_columns: 32\n", "32 grasped columns, but the band has 32"),
             ("base: band_stretch\nsize_m: [1, 1]\n", "size_m: unknown"),
             ("base: vest_hang\nhook_reach_m: 0.1\n", "as far as the held node"),
             ("base: vest_hang\nhook_drop_m: 0.01\n", "hook starts"),

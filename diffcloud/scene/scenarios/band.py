@@ -23,9 +23,10 @@ _CLEARANCE = 0.004
 class BandScenario(ScenarioOptions):
     """A band that stands upright on a table around a pole, held in front (at -y): everything a YAML file may change."""
 
-    circumference_m: Positive = 0.84
-    width_m: Positive = 0.04
-    nodes: tuple[Annotated[int, Field(ge=4)], Annotated[int, Field(ge=2)]] = (28, 3)
+    material: str = "basis-elastic"
+    circumference_m: Positive = 1.2
+    width_m: Positive = 0.05
+    nodes: tuple[Annotated[int, Field(ge=4)], Annotated[int, Field(ge=2)]] = (32, 3)
     """Node counts along the band and across it."""
     center_m: tuple[float, float] = (0.0, 0.0)
     """Where the band's middle stands on the table."""
@@ -33,10 +34,10 @@ class BandScenario(ScenarioOptions):
     gap_m: NonNegative = 0.005
     """Height of the band over the table at the start."""
     pole: Literal["square", "round"] = "square"
-    pole_width_m: Positive = 0.07
+    pole_width_m: Positive = 0.1
     """Side of the square, or diameter."""
-    pole_height_m: Positive = 0.30
-    pole_offset_m: tuple[float, float] = (0.0, 0.06)
+    pole_height_m: Positive = 0.4
+    pole_offset_m: tuple[float, float] = (0.0, 0.085)
     """Of the pole's axis from the band's middle."""
     grasped_columns: Annotated[int, Field(ge=1)] = 3
     """Nodes along the band that the gripper holds, over its whole width."""
@@ -44,7 +45,7 @@ class BandScenario(ScenarioOptions):
 
 BAND_STRETCH = BandScenario(
     name="band_stretch",
-    path=[(0.0, 0.0, 0.0, 0.0), (2.4, 0.0, -0.24, 0.18)],
+    path=[(0.0, 0.0, 0.0, 0.0), (2.4, 0.0, -0.34, 0.25)],
     frames=25,
     steps_per_frame=3,
     loss_frames=(24,),

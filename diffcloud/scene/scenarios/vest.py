@@ -25,6 +25,7 @@ class VestScenario(ScenarioOptions):
     The gripper holds the shoulder at +x at its neck end; the hook comes from +x and ends under that shoulder.
     """
 
+    material: str = "basis-elastic"
     width_m: Positive = 0.22
     """Of a panel, flat."""
     height_m: Positive = 0.26
