@@ -83,8 +83,9 @@ def _hidden(scenario: Scenario, config: EpisodesConfig, rng: np.random.Generator
     """Hidden multipliers, name -> [episodes]: as the paper draws them for its simulated targets (uniform over the fit's
     bounds), or log-uniform over the configured range for recordings by cameras."""
     if scenario.recorder == "whole_surface":
-        bounds = {name: scenario.bounds.get(name, PARAMETERS[name].bounds) for name in _HIDDEN}
-        return {name: rng.uniform(low, high, config.per_scenario) for name, (low, high) in bounds.items()}
+        low, high = np.transpose([scenario.bounds.get(name, PARAMETERS[name].bounds) for name in _HIDDEN])
+        drawn = rng.uniform(low, high, (config.per_scenario, len(_HIDDEN)))  # more episodes leave the first as they are
+        return dict(zip(_HIDDEN, drawn.T, strict=True))
     low, high = np.log(config.hidden_range)
     return {name: np.exp(rng.uniform(low, high, config.per_scenario)) for name in _HIDDEN}
 
