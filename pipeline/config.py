@@ -35,7 +35,8 @@ class EpisodesConfig(Section):
     """Synthetic episodes of each scenario."""
     seed: int = 0
     hidden_range: Bounds = (0.3, 3.0)
-    """Hidden multipliers are drawn log-uniformly from it."""
+    """Hidden multipliers of camera recordings are drawn log-uniformly from it; fully observed scenarios (`recorder:
+    whole_surface`) draw uniformly over the bounds of a fit, as the paper does."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -105,7 +106,7 @@ class ReportConfig(Section):
 class Config(Section):
     """All of params.yaml."""
 
-    scenarios: Annotated[list[str], Field(min_length=1)] = ["lift", "fold"]
+    scenarios: Annotated[list[str], Field(min_length=1)] = ["lift", "fold", "band_stretch", "vest_hang"]
     episodes: EpisodesConfig = EpisodesConfig()
     preprocess: PreprocessConfig = PreprocessConfig()
     fit: FitConfig = FitConfig()

@@ -16,6 +16,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.fit import read_fit
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import write_text
+from diffcloud.mesh import SurfaceMesh
 from diffcloud.report import EpisodeEntry, build_page
 from pipeline.config import load_config
 from pipeline.console import JsonFlag, ParamsFile, errors, finish
@@ -52,6 +53,7 @@ def report(
                     start_nodes=run["start_nodes"],
                     faces=run["faces"],
                     times=run["times"],
+                    bodies=SurfaceMesh(run["obstacle_nodes"], run["obstacle_faces"]),
                 )
             )
     environment = {

@@ -23,7 +23,9 @@ from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, 
 
 
 def rollout(
-    out: Annotated[Path, typer.Option(help="NPZ: nodes [T+1, V, 3], faces [F, 3], times [T+1].")],
+    out: Annotated[
+        Path, typer.Option(help="NPZ: nodes [T+1, V, 3], faces [F, 3], times [T+1], obstacle_nodes, obstacle_faces.")
+    ],
     scenario: ScenarioName = None,
     scene: SceneFile = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="PARAMETER=VALUE, repeatable.")] = None,
@@ -64,7 +66,15 @@ def rollout(
     nodes = run.positions[0, :: chosen.scene.frame_steps].numpy()
     times = run.times[:: chosen.scene.frame_steps].numpy()
     with atomic_path(out) as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(stream, nodes=nodes, faces=system.mesh.faces, times=times)
+        bodies = chosen.scene.bodies
+        np.savez_compressed(
+            stream,
+            nodes=nodes,
+            faces=system.mesh.faces,
+            times=times,
+            obstacle_nodes=bodies.nodes,
+            obstacle_faces=bodies.faces,
+        )
     for folder, suffix in ((obj, "obj"), (ply, "ply")):
         for index, frame in enumerate(nodes if folder is not None else []):
             path = Path(str(folder)) / f"{index:03d}.{suffix}"

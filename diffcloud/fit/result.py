@@ -18,6 +18,7 @@ from diffcloud.fit.objective import Objective
 from diffcloud.fit.optimise import AdamSettings, FitOutcome
 from diffcloud.fit.parameters import NUISANCE, FitSpace
 from diffcloud.io.files import atomic_path, read_json, write_json
+from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS
 
@@ -38,6 +39,8 @@ class FitResult:
     """[F, 3]"""
     times: NDArray[np.float64]
     """[T + 1] [s]"""
+    bodies: SurfaceMesh
+    """Fixed bodies around the cloth, without tables."""
 
 
 def physical_values(scenario: Scenario, values: Mapping[str, float]) -> dict[str, dict[str, Any]]:
@@ -160,6 +163,7 @@ def describe_fit(
         start_positions=start.positions[0, ::frame_steps].cpu().numpy(),
         faces=objective.system.mesh.faces,
         times=run.times[::frame_steps].cpu().numpy(),
+        bodies=scenario.scene.bodies,
     )
 
 
@@ -173,6 +177,8 @@ def write_fit(folder: Path, name: str, result: FitResult) -> Path:
             start_nodes=result.start_positions,
             faces=result.faces,
             times=result.times,
+            obstacle_nodes=result.bodies.nodes,
+            obstacle_faces=result.bodies.faces,
         )
     path = folder / f"{name}.json"
     write_json(path, result.summary)

@@ -1,6 +1,27 @@
-"""Triangle meshes: topology, material-space geometry, and procedural shapes (numpy only)."""
+"""Triangle meshes: topology, material-space geometry, and procedural shapes (numpy and scipy only)."""
 
-from diffcloud.mesh.shapes import grid_cloth
+from diffcloud.mesh.shapes import (
+    box_surface,
+    cylinder_surface,
+    grid_cloth,
+    loop_cloth,
+    rectangle_surface,
+    sphere_surface,
+    vest_cloth,
+    vest_shoulder,
+)
 from diffcloud.mesh.topology import ClothMesh, Hinges, SurfaceMesh
 
-__all__ = ["ClothMesh", "Hinges", "SurfaceMesh", "grid_cloth"]
+__all__ = [
+    "ClothMesh",
+    "Hinges",
+    "SurfaceMesh",
+    "box_surface",
+    "cylinder_surface",
+    "grid_cloth",
+    "loop_cloth",
+    "rectangle_surface",
+    "sphere_surface",
+    "vest_cloth",
+    "vest_shoulder",
+]

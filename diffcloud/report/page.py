@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.io.episodes import Episode
+from diffcloud.mesh.topology import SurfaceMesh
 
 _DECIMALS = 4
 
@@ -35,6 +36,8 @@ class EpisodeEntry:
     faces: NDArray[np.int64]
     times: NDArray[np.float64]
     """[T + 1] [s]"""
+    bodies: SurfaceMesh
+    """Fixed bodies around the cloth; may be empty."""
 
 
 def build_page(
@@ -92,6 +95,7 @@ def _entry_data(entry: EpisodeEntry, overlay_points: int, rng: np.random.Generat
         "name": f"{entry.scenario} / {entry.name}",
         "frames": frames,
         "faces": entry.faces.T.tolist(),
+        "bodies": {"nodes": _axes(entry.bodies.nodes), "faces": entry.bodies.faces.T.tolist()},
         "lossFrame": min(entry.fit["settings"]["frames"][0] % count, len(frames) - 1),
         "loss": [float(f"{value:.4g}") for value in best],
     }

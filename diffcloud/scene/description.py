@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 
-from diffcloud.mesh.topology import ClothMesh
+from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.sim.build import Surrounding, build_system
 from diffcloud.sim.energies import Handles
 from diffcloud.sim.materials import Material
@@ -43,6 +44,18 @@ class Scene:
         if math.isinf(self.end_time):
             return None
         return math.ceil(math.ceil(self.end_time / self.time_step - 1e-9) / self.frame_steps)
+
+    @property
+    def bodies(self) -> SurfaceMesh:
+        """All obstacles but the planar ones (tables), as one mesh to draw; without any, no nodes and no faces."""
+        bodies = [obstacle for obstacle in self.surrounding.obstacles if obstacle.plane() is None]
+        first = np.cumsum([0, *(len(body.nodes) for body in bodies)])
+        return SurfaceMesh(
+            np.concatenate([np.zeros((0, 3)), *(body.nodes for body in bodies)]),
+            np.concatenate(
+                [np.zeros((0, 3), np.int64), *(body.faces + n for body, n in zip(bodies, first[:-1], strict=True))]
+            ),
+        )
 
     def build(self, *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> tuple[System, State]:
         """(System, State at time zero with batch 1)."""

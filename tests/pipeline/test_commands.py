@@ -146,6 +146,36 @@ def test_stages_run_in_a_row_and_the_page_is_whole(work):
     assert (work / "reports" / "metrics.json").read_bytes() == first
 
 
+def test_simulated_targets_are_whole_uniform_and_left_as_they_are(work):
+    """The hidden parameters are recoverable in principle: at the truth only the sampling of the surface is left."""
+    (work / "raw" / "scenes").mkdir(parents=True)
+    (work / "raw" / "scenes" / "v.yaml").write_text("base: vest_hang\nframes: 3\nloss_frames: [2]\npoints: 900\n")
+    (work / "p.yaml").write_text(yaml.safe_dump({"scenarios": ["v"], "episodes": {"per_scenario": 3}}))
+    run("episodes", "--params", "p.yaml", "--out", "recorded", cwd=work)
+    run("preprocess", "--params", "p.yaml", "--out", "episodes", "recorded", cwd=work)
+    for number in (1, 2, 3):
+        recorded, kept = (
+            read_episode(work / folder / "v" / f"v_hidden{number}.npz") for folder in ("recorded", "episodes")
+        )
+        np.testing.assert_array_equal(kept.points, recorded.points)
+        assert np.diff(kept.offsets).tolist() == [900] * 4
+        truth = kept.meta["truth"]
+        assert all(0.1 <= value <= 10 for value in truth.values())
+    values = [f"{name}={value!r}" for name, value in truth.items()]
+    flags = [word for value in values for word in ("--set", value)]
+    done = run("evaluate", "loss", "--scenario", "v", *flags, "--json", "episodes/v/v_hidden3.npz", cwd=work)
+    assert result(done)["loss"] < 2 * 0.13 / (np.pi * 900)  # mean squared distance to the nearest of 900 points on 0.13 m²
+
+
+def test_rollouts_carry_the_bodies_to_draw(work):
+    run("rollout", "--scenario", "vest_hang", "--frames", 1, "--out", "vest.npz", cwd=work)
+    run("rollout", "--scenario", "small.yaml", "--frames", 1, "--out", "lift.npz", cwd=work)
+    with np.load(work / "vest.npz") as vest, np.load(work / "lift.npz") as lift:
+        assert vest["nodes"].shape == (2, 80, 3)
+        assert vest["obstacle_faces"].max() == len(vest["obstacle_nodes"]) - 1
+        assert lift["obstacle_nodes"].shape == (0, 3)  # the table is not drawn
+
+
 def test_synthetic_episodes_are_the_same_bytes_for_the_same_seed(work):
     (work / "raw" / "scenes").mkdir(parents=True)
     (work / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump(SMALL))

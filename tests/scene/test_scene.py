@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -13,6 +13,8 @@ from diffcloud.errors import ConfigError, MeshError, SceneError
 from diffcloud.io.obj import write_cloth, write_surface
 from diffcloud.mesh import SurfaceMesh, grid_cloth
 from diffcloud.scene import SCENARIO_NAMES, load_scenario, load_scene, write_scene
+from diffcloud.scene.scenarios import built_in, make_scenario
+from tests.sim.contact.penetration import find_penetrations, minimal_distance
 
 MATERIAL = {"density": 0.3, "stretching": [[30, 1, 40, 20]] * 6, "bending": [[1e-5] * 5] * 3}
 
@@ -118,7 +120,7 @@ def assert_same(a, b, path="system"):
         assert a == b, path
 
 
-@pytest.mark.parametrize("source", ["file", "lift", "fold"])
+@pytest.mark.parametrize("source", ["file", "lift", "fold", "band_stretch", "vest_hang"])
 def test_a_written_scene_loads_to_the_same_system(folder, tmp_path, source):
     scene = load_scene(write(folder, scene_data())) if source == "file" else load_scenario(source).scene
     again = load_scene(write_scene(scene, tmp_path / "written"))
@@ -189,7 +191,8 @@ def test_damaged_scene_files(folder):
 
 class TestScenarios:
     def test_names(self):
-        assert SCENARIO_NAMES == ("lift", "fold", "release_lift", "release_fold", "release_hang", "release_band")
+        assert SCENARIO_NAMES[:4] == ("lift", "fold", "band_stretch", "vest_hang")
+        assert SCENARIO_NAMES[4:] == ("release_lift", "release_fold", "release_hang", "release_band")
         with pytest.raises(ConfigError, match=r"Unknown scenario 'lfit'. Allowed: .*lift"):
             load_scenario("lfit")
         with pytest.raises(ConfigError, match="needs --scene"):
@@ -206,6 +209,86 @@ class TestScenarios:
         assert scenario.scene.frame_steps >= 4
         assert scenario.points == 3500
         assert scenario.scene.surrounding.gravity == (0, 0, -9.81)
+
+    @pytest.mark.parametrize(
+        ("name", "frames", "loss_frame", "points", "learning_rate"),
+        [("band_stretch", 25, 24, 5500, 0.4), ("vest_hang", 15, 10, 3500, 0.3)],
+    )
+    def test_simulated_built_ins_hold_what_the_paper_says(self, name, frames, loss_frame, points, learning_rate):
+        scenario = load_scenario(name)
+        assert (scenario.frames, scenario.loss_frames) == (frames, (loss_frame,))
+        assert (scenario.points, scenario.learning_rate) == (points, learning_rate)
+        assert scenario.threshold == pytest.approx(5e-4 * 0.35**2)
+        assert scenario.recorder == "whole_surface"
+        assert scenario.scene.surrounding.gravity == (0, 0, -9.81)
+        assert scenario.loss_faces is None
+        assert dict(scenario.node_sets) == {}  # the mass of all nodes
+
+    @pytest.mark.parametrize("name", ["band_stretch", "vest_hang"])
+    @pytest.mark.parametrize("changes", [{}, {"pole": "round"}])
+    def test_simulated_built_ins_start_clear_of_everything(self, name, changes):
+        options = built_in(name)
+        changes = {field: value for field, value in changes.items() if hasattr(options, field)}
+        scene = make_scenario(options.model_copy(update=changes)).scene
+        cloth = (scene.mesh.nodes, scene.mesh.faces)
+        for obstacle in scene.surrounding.obstacles:
+            assert minimal_distance(cloth, (obstacle.nodes, obstacle.faces)) >= 0.004
+        assert minimal_distance(cloth, cloth, apart=True) >= 0.003
+        assert not find_penetrations(scene.mesh.nodes[None], scene.mesh, scene.surrounding.obstacles)
+        assert all(obstacle.plane() is None for obstacle in scene.surrounding.obstacles[:1])  # the one in the targets
+
+    def test_the_pull_makes_the_band_taut(self):
+        """From the gripper around the far side of the pole and back is longer than the band."""
+        options = built_in("band_stretch")
+        scenario = load_scenario("band_stretch")
+        gripper = scenario.scene.mesh.nodes[scenario.grasped].mean(axis=0) + options.path[-1][1:]
+        pole = scenario.scene.surrounding.obstacles[0].nodes
+        far = pole[:, 1].max() - gripper[1]
+        assert 2 * np.hypot(far, options.path[-1][3]) > 1.05 * options.circumference_m
+
+    def test_the_gripper_passes_the_vest_to_the_hook(self):
+        scenario = load_scenario("vest_hang")
+        start = scenario.scene.mesh.nodes[scenario.grasped[0]]
+        end = start + built_in("vest_hang").path[-1][1:]
+        hook = scenario.scene.surrounding.obstacles[0].nodes
+        top = hook[:, 2].max()
+        assert start[2] > top + 0.02
+        assert end[2] < top  # the shoulder's other end then lies on the hook
+        assert end[0] < hook[:, 0].min() - 0.01  # beyond its tip
+
+    def test_bodies_to_draw_are_all_but_the_tables(self):
+        scene = load_scenario("band_stretch").scene
+        pole, _ = scene.surrounding.obstacles
+        twice = replace(scene, surrounding=replace(scene.surrounding, obstacles=(pole, pole)))
+        np.testing.assert_array_equal(scene.bodies.faces, pole.faces)
+        np.testing.assert_array_equal(twice.bodies.nodes[twice.bodies.faces[-1]], pole.nodes[pole.faces[-1]])
+        assert len(load_scenario("lift").scene.bodies.faces) == 0
+
+    def test_own_band_and_vest(self, tmp_path):
+        (tmp_path / "b.yaml").write_text("base: band_stretch\npole: round\ncircumference_m: 1.0\nnodes: [30, 2]\n")
+        band = load_scenario(tmp_path / "b.yaml")
+        assert len(band.scene.mesh.nodes) == 60
+        assert len(band.scene.surrounding.obstacles[0].faces) > 12
+        (tmp_path / "v.yaml").write_text("base: vest_hang\nhem_height_m: 1.0\ncenter_m: [0.5, 0.2]\nhook_sides: 8\n")
+        vest = load_scenario(tmp_path / "v.yaml")
+        assert vest.scene.mesh.nodes[:, 2].min() == pytest.approx(1.0)
+        assert vest.scene.surrounding.obstacles[0].nodes[:, 1].mean() == pytest.approx(0.2)
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("base: band_stretch\npole_offset_m: [0.0, 0.3]\n", "the pole reaches .* m from the band's middle"),
+            ("base: band_stretch\ngrasped_columns: 32\n", "32 grasped columns, but the band has 32"),
+            ("base: band_stretch\nsize_m: [1, 1]\n", "size_m: unknown"),
+            ("base: vest_hang\nhook_reach_m: 0.1\n", "as far as the held node"),
+            ("base: vest_hang\nhook_drop_m: 0.01\n", "hook starts"),
+            ("base: vest_hang\nloss_frames: [16]\n", "loss_frames"),
+        ],
+    )
+    def test_impossible_bands_and_vests(self, tmp_path, text, message):
+        (tmp_path / "t.yaml").write_text(text)
+        with pytest.raises(SceneError, match=message):
+            load_scenario(tmp_path / "t.yaml")
 
     def test_fold_samples_the_grasped_half(self):
         scenario = load_scenario("fold")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from diffcloud.errors import EpisodeError
-from diffcloud.sensing import DepthCamera, clean_frame, default_cameras
+from diffcloud.mesh import box_surface, grid_cloth
+from diffcloud.sensing import DepthCamera, clean_frame, default_cameras, sample_surface
 
 
 @pytest.fixture
@@ -60,6 +61,38 @@ def test_noise_grows_with_the_square_of_the_distance(rng):
 def test_default_cameras_are_an_overhead_and_a_side_view():
     overhead, side = default_cameras((0.0, 0.0, 0.1))
     assert overhead.T_world_camera[2, 3] > side.T_world_camera[2, 3]
+
+
+class TestWholeSurface:
+    BOX = box_surface([1.0, 0.0, 0.0], [1.2, 0.2, 0.2])
+
+    def sampled(self, obstacle, seed=0):
+        cloth = grid_cloth(4, 4, 0.2, 0.6)
+        nodes = np.stack([np.add(cloth.nodes, (0, 0, z)) for z in (-0.1, -0.3)])
+        times = np.array([0.0, 0.1])
+        return sample_surface(nodes, cloth.faces, times, obstacle, points=3000, seed=seed, meta={"scenario": "s"})
+
+    def test_points_lie_on_cloth_and_obstacle_in_proportion_to_area(self):
+        episode = self.sampled(self.BOX)
+        for index, height in enumerate((-0.1, -0.3)):
+            points = episode.frame(index).astype(float)
+            assert len(points) == 3000
+            on_cloth = np.abs(points[:, 2] - height) < 1e-6
+            assert on_cloth.mean() == pytest.approx(0.12 / (0.12 + 6 * 0.04), abs=0.005)
+            local = points[~on_cloth] - [1.1, 0.1, 0.1]
+            assert np.abs(local).max(axis=1) == pytest.approx(np.full((~on_cloth).sum(), 0.1), abs=1e-6)
+
+    def test_frames_are_drawn_anew_and_reproducibly(self):
+        episode = self.sampled(self.BOX)
+        assert not np.allclose(episode.frame(0)[:, :2], episode.frame(1)[:, :2])
+        np.testing.assert_array_equal(episode.points, self.sampled(self.BOX).points)
+        assert not np.array_equal(episode.points, self.sampled(self.BOX, seed=1).points)
+
+    def test_without_an_obstacle_only_the_cloth(self):
+        episode = self.sampled(None)
+        assert np.abs(episode.frame(0)[:, 2] + 0.1).max() < 1e-6
+        assert episode.gripper is None  # a fit then moves the handles as the scene does
+        assert episode.meta["noise_free"]
 
 
 class TestFilters:

@@ -1,0 +1,117 @@
+"""All scenarios by name, and YAML files that start from a built-in and change what differs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, overload
+
+import yaml
+from pydantic import ValidationError
+
+from diffcloud.errors import ConfigError, SceneError, unknown_name
+from diffcloud.scene.load import load_scene
+from diffcloud.scene.scenarios.band import BAND_STRETCH, BandScenario, band_scenario
+from diffcloud.scene.scenarios.grid import FOLD, LIFT, GridScenario, grid_scenario
+from diffcloud.scene.scenarios.release import RELEASE, release_scenario
+from diffcloud.scene.scenarios.scenario import Scenario
+from diffcloud.scene.scenarios.vest import VEST_HANG, VestScenario, vest_scenario
+from diffcloud.scene.schema import explain
+
+Options = GridScenario | BandScenario | VestScenario
+
+_BUILT_IN: dict[str, Options] = {options.name: options for options in (LIFT, FOLD, BAND_STRETCH, VEST_HANG)}
+SCENARIO_NAMES = (*_BUILT_IN, *RELEASE)
+
+
+def load_scenario(name: str | Path | None, scene: Path | None = None) -> Scenario:
+    """A scenario by name or YAML file, or from a scene file, or both.
+
+    Args:
+        name: a built-in, a `release_*` experiment (then `scene` is needed), the path of a YAML file, or None for a
+            scene file as it is written.
+        scene: an ARCSim scene JSON.
+
+    Raises:
+        ConfigError, SceneError, MeshError: what is wrong and what is allowed.
+    """
+    if name is None:
+        if scene is None:
+            raise ConfigError(
+                f"Give --scenario (one of {', '.join(SCENARIO_NAMES)}, or a YAML file), or --scene FILE.json."
+            )
+        loaded = load_scene(scene)
+        frames = loaded.default_frames or 25
+        return Scenario(Path(scene).stem, loaded, frames, loss_frames=(-1,))
+    text = str(name)
+    if text in RELEASE:
+        if scene is None:
+            raise ConfigError(f"Scenario {text} needs --scene with the published scene file (README: published data).")
+        return release_scenario(text, scene)
+    if scene is not None:
+        raise ConfigError(f"Scenario {text} makes its own scene; --scene goes with release_* scenarios or alone.")
+    if text in _BUILT_IN:
+        return make_scenario(_BUILT_IN[text])
+    if Path(text).suffix in (".yaml", ".yml"):
+        return make_scenario(read_options(Path(text)))
+    raise ConfigError(unknown_name("scenario", text, SCENARIO_NAMES) + " Or give the path of a YAML file.")
+
+
+def make_scenario(options: Options) -> Scenario:
+    """The scenario of any built-in's options.
+
+    Raises:
+        SceneError, MeshError: options that contradict each other.
+    """
+    match options:
+        case GridScenario():
+            return grid_scenario(options)
+        case BandScenario():
+            return band_scenario(options)
+        case VestScenario():
+            return vest_scenario(options)
+
+
+@overload
+def built_in(name: Literal["lift", "fold"]) -> GridScenario: ...
+@overload
+def built_in(name: Literal["band_stretch"]) -> BandScenario: ...
+@overload
+def built_in(name: Literal["vest_hang"]) -> VestScenario: ...
+@overload
+def built_in(name: str) -> Options: ...
+def built_in(name: str) -> Options:
+    """The options of a built-in scenario, to vary.
+
+    Raises:
+        ConfigError: no such built-in.
+    """
+    if name not in _BUILT_IN:
+        raise ConfigError(unknown_name("built-in scenario", name, _BUILT_IN))
+    return _BUILT_IN[name]
+
+
+def read_options(path: Path) -> Options:
+    """Read a person's own scenario: `base:` with a built-in's name (default `lift`), then the fields that differ.
+
+    Raises:
+        SceneError: an unreadable file, an unknown field, or a value out of range.
+    """
+    try:
+        data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise SceneError(f"No such scenario file: {path}.") from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise SceneError(f"{path} is not readable YAML: {error}.") from error
+    if not isinstance(data, dict):
+        raise SceneError(f"{path}: a scenario is a mapping of fields, got {type(data).__name__}.")
+    base = data.pop("base", "lift")
+    if base not in _BUILT_IN:
+        raise SceneError(f"{path}: " + unknown_name("base", base, _BUILT_IN))
+    material = data.get("material")
+    if isinstance(material, str) and material.endswith(".json"):
+        data["material"] = str((Path(path).parent / material).resolve())
+    options = _BUILT_IN[base]
+    try:
+        return type(options).model_validate({**options.model_dump(), "name": Path(path).stem, **data})
+    except ValidationError as error:
+        raise explain(path, error, SceneError) from error

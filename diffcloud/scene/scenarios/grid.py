@@ -1,0 +1,108 @@
+"""A rectangular cloth over a table: the built-ins `lift` and `fold`, and a person's own cloth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from diffcloud.errors import SceneError, unknown_name
+from diffcloud.mesh.shapes import grid_cloth, rectangle_surface
+from diffcloud.mesh.topology import ClothMesh
+from diffcloud.scene.scenarios.options import ScenarioOptions, assemble
+from diffcloud.scene.scenarios.scenario import Scenario
+from diffcloud.scene.schema import NonNegative, Positive
+
+
+class GridScenario(ScenarioOptions):
+    """A rectangular cloth over a table: everything a person may change in a YAML file (SI units)."""
+
+    size_m: tuple[Positive, Positive]
+    """Extent along the cloth's own x and y."""
+    nodes: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]] = (7, 7)
+    """Node counts along x and y."""
+    center_m: tuple[float, float] = (0.0, 0.0)
+    """Where the cloth's centre lies on the table."""
+    yaw_deg: float = 45.0
+    """Rotation about the vertical; 45 lays a square cloth as a diamond."""
+    table_height_m: float = 0.0
+    gap_m: NonNegative = 0.002
+    """Height of the cloth over the table at the start."""
+    grasped: tuple[str | int, ...]
+    """Nodes that the gripper moves: corner names (left/right_bottom/top of the unrotated cloth) or indices."""
+    held: tuple[str | int, ...] = ()
+    """Nodes that stay where they are."""
+    loss_surface: Literal["all", "grasped_half"] = "all"
+
+
+_SIDE = 0.2625
+"""Side of the cloth of the paper's experiments [m] (0.75 release units)."""
+LIFT = GridScenario(
+    name="lift",
+    size_m=(_SIDE, _SIDE),
+    grasped=("right_top",),
+    path=[(0.0, 0.0, 0.0, 0.0), (2.5, 0.0, -0.14, 0.40)],
+)
+FOLD = GridScenario(
+    name="fold",
+    size_m=(_SIDE, _SIDE),
+    grasped=("left_bottom",),
+    held=("right_top",),
+    path=[(0.0, 0.0, 0.0, 0.0), (1.25, 0.0, 0.12, 0.26), (2.5, 0.0, 0.28, 0.08)],
+    loss_frames=(15,),
+    loss_surface="grasped_half",
+)
+
+
+def grid_scenario(options: GridScenario) -> Scenario:
+    """The scenario of a rectangular cloth over a table.
+
+    Raises:
+        SceneError: a corner or node that does not exist.
+    """
+    columns, rows = options.nodes
+    flat = grid_cloth(rows, columns, options.size_m[1], options.size_m[0])
+    yaw = np.deg2rad(options.yaw_deg)
+    turn = np.array([[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])  # for row vectors
+    start = np.array([*options.center_m, options.table_height_m + options.gap_m])
+    mesh = replace(flat, nodes=flat.nodes @ turn + start)
+    grasped, held = (_named_nodes(options, names) for names in (options.grasped, options.held))
+    extent = 2.0 * max(options.size_m) + options.reach
+    return assemble(
+        options,
+        mesh,
+        (rectangle_surface(options.center_m, (extent, extent), options.table_height_m),),
+        grasped=grasped,
+        held=held,
+        loss_faces=_half(mesh, grasped) if options.loss_surface == "grasped_half" else None,
+    )
+
+
+def _named_nodes(options: GridScenario, names: Sequence[str | int]) -> list[int]:
+    columns, rows = options.nodes
+    corners = {
+        "left_bottom": 0,
+        "right_bottom": columns - 1,
+        "left_top": (rows - 1) * columns,
+        "right_top": rows * columns - 1,
+    }
+    nodes = []
+    for name in names:
+        if isinstance(name, str) and name not in corners:
+            raise SceneError(f"Scenario {options.name}: " + unknown_name("corner", name, corners))
+        node = corners[name] if isinstance(name, str) else name
+        if not 0 <= node < rows * columns:
+            raise SceneError(f"Scenario {options.name}: node {node} does not exist, the cloth has 0..{rows * columns - 1}.")
+        nodes.append(node)
+    return nodes
+
+
+def _half(mesh: ClothMesh, grasped: list[int]) -> NDArray[np.int64]:
+    """Faces on the grasped side of the cloth's middle: the part that comes to lie on top."""
+    side = mesh.nodes[grasped].mean(axis=0) - mesh.nodes.mean(axis=0)
+    centre = mesh.nodes[mesh.faces].mean(axis=1) - mesh.nodes.mean(axis=0)
+    return np.flatnonzero(centre @ side > 0)

@@ -1,0 +1,113 @@
+"""What every built-in scenario lets a person change, and how it becomes a `Scenario`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from diffcloud.errors import SceneError
+from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
+from diffcloud.scene.description import Scene
+from diffcloud.scene.scenarios.scenario import Recorder, Scenario
+from diffcloud.scene.schema import Checked, NonNegative, Positive, Vector
+from diffcloud.sim.build import Surrounding
+from diffcloud.sim.contact import ContactSettings
+from diffcloud.sim.energies import Handles
+from diffcloud.sim.energies.handles import Handle
+from diffcloud.sim.materials import preset, read_material
+from diffcloud.sim.motion import Keyframe, Motion
+
+
+class ScenarioOptions(Checked):
+    """The fields that all built-in scenarios share (SI units)."""
+
+    name: str
+    material: str = "basis-knit"
+    """A preset, or the path of an ARCSim material JSON."""
+    path: Annotated[list[tuple[float, float, float, float]], Field(min_length=2)]
+    """Keyframes (time s, dx, dy, dz m) of the gripper's displacement, in the world's axes."""
+    frames: Annotated[int, Field(ge=1)] = 25
+    rate_hz: Positive = 10.0
+    steps_per_frame: Annotated[int, Field(ge=1)] = 4
+    newton_iterations: Annotated[int, Field(ge=1)] = 1
+    soft_handles: bool = False
+    loss_frames: tuple[int, ...] = (-1,)
+    points: Annotated[int, Field(ge=1)] = 3500
+    learning_rate: Positive = 0.2
+    threshold_m2: NonNegative = 0.0
+    """A fit stops when its loss is below; 0: never."""
+    recorder: Recorder = "depth_cameras"
+    gravity: Vector = (0.0, 0.0, -9.81)
+    air_density: NonNegative = 1.2
+    friction_obstacle: NonNegative = 0.3
+    friction_cloth: NonNegative = 0.6
+    contact_stiffness: NonNegative = 1e5
+    contact_thickness_m: Positive = 0.002
+
+    @property
+    def reach(self) -> float:
+        """Largest displacement of the gripper along an axis [m]."""
+        return float(np.abs([key[1:] for key in self.path]).max())
+
+
+def assemble(
+    options: ScenarioOptions,
+    mesh: ClothMesh,
+    obstacles: tuple[SurfaceMesh, ...],
+    *,
+    grasped: Sequence[int],
+    held: Sequence[int] = (),
+    loss_faces: NDArray[np.int64] | None = None,
+) -> Scenario:
+    """The scenario of a cloth and its obstacles in their places.
+
+    Args:
+        grasped: nodes that follow the gripper's path.
+        held: nodes that stay where they are.
+        loss_faces: faces whose surface the loss samples; None for all.
+
+    Raises:
+        SceneError: a node both grasped and held, or a loss frame after the end.
+    """
+    both = sorted(set(grasped) & set(held))
+    if both:
+        raise SceneError(f"Scenario {options.name}: nodes {both} are both grasped and held.")
+    frames = {frame if frame >= 0 else options.frames + 1 + frame for frame in options.loss_frames}
+    if not frames or min(frames) < 0 or max(frames) > options.frames:
+        raise SceneError(f"Scenario {options.name}: loss_frames {list(options.loss_frames)} leave 0..{options.frames}.")
+    motion = Motion(tuple(Keyframe(time, (x, y, z)) for time, x, y, z in options.path))
+    handles = (*(Handle(node, motion) for node in grasped), *(Handle(node) for node in held))
+    material = options.material
+    thickness = options.contact_thickness_m
+    scene = Scene(
+        mesh=mesh,
+        material=read_material(Path(material)) if material.endswith(".json") else preset(material),
+        handles=Handles(handles, hard=not options.soft_handles),
+        frame_time=1 / options.rate_hz,
+        frame_steps=options.steps_per_frame,
+        surrounding=Surrounding(
+            gravity=options.gravity,
+            air_density=options.air_density,
+            friction_obstacle=options.friction_obstacle,
+            friction_cloth=options.friction_cloth,
+            contact=ContactSettings(options.contact_stiffness, thickness, 0.1 * thickness),
+            obstacles=obstacles,
+        ),
+        newton_iterations=options.newton_iterations,
+    )
+    return Scenario(
+        name=options.name,
+        scene=scene,
+        frames=options.frames,
+        loss_frames=tuple(options.loss_frames),
+        loss_faces=loss_faces,
+        points=options.points,
+        learning_rate=options.learning_rate,
+        threshold=options.threshold_m2,
+        recorder=options.recorder,
+    )

@@ -1,0 +1,69 @@
+"""A scene and how an experiment looks at it: which frame, which faces, which bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloud.scene.description import Scene
+from diffcloud.sim.properties import Properties, scaled_properties
+from diffcloud.sim.state import System
+
+Recorder = Literal["depth_cameras", "whole_surface"]
+"""How synthetic episodes are made: seen by depth cameras with their noise, or points all over the cloth and the first
+obstacle, without noise."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A scene and the settings of an experiment on it."""
+
+    name: str
+    scene: Scene
+    frames: int
+    """Simulated frames after the start."""
+    loss_frames: tuple[int, ...]
+    """Frames of an episode that enter the loss; negative ones count from the end."""
+    loss_faces: NDArray[np.int64] | None = None
+    """Faces whose surface is sampled; None for all."""
+    node_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    """Parameter name -> nodes it acts on."""
+    points: int = 3500
+    """Sampled per frame."""
+    learning_rate: float = 0.2
+    iterations: int = 50
+    threshold: float = 0.0
+    """Stop when the loss [squared length unit] is below; 0: never."""
+    length_unit_m: float = 1.0
+    first_frame_time: float = 0.0
+    """Time of a recorded episode's first frame since the start [s]."""
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Overrides of the parameters' own bounds."""
+    recorder: Recorder = "depth_cameras"
+
+    @property
+    def steps(self) -> int:
+        return self.frames * self.scene.frame_steps
+
+    @property
+    def grasped(self) -> list[int]:
+        """Nodes that a moving handle holds."""
+        return [handle.node for handle in self.scene.handles.handles if handle.motion is not None]
+
+    def properties(self, system: System, values: Mapping[str, Tensor]) -> Properties:
+        """Physical quantities of parameter sets, name -> [B], with the scenario's node sets applied.
+
+        Raises:
+            ConfigError: an unknown parameter.
+        """
+        sets = {}
+        for name in values.keys() & self.node_sets.keys():
+            sets[name] = torch.zeros(len(system.mesh.nodes), dtype=torch.bool, device=system.device)
+            sets[name][torch.as_tensor(self.node_sets[name], device=system.device)] = True
+        return scaled_properties(system.properties, values, faces=system.stretching.elements.nodes, node_sets=sets)
