@@ -185,14 +185,19 @@ class ImplicitStep:
             # shorten the step until it is free of collisions and the next correction is smaller (Deuflhard's test)
             alpha = active.to(zero.dtype)
             length = direction.square().sum((1, 2))
+            downhill = -(residual * direction).sum((1, 2))
             shortened = False
             for _ in range(_HALVINGS):
                 trial = self._towards(here, direction, start, room, alpha)
                 remaining = self._residual(trial.u, start, trial.measured, trial.points)
                 if bool((change[active] < _REUSE).all()):
                     break
-                left = factor.solve(remaining).square().sum((1, 2))
-                worse = ~(left <= length * (1 - 0.25 * alpha)) & active
+                if exact:
+                    left = factor.solve(remaining).square().sum((1, 2))
+                    worse = ~(left <= length * (1 - 0.25 * alpha)) & active
+                else:
+                    uphill = (remaining * direction).sum((1, 2))
+                    worse = ~(uphill <= 0.9 * downhill) & active
                 if not bool(worse.any()):
                     break
                 shortened = True
