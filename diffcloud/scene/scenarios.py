@@ -26,7 +26,7 @@ from diffcloud.scene.description import Scene
 from diffcloud.scene.load import load_scene
 from diffcloud.scene.schema import Checked, NonNegative, Positive, Vector, explain
 from diffcloud.sim.build import Surrounding
-from diffcloud.sim.contact import ContactSettings
+from diffcloud.sim.contact import ContactSettings, ReferenceContact
 from diffcloud.sim.energies import Handles
 from diffcloud.sim.energies.handles import Handle
 from diffcloud.sim.materials import Material, preset, read_material
@@ -339,6 +339,7 @@ def _table(options: GridScenario, extent: float) -> SurfaceMesh:
 
 def _release(name: str, settings: _Release, path: Path) -> Scenario:
     scene = load_scene(path, reload_materials=True)
+    scene = replace(scene, surrounding=replace(scene.surrounding, reference_contact=ReferenceContact.as_published()))
     faces, nodes = settings.loss_faces, settings.mass_nodes
     for what, index, count in (("face", faces, len(scene.mesh.faces)), ("node", nodes, len(scene.mesh.nodes))):
         if index and max(index) >= count:

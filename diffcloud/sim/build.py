@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from diffcloud.errors import SceneError
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
-from diffcloud.sim.contact import ContactSettings, HalfSpaces
+from diffcloud.sim.contact import ContactSettings, HalfSpaces, MeshContact, ReferenceContact
 from diffcloud.sim.energies import Air, Bending, Handles, Stretching
 from diffcloud.sim.linear_solve import pattern
 from diffcloud.sim.materials import Material
@@ -37,6 +37,8 @@ class Surrounding:
     proximity: bool = True
     """Whether planes repel and rub (off: only projection)."""
     obstacles: tuple[SurfaceMesh, ...] = ()
+    reference_contact: ReferenceContact | None = None
+    """Contact with all meshes and of the cloth with itself by proximity and impact zones; None: with planes only."""
 
 
 def build_system(
@@ -66,6 +68,8 @@ def build_system(
     device = torch.device(device)
     if not time_step > 0 or newton_iterations < 1:
         raise SceneError(f"Time step and Newton iterations must be positive, got {time_step} s and {newton_iterations}.")
+    if surrounding.reference_contact is not None and newton_iterations > 1:
+        raise SceneError("Contact by proximity and impact zones belongs to the linearised step; set newton_iterations to 1.")
     for node in handles.nodes:
         if not 0 <= node < len(mesh.nodes):
             raise SceneError(f"A handle holds node {node}, but the cloth has nodes 0..{len(mesh.nodes) - 1}.")
@@ -95,6 +99,7 @@ def build_system(
         air=Air(stretching.elements, stretching.area, tensor(surrounding.wind)),
         handles=handles,
         halfspaces=_halfspaces(mesh, surrounding, dtype, device),
+        contact=_mesh_contact(mesh, surrounding, dtype, device),
         obstacles=surrounding.obstacles,
         properties=properties,
         pattern=pattern(len(mesh.nodes), [mesh.faces, mesh.hinges.nodes], device),
@@ -102,8 +107,24 @@ def build_system(
     )
 
 
+def _mesh_contact(mesh: ClothMesh, surrounding: Surrounding, dtype: torch.dtype, device: torch.device) -> MeshContact | None:
+    if surrounding.reference_contact is None:
+        return None
+    return MeshContact.build(
+        mesh,
+        surrounding.obstacles,
+        surrounding.contact,
+        surrounding.reference_contact,
+        proximity=surrounding.proximity,
+        dtype=dtype,
+        device=device,
+    )
+
+
 def _halfspaces(mesh: ClothMesh, surrounding: Surrounding, dtype: torch.dtype, device: torch.device) -> HalfSpaces | None:
     """Planar obstacles as half-spaces, on the side where most of the cloth starts."""
+    if surrounding.reference_contact is not None:
+        return None
     planes = [plane for plane in (obstacle.plane() for obstacle in surrounding.obstacles) if plane is not None]
     if not planes:
         return None

@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from diffcloud.sim.contact import HalfSpaceContact
+from diffcloud.sim.contact.proximity import Proximity, ProximityContact
 from diffcloud.sim.energies.base import Geometry, Linearisation, geometry
-from diffcloud.sim.linear_solve import Factor
+from diffcloud.sim.linear_solve import Couplings, Factor
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.state import System
 
@@ -67,6 +68,7 @@ class StepTerms:
     geometry: Geometry
     energies: tuple[Linearisation, ...]
     contact: HalfSpaceContact | None
+    proximity: ProximityContact | None
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,8 @@ class StepProblem:
     """[H] node of each handle."""
     held: Held | None
     """None if no hard handle is active."""
+    proximity: Proximity | None = None
+    """Pairs of meshes that repel in this step."""
 
     @property
     def exact(self) -> bool:
@@ -160,10 +164,20 @@ class StepProblem:
                 values.friction_obstacle,
                 system.time_step,
             )
+        proximity = None
+        if self.proximity is not None and system.contact is not None:
+            proximity = self.proximity.at(
+                system.contact.all_points(start.positions),
+                system.contact.with_rest(start.velocities),
+                system.contact.with_rest(1 / values.node_mass),
+                (values.friction_obstacle, values.friction_cloth),
+                system.time_step,
+            )
         return StepTerms(
             shape,
             tuple(energy.at(shape, values) for energy in (system.stretching, system.bending)),
             contact,
+            proximity,
         )
 
     def _residual(self, u: Tensor, start: StepStart, terms: StepTerms) -> Tensor:
@@ -183,6 +197,8 @@ class StepProblem:
             force = force + energy.forces(displacement)
         if terms.contact is not None:
             force = force + terms.contact.forces(step, velocity)
+        if terms.proximity is not None:
+            force = force + terms.proximity.forces(step, velocity)
         if self.held is None and len(self.handle_nodes):
             offset = start.targets - (start.positions + dt * velocity)[:, self.handle_nodes]
             pull = (system.handles.stiffness * self.strength)[:, None] * offset
@@ -208,7 +224,17 @@ class StepProblem:
             own = values.node_mass[..., None, None] * identity
             diagonal = torch.where(self.held.mask[..., None], own, diagonal)
             blocks = [block * free for block, free in zip(blocks, self.held.free_blocks, strict=True)]
-        return system.pattern.factorise(diagonal, blocks)
+        return system.pattern.factorise(diagonal, blocks, self._couplings(terms))
+
+    def _couplings(self, terms: StepTerms) -> Couplings | None:
+        if terms.proximity is None:
+            return None
+        couplings = terms.proximity.couplings(self.system.time_step)
+        if self.held is None:
+            return couplings
+        mask = self.held.mask[:, 0]
+        free = ~(mask[couplings.rows] | mask[couplings.columns])
+        return Couplings(*(getattr(couplings, name)[free] for name in ("entry", "rows", "columns", "blocks")))
 
     def _backtrack(self, u: Tensor, direction: Tensor, residual: Tensor, start: StepStart) -> Tensor:
         """u + α direction, with α halved per batch entry while the residual grows."""

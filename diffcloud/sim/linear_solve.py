@@ -30,6 +30,20 @@ class NotPositiveDefiniteError(ArithmeticError):
         super().__init__(f"step matrix is not positive definite in batch entries {entries}")
 
 
+@dataclass(frozen=True)
+class Couplings:
+    """Blocks at places that the pattern need not have: Q pairs of nodes."""
+
+    entry: Tensor
+    """[Q] batch entry."""
+    rows: Tensor
+    """[Q] node"""
+    columns: Tensor
+    """[Q] node"""
+    blocks: Tensor
+    """[Q, 3, 3]; the blocks of all couplings together are symmetric."""
+
+
 class Factor(Protocol):
     """A factorised matrix."""
 
@@ -41,12 +55,13 @@ class Factor(Protocol):
 class MatrixPattern(Protocol):
     """Where the blocks of elements go."""
 
-    def factorise(self, diagonal: Tensor, blocks: Sequence[Tensor]) -> Factor:
+    def factorise(self, diagonal: Tensor, blocks: Sequence[Tensor], couplings: Couplings | None = None) -> Factor:
         """Assemble and factorise.
 
         Args:
             diagonal: [B, V, 3, 3].
             blocks: one [B, E, 3n, 3n] per element group of the pattern.
+            couplings: added on top, between any nodes.
 
         Raises:
             NotPositiveDefiniteError: names the batch entries.
@@ -75,11 +90,16 @@ class DensePattern:
         rows, columns = _entries(node_count, groups)
         return DensePattern(node_count, torch.as_tensor(rows * size + columns, device=device))
 
-    def factorise(self, diagonal: Tensor, blocks: Sequence[Tensor]) -> Factor:
+    def factorise(self, diagonal: Tensor, blocks: Sequence[Tensor], couplings: Couplings | None = None) -> Factor:
         size = 3 * self.node_count
         values = torch.cat([diagonal.flatten(1), *(block.flatten(1) for block in blocks)], dim=1)
         index = self.index.expand(len(values), -1)
         matrix = values.new_zeros(len(values), size * size).scatter_add_(1, index, values)
+        if couplings is not None:
+            axis = torch.arange(3, device=index.device)
+            rows = (couplings.entry * size + 3 * couplings.rows)[:, None, None] + axis[:, None]
+            place = rows * size + 3 * couplings.columns[:, None, None] + axis
+            matrix.view(-1).index_add_(0, place.flatten(), couplings.blocks.flatten())
         return DenseFactor(_cholesky(matrix.view(-1, size, size)))
 
 

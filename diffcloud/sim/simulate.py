@@ -62,7 +62,7 @@ def step(system: System, properties: Properties, schedule: HandleSchedule, state
         DivergedError: names the step and the batch entries.
     """
     state = _take_anchors(system, schedule, state)
-    problem, targets = _problem(system, schedule, state)
+    problem, targets = _problem(system, schedule, state, copies)
     start = StepStart(state.positions, state.velocities, targets.expand(properties.batch, -1, -1), properties)
     try:
         change = implicit_solve(problem, *start.tensors(), copies=copies)
@@ -75,6 +75,13 @@ def step(system: System, properties: Properties, schedule: HandleSchedule, state
         velocities = velocities + (projected - positions) / system.time_step
         positions = projected
     _refuse_divergence(positions, state.step + 1)
+    if system.contact is not None:
+        inverse_mass = 1 / properties.node_mass
+        if problem.held is not None:
+            inverse_mass = torch.where(problem.held.mask[:, 0], 0.0, inverse_mass)
+        resolved = system.contact.resolve(state.positions, positions, inverse_mass, step=state.step + 1, copies=copies)
+        velocities = velocities + (resolved - positions) / system.time_step
+        positions = resolved
     return State(positions, velocities, state.anchors, state.step + 1)
 
 
@@ -134,7 +141,7 @@ def _take_anchors(system: System, schedule: HandleSchedule, state: State) -> Sta
     return replace(state, anchors=state.anchors.index_copy(1, index, anchors))
 
 
-def _problem(system: System, schedule: HandleSchedule, state: State) -> tuple[StepProblem, Tensor]:
+def _problem(system: System, schedule: HandleSchedule, state: State, copies: int) -> tuple[StepProblem, Tensor]:
     """The equation of this step, and the targets [B, H, 3] of its active handles."""
     active = schedule.active[state.step]
     nodes, held = _held(system, schedule, tuple(np.flatnonzero(active)))
@@ -142,7 +149,10 @@ def _problem(system: System, schedule: HandleSchedule, state: State) -> tuple[St
     strength = schedule.strength[state.step]
     if len(nodes) < len(active):
         targets, strength = targets[:, active], strength[active]
-    return StepProblem(system, strength, nodes, held), targets
+    proximity = None
+    if system.contact is not None:
+        proximity = system.contact.near(state.positions[: len(state.positions) // copies])
+    return StepProblem(system, strength, nodes, held, proximity), targets
 
 
 def _held(system: System, schedule: HandleSchedule, active: tuple[int, ...]) -> tuple[Tensor, Held | None]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
-from diffcloud.sim.contact import HalfSpaces
+from diffcloud.sim.contact import HalfSpaces, MeshContact
 from diffcloud.sim.energies import Air, Bending, Handles, Stretching
 from diffcloud.sim.linear_solve import MatrixPattern
 from diffcloud.sim.properties import Properties
@@ -28,8 +28,11 @@ class System:
     air: Air
     handles: Handles
     halfspaces: HalfSpaces | None
+    """Planes only; None where `contact` covers them."""
+    contact: MeshContact | None
+    """Meshes and self-contact by proximity and impact zones."""
     obstacles: tuple[SurfaceMesh, ...]
-    """Meshes to draw; the planar ones are in `halfspaces` too."""
+    """Meshes to draw, and what contact is built from."""
     properties: Properties
     """Of the basis material, batch 1."""
     pattern: MatrixPattern
