@@ -35,6 +35,8 @@ _REACH = 0.01
 """[m] Candidate pairs are listed this far, and again once a point has moved half of it."""
 _TIME_TIE = 1e-4
 """Impacts in one interval of this length (of the step) count as simultaneous; then the order is that of the list."""
+_TOUCH = 1e-5
+"""[m] Added to the boxes; covers the tolerances of the detection."""
 _EXCHANGES = 40
 """Most exchanges of the active set before the slower, certain solver takes over."""
 _REGULAR = 1e-13
@@ -415,18 +417,14 @@ def _places(entry: Tensor, batch: int) -> Tensor:
 
 def _boxes_meet(pairs: MeetingPairs, start: Tensor, end: Tensor) -> Tensor:
     """[C] whether the boxes that both primitives sweep touch."""
-    both = torch.cat([start, end], 1)  # the four points twice
-    first = torch.where(pairs.edge_edge[:, None] == 1, both.new_tensor(_FIRST[1]), both.new_tensor(_FIRST[0]))[..., None]
-    inside, outside = both.masked_fill(first == 0, torch.inf), both.masked_fill(first == 1, torch.inf)
-    low = torch.stack([inside.amin(1), outside.amin(1)])
-    inside, outside = both.masked_fill(first == 0, -torch.inf), both.masked_fill(first == 1, -torch.inf)
-    high = torch.stack([inside.amax(1), outside.amax(1)])
-    return ((low[0] <= high[1] + _TOUCH) & (low[1] <= high[0] + _TOUCH)).all(-1)
-
-
-_FIRST = ((1, 0, 0, 0, 1, 0, 0, 0), (1, 1, 0, 0, 1, 1, 0, 0))
-_TOUCH = 1e-5
-"""[m] Covers the tolerances of the detection."""
+    is_edge = (pairs.edge_edge == 1)[:, None]
+    low, high = torch.minimum(start, end), torch.maximum(start, end)  # the second point belongs to the face or first edge
+    low_first = torch.where(is_edge, torch.minimum(low[:, 0], low[:, 1]), low[:, 0])
+    high_first = torch.where(is_edge, torch.maximum(high[:, 0], high[:, 1]), high[:, 0])
+    low_last, high_last = torch.minimum(low[:, 2], low[:, 3]), torch.maximum(high[:, 2], high[:, 3])
+    low_other = torch.where(is_edge, low_last, torch.minimum(low_last, low[:, 1]))
+    high_other = torch.where(is_edge, high_last, torch.maximum(high_last, high[:, 1]))
+    return ((low_first <= high_other + _TOUCH) & (low_other <= high_first + _TOUCH)).all(-1)
 
 
 def _describe(surface: ContactSurface, pairs: MeetingPairs) -> str:
