@@ -69,7 +69,9 @@ def build_system(
     if not time_step > 0 or newton_iterations < 1:
         raise SceneError(f"Time step and Newton iterations must be positive, got {time_step} s and {newton_iterations}.")
     if surrounding.reference_contact is not None and newton_iterations > 1:
-        raise SceneError("Contact by proximity and impact zones belongs to the linearised step; set newton_iterations to 1.")
+        raise SceneError(
+            "Contact by proximity and impact zones belongs to the linearised step; set newton_iterations to 1."
+        )
     for node in handles.nodes:
         if not 0 <= node < len(mesh.nodes):
             raise SceneError(f"A handle holds node {node}, but the cloth has nodes 0..{len(mesh.nodes) - 1}.")
@@ -107,7 +109,9 @@ def build_system(
     )
 
 
-def _mesh_contact(mesh: ClothMesh, surrounding: Surrounding, dtype: torch.dtype, device: torch.device) -> MeshContact | None:
+def _mesh_contact(
+    mesh: ClothMesh, surrounding: Surrounding, dtype: torch.dtype, device: torch.device
+) -> MeshContact | None:
     if surrounding.reference_contact is None:
         return None
     return MeshContact.build(

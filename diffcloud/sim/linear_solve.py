@@ -14,8 +14,9 @@ from typing import Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 _DENSE_NODES = 200
@@ -152,11 +153,17 @@ class BlockTridiagonalPattern:
             index=torch.as_tensor(np.where(below < 0, spare, flat), device=device),
         )
 
-    def factorise(self, diagonal: Tensor, blocks: Sequence[Tensor]) -> Factor:
+    def factorise(self, diagonal: Tensor, blocks: Sequence[Tensor], couplings: Couplings | None = None) -> Factor:
         values = torch.cat([diagonal.flatten(1), *(block.flatten(1) for block in blocks)], dim=1)
         count, width = self.block_count, self.width
         storage = values.new_zeros(len(values), 2 * count * width * width + 1)
         storage.scatter_add_(1, self.index.expand(len(values), -1), values)
+        if couplings is not None:
+            place, far = self._places(couplings)
+            if bool(far.any()):
+                return self._sparse(storage, couplings)
+            flat = couplings.entry[:, None, None] * storage.shape[1] + place
+            storage.view(-1).index_add_(0, flat.flatten(), couplings.blocks.flatten())
         matrix = storage[:, :-1].view(-1, 2, count, width, width)
         padding = count * width - 3 * self.node_count
         if padding:
@@ -171,6 +178,60 @@ class BlockTridiagonalPattern:
                 current = current - step.mT @ step
             lower.append(_cholesky(current))
         return BlockTridiagonalFactor(self, lower, coupling)
+
+    def _places(self, couplings: Couplings) -> tuple[Tensor, Tensor]:
+        """(place in the storage [Q, 3, 3], whether the coupling is outside of the three diagonals of blocks [Q])."""
+        axis = torch.arange(3, device=self.place.device)
+        rows = 3 * self.place[couplings.rows][:, None, None] + axis[:, None]
+        columns = 3 * self.place[couplings.columns][:, None, None] + axis
+        row_block, column_block, width = rows // self.width, columns // self.width, self.width
+        below = row_block - column_block
+        flat = ((below * self.block_count + row_block - below) * width + rows % width) * width + columns % width
+        spare = 2 * self.block_count * width * width
+        return torch.where(below < 0, spare, flat), (below.abs() > 1).flatten(1).any(1)
+
+    def _sparse(self, storage: Tensor, couplings: Couplings) -> SparseFactor:
+        """Where far couplings break the band: a sparse factor for each entry (scipy, on the CPU)."""
+        count, width, size = self.block_count, self.width, 3 * self.node_count
+        below, block, row, column = np.unravel_index(np.arange(2 * count * width**2), (2, count, width, width))
+        rows, columns = (block + below) * width + row, block * width + column
+        inside = (rows < size) & (columns < size)
+        rows, columns, under = rows[inside], columns[inside], below[inside] == 1
+        band = storage[:, :-1].cpu().numpy()[:, inside]
+        entry, nodes = couplings.entry.cpu().numpy(), (self.place[couplings.rows], self.place[couplings.columns])
+        first, second = (3 * node.cpu().numpy()[:, None, None] for node in nodes)
+        axis = np.arange(3)
+        first, second = np.broadcast_arrays(first + axis[:, None], second + axis)
+        extra = couplings.blocks.cpu().numpy()
+        factors, indefinite = [], []
+        for index, values in enumerate(band):
+            own = entry == index
+            matrix = csc_matrix((values, (rows, columns)), shape=(size, size))
+            matrix += csc_matrix((values[under], (columns[under], rows[under])), shape=(size, size))
+            matrix += csc_matrix((extra[own].ravel(), (first[own].ravel(), second[own].ravel())), shape=(size, size))
+            matrix.eliminate_zeros()
+            # pivots on the diagonal, as a symmetric matrix allows: they are positive where it is positive definite
+            factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+            factors.append(factor)
+            if not (factor.U.diagonal() > 0).all():
+                indefinite.append(index)
+        if indefinite:
+            raise NotPositiveDefiniteError(indefinite)
+        return SparseFactor(self, factors)
+
+
+@dataclass(frozen=True)
+class SparseFactor:
+    """One sparse LU factor for each entry."""
+
+    pattern: BlockTridiagonalPattern
+    factors: list[SuperLU]
+
+    def solve(self, right: Tensor) -> Tensor:
+        columns = _copies_as_columns(right[:, self.pattern.order], len(self.factors))
+        solved = [factor.solve(column.cpu().numpy()) for factor, column in zip(self.factors, columns, strict=True)]
+        solution = torch.as_tensor(np.stack(solved), dtype=right.dtype, device=right.device)
+        return _columns_as_copies(solution, right)[:, self.pattern.place]
 
 
 @dataclass(frozen=True)

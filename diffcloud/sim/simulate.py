@@ -79,7 +79,14 @@ def step(system: System, properties: Properties, schedule: HandleSchedule, state
         inverse_mass = 1 / properties.node_mass
         if problem.held is not None:
             inverse_mass = torch.where(problem.held.mask[:, 0], 0.0, inverse_mass)
-        resolved = system.contact.resolve(state.positions, positions, inverse_mass, step=state.step + 1, copies=copies)
+        resolved = system.contact.resolve(
+            state.positions,
+            positions,
+            inverse_mass,
+            (properties.friction_obstacle, properties.friction_cloth),
+            step=state.step + 1,
+            copies=copies,
+        )
         velocities = velocities + (resolved - positions) / system.time_step
         positions = resolved
     return State(positions, velocities, state.anchors, state.step + 1)

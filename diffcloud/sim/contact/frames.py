@@ -11,7 +11,6 @@ where c·d = 0.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -60,9 +59,9 @@ class MeetingPairs:
         tensors = (self.edge_edge, self.entry, self.points, self.primitives, self.area)
         return MeetingPairs(*(tensor[keep] for tensor in tensors))
 
-    def and_then(self, others: Sequence[MeetingPairs]) -> MeetingPairs:
-        """This list and the others, one after the other."""
-        parts = [(p.edge_edge, p.entry, p.points, p.primitives, p.area) for p in (self, *others)]
+    def then(self, others: MeetingPairs) -> MeetingPairs:
+        """These pairs, then the others."""
+        parts = [(p.edge_edge, p.entry, p.points, p.primitives, p.area) for p in (self, others)]
         return MeetingPairs(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
 
     def gather(self, field: Tensor) -> Tensor:

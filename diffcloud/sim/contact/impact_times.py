@@ -103,7 +103,7 @@ def first_impacts(pairs: MeetingPairs, start: Tensor, end: Tensor, smallest: flo
     chosen = pairs.where(pair)
     frames = chosen.frames(at)
     meet = (frames.square > 0) & (frames.square >= smallest)
-    meet &= ((frames.normals * along(frames.weights, at)).sum(-1).abs() <= _COPLANAR)
+    meet &= (frames.normals * along(frames.weights, at)).sum(-1).abs() <= _COPLANAR
     meet &= chosen.covers(frames.weights, _OUTSIDE)
     pair, time = pair[meet], time[meet]
     first = torch.ones_like(pair, dtype=torch.bool)

@@ -17,7 +17,7 @@ through the replay.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -29,6 +29,7 @@ from diffcloud.sim.contact.frames import Frames, MeetingPairs, along
 from diffcloud.sim.contact.impact_times import first_impacts, meeting_time
 from diffcloud.sim.contact.pairs import candidates
 from diffcloud.sim.contact.surface import ContactSurface
+from diffcloud.sim.elements import safe_norm
 
 _PASSES = 100
 _REACH = 0.01
@@ -43,6 +44,9 @@ _REGULAR = 1e-13
 """Added to the unit diagonal of the dual problem: redundant constraints (a point met twice) then share their force."""
 _HARD = 1e-7
 """Instead of it where an entry's constraints contradict each other: they are then met in the sense of least squares."""
+
+_CONTRADICTION = 1e-6
+"""Part of the largest correction by which a constraint may stay unmet before the entry counts as contradictory."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +82,28 @@ class Constraints:
     place: Tensor
     """[J] row among the constraints of the entry."""
 
-    def __len__(self) -> int:
-        return len(self.time)
+    def repeated(self, copies: int, batch: int) -> Constraints:
+        """The same for `copies` copies of a batch, copies outermost."""
+        if copies == 1:
+            return self
+        tensors = (self.time, self.sign, self.weights, self.normals, self.place)
+        repeated = (tensor.repeat(copies, *[1] * (tensor.dim() - 1)) for tensor in tensors)
+        return Constraints(self.pairs.repeated(copies, batch), *repeated)
+
+    def then(self, new: Constraints, batch: int) -> Constraints:
+        """These and new ones, whose rows follow in each entry."""
+        used = torch.bincount(self.pairs.entry, minlength=batch)
+        new = replace(new, place=new.place + used[new.pairs.entry])
+        names = ("time", "sign", "weights", "normals", "place")
+        joined = (torch.cat([getattr(self, name), getattr(new, name)]) for name in names)
+        return Constraints(self.pairs.then(new.pairs), *joined)
+
+    def frames(self, start: Tensor, places: Tensor) -> Frames:
+        """Weights and normals of these impacts, differentiable in the motion [B, N, 3] from start to places."""
+        begin, end = self.pairs.gather(start), self.pairs.gather(places)
+        time = meeting_time(self.pairs, self.time, begin, end)
+        frames = self.pairs.frames(begin + time[:, None, None] * (end - begin))
+        return replace(frames, normals=self.sign[:, None] * frames.normals)
 
 
 def resolve(
@@ -88,10 +112,10 @@ def resolve(
     start: Tensor,
     candidate: Tensor,
     inverse_mass: Tensor,
+    friction: tuple[Tensor, Tensor],
     *,
     step: int,
     copies: int = 1,
-    friction: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
     """Positions after the impacts of a step.
 
@@ -99,9 +123,9 @@ def resolve(
         start: [B, N, 3] points at the start of the step, free of intersections.
         candidate: [B, N, 3] points at its end, before contact.
         inverse_mass: [B, N] [1/kg]; zero for points that cannot move.
+        friction: Coulomb coefficients [B] with obstacles and among cloth; used where the settings ask for friction.
         step: named in the error.
         copies: see `adjoint.implicit_solve`.
-        friction: Coulomb coefficients [B] with obstacles and among cloth, where the settings ask for friction.
 
     Returns:
         [B, N, 3], differentiable in start, candidate, inverse_mass and friction.
@@ -110,12 +134,22 @@ def resolve(
         UnresolvedContactError: 100 passes did not suffice.
     """
     batch = len(start) // copies
-    with torch.no_grad():
-        finder = _Finder(surface, settings, start[:batch].detach(), candidate[:batch].detach(), inverse_mass[:batch].detach())
-        history = finder.run(step)
-    if not history:
+
+    def project(wanted: Tensor) -> _Projection | None:
+        with torch.no_grad():
+            first = slice(batch)
+            given = (tensor[first].detach() for tensor in (start, wanted, inverse_mass))
+            history = _Finder(surface, settings, *given).run(step)
+        return _replay(history, settings, start, wanted, inverse_mass, copies) if history else None
+
+    found = project(candidate)
+    if found is None:
         return candidate
-    return _replay(history, settings, start, candidate, inverse_mass, copies)
+    if not settings.friction:
+        return found.places
+    slowed = candidate + found.friction(surface, start, inverse_mass, friction)
+    found = project(slowed)
+    return slowed if found is None else found.places
 
 
 @dataclass(frozen=True)
@@ -130,6 +164,14 @@ class _Pass:
     """bool [B, R] of the rows, after the projection."""
     regular: Tensor
     """[B] regularisation used."""
+
+    def newest(self) -> Constraints:
+        """The impacts that this pass added."""
+        all_, new = self.constraints, slice(len(self.constraints.time) - self.fresh, None)
+        index = torch.arange(len(all_.time), device=all_.time.device)[new]
+        return Constraints(
+            all_.pairs.where(index), all_.time[new], all_.sign[new], all_.weights[new], all_.normals[new], all_.place[new]
+        )
 
 
 class _Finder:
@@ -155,10 +197,11 @@ class _Finder:
             if impacts is None:
                 return history
             constraints, fresh = impacts
+            before = None
             if history:
-                constraints = _append(history[-1].constraints, constraints, len(self.start))
-            before = history[-1].active if history else None
-            rows = dual_rows(constraints, constraints.weights, constraints.normals, self.inverse_mass)
+                constraints = history[-1].constraints.then(constraints, len(self.start))
+                before = history[-1].active
+            rows = dual_rows(constraints, self.inverse_mass)
             target = self.settings.thickness - rows.apply(self.candidate)
             force, regular = solve_dual(rows, target, before)
             history.append(_Pass(constraints, fresh, force > 0, regular))
@@ -251,20 +294,22 @@ class DualRows:
         full = change.new_zeros(len(force), self.point_count, 3)
         return full.index_copy(1, self.points, change)
 
-    def gram(self) -> Tensor:
-        """[B, R, R] W M⁻¹ Wᵀ."""
-        flat = self.matrix.flatten(2)
-        return (self.matrix * self.inverse_mass[:, None, :, None]).flatten(2) @ flat.mT
+    def scaled(self, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The dual problem with unit diagonal: (S W M⁻¹ Wᵀ S [B, R, R], S target [B, R], S [B, R])."""
+        gram = (self.matrix * self.inverse_mass[:, None, :, None]).flatten(2) @ self.matrix.flatten(2).mT
+        scale = gram.detach().diagonal(dim1=1, dim2=2).clamp(min=1e-300).rsqrt()
+        scale = torch.where(self.used, scale, 0.0)
+        return gram * scale[:, :, None] * scale[:, None, :], target * scale, scale
 
 
-def dual_rows(constraints: Constraints, weights: Tensor, normals: Tensor, inverse_mass: Tensor) -> DualRows:
-    """Rows n_j · Σ w_jk x_k."""
+def dual_rows(constraints: Constraints, inverse_mass: Tensor) -> DualRows:
+    """Rows n_j · Σ w_jk x_k, for inverse masses [B, N]."""
     pairs, place = constraints.pairs, constraints.place
     batch, point_count = inverse_mass.shape
     count = int(place.max()) + 1
     points, position = torch.unique(pairs.points, return_inverse=True)
     index = ((pairs.entry * count + place)[:, None] * len(points) + position).flatten()
-    values = (weights[..., None] * normals[:, None]).flatten(0, 1)
+    values = (constraints.weights[..., None] * constraints.normals[:, None]).flatten(0, 1)
     matrix = values.new_zeros(batch * count * len(points), 3).index_add(0, index, values)
     used = torch.zeros(batch * count, dtype=torch.bool, device=index.device)
     used[pairs.entry * count + place] = True
@@ -286,18 +331,14 @@ def solve_dual(rows: DualRows, target: Tensor, guess: Tensor | None = None) -> t
     Returns:
         (λ [B, R], regularisation [B] of the unit-diagonal problem).
     """
-    gram = rows.gram()
-    scale = gram.diagonal(dim1=1, dim2=2).clamp(min=1e-300).rsqrt()
-    scale = torch.where(rows.used, scale, 0.0)
-    matrix = gram * scale[:, :, None] * scale[:, None, :]
-    right = torch.where(rows.used, target * scale, 0.0)
+    matrix, right, scale = rows.scaled(target)
     active = right > 0
     if guess is not None:
         active[:, : guess.shape[1]] |= guess
     active &= rows.used
     regular = right.new_full((len(right),), _REGULAR)
     tolerance = 1e-12 * right.abs().amax(1, keepdim=True)
-    force = torch.zeros_like(right)
+    force, lacking = right, right
     wrong = torch.ones_like(regular, dtype=torch.bool)
     for _ in range(_EXCHANGES):
         force = solve_active(matrix, right, active, regular)
@@ -307,7 +348,8 @@ def solve_dual(rows: DualRows, target: Tensor, guess: Tensor | None = None) -> t
         if not bool(wrong.any()):
             break
         active = following
-    for entry in wrong.nonzero().flatten().tolist():  # rare: entries whose active set cycles
+    wrong |= (lacking > _CONTRADICTION * right.abs().amax(1, keepdim=True)).any(1)
+    for entry in wrong.nonzero().flatten().tolist():  # rare: the active set cycles, or there is no solution
         exact, contradiction = _least_distance(matrix[entry], right[entry])
         if contradiction:
             regular[entry] = _HARD
@@ -327,83 +369,86 @@ def solve_active(matrix: Tensor, right: Tensor, active: Tensor, regular: Tensor)
 def _least_distance(matrix: Tensor, right: Tensor) -> tuple[Tensor, bool]:
     """(active set [R], whether the constraints contradict each other) by non-negative least squares.
 
-    λᵀ A λ / 2 - rightᵀ λ over λ >= 0 is |L ᵀλ - L⁻¹ right|² / 2 with A + ε = L Lᵀ.
+    λᵀ A λ / 2 - rightᵀ λ over λ >= 0 is |Lᵀ λ - L⁻¹ right|² / 2 with A + ε = L Lᵀ.
     """
-    values = matrix.cpu().numpy()
-    target = right.cpu().numpy()
-    for regular in (_REGULAR, _HARD):
-        lower = np.linalg.cholesky(values + max(regular, 1e-12) * np.eye(len(values)))
+    values, target = matrix.cpu().numpy(), right.cpu().numpy()
+
+    def active(regular: float) -> tuple[Tensor, float]:
+        lower = np.linalg.cholesky(values + regular * np.eye(len(values)))
         force, _ = nnls(lower.T, np.linalg.solve(lower, target), maxiter=30 * len(values))
-        lacking = float((target - values @ force).max())
-        if lacking <= 1e-6 * float(np.abs(target).max()):
-            return torch.as_tensor(force > 0, device=matrix.device), False
-    return torch.as_tensor(force > 0, device=matrix.device), True
+        return torch.as_tensor(force > 0, device=matrix.device), float((target - values @ force).max())
+
+    found, lacking = active(10 * _REGULAR)
+    if lacking <= _CONTRADICTION * float(np.abs(target).max()):
+        return found, False
+    return active(_HARD)[0], True
+
+
+@dataclass(frozen=True)
+class _Projection:
+    """The end of the passes."""
+
+    places: Tensor
+    """[B, N, 3]"""
+    pairs: MeetingPairs
+    weights: Tensor
+    """[J, 4]"""
+    normals: Tensor
+    """[J, 3]"""
+    force: Tensor
+    """[J] λ: the impulse times the time step [kg·m]."""
+
+    def friction(
+        self, surface: ContactSurface, start: Tensor, inverse_mass: Tensor, coefficients: tuple[Tensor, Tensor]
+    ) -> Tensor:
+        """[B, N, 3] displacement by Coulomb friction: at most μ λ against the sliding of each impact, and no reversal.
+
+        All impacts act at once; where several share a point each gets its share of the mass (Tonge, Benevolenski &
+        Voroshilov 2012), so that together they do not reverse the sliding either.
+        """
+        pairs = self.pairs
+        moved = along(self.weights, pairs.gather(self.places) - pairs.gather(start))
+        sliding = moved - (self.normals * moved).sum(-1, keepdim=True) * self.normals
+        with_obstacle = (pairs.points >= surface.cloth_points).any(1)
+        obstacle, cloth = (coefficient[pairs.entry] for coefficient in coefficients)
+        limit = torch.where(with_obstacle, obstacle, cloth) * self.force
+        batch, count = inverse_mass.shape
+        index = (pairs.entry[:, None] * count + pairs.points).flatten()
+        acting = (self.force.detach() > 0).to(limit.dtype).repeat_interleave(4)
+        shared = limit.new_zeros(batch * count).index_add(0, index, acting)
+        mobility = pairs.gather(inverse_mass)
+        sticking = limit * (self.weights.square() * mobility * shared[index].view(-1, 4)).sum(-1)
+        gamma = limit / torch.maximum(safe_norm(sliding), sticking)
+        change = -(self.weights * mobility * gamma[:, None])[..., None] * sliding[:, None]
+        return torch.zeros_like(start).flatten(0, 1).index_add(0, index, change.flatten(0, 1)).view_as(start)
 
 
 def _replay(
     history: list[_Pass], settings: ImpactSettings, start: Tensor, candidate: Tensor, inverse_mass: Tensor, copies: int
-) -> Tensor:
-    """The passes again, as differentiable expressions on their active sets."""
+) -> _Projection:
+    """The passes again, as differentiable expressions on their active sets.
+
+    Where weights and normals count as constants only the last pass matters.
+    """
     batch = len(start) // copies
-    places = candidate
-    weights: list[Tensor] = []
+    places, force = candidate, candidate.new_zeros(0)
+    weights: list[Tensor] = []  # of the impacts of each pass, [K, J, ...]
     normals: list[Tensor] = []
-    steps = history if settings.differentiate_normals else history[-1:]
-    for index, found in enumerate(steps):
-        constraints = _repeated(found.constraints, copies, batch)
+    constraints = history[-1].constraints
+    for found in history if settings.differentiate_normals else history[-1:]:
+        constraints = found.constraints.repeated(copies, batch)
         if settings.differentiate_normals:
-            fresh = slice(len(found.constraints) - found.fresh, None)
-            pairs, time, sign = (
-                found.constraints.pairs.where(torch.arange(len(found.constraints), device=start.device)[fresh]).repeated(
-                    copies, batch
-                ),
-                found.constraints.time[fresh].repeat(copies),
-                found.constraints.sign[fresh].repeat(copies),
-            )
-            begin, end = pairs.gather(start), pairs.gather(places)
-            time = meeting_time(pairs, time, begin, end)
-            frames = pairs.frames(begin + time[:, None, None] * (end - begin))
+            frames = found.newest().repeated(copies, batch).frames(start, places)
             weights.append(frames.weights.unflatten(0, (copies, -1)))
-            normals.append((sign[:, None] * frames.normals).unflatten(0, (copies, -1)))
-            all_weights = torch.cat(weights, 1).flatten(0, 1)
-            all_normals = torch.cat(normals, 1).flatten(0, 1)
-        else:
-            all_weights, all_normals = constraints.weights, constraints.normals
-        rows = dual_rows(constraints, all_weights, all_normals, inverse_mass)
-        target = settings.thickness - rows.apply(candidate)
-        gram = rows.gram()
-        scale = gram.detach().diagonal(dim1=1, dim2=2).clamp(min=1e-300).rsqrt()
-        scale = torch.where(rows.used, scale, 0.0)
-        active, regular = found.active.repeat(copies, 1), found.regular.repeat(copies)
-        force = solve_active(gram * scale[:, :, None] * scale[:, None, :], target * scale, active, regular) * scale
+            normals.append(frames.normals.unflatten(0, (copies, -1)))
+            all_weights, all_normals = torch.cat(weights, 1).flatten(0, 1), torch.cat(normals, 1).flatten(0, 1)
+            constraints = replace(constraints, weights=all_weights, normals=all_normals)
+        rows = dual_rows(constraints, inverse_mass)
+        matrix, right, scale = rows.scaled(settings.thickness - rows.apply(candidate))
+        force = solve_active(matrix, right, found.active.repeat(copies, 1), found.regular.repeat(copies)) * scale
         places = candidate + (1 - settings.residue) * rows.move(force)
-    return places
-
-
-def _repeated(constraints: Constraints, copies: int, batch: int) -> Constraints:
-    if copies == 1:
-        return constraints
-    return Constraints(
-        constraints.pairs.repeated(copies, batch),
-        constraints.time.repeat(copies),
-        constraints.sign.repeat(copies),
-        constraints.weights.repeat(copies, 1),
-        constraints.normals.repeat(copies, 1),
-        constraints.place.repeat(copies),
-    )
-
-
-def _append(old: Constraints, new: Constraints, batch: int) -> Constraints:
-    """The constraints of both; the rows of the new ones follow those of the old in each entry."""
-    used = torch.bincount(old.pairs.entry, minlength=batch)
-    return Constraints(
-        old.pairs.and_then([new.pairs]),
-        torch.cat([old.time, new.time]),
-        torch.cat([old.sign, new.sign]),
-        torch.cat([old.weights, new.weights]),
-        torch.cat([old.normals, new.normals]),
-        torch.cat([old.place, new.place + used[new.pairs.entry]]),
-    )
+    each = force[constraints.pairs.entry, constraints.place]
+    return _Projection(places, constraints.pairs, constraints.weights, constraints.normals, each)
 
 
 def _places(entry: Tensor, batch: int) -> Tensor:

@@ -32,6 +32,8 @@ class ReferenceContact:
     """Part of each impact correction that is left out; decides ties in the next step."""
     differentiate_normals: bool = True
     """Whether derivatives include how times, weights and normals of impacts move."""
+    impact_friction: bool = False
+    """Whether impacts rub too; in the original only proximity does."""
 
     @staticmethod
     def as_published() -> ReferenceContact:
@@ -73,7 +75,11 @@ class MeshContact:
             start = torch.cat([torch.as_tensor(cloth.nodes, dtype=dtype, device=device)[None], points], dim=1)
             slots = Slots.build(surface, repulsion, start)
         impacts = ImpactSettings(
-            numbers.projection_thickness, choices.smallest, choices.residue, choices.differentiate_normals
+            numbers.projection_thickness,
+            choices.smallest,
+            choices.residue,
+            choices.differentiate_normals,
+            choices.impact_friction,
         )
         return MeshContact(surface, points, impacts, repulsion, slots)
 
@@ -93,9 +99,16 @@ class MeshContact:
         return find_proximity(self.surface, self.proximity, self.slots, self.all_points(positions))
 
     def resolve(
-        self, start: Tensor, candidate: Tensor, inverse_mass: Tensor, *, step: int, copies: int = 1
+        self,
+        start: Tensor,
+        candidate: Tensor,
+        inverse_mass: Tensor,
+        friction: tuple[Tensor, Tensor],
+        *,
+        step: int,
+        copies: int = 1,
     ) -> Tensor:
-        """[B, V, 3] candidate positions with all impacts since `start` resolved.
+        """[B, V, 3] candidate positions with all impacts since `start` resolved; see `impact_zones.resolve`.
 
         Raises:
             UnresolvedContactError: names step, batch entries and a pair.
@@ -106,6 +119,7 @@ class MeshContact:
             self.all_points(start),
             self.all_points(candidate),
             self.with_rest(inverse_mass),
+            friction,
             step=step,
             copies=copies,
         )

@@ -1,9 +1,9 @@
 """Repulsion and lagged friction between meshes, as terms of the linearised step (ARCSim).
 
-A pair at signed distance h, with n turned so that h > 0, has C = h - τ and the violation c = max(-C, 0). Energy
-K c³/(6 τ) with K = k_c times the smaller area; force K c²/(2 τ) along n, stiffness K c/τ, shared over the four points by the
-weights w. Friction is γ = min(μ f_n/|P v|, 1/(Δt Σ w_k²/m_k)) times the sliding velocity P v, P = I - n nᵀ, with f_n and v of
-the start of the step in γ and implicit in the sliding velocity itself.
+A pair at distance h, with n turned so that h > 0, violates the thickness τ by c = max(τ - h, 0). Energy K c³/(6 τ) with
+K = k_c times the smaller area; force K c²/(2 τ) along n, stiffness K c/τ, shared over the four points by the weights w.
+Friction is γ = min(μ f_n/|P v|, 1/(Δt Σ w_k²/m_k)) times the sliding velocity P v, P = I - n nᵀ. In γ the force f_n and
+the velocity v = Σ w_k v_k are those of the start of the step; the sliding velocity itself is implicit.
 
 Which pairs. Each point, edge and face has a slot on each of its two sides that keeps only the nearest pair. A pair that
 holds two slots counts twice in the original (`count_once` off).
@@ -11,7 +11,7 @@ holds two slots counts twice in the original (`count_once` off).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -56,19 +56,16 @@ class Slots:
         Args:
             points: [1, N, 3] at the start; obstacles do not move.
         """
-        slots = 2 * (len(surface.points) + len(surface.faces) + len(surface.edges))
-        empty = points.new_full((slots,), torch.inf)
-        found = Slots(len(surface.points), len(surface.faces), empty)
-        owner = surface.owner.clone()
-        owner[: surface.cloth_points] = -1
+        empty = points.new_full((2 * (len(surface.points) + len(surface.faces) + len(surface.edges)),), torch.inf)
+        slots = Slots(len(surface.points), len(surface.faces), empty)
         pairs = MeetingPairs.join(candidates(surface, (points,), settings.thickness, among_fixed=True))
-        between = surface.owner[pairs.points]
-        pairs = pairs.where((between > 0).all(1) & (between[:, 0] != between[:, 3]))
-        near, distance, _ = _near(surface, settings, pairs, points)
-        if not len(near):
-            return found
-        index = found.index(surface, near, points)
-        return Slots(found.point_count, found.face_count, empty.scatter_reduce(0, index.flatten(), distance.repeat_interleave(2), "amin"))
+        owner = surface.owner[pairs.points]
+        pairs = pairs.where((owner > 0).all(1) & (owner[:, 0] != owner[:, 3]))
+        pairs, distance, _ = _near(surface, settings, pairs, points)
+        if not len(pairs):
+            return slots
+        index = slots.index(surface, pairs, points).flatten()
+        return replace(slots, held=empty.scatter_reduce(0, index, distance.repeat_interleave(2), "amin"))
 
     def index(self, surface: ContactSurface, pairs: MeetingPairs, points: Tensor) -> Tensor:
         """[C, 2] the slot, within its entry, that a pair takes of each of its primitives."""

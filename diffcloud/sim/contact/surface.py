@@ -70,7 +70,7 @@ class ContactSurface:
         points = [np.arange(len(cloth.nodes))]
         edges, faces = [cloth.edges[0]], [cloth.faces]
         edge_area = [_spread(cloth.edges[1], cloth.face_area)]
-        edge_faces = [cloth.edges[1]]
+        edge_faces: list[NDArray[np.int64]] = [cloth.edges[1]]
         face_area, point_area = [cloth.face_area], [cloth.node_area]
         owner = [np.zeros(len(cloth.nodes), dtype=np.int64)]
         count, face_count = len(cloth.nodes), len(cloth.faces)
@@ -79,7 +79,7 @@ class ContactSurface:
             area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
             kept, sides = directed_edges(mesh.faces) if all_edges else _sharp_edges(mesh)
             used = np.unique(kept)
-            per_point = np.bincount(mesh.faces.ravel(), np.repeat(area / 3, 3), len(mesh.nodes))
+            per_point = np.bincount(mesh.faces.ravel(), np.repeat(area / 3, 3), len(mesh.nodes)).astype(np.float64)
             points.append(used + count)
             point_area.append(per_point[used])
             edges.append(kept + count)
