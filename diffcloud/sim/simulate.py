@@ -148,7 +148,7 @@ def _take_anchors(system: System, schedule: HandleSchedule, state: State) -> Sta
     return replace(state, anchors=state.anchors.index_copy(1, index, anchors))
 
 
-def _problem(system: System, schedule: HandleSchedule, state: State, copies: int) -> tuple[StepProblem, Tensor]:
+def _problem(system: System, schedule: HandleSchedule, state: State, copies: int = 1) -> tuple[StepProblem, Tensor]:
     """The equation of this step, and the targets [B, H, 3] of its active handles."""
     active = schedule.active[state.step]
     nodes, held = _held(system, schedule, tuple(np.flatnonzero(active)))

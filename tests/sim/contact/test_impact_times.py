@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -73,7 +75,7 @@ def test_first_impact_agrees_with_dense_sampling(motion, generator):
     times = torch.linspace(0, 1, samples, dtype=torch.float64)
     expected = torch.full((len(start),), torch.inf, dtype=torch.float64)
     before = coplanarity(pairs, start)
-    for low, high in zip(times[:-1], times[1:], strict=True):
+    for low, high in itertools.pairwise(times):
         now = coplanarity(pairs, start + high * (end - start))
         middle = pairs.frames(start + 0.5 * (low + high) * (end - start)).weights
         hit = (before.sign() != now.sign()) & pairs.covers(middle, 0.0) & torch.isinf(expected)

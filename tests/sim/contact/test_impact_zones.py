@@ -145,9 +145,9 @@ def test_nothing_has_passed_and_momentum_is_kept():
 def test_no_impact_leaves_the_candidate_alone():
     fall = Fall()
     candidate = fall.candidate(0.01)
-    assert resolve(fall.surface, ImpactSettings(THICKNESS), fall.start, candidate, fall.inverse_mass, NO_FRICTION, step=1) is (
-        candidate
-    )
+    assert resolve(
+        fall.surface, ImpactSettings(THICKNESS), fall.start, candidate, fall.inverse_mass, NO_FRICTION, step=1
+    ) is (candidate)
 
 
 def test_entries_of_a_batch_do_not_see_each_other():
@@ -156,7 +156,13 @@ def test_entries_of_a_batch_do_not_see_each_other():
     candidate = torch.cat([fall.candidate(d) for d in distances])
     settings = ImpactSettings(THICKNESS)
     batch = resolve(
-        fall.surface, settings, fall.start.expand(3, -1, -1), candidate, fall.inverse_mass.expand(3, -1), NO_FRICTION, step=1
+        fall.surface,
+        settings,
+        fall.start.expand(3, -1, -1),
+        candidate,
+        fall.inverse_mass.expand(3, -1),
+        NO_FRICTION,
+        step=1,
     )
     for index, distance in enumerate(distances):
         single = resolve(
@@ -213,9 +219,7 @@ def test_friction_takes_at_most_the_coulomb_share():
     lift = 0.02 + THICKNESS
     for coefficient, left in ((0.0, 0.02), (0.4, 0.02 - 0.4 * lift), (2.0, 0.0)):
         mu = torch.full((1,), coefficient, dtype=torch.float64)
-        found = resolve(
-            surface, ImpactSettings(THICKNESS, friction=True), start, candidate, inverse_mass, (mu, mu), step=1
-        )
+        found = resolve(surface, ImpactSettings(THICKNESS, friction=True), start, candidate, inverse_mass, (mu, mu), step=1)
         assert float(found[0, 0, 2]) == pytest.approx(THICKNESS, abs=1e-12)
         assert float(found[0, 0, 0]) == pytest.approx(left, abs=1e-12)
 
