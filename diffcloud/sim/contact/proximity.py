@@ -251,9 +251,10 @@ def face_normals(surface: ContactSurface, points: Tensor) -> Tensor:
 
 
 def point_normals(surface: ContactSurface, points: Tensor) -> Tensor:
-    """[B, N, 3] normals (not of unit length) after Max 1999: sum over corners of (e1 × e2)/(|e1|² |e2|²)."""
+    """[B, N, 3] unit normals after Max 1999: along the sum over corners of (e1 × e2)/(|e1|² |e2|²)."""
     corner = points[:, surface.faces]  # [B, F, 3, 3]
     following, before = corner.roll(-1, 2) - corner, corner.roll(1, 2) - corner
     weight = (following.square().sum(-1) * before.square().sum(-1)).clamp(min=1e-300)
     share = torch.linalg.cross(following, before) / weight[..., None]
-    return torch.zeros_like(points).index_add(1, surface.faces.flatten(), share.flatten(1, 2))
+    total = torch.zeros_like(points).index_add(1, surface.faces.flatten(), share.flatten(1, 2))
+    return total / safe_norm(total)[..., None]
