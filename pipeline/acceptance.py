@@ -49,7 +49,7 @@ def acceptance(
     else:
         write_text(out / "trajectories.md", _trajectories(release, reference))
     write_text(out / "simulated_clouds.md", _simulated_clouds(release))
-    timings = run_benchmarks(_scene(release, "release_lift"), repeats=3, device="cpu")
+    timings = run_benchmarks({name: _scene(release, name) for name in SCENES}, repeats=3, device="cpu")
     write_text(out / "speed.md", _speed(timings))
     if not skip_fits:
         write_text(out / "simulated_fits.md", _simulated_fits(release))
@@ -254,8 +254,8 @@ def _trajectories(release: Path, reference: Path) -> str:
         [
             "# Agreement with the reference simulator",
             "",
-            "Node distances in release units to recorded reference runs. After contact the reference is chaotic: it matters "
-            "which of two nearly simultaneous impacts is resolved first, and which of two equally near nodes is pushed.",
+            "Node distances in release units to recorded reference runs. After contact the reference is chaotic: which of "
+            "two nearly simultaneous impacts comes first, and which of two equally near nodes is pushed, decides branches.",
             "",
             *_markdown(head, rows),
             "",
