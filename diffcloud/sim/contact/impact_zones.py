@@ -40,8 +40,9 @@ _TOUCH = 1e-5
 """[m] Added to the boxes; covers the tolerances of the detection."""
 _EXCHANGES = 40
 """Most exchanges of the active set before the slower, certain solver takes over."""
-_REGULAR = 1e-13
-"""Added to the unit diagonal of the dual problem: redundant constraints (a point met twice) then share their force."""
+_REGULAR = 500
+"""Units of rounding added to the unit diagonal of the dual problem: redundant constraints (a point met twice) then share
+their force."""
 _HARD = 1e-7
 """Instead of it where an entry's constraints contradict each other: they are then met in the sense of least squares."""
 
@@ -336,8 +337,9 @@ def solve_dual(rows: DualRows, target: Tensor, guess: Tensor | None = None) -> t
     if guess is not None:
         active[:, : guess.shape[1]] |= guess
     active &= rows.used
-    regular = right.new_full((len(right),), _REGULAR)
-    tolerance = 1e-12 * right.abs().amax(1, keepdim=True)
+    rounding = torch.finfo(right.dtype).eps
+    regular = right.new_full((len(right),), _REGULAR * rounding)
+    tolerance = 10 * _REGULAR * rounding * right.abs().amax(1, keepdim=True)
     force, lacking = right, right
     wrong = torch.ones_like(regular, dtype=torch.bool)
     for _ in range(_EXCHANGES):
@@ -348,7 +350,7 @@ def solve_dual(rows: DualRows, target: Tensor, guess: Tensor | None = None) -> t
         if not bool(wrong.any()):
             break
         active = following
-    wrong |= (lacking > _CONTRADICTION * right.abs().amax(1, keepdim=True)).any(1)
+    wrong |= (lacking > max(_CONTRADICTION, 1e5 * rounding) * right.abs().amax(1, keepdim=True)).any(1)
     for entry in wrong.nonzero().flatten().tolist():  # rare: the active set cycles, or there is no solution
         exact, contradiction = _least_distance(matrix[entry], right[entry])
         if contradiction:
@@ -371,14 +373,14 @@ def _least_distance(matrix: Tensor, right: Tensor) -> tuple[Tensor, bool]:
 
     λᵀ A λ / 2 - rightᵀ λ over λ >= 0 is |Lᵀ λ - L⁻¹ right|² / 2 with A + ε = L Lᵀ.
     """
-    values, target = matrix.cpu().numpy(), right.cpu().numpy()
+    values, target = matrix.double().cpu().numpy(), right.double().cpu().numpy()
 
     def active(regular: float) -> tuple[Tensor, float]:
         lower = np.linalg.cholesky(values + regular * np.eye(len(values)))
         force, _ = nnls(lower.T, np.linalg.solve(lower, target), maxiter=30 * len(values))
         return torch.as_tensor(force > 0, device=matrix.device), float((target - values @ force).max())
 
-    found, lacking = active(10 * _REGULAR)
+    found, lacking = active(10 * _REGULAR * torch.finfo(torch.float64).eps)
     if lacking <= _CONTRADICTION * float(np.abs(target).max()):
         return found, False
     return active(_HARD)[0], True
