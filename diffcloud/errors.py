@@ -38,6 +38,14 @@ class DivergedError(DiffCloudError):
         )
 
 
+class UnresolvedContactError(DivergedError):
+    """Impacts of one step could not be resolved."""
+
+    def __init__(self, step: int, entries: list[int], pair: str, passes: int) -> None:
+        self.pair = pair
+        super().__init__(step, entries, f"{passes} passes did not resolve all impacts; the last was {pair}")
+
+
 def unknown_name(kind: str, name: object, allowed: Iterable[object]) -> str:
     """The message for a name that is not in a closed set."""
     return f"Unknown {kind} {name!r}. Allowed: {', '.join(sorted(map(str, allowed)))}."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,19 +28,24 @@ def bench(
     json: JsonFlag = False,
 ) -> None:
     """Time lift episodes; with --scene the published lift too (25 steps)."""
-    timings = run_benchmarks(scene, repeats=repeats, device=device)
+    published = {} if scene is None else {"release_lift": scene}
+    timings = run_benchmarks(published, repeats=repeats, device=device)
     show(benchmark_table(timings), json)
     finish({"threads": torch.get_num_threads(), "device": device, "timings": timings}, json)
 
 
-def run_benchmarks(scene: Path | None, *, repeats: int, device: str) -> list[dict[str, Any]]:
-    """All timings in one run; machines are noisy, so compare within it."""
+def run_benchmarks(published: Mapping[str, Path], *, repeats: int, device: str) -> list[dict[str, Any]]:
+    """All timings in one run; machines are noisy, so compare within it.
+
+    Args:
+        published: scenario name -> its published scene file.
+    """
     lift = choose_scenario("lift")
     jobs: list[tuple[str, Scenario, int]] = [("lift", lift, batch) for batch in _BATCHES]
     jobs += [("lift, 25 steps", _short(built_in("lift")), batch) for batch in _BATCHES]
-    if scene is not None:
-        published = choose_scenario("release_lift", scene)
-        jobs += [("release_lift", published, batch) for batch in _BATCHES]
+    for name, scene in published.items():
+        scenario = choose_scenario(name, scene)
+        jobs += [(name, scenario, batch) for batch in _BATCHES]
     for side in _SIDES:
         jobs.append((f"lift {side} x {side}, 25 steps", _short(_finer(side)), 1))
     timings = []

@@ -32,11 +32,11 @@ def choose_scenario(name: str | None, scene: Path | None = None) -> Scenario:
 
 def limits(scenario: Scenario) -> list[str]:
     """What the scene asks for and the contact model lacks."""
-    obstacles = scenario.scene.surrounding.obstacles
-    meshes = [index for index, obstacle in enumerate(obstacles) if obstacle.plane() is None]
-    if not meshes:
+    surrounding = scenario.scene.surrounding
+    meshes = [index for index, obstacle in enumerate(surrounding.obstacles) if obstacle.plane() is None]
+    if not meshes or surrounding.reference_contact is not None:
         return []
     return [
-        f"Obstacles {meshes} of {scenario.name} are not planar. Contact is simulated with planes only: the cloth passes "
-        "through these, and results are valid until the first such contact."
+        f"Obstacles {meshes} of {scenario.name} are not planar. Contact of this scene is simulated with planes only: the "
+        "cloth passes through these, and results are valid until the first such contact."
     ]

@@ -119,18 +119,7 @@ class ClothMesh:
         the one that traverses it backwards. Where two faces traverse it the same way the later one takes the slot
         and the edge counts as boundary, as in ARCSim (the published band mesh has two such edges).
         """
-        half = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        key = np.sort(half, axis=1)
-        _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
-        order = np.argsort(first)
-        rank = np.empty_like(order)
-        rank[order] = np.arange(len(order))
-        edge_of_half = rank[inverse.ravel()]
-        edges = half[np.sort(first)]
-        slot = (half[:, 0] != edges[edge_of_half, 0]).astype(np.int64)
-        faces = np.full((len(edges), 2), _MISSING, dtype=np.int64)
-        faces[edge_of_half, slot] = np.repeat(np.arange(len(self.faces)), 3)
-        return edges, faces
+        return directed_edges(self.faces)
 
     @cached_property
     def hinges(self) -> Hinges:
@@ -181,6 +170,22 @@ class ClothMesh:
                 f"The edge between nodes {worst[0]} and {worst[1]} belongs to {count.max()} faces; a cloth is a manifold, "
                 "where an edge has one or two. Split the mesh there."
             )
+
+
+def directed_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
+    """(edges [E, 2], faces [E, 2]) of triangles [F, 3]; the conventions are those of `ClothMesh.edges`."""
+    half = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    key = np.sort(half, axis=1)
+    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    edge_of_half = rank[inverse.ravel()]
+    edges = half[np.sort(first)]
+    slot = (half[:, 0] != edges[edge_of_half, 0]).astype(np.int64)
+    sides = np.full((len(edges), 2), _MISSING, dtype=np.int64)
+    sides[edge_of_half, slot] = np.repeat(np.arange(len(faces)), 3)
+    return edges, sides
 
 
 def _opposite_node(corners: IntArray, edge: IntArray) -> IntArray:

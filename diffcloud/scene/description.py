@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
-from diffcloud.sim.build import Surrounding, build_system
+from diffcloud.sim.build import Integrator, Surrounding, build_system
 from diffcloud.sim.energies import Handles
 from diffcloud.sim.materials import Material
 from diffcloud.sim.simulate import init
@@ -31,7 +31,8 @@ class Scene:
     surrounding: Surrounding = field(default_factory=Surrounding)
     mass_material: Material | None = None
     """Gives the node masses where it differs from `material` (see `load.load_scene`)."""
-    newton_iterations: int = 1
+    integrator: Integrator = "implicit"
+    """"implicit": converged steps with smooth contact and rigid bodies; "linearised": ARCSim's steps and contact."""
 
     @property
     def time_step(self) -> float:
@@ -66,7 +67,7 @@ class Scene:
             handles=self.handles,
             surrounding=self.surrounding,
             mass_material=self.mass_material,
-            newton_iterations=self.newton_iterations,
+            integrator=self.integrator,
             dtype=dtype,
             device=device,
         )

@@ -15,7 +15,7 @@ from diffcloud.mesh.topology import ClothMesh, FloatArray, SurfaceMesh
 from diffcloud.scene.description import Scene
 from diffcloud.scene.schema import KeyframeBlock, SceneFile, TransformBlock, explain
 from diffcloud.sim.build import Surrounding
-from diffcloud.sim.contact import ContactSettings
+from diffcloud.sim.contact import ContactSettings, ReferenceContact
 from diffcloud.sim.energies import Handles
 from diffcloud.sim.energies.handles import Handle
 from diffcloud.sim.materials import read_material
@@ -81,12 +81,13 @@ def load_scene(path: Path, *, reload_materials: bool = False) -> Scene:
                 projection_thickness=magic.projection_thickness or 0.1 * thickness,
             ),
             proximity="proximity" not in scene.disable,
+            reference_contact=ReferenceContact.as_published() if scene.diffcloud.reference_contact else None,
             obstacles=tuple(
                 _transform_surface(read_surface(_inside(root, obstacle.mesh, path)), obstacle.transform)
                 for obstacle in scene.obstacles
             ),
         ),
-        newton_iterations=scene.diffcloud.newton_iterations,
+        integrator=scene.diffcloud.integrator,
     )
 
 

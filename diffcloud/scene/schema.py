@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from diffcloud.errors import DiffCloudError
+from diffcloud.sim.build import Integrator
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
@@ -93,7 +94,10 @@ class ExtensionBlock(Checked):
     """What ARCSim cannot say."""
 
     hard_handles: bool = False
-    newton_iterations: Annotated[int, Field(ge=1)] = 1
+    integrator: Integrator = "implicit"
+    """"linearised": ARCSim's own step and, without `reference_contact`, contact with planes only."""
+    reference_contact: bool = False
+    """ARCSim's contact by proximity and impact zones, with all its quirks; with the linearised integrator."""
     damping: NonNegative | None = None
 
 

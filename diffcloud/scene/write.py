@@ -67,7 +67,11 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
             "repulsion_thickness": around.contact.repulsion_thickness,
             "projection_thickness": around.contact.projection_thickness,
         },
-        "diffcloud": {"hard_handles": scene.handles.hard, "newton_iterations": scene.newton_iterations},
+        "diffcloud": {
+            "hard_handles": scene.handles.hard,
+            "integrator": scene.integrator,
+            "reference_contact": scene.surrounding.reference_contact is not None,
+        },
     }
     if math.isfinite(scene.end_time):
         data["end_time"] = scene.end_time

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from diffcloud.errors import SceneError
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
-from diffcloud.sim.contact import ContactSettings, HalfSpaces
+from diffcloud.sim.contact import ContactSettings, HalfSpaces, MeshContact, ReferenceContact
 from diffcloud.sim.contact.barrier import Barrier
 from diffcloud.sim.contact.smooth import PlaneContacts, SmoothContact
 from diffcloud.sim.contact.surface import ContactSurface
@@ -49,6 +49,8 @@ class Surrounding:
     """Static ones."""
     moving: tuple[MovingObstacle, ...] = ()
     bodies: tuple[RigidBody, ...] = ()
+    reference_contact: ReferenceContact | None = None
+    """Contact with all meshes and of the cloth with itself by proximity and impact zones; None: with planes only."""
 
 
 def build_system(
@@ -59,8 +61,7 @@ def build_system(
     handles: Handles,
     surrounding: Surrounding | None = None,
     mass_material: Material | None = None,
-    newton_iterations: int = 1,
-    integrator: Integrator = "linearised",
+    integrator: Integrator = "implicit",
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> System:
@@ -71,15 +72,18 @@ def build_system(
         mass_material: material whose density gives the node masses, where it differs from `material` (the published
             experiments reload their tables after the masses were computed).
         integrator: "implicit" for the converged step with smooth contact and rigid bodies, "linearised" for ARCSim's.
-        newton_iterations: 1 for one linearised step (ARCSim), more for a converged implicit step.
 
     Raises:
         SceneError: a time step that is not positive, or a handle on a node that does not exist.
     """
     surrounding = surrounding or Surrounding()
     device = torch.device(device)
-    if not time_step > 0 or newton_iterations < 1:
-        raise SceneError(f"Time step and Newton iterations must be positive, got {time_step} s and {newton_iterations}.")
+    if not time_step > 0:
+        raise SceneError(f"The time step must be positive, got {time_step} s.")
+    if integrator == "linearised" and (surrounding.moving or surrounding.bodies):
+        raise SceneError("Moving obstacles and rigid bodies need the implicit integrator.")
+    if integrator == "implicit" and surrounding.reference_contact is not None:
+        raise SceneError("Contact by proximity and impact zones belongs to the linearised integrator.")
     for node in handles.nodes:
         if not 0 <= node < len(mesh.nodes):
             raise SceneError(f"A handle holds node {node}, but the cloth has nodes 0..{len(mesh.nodes) - 1}.")
@@ -101,8 +105,6 @@ def build_system(
         friction_cloth=tensor([surrounding.friction_cloth]),
         body_mass=torch.zeros(1, 0, dtype=dtype, device=device),
     )
-    if integrator == "linearised" and (surrounding.moving or surrounding.bodies):
-        raise SceneError("Moving obstacles and rigid bodies need the implicit integrator.")
     air = Air(stretching.elements, stretching.area, tensor(surrounding.wind))
     setup = None
     if integrator == "implicit":
@@ -117,6 +119,7 @@ def build_system(
         air=air,
         handles=handles,
         halfspaces=_halfspaces(mesh, surrounding, dtype, device),
+        contact=_mesh_contact(mesh, surrounding, dtype, device),
         obstacles=(
             *surrounding.obstacles,
             *(obstacle.mesh for obstacle in surrounding.moving),
@@ -124,7 +127,6 @@ def build_system(
         ),
         properties=properties,
         pattern=pattern(len(mesh.nodes), [mesh.faces, mesh.hinges.nodes], device),
-        newton_iterations=newton_iterations,
         implicit=setup,
     )
 
@@ -171,8 +173,26 @@ def _implicit(
     )
 
 
+def _mesh_contact(
+    mesh: ClothMesh, surrounding: Surrounding, dtype: torch.dtype, device: torch.device
+) -> MeshContact | None:
+    if surrounding.reference_contact is None:
+        return None
+    return MeshContact.build(
+        mesh,
+        surrounding.obstacles,
+        surrounding.contact,
+        surrounding.reference_contact,
+        proximity=surrounding.proximity,
+        dtype=dtype,
+        device=device,
+    )
+
+
 def _halfspaces(mesh: ClothMesh, surrounding: Surrounding, dtype: torch.dtype, device: torch.device) -> HalfSpaces | None:
     """Planar obstacles as half-spaces, on the side where most of the cloth starts."""
+    if surrounding.reference_contact is not None:
+        return None
     planes = [plane for plane in (obstacle.plane() for obstacle in surrounding.obstacles) if plane is not None]
     if not planes:
         return None

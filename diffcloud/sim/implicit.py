@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -128,10 +129,6 @@ class ImplicitStep:
         bodies = self._moved(u, start) if len(self.setup.bodies) else start.bodies
         return start.positions + self.system.time_step * velocities, velocities, bodies
 
-    @property
-    def exact(self) -> bool:
-        return True
-
     # --- what the adjoint asks for -----------------------------------------------------------------------------------
 
     def residual(self, u: Tensor, *inputs: Tensor) -> Tensor:
@@ -141,19 +138,18 @@ class ImplicitStep:
         points = self._points(u, start, self.scenery[1])
         return self._residual(u, start, self._measure(near, points), points)
 
-    def solve(self, *inputs: Tensor) -> tuple[Tensor, None]:
-        """u; its exact factor is made by `factorise` when derivatives need it.
+    def solve(self, *inputs: Tensor) -> tuple[Tensor, Factor]:
+        """u, and the exact ∂r/∂u there, factorised when it is first used.
 
         Raises:
             StuckError, SingularMatrixError: name the batch entries.
         """
-        u, near = self._newton(ImplicitStart.of(inputs))
+        start = ImplicitStart.of([tensor.detach() for tensor in inputs])
+        u, near = self._newton(start)
         self.memory.near, self.memory.batch = near, len(u)
-        return u, None
+        return u, _LateFactor(self, u, start)
 
-    def factorise(self, u: Tensor, *inputs: Tensor) -> Factor:
-        """The exact ∂r/∂u."""
-        start = ImplicitStart.of(inputs)
+    def _factorise(self, u: Tensor, start: ImplicitStart) -> Factor:
         points = self._points(u, start, self.scenery[1])
         return self._jacobian(u, start, self._measure(self.memory.near, points), points)
 
@@ -359,10 +355,10 @@ class ImplicitStep:
             own = values.node_mass[:, self.handle_nodes][..., None, None] * identity
             diagonal = diagonal.index_copy(1, self.handle_nodes, own)
             blocks = [
-                block * free[energy.elements.nodes].repeat_interleave(3, dim=1)[..., None]
-                for block, energy in zip(blocks, (system.stretching, system.bending), strict=True)
+                block * free[elements.nodes].repeat_interleave(3, dim=1)[..., None]
+                for block, elements in zip(blocks, (system.stretching.elements, system.bending.elements), strict=True)
             ]
-            couplings = [replace(c, values=c.values * free[c.row][:, None, None]) for c in couplings]
+            couplings = [replace(c, blocks=c.blocks * free[c.rows][:, None, None]) for c in couplings]
         return setup.pattern.factorise(diagonal, blocks, couplings)
 
     def _face_blocks(self, u: Tensor, start: ImplicitStart) -> Tensor:
@@ -457,6 +453,21 @@ class ImplicitStep:
         values = dt * (skew(touch) @ turning[1])  # -(dt) (d arm) x f = dt f x d arm
         first = like.shape[1] - 2 * len(bodies)
         return torch.zeros_like(like).index_add(1, first + 2 * bodies.body + 1, values)
+
+
+class _LateFactor:
+    """∂r/∂u at the solution of a step, which only derivatives need."""
+
+    def __init__(self, step: ImplicitStep, u: Tensor, start: ImplicitStart) -> None:
+        self.place = (step, u, start)
+
+    @cached_property
+    def factor(self) -> Factor:
+        step, u, start = self.place
+        return step._factorise(u, start)
+
+    def solve(self, right: Tensor, *, transposed: bool = False) -> Tensor:
+        return self.factor.solve(right, transposed=transposed)
 
 
 def _moves(point: Tensor, nodes: int, first_body_point: int) -> Tensor:

@@ -39,6 +39,20 @@ class SingularMatrixError(ArithmeticError):
         super().__init__(f"the step's Jacobian is singular in batch entries {entries}")
 
 
+@dataclass(frozen=True)
+class Couplings:
+    """Blocks at places that the pattern need not have: Q pairs of nodes."""
+
+    entry: Tensor
+    """[Q] batch entry."""
+    rows: Tensor
+    """[Q] node"""
+    columns: Tensor
+    """[Q] node"""
+    blocks: Tensor
+    """[Q, 3, 3]; together symmetric where the pattern's matrices are."""
+
+
 class Factor(Protocol):
     """A factorised matrix."""
 
@@ -50,12 +64,13 @@ class Factor(Protocol):
 class MatrixPattern(Protocol):
     """Where the blocks of elements go."""
 
-    def factorise(self, diagonal: Tensor, blocks: Sequence[Tensor]) -> Factor:
+    def factorise(self, diagonal: Tensor, blocks: Sequence[Tensor], couplings: Couplings | None = None) -> Factor:
         """Assemble and factorise.
 
         Args:
             diagonal: [B, V, 3, 3].
             blocks: one [B, E, 3n, 3n] per element group of the pattern.
+            couplings: added on top, between any nodes.
 
         Raises:
             NotPositiveDefiniteError: names the batch entries.
@@ -84,11 +99,16 @@ class DensePattern:
         rows, columns = _entries(node_count, groups)
         return DensePattern(node_count, torch.as_tensor(rows * size + columns, device=device))
 
-    def factorise(self, diagonal: Tensor, blocks: Sequence[Tensor]) -> Factor:
+    def factorise(self, diagonal: Tensor, blocks: Sequence[Tensor], couplings: Couplings | None = None) -> Factor:
         size = 3 * self.node_count
         values = torch.cat([diagonal.flatten(1), *(block.flatten(1) for block in blocks)], dim=1)
         index = self.index.expand(len(values), -1)
         matrix = values.new_zeros(len(values), size * size).scatter_add_(1, index, values)
+        if couplings is not None:
+            axis = torch.arange(3, device=index.device)
+            rows = (couplings.entry * size + 3 * couplings.rows)[:, None, None] + axis[:, None]
+            place = rows * size + 3 * couplings.columns[:, None, None] + axis
+            matrix.view(-1).index_add_(0, place.flatten(), couplings.blocks.flatten())
         return DenseFactor(_cholesky(matrix.view(-1, size, size)))
 
 
@@ -141,11 +161,17 @@ class BlockTridiagonalPattern:
             index=torch.as_tensor(np.where(below < 0, spare, flat), device=device),
         )
 
-    def factorise(self, diagonal: Tensor, blocks: Sequence[Tensor]) -> Factor:
+    def factorise(self, diagonal: Tensor, blocks: Sequence[Tensor], couplings: Couplings | None = None) -> Factor:
         values = torch.cat([diagonal.flatten(1), *(block.flatten(1) for block in blocks)], dim=1)
         count, width = self.block_count, self.width
         storage = values.new_zeros(len(values), 2 * count * width * width + 1)
         storage.scatter_add_(1, self.index.expand(len(values), -1), values)
+        if couplings is not None:
+            place, far = self._places(couplings)
+            if bool(far.any()):
+                return self._sparse(storage, couplings)
+            flat = couplings.entry[:, None, None] * storage.shape[1] + place
+            storage.view(-1).index_add_(0, flat.flatten(), couplings.blocks.flatten())
         matrix = storage[:, :-1].view(-1, 2, count, width, width)
         padding = count * width - 3 * self.node_count
         if padding:
@@ -160,6 +186,58 @@ class BlockTridiagonalPattern:
                 current = current - step.mT @ step
             lower.append(_cholesky(current))
         return BlockTridiagonalFactor(self, lower, coupling)
+
+    def _places(self, couplings: Couplings) -> tuple[Tensor, Tensor]:
+        """(place in the storage [Q, 3, 3], whether the coupling is outside of the three diagonals of blocks [Q])."""
+        axis = torch.arange(3, device=self.place.device)
+        rows = 3 * self.place[couplings.rows][:, None, None] + axis[:, None]
+        columns = 3 * self.place[couplings.columns][:, None, None] + axis
+        row_block, column_block, width = rows // self.width, columns // self.width, self.width
+        below = row_block - column_block
+        flat = ((below * self.block_count + row_block - below) * width + rows % width) * width + columns % width
+        spare = 2 * self.block_count * width * width
+        return torch.where(below < 0, spare, flat), (below.abs() > 1).flatten(1).any(1)
+
+    def _sparse(self, storage: Tensor, couplings: Couplings) -> ReorderedFactor:
+        """Where far couplings break the band: a sparse factor for each entry (scipy, on the CPU)."""
+        count, width, size = self.block_count, self.width, 3 * self.node_count
+        below, block, row, column = np.unravel_index(np.arange(2 * count * width**2), (2, count, width, width))
+        rows, columns = (block + below) * width + row, block * width + column
+        inside = (rows < size) & (columns < size)
+        rows, columns, under = rows[inside], columns[inside], below[inside] == 1
+        band = storage[:, :-1].cpu().numpy()[:, inside]
+        entry, nodes = couplings.entry.cpu().numpy(), (self.place[couplings.rows], self.place[couplings.columns])
+        first, second = (3 * node.cpu().numpy()[:, None, None] for node in nodes)
+        axis = np.arange(3)
+        first, second = np.broadcast_arrays(first + axis[:, None], second + axis)
+        extra = couplings.blocks.cpu().numpy()
+        factors, indefinite = [], []
+        for index, values in enumerate(band):
+            own = entry == index
+            matrix = csc_matrix((values, (rows, columns)), shape=(size, size))
+            matrix += csc_matrix((values[under], (columns[under], rows[under])), shape=(size, size))
+            matrix += csc_matrix((extra[own].ravel(), (first[own].ravel(), second[own].ravel())), shape=(size, size))
+            matrix.eliminate_zeros()
+            # pivots on the diagonal, as a symmetric matrix allows: they are positive where it is positive definite
+            factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+            factors.append(factor)
+            if not (factor.U.diagonal() > 0).all():
+                indefinite.append(index)
+        if indefinite:
+            raise NotPositiveDefiniteError(indefinite)
+        return ReorderedFactor(self, SparseLU(factors))
+
+
+@dataclass(frozen=True)
+class ReorderedFactor:
+    """The factor of a matrix whose nodes are in the pattern's order."""
+
+    pattern: BlockTridiagonalPattern
+    factor: SparseLU
+
+    def solve(self, right: Tensor, *, transposed: bool = False) -> Tensor:
+        ordered = self.factor.solve(right[:, self.pattern.order], transposed=transposed)
+        return ordered[:, self.pattern.place]
 
 
 @dataclass(frozen=True)
@@ -220,20 +298,6 @@ def _columns_as_copies(solution: Tensor, like: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Couplings:
-    """3 x 3 blocks between any two nodes, on top of a pattern: contacts."""
-
-    entry: Tensor
-    """[K] batch entry."""
-    row: Tensor
-    """[K] node."""
-    column: Tensor
-    """[K] node."""
-    values: Tensor
-    """[K, 3, 3]"""
-
-
-@dataclass(frozen=True)
 class GeneralPattern:
     """Matrices without symmetry over the nodes of a mesh, with couplings wherever contact puts them.
 
@@ -262,9 +326,9 @@ class GeneralPattern:
         extra = [
             (
                 c.entry.repeat_interleave(9),
-                (3 * c.row[:, None, None] + axis[:, None]).expand(-1, 3, 3).flatten(),
-                (3 * c.column[:, None, None] + axis).expand(-1, 3, 3).flatten(),
-                c.values.flatten(),
+                (3 * c.rows[:, None, None] + axis[:, None]).expand(-1, 3, 3).flatten(),
+                (3 * c.columns[:, None, None] + axis).expand(-1, 3, 3).flatten(),
+                c.blocks.flatten(),
             )
             for c in couplings
         ]

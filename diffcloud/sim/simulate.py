@@ -13,8 +13,8 @@ from diffcloud.errors import DivergedError
 from diffcloud.sim.adjoint import implicit_solve
 from diffcloud.sim.energies.handles import HandleSchedule, follow_track
 from diffcloud.sim.implicit import ImplicitStart, ImplicitStep, StuckError
-from diffcloud.sim.integrator import Held, NewtonStallError, StepProblem, StepStart
 from diffcloud.sim.linear_solve import NotPositiveDefiniteError, SingularMatrixError
+from diffcloud.sim.linearised import Held, LinearisedStep, StepStart
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.rigid import BodyState
 from diffcloud.sim.state import ImplicitSetup, State, System
@@ -74,11 +74,11 @@ def step(system: System, properties: Properties, schedule: HandleSchedule, state
     state = _take_anchors(system, schedule, state)
     if system.implicit is not None:
         return _implicit_step(system, system.implicit, properties, schedule, state, copies)
-    problem, targets = _problem(system, schedule, state)
+    problem, targets = _problem(system, schedule, state, copies)
     start = StepStart(state.positions, state.velocities, targets.expand(properties.batch, -1, -1), properties)
     try:
         change = implicit_solve(problem, *start.tensors(), copies=copies)
-    except (NotPositiveDefiniteError, NewtonStallError) as error:
+    except NotPositiveDefiniteError as error:
         raise DivergedError(state.step + 1, error.entries, str(error)) from error
     velocities = state.velocities + problem.prescribe(change, start)
     positions = state.positions + system.time_step * velocities
@@ -87,6 +87,20 @@ def step(system: System, properties: Properties, schedule: HandleSchedule, state
         velocities = velocities + (projected - positions) / system.time_step
         positions = projected
     _refuse_divergence(positions, state.step + 1)
+    if system.contact is not None:
+        inverse_mass = 1 / properties.node_mass
+        if problem.held is not None:
+            inverse_mass = torch.where(problem.held.mask[:, 0], 0.0, inverse_mass)
+        resolved = system.contact.resolve(
+            state.positions,
+            positions,
+            inverse_mass,
+            (properties.friction_obstacle, properties.friction_cloth),
+            step=state.step + 1,
+            copies=copies,
+        )
+        velocities = velocities + (resolved - positions) / system.time_step
+        positions = resolved
     return State(positions, velocities, state.anchors, state.step + 1)
 
 
@@ -143,7 +157,8 @@ def _advance(
     except DivergedError as error:
         raise DivergedError(step, [failed[entry] for entry in error.entries], error.reason) from error
     order = torch.cat([chosen for chosen, _ in parts]).argsort()
-    positions, velocities = (torch.cat([part[field] for _, part in parts])[order] for field in (0, 1))
+    positions = torch.cat([part[0] for _, part in parts])[order]
+    velocities = torch.cat([part[1] for _, part in parts])[order]
     bodies = BodyState(*(torch.cat(columns)[order] for columns in zip(*(p[2].tensors() for _, p in parts), strict=True)))
     return positions, velocities, bodies
 
@@ -228,7 +243,7 @@ def _take_anchors(system: System, schedule: HandleSchedule, state: State) -> Sta
     return replace(state, anchors=state.anchors.index_copy(1, index, anchors))
 
 
-def _problem(system: System, schedule: HandleSchedule, state: State) -> tuple[StepProblem, Tensor]:
+def _problem(system: System, schedule: HandleSchedule, state: State, copies: int = 1) -> tuple[LinearisedStep, Tensor]:
     """The equation of this step, and the targets [B, H, 3] of its active handles."""
     active = schedule.active[state.step]
     nodes, held = _held(system, schedule, tuple(np.flatnonzero(active)))
@@ -236,7 +251,10 @@ def _problem(system: System, schedule: HandleSchedule, state: State) -> tuple[St
     strength = schedule.strength[state.step]
     if len(nodes) < len(active):
         targets, strength = targets[:, active], strength[active]
-    return StepProblem(system, strength, nodes, held), targets
+    proximity = None
+    if system.contact is not None:
+        proximity = system.contact.near(state.positions[: len(state.positions) // copies])
+    return LinearisedStep(system, strength, nodes, held, proximity), targets
 
 
 def _held(system: System, schedule: HandleSchedule, active: tuple[int, ...]) -> tuple[Tensor, Held | None]:

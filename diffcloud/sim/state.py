@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
-from diffcloud.sim.contact import HalfSpaces
+from diffcloud.sim.contact import HalfSpaces, MeshContact
 from diffcloud.sim.contact.smooth import SmoothContact
 from diffcloud.sim.elements import Elements
 from diffcloud.sim.energies import Air, Bending, Handles, Stretching
@@ -57,13 +57,14 @@ class System:
     air: Air
     handles: Handles
     halfspaces: HalfSpaces | None
+    """Planes only; None where `contact` covers them."""
+    contact: MeshContact | None
+    """Meshes and self-contact by proximity and impact zones."""
     obstacles: tuple[SurfaceMesh, ...]
-    """Meshes to draw; the planar ones are in `halfspaces` too."""
+    """Meshes to draw, and what contact is built from."""
     properties: Properties
     """Of the basis material, batch 1."""
     pattern: MatrixPattern
-    newton_iterations: int = 1
-    """1: one linearised step, as ARCSim does. More: Newton until the implicit step has converged."""
     implicit: ImplicitSetup | None = None
     """For the converged implicit step with smooth contact; None: the linearised step."""
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
 from diffcloud.io.imports import release_episodes
 from diffcloud.scene import load_scenario
-from diffcloud.sim import rollout
-from pipeline.acceptance import SCENES
+from diffcloud.sim import Properties, rollout, rollout_tangents
+from pipeline.acceptance import SCENES, _simulated_clouds
 from pipeline.config import FitConfig
 
 # positions of the reference simulator (float32 prints) at given steps: scenario, (stretch, mass), step, node, position
@@ -60,6 +61,71 @@ def test_every_published_episode_is_imported(release):
             assert set(episode.meta["predictions"]) == {"mlp", "pointnet2", "meteornet"}
         else:
             assert set(episode.meta["truth"]) == {"stretch", "mass"}
+
+
+@pytest.mark.parametrize(
+    ("run", "limit"),
+    [("lift_s1_m1", 1e-6), ("lift_s5_m0.5", 1e-6), ("fold_s1_m1", 1e-6), ("band_s0.5_m5", 1e-5), ("hang_s1_m1", 1e-2)],
+)
+def test_whole_episodes_with_contact_are_the_reference_simulators(release, run, limit):
+    """RMS node distance; in the first four the reference happens not to branch."""
+    path = release.parent.parent / "diffsim" / f"{run}.npz"
+    if not path.is_file():
+        pytest.skip(f"{path} is not there (recorded runs of the reference simulator)")
+    with np.load(path) as recorded:
+        expected, values = recorded["verts"], (float(recorded["stretch_mult"]), float(recorded["mass_mult"]))
+    found = simulate(scenario_of(release, f"release_{run.split('_')[0]}"), *values, len(expected) - 1)
+    assert np.sqrt(((found - expected) ** 2).sum(-1).mean()) <= limit
+
+
+def test_simulated_clouds_are_met_at_their_true_parameters(release):
+    table = _simulated_clouds(release).splitlines()
+    at_loss, always = (next(line for line in table if line.startswith(f"- {start}")) for start in ("at most", "on every"))
+    assert int(at_loss.split(": ")[1].split()[0]) >= 10
+    assert int(always.split(": ")[1].split()[0]) >= 9
+
+
+@pytest.mark.parametrize(("kind", "stretch", "mass"), [("hang", 1.0, 1.0), ("hang", 0.53, 6.32), ("band", 1.3, 2.15)])
+def test_derivatives_through_published_contact(release, kind, stretch, mass):
+    """Self-contact, a hook, a pole and a plane: reverse and forward mode and central differences."""
+    scenario = scenario_of(release, f"release_{kind}")
+    system, _ = scenario.scene.build()
+    steps = scenario.loss_frames[0]
+
+    def properties(values):
+        return scenario.properties(system, dict(zip(("stretch", "mass"), values.unbind(-1), strict=True)))
+
+    def loss(values):
+        return rollout(system, steps, properties=properties(values)).positions[:, -1].square().sum((1, 2))
+
+    base = torch.tensor([[stretch, mass]], dtype=torch.float64, requires_grad=True)
+    (reverse,) = torch.autograd.grad(loss(base).sum(), base)
+    identity = torch.eye(2, dtype=torch.float64)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(base.detach().repeat(2, 1), identity)
+        pairs = [forward_ad.unpack_dual(tensor) for tensor in properties(dual).tensors()]
+        tangents = Properties(*(torch.zeros_like(p) if t is None else t for p, t in pairs))
+    run, tangent = rollout_tangents(system, steps, properties=properties(base.detach()), tangents=tangents)
+    forward = (2 * run.positions[:, -1] * tangent[:, :, -1]).sum((1, 2, 3))
+    torch.testing.assert_close(forward, reverse[0], rtol=1e-8, atol=1e-10)
+    errors = []
+    for h in (1e-4, 1e-5, 1e-6):
+        step = h * base.detach() * identity
+        with torch.no_grad():
+            central = (loss(base + step) - loss(base - step)) / (2 * step.sum(1))
+        errors.append(((central - reverse[0]).abs() / reverse[0].abs()).max())
+    assert min(errors) <= 1e-4
+
+
+@pytest.mark.parametrize("kind", ["hang", "band"])
+def test_a_simulated_episode_is_fitted_below_the_papers_threshold(release, kind):
+    scenario = scenario_of(release, f"release_{kind}")
+    episode = next(e for s, n, e in release_episodes(release) if s == f"release_{kind}" and n == "1")
+    space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
+    settings = AdamSettings(learning_rate=scenario.learning_rate, threshold=scenario.threshold)
+    outcome = fit_adam(Objective(scenario, [episode]), space, settings)
+    assert outcome.loss < scenario.threshold
+    assert outcome.iterations > 0
 
 
 @pytest.mark.slow

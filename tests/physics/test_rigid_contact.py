@@ -17,12 +17,10 @@ from diffcloud.sim.energies import Handles
 from diffcloud.sim.energies.handles import Handle
 from diffcloud.sim.materials import isotropic
 from diffcloud.sim.rigid import RigidBody
-from diffcloud.sim.simulate import init, rollout
+from diffcloud.sim.simulate import rollout
 
 FABRIC = isotropic("test-fabric", density=0.2, stretching=200.0, shear=80.0, bending=1e-5, source="test")
-GROUND = SurfaceMesh(
-    np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
-)
+GROUND = SurfaceMesh(np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def box(size, centre=(0.0, 0.0, 0.0)) -> SurfaceMesh:
@@ -37,7 +35,9 @@ def bystander(height: float = 5.0) -> tuple[ClothMesh, Handles]:
     return cloth, Handles(tuple(Handle(node) for node in range(4)), hard=True)
 
 
-def system_of(bodies, *, gravity, friction=0.3, obstacles=(GROUND,), time_step=0.01, contact=None, cloth=None, handles=None):
+def system_of(
+    bodies, *, gravity, friction=0.3, obstacles=(GROUND,), time_step=0.01, contact=None, cloth=None, handles=None
+):
     if cloth is None:
         cloth, handles = bystander()
     return build_system(
@@ -90,7 +90,9 @@ def test_a_spinning_body_keeps_its_angular_momentum():
     bodies = system.implicit.bodies
     momentum = torch.stack(
         [
-            bodies.angular_momentum(bodies.mass[None], run.bodies.orientation[:, k], run.bodies.angular_velocity[:, k])[0, 0]
+            bodies.angular_momentum(bodies.mass[None], run.bodies.orientation[:, k], run.bodies.angular_velocity[:, k])[
+                0, 0
+            ]
             for k in range(201)
         ]
     )
@@ -134,13 +136,13 @@ def test_colliding_bodies_and_cloth_conserve_momentum():
         bodies,
         gravity=(0, 0, 0),
         obstacles=(),
-        friction=float(__import__("os").environ.get("FR","0.3")),
-        time_step=float(__import__("os").environ.get("DT","5e-4")),
-        contact=ContactSettings(1e5, float(__import__("os").environ.get("TH","4e-3")), 1e-4),
+        friction=float(__import__("os").environ.get("FR", "0.3")),
+        time_step=float(__import__("os").environ.get("DT", "5e-4")),
+        contact=ContactSettings(1e5, float(__import__("os").environ.get("TH", "4e-3")), 1e-4),
         cloth=cloth,
         handles=Handles(()),
     )
-    run = rollout(system, int(0.15/system.time_step))
+    run = rollout(system, int(0.15 / system.time_step))
     before, after = momenta(system, run, 0), momenta(system, run, len(run.times) - 3)
     assert float((run.positions[0, -1] - run.positions[0, 0]).norm(dim=-1).max()) > 0.01  # it was hit
     scale = 0.05 * 0.6

@@ -83,7 +83,7 @@ class Episode:
     def reverse(self, directions: Sequence[Mapping[str, Tensor]]) -> list[float]:
         """One backward pass, dotted with every direction."""
         inputs = {name: value.requires_grad_(True) for name, value in self.base().items()}
-        found = torch.autograd.grad(self.run(inputs).sum(), list(inputs.values()))
+        found = torch.autograd.grad(self.run(inputs).sum(), list(inputs.values()), materialize_grads=True)
         gradients = dict(zip(inputs, found, strict=True))
         for name, gradient in gradients.items():
             assert torch.isfinite(gradient).all(), name

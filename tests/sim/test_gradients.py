@@ -140,5 +140,5 @@ def test_gradients_stay_finite_where_formulas_degenerate():
 def test_scalars_cover_every_parameter():
     from diffcloud.sim import PARAMETERS
 
-    # friction between cloths waits for cloth-cloth contact; it has no effect yet
+    # friction between cloths acts only in scenes with contact of the cloth with itself
     assert set(SCALARS) | {"friction_cloth"} == set(PARAMETERS)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from diffcloud.mesh import grid_cloth
-from diffcloud.sim.linear_solve import BlockTridiagonalPattern, DensePattern, NotPositiveDefiniteError
+from diffcloud.sim.linear_solve import BlockTridiagonalPattern, Couplings, DensePattern, NotPositiveDefiniteError
 
 CPU = torch.device("cpu")
 
@@ -56,4 +56,40 @@ def test_an_indefinite_matrix_names_its_batch_entry(pattern, rng):
     diagonal[1] -= 1e3 * torch.eye(3, dtype=torch.float64)
     with pytest.raises(NotPositiveDefiniteError) as caught:
         pattern.build(len(mesh.nodes), groups, CPU).factorise(diagonal, blocks)
+    assert caught.value.entries == [1]
+
+
+@pytest.mark.parametrize("pattern", [DensePattern, BlockTridiagonalPattern])
+@pytest.mark.parametrize("reach", [1, 40])
+def test_couplings_between_any_nodes(pattern, reach, rng):
+    """Near ones fall into the pattern's blocks; far ones break its band."""
+    mesh = grid_cloth(4, 15, 1.0, 1.0)
+    groups, diagonal, blocks, dense = random_system(mesh, 3, rng)
+    first = rng.integers(0, len(mesh.nodes) - reach, 10)
+    entries, rows, columns, values = [], [], [], []
+    for node, entry in zip(first, rng.integers(0, 2, 10), strict=True):  # the last entry has none
+        direction = rng.normal(size=6)
+        both = (node, node + reach)
+        for (i, a), (j, b) in ((p, q) for p in enumerate(both) for q in enumerate(both)):
+            block = torch.as_tensor(np.outer(direction[3 * i : 3 * i + 3], direction[3 * j : 3 * j + 3]))
+            dense[entry, 3 * a : 3 * a + 3, 3 * b : 3 * b + 3] += block
+            entries.append(int(entry))
+            rows.append(int(a))
+            columns.append(int(b))
+            values.append(block)
+    couplings = Couplings(torch.tensor(entries), torch.tensor(rows), torch.tensor(columns), torch.stack(values))
+    factor = pattern.build(len(mesh.nodes), groups, CPU).factorise(diagonal, blocks, couplings)
+    right = torch.as_tensor(rng.normal(size=(6, len(mesh.nodes), 3)))
+    expected = torch.linalg.solve(dense.repeat(2, 1, 1), right.flatten(1)).view_as(right)
+    torch.testing.assert_close(factor.solve(right), expected, rtol=1e-9, atol=1e-11)
+
+
+def test_a_far_coupling_that_makes_the_matrix_indefinite(rng):
+    mesh = grid_cloth(4, 15, 1.0, 1.0)
+    groups, diagonal, blocks, _ = random_system(mesh, 2, rng)
+    nodes = torch.tensor([0, 59])
+    block = 1e4 * torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
+    couplings = Couplings(torch.tensor([1, 1]), nodes, nodes.flip(0), block)
+    with pytest.raises(NotPositiveDefiniteError) as caught:
+        BlockTridiagonalPattern.build(60, groups, CPU).factorise(diagonal, blocks, couplings)
     assert caught.value.entries == [1]

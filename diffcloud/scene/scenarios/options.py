@@ -15,7 +15,7 @@ from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.scene.description import Scene
 from diffcloud.scene.scenarios.scenario import Recorder, Scenario
 from diffcloud.scene.schema import Checked, NonNegative, Positive, Vector
-from diffcloud.sim.build import Surrounding
+from diffcloud.sim.build import Integrator, Surrounding
 from diffcloud.sim.contact import ContactSettings
 from diffcloud.sim.energies import Handles
 from diffcloud.sim.energies.handles import Handle
@@ -34,7 +34,7 @@ class ScenarioOptions(Checked):
     frames: Annotated[int, Field(ge=1)] = 25
     rate_hz: Positive = 10.0
     steps_per_frame: Annotated[int, Field(ge=1)] = 4
-    newton_iterations: Annotated[int, Field(ge=1)] = 1
+    integrator: Integrator = "implicit"
     soft_handles: bool = False
     loss_frames: tuple[int, ...] = (-1,)
     points: Annotated[int, Field(ge=1)] = 3500
@@ -46,8 +46,8 @@ class ScenarioOptions(Checked):
     air_density: NonNegative = 1.2
     friction_obstacle: NonNegative = 0.3
     friction_cloth: NonNegative = 0.6
-    contact_stiffness: NonNegative = 1e5
-    contact_thickness_m: Positive = 0.002
+    contact_stiffness: NonNegative = 1e4
+    contact_thickness_m: Positive = 0.003
 
     @property
     def reach(self) -> float:
@@ -98,7 +98,7 @@ def assemble(
             contact=ContactSettings(options.contact_stiffness, thickness, 0.1 * thickness),
             obstacles=obstacles,
         ),
-        newton_iterations=options.newton_iterations,
+        integrator=options.integrator,
     )
     return Scenario(
         name=options.name,

@@ -55,23 +55,20 @@ class HalfSpaces:
     def at(
         self,
         positions: Tensor,
-        start: Tensor,
         velocities: Tensor,
         node_mass: Tensor,
         friction: Tensor,
         time_step: float,
     ) -> HalfSpaceContact:
-        """Contact linearised at `positions`, with friction lagged from the start of the step.
+        """Contact linearised at the start of the step, which friction is lagged from.
 
         Args:
-            positions: [B, V, 3] the point of linearisation.
-            start, velocities: [B, V, 3] at the start of the step.
+            positions, velocities: [B, V, 3] at the start of the step.
             node_mass, friction: [B, V] [kg], [B] [-].
         """
         violation, stiffness = self._violation(positions)
         normal_force = 0.5 * stiffness * violation
-        lagged = normal_force if start is positions else 0.5 * torch.mul(*self._violation(start))
-        limit = friction[:, None, None] * lagged
+        limit = friction[:, None, None] * normal_force
         normal_speed = velocities @ self.normals.T
         tangential = velocities[:, :, None] - normal_speed[..., None] * self.normals
         sticking = limit * (time_step / node_mass)[..., None]

@@ -59,13 +59,16 @@ class Pairs:
         )
 
 
-def candidates(surface: ContactSurface, places: tuple[Tensor, ...], margin: float) -> tuple[Pairs, Pairs]:
+def candidates(
+    surface: ContactSurface, places: tuple[Tensor, ...], margin: float, *, among_fixed: bool = False
+) -> tuple[Pairs, Pairs]:
     """(point-face, edge-edge) pairs whose boxes come within `margin` of each other [m].
 
     Pairs that share a point, that lie on one obstacle, or of which neither can move are left out.
 
     Args:
         places: positions [B, N, 3] of all points; a box holds a primitive at all of them (start and end of a motion).
+        among_fixed: keep the pairs of which neither can move.
     """
 
     def boxes(primitives: Tensor) -> Boxes:
@@ -74,23 +77,26 @@ def candidates(surface: ContactSurface, places: tuple[Tensor, ...], margin: floa
 
     entry, point, face = overlapping(boxes(surface.points[:, None]), boxes(surface.faces))
     corner = torch.cat([surface.points[point][:, None], surface.faces[face]], dim=1)
-    keep = _may_touch(surface, corner[:, 0], corner[:, 1]) & (corner[:, :1] != corner[:, 1:]).all(-1)
+    keep = _may_touch(surface, corner[:, 0], corner[:, 1], among_fixed) & (corner[:, :1] != corner[:, 1:]).all(-1)
     area = torch.minimum(surface.point_area[point], surface.face_area[face])
     point_face = Pairs("point_face", entry, corner, torch.stack([point, face], 1), area).where(keep)
 
-    edge_boxes = boxes(surface.edges)
-    entry, first, second = overlapping(edge_boxes, edge_boxes)
-    below = first < second
-    entry, first, second = entry[below], first[below], second[below]
+    # of two edges at least one can move, and two that can move are met in both orders
+    moves = surface.movable[surface.owner[surface.edges[:, 0]]] | among_fixed
+    edge_boxes, moving = boxes(surface.edges), moves.nonzero().flatten()
+    entry, first, second = overlapping(Boxes(edge_boxes.low[:, moving], edge_boxes.high[:, moving]), edge_boxes)
+    first = moving[first]
+    once = (first < second) | ~moves[second]
+    entry, first, second = entry[once], first[once], second[once]
     corner = torch.cat([surface.edges[first], surface.edges[second]], dim=1)
-    keep = _may_touch(surface, corner[:, 0], corner[:, 2])
+    keep = _may_touch(surface, corner[:, 0], corner[:, 2], among_fixed)
     keep &= (corner[:, :2, None] != corner[:, None, 2:]).flatten(1).all(-1)
     area = torch.minimum(surface.edge_area[first], surface.edge_area[second])
     edge_edge = Pairs("edge_edge", entry, corner, torch.stack([first, second], 1), area).where(keep)
     return point_face, edge_edge
 
 
-def _may_touch(surface: ContactSurface, first: Tensor, second: Tensor) -> Tensor:
+def _may_touch(surface: ContactSurface, first: Tensor, second: Tensor, among_fixed: bool) -> Tensor:
     """Whether contact between the objects of two points [C] has to be looked for."""
     a, b = surface.owner[first], surface.owner[second]
-    return ((a != b) | (a == 0)) & (surface.movable[a] | surface.movable[b])
+    return ((a != b) | (a == 0)) & (surface.movable[a] | surface.movable[b] | among_fixed)

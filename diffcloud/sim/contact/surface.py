@@ -3,8 +3,8 @@
 Points 0..V-1 are the cloth's nodes; those of the obstacles follow, obstacle by obstacle. An *owner* is 0 for the cloth
 (one mesh may hold several cloths) and 1, 2, ... for the obstacles.
 
-Edges and points of an obstacle where the surface is flat or concave are left out: nothing straight can meet them before
-it meets a face, a point or another edge.
+Edges and points of an obstacle where the surface is flat or concave are left out by default: nothing straight can meet
+them before it meets a face, a point or another edge.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
+from diffcloud.mesh.topology import ClothMesh, SurfaceMesh, directed_edges
 
 _FLAT = 1e-6
 """Sine of the dihedral angle below which an obstacle's edge counts as flat."""
@@ -35,6 +35,8 @@ class ContactSurface:
     """[P] points that take part in point-face pairs."""
     edges: Tensor
     """[E, 2] points."""
+    edge_faces: Tensor
+    """[E, 2] the face on each side of an edge (`ClothMesh.edges`), -1 where none."""
     faces: Tensor
     """[F, 3] points."""
     owner: Tensor
@@ -60,6 +62,7 @@ class ContactSurface:
         obstacles: Sequence[SurfaceMesh],
         *,
         movable: Sequence[bool] | None = None,
+        all_edges: bool = False,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> ContactSurface:
@@ -67,30 +70,33 @@ class ContactSurface:
 
         Args:
             movable: of each obstacle; default none.
+            all_edges: keep the flat and concave edges and points of obstacles, as ARCSim does.
         """
         movable = [False] * len(obstacles) if movable is None else list(movable)
         points = [np.arange(len(cloth.nodes))]
         edges, faces = [cloth.edges[0]], [cloth.faces]
         edge_area = [_spread(cloth.edges[1], cloth.face_area)]
+        edge_faces: list[NDArray[np.int64]] = [cloth.edges[1]]
         face_area, point_area = [cloth.face_area], [cloth.node_area]
         owner = [np.zeros(len(cloth.nodes), dtype=np.int64)]
         shares = [_shares(cloth.faces, len(cloth.nodes))]
-        count = len(cloth.nodes)
+        count, face_count = len(cloth.nodes), len(cloth.faces)
         for index, mesh in enumerate(obstacles):
             corner = mesh.nodes[mesh.faces]
             area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-            sharp, sharp_faces = _sharp_edges(mesh)
-            used = np.unique(sharp).astype(np.int64)
-            per_point = np.bincount(mesh.faces.ravel(), np.repeat(area / 3, 3), len(mesh.nodes))
+            kept, sides = directed_edges(mesh.faces) if all_edges else _sharp_edges(mesh)
+            used = np.unique(kept)
+            per_point = np.bincount(mesh.faces.ravel(), np.repeat(area / 3, 3), len(mesh.nodes)).astype(np.float64)
             points.append(used + count)
             point_area.append(per_point[used])
-            edges.append(sharp + count)
-            edge_area.append(_spread(sharp_faces, area))
+            edges.append(kept + count)
+            edge_faces.append(np.where(sides < 0, -1, sides + face_count))
+            edge_area.append(_spread(sides, area))
             faces.append(mesh.faces + count)
             face_area.append(area)
             shares.append(_shares(mesh.faces, len(mesh.nodes)))
             owner.append(np.full(len(mesh.nodes), index + 1, dtype=np.int64))
-            count += len(mesh.nodes)
+            count, face_count = count + len(mesh.nodes), face_count + len(mesh.faces)
 
         def index_tensor(parts: list[NDArray[np.int64]]) -> Tensor:
             return torch.as_tensor(np.concatenate(parts), dtype=torch.long, device=device)
@@ -103,6 +109,7 @@ class ContactSurface:
             point_count=count,
             points=index_tensor(points),
             edges=index_tensor(edges),
+            edge_faces=index_tensor(edge_faces),
             faces=index_tensor(faces),
             owner=index_tensor(owner),
             point_area=area_tensor(point_area),

@@ -1,12 +1,11 @@
-"""One implicit step, as an equation for the velocity change u.
+"""One linearised backward-Euler step, ARCSim's, as an equation for the velocity change u.
 
     r(u) = m u - Δt f(u) = 0,   v = v₀ + u,   x = x₀ + Δt v
 
-    f = F(y) - H(y) (x - y + β v) + m g + f_air(x₀, v₀) - strength k_h (x - x*) + contact
+    f = F(x₀) - H(x₀) (x - x₀ + β v) + m g + f_air(x₀, v₀) - strength k_h (x - x*) + contact
 
-with y the point of linearisation. With y = x₀ the equation is linear: one linearised backward-Euler step, exactly
-ARCSim's, and ∂r/∂u is the assembled matrix. With y = x (Newton) it is backward Euler itself. β is stiffness-proportional
-damping. Hard handles replace the rows of their nodes.
+The equation is linear: ∂r/∂u is the assembled matrix. β is stiffness-proportional damping. Hard handles replace the rows of
+their nodes. (`implicit` has the converged step.)
 """
 
 from __future__ import annotations
@@ -18,24 +17,11 @@ import torch
 from torch import Tensor
 
 from diffcloud.sim.contact import HalfSpaceContact
+from diffcloud.sim.contact.proximity import Proximity, ProximityContact
 from diffcloud.sim.energies.base import Geometry, Linearisation, geometry
-from diffcloud.sim.linear_solve import Factor
+from diffcloud.sim.linear_solve import Couplings, Factor
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.state import System
-
-_NEWTON_TOLERANCE = 1e-12
-"""Relative to the largest velocity of the step."""
-_NEWTON_ACCEPTED = 1e-6
-"""A step that stops short of the tolerance is still accepted below this."""
-_HALVINGS = 6
-
-
-class NewtonStallError(ArithmeticError):
-    """Newton's method did not converge. `entries` lists the batch entries."""
-
-    def __init__(self, entries: list[int], change: float) -> None:
-        self.entries = entries
-        super().__init__(f"Newton's method stalled with a relative change of {change:.1e}")
 
 
 @dataclass(frozen=True)
@@ -51,7 +37,7 @@ class StepStart:
     properties: Properties
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """As the inputs of a `StepProblem`; `of` reads them back."""
+        """As the inputs of a `LinearisedStep`; `of` reads them back."""
         return (self.positions, self.velocities, self.targets, *self.properties.tensors())
 
     @staticmethod
@@ -67,6 +53,7 @@ class StepTerms:
     geometry: Geometry
     energies: tuple[Linearisation, ...]
     contact: HalfSpaceContact | None
+    proximity: ProximityContact | None
 
 
 @dataclass(frozen=True)
@@ -88,7 +75,7 @@ class Held:
 
 
 @dataclass(frozen=True)
-class StepProblem:
+class LinearisedStep:
     """The equation of one step. Inputs: positions, velocities [B, V, 3], targets [B, H, 3], *properties."""
 
     system: System
@@ -98,40 +85,24 @@ class StepProblem:
     """[H] node of each handle."""
     held: Held | None
     """None if no hard handle is active."""
-
-    @property
-    def exact(self) -> bool:
-        return self.system.newton_iterations == 1
+    proximity: Proximity | None = None
+    """Pairs of meshes that repel in this step."""
 
     def residual(self, u: Tensor, *inputs: Tensor) -> Tensor:
         """r [B, V, 3] [N·s]."""
         start = StepStart.of(inputs)
-        return self._residual(u, start, self._linearise(start, self._point(u, start)))
+        return self._residual(u, start, self._linearise(start))
 
     def solve(self, *inputs: Tensor) -> tuple[Tensor, Factor]:
-        """u [B, V, 3] [m/s] and the factor of the (last) step matrix.
+        """u [B, V, 3] [m/s] and the factor of the step matrix.
 
         Raises:
-            NotPositiveDefiniteError, NewtonStallError: name the batch entries.
+            NotPositiveDefiniteError: names the batch entries.
         """
         start = StepStart.of(inputs)
-        u = torch.zeros_like(start.velocities)
-        change = torch.full_like(u[:, 0, 0], torch.inf)
-        for _ in range(self.system.newton_iterations):
-            terms = self._linearise(start, self._point(u, start))
-            factor = self._factorise(start, terms)
-            residual = self._residual(u, start, terms)
-            direction = -factor.solve(residual)
-            if self.exact:
-                return direction, factor
-            u = self._backtrack(u, direction, residual, start)
-            largest = (start.velocities + self.prescribe(u, start)).abs().amax((1, 2))
-            change = direction.abs().amax((1, 2)) / (largest + 1e-9)
-            if bool((change <= _NEWTON_TOLERANCE).all()):
-                break
-        if not bool((change <= _NEWTON_ACCEPTED).all()):
-            raise NewtonStallError((~(change <= _NEWTON_ACCEPTED)).nonzero().flatten().tolist(), float(change.max()))
-        return u, factor
+        terms = self._linearise(start)
+        factor = self._factorise(start, terms)
+        return -factor.solve(self._residual(torch.zeros_like(start.velocities), start, terms)), factor
 
     def prescribe(self, u: Tensor, start: StepStart) -> Tensor:
         """u with the velocity change of hard-held nodes filled in."""
@@ -141,29 +112,28 @@ class StepProblem:
         change = (wanted - start.positions) / self.system.time_step - start.velocities
         return torch.where(self.held.mask, change, u)
 
-    def _point(self, u: Tensor, start: StepStart) -> Tensor:
-        """The point of linearisation [B, V, 3]."""
-        if self.exact:
-            return start.positions
-        return start.positions + self.system.time_step * (start.velocities + self.prescribe(u, start))
-
-    def _linearise(self, start: StepStart, positions: Tensor) -> StepTerms:
+    def _linearise(self, start: StepStart) -> StepTerms:
         system, values = self.system, start.properties
-        shape = geometry(system.stretching.elements, positions)
+        shape = geometry(system.stretching.elements, start.positions)
         contact = None
         if system.halfspaces is not None:
             contact = system.halfspaces.at(
-                positions,
-                start.positions,
-                start.velocities,
-                values.node_mass,
-                values.friction_obstacle,
+                start.positions, start.velocities, values.node_mass, values.friction_obstacle, system.time_step
+            )
+        proximity = None
+        if self.proximity is not None and system.contact is not None:
+            proximity = self.proximity.at(
+                system.contact.all_points(start.positions),
+                system.contact.with_rest(start.velocities),
+                system.contact.with_rest(1 / values.node_mass),
+                (values.friction_obstacle, values.friction_cloth),
                 system.time_step,
             )
         return StepTerms(
             shape,
             tuple(energy.at(shape, values) for energy in (system.stretching, system.bending)),
             contact,
+            proximity,
         )
 
     def _residual(self, u: Tensor, start: StepStart, terms: StepTerms) -> Tensor:
@@ -172,17 +142,15 @@ class StepProblem:
         velocity = start.velocities + change
         mass = values.node_mass[..., None]
         step = dt * velocity
-        shape = terms.geometry
-        if not self.exact:
-            step = step + (start.positions - shape.positions)
-            shape = geometry(system.stretching.elements, start.positions)
         displacement = step + values.damping[:, None, None] * velocity
 
-        force = mass * system.gravity + system.air.forces(shape, start.velocities, values)
+        force = mass * system.gravity + system.air.forces(terms.geometry, start.velocities, values)
         for energy in terms.energies:
             force = force + energy.forces(displacement)
         if terms.contact is not None:
             force = force + terms.contact.forces(step, velocity)
+        if terms.proximity is not None:
+            force = force + terms.proximity.forces(step, velocity)
         if self.held is None and len(self.handle_nodes):
             offset = start.targets - (start.positions + dt * velocity)[:, self.handle_nodes]
             pull = (system.handles.stiffness * self.strength)[:, None] * offset
@@ -208,17 +176,14 @@ class StepProblem:
             own = values.node_mass[..., None, None] * identity
             diagonal = torch.where(self.held.mask[..., None], own, diagonal)
             blocks = [block * free for block, free in zip(blocks, self.held.free_blocks, strict=True)]
-        return system.pattern.factorise(diagonal, blocks)
+        return system.pattern.factorise(diagonal, blocks, self._couplings(terms))
 
-    def _backtrack(self, u: Tensor, direction: Tensor, residual: Tensor, start: StepStart) -> Tensor:
-        """u + α direction, with α halved per batch entry while the residual grows."""
-        before = residual.square().sum((1, 2))
-        alpha = torch.ones_like(before)
-        for _ in range(_HALVINGS):
-            candidate = u + alpha[:, None, None] * direction
-            trial = self._residual(candidate, start, self._linearise(start, self._point(candidate, start)))
-            worse = trial.square().sum((1, 2)) > before * (1 + 1e-9) + 1e-300
-            if not bool(worse.any()):
-                break
-            alpha = torch.where(worse, 0.5 * alpha, alpha)
-        return u + alpha[:, None, None] * direction
+    def _couplings(self, terms: StepTerms) -> Couplings | None:
+        if terms.proximity is None:
+            return None
+        couplings = terms.proximity.couplings(self.system.time_step)
+        if self.held is None:
+            return couplings
+        mask = self.held.mask[:, 0]
+        free = ~(mask[couplings.rows] | mask[couplings.columns])
+        return Couplings(*(getattr(couplings, name)[free] for name in ("entry", "rows", "columns", "blocks")))

@@ -1,0 +1,30 @@
+"""Small scenes with meshes to touch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from diffcloud.mesh import SurfaceMesh
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.contact import ReferenceContact
+from tests.conftest import small_lift
+
+
+def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> SurfaceMesh:
+    """A box with outward faces."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
+    return SurfaceMesh(np.array(low) + corners * (np.array(high) - np.array(low)), np.array(faces))
+
+
+def over_box(contact: ReferenceContact, *, proximity: bool = True, height: float = 0.012, **changes: object) -> Scenario:
+    """A small cloth, lifted at a corner, that falls over the edges and corners of a box without lying on them exactly."""
+    scenario = small_lift(
+        contact_stiffness=1e6, contact_thickness_m=0.005, gravity=(0.0, 0.0, -30.0), gap_m=height, **changes
+    )
+    obstacle = box((-0.047, -0.061, -0.2), (0.053, 0.043, 0.0))
+    surrounding = replace(scenario.scene.surrounding, obstacles=(obstacle,), reference_contact=contact, proximity=proximity)
+    return replace(scenario, scene=replace(scenario.scene, surrounding=surrounding))
