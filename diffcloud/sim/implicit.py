@@ -39,8 +39,8 @@ _ITERATIONS = 60
 _HALVINGS = 8
 _SLOWEST = 1e-1
 """Velocities below this are at rest for the tolerance [m/s]."""
-_CLOSE = 0.5
-"""Below this relative change the exact Jacobian takes over from its positive semidefinite part."""
+_LEAST_CAUTION = 0.05
+"""Caution below this is none."""
 _REUSE = 1e-4
 """A relative change below this is followed by one correction with the same matrix instead of a new one."""
 _ROOM = 0.5
@@ -170,49 +170,67 @@ class ImplicitStep:
         residual = self._residual(here.u, start, here.measured, here.points)
         active = everything
         change = torch.full((batch,), torch.inf, dtype=zero.dtype, device=zero.device)
+        caution = torch.ones_like(change)
         factor: Factor | None = None
-        exact = False
         for _ in range(_ITERATIONS):
             if factor is None:
-                factor = self._jacobian(here.u, start, here.measured, here.points, exact=exact)
+                factor = self._jacobian(here.u, start, here.measured, here.points, caution)
             direction = -factor.solve(residual)
-            speed = (zero + here.u).abs().amax((1, 2)).clamp(min=_SLOWEST)
-            before, change = change, torch.where(active, direction.abs().amax((1, 2)) / speed, change)
-            # shorten the step until it is free of collisions and the next correction is smaller (Deuflhard's test)
-            alpha = active.to(zero.dtype)
-            length = direction.square().sum((1, 2))
             downhill = -(residual * direction).sum((1, 2))
-            shortened = False
-            for _ in range(_HALVINGS):
-                trial = self._towards(here, direction, start, room, alpha)
-                remaining = self._residual(trial.u, start, trial.measured, trial.points)
-                if bool((change[active] < _REUSE).all()):
-                    break
-                if exact:
-                    left = factor.solve(remaining).square().sum((1, 2))
-                    worse = ~(left <= length * (1 - 0.25 * alpha)) & active
-                else:
-                    uphill = (remaining * direction).sum((1, 2))
-                    worse = ~(uphill <= 0.9 * downhill) & active
-                if not bool(worse.any()):
-                    break
-                shortened = True
-                gone = (trial.u - here.u).abs().amax((1, 2)) / direction.abs().amax((1, 2))
-                alpha = torch.where(worse, 0.5 * gone, alpha)
-            here, residual = trial, remaining
-            arrived = (here.scenery == self.scenery[1]).flatten(1).all(1)
-            expected = torch.where(before.isfinite(), change * (change / before).clamp(max=1.0), change)
-            settled = (expected < _TOLERANCE) | ((change < _ROUNDING) & (change > 0.3 * before))
-            active = active & ~(settled & arrived)
-            if not bool(active.any()):
-                return here.u, room.near
-            largest = float(change[active].max())
-            if not (exact and largest < _REUSE):
-                factor = None
-            exact = largest < _CLOSE and not shortened
+            speed = (zero + here.u).abs().amax((1, 2)).clamp(min=_SLOWEST)
+            size = direction.abs().amax((1, 2)) / speed
+            rough = active & (size > _REUSE)
+            bad = rough & (downhill <= 0)
+            if not bool(bad.any()):
+                trial, remaining, short = self._search(here, direction, downhill, start, room, active, rough)
+                arrived = (trial.scenery == self.scenery[1]).flatten(1).all(1)
+                before, change = change, torch.where(active, size, change)
+                expected = torch.where(before.isfinite(), change * (change / before).clamp(max=1.0), change)
+                settled = (expected < _TOLERANCE) | ((change < _ROUNDING) & (change > 0.3 * before))
+                here, residual = trial, remaining
+                active = active & ~(settled & arrived)
+                if not bool(active.any()):
+                    return here.u, room.near
+                bad = short
+                if not bool(bad.any()) and not bool(rough.any()) and bool((caution == 0).all()):
+                    continue
+            factor = None
+            eager = torch.where(caution > _LEAST_CAUTION, caution / 4, 0.0)
+            caution = torch.where(bad, (4 * caution).clamp(_LEAST_CAUTION, 1.0), eager)
         entries = active.nonzero().flatten().tolist()
         pair = "none" if contact is None else contact.closest(here.measured, here.points)[1][entries[0]]
         raise StuckError(entries, float(change[active].max()), pair)
+
+    def _search(
+        self,
+        here: _Place,
+        direction: Tensor,
+        downhill: Tensor,
+        start: ImplicitStart,
+        room: _Room,
+        active: Tensor,
+        rough: Tensor,
+    ) -> tuple[_Place, Tensor, Tensor]:
+        """The step along `direction` at whose end it leads downhill still, or uphill less steeply than it began.
+
+        Where forces have a potential, that is a step along which it falls; friction, drag and damping are judged alike.
+
+        Returns:
+            The place, the residual there, and bool [B] whether the step had to be shortened for it.
+        """
+        alpha = active.to(direction.dtype)
+        short = torch.zeros_like(active)
+        for _ in range(_HALVINGS):
+            trial = self._towards(here, direction, start, room, alpha)
+            remaining = self._residual(trial.u, start, trial.measured, trial.points)
+            uphill = (remaining * direction).sum((1, 2))
+            worse = rough & ~(uphill <= 0.9 * downhill)
+            if not bool(worse.any()):
+                break
+            short = short | worse
+            gone = (trial.u - here.u).abs().amax((1, 2)) / direction.abs().amax((1, 2))
+            alpha = torch.where(worse, 0.5 * gone, alpha)
+        return trial, remaining, short
 
     def _towards(self, here: _Place, direction: Tensor, start: ImplicitStart, room: _Room, alpha: Tensor) -> _Place:
         """`here` + α direction with the longest α up to the given [B] that has no collision on the way."""
@@ -313,8 +331,10 @@ class ImplicitStep:
 
     # --- Jacobian ----------------------------------------------------------------------------------------------------
 
-    def _jacobian(self, u: Tensor, start: ImplicitStart, measured: Measured, end: Tensor, *, exact: bool = True) -> Factor:
-        """∂r/∂u; not `exact`: a positive definite matrix near it, for steps from afar."""
+    def _jacobian(
+        self, u: Tensor, start: ImplicitStart, measured: Measured, end: Tensor, caution: Tensor | None = None
+    ) -> Factor:
+        """∂r/∂u, and with `caution` [B] in [0, 1] so much of a positive definite matrix near it instead."""
         system, setup, dt, values = self.system, self.setup, self.system.time_step, start.properties
         batch, nodes = len(u), start.positions.shape[1]
         hard = system.handles.hard and len(self.handle_nodes) > 0
@@ -324,19 +344,25 @@ class ImplicitStep:
             weight = weight.scatter_add(1, self.handle_nodes.expand(batch, -1), spring)
         identity = torch.eye(3, dtype=u.dtype, device=u.device)
         diagonal = weight[..., None, None] * identity
+        careful = caution is not None and bool((caution > 0).any())
+        exact = caution is None or bool((caution < 1).any())
+        blocks = []
         if exact:
             blocks = [self._face_blocks(u, start), self._hinge_blocks(u, start)]
-        else:
+        if careful:
+            assert caution is not None
             shape = geometry(system.stretching.elements, start.positions + dt * (start.velocities + u[:, :nodes]))
             scale = (dt * (dt + values.damping))[:, None, None, None]
-            blocks = [scale * energy.at(shape, values).hessian() for energy in (system.stretching, system.bending)]
+            safe = [scale * energy.at(shape, values).hessian() for energy in (system.stretching, system.bending)]
+            part = caution[:, None, None, None]
+            blocks = [b + part * (s - b) for b, s in zip(blocks, safe, strict=True)] if exact else safe
         couplings: list[Couplings] = []
         if len(setup.bodies):
             diagonal = torch.cat([diagonal, self._body_inertia(u, start)], dim=1)
         if setup.contact is not None:
             begin = self._start_points(start)
             arguments = (measured, begin, end, values.friction_obstacle, values.friction_cloth, dt)
-            found = setup.contact.blocks(*arguments, exact=exact)
+            found = setup.contact.blocks(*arguments, caution=caution if careful else None)
             if len(setup.bodies):
                 turning = self._turning(u, start)
                 couplings = [c for block in found for c in self._couple(block, turning, nodes)]

@@ -38,7 +38,7 @@ _TINY = 1e-300
 class Barrier:
     """Numbers of the contact law."""
 
-    stiffness: float
+    scale: float
     """k_c [N/m³]"""
     thickness: float
     """d̂ [m]"""
@@ -49,7 +49,7 @@ class Barrier:
         """φ per area [J/m²] at distances [...] > 0."""
         ratio = distance / self.thickness
         inside = self.thickness**2 * (ratio - 1).square() * ratio.clamp(min=_TINY).log()
-        return torch.where(ratio < 1, -self.stiffness / 6 * inside, 0.0)
+        return torch.where(ratio < 1, -self.scale / 6 * inside, 0.0)
 
     def pressure(self, distance: Tensor) -> Tensor:
         """-dφ/dd per area [Pa]."""
@@ -57,15 +57,25 @@ class Barrier:
         below = ratio < 1
         safe = torch.where(below, ratio, 0.5)
         slope = 2 * (safe - 1) * safe.log() + (safe - 1).square() / safe
-        return torch.where(below, self.stiffness * self.thickness / 6 * slope, 0.0)
+        return torch.where(below, self.scale / 6 * self.thickness * slope, 0.0)
+
+    def stiffness(self, distance: Tensor) -> Tensor:
+        """d²φ/dd² per area [N/m³]."""
+        ratio = distance / self.thickness
+        below = ratio < 1
+        safe = torch.where(below, ratio, 0.5)
+        curvature = -2 * safe.log() - 4 * (safe - 1) / safe + ((safe - 1) / safe).square()
+        return torch.where(below, self.scale / 6 * curvature, 0.0)
 
     def friction(self, normal_force: Tensor, coefficient: Tensor, sliding: Tensor) -> Tensor:
         """[..., 3] force against the tangential velocity `sliding` [..., 3] [m/s]."""
         speed = safe_norm(sliding)
-        # f(|v|)/|v|: finite at rest
+        return -(coefficient * normal_force * self._per_speed(speed))[..., None] * sliding
+
+    def _per_speed(self, speed: Tensor) -> Tensor:
+        """f(|v|)/|v|, finite at rest [s/m]."""
         sticking = (2 - speed / self.sticking_speed) / self.sticking_speed
-        per_speed = torch.where(speed < self.sticking_speed, sticking, 1 / speed)
-        return -(coefficient * normal_force * per_speed)[..., None] * sliding
+        return torch.where(speed < self.sticking_speed, sticking, 1 / speed)
 
     def place_forces(
         self,
@@ -87,14 +97,44 @@ class Barrier:
         Returns:
             [C, 4, 3] [N].
         """
-        gap = weights @ end  # [C, S, 3]
-        distance = safe_norm(gap)
-        normal = gap / distance[..., None]
+        distance, normal, sliding = _meeting(weights, start, end, time_step)
         force = share * self.pressure(distance)
-        velocity = weights @ ((end - start) / time_step)
-        sliding = velocity - (velocity * normal).sum(-1, keepdim=True) * normal
         push = force[..., None] * normal + self.friction(force, coefficient[:, None], sliding)
         return weights.mT @ push
+
+    def place_stiffness(
+        self,
+        weights: Tensor,
+        share: Tensor,
+        start: Tensor,
+        end: Tensor,
+        coefficient: Tensor,
+        time_step: float,
+    ) -> Tensor:
+        """What of -d forces / d end resists motion, with places and normals held: positive semidefinite.
+
+        Arguments as for `place_forces`.
+
+        Returns:
+            [C, 12, 12] [N/m].
+        """
+        distance, normal, sliding = _meeting(weights, start, end, time_step)
+        counted = share.clamp(min=0)
+        along = counted * self.stiffness(distance)
+        rubbing = counted * self.pressure(distance) * coefficient[:, None] * self._per_speed(safe_norm(sliding)) / time_step
+        identity = torch.eye(3, dtype=end.dtype, device=end.device)
+        both = (along - rubbing)[..., None, None] * normal[..., :, None] * normal[..., None, :]
+        local = both + rubbing[..., None, None] * identity  # [C, S, 3, 3]
+        return torch.einsum("csi,csj,csab->ciajb", weights, weights, local).reshape(len(end), 12, 12)
+
+
+def _meeting(weights: Tensor, start: Tensor, end: Tensor, time_step: float) -> tuple[Tensor, Tensor, Tensor]:
+    """(distance [C, S], unit normal [C, S, 3], sliding velocity [C, S, 3]) at the end of the step."""
+    gap = weights @ end
+    distance = safe_norm(gap)
+    normal = gap / distance[..., None]
+    velocity = weights @ ((end - start) / time_step)
+    return distance, normal, velocity - (velocity * normal).sum(-1, keepdim=True) * normal
 
 
 def point_face_places(corners: Tensor, edge_share: Tensor, point_share: Tensor) -> tuple[Tensor, Tensor]:

@@ -146,9 +146,13 @@ class SmoothContact:
         friction_cloth: Tensor,
         time_step: float,
         *,
-        exact: bool = True,
+        caution: Tensor | None = None,
     ) -> list[ContactBlocks]:
-        """d forces / d end, arguments as for `forces`; not `exact`: the negative semidefinite part of its symmetric part."""
+        """d forces / d end, arguments as for `forces`.
+
+        Args:
+            caution: [B] in [0, 1], so much of a negative semidefinite matrix near it instead.
+        """
         found = []
         if self.planes is not None:
             planes = self.planes
@@ -163,7 +167,8 @@ class SmoothContact:
 
                 entry, point = close.nonzero(as_tuple=True)
                 values = element_jacobian(push, at, 3)[entry, point]
-                values = values if exact else _resisting(values)
+                if caution is not None:
+                    values = values + caution[entry][:, None, None] * (_resisting(values) - values)
                 found.append(ContactBlocks(entry, planes.points[point], planes.points[point], values))
         for pairs in measured.touching:
             coefficient = self._coefficient(pairs, friction_obstacle, friction_cloth)
@@ -179,7 +184,10 @@ class SmoothContact:
                 return forces.flatten(1)
 
             values = element_jacobian(pair_push, last.flatten(1), 12)
-            values = values if exact else _resisting(values)
+            if caution is not None:
+                weights, share = self._places(pairs, last)
+                safe = -self.barrier.place_stiffness(weights, share, first, last, coefficient, time_step)
+                values = values + caution[pairs.entry][:, None, None] * (safe - values)
             values = values.view(-1, 4, 3, 4, 3).transpose(2, 3)
             found.append(
                 ContactBlocks(
@@ -280,6 +288,6 @@ class SmoothContact:
 
 
 def _resisting(blocks: Tensor) -> Tensor:
-    """[..., n, n] -> the negative semidefinite part of the symmetric part: the stiffness that resists motion."""
+    """[K, 3, 3] -> the negative semidefinite part of the symmetric part."""
     values, vectors = torch.linalg.eigh(0.5 * (blocks + blocks.mT))
     return (vectors * values.clamp(max=0)[..., None, :]) @ vectors.mT
