@@ -46,6 +46,9 @@ _REUSE = 1e-4
 _ROOM = 0.5
 """First guess of how far points leave their predicted path, as part of the thickness and of the path."""
 
+_LONGEST = 5.0
+"""Newton's steps are kept within this many times the thickness and the path."""
+
 
 class StuckError(ArithmeticError):
     """Newton's method did not converge. `entries` lists the batch entries; the message names the closest pair."""
@@ -195,7 +198,7 @@ class ImplicitStep:
                 if not bool(bad.any()) and not bool(rough.any()) and bool((caution == 0).all()):
                     continue
             factor = None
-            eager = torch.where(caution > _LEAST_CAUTION, caution / 4, 0.0)
+            eager = torch.where(caution > _LEAST_CAUTION, caution / 16, 0.0)
             caution = torch.where(bad, (4 * caution).clamp(_LEAST_CAUTION, 1.0), eager)
         entries = active.nonzero().flatten().tolist()
         pair = "none" if contact is None else contact.closest(here.measured, here.points)[1][entries[0]]
@@ -243,7 +246,11 @@ class ImplicitStep:
             points = self._points(u, start, scenery)
             if contact is None:
                 break
-            if room.cover(points):
+            away = room.away(points)
+            if bool((away > room.longest).any()):
+                alpha = alpha * torch.where(away > room.longest, 0.5 * room.longest / away, 1.0)
+                continue
+            if room.cover(float(away.max())):
                 here = replace(here, measured=contact.measure(room.near, here.points))
             fraction = contact.safe_fraction(here.measured, here.points, points)
             if bool((fraction == 1).all()):
@@ -531,20 +538,22 @@ class _Room:
             self.held[step.handle_nodes] = True
         self.near = Near((), self.held)
         if self.contact is None or self.contact.surface is None:
-            self.size = float("inf")
+            self.size = self.longest = float("inf")
             return
         path = float((self.high - self.low).max())
         self.size = _ROOM * (self.contact.barrier.thickness + 0.2 * path)
+        self.longest = _LONGEST * (self.contact.barrier.thickness + path)
         self.near = self.contact.near(self.places, 2 * self.size, self.held)
 
-    def cover(self, points: Tensor) -> bool:
-        """Make sure that the list holds all pairs that may touch on the way to `points`; whether it had to grow."""
-        if self.size == float("inf"):
-            return False
-        beyond = float(torch.maximum(self.low - points, points - self.high).max())
-        if beyond <= self.size:
+    def away(self, points: Tensor) -> Tensor:
+        """[B] how far the points of each entry are from the path [m]."""
+        return torch.maximum(self.low - points, points - self.high).amax((1, 2)).clamp(min=0)
+
+    def cover(self, distance: float) -> bool:
+        """Make sure that the list holds all pairs that may touch so far from the path; whether it had to grow."""
+        if distance <= self.size:
             return False
         assert self.contact is not None
-        self.size = 2 * beyond
+        self.size = min(2 * distance, self.longest)
         self.near = self.contact.near(self.places, 2 * self.size, self.held)
         return True
