@@ -40,30 +40,34 @@ def grid_cloth(rows: int, columns: int, height: float, width: float, *, alternat
     return ClothMesh(nodes=nodes, verts=verts, vert_node=np.arange(len(verts)), face_verts=faces)
 
 
-def loop_cloth(rows: int, columns: int, width: float, circumference: float) -> ClothMesh:
-    """A closed band standing upright around the z axis, centred on the origin, at rest in its world shape.
+def loop_cloth(rows: int, columns: int, width: float, circumference: float, end_radius: float | None = None) -> ClothMesh:
+    """A closed band standing upright around the z axis, centred on the origin.
 
     Material space is the unrolled strip: u runs along the band (counter-clockwise seen from above), v upwards. Node
-    (i, j) has index i·columns + j, i runs upwards, j along the band from +x. Where the strip is closed, at j = 0, a node
-    owns two verts. Faces are counter-clockwise seen from outside.
+    (i, j) has index i·columns + j, i runs upwards, j along the band from its place at -y. Where the strip is closed, at
+    j = 0, a node owns two verts. Faces are counter-clockwise seen from outside.
 
     Args:
         rows: nodes across the band, at least 2.
         columns: nodes along it, at least 3.
         width: across the band [m].
-        circumference: along the band [m]; the world shape is the regular polygon of that perimeter.
+        circumference: along the band [m].
+        end_radius: of the two half circles at -y and +y; straight lines join them. None: one circle. Where the band is
+            curved, the world shape's chords are a little shorter than the rest shape [m].
 
     Raises:
-        MeshError: too few nodes, or a size that is not positive.
+        MeshError: too few nodes, a size that is not positive, or a radius too large for the circumference.
     """
     if rows < 2 or columns < 3:
         raise MeshError(f"A loop needs at least 2 nodes across and 3 along, got {rows} and {columns}.")
     if not (width > 0 and circumference > 0):
         raise MeshError(f"A loop needs a positive width and circumference in metres, got {width} and {circumference}.")
+    round_radius = circumference / (2 * np.pi)
+    radius = round_radius if end_radius is None else end_radius
+    if not 0 < radius <= round_radius:
+        raise MeshError(f"A loop of {circumference} m allows end radii up to {round_radius:.4g} m, got {radius}.")
     v, u = np.meshgrid(np.linspace(0, width, rows), np.linspace(0, circumference, columns + 1), indexing="ij")
-    angle = 2 * np.pi * np.arange(columns) / columns
-    radius = circumference / columns / (2 * np.sin(np.pi / columns))
-    ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ring = _stadium(circumference * np.arange(columns) / columns, circumference, radius)
     height = np.linspace(-width / 2, width / 2, rows)
     nodes = np.column_stack([np.tile(ring, (rows, 1)), np.repeat(height, columns)])
     return ClothMesh(
@@ -72,6 +76,18 @@ def loop_cloth(rows: int, columns: int, width: float, circumference: float) -> C
         vert_node=(np.arange(rows)[:, None] * columns + np.arange(columns + 1) % columns).ravel(),
         face_verts=_grid_faces(rows, columns + 1, alternate_diagonals=True),
     )
+
+
+def _stadium(along: FloatArray, circumference: float, radius: float) -> FloatArray:
+    """[N] distances along a stadium, counter-clockwise from its lowest point -> [N, 2] places."""
+    straight = (circumference - 2 * np.pi * radius) / 2
+    quarter = np.pi * radius / 2
+    past = along[:, None] - np.cumsum([0, quarter, straight, 2 * quarter, straight])
+    turn = np.clip(past, 0, [quarter, straight, 2 * quarter, straight, quarter])  # how much of each part lies behind
+    angle = -np.pi / 2 + (turn[:, 0] + turn[:, 2] + turn[:, 4]) / radius
+    centre = -straight / 2 + turn[:, 1] - turn[:, 3]
+    # counter-clockwise the right side runs up and the left side down
+    return np.stack([radius * np.cos(angle), centre + radius * np.sin(angle)], axis=1)
 
 
 _VEST_UP = np.array([0.0, 0.2, 0.4, 0.58, 0.72, 0.86, 1.0])

@@ -121,10 +121,6 @@ _BASIS_SOURCE = (
     "chosen, not measured: soft enough that the whole box [0.1, 10]² of multipliers moves a hand-sized cloth by more "
     "than a depth camera's noise (docs/scenarios.md); most real fabrics lie at its stiff edge"
 )
-_ELASTIC_SOURCE = (
-    "chosen, not measured: softer and heavier still, so that most multipliers drawn uniformly from [0.1, 10] show in "
-    "a band pulled taut, or a vest hung up, beyond the paper's threshold"
-)
 _KES_SOURCE = (
     "order of magnitude from published KES-F / ASTM D1388 ranges for this kind of fabric (e.g. Kawabata, The "
     "Standardization and Analysis of Hand Evaluation, 1980); measure your own before you rely on it"
@@ -142,15 +138,6 @@ _PRESETS = {
             stiffening=3.0,
             damping=0.0,
             source=_BASIS_SOURCE,
-        ),
-        isotropic(
-            "basis-elastic",
-            density=0.3,
-            stretching=1.5,
-            shear=0.75,
-            bending=4e-6,
-            stiffening=3.0,
-            source=_ELASTIC_SOURCE,
         ),
         isotropic("jersey-knit", density=0.16, stretching=60.0, shear=30.0, bending=3e-6, source=_KES_SOURCE),
         isotropic("cotton-shirting", density=0.12, stretching=800.0, shear=60.0, bending=8e-6, source=_KES_SOURCE),

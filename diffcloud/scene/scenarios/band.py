@@ -16,29 +16,31 @@ from diffcloud.scene.scenarios.release import PAPER_THRESHOLD, RELEASE_UNIT_M
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.scene.schema import NonNegative, Positive
 
-_CLEARANCE = 0.004
-"""Least distance between the band and the pole at the start [m]."""
-
 
 class BandScenario(ScenarioOptions):
-    """A band that stands upright on a table around a pole, held in front (at -y): everything a YAML file may change."""
+    """A band that stands upright on a table, laid around a pole and a gripper in front (at -y) without slack.
 
-    material: str = "basis-elastic"
+    Everything here may change in a YAML file.
+    """
+
+    contact_thickness_m: Positive = 0.004
     circumference_m: Positive = 1.2
-    width_m: Positive = 0.05
-    nodes: tuple[Annotated[int, Field(ge=4)], Annotated[int, Field(ge=2)]] = (32, 3)
+    width_m: Positive = 0.06
+    nodes: tuple[Annotated[int, Field(ge=4)], Annotated[int, Field(ge=2)]] = (32, 2)
     """Node counts along the band and across it."""
     center_m: tuple[float, float] = (0.0, 0.0)
     """Where the band's middle stands on the table."""
     table_height_m: float = 0.0
     gap_m: NonNegative = 0.005
     """Height of the band over the table at the start."""
-    pole: Literal["square", "round"] = "square"
+    pole: Literal["square", "round"] = "round"
     pole_width_m: Positive = 0.1
     """Side of the square, or diameter."""
     pole_height_m: Positive = 0.4
-    pole_offset_m: tuple[float, float] = (0.0, 0.085)
-    """Of the pole's axis from the band's middle."""
+    pole_sides: Annotated[int, Field(ge=3)] = 24
+    """Of a round pole."""
+    pole_gap_m: Positive = 0.008
+    """Between the band and the pole at the start."""
     grasped_columns: Annotated[int, Field(ge=1)] = 3
     """Nodes along the band that the gripper holds, over its whole width."""
 
@@ -60,45 +62,36 @@ def band_scenario(options: BandScenario) -> Scenario:
     """The scenario of a band around a pole.
 
     Raises:
-        SceneError: a pole that does not stand inside the band, or more grasped columns than the band has.
+        MeshError: a pole too thick for the band.
+        SceneError: more grasped columns than the band has.
     """
     along, across = options.nodes
     if options.grasped_columns >= along:
         raise SceneError(
             f"Scenario {options.name}: {options.grasped_columns} grasped columns, but the band has {along} nodes along it."
         )
-    loop = loop_cloth(across, along, options.width_m, options.circumference_m)
+    radius = options.pole_gap_m + options.pole_width_m * (0.5 if options.pole == "round" else 0.5**0.5)
+    loop = loop_cloth(across, along, options.width_m, options.circumference_m, radius)
     middle = options.table_height_m + options.gap_m + options.width_m / 2
     mesh = replace(loop, nodes=np.add(loop.nodes, (*options.center_m, middle)))
-    _refuse_pole_outside(options, float(np.linalg.norm(loop.nodes[0, :2])))
-    front = round(0.75 * along) - options.grasped_columns // 2  # three quarters around from +x is -y
+    front = -(options.grasped_columns // 2)
     columns = (front + np.arange(options.grasped_columns)) % along
     extent = options.circumference_m + options.reach
     return assemble(
         options,
         mesh,
-        (_pole(options), rectangle_surface(options.center_m, (extent, extent), options.table_height_m)),
+        (
+            _pole(options, float(loop.nodes[:, 1].max()) - radius),
+            rectangle_surface(options.center_m, (extent, extent), options.table_height_m),
+        ),
         grasped=[int(row * along + column) for row in range(across) for column in columns],
     )
 
 
-def _pole(options: BandScenario) -> SurfaceMesh:
-    axis = np.add(options.center_m, options.pole_offset_m)
+def _pole(options: BandScenario, offset: float) -> SurfaceMesh:
+    axis = np.add(options.center_m, (0.0, offset))
     half = options.pole_width_m / 2
     bottom, top = options.table_height_m, options.table_height_m + options.pole_height_m
     if options.pole == "square":
         return box_surface([*(axis - half), bottom], [*(axis + half), top])
-    return cylinder_surface([*axis, bottom], [*axis, top], half)
-
-
-def _refuse_pole_outside(options: BandScenario, radius: float) -> None:
-    along = options.nodes[0]
-    inner = radius * np.cos(np.pi / along)  # of the circle inside the polygon
-    distance = np.linalg.norm(np.abs(options.pole_offset_m) + options.pole_width_m / 2)
-    if options.pole == "round":
-        distance = np.linalg.norm(options.pole_offset_m) + options.pole_width_m / 2
-    if distance > inner - _CLEARANCE:
-        raise SceneError(
-            f"Scenario {options.name}: the pole reaches {distance:.4g} m from the band's middle, but must stay inside "
-            f"{inner - _CLEARANCE:.4g} m. Make the band longer, or the pole thinner or nearer to the middle."
-        )
+    return cylinder_surface([*axis, bottom], [*axis, top], half, options.pole_sides)

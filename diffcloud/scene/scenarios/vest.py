@@ -25,28 +25,28 @@ class VestScenario(ScenarioOptions):
     The gripper holds the shoulder at +x at its neck end; the hook comes from +x and ends under that shoulder.
     """
 
-    material: str = "basis-elastic"
-    width_m: Positive = 0.22
+    contact_thickness_m: Positive = 0.004
+    width_m: Positive = 0.40
     """Of a panel, flat."""
-    height_m: Positive = 0.26
+    height_m: Positive = 0.47
     """From the hem to the shoulder, flat."""
-    depth_m: Positive = 0.035
+    depth_m: Positive = 0.063
     """Half the distance between front and back."""
     center_m: tuple[float, float] = (0.0, 0.0)
     """Where the vest's middle is."""
-    hem_height_m: float = 0.3
-    hook_radius_m: Positive = 0.007
-    hook_length_m: Positive = 0.2
+    hem_height_m: float = 0.6
+    hook_radius_m: Positive = 0.0125
+    hook_length_m: Positive = 0.36
     hook_sides: Annotated[int, Field(ge=3)] = 16
-    hook_drop_m: Positive = 0.05
+    hook_drop_m: Positive = 0.09
     """Of the hook's axis below the shoulder."""
-    hook_reach_m: Positive = 0.026
+    hook_reach_m: Positive = 0.047
     """How far the hook reaches under the shoulder, from its arm end."""
 
 
 VEST_HANG = VestScenario(
     name="vest_hang",
-    path=[(0.0, 0.0, 0.0, 0.0), (1.2, -0.02, 0.0, -0.065)],
+    path=[(0.0, 0.0, 0.0, 0.0), (1.2, -0.036, 0.0, -0.117)],
     frames=15,
     steps_per_frame=3,
     loss_frames=(10,),

@@ -17,7 +17,9 @@ from diffcloud.sim.contact.pairs import Kind
 
 _LEFT = 0.2
 """Part of the starting distance that the first advance leaves; later ones may go down to half of that."""
-_ADVANCES = 200
+_ENOUGH = 2.0
+"""An advance stops when the distance is less than this many times its goal."""
+_ADVANCES = 100
 """Stopping earlier is safe, only short."""
 
 
@@ -28,7 +30,7 @@ def pair_distance(kind: Kind, corners: Tensor) -> Tensor:
 
 
 def safe_fraction(kind: Kind, start: Tensor, end: Tensor, distance: Tensor) -> Tensor:
-    """The fraction of each pair's motion that keeps a tenth of its distance.
+    """The fraction of each pair's motion that keeps at least a tenth of its distance.
 
     Args:
         start, end: [C, 4, 3] positions [m].
@@ -58,11 +60,11 @@ def _advance(measure: Callable[[Tensor], Tensor], start: Tensor, motion: Tensor,
     for _ in range(_ADVANCES):
         tried = fraction[active] + ahead[active]
         left = measure(start[active] + tried[:, None, None] * motion[active])
-        stopped = left < goal[active]
         over = tried >= 1
-        fraction[active] = torch.where(over & ~stopped, 1.0, torch.where(stopped, fraction[active], tried))
-        keep = ~(stopped | over)
-        ahead[active] = (0.9 * (left - goal[active]) / bound[active]).clamp(min=0)
+        fraction[active] = tried.clamp(max=1.0)
+        # near the goal each advance would be shorter than the last: enough
+        keep = ~(over | (left < _ENOUGH * goal[active]))
+        ahead[active] = 0.9 * (left - goal[active]).clamp(min=0) / bound[active]
         active = active[keep]
         if not len(active):
             break
