@@ -31,8 +31,10 @@ from diffcloud.sim.rigid.bodies import BodyState
 from diffcloud.sim.rigid.rotation import left_jacobian, rotation, skew
 from diffcloud.sim.state import ImplicitSetup, System
 
-_TOLERANCE = 1e-10
-"""Change of velocity, relative to the step's largest velocity, at which Newton's method has converged."""
+_TOLERANCE = 1e-8
+"""Expected next change of velocity, relative to the largest, at which Newton's method has converged.
+
+It is overestimated: convergence is quadratic in the end, so what is left is far smaller."""
 _ROUNDING = 1e-7
 """Below this relative change a step that no longer shrinks has reached the arithmetic's precision."""
 _ITERATIONS = 60
@@ -40,7 +42,7 @@ _HALVINGS = 8
 _SLOWEST = 1e-1
 """Velocities below this are at rest for the tolerance [m/s]."""
 _LEAST_CAUTION = 0.05
-"""Caution below this is none."""
+"""Of the step after one that the exact matrix led astray."""
 _REUSE = 1e-4
 """A relative change below this is followed by one correction with the same matrix instead of a new one."""
 _ROOM = 0.5
@@ -89,7 +91,7 @@ class ImplicitStart:
 class Memory:
     """What `solve` found and derivatives need."""
 
-    near: Near = field(default_factory=lambda: Near((), None))
+    near: Near = field(default_factory=lambda: Near((), None, torch.zeros(0), ()))
     """Pairs near each other in the solution."""
     batch: int = 1
 
@@ -198,8 +200,7 @@ class ImplicitStep:
                 if not bool(bad.any()) and not bool(rough.any()) and bool((caution == 0).all()):
                     continue
             factor = None
-            eager = torch.where(caution > _LEAST_CAUTION, caution / 16, 0.0)
-            caution = torch.where(bad, (4 * caution).clamp(_LEAST_CAUTION, 1.0), eager)
+            caution = torch.where(bad, (4 * caution).clamp(_LEAST_CAUTION, 1.0), 0.0)
         entries = active.nonzero().flatten().tolist()
         pair = "none" if contact is None else contact.closest(here.measured, here.points)[1][entries[0]]
         raise StuckError(entries, float(change[active].max()), pair)
@@ -536,7 +537,7 @@ class _Room:
         if step.system.handles.hard and len(step.handle_nodes):
             self.held = ~step.setup.moves
             self.held[step.handle_nodes] = True
-        self.near = Near((), self.held)
+        self.near = Near((), self.held, begin, ())
         if self.contact is None or self.contact.surface is None:
             self.size = self.longest = float("inf")
             return

@@ -34,7 +34,7 @@ def safe_fraction(kind: Kind, start: Tensor, end: Tensor, distance: Tensor) -> T
 
     Args:
         start, end: [C, 4, 3] positions [m].
-        distance: [C] at the start.
+        distance: [C] at the start, or a lower bound.
 
     Returns:
         [C] in (0, 1].

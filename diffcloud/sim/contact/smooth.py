@@ -47,9 +47,20 @@ class Near:
     lists: tuple[Pairs, ...]
     held: Tensor | None
     """bool [N] points whose motion is prescribed; None: none."""
+    reference: Tensor
+    """[B, N, 3] a configuration at which distances are known [m]."""
+    distances: tuple[Tensor, ...]
+    """Of each list at the reference [m]."""
 
     def repeated(self, copies: int, batch: int) -> Near:
-        return Near(tuple(pairs.repeated(copies, batch) for pairs in self.lists), self.held)
+        if copies == 1:
+            return self
+        return Near(
+            tuple(pairs.repeated(copies, batch) for pairs in self.lists),
+            self.held,
+            self.reference.repeat(copies, 1, 1),
+            tuple(distance.repeat(copies) for distance in self.distances),
+        )
 
 
 @dataclass(frozen=True)
@@ -58,7 +69,7 @@ class Measured:
 
     near: Near
     distances: tuple[Tensor, ...]
-    """Of each list of `near` [m]."""
+    """Of each list of `near`, or a lower bound where that is beyond the thickness [m]."""
     touching: tuple[Pairs, ...]
     """Those closer than the thickness."""
 
@@ -93,22 +104,34 @@ class SmoothContact:
             held: bool [N] points whose motion is prescribed; what only such points could resolve is left out.
         """
         if self.surface is None:
-            return Near((), held)
+            return Near((), held, places[0], ())
         lists = []
         for pairs in candidates(self.surface, places, margin + self.barrier.thickness):
             if held is not None and len(pairs):
                 pairs = pairs.where(~held[pairs.points].all(-1))
             if len(pairs):
                 lists.append(pairs)
-        return Near(tuple(lists), held)
+        reference = places[0].detach()
+        return Near(tuple(lists), held, reference, tuple(pair_distance(p.kind, p.gather(reference)) for p in lists))
 
     def measure(self, near: Near, points: Tensor) -> Measured:
         """Distances of all pairs at `points` [B, N, 3]; they are not differentiable, forces are."""
         points = points.detach()
-        distances = tuple(pair_distance(pairs.kind, pairs.gather(points)) for pairs in near.lists)
-        closest = [(d < self.barrier.thickness).nonzero().flatten() for d in distances]
-        touching = tuple(pairs.where(index) for pairs, index in zip(near.lists, closest, strict=True) if len(index))
-        return Measured(near, distances, touching)
+        moved = (points - near.reference).norm(dim=-1).flatten()
+        distances, touching = [], []
+        for pairs, reference in zip(near.lists, near.distances, strict=True):
+            # a pair cannot have come closer than its points have moved: most need no look at their geometry
+            reach = moved[pairs.entry[:, None] * points.shape[1] + pairs.points]
+            split = 1 if pairs.kind == "point_face" else 2
+            distance = reference - reach[:, :split].amax(1) - reach[:, split:].amax(1)
+            maybe = (distance < self.barrier.thickness).nonzero().flatten()
+            chosen = pairs.where(maybe)
+            exact = pair_distance(pairs.kind, chosen.gather(points))
+            distances.append(distance.index_copy(0, maybe, exact))
+            close = (exact < self.barrier.thickness).nonzero().flatten()
+            if len(close):
+                touching.append(chosen.where(close))
+        return Measured(near, tuple(distances), tuple(touching))
 
     def forces(
         self,
@@ -183,11 +206,12 @@ class SmoothContact:
                 )
                 return forces.flatten(1)
 
-            values = element_jacobian(pair_push, last.flatten(1), 12)
             if caution is not None:
                 weights, share = self._places(pairs, last)
-                safe = -self.barrier.place_stiffness(weights, share, first, last, coefficient, time_step)
-                values = values + caution[pairs.entry][:, None, None] * (safe - values)
+                values = -self.barrier.place_stiffness(weights, share, first, last, coefficient, time_step)
+            if caution is None or bool((caution < 1).any()):
+                exact = element_jacobian(pair_push, last.flatten(1), 12)
+                values = exact if caution is None else exact + caution[pairs.entry][:, None, None] * (values - exact)
             values = values.view(-1, 4, 3, 4, 3).transpose(2, 3)
             found.append(
                 ContactBlocks(
@@ -229,7 +253,8 @@ class SmoothContact:
             smallest, where = gap.min(1)
             count = len(self.planes.offsets)
             names = [f"point {int(self.planes.points[w // count])} and half-space {int(w % count)}" for w in where]
-        for pairs, distance in zip(measured.near.lists, measured.distances, strict=True):
+        for pairs in measured.near.lists:
+            distance = pair_distance(pairs.kind, pairs.gather(positions))
             for entry in range(len(positions)):  # for reports and errors only
                 own = (pairs.entry == entry).nonzero().flatten()
                 if len(own) and float(distance[own].min()) < float(smallest[entry]):
