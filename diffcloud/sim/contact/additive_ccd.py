@@ -7,8 +7,6 @@ motions or zero thickness, and the answer is always on the safe side.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -29,43 +27,40 @@ def pair_distance(kind: Kind, corners: Tensor) -> Tensor:
     return (weights[:, None] @ corners).squeeze(1).norm(dim=-1)
 
 
-def safe_fraction(kind: Kind, start: Tensor, end: Tensor, distance: Tensor) -> Tensor:
-    """The fraction of each pair's motion that keeps at least a tenth of its distance.
+def safe_fraction(kind: Kind, entry: Tensor, start: Tensor, end: Tensor, distance: Tensor, limit: Tensor) -> Tensor:
+    """The fraction of the motion of each batch entry that keeps at least a tenth of every pair's distance.
 
     Args:
+        entry: [C] of each pair.
         start, end: [C, 4, 3] positions [m].
-        distance: [C] at the start, or a lower bound.
+        distance: [C] at the start, or a lower bound [m].
+        limit: [B] fractions beyond which nobody asks.
 
     Returns:
-        [C] in (0, 1].
+        [B] in (0, 1], at most `limit`.
     """
     motion = end - start
     motion = motion - motion.mean(1, keepdim=True)
     speed = motion.norm(dim=-1)  # [C, 4]
     split = 1 if kind == "point_face" else 2
     bound = speed[:, :split].amax(1) + speed[:, split:].amax(1)
-    fraction = torch.ones_like(distance)
-    near = (bound > (1 - _LEFT) * distance).nonzero().flatten()
-    if len(near):
-        fraction[near] = _advance(lambda corners: pair_distance(kind, corners), start[near], motion[near], bound[near])
-    return fraction
-
-
-def _advance(measure: Callable[[Tensor], Tensor], start: Tensor, motion: Tensor, bound: Tensor) -> Tensor:
-    first = measure(start)
+    # a pair that moves so little that it cannot touch needs no look
+    near = (bound * limit[entry] > (1 - _LEFT) * distance).nonzero().flatten()
+    if not len(near):
+        return limit
+    entry, start, motion, bound = entry[near], start[near], motion[near], bound[near]
+    first = pair_distance(kind, start)
     goal = 0.5 * _LEFT * first
-    fraction = torch.zeros_like(first)
-    ahead = (1 - _LEFT) * first / bound
-    active = torch.arange(len(first), device=first.device)
+    fraction = ((1 - _LEFT) * first / bound.clamp(min=1e-300)).clamp(max=1.0)
+    active = (fraction < limit[entry]).nonzero().flatten()
     for _ in range(_ADVANCES):
-        tried = fraction[active] + ahead[active]
-        left = measure(start[active] + tried[:, None, None] * motion[active])
-        over = tried >= 1
-        fraction[active] = tried.clamp(max=1.0)
-        # near the goal each advance would be shorter than the last: enough
-        keep = ~(over | (left < _ENOUGH * goal[active]))
-        ahead[active] = 0.9 * (left - goal[active]).clamp(min=0) / bound[active]
-        active = active[keep]
         if not len(active):
             break
-    return fraction
+        left = pair_distance(kind, start[active] + fraction[active][:, None, None] * motion[active])
+        # near the goal each advance would be shorter than the last: enough
+        stopped = left < _ENOUGH * goal[active]
+        limit = limit.scatter_reduce(0, entry[active[stopped]], fraction[active[stopped]], "amin")
+        active, left = active[~stopped], left[~stopped]
+        fraction[active] += 0.9 * (left - goal[active]) / bound[active]
+        active = active[fraction[active] < limit[entry[active]]]
+    return limit.scatter_reduce(0, entry[active], fraction[active], "amin")

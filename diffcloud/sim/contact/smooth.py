@@ -240,8 +240,7 @@ class SmoothContact:
             closing = (before - after).clamp(min=1e-300)
             allowed = torch.where(through, (1 - _LEFT) * before / closing, 1.0).flatten(1).amin(1)
         for pairs, distance in zip(near.lists, measured.distances, strict=True):
-            fraction = safe_fraction(pairs.kind, pairs.gather(start), pairs.gather(end), distance)
-            allowed = allowed.scatter_reduce(0, pairs.entry, fraction, "amin")
+            allowed = safe_fraction(pairs.kind, pairs.entry, pairs.gather(start), pairs.gather(end), distance, allowed)
         return allowed
 
     def closest(self, measured: Measured, positions: Tensor) -> tuple[Tensor, list[str]]:
