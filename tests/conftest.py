@@ -26,13 +26,14 @@ def rng() -> np.random.Generator:
 
 
 def small_lift(**changes: object) -> Scenario:
-    """A lift with 5 x 5 nodes and few steps, for tests that only need some motion."""
+    """A lift with 5 x 5 nodes and few steps of the quicker integrator, for tests that only need some motion."""
     defaults: dict[str, object] = {
         "nodes": (5, 5),
         "frames": 5,
         "steps_per_frame": 2,
         "rate_hz": 10.0,
         "points": 200,
+        "integrator": "linearised",
         "path": [(0.0, 0.0, 0.0, 0.0), (0.5, 0.0, -0.05, 0.15)],
     }
     return grid_scenario(built_in("lift").model_copy(update={**defaults, **changes}))

@@ -30,11 +30,8 @@ class Episode:
     """[S + 1, V, 3] of the linear functional whose derivative is taken."""
 
     @staticmethod
-    def build(scenario: Scenario, steps: int, *, newton_iterations: int = 1, seed: int = 0) -> Episode:
-        from dataclasses import replace
-
+    def build(scenario: Scenario, steps: int, *, seed: int = 0) -> Episode:
         system, _ = scenario.scene.build()
-        system = replace(system, newton_iterations=newton_iterations)
         generator = torch.Generator().manual_seed(seed)
         moving = next(h for h in system.handles.handles if h.motion is not None)
         times = torch.arange(1, steps + 1, dtype=torch.float64) * system.time_step

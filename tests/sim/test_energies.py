@@ -55,6 +55,7 @@ def ones(mesh) -> Properties:
         air_drag=0.3 * one,
         friction_obstacle=one,
         friction_cloth=one,
+        body_mass=torch.zeros(1, 0, dtype=torch.float64),
     )
 
 

@@ -103,10 +103,10 @@ def test_a_flat_table_agrees_with_the_half_space_for_impacts():
     assert expected[0, -1, :, 2].min() == pytest.approx(5e-4, abs=1e-9)
 
 
-def test_newton_iterations_are_refused():
+def test_the_implicit_integrator_is_refused():
     scenario = over_box(ReferenceContact())
-    with pytest.raises(SceneError, match="linearised step"):
-        replace(scenario.scene, newton_iterations=3).build()
+    with pytest.raises(SceneError, match="linearised integrator"):
+        replace(scenario.scene, integrator="implicit").build()
 
 
 def test_the_published_quirks_are_off_by_default():

@@ -1,0 +1,154 @@
+"""Derivatives through smooth contact: a cloth dropped on a sloping table with a second cloth and a box on it, sticking and sliding."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import torch.autograd.forward_ad as forward_ad
+from torch import Tensor
+
+from diffcloud.mesh import ClothMesh, box_surface, grid_cloth, rectangle_surface
+from diffcloud.sim.build import Surrounding, build_system
+from diffcloud.sim.contact import ContactSettings
+from diffcloud.sim.energies import Handles
+from diffcloud.sim.energies.handles import Handle
+from diffcloud.sim.materials import isotropic
+from diffcloud.sim.motion import Keyframe, Motion
+from diffcloud.sim.properties import scaled_properties
+from diffcloud.sim.rigid import RigidBody
+from diffcloud.sim.rigid.rotation import rotation
+from diffcloud.sim.simulate import init, rollout
+
+STEPS = 25
+FABRIC = isotropic("test", density=0.3, stretching=60.0, bending=1e-4, shear=30.0)
+NAMES = ("stretch", "mass", "bending", "drag", "damping", "friction_obstacle", "friction_cloth", "body_mass")
+
+
+def two_layers(lower: ClothMesh, upper: ClothMesh, gap: float) -> ClothMesh:
+    """Two cloths as one mesh, one over the other."""
+    return ClothMesh(
+        np.concatenate([lower.nodes, upper.nodes + [0.013, 0.007, gap]]),
+        np.concatenate([lower.verts, upper.verts]),
+        np.concatenate([lower.vert_node, upper.vert_node + len(lower.nodes)]),
+        np.concatenate([lower.face_verts, upper.face_verts + len(lower.verts)]),
+    )
+
+
+def build():
+    cloth = two_layers(grid_cloth(5, 5, 0.2, 0.2), grid_cloth(3, 3, 0.1, 0.1), 0.005)
+    rng = np.random.default_rng(0)
+    cloth = replace(cloth, nodes=cloth.nodes * [1.01, 1.01, 1] + 1e-4 * rng.normal(size=cloth.nodes.shape) + [0, 0, 0.006])
+    motion = Motion((Keyframe(0.0, (0, 0, 0)), Keyframe(0.3, (-0.02, 0.0, 0.01))))
+    box = box_surface([-0.02, -0.03, 0.02], [0.04, 0.03, 0.05])
+    return build_system(
+        cloth,
+        FABRIC,
+        time_step=0.01,
+        handles=Handles((Handle(0, motion),), hard=True),
+        integrator="implicit",
+        surrounding=Surrounding(
+            gravity=(2.0, 0.5, -9.0),
+            contact=ContactSettings(1e5, 4e-3, 4e-4, sticking_speed=1e-2),
+            obstacles=(rectangle_surface((0.0, 0.0), (4.0, 4.0), 0.0),),
+            bodies=(RigidBody(box, mass=0.02, velocity=(0.2, 0.0, -0.1), angular_velocity=(0, 0, 2.0)),),
+        ),
+    )
+
+
+def inputs(system) -> dict[str, Tensor]:
+    one = torch.ones(1, dtype=torch.float64)
+    found = {name: one.clone() for name in NAMES}
+    found |= {"friction_obstacle": 0.3 * one, "friction_cloth": 0.5 * one, "damping": 2e-3 * one}
+    start = init(system)
+    times = torch.arange(1, STEPS + 1, dtype=torch.float64)[None, :, None] * 0.01
+    found |= {
+        "centre": start.bodies.centre.clone(),
+        "turn": torch.zeros(1, 1, 3, dtype=torch.float64),
+        "velocity": start.bodies.velocity.clone(),
+        "spin": start.bodies.angular_velocity.clone(),
+        "track": times * torch.tensor([-0.05, 0.0, 0.03], dtype=torch.float64),
+    }
+    return found
+
+
+def functional(system, values: dict[str, Tensor], weights: tuple[Tensor, Tensor], copies: int = 1) -> Tensor:
+    batch = len(values["stretch"])
+    properties = scaled_properties(
+        system.properties, {name: values[name] for name in NAMES}, faces=system.stretching.elements.nodes
+    )
+    state = init(system, batch)
+    bodies = replace(
+        state.bodies,
+        centre=values["centre"],
+        orientation=rotation(values["turn"]) @ state.bodies.orientation,
+        velocity=values["velocity"],
+        angular_velocity=values["spin"],
+    )
+    run = rollout(
+        system, STEPS, properties=properties, state=replace(state, bodies=bodies), track=values["track"], copies=copies
+    )
+    assert run.bodies is not None
+    return (run.positions[:, -1] * weights[0]).sum((1, 2)) + (run.bodies.centre[:, -1] * weights[1]).sum((1, 2))
+
+
+@pytest.fixture(scope="module")
+def case():
+    system = build()
+    generator = torch.Generator().manual_seed(1)
+    weights = (
+        torch.randn(34, 3, dtype=torch.float64, generator=generator),
+        5 * torch.randn(1, 3, dtype=torch.float64, generator=generator),
+    )
+    values = {name: value.requires_grad_(True) for name, value in inputs(system).items()}
+    gradients = torch.autograd.grad(functional(system, values, weights).sum(), list(values.values()))
+    directions = {
+        name: torch.randn(value.shape, dtype=torch.float64, generator=generator) for name, value in values.items()
+    }
+    reverse = {name: float((gradient * directions[name]).sum()) for name, gradient in zip(values, gradients, strict=True)}
+    return system, weights, {name: value.detach() for name, value in values.items()}, directions, reverse
+
+
+def test_forward_mode_agrees_with_reverse_mode(case):
+    system, weights, values, directions, reverse = case
+    count = len(values)
+    with torch.no_grad(), forward_ad.dual_level():
+        duals = {}
+        for row, (name, value) in enumerate(values.items()):
+            tangent = torch.zeros(count, *value.shape[1:], dtype=torch.float64)
+            tangent[row] = directions[name][0]
+            duals[name] = forward_ad.make_dual(value.repeat(count, *[1] * (value.dim() - 1)), tangent)
+        found = forward_ad.unpack_dual(functional(system, duals, weights, copies=count)).tangent
+    for row, name in enumerate(values):
+        assert float(found[row]) == pytest.approx(reverse[name], rel=1e-8, abs=1e-12), name
+
+
+def test_central_differences_agree(case):
+    """The step is swept; what is left is truncation and rounding."""
+    system, weights, values, directions, reverse = case
+    wrong = {}
+    for name, value in values.items():
+        errors = []
+        for size in (1e-3, 1e-4, 1e-5, 1e-6):
+            both = torch.cat([value + size * directions[name], value - size * directions[name]])
+            batch = {other: v.repeat(2, *[1] * (v.dim() - 1)) for other, v in values.items()} | {name: both}
+            with torch.no_grad():
+                plus, minus = functional(system, batch, weights)
+            errors.append(abs(float(plus - minus) / (2 * size) - reverse[name]) / max(abs(reverse[name]), 1e-9))
+        wrong[name] = min(errors)
+        assert reverse[name] != 0.0, name
+    print({name: f"{reverse[name]:.3e} {error:.1e}" for name, error in wrong.items()})
+    assert sorted(wrong.values())[int(0.9 * len(wrong)) - 1] <= 1e-4, wrong
+
+
+def test_the_episode_touches_sticks_and_slides(case):
+    system, _, values, _, _ = case
+    with torch.no_grad():
+        run = rollout(system, STEPS, track=values["track"])
+    assert run.positions[0, -1, :, 2].min() < 4e-3
+    assert run.bodies.centre[0, -1, 0, 2] < run.bodies.centre[0, 0, 0, 2]
+    speed = (run.positions[0, -1] - run.positions[0, -2])[:, :2].norm(dim=-1) / 0.01
+    low = run.positions[0, -1, :, 2] < 4e-3
+    assert (speed[low] > 1e-2).any()
