@@ -34,7 +34,7 @@ def limits(scenario: Scenario) -> list[str]:
     """What the scene asks for and the contact model lacks."""
     surrounding = scenario.scene.surrounding
     meshes = [index for index, obstacle in enumerate(surrounding.obstacles) if obstacle.plane() is None]
-    if not meshes or surrounding.reference_contact is not None:
+    if not meshes or surrounding.reference_contact is not None or scenario.scene.integrator == "implicit":
         return []
     return [
         f"Obstacles {meshes} of {scenario.name} are not planar. Contact of this scene is simulated with planes only: the "

@@ -31,8 +31,8 @@ class Scene:
     surrounding: Surrounding = field(default_factory=Surrounding)
     mass_material: Material | None = None
     """Gives the node masses where it differs from `material` (see `load.load_scene`)."""
-    integrator: Integrator = "implicit"
-    """"implicit": converged steps with smooth contact and rigid bodies; "linearised": ARCSim's steps and contact."""
+    integrator: Integrator = "linearised"
+    """"implicit": converged steps with smooth contact and rigid bodies; "linearised": ARCSim's steps."""
 
     @property
     def time_step(self) -> float:

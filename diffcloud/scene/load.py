@@ -81,7 +81,7 @@ def load_scene(path: Path, *, reload_materials: bool = False) -> Scene:
                 projection_thickness=magic.projection_thickness or 0.1 * thickness,
             ),
             proximity="proximity" not in scene.disable,
-            reference_contact=ReferenceContact.as_published() if scene.diffcloud.reference_contact else None,
+            reference_contact=_contact(scene),
             obstacles=tuple(
                 _transform_surface(read_surface(_inside(root, obstacle.mesh, path)), obstacle.transform)
                 for obstacle in scene.obstacles
@@ -108,6 +108,12 @@ def _refuse_unsupported(path: Path, scene: SceneFile) -> None:
             faults.append(f"handles.{index}.motion: {handle.motion}, but the scene has {len(scene.motions)} motions")
     if faults:
         raise SceneError(f"{path}: " + "; ".join(faults) + ".")
+
+
+def _contact(scene: SceneFile) -> ReferenceContact | None:
+    if scene.diffcloud.integrator == "implicit" or scene.diffcloud.contact == "planes":
+        return None
+    return ReferenceContact.as_published() if scene.diffcloud.contact == "published" else ReferenceContact()
 
 
 def _handles(path: Path, scene: SceneFile, mesh: ClothMesh) -> tuple[Handle, ...]:

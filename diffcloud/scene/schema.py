@@ -94,10 +94,11 @@ class ExtensionBlock(Checked):
     """What ARCSim cannot say."""
 
     hard_handles: bool = False
-    integrator: Integrator = "implicit"
-    """"linearised": ARCSim's own step and, without `reference_contact`, contact with planes only."""
-    reference_contact: bool = False
-    """ARCSim's contact by proximity and impact zones, with all its quirks; with the linearised integrator."""
+    integrator: Integrator = "linearised"
+    """"implicit": converged steps with smooth contact."""
+    contact: Literal["meshes", "published", "planes"] = "meshes"
+    """Of the linearised integrator: with all meshes and the cloth itself; the same with ARCSim's quirks, which the
+    published experiments need; or with planes only."""
     damping: NonNegative | None = None
 
 

@@ -10,6 +10,7 @@ from diffcloud.errors import SceneError
 from diffcloud.io.files import write_json
 from diffcloud.io.obj import write_cloth, write_surface
 from diffcloud.scene.description import Scene
+from diffcloud.sim.contact import ReferenceContact
 from diffcloud.sim.materials import Material
 from diffcloud.sim.motion import Motion
 
@@ -70,7 +71,7 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
         "diffcloud": {
             "hard_handles": scene.handles.hard,
             "integrator": scene.integrator,
-            "reference_contact": scene.surrounding.reference_contact is not None,
+            "contact": _contact_name(scene.surrounding.reference_contact),
         },
     }
     if math.isfinite(scene.end_time):
@@ -103,3 +104,9 @@ def _motion(motion: Motion) -> list[dict[str, Any]]:
             block["velocity"] = {"translate": list(key.velocity[:3]), "scale": key.velocity[3]}
         keys.append(block)
     return keys
+
+
+def _contact_name(contact: ReferenceContact | None) -> str:
+    if contact is None:
+        return "planes"
+    return "published" if contact == ReferenceContact.as_published() else "meshes"

@@ -45,6 +45,8 @@ class Surrounding:
     contact: ContactSettings = field(default_factory=ContactSettings)
     proximity: bool = True
     """Whether planes repel and rub (off: only projection)."""
+    self_contact: bool = True
+    """Whether the cloth meets itself (implicit integrator); without, layers pass through each other in quicker steps."""
     obstacles: tuple[SurfaceMesh, ...] = ()
     """Static ones."""
     moving: tuple[MovingObstacle, ...] = ()
@@ -61,7 +63,7 @@ def build_system(
     handles: Handles,
     surrounding: Surrounding | None = None,
     mass_material: Material | None = None,
-    integrator: Integrator = "implicit",
+    integrator: Integrator = "linearised",
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> System:
@@ -144,6 +146,7 @@ def _implicit(
         mesh,
         obstacles,
         movable=[False] * (len(obstacles) - len(bodies)) + [True] * len(bodies),
+        touches_itself=surrounding.self_contact,
         dtype=dtype,
         device=device,
     )

@@ -37,7 +37,7 @@ _TOLERANCE = 1e-8
 It is overestimated: convergence is quadratic in the end, so what is left is far smaller."""
 _ROUNDING = 1e-7
 """Below this relative change a step that no longer shrinks has reached the arithmetic's precision."""
-_ITERATIONS = 60
+_ITERATIONS = 30
 _HALVINGS = 8
 _SLOWEST = 1e-1
 """Velocities below this are at rest for the tolerance [m/s]."""

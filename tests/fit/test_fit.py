@@ -134,7 +134,7 @@ class TestRecovery:
         torch.testing.assert_close(together, torch.stack(alone).mean(0))
 
     def test_truth_has_the_lowest_loss(self):
-        scenario = small_lift(points=600, path=[(0, 0, 0, 0), (0.5, 0, -0.05, 0.3)])
+        scenario = small_lift(points=4000, path=[(0, 0, 0, 0), (0.5, 0, -0.05, 0.3)])
         objective = Objective(scenario, [clouds_of(scenario, stretch=1.0, mass=1.0)])
         stretch = torch.tensor([0.5, 0.8, 1.0, 1.25, 2.0]).double()
         assert int(objective({"stretch": stretch}).argmin()) == 2

@@ -63,12 +63,26 @@ def test_a_loop_is_an_annulus_that_looks_outwards(rows, columns):
 
 
 @pytest.mark.parametrize(("rows", "columns"), LOOPS)
-def test_a_loop_is_at_rest_and_its_seam_nodes_own_two_verts(rows, columns):
+def test_a_loop_is_nearly_at_rest_and_its_seam_nodes_own_two_verts(rows, columns):
     mesh = loop_cloth(rows, columns, 0.04, 0.9)
-    assert stretches(mesh) == pytest.approx(np.ones((len(mesh.faces), 2)))
+    # chords of a circle whose arcs are the material's length
+    chord = np.sin(np.pi / columns) / (np.pi / columns)
+    assert stretches(mesh).max() == pytest.approx(1.0)
+    assert stretches(mesh).min() == pytest.approx(chord)
     owned = np.bincount(mesh.vert_node)
     assert np.flatnonzero(owned == 2).tolist() == [row * columns for row in range(rows)]
     assert set(owned) == {1, 2}
+
+
+def test_a_loop_with_ends_is_a_stadium():
+    mesh = loop_cloth(2, 60, 0.04, 1.2, 0.06)
+    assert np.ptp(mesh.nodes[:, 0]) == pytest.approx(0.12, rel=2e-2)
+    straight = (1.2 - 2 * np.pi * 0.06) / 2
+    assert np.ptp(mesh.nodes[:, 1]) == pytest.approx(straight + 0.12, rel=1e-2)
+    assert mesh.nodes[0] == pytest.approx([0, -straight / 2 - 0.06, -0.02])
+    assert stretches(mesh).min() > 0.98
+    with pytest.raises(MeshError, match="end radii up to"):
+        loop_cloth(2, 60, 0.04, 1.2, 0.3)
 
 
 def test_a_vest_has_four_openings_and_two_panels():

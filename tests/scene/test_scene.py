@@ -83,8 +83,11 @@ def test_every_field_reaches_the_system(folder):
     assert system.handles.stiffness == 500
     assert system.handles.handles[2].start == 0.1
     assert system.handles.handles[2].fade == 0.2
-    assert system.halfspaces.offsets.tolist() == pytest.approx([-0.15])
-    assert system.halfspaces.settings.projection_thickness == pytest.approx(5e-4)
+    assert system.halfspaces is None  # planes are met as meshes
+    assert system.contact is not None
+    planes, _ = replace(scene, surrounding=replace(scene.surrounding, reference_contact=None)).build()
+    assert planes.halfspaces.offsets.tolist() == pytest.approx([-0.15])
+    assert planes.halfspaces.settings.projection_thickness == pytest.approx(5e-4)
     assert float(system.properties.node_mass.sum()) == pytest.approx(0.6 * 0.16)
     linear, translation = system.handles.handles[2].motion.at(np.array([1.0]))
     assert translation.tolist() == [[0, 0, 1]]
@@ -277,7 +280,7 @@ class TestScenarios:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("base: band_stretch\npole_offset_m: [0.0, 0.3]\n", "the pole reaches .* m from the band's middle"),
+            ("base: band_stretch\npole_width_m: 0.4\n", "does not go around a round pole"),
             ("base: band_stretch\ngrasped_columns: 32\n", "32 grasped columns, but the band has 32"),
             ("base: band_stretch\nsize_m: [1, 1]\n", "size_m: unknown"),
             ("base: vest_hang\nhook_reach_m: 0.1\n", "as far as the held node"),
@@ -310,7 +313,7 @@ class TestScenarios:
         assert np.ptp(mesh.nodes, axis=0) == pytest.approx([0.3, 0.5, 0.0])  # turned by 90 degrees
         assert mesh.nodes.mean(0) == pytest.approx([0.6, 0.1, 0.102])
         assert scenario.scene.material.name == "silk"
-        assert scenario.scene.build()[0].halfspaces.offsets.tolist() == [0.1]
+        assert scenario.scene.surrounding.obstacles[0].plane()[1] == pytest.approx(0.1)
 
     def test_own_material_file_is_found_beside_the_yaml(self, tmp_path):
         (tmp_path / "m.json").write_text(json.dumps(MATERIAL))

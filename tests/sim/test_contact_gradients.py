@@ -1,4 +1,4 @@
-"""Derivatives through smooth contact: a cloth dropped on a sloping table with a second cloth and a box on it, sticking and sliding."""
+"""Derivatives through smooth contact: a cloth on a sloping table with a second cloth and a box on it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NAMES = ("stretch", "mass", "bending", "drag", "damping", "friction_obstacle", "
 def two_layers(lower: ClothMesh, upper: ClothMesh, gap: float) -> ClothMesh:
     """Two cloths as one mesh, one over the other."""
     return ClothMesh(
-        np.concatenate([lower.nodes, upper.nodes + [0.013, 0.007, gap]]),
+        np.concatenate([lower.nodes, np.add(upper.nodes, (0.013, 0.007, gap))]),
         np.concatenate([lower.verts, upper.verts]),
         np.concatenate([lower.vert_node, upper.vert_node + len(lower.nodes)]),
         np.concatenate([lower.face_verts, upper.face_verts + len(lower.verts)]),

@@ -127,7 +127,7 @@ def test_node_sets(parameter):
 
 def test_gradients_stay_finite_where_formulas_degenerate():
     """A cloth at rest, flat, unstretched, touching nothing: norms and angles are at their singular points."""
-    scenario = small_lift()
+    scenario = small_lift(mesh_contact=False)  # a collapsed cloth lies in itself
     episode = Episode.build(scenario, 3)
     inputs = {name: value.requires_grad_(True) for name, value in episode.base().items()}
     inputs["positions"] = torch.as_tensor(episode.system.mesh.nodes)[None].requires_grad_(True)

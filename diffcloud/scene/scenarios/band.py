@@ -62,8 +62,7 @@ def band_scenario(options: BandScenario) -> Scenario:
     """The scenario of a band around a pole.
 
     Raises:
-        MeshError: a pole too thick for the band.
-        SceneError: more grasped columns than the band has.
+        SceneError: a pole too thick for the band, or more grasped columns than the band has.
     """
     along, across = options.nodes
     if options.grasped_columns >= along:
@@ -71,6 +70,12 @@ def band_scenario(options: BandScenario) -> Scenario:
             f"Scenario {options.name}: {options.grasped_columns} grasped columns, but the band has {along} nodes along it."
         )
     radius = options.pole_gap_m + options.pole_width_m * (0.5 if options.pole == "round" else 0.5**0.5)
+    if 2 * np.pi * radius > options.circumference_m:
+        raise SceneError(
+            f"Scenario {options.name}: a band of {options.circumference_m} m does not go around a {options.pole} pole "
+            f"{options.pole_width_m} m wide with gaps of {options.pole_gap_m} m; make it longer than "
+            f"{2 * np.pi * radius:.3g} m, or the pole thinner."
+        )
     loop = loop_cloth(across, along, options.width_m, options.circumference_m, radius)
     middle = options.table_height_m + options.gap_m + options.width_m / 2
     mesh = replace(loop, nodes=np.add(loop.nodes, (*options.center_m, middle)))

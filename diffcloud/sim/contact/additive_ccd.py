@@ -7,7 +7,6 @@ motions or zero thickness, and the answer is always on the safe side.
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from diffcloud.sim.contact.distance import edge_edge_weights, point_face_weights

@@ -28,14 +28,14 @@ _TINY = 1e-12
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """Numbers of the contact model (ARCSim's `magic`)."""
+    """Numbers of the contact models."""
 
-    stiffness: float = 1e9
-    """k_c [N/m³]: times a node's area gives the contact stiffness."""
-    repulsion_thickness: float = 1e-3
-    """τ [m]"""
-    projection_thickness: float = 1e-4
-    """[m]"""
+    stiffness: float = 1e4
+    """k_c [N/m³]: times a node's area gives the contact stiffness (ARCSim's default is 1e9)."""
+    repulsion_thickness: float = 3e-3
+    """τ, and d̂ of smooth contact [m] (ARCSim's default is 1e-3)."""
+    projection_thickness: float = 3e-4
+    """Of the linearised integrator [m]."""
     sticking_speed: float = 1e-3
     """v_s of smooth contact: what sticks creeps slower than this [m/s]."""
 

@@ -99,4 +99,5 @@ def candidates(
 def _may_touch(surface: ContactSurface, first: Tensor, second: Tensor, among_fixed: bool) -> Tensor:
     """Whether contact between the objects of two points [C] has to be looked for."""
     a, b = surface.owner[first], surface.owner[second]
-    return ((a != b) | (a == 0)) & (surface.movable[a] | surface.movable[b] | among_fixed)
+    own = (a == 0) & surface.touches_itself
+    return ((a != b) | own) & (surface.movable[a] | surface.movable[b] | among_fixed)

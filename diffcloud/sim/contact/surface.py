@@ -55,6 +55,8 @@ class ContactSurface:
     """[F, 3] what each face adds for its corners: one over the faces around an inner point."""
     movable: Tensor
     """bool [owners]: the cloth, and bodies that contact can move."""
+    touches_itself: bool
+    """Whether the cloth's own parts are paired with each other."""
 
     @staticmethod
     def build(
@@ -63,6 +65,7 @@ class ContactSurface:
         *,
         movable: Sequence[bool] | None = None,
         all_edges: bool = False,
+        touches_itself: bool = True,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> ContactSurface:
@@ -70,6 +73,7 @@ class ContactSurface:
 
         Args:
             movable: of each obstacle; default none.
+            touches_itself: whether the cloth's own parts are paired with each other.
             all_edges: keep the flat and concave edges and points of obstacles, as ARCSim does.
         """
         movable = [False] * len(obstacles) if movable is None else list(movable)
@@ -119,6 +123,7 @@ class ContactSurface:
             edge_share=area_tensor([edge for edge, _ in shares]),
             corner_share=area_tensor([corner for _, corner in shares]),
             movable=torch.tensor([True, *movable], device=device),
+            touches_itself=touches_itself,
         )
 
 
