@@ -9,13 +9,14 @@ import pytest
 import torch
 import trimesh
 
-from diffcloud.mesh.shapes import grid_cloth
+from diffcloud.mesh.shapes import cylinder_surface, grid_cloth
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.sim.build import Surrounding, build_system
 from diffcloud.sim.contact import ContactSettings
 from diffcloud.sim.energies import Handles
 from diffcloud.sim.energies.handles import Handle
 from diffcloud.sim.materials import isotropic
+from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.rigid import RigidBody
 from diffcloud.sim.simulate import rollout
 
@@ -121,7 +122,9 @@ def momenta(system, run, step):
     return linear, angular
 
 
+@pytest.mark.slow
 def test_colliding_bodies_and_cloth_conserve_momentum():
+    """Linear to rounding, angular to first order in the time step (2.9e-4 at 5e-4 s, 1.2e-4 at 2.5e-4 s)."""
     flat = grid_cloth(5, 5, 0.3, 0.3)
     cloth = ClothMesh(np.add(flat.nodes, (0.0, 0.0, 0.004)), flat.verts, flat.vert_node, flat.face_verts)
     turned = trimesh.transformations.rotation_matrix(0.5, [1, 0.3, 0.2])[:3, :3]
@@ -137,14 +140,81 @@ def test_colliding_bodies_and_cloth_conserve_momentum():
         gravity=(0, 0, 0),
         obstacles=(),
         friction=0.0,  # friction acts across the gap, which gives a small couple,
-        time_step=2.5e-4,
+        time_step=1e-4,
         contact=ContactSettings(1e5, 4e-3, 1e-4),
         cloth=cloth,
         handles=Handles(()),
     )
-    run = rollout(system, 600)
+    run = rollout(system, 1500)
     before, after = momenta(system, run, 0), momenta(system, run, len(run.times) - 3)
     assert float((run.positions[0, -1] - run.positions[0, 0]).norm(dim=-1).max()) > 0.01  # it was hit
     scale = 0.05 * 0.6
     assert float((after[0] - before[0]).abs().max()) / scale < 1e-8
     assert float((after[1] - before[1]).abs().max()) / (scale * 0.1) < 1e-4
+
+
+@pytest.mark.slow
+def test_a_box_on_a_cloth_held_at_its_corners_comes_to_rest():
+    """The handles carry the weight of both."""
+    size = 5
+    flat = grid_cloth(size, size, 0.2, 0.2)
+    cloth = ClothMesh(np.add(flat.nodes, (0, 0, 0.3)), flat.verts, flat.vert_node, flat.face_verts)
+    corners = (0, size - 1, size * (size - 1), size * size - 1)
+    handles = Handles(tuple(Handle(node) for node in corners), hard=False)
+    body = RigidBody(box((0.08, 0.08, 0.04), (0.0, 0.0, 0.325)), mass=0.05)
+    system = system_of(
+        [body],
+        gravity=(0, 0, -9.81),
+        obstacles=(),
+        time_step=0.02,
+        contact=ContactSettings(1e5, 3e-3, 3e-4),
+        cloth=cloth,
+        handles=handles,
+    )
+    run = rollout(system, 400)
+    assert float(run.bodies.velocity[0, -1].abs().max()) < 1e-3
+    start = torch.as_tensor(cloth.nodes)[list(corners)]
+    pull = system.handles.stiffness * (start - run.positions[0, -1, list(corners)])
+    weight = 9.81 * (0.05 + float(system.properties.node_mass.sum()))
+    assert float(pull[:, 2].sum()) == pytest.approx(weight, rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_band_around_a_pole_holds_as_the_capstan_says():
+    """A light band over half a pole, pulled at one end: at the point of slipping T2 / T1 = exp(mu phi)."""
+    friction, radius, width, columns = 0.3, 0.05, 0.01, 33
+    arc, straight = math.pi * radius, 0.1
+    flat = grid_cloth(2, columns, width, arc + 2 * straight)
+    along = flat.nodes[:, 0] + (arc / 2 + straight)
+    lift = radius + 0.0018
+    angle = np.clip((along - straight) / radius, 0, math.pi)
+    x = -lift * np.cos(angle)
+    z = lift * np.sin(angle) - np.clip(straight - along, 0, None) - np.clip(along - straight - arc, 0, None)
+    band = ClothMesh(np.stack([x, flat.nodes[:, 1], z], 1), flat.verts, flat.vert_node, flat.face_verts)
+    fabric = isotropic("band", density=0.05, stretching=2000.0, shear=500.0, bending=1e-7, source="test")
+    ends = [0, columns], [columns - 1, 2 * columns - 1]
+    pole = cylinder_surface([0, -0.05, 0], [0, 0.05, 0], radius, 96)
+    # pulled on one side, the band slips towards it: tension falls from that side to the other
+    pulled = Motion((Keyframe(0.0), Keyframe(2.0, (0.0, 0.0, -0.06))))
+    handles = Handles((*(Handle(n) for n in ends[0]), *(Handle(n, pulled) for n in ends[1])), stiffness=400.0)
+    system = build_system(
+        band,
+        fabric,
+        time_step=0.02,
+        handles=handles,
+        integrator="implicit",
+        surrounding=Surrounding(
+            gravity=(0, 0, 0),
+            air_density=0.0,
+            friction_obstacle=friction,
+            contact=ContactSettings(1e7, 2e-3, 2e-4, sticking_speed=1e-4),
+            obstacles=(pole,),
+            self_contact=False,
+        ),
+    )
+    run = rollout(system, 100)
+    target = torch.as_tensor(band.nodes)
+    last = run.positions[0, -1]
+    loose = 400.0 * (last[ends[0], 2] - target[ends[0], 2]).sum()
+    taut = 400.0 * (last[ends[1], 2] - (target[ends[1], 2] - 0.06)).sum()
+    assert float(taut / loose) == pytest.approx(math.exp(friction * math.pi), rel=0.05)
