@@ -48,6 +48,8 @@ _REUSE = 1e-4
 _ROOM = 0.5
 """First guess of how far points leave their predicted path, as part of the thickness and of the path."""
 
+_PROBE = 1e-4
+"""Part of the obstacles' way over which its effect is measured."""
 _LONGEST = 5.0
 """Newton's steps are kept within this many times the thickness and the path."""
 
@@ -180,7 +182,7 @@ class ImplicitStep:
         for _ in range(_ITERATIONS):
             if factor is None:
                 factor = self._jacobian(here.u, start, here.measured, here.points, caution)
-            direction = -factor.solve(residual)
+            direction = -factor.solve(residual + self._pushed(here, residual, start))
             downhill = -(residual * direction).sum((1, 2))
             speed = (zero + here.u).abs().amax((1, 2)).clamp(min=_SLOWEST)
             size = direction.abs().amax((1, 2)) / speed
@@ -204,6 +206,17 @@ class ImplicitStep:
         entries = active.nonzero().flatten().tolist()
         pair = "none" if contact is None else contact.closest(here.measured, here.points)[1][entries[0]]
         raise StuckError(entries, float(change[active].max()), pair)
+
+    def _pushed(self, here: _Place, residual: Tensor, start: ImplicitStart) -> Tensor:
+        """How the residual changes as moving obstacles go the rest of their way, to first order.
+
+        Without it a step would not know that they come, and they would eat up the gap instead of pushing.
+        """
+        left = self.scenery[1] - here.scenery
+        if not left.numel() or not bool((left != 0).any()):
+            return torch.zeros_like(residual)
+        points = self._points(here.u, start, here.scenery + _PROBE * left)
+        return (self._residual(here.u, start, here.measured, points) - residual) / _PROBE
 
     def _search(
         self,
@@ -232,7 +245,7 @@ class ImplicitStep:
             if not bool(worse.any()):
                 break
             short = short | worse
-            gone = (trial.u - here.u).abs().amax((1, 2)) / direction.abs().amax((1, 2))
+            gone = (trial.u - here.u).abs().amax((1, 2)) / direction.abs().amax((1, 2)).clamp(min=1e-300)
             alpha = torch.where(worse, 0.5 * gone, alpha)
         return trial, remaining, short
 
@@ -246,7 +259,7 @@ class ImplicitStep:
             scenery = torch.where(step == 1, final, here.scenery + step * (final - here.scenery))
             points = self._points(u, start, scenery)
             if contact is None:
-                break
+                return _Place(u, scenery, points, self._measure(room.near, points))
             away = room.away(points)
             if bool((away > room.longest).any()):
                 alpha = alpha * torch.where(away > room.longest, 0.5 * room.longest / away, 1.0)
@@ -255,10 +268,10 @@ class ImplicitStep:
                 here = replace(here, measured=contact.measure(room.near, here.points))
             fraction = contact.safe_fraction(here.measured, here.points, points)
             if bool((fraction == 1).all()):
-                break
+                return _Place(u, scenery, points, self._measure(room.near, points))
             # what is straight in u is not quite straight in space where bodies turn: look again at the shorter step
             alpha = alpha * torch.where(fraction < 1, fraction * (0.9 if halving else 1.0), 1.0)
-        return _Place(u, scenery, points, self._measure(room.near, points))
+        return here  # no step this way is free of collisions
 
     def _measure(self, near: Near, points: Tensor) -> Measured:
         contact = self.setup.contact

@@ -26,7 +26,9 @@ def pair_distance(kind: Kind, corners: Tensor) -> Tensor:
     return (weights[:, None] @ corners).squeeze(1).norm(dim=-1)
 
 
-def safe_fraction(kind: Kind, entry: Tensor, start: Tensor, end: Tensor, distance: Tensor, limit: Tensor) -> Tensor:
+def safe_fraction(
+    kind: Kind, entry: Tensor, start: Tensor, end: Tensor, distance: Tensor, limit: Tensor, floor: float = 0.0
+) -> Tensor:
     """The fraction of the motion of each batch entry that keeps at least a tenth of every pair's distance.
 
     Args:
@@ -34,9 +36,10 @@ def safe_fraction(kind: Kind, entry: Tensor, start: Tensor, end: Tensor, distanc
         start, end: [C, 4, 3] positions [m].
         distance: [C] at the start, or a lower bound [m].
         limit: [B] fractions beyond which nobody asks.
+        floor: pairs as close as this may not come closer at all: below, rounding could put them on the wrong side [m].
 
     Returns:
-        [B] in (0, 1], at most `limit`.
+        [B] in [0, 1], at most `limit`.
     """
     motion = end - start
     motion = motion - motion.mean(1, keepdim=True)
@@ -49,8 +52,8 @@ def safe_fraction(kind: Kind, entry: Tensor, start: Tensor, end: Tensor, distanc
         return limit
     entry, start, motion, bound = entry[near], start[near], motion[near], bound[near]
     first = pair_distance(kind, start)
-    goal = 0.5 * _LEFT * first
-    fraction = ((1 - _LEFT) * first / bound.clamp(min=1e-300)).clamp(max=1.0)
+    goal = (0.5 * _LEFT * first).clamp(min=floor)
+    fraction = (0.9 * (first - goal) / bound.clamp(min=1e-300)).clamp(0.0, 1.0)
     active = (fraction < limit[entry]).nonzero().flatten()
     for _ in range(_ADVANCES):
         if not len(active):

@@ -18,6 +18,8 @@ from diffcloud.sim.contact.surface import ContactSurface
 from diffcloud.sim.elements import safe_norm
 from diffcloud.sim.jacobian import element_jacobian
 
+_CLOSEST = 1e-6
+"""Part of the thickness below which nothing may come closer."""
 _LEFT = 0.2
 """Part of the distance to a half-space that a step leaves."""
 
