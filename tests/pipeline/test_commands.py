@@ -146,6 +146,12 @@ def test_stages_run_in_a_row_and_the_page_is_whole(work):
     assert (work / "reports" / "metrics.json").read_bytes() == first
 
 
+def built_in_mesh(name):
+    from diffcloud.scene.scenarios import load_scenario
+
+    return load_scenario(name).scene.mesh
+
+
 def test_simulated_targets_are_whole_uniform_and_left_as_they_are(work):
     """The hidden parameters are recoverable in principle: at the truth only the sampling of the surface is left."""
     (work / "raw" / "scenes").mkdir(parents=True)
@@ -164,7 +170,8 @@ def test_simulated_targets_are_whole_uniform_and_left_as_they_are(work):
     values = [f"{name}={value!r}" for name, value in truth.items()]
     flags = [word for value in values for word in ("--set", value)]
     done = run("evaluate", "loss", "--scenario", "v", *flags, "--json", "episodes/v/v_hidden3.npz", cwd=work)
-    assert result(done)["loss"] < 2 * 0.13 / (np.pi * 900)  # mean squared distance to the nearest of 900 points on 0.13 m²
+    area = float(built_in_mesh("vest_hang").face_area.sum())
+    assert result(done)["loss"] < 2 * area / (np.pi * 900)  # twice the mean squared distance to the nearest of 900 points
 
 
 def test_rollouts_carry_the_bodies_to_draw(work):
