@@ -33,6 +33,8 @@ class Scene:
     """Gives the node masses where it differs from `material` (see `load.load_scene`)."""
     integrator: Integrator = "linearised"
     """"implicit": converged steps with smooth contact and rigid bodies; "linearised": ARCSim's steps."""
+    shaped: bool = False
+    """Whether the cloth's hinges are at rest as the mesh stands (something sewn or moulded), not flat."""
 
     @property
     def time_step(self) -> float:
@@ -68,6 +70,7 @@ class Scene:
             surrounding=self.surrounding,
             mass_material=self.mass_material,
             integrator=self.integrator,
+            shaped=self.shaped,
             dtype=dtype,
             device=device,
         )

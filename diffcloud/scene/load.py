@@ -88,6 +88,7 @@ def load_scene(path: Path, *, reload_materials: bool = False) -> Scene:
             ),
         ),
         integrator=scene.diffcloud.integrator,
+        shaped=scene.diffcloud.shaped,
     )
 
 

@@ -71,6 +71,7 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
         "diffcloud": {
             "hard_handles": scene.handles.hard,
             "integrator": scene.integrator,
+            "shaped": scene.shaped,
             "contact": _contact_name(scene.surrounding.reference_contact),
         },
     }

@@ -64,6 +64,7 @@ def build_system(
     surrounding: Surrounding | None = None,
     mass_material: Material | None = None,
     integrator: Integrator = "linearised",
+    shaped: bool = False,
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> System:
@@ -74,6 +75,7 @@ def build_system(
         mass_material: material whose density gives the node masses, where it differs from `material` (the published
             experiments reload their tables after the masses were computed).
         integrator: "implicit" for the converged step with smooth contact and rigid bodies, "linearised" for ARCSim's.
+        shaped: whether the cloth's hinges are at rest as the mesh stands, not flat.
 
     Raises:
         SceneError: a time step that is not positive, or a handle on a node that does not exist.
@@ -94,7 +96,7 @@ def build_system(
         return torch.as_tensor(np.asarray(array, dtype=np.float64), dtype=dtype, device=device)
 
     stretching = Stretching.build(mesh, material, dtype=dtype, device=device)
-    bending = Bending.build(mesh, material, dtype=dtype, device=device)
+    bending = Bending.build(mesh, material, dtype=dtype, device=device, shaped=shaped)
     density = (mass_material or material).density
     properties = Properties(
         node_mass=tensor(density * mesh.node_area)[None],

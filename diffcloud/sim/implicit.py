@@ -7,7 +7,7 @@ D = V + 2 N. The equations are the balances of momentum over the step (see `rigi
 
 with x₁ = x₀ + Δt v₁ and v₁ = v₀ + u. Hard handles replace their nodes' rows by u = (x* - x₀)/Δt - v₀.
 
-Newton's matrix is the exact Jacobian, assembled from elements (each differentiated on its own, in forward mode), so the
+Newton's matrix is the exact Jacobian, assembled from elements (each differentiated on its own), so the
 last steps converge quadratically and the same matrix gives exact derivatives of the step. Each Newton step is shortened
 until the straight path of all points is free of collisions, so nothing ever passes through anything. Prescribed motion
 (hard handles, moving obstacles) takes part in this: it advances with the Newton steps and arrives when they are full.
@@ -15,7 +15,7 @@ until the straight path of all points is free of collisions, so nothing ever pas
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -23,7 +23,8 @@ import torch
 from torch import Tensor
 
 from diffcloud.sim.contact.smooth import ContactBlocks, Measured, Near
-from diffcloud.sim.energies.base import Geometry, geometry
+from diffcloud.sim.elements import Elements
+from diffcloud.sim.energies.base import geometry
 from diffcloud.sim.jacobian import element_jacobian
 from diffcloud.sim.linear_solve import Couplings, Factor
 from diffcloud.sim.properties import Properties
@@ -54,11 +55,19 @@ _LONGEST = 5.0
 """Newton's steps are kept within this many times the thickness and the path."""
 
 
-class StuckError(ArithmeticError):
-    """Newton's method did not converge. `entries` lists the batch entries; the message names the closest pair."""
+_FEW = 0.7
+"""When at most this part of a batch has not converged, it goes on without the others."""
 
-    def __init__(self, entries: list[int], change: float, pair: str) -> None:
-        self.entries = entries
+
+class StuckError(ArithmeticError):
+    """Newton's method did not converge.
+
+    `entries` lists the batch entries, `found` [B, D, 3] holds the solutions of the others; the message names the closest
+    pair.
+    """
+
+    def __init__(self, entries: list[int], found: Tensor, change: float, pair: str) -> None:
+        self.entries, self.found, self.change, self.pair = entries, found, change, pair
         super().__init__(f"the implicit step did not converge (relative change {change:.1e}; closest: {pair})")
 
 
@@ -96,6 +105,8 @@ class Memory:
     near: Near = field(default_factory=lambda: Near((), None, torch.zeros(0), ()))
     """Pairs near each other in the solution."""
     batch: int = 1
+    guess: Tensor | None = None
+    """u [B, D, 3] that was found before, where the step has been solved in another batch."""
 
 
 @dataclass(frozen=True)
@@ -112,9 +123,9 @@ class ImplicitStep:
     """[O, 3] points of static and moving obstacles at both ends of the step [m]."""
     memory: Memory = field(default_factory=lambda: Memory(), compare=False)
 
-    def fresh(self) -> ImplicitStep:
-        """The same step for another batch."""
-        return replace(self, memory=Memory())
+    def fresh(self, guess: Tensor | None = None) -> ImplicitStep:
+        """The same step for another batch, whose solution [B, D, 3] may be known."""
+        return replace(self, memory=Memory(guess=guess))
 
     def halves(self) -> tuple[ImplicitStep, ImplicitStep]:
         """Two steps of half the length; obstacles go straight."""
@@ -143,7 +154,7 @@ class ImplicitStep:
         start = ImplicitStart.of(inputs)
         near = self.memory.near.repeated(len(u) // self.memory.batch, self.memory.batch)
         points = self._points(u, start, self.scenery[1])
-        return self._residual(u, start, self._measure(near, points), points)
+        return self._residual(u, start, self.setup.contact.measure(near, points), points)
 
     def solve(self, *inputs: Tensor) -> tuple[Tensor, Factor]:
         """u, and the exact ∂r/∂u there, factorised when it is first used.
@@ -152,34 +163,40 @@ class ImplicitStep:
             StuckError, SingularMatrixError: name the batch entries.
         """
         start = ImplicitStart.of([tensor.detach() for tensor in inputs])
-        u, near = self._newton(start)
+        guess = self.memory.guess
+        arrival = None if guess is None else _Arrival.at(guess, self.scenery[1].expand(len(guess), -1, -1))
+        u, near = self._newton(start, arrival)
         self.memory.near, self.memory.batch = near, len(u)
         return u, _LateFactor(self, u, start)
 
     def _factorise(self, u: Tensor, start: ImplicitStart) -> Factor:
         points = self._points(u, start, self.scenery[1])
-        return self._jacobian(u, start, self._measure(self.memory.near, points), points)
+        return self._jacobian(u, start, self.setup.contact.measure(self.memory.near, points), points)
 
     # --- Newton ------------------------------------------------------------------------------------------------------
 
-    def _newton(self, start: ImplicitStart) -> tuple[Tensor, Near]:
-        contact = self.setup.contact
+    def _newton(self, start: ImplicitStart, arrival: _Arrival | None = None) -> tuple[Tensor, Near]:
+        """u and the pairs near each other there; begins at `arrival` if it is given."""
         zero = self._initial_velocities(start)
         batch = len(zero)
         scenery = self.scenery[0].expand(batch, -1, -1)
         begin = self._points(-zero, start, scenery)  # every point where the step starts
         room = _Room(self, begin, self._points(torch.zeros_like(zero), start, self.scenery[1]))
-
-        # first guess: velocities go on, as far as nothing is in the way
-        everything = torch.ones(batch, dtype=torch.bool, device=zero.device)
-        here = _Place(-zero, scenery, begin, self._measure(room.near, begin))
-        here = self._towards(here, zero, start, room, everything.to(zero.dtype))
+        active = torch.ones(batch, dtype=torch.bool, device=zero.device)
+        if arrival is None:  # velocities go on, as far as nothing is in the way
+            here = _Place(-zero, scenery, begin, self.setup.contact.measure(room.near, begin))
+            here = self._towards(here, zero, start, room, active.to(zero.dtype))
+            change = torch.full((batch,), torch.inf, dtype=zero.dtype, device=zero.device)
+            caution, left = torch.ones_like(change), _ITERATIONS
+        else:
+            points = self._points(arrival.u, start, arrival.scenery)
+            room.cover(float(room.away(points).max()))
+            here = _Place(arrival.u, arrival.scenery, points, self.setup.contact.measure(room.near, points))
+            change, caution, left = arrival.change, arrival.caution, arrival.left
         residual = self._residual(here.u, start, here.measured, here.points)
-        active = everything
-        change = torch.full((batch,), torch.inf, dtype=zero.dtype, device=zero.device)
-        caution = torch.ones_like(change)
         factor: Factor | None = None
-        for _ in range(_ITERATIONS):
+        while left:
+            left -= 1
             if factor is None:
                 factor = self._jacobian(here.u, start, here.measured, here.points, caution)
             direction = -factor.solve(residual + self._pushed(here, residual, start))
@@ -203,9 +220,19 @@ class ImplicitStep:
                     continue
             factor = None
             caution = torch.where(bad, (4 * caution).clamp(_LEAST_CAUTION, 1.0), 0.0)
+            if int(active.sum()) <= _FEW * batch:
+                few = active.nonzero().flatten()
+                arrival = _Arrival(here.u[few], here.scenery[few], change[few], caution[few], left)
+                try:
+                    u = here.u.index_copy(0, few, self._newton(start.only(few), arrival)[0])
+                except StuckError as error:
+                    entries = few[error.entries].tolist()
+                    raise StuckError(entries, here.u.index_copy(0, few, error.found), error.change, error.pair) from error
+                room.cover(float(room.away(self._points(u, start, self.scenery[1])).max()))
+                return u, room.near
         entries = active.nonzero().flatten().tolist()
-        pair = "none" if contact is None else contact.closest(here.measured, here.points)[1][entries[0]]
-        raise StuckError(entries, float(change[active].max()), pair)
+        pair = self.setup.contact.closest(here.measured, here.points)[1][entries[0]]
+        raise StuckError(entries, here.u, float(change[active].max()), pair)
 
     def _pushed(self, here: _Place, residual: Tensor, start: ImplicitStart) -> Tensor:
         """How the residual changes as moving obstacles go the rest of their way, to first order.
@@ -258,8 +285,6 @@ class ImplicitStep:
             u = here.u + step * direction
             scenery = torch.where(step == 1, final, here.scenery + step * (final - here.scenery))
             points = self._points(u, start, scenery)
-            if contact is None:
-                return _Place(u, scenery, points, self._measure(room.near, points))
             away = room.away(points)
             if bool((away > room.longest).any()):
                 alpha = alpha * torch.where(away > room.longest, 0.5 * room.longest / away, 1.0)
@@ -268,14 +293,10 @@ class ImplicitStep:
                 here = replace(here, measured=contact.measure(room.near, here.points))
             fraction = contact.safe_fraction(here.measured, here.points, points)
             if bool((fraction == 1).all()):
-                return _Place(u, scenery, points, self._measure(room.near, points))
+                return _Place(u, scenery, points, self.setup.contact.measure(room.near, points))
             # what is straight in u is not quite straight in space where bodies turn: look again at the shorter step
             alpha = alpha * torch.where(fraction < 1, fraction * (0.9 if halving else 1.0), 1.0)
         return here  # no step this way is free of collisions
-
-    def _measure(self, near: Near, points: Tensor) -> Measured:
-        contact = self.setup.contact
-        return Measured(near, (), ()) if contact is None else contact.measure(near, points)
 
     # --- forces ------------------------------------------------------------------------------------------------------
 
@@ -320,12 +341,10 @@ class ImplicitStep:
             pull = (system.handles.stiffness * self.strength)[:, None] * offset
             index = self.handle_nodes.view(1, -1, 1).expand_as(pull)
             force = force.scatter_add(1, index, pull)
-        touch = None
-        if setup.contact is not None:
-            touch = setup.contact.forces(
-                measured, self._start_points(start), end, values.friction_obstacle, values.friction_cloth, dt
-            )
-            force = force + touch[:, :nodes]
+        touch = setup.contact.forces(
+            measured, self._start_points(start), end, values.friction_obstacle, values.friction_cloth, dt
+        )
+        force = force + touch[:, :nodes]
         residual = mass * change - dt * force
         if len(self.handle_nodes) and system.handles.hard:
             wanted = (start.targets - start.positions[:, self.handle_nodes]) / dt - start.velocities[:, self.handle_nodes]
@@ -335,16 +354,15 @@ class ImplicitStep:
             return residual
         return torch.cat([residual, self._body_residual(u, start, touch)], dim=1)
 
-    def _body_residual(self, u: Tensor, start: ImplicitStart, touch: Tensor | None) -> Tensor:
+    def _body_residual(self, u: Tensor, start: ImplicitStart, touch: Tensor) -> Tensor:
         system, dt, bodies = self.system, self.system.time_step, self.setup.bodies
         mass = start.properties.body_mass
         moved = self._moved(u, start)
         force = mass[..., None] * system.gravity
-        torque = torch.zeros_like(force)
-        if touch is not None:
-            push = touch[:, -len(bodies.points) :]
-            force = force.index_add(1, bodies.body, push)
-            torque = torque.index_add(1, bodies.body, torch.linalg.cross(bodies.arms(moved.orientation), push))
+        push = touch[:, -len(bodies.points) :]
+        force = force.index_add(1, bodies.body, push)
+        moment = torch.linalg.cross(bodies.arms(moved.orientation), push)
+        torque = torch.zeros_like(force).index_add(1, bodies.body, moment)
         linear = mass[..., None] * (moved.velocity - start.bodies.velocity) - dt * force
         before = bodies.angular_momentum(mass, start.bodies.orientation, start.bodies.angular_velocity)
         after = bodies.angular_momentum(mass, moved.orientation, moved.angular_velocity)
@@ -377,25 +395,23 @@ class ImplicitStep:
             safe = [scale * energy.at(shape, values).hessian() for energy in (system.stretching, system.bending)]
             part = caution[:, None, None, None]
             blocks = [b + part * (s - b) for b, s in zip(blocks, safe, strict=True)] if exact else safe
-        couplings: list[Couplings] = []
         if len(setup.bodies):
             diagonal = torch.cat([diagonal, self._body_inertia(u, start)], dim=1)
-        if setup.contact is not None:
-            begin = self._start_points(start)
-            arguments = (measured, begin, end, values.friction_obstacle, values.friction_cloth, dt)
-            found = setup.contact.blocks(*arguments, caution=caution if careful else None)
-            if len(setup.bodies):
-                turning = self._turning(u, start)
-                couplings = [c for block in found for c in self._couple(block, turning, nodes)]
-                if found and exact:
-                    touch = setup.contact.forces(*arguments)[:, -len(setup.bodies.points) :]
-                    diagonal = diagonal + self._swing(touch, turning, diagonal)
-            else:
-                couplings = [
-                    Couplings(block.entry[own], block.row[own], block.column[own], -(dt**2) * block.values[own])
-                    for block in found
-                    for own in [(block.row < nodes) & (block.column < nodes)]
-                ]
+        begin = self._start_points(start)
+        arguments = (measured, begin, end, values.friction_obstacle, values.friction_cloth, dt)
+        found = setup.contact.blocks(*arguments, caution=caution if careful else None)
+        if len(setup.bodies):
+            turning = self._turning(u, start)
+            couplings = [c for block in found for c in self._couple(block, turning, nodes)]
+            if found and exact:
+                touch = setup.contact.forces(*arguments)[:, -len(setup.bodies.points) :]
+                diagonal = diagonal + self._swing(touch, turning, diagonal)
+        else:
+            couplings = [
+                Couplings(block.entry[own], block.row[own], block.column[own], -(dt**2) * block.values[own])
+                for block in found
+                for own in [(block.row < nodes) & (block.column < nodes)]
+            ]
         if hard:  # the row of a held node says only what its own change is
             free = torch.ones(diagonal.shape[1], dtype=u.dtype, device=u.device)
             free[self.handle_nodes] = 0.0
@@ -410,37 +426,43 @@ class ImplicitStep:
 
     def _face_blocks(self, u: Tensor, start: ImplicitStart) -> Tensor:
         """[B, F, 9, 9]: stretching and air."""
-        system, setup, dt = self.system, self.setup, self.system.time_step
-        stretching, air = setup.apart.stretching, setup.apart.air
-        corners = system.stretching.elements
-        first, before = (corners.gather(field).flatten(1, 2) for field in (start.positions, start.velocities))
-        change = corners.gather(u[:, : corners.node_count])
+        apart = self.setup.apart
 
-        def force(local: Tensor, copies: int) -> Tensor:
-            values = start.properties.repeated(copies)
-            velocity = before.repeat(copies, 1, 1) + local.flatten(1).view(len(local), -1, 3)
-            shape = geometry(stretching.elements, first.repeat(copies, 1, 1) + dt * velocity)
-            damped = values.damping[:, None, None] * velocity
-            total = stretching.at(shape, values).forces(damped) + air.forces(shape, velocity, values)
-            return total.view_as(local)
+        def force(positions: Tensor, velocities: Tensor, values: Properties) -> Tensor:
+            shape = geometry(apart.stretching.elements, positions)
+            damped = values.damping[:, None, None] * velocities
+            return apart.stretching.at(shape, values).forces(damped) + apart.air.forces(shape, velocities, values)
 
-        return -dt * element_jacobian(force, change.flatten(2), 9)
+        return self._element_blocks(self.system.stretching.elements, force, u, start)
 
     def _hinge_blocks(self, u: Tensor, start: ImplicitStart) -> Tensor:
         """[B, H, 12, 12]: bending."""
-        system, setup, dt = self.system, self.setup, self.system.time_step
-        bending = setup.apart.bending
-        corners = system.bending.elements
-        first, before = (corners.gather(field).flatten(1, 2) for field in (start.positions, start.velocities))
-        change = corners.gather(u[:, : corners.node_count])
+        apart = self.setup.apart
 
-        def force(local: Tensor, copies: int) -> Tensor:
-            values = start.properties.repeated(copies)
-            velocity = before.repeat(copies, 1, 1) + local.flatten(1).view(len(local), -1, 3)
-            shape: Geometry = geometry(setup.apart.hinge_faces, first.repeat(copies, 1, 1) + dt * velocity)
-            return bending.at(shape, values).forces(values.damping[:, None, None] * velocity).view_as(local)
+        def force(positions: Tensor, velocities: Tensor, values: Properties) -> Tensor:
+            shape = geometry(apart.hinge_faces, positions)
+            return apart.bending.at(shape, values).forces(values.damping[:, None, None] * velocities)
 
-        return -dt * element_jacobian(force, change.flatten(2), 12)
+        return self._element_blocks(self.system.bending.elements, force, u, start)
+
+    def _element_blocks(
+        self,
+        elements: Elements,
+        force: Callable[[Tensor, Tensor, Properties], Tensor],
+        u: Tensor,
+        start: ImplicitStart,
+    ) -> Tensor:
+        """-Δt d force / du [B, E, 3n, 3n] of a force on elements apart, given their corners' end-of-step motion."""
+        dt = self.system.time_step
+        first, before = (elements.gather(field).flatten(1, 2) for field in (start.positions, start.velocities))
+        change = elements.gather(u[:, : elements.node_count]).flatten(2)
+
+        def of_change(local: Tensor, copies: int) -> Tensor:
+            velocities = before.repeat(copies, 1, 1) + local.flatten(1).view(len(local), -1, 3)
+            positions = first.repeat(copies, 1, 1) + dt * velocities
+            return force(positions, velocities, start.properties.repeated(copies)).view_as(local)
+
+        return -dt * element_jacobian(of_change, change, change.shape[-1])
 
     def _body_inertia(self, u: Tensor, start: ImplicitStart) -> Tensor:
         """[B, 2 N, 3, 3]: mass, and the derivative of the angular momentum by the angular velocity."""
@@ -539,6 +561,27 @@ class _Place:
     measured: Measured
 
 
+@dataclass(frozen=True)
+class _Arrival:
+    """Where Newton's method goes on in another batch."""
+
+    u: Tensor
+    """[B, D, 3]"""
+    scenery: Tensor
+    """[B, O, 3]"""
+    change: Tensor
+    """[B] the last relative change."""
+    caution: Tensor
+    """[B]"""
+    left: int
+    """Iterations."""
+
+    @staticmethod
+    def at(u: Tensor, scenery: Tensor) -> _Arrival:
+        change = torch.full((len(u),), torch.inf, dtype=u.dtype, device=u.device)
+        return _Arrival(u, scenery, change, torch.zeros_like(change), _ITERATIONS)
+
+
 class _Room:
     """Pairs near each other while all points stay within a distance of the path from `begin` to `predicted`."""
 
@@ -550,10 +593,6 @@ class _Room:
         if step.system.handles.hard and len(step.handle_nodes):
             self.held = ~step.setup.moves
             self.held[step.handle_nodes] = True
-        self.near = Near((), self.held, begin, ())
-        if self.contact is None or self.contact.surface is None:
-            self.size = self.longest = float("inf")
-            return
         path = float((self.high - self.low).max())
         self.size = _ROOM * (self.contact.barrier.thickness + 0.2 * path)
         self.longest = _LONGEST * (self.contact.barrier.thickness + path)
@@ -567,7 +606,6 @@ class _Room:
         """Make sure that the list holds all pairs that may touch so far from the path; whether it had to grow."""
         if distance <= self.size:
             return False
-        assert self.contact is not None
         self.size = min(2 * distance, self.longest)
         self.near = self.contact.near(self.places, 2 * self.size, self.held)
         return True

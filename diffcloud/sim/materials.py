@@ -121,6 +121,10 @@ _BASIS_SOURCE = (
     "chosen, not measured: soft enough that the whole box [0.1, 10]² of multipliers moves a hand-sized cloth by more "
     "than a depth camera's noise (docs/scenarios.md); most real fabrics lie at its stiff edge"
 )
+_FOAM_SOURCE = (
+    "chosen, not measured: so soft in its plane and so stiff across it that weight, stretching and bending are of one size "
+    "over half a metre, as in a thick sheet of foam; then both multipliers show in the shape (docs/scenarios.md)"
+)
 _KES_SOURCE = (
     "order of magnitude from published KES-F / ASTM D1388 ranges for this kind of fabric (e.g. Kawabata, The "
     "Standardization and Analysis of Hand Evaluation, 1980); measure your own before you rely on it"
@@ -138,6 +142,26 @@ _PRESETS = {
             stiffening=3.0,
             damping=0.0,
             source=_BASIS_SOURCE,
+        ),
+        isotropic(
+            "basis-foam",
+            density=0.2,
+            stretching=2.0,
+            shear=1.0,
+            bending=0.12,
+            stiffening=3.0,
+            damping=0.05,
+            source=_FOAM_SOURCE,
+        ),
+        isotropic(
+            "basis-soft-foam",
+            density=0.2,
+            stretching=1.0,
+            shear=0.5,
+            bending=0.12,
+            stiffening=3.0,
+            damping=0.05,
+            source=_FOAM_SOURCE,
         ),
         isotropic("jersey-knit", density=0.16, stretching=60.0, shear=30.0, bending=3e-6, source=_KES_SOURCE),
         isotropic("cotton-shirting", density=0.12, stretching=800.0, shear=60.0, bending=8e-6, source=_KES_SOURCE),

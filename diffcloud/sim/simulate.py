@@ -145,12 +145,14 @@ def _advance(
             )
             raise DivergedError(step, error.entries, advice) from error
         failed = error.entries
+        found = error.found if isinstance(error, StuckError) else None
     batch = len(start.positions) // copies
     rest = [entry for entry in range(batch) if entry not in set(failed)]
     parts = []
     if rest:
         chosen = _entries(rest, batch, copies, start.positions.device)
-        parts.append((chosen, _advance(problem.fresh(), start.only(chosen), copies, step, depth)))
+        known = None if found is None else found[rest]
+        parts.append((chosen, _advance(problem.fresh(known), start.only(chosen), copies, step, depth)))
     chosen = _entries(failed, batch, copies, start.positions.device)
     try:
         parts.append((chosen, _halves(problem, start.only(chosen), copies, step, depth)))

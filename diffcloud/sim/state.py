@@ -33,8 +33,7 @@ class Apart:
 class ImplicitSetup:
     """What the converged implicit step needs beyond the linearised one."""
 
-    contact: SmoothContact | None
-    """None where there is nothing to touch."""
+    contact: SmoothContact
     bodies: Bodies
     scenery: Scenery
     moves: Tensor

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -89,8 +91,6 @@ class TestLaws:
         positions = crumpled(mesh, rng).requires_grad_(True)
         at = energy.at(geometry(Stretching.build(mesh, material, **OPTIONS).elements, positions), properties)
         frozen = {"stiffness": at.stiffness.detach()} | ({"shear": at.shear.detach()} if kind is Stretching else {})
-        from dataclasses import replace
-
         (gradient,) = torch.autograd.grad(replace(at, **frozen).energy().sum(), positions)
         torch.testing.assert_close(at.forces(), -gradient, rtol=1e-10, atol=1e-12)
 
@@ -226,3 +226,48 @@ def test_air_pushes_against_the_motion_and_as_formulas_say(mesh):
     total = air.forces(at, velocities, properties).sum(1)[0]
     area = 0.3 * 0.4
     assert total.tolist() == pytest.approx([-0.3 * area * 2.0, 0.0, 1.0 * area * 1.5 * 1.5])
+
+
+class TestShaped:
+    """Hinges at rest as the mesh stands."""
+
+    @pytest.fixture
+    def bent(self, mesh, rng):
+        return replace(mesh, nodes=mesh.nodes + 0.02 * rng.normal(size=mesh.nodes.shape))
+
+    def test_no_force_as_it_stands_wherever_it_stands(self, bent, rng):
+        energy, faces = (
+            Bending.build(bent, CAMEL, **OPTIONS, shaped=True),
+            Stretching.build(bent, CAMEL, **OPTIONS).elements,
+        )
+        turned = torch.as_tensor(bent.nodes @ rotation(rng).T + rng.normal(size=3))[None]
+        at = energy.at(geometry(faces, turned), ones(bent))
+        flat = Bending.build(bent, CAMEL, **OPTIONS).at(geometry(faces, turned), ones(bent))
+        assert flat.forces().abs().max() > 1e-6
+        assert at.forces().abs().max() < 1e-9 * flat.forces().abs().max()
+
+    def test_angles_count_from_rest(self, mesh, bent, rng):
+        faces = Stretching.build(bent, CONSTANT, **OPTIONS).elements
+        shaped, flat = (Bending.build(bent, CONSTANT, **OPTIONS, shaped=shaped) for shaped in (True, False))
+        moved = geometry(faces, crumpled(mesh, rng))
+        rest = flat.at(geometry(faces, torch.as_tensor(bent.nodes)[None]), ones(bent)).angle
+        torch.testing.assert_close(shaped.at(moved, ones(bent)).angle, flat.at(moved, ones(bent)).angle - rest)
+
+    def test_a_fold_beyond_a_half_turn_goes_the_short_way(self):
+        """From folded up by 175 degrees to folded down by 175: 10 degrees away, not 350."""
+        one = grid_cloth(2, 2, 1.0, 1.0)
+        assert len(one.hinges.length) == 1
+
+        def folded(degrees: float) -> np.ndarray:
+            nodes = one.nodes.copy()
+            first, second, tip, _ = one.hinges.nodes[0]
+            axis = (one.nodes[second] - one.nodes[first]) / np.linalg.norm(one.nodes[second] - one.nodes[first])
+            arm, turn = one.nodes[tip] - one.nodes[first], np.deg2rad(degrees)
+            across = arm - axis * (axis @ arm)
+            nodes[tip] += across * (np.cos(turn) - 1) + np.cross(axis, across) * np.sin(turn)
+            return nodes
+
+        up = replace(one, nodes=folded(175.0))
+        energy = Bending.build(up, CONSTANT, **OPTIONS, shaped=True)
+        down = geometry(Stretching.build(up, CONSTANT, **OPTIONS).elements, torch.as_tensor(folded(-175.0))[None])
+        assert float(energy.at(down, ones(up)).angle.abs()) == pytest.approx(np.deg2rad(10.0))

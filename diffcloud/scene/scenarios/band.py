@@ -1,4 +1,4 @@
-"""An elastic band around a pole on a table, pulled away and up until it is taut: the built-in `band_stretch`."""
+"""An elastic band that hangs on a level pole and is pulled away from it: the built-in `band_stretch`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from diffcloud.errors import SceneError
-from diffcloud.mesh.shapes import box_surface, cylinder_surface, loop_cloth, rectangle_surface
+from diffcloud.mesh.shapes import box_surface, cylinder_surface, loop_cloth
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios.options import ScenarioOptions, assemble
 from diffcloud.scene.scenarios.release import PAPER_THRESHOLD, RELEASE_UNIT_M
@@ -18,28 +18,29 @@ from diffcloud.scene.schema import NonNegative, Positive
 
 
 class BandScenario(ScenarioOptions):
-    """A band that stands upright on a table, laid around a pole and a gripper in front (at -y) without slack.
+    """A band laid around a level pole and a gripper in front (at -y) without slack: a belt on edge, its strands one above
+    the other.
 
     Everything here may change in a YAML file.
     """
 
-    contact_thickness_m: Positive = 0.004
-    circumference_m: Positive = 1.2
-    width_m: Positive = 0.06
+    material: str = "basis-soft-foam"
+    contact_thickness_m: Positive = 0.008
+    contact_stiffness: NonNegative = 1e6
+    circumference_m: Positive = 1.75
+    width_m: Positive = 0.05
     nodes: tuple[Annotated[int, Field(ge=4)], Annotated[int, Field(ge=2)]] = (32, 2)
     """Node counts along the band and across it."""
-    center_m: tuple[float, float] = (0.0, 0.0)
-    """Where the band's middle stands on the table."""
-    table_height_m: float = 0.0
-    gap_m: NonNegative = 0.005
-    """Height of the band over the table at the start."""
+    center_m: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """The middle of the band at the start."""
     pole: Literal["square", "round"] = "round"
-    pole_width_m: Positive = 0.1
+    pole_width_m: Positive = 0.08
     """Side of the square, or diameter."""
-    pole_height_m: Positive = 0.4
+    pole_length_m: Positive = 0.4
+    """Along x, the band in its middle."""
     pole_sides: Annotated[int, Field(ge=3)] = 24
     """Of a round pole."""
-    pole_gap_m: Positive = 0.008
+    pole_gap_m: Positive = 0.012
     """Between the band and the pole at the start."""
     grasped_columns: Annotated[int, Field(ge=1)] = 3
     """Nodes along the band that the gripper holds, over its whole width."""
@@ -47,7 +48,7 @@ class BandScenario(ScenarioOptions):
 
 BAND_STRETCH = BandScenario(
     name="band_stretch",
-    path=[(0.0, 0.0, 0.0, 0.0), (2.4, 0.0, -0.34, 0.25)],
+    path=[(0.0, 0.0, 0.0, 0.0), (1.2, 0.0, -0.2, 0.0)],
     frames=25,
     steps_per_frame=3,
     loss_frames=(24,),
@@ -56,6 +57,9 @@ BAND_STRETCH = BandScenario(
     threshold_m2=PAPER_THRESHOLD * RELEASE_UNIT_M**2,
     recorder="whole_surface",
 )
+
+_ON_EDGE = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+"""Turns a loop that lies level, and its axis z, on edge: the axis to -x, x upwards."""
 
 
 def band_scenario(options: BandScenario) -> Scenario:
@@ -77,26 +81,21 @@ def band_scenario(options: BandScenario) -> Scenario:
             f"{2 * np.pi * radius:.3g} m, or the pole thinner."
         )
     loop = loop_cloth(across, along, options.width_m, options.circumference_m, radius)
-    middle = options.table_height_m + options.gap_m + options.width_m / 2
-    mesh = replace(loop, nodes=np.add(loop.nodes, (*options.center_m, middle)))
+    pole = _pole(options, float(loop.nodes[:, 1].max()) - radius)
+    mesh = replace(loop, nodes=loop.nodes @ _ON_EDGE.T + options.center_m)
     front = -(options.grasped_columns // 2)
     columns = (front + np.arange(options.grasped_columns)) % along
-    extent = options.circumference_m + options.reach
     return assemble(
         options,
         mesh,
-        (
-            _pole(options, float(loop.nodes[:, 1].max()) - radius),
-            rectangle_surface(options.center_m, (extent, extent), options.table_height_m),
-        ),
+        (replace(pole, nodes=pole.nodes @ _ON_EDGE.T + options.center_m),),
         grasped=[int(row * along + column) for row in range(across) for column in columns],
     )
 
 
 def _pole(options: BandScenario, offset: float) -> SurfaceMesh:
-    axis = np.add(options.center_m, (0.0, offset))
-    half = options.pole_width_m / 2
-    bottom, top = options.table_height_m, options.table_height_m + options.pole_height_m
+    """Upright, at y = offset."""
+    half, end = options.pole_width_m / 2, options.pole_length_m / 2
     if options.pole == "square":
-        return box_surface([*(axis - half), bottom], [*(axis + half), top])
-    return cylinder_surface([*axis, bottom], [*axis, top], half, options.pole_sides)
+        return box_surface([-half, offset - half, -end], [half, offset + half, end])
+    return cylinder_surface([0.0, offset, -end], [0.0, offset, end], half, options.pole_sides)

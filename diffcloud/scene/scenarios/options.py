@@ -36,6 +36,8 @@ class ScenarioOptions(Checked):
     steps_per_frame: Annotated[int, Field(ge=1)] = 4
     integrator: Integrator = "linearised"
     """"implicit" has smooth contact, whose gradients are better behaved; its steps take about ten times as long."""
+    shaped: bool = False
+    """Whether the cloth is at rest in bending as it starts, not flat."""
     soft_handles: bool = False
     loss_frames: tuple[int, ...] = (-1,)
     points: Annotated[int, Field(ge=1)] = 3500
@@ -106,6 +108,7 @@ def assemble(
             obstacles=obstacles,
         ),
         integrator=options.integrator,
+        shaped=options.shaped,
     )
     return Scenario(
         name=options.name,

@@ -60,7 +60,7 @@ def safe_fraction(
             break
         left = pair_distance(kind, start[active] + fraction[active][:, None, None] * motion[active])
         # near the goal each advance would be shorter than the last: enough
-        stopped = left < _ENOUGH * goal[active]
+        stopped = (left < _ENOUGH * goal[active]) & (left <= first[active])
         limit = limit.scatter_reduce(0, entry[active[stopped]], fraction[active[stopped]], "amin")
         active, left = active[~stopped], left[~stopped]
         fraction[active] += 0.9 * (left - goal[active]) / bound[active]

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_ALL_PAIRS = 60_000
-"""Up to this many pairs per batch entry, comparing all is faster than a grid (measured on a CPU)."""
+_ALL_PAIRS = 500_000
+"""Up to this many pairs per batch entry, comparing all is quicker than a grid on a CPU (measured on folded cloths: by a
+half there, and by up to eight times below a tenth of it, where boxes overlap much)."""
 _MOST_CELLS = 64
 """A box that covers more grid cells is compared with all others."""
 
@@ -42,12 +43,13 @@ def overlapping(first: Boxes, second: Boxes) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _all_pairs(first: Boxes, second: Boxes) -> tuple[Tensor, Tensor, Tensor]:
-    together: Tensor | None = None
-    for axis in range(3):
-        meet = first.low[:, :, None, axis] <= second.high[:, None, :, axis]
-        meet &= second.low[:, None, :, axis] <= first.high[:, :, None, axis]
-        together = meet if together is None else together & meet
-    assert together is not None
+    # axis by axis in memory, which the comparisons need to be vectorised
+    low_a, high_a, low_b, high_b = (t.movedim(-1, 0).contiguous() for t in (first.low, first.high, second.low, second.high))
+    together = low_a[0, :, :, None] <= high_b[0, :, None]
+    together &= low_b[0, :, None] <= high_a[0, :, :, None]
+    for axis in (1, 2):
+        together &= low_a[axis, :, :, None] <= high_b[axis, :, None]
+        together &= low_b[axis, :, None] <= high_a[axis, :, :, None]
     entry, a, b = together.nonzero(as_tuple=True)
     return entry, a, b
 

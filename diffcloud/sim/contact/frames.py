@@ -56,6 +56,7 @@ class MeetingPairs:
 
     def where(self, keep: Tensor) -> MeetingPairs:
         """The pairs of a bool [C] mask or an index."""
+        keep = keep.nonzero().flatten() if keep.dtype == torch.bool else keep  # once, not for each tensor
         tensors = (self.edge_edge, self.entry, self.points, self.primitives, self.area)
         return MeetingPairs(*(tensor[keep] for tensor in tensors))
 

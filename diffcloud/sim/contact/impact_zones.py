@@ -33,7 +33,8 @@ from diffcloud.sim.elements import safe_norm
 
 _PASSES = 100
 _REACH = 0.01
-"""[m] Candidate pairs are listed this far, and again once a point has moved half of it."""
+"""[m] Candidate pairs of an entry are listed this far around the boxes that its points sweep, and again once one of them
+leaves its box by almost half of that."""
 _TIME_TIE = 1e-4
 """Impacts in one interval of this length (of the step) count as simultaneous; then the order is that of the list."""
 _TOUCH = 1e-5
@@ -187,7 +188,7 @@ class _Finder:
 
     def run(self, step: int) -> list[_Pass]:
         places = self.candidate
-        pairs = self._list(places)
+        pairs = self._list(places, torch.arange(len(places), device=places.device))
         listed_at = places
         if not len(pairs):
             return []
@@ -209,20 +210,27 @@ class _Finder:
             moved = self.candidate + (1 - self.settings.residue) * rows.move(force)
             changed = (moved != places).any(-1)
             places = moved
-            if float((places - listed_at).abs().max()) > 0.4 * _REACH:
-                pairs, listed_at = self._list(places), places
+            stray = torch.maximum(
+                places - torch.maximum(self.start, listed_at), torch.minimum(self.start, listed_at) - places
+            )
+            far = stray.flatten(1).amax(1) > 0.4 * _REACH
+            if bool(far.any()):
+                pairs = pairs.where(~far[pairs.entry]).then(self._list(places, far.nonzero().flatten()))
+                listed_at = torch.where(far[:, None, None], places, listed_at)
         last = history[-1].constraints
         late = torch.unique(last.pairs.entry[-history[-1].fresh :]).tolist()
         raise UnresolvedContactError(step, late, _describe(self.surface, last.pairs), _PASSES)
 
-    def _list(self, places: Tensor) -> MeetingPairs:
-        return MeetingPairs.join(candidates(self.surface, (self.start, places), _REACH))
+    def _list(self, places: Tensor, entries: Tensor) -> MeetingPairs:
+        """Candidate pairs of some batch entries [E]."""
+        found = MeetingPairs.join(candidates(self.surface, (self.start[entries], places[entries]), _REACH))
+        return replace(found, entry=entries[found.entry])
 
     def _impacts(self, pairs: MeetingPairs, places: Tensor, changed: Tensor) -> tuple[Constraints, int] | None:
         """The impacts of this pass that are kept, none if there are none."""
         pairs = pairs.where(pairs.gather(changed).any(1))
         start, end = pairs.gather(self.start), pairs.gather(places)
-        near = _boxes_meet(pairs, start, end)
+        near = _boxes_meet(pairs, start, end).nonzero().flatten()
         pairs, start, end = pairs.where(near), start[near], end[near]
         if not len(pairs):
             return None

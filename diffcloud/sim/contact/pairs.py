@@ -37,6 +37,7 @@ class Pairs:
 
     def where(self, keep: Tensor) -> Pairs:
         """The pairs of a bool [C] mask or an index."""
+        keep = keep.nonzero().flatten() if keep.dtype == torch.bool else keep  # once, not for each tensor
         return Pairs(self.kind, self.entry[keep], self.points[keep], self.primitives[keep], self.area[keep])
 
     def gather(self, positions: Tensor) -> Tensor:

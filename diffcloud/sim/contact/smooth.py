@@ -15,7 +15,6 @@ from diffcloud.sim.contact.additive_ccd import pair_distance, safe_fraction
 from diffcloud.sim.contact.barrier import Barrier, edge_edge_places, point_face_places
 from diffcloud.sim.contact.pairs import Pairs, candidates
 from diffcloud.sim.contact.surface import ContactSurface
-from diffcloud.sim.elements import safe_norm
 from diffcloud.sim.jacobian import element_jacobian
 
 _CLOSEST = 1e-6
@@ -95,8 +94,7 @@ class SmoothContact:
     """Contact of everything with everything."""
 
     barrier: Barrier
-    surface: ContactSurface | None
-    """None where nothing but half-spaces can be met."""
+    surface: ContactSurface
     planes: PlaneContacts | None
 
     def near(self, places: tuple[Tensor, ...], margin: float, held: Tensor | None) -> Near:
@@ -105,8 +103,6 @@ class SmoothContact:
         Args:
             held: bool [N] points whose motion is prescribed; what only such points could resolve is left out.
         """
-        if self.surface is None:
-            return Near((), held, places[0], ())
         lists = []
         for pairs in candidates(self.surface, places, margin + self.barrier.thickness):
             if held is not None and len(pairs):
@@ -226,13 +222,13 @@ class SmoothContact:
         return found
 
     def safe_fraction(self, measured: Measured, start: Tensor, end: Tensor) -> Tensor:
-        """[B] in (0, 1]: how far all points of an entry may go straight from `start` to `end` without touching.
+        """[B] in [0, 1]: how far all points of an entry may go straight from `start` to `end` without touching.
 
         Args:
             measured: at `start`.
             start, end: [B, N, 3] [m].
         """
-        near = measured.near
+        near, floor = measured.near, _CLOSEST * self.barrier.thickness
         allowed = start.new_ones(len(start))
         if self.planes is not None:
             before, after = self.planes.gap(start), self.planes.gap(end)
@@ -242,7 +238,8 @@ class SmoothContact:
             closing = (before - after).clamp(min=1e-300)
             allowed = torch.where(through, (1 - _LEFT) * before / closing, 1.0).flatten(1).amin(1)
         for pairs, distance in zip(near.lists, measured.distances, strict=True):
-            allowed = safe_fraction(pairs.kind, pairs.entry, pairs.gather(start), pairs.gather(end), distance, allowed)
+            first, last = pairs.gather(start), pairs.gather(end)
+            allowed = safe_fraction(pairs.kind, pairs.entry, first, last, distance, allowed, floor)
         return allowed
 
     def closest(self, measured: Measured, positions: Tensor) -> tuple[Tensor, list[str]]:
@@ -264,19 +261,6 @@ class SmoothContact:
                     names[entry] = f"{pairs.kind.replace('_', '-')} pair of points {pairs.points[least].tolist()}"
         return smallest, names
 
-    def energy(self, measured: Measured, positions: Tensor) -> Tensor:
-        """[B] potential of the barrier [J]."""
-        total = positions.new_zeros(len(positions))
-        if self.planes is not None:
-            total = (self.barrier.energy(self.planes.gap(positions)) * self.planes.area[:, None]).sum((1, 2))
-        for pairs in measured.touching:
-            corners = pairs.gather(positions)
-            weights, share = self._places(pairs, corners)
-            distance = safe_norm(weights @ corners)
-            energy = (share * self.barrier.energy(distance)).sum(1)
-            total = total.index_add(0, pairs.entry, energy)
-        return total
-
     def _plane_forces(self, start: Tensor, end: Tensor, coefficient: Tensor, time_step: float) -> Tensor:
         """[B, Q, 3] on the planes' points."""
         planes = self.planes
@@ -295,7 +279,6 @@ class SmoothContact:
     def _places(self, pairs: Pairs, corners: Tensor) -> tuple[Tensor, Tensor]:
         """Weights [C, S, 4] of the places of each pair and the area [C, S] that counts for each [m²]."""
         surface = self.surface
-        assert surface is not None
         if pairs.kind == "edge_edge":
             weights, share = edge_edge_places(corners)
             return weights, share * pairs.area[:, None]
@@ -307,7 +290,6 @@ class SmoothContact:
 
     def _coefficient(self, pairs: Pairs, obstacle: Tensor, cloth: Tensor) -> Tensor:
         """[C] friction of each pair: the cloth's own, or that of anything with an obstacle."""
-        assert self.surface is not None
         second = 1 if pairs.kind == "point_face" else 2
         owner = self.surface.owner[pairs.points[:, [0, second]]]
         return torch.where((owner == 0).all(-1), cloth[pairs.entry], obstacle[pairs.entry])

@@ -2,15 +2,16 @@
 
     energy per hinge = K θ²/2,   K = k_b l² / (4 (a0 + a1)),   k_b = min over both sides of the table
 
-θ is the dihedral angle (rest angle zero everywhere, also for meshes that start curved), l the material-space length of
-the edge. The table is looked up at the edge's direction in material space, which is constant, and at the curvature
-0.05 θ l/(a0+a1), signed: negative angles take the first column. So each side is reduced to five numbers beforehand, and
-the look-up is one-dimensional. As with stretching, k_b counts as constant in force and Hessian, and the Hessian is
-K ∇θ ∇θᵀ (no second derivative of θ).
+θ is the dihedral angle less its rest angle: zero everywhere, as in ARCSim, also for meshes that start curved; or the angle
+at the start, for what keeps its shape (`shaped`). l is the material-space length of the edge. The table is looked up
+at the edge's direction in material space, which is constant, and at the curvature 0.05 θ l/(a0+a1), signed: negative
+angles take the first column. So each side is reduced to five numbers beforehand, and the look-up is one-dimensional. As
+with stretching, k_b counts as constant in force and Hessian, and the Hessian is K ∇θ ∇θᵀ (no second derivative of θ).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,12 +43,20 @@ class Bending:
     """[H] l² / (4 (a0 + a1)) [-]: times k_b [N·m] gives K."""
     curvature: Tensor
     """[H] 2.5 · 0.05 · l / (a0 + a1): table columns per radian."""
+    rest_angle: Tensor
+    """[H] [rad]"""
     table: Tensor
     """[H, 2, 5] k_b over curvature columns, already interpolated to the direction of each side [N·m]."""
 
     @staticmethod
-    def build(mesh: ClothMesh, material: Material, *, dtype: torch.dtype, device: torch.device) -> Bending:
-        """Precompute the hinges and their table rows."""
+    def build(
+        mesh: ClothMesh, material: Material, *, dtype: torch.dtype, device: torch.device, shaped: bool = False
+    ) -> Bending:
+        """Precompute the hinges and their table rows.
+
+        Args:
+            shaped: whether the hinges are at rest as the mesh stands, not flat.
+        """
         hinges = mesh.hinges
         area = mesh.face_area[hinges.faces].sum(axis=1)
 
@@ -59,6 +68,7 @@ class Bending:
             faces=torch.as_tensor(hinges.faces.reshape(-1), device=device),
             stiffness=tensor(hinges.length**2 / (4 * area)),
             curvature=tensor(2.5 * _CURVATURE_SCALE * hinges.length / area),
+            rest_angle=_angles(mesh, tensor) if shaped else tensor(np.zeros(len(hinges.length))),
             table=tensor(_rows_at(material.bending, hinges.angle)),
         )
 
@@ -72,11 +82,8 @@ class Bending:
         normals = geometry.area_normals.gather(1, self.faces.view(1, -1, 1).expand(len(edge), -1, 3)).view_as(opposite)
         area = safe_norm(normals)  # length times height
         n0, n1 = normals.unbind(2)
-        sine = -(edge * torch.linalg.cross(n0, n1)).sum(-1) / length
-        cosine = (n0 * n1).sum(-1)
-        # atan2(0, 0), a hinge with a collapsed face, has no derivative: call it flat
-        cosine = cosine + (sine.abs() + cosine.abs() < _TINY)
-        angle = torch.atan2(sine, cosine)
+        angle = _dihedral(edge, length, n0, n1) - self.rest_angle
+        angle = angle - 2 * torch.pi * (angle.detach() / (2 * torch.pi)).round()  # the short way round
         # unit normal over height, with the height kept above a part of the edge
         tilt = normals / (area * torch.maximum(area / length[..., None], _SMALLEST_HEIGHT * length[..., None]))[..., None]
         on_edge = torch.stack([along - 1.0, -along], dim=-2) @ tilt  # [B, H, 2, 3]: on n0 and n1
@@ -100,7 +107,7 @@ class BendingAt:
 
     of: Bending
     angle: Tensor
-    """[B, H] θ [rad]"""
+    """[B, H] θ [rad], less the rest angle"""
     gradient: Tensor
     """[B, H, 4, 3] ∇θ [rad/m]"""
     stiffness: Tensor
@@ -127,3 +134,20 @@ def _rows_at(bending: NDArray[np.float64], angle: NDArray[np.float64]) -> NDArra
     low = np.minimum(row.astype(int), 1)
     fraction = (row - low)[..., None]
     return bending[low] * (1 - fraction) + bending[low + 1] * fraction
+
+
+def _dihedral(edge: Tensor, length: Tensor, first: Tensor, second: Tensor) -> Tensor:
+    """[...] angle of the normals [..., 3] (any length) on both sides of an edge [..., 3] with its length [...] [rad]."""
+    sine = -(edge * torch.linalg.cross(first, second)).sum(-1) / length
+    cosine = (first * second).sum(-1)
+    # atan2(0, 0), a hinge with a collapsed face, has no derivative: call it flat
+    cosine = cosine + (sine.abs() + cosine.abs() < _TINY)
+    return torch.atan2(sine, cosine)
+
+
+def _angles(mesh: ClothMesh, tensor: Callable[[NDArray[np.float64]], Tensor]) -> Tensor:
+    """[H] dihedral angles as the mesh stands [rad]."""
+    corner = mesh.nodes[mesh.faces[mesh.hinges.faces]]  # [H, 2, 3, 3]
+    normals = tensor(np.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0]))
+    edge = tensor(mesh.nodes[mesh.hinges.nodes[:, 1]] - mesh.nodes[mesh.hinges.nodes[:, 0]])
+    return _dihedral(edge, safe_norm(edge), normals[:, 0], normals[:, 1])

@@ -115,6 +115,18 @@ def test_what_a_safe_fraction_allows_never_touches(rng, kind):
     assert (fraction < 1).float().mean() > 0.05
 
 
+def test_nothing_comes_closer_than_the_floor_but_may_leave():
+    triangle = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    start = torch.tensor([[[0.2, 0.2, 1.5e-9], *triangle]] * 2, dtype=torch.float64)
+    end = start.clone()
+    end[:, 0, 2] = torch.tensor([-0.1, 0.1])
+    distance, one = pair_distance("point_face", start), torch.ones(2, dtype=torch.float64)
+    fraction = safe_fraction("point_face", torch.arange(2), start, end, distance, one, 1e-9)
+    assert pair_distance("point_face", start + fraction[:, None, None] * (end - start)).min() >= 1e-9
+    assert fraction[0] < 1e-8
+    assert fraction[1] == 1.0
+
+
 def test_obstacle_edges_that_are_flat_are_left_out():
     cube = box_surface([0, 0, 0], [1, 1, 1])
     surface = ContactSurface.build(grid_cloth(2, 2, 1, 1), [cube])
