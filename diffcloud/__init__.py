@@ -3,9 +3,12 @@
 Imports run one way (a test holds this):
 
     mesh, io  <-  sim  <-  scene
-    clouds    <-  mesh
+    clouds    <-  mesh, io
     fit       <-  sim, scene, clouds
+    datasets  <-  sim, scene, clouds
+    regressors <- mesh, clouds, io
     sensing   <-  mesh, clouds, io
+    hardware  <-  sensing, io                  (cameras and arm; their packages are imported when one is opened)
     report    <-  everything but pipeline
 """
 

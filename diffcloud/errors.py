@@ -21,8 +21,36 @@ class EpisodeError(DiffCloudError):
     """A recorded episode or a cloud file that is damaged, empty, or of the wrong shape."""
 
 
+class HardwareError(DiffCloudError):
+    """A camera or an arm that is missing, cannot be opened, or failed while it ran."""
+
+
+class LimitError(HardwareError):
+    """A motion that would leave, or has left, what the person allowed: box, speed, acceleration, wrench."""
+
+
+class CalibrationError(DiffCloudError):
+    """A calibration that cannot be made from the data, or does not belong to the camera."""
+
+
+class RobotError(DiffCloudError):
+    """A robot description that is damaged or incomplete, or a pose that the robot cannot take."""
+
+
+class DatasetError(DiffCloudError):
+    """A simulated set that is missing, damaged, or does not fit together."""
+
+
 class ConfigError(DiffCloudError):
     """A parameter file or command option that is wrong."""
+
+
+class CheckpointError(DiffCloudError):
+    """A file of trained weights that is missing, damaged, or of another model."""
+
+
+class TrainingError(DiffCloudError):
+    """A training that cannot go on."""
 
 
 class DivergedError(DiffCloudError):

@@ -9,10 +9,16 @@ import torch
 import typer
 
 from diffcloud.errors import DiffCloudError
-from pipeline import acceptance, bench, evaluate, fit, importing, report, rollout
+from pipeline import acceptance, bench, evaluate, fit, importing, raw_episode, report, rollout
+from pipeline.calibrate import calibrate
+from pipeline.capture import record
 from pipeline.console import errors
+from pipeline.doctor import doctor
 from pipeline.episodes import episodes
+from pipeline.predict import predict
 from pipeline.preprocess import preprocess
+from pipeline.simulate import simulate
+from pipeline.train import train
 from pipeline.visibility import visibility
 
 app = typer.Typer(
@@ -22,13 +28,20 @@ app = typer.Typer(
 )
 app.add_typer(importing.app, name="import")
 app.add_typer(evaluate.app, name="evaluate")
+app.add_typer(raw_episode.app, name="episode")
 app.command()(episodes)
 app.command()(preprocess)
+app.command()(simulate)
 app.command()(fit.fit)
+app.command()(train)
+app.command()(predict)
 app.command()(report.report)
 app.command()(rollout.rollout)
 app.command()(visibility)
 app.command()(bench.bench)
+app.command("capture")(record)
+app.command()(calibrate)
+app.command()(doctor)
 app.command()(acceptance.acceptance)
 
 

@@ -9,10 +9,14 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from diffcloud.errors import ConfigError
+from diffcloud.regressors.settings import Loss, Profile, Target
 from diffcloud.scene.schema import NonNegative, Positive, explain
+from diffcloud.sensing.filters import Thinning
+from diffcloud.sensing.fusion import FusionSettings
 
 Count = Annotated[int, Field(ge=1)]
 Bounds = tuple[float, float]
+Point = tuple[float, float, float]
 
 
 def _check_bounds(name: str, bounds: Bounds) -> None:
@@ -46,16 +50,58 @@ class EpisodesConfig(Section):
         return self
 
 
+class RawConfig(Section):
+    """From raw episodes to clouds (`diffcloud.sensing.fusion.FusionSettings` says what each means)."""
+
+    robot: str | None = "gen3"
+    """Whose pixels are masked: `gen3`, the package's own description, or the path of a URDF; null: nobody's."""
+    inflation_m: NonNegative = 0.01
+    """Margin around the robot."""
+    workspace_m: tuple[Point, Point] = FusionSettings.workspace_m
+    eyes_m: tuple[float, ...] = FusionSettings.eyes_m
+    flying_m: NonNegative = FusionSettings.flying_m
+    lag_s: float = FusionSettings.lag_s
+    table: bool = FusionSettings.table
+    clearance_m: Positive = FusionSettings.clearance_m
+    color_difference: Positive = FusionSettings.color_difference
+    subpixel_px: Positive = FusionSettings.subpixel_px
+    baseline_m: Positive = FusionSettings.baseline_m
+    origin_m: Point = FusionSettings.origin_m
+    yaw_rad: float = FusionSettings.yaw_rad
+    length_unit_m: Positive = FusionSettings.length_unit_m
+
+    def fusion(self) -> FusionSettings:
+        return FusionSettings(**self.model_dump(exclude={"robot", "inflation_m"}))
+
+
 class PreprocessConfig(Section):
     """Cleaning of clouds."""
 
-    crop_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    raw: RawConfig = RawConfig()
+    crop_m: tuple[Point, Point] | None = None
     """Lowest and highest corner of a box in the scene's frame."""
     outlier_neighbours: Annotated[int, Field(ge=0)] = 20
     outlier_deviations: Positive = 2.5
+    radius_m: Positive | None = None
+    """Points with fewer than `radius_neighbours` others within it are outliers too; in the scene's unit."""
+    radius_neighbours: Count = 4
     points: Count | None = 3500
     """Kept per frame at most."""
+    thinning: Thinning = "random"
     seed: int = 0
+
+
+class SimulateConfig(Section):
+    """Simulated sets for the regressors."""
+
+    scenarios: Annotated[list[str], Field(min_length=1)] = ["lift", "fold"]
+    """Those that the pipeline makes sets of."""
+    parameters: Annotated[list[str], Field(min_length=1)] = ["stretch", "mass"]
+    draws: Literal["uniform", "modes", "sobol"] = "uniform"
+    """Over the bounds, `sobol`, or `modes`: the published code's mixture of soft, medium and stiff cloths."""
+    train: Annotated[int, Field(ge=0)] = 1500
+    test: Annotated[int, Field(ge=0)] = 375
+    seed: Annotated[int, Field(ge=0)] = 0
 
 
 class FitConfig(Section):
@@ -87,6 +133,33 @@ class FitConfig(Section):
         return self
 
 
+class TrainConfig(Section):
+    """Regressors. What is not given (null) is the profile's (`diffcloud.regressors.settings`)."""
+
+    scenarios: Annotated[list[str], Field(min_length=1)] = ["lift", "fold"]
+    """Those that the pipeline trains for."""
+    models: Annotated[list[str], Field(min_length=1)] = ["mlp", "pointnet2", "meteornet"]
+    profile: Profile = "reduced"
+    epochs: Count | None = None
+    draws: Count | None = None
+    points: Count | None = None
+    batch_size: Count | None = None
+    learning_rate: Positive | None = None
+    loss: Loss | None = None
+    target: Target | None = None
+    augment: bool | None = None
+    heteroscedastic: bool | None = None
+    patience: Count | None = None
+    seed: int | None = None
+    device: Literal["auto", "cpu", "gpu"] = "auto"
+    workers: Annotated[int, Field(ge=0)] = 0
+    """Processes that sample clouds; they change nothing but the time."""
+
+    def changes(self) -> dict[str, object]:
+        """What differs from the profile."""
+        return self.model_dump(exclude={"scenarios", "models", "profile", "device", "workers"}, exclude_none=True)
+
+
 class EvaluateConfig(Section):
     """Measuring fits."""
 
@@ -109,7 +182,9 @@ class Config(Section):
     scenarios: Annotated[list[str], Field(min_length=1)] = ["lift", "fold", "band_stretch", "vest_hang"]
     episodes: EpisodesConfig = EpisodesConfig()
     preprocess: PreprocessConfig = PreprocessConfig()
+    simulate: SimulateConfig = SimulateConfig()
     fit: FitConfig = FitConfig()
+    train: TrainConfig = TrainConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
     report: ReportConfig = ReportConfig()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +13,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam, write_fit
 from diffcloud.fit.optimise import FitOutcome, Progress
 from diffcloud.fit.result import describe_fit
-from diffcloud.io.episodes import read_episode
+from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.scene.scenarios import Scenario
 from pipeline.config import load_config, updated
 from pipeline.console import JsonFlag, ParamsFile, assignments, episode_files, errors, finish, progress_bar, show
@@ -34,7 +35,12 @@ def fit(
     iterations: Annotated[int | None, typer.Option(help="Updates at most.")] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Default: the scenario's.")] = None,
     starts: Annotated[int | None, typer.Option(help="Starts fitted together; the first is --init.")] = None,
-    init: Annotated[str, typer.Option(help="middle, or PARAMETER=VALUE,... of the first start.")] = "middle",
+    init: Annotated[
+        str,
+        typer.Option(
+            help="First start: middle, PARAMETER=VALUE,..., or a regressor's prediction: mlp, ... or its checkpoint."
+        ),
+    ] = "middle",
     smoothing: Annotated[float | None, typer.Option(help="Perturbation whose gradients are averaged; 0: none.")] = None,
     threshold: Annotated[float | None, typer.Option(help="Stop below this loss; default: the scenario's.")] = None,
     points: Annotated[int | None, typer.Option(help="Sampled per frame.")] = None,
@@ -66,10 +72,10 @@ def fit(
     )
     chosen = choose_scenario(scenario, scene)
     files = episode_files(episodes)
-    first = {} if init == "middle" else assignments(init.split(","), "--init")
     # everything is read before anything is fitted: a damaged last file must not cost the first ones' time
     recorded = {path.stem: read_episode(path) for path in files}
     jobs = [("joint", list(recorded))] if settings.joint else [(name, [name]) for name in recorded]
+    firsts = {name: _first_start(init, chosen, [recorded[m] for m in members]) for name, members in jobs}
     objectives = {
         name: Objective(
             chosen, [recorded[m] for m in members], frames=settings.frames, points=settings.points, seed=settings.seed
@@ -91,13 +97,13 @@ def fit(
         seed=settings.seed,
         resample=settings.resample,
         smoothing=settings.smoothing,
-        init=first,
     )
     table = Table("episode", "start", "final", "rms mm", *space.names, "iterations", "seconds", "stopped by")
     results: dict[str, Any] = {}
     for name, members in jobs:
-        outcome = _run(name, objectives[name], space, adam)
-        result = describe_fit(objectives[name], space, adam, outcome, episodes=members)
+        started = replace(adam, init=firsts[name])
+        outcome = _run(name, objectives[name], space, started)
+        result = describe_fit(objectives[name], space, started, outcome, episodes=members)
         write_fit(out, name, result)
         results[name] = {key: result.summary[key] for key in _SHOWN}
         table.add_row(name, *_row(outcome, chosen, space))
@@ -123,6 +129,19 @@ def _run(name: str, objective: Objective, space: FitSpace, adam: AdamSettings) -
             update(progress.iteration, f"loss {progress.loss:.3e}  best {progress.best:.3e}  {values}")
 
         return fit_adam(objective, space, adam, progress=show_progress)
+
+
+def _first_start(init: str, scenario: Scenario, episodes: list[Episode]) -> dict[str, float]:
+    """Values of the first start by name; episodes of a joint fit give the mean of their predictions."""
+    if init == "middle":
+        return {}
+    if "=" in init:
+        return assignments(init.split(","), "--init")
+    # imported here: the fits of the pipeline start elsewhere, and must not be stale when a regressor changes
+    from pipeline.predict import predicted_start
+
+    found = [predicted_start(init, scenario.name, episode) for episode in episodes]
+    return {name: sum(values[name] for values in found) / len(found) for name in found[0]}
 
 
 def _row(outcome: FitOutcome, scenario: Scenario, space: FitSpace) -> list[str]:

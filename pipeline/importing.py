@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from diffcloud.errors import ConfigError
+from diffcloud.hardware.realsense import play_recordings
+from diffcloud.io.depth_folders import depth_folders
 from diffcloud.io.episodes import write_episode
 from diffcloud.io.imports import cloud_folder, release_episodes
-from pipeline.console import JsonFlag, errors, finish
+from diffcloud.io.recordings import Recording, read_joint_log, write_recording
+from diffcloud.io.ros_recordings import ros_recording
+from pipeline.console import JsonFlag, errors, finish, warn
 
 app = typer.Typer(no_args_is_help=True, help="Turn recordings of others into episodes.")
 
@@ -46,3 +54,97 @@ def clouds(
     write_episode(out, episode)
     errors.print(f"Wrote {episode.frame_count} frames, {len(episode.points)} points to {out}.")
     finish({"out": str(out), "frames": episode.frame_count, "points": len(episode.points)}, json)
+
+
+@app.command()
+def recording(
+    source: Annotated[
+        list[Path],
+        typer.Argument(
+            help="A ROS recording (.bag, .mcap, .db3, rosbag2 folder); or, one per camera and as NAME=PATH, recordings of "
+            "the RealSense SDK (.db3, .bag) or folders with depth/*.png and camera.json."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of the raw episode; must not exist.")],
+    joint_log: Annotated[Path | None, typer.Option(help="CSV with the columns of robot.csv.")] = None,
+    log_offset: Annotated[float, typer.Option(help="Seconds to add to the joint log's times.")] = 0.0,
+    rate_hz: Annotated[float | None, typer.Option(help="Frame rate, where the source has no times.")] = None,
+    world_frame: Annotated[str, typer.Option(help="ROS: the robot's base in tf.")] = "base_link",
+    tool_frame: Annotated[str, typer.Option(help="ROS: the tool in tf.")] = "tool_frame",
+    joint: Annotated[
+        list[str] | None, typer.Option(help="ROS: the arm's joints in order; joint_1, ... if not given.")
+    ] = None,
+    gripper_joint: Annotated[str, typer.Option(help="ROS: in joint_states.")] = "finger_joint",
+    gripper_closed: Annotated[float, typer.Option(help="ROS: its angle when closed, rad.")] = 0.8,
+    scenario: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
+    fabric: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Import depth recordings of others as a raw episode. Check it with `diffcloud episode validate`."""
+    named = _named(source)
+    kinds = {_kind(path) for path in named.values()}
+    if len(kinds) > 1 or (kinds == {"ros"} and len(named) > 1):
+        raise ConfigError("Give one ROS recording, or one RealSense recording or folder per camera, not a mixture.")
+    with ExitStack() as stack:
+        if kinds == {"ros"}:
+            found = ros_recording(
+                source[0],
+                world_frame=world_frame,
+                tool_frame=tool_frame,
+                joint_names=joint or None,
+                gripper_joint=gripper_joint,
+                gripper_closed_rad=gripper_closed,
+            )
+        elif kinds == {"realsense"}:
+            found = stack.enter_context(play_recordings(named))
+        else:
+            found = depth_folders(named, rate_hz=rate_hz)
+        if joint_log is not None:
+            found = _with_log(found, joint_log, log_offset)
+        if found.robot is None:
+            warn("No joint log: the robot cannot be masked later. Give --joint-log if there is one.")
+        meta = {key: value for key, value in (("scenario", scenario), ("fabric", fabric)) if value is not None}
+        frames = write_recording(out, found, rate_hz=rate_hz, meta=meta)
+    errors.print(f"Wrote {frames} frames to {out}.", markup=False)
+    rows = 0 if found.robot is None else len(found.robot.times)
+    finish({"out": str(out), "frames": frames, "robot_rows": rows, "source": found.source}, json)
+
+
+def _named(sources: list[Path]) -> dict[str, Path]:
+    named: dict[str, Path] = {}
+    for source in sources:
+        name, equals, path = str(source).partition("=")
+        entry = (name, Path(path)) if equals else (source.stem, source)
+        if entry[0] in named:
+            raise ConfigError(f"Two sources are named {entry[0]!r}; name them with NAME=PATH.")
+        if not entry[1].exists():
+            raise ConfigError(f"No such recording: {entry[1]}.")
+        named[entry[0]] = entry[1]
+    return named
+
+
+def _kind(path: Path) -> str:
+    """ros, realsense or folder."""
+    if path.is_dir():
+        return "ros" if (path / "metadata.yaml").is_file() else "folder"
+    if path.suffix not in (".bag", ".db3", ".mcap"):
+        raise ConfigError(f"{path}: unknown kind of recording; allowed are .bag, .db3, .mcap and folders.")
+    # the SDK's files are bags too, and name their topics after the device
+    marker = b"/device_0/sensor_"
+    with path.open("rb") as stream:
+        tail = b""
+        while block := stream.read(1 << 20):
+            if marker in tail + block:
+                return "realsense"
+            tail = block[-len(marker) :]
+            if stream.tell() > 64 << 20:
+                break
+    return "ros"
+
+
+def _with_log(found: Recording, path: Path, offset_s: float) -> Recording:
+    frames = iter(found.frames)
+    first = next(frames, None)
+    start = 0.0 if first is None else first.time_s
+    log = read_joint_log(path, offset_s=offset_s, recording_start_s=start)
+    return replace(found, frames=frames if first is None else chain([first], frames), robot=log)

@@ -1,7 +1,8 @@
-"""`diffcloud preprocess`: clean recorded clouds."""
+"""`diffcloud preprocess`: raw episodes to clouds, and clouds to clean ones."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,39 +10,111 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from diffcloud.errors import EpisodeError
+from diffcloud.errors import ConfigError, EpisodeError
+from diffcloud.io.calibrations import Calibration, read_calibration
 from diffcloud.io.episodes import Episode, read_episode, write_episode
+from diffcloud.io.raw_episodes import read_description, read_raw_episode
 from diffcloud.sensing import clean_frame
-from pipeline.config import PreprocessConfig, load_config
+from diffcloud.sensing.fusion import fuse
+from diffcloud.sensing.masking import RobotMask
+from diffcloud.sensing.robot import Robot, gen3
+from pipeline.config import PreprocessConfig, RawConfig, load_config, updated
 from pipeline.console import JsonFlag, ParamsFile, episode_files, errors, finish, progress_bar
 
 
 def preprocess(
-    recorded: Annotated[Path, typer.Argument(help="Folder with <scenario>/<episode>.npz.")],
-    out: Annotated[Path, typer.Option(help="Folder for the cleaned episodes, same layout.")],
+    recorded: Annotated[
+        Path,
+        typer.Argument(help="Holds <scenario>/<episode> (.npz or raw); or one raw episode, or a folder of them."),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the cleaned episodes: <scenario>/<episode>.npz.")],
+    urdf: Annotated[Path | None, typer.Option(help="The robot of raw episodes; without it, as params say.")] = None,
+    mask: Annotated[bool, typer.Option(help="Take the robot out of raw episodes.")] = True,
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file for the cameras of raw episodes.")] = None,
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
-    """Crop, remove outliers, thin."""
+    """Raw episodes: depth to points, robot and table out, views merged. Then all: crop, remove outliers, thin."""
     config = load_config(params)
-    files = [path for name in config.scenarios for path in episode_files([recorded / name])]
+    settings = updated(config.preprocess, raw=updated(config.preprocess.raw, robot=None if urdf is None else str(urdf)))
+    if not mask:
+        settings = settings.model_copy(update={"raw": settings.raw.model_copy(update={"robot": None})})
+    sources = _sources(recorded, config.scenarios)
+    calibrated = None if calibration is None else read_calibration(calibration)
+    robot = _mask(settings.raw) if any(path.is_dir() for _, path in sources) else None
     kept: dict[str, Any] = {}
-    with progress_bar("preprocess", len(files)) as update:
-        for index, path in enumerate(files):
+    with progress_bar("preprocess", len(sources)) as update:
+        for index, (scenario, path) in enumerate(sources):
+            tell = _teller(update, index, path.name)
             try:
-                episode = _clean(read_episode(path), config.preprocess)
+                episode = _fused(path, robot, settings.raw, calibrated, tell) if path.is_dir() else read_episode(path)
+                episode = _clean(episode, settings)
             except EpisodeError as error:
                 raise EpisodeError(f"{path}: {error}") from error
-            write_episode(out / path.parent.name / path.name, episode)
-            kept[path.stem] = {"recorded": episode.meta["quality"]["recorded"], "kept": episode.meta["quality"]["kept"]}
-            update(index + 1, path.stem)
-    errors.print(f"Cleaned {len(files)} episodes into {out}.")
+            write_episode(out / scenario / f"{_stem(path)}.npz", episode)
+            kept[_stem(path)] = {"recorded": episode.meta["quality"]["recorded"], "kept": episode.meta["quality"]["kept"]}
+            update(index + 1, path.name)
+    errors.print(f"Cleaned {len(sources)} episodes into {out}.")
     finish({"out": str(out), "points": kept}, json)
+
+
+def _sources(recorded: Path, scenarios: list[str]) -> list[tuple[str, Path]]:
+    """(scenario, episode file or raw episode) of each episode."""
+    raw = [recorded] if (recorded / "episode.json").is_file() else _raw_in(recorded)
+    if raw:
+        return [(_scenario(path), path) for path in raw]
+    found = []
+    for name in scenarios:
+        folder = recorded / name
+        paths = _raw_in(folder)
+        if not paths or any(folder.glob("*.npz")):
+            paths += episode_files([folder])
+        names = [_stem(path) for path in paths]
+        doubled = sorted({stem for stem in names if names.count(stem) > 1})
+        if doubled:
+            raise ConfigError(f"{folder}: {', '.join(doubled)} is there as raw episode and as .npz; remove one.")
+        found += [(name, path) for path in paths]
+    return found
+
+
+def _raw_in(folder: Path) -> list[Path]:
+    return sorted(path.parent for path in folder.glob("*/episode.json"))
+
+
+def _scenario(raw: Path) -> str:
+    name = read_description(raw).get("scenario")
+    if not isinstance(name, str) or not name.replace("_", "").replace("-", "").isalnum():
+        raise ConfigError(
+            f"{raw / 'episode.json'} names no scenario (found {name!r}). Put the episode into a folder of the "
+            "scenario's name, and give the folder above."
+        )
+    return name
+
+
+def _stem(path: Path) -> str:
+    return path.name if path.is_dir() else path.stem
+
+
+def _mask(raw: RawConfig) -> RobotMask | None:
+    if raw.robot is None:
+        return None
+    robot = gen3() if raw.robot == "gen3" else Robot.from_urdf(Path(raw.robot))
+    return RobotMask(robot, inflation_m=raw.inflation_m)
+
+
+def _teller(update: Callable[[int, str], None], done: int, name: str) -> Callable[[int, str], None]:
+    return lambda _, text: update(done, f"{name}, {text}")
+
+
+def _fused(
+    path: Path, mask: RobotMask | None, raw: RawConfig, calibration: Calibration | None, tell: Callable[[int, str], None]
+) -> Episode:
+    return fuse(read_raw_episode(path), mask, raw.fusion(), calibration=calibration, tell=tell)
 
 
 def _clean(episode: Episode, config: PreprocessConfig) -> Episode:
     if episode.meta.get("noise_free"):  # nothing to clean; thinning would only take what the loss compares with
-        config = config.model_copy(update={"outlier_neighbours": 0, "points": None, "crop_m": None})
+        config = config.model_copy(update={"outlier_neighbours": 0, "points": None, "crop_m": None, "radius_m": None})
     rng = np.random.default_rng(config.seed)
     indices, reports = [], []
     for frame in range(episode.frame_count):  # frames are ragged; each is vectorised
@@ -51,7 +124,10 @@ def _clean(episode: Episode, config: PreprocessConfig) -> Episode:
                 crop=config.crop_m,
                 neighbours=config.outlier_neighbours,
                 deviations=config.outlier_deviations,
+                radius_m=config.radius_m,
+                radius_neighbours=config.radius_neighbours,
                 limit=config.points,
+                thinning=config.thinning,
                 rng=rng,
             )
         except EpisodeError as error:
@@ -67,5 +143,5 @@ def _clean(episode: Episode, config: PreprocessConfig) -> Episode:
         camera=None if episode.camera is None else episode.camera[joined],
         pixel=None if episode.pixel is None else episode.pixel[joined],
         sigma=None if episode.sigma is None else episode.sigma[joined],
-        meta={**episode.meta, "quality": quality},
+        meta={**episode.meta, "quality": {**episode.meta.get("quality", {}), **quality}},
     )

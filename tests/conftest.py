@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from diffcloud.io.simulated import SimulatedSet
+from diffcloud.mesh import grid_cloth
 from diffcloud.scene.scenarios import Scenario, built_in, grid_scenario
 
 if "OMP_NUM_THREADS" not in os.environ:
@@ -37,6 +40,32 @@ def small_lift(**changes: object) -> Scenario:
         "path": [(0.0, 0.0, 0.0, 0.0), (0.5, 0.0, -0.05, 0.15)],
     }
     return grid_scenario(built_in("lift").model_copy(update={**defaults, **changes}))
+
+
+def flat_set(
+    *,
+    runs: int = 3,
+    frames: int = 2,
+    nodes_of: Sequence[Sequence[float]] | None = None,
+    faces: Sequence[Sequence[int]] | None = None,
+) -> SimulatedSet:
+    """A simulated set of a cloth that lies still: 4 x 5 nodes, or the given mesh."""
+    mesh = grid_cloth(4, 5, 0.3, 0.4)
+    nodes = np.array(mesh.nodes if nodes_of is None else nodes_of, dtype=np.float32)
+    return SimulatedSet(
+        scenario="flat",
+        names=("stretch", "mass"),
+        bounds=np.array([[0.1, 10.0], [0.1, 10.0]]),
+        parameters=np.random.default_rng(0).uniform(0.1, 10, (runs, 2)),
+        nodes=np.tile(nodes, (runs, frames, 1, 1)),
+        times=0.1 * np.arange(frames),
+        faces=mesh.faces if faces is None else np.array(faces),
+        loss_faces=None,
+        loss_frame=frames - 1,
+        first_frame=0,
+        obstacle=None,
+        length_unit_m=1.0,
+    )
 
 
 @pytest.fixture

@@ -14,10 +14,13 @@ ALLOWED = {
     "io": {"mesh"},
     "sim": {"mesh", "io"},
     "scene": {"mesh", "io", "sim"},
-    "clouds": {"mesh"},
+    "clouds": {"mesh", "io"},
+    "datasets": {"mesh", "io", "sim", "scene", "clouds"},
     "fit": {"mesh", "io", "sim", "scene", "clouds"},
+    "regressors": {"mesh", "io", "clouds"},
     "sensing": {"mesh", "io", "clouds"},
-    "report": {"mesh", "io", "sim", "scene", "clouds", "fit", "sensing"},
+    "hardware": {"mesh", "io", "clouds", "sensing"},
+    "report": {"mesh", "io", "sim", "scene", "clouds", "fit", "regressors", "sensing"},
 }
 """Sub-package -> the sub-packages it may import; all may import errors."""
 
@@ -76,7 +79,7 @@ def stages() -> dict:
     return yaml.safe_load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
 
 
-@pytest.mark.parametrize("stage", ["episodes", "preprocess", "fit", "evaluate", "report"])
+@pytest.mark.parametrize("stage", ["episodes", "preprocess", "simulate", "fit", "train", "evaluate", "report"])
 def test_stage_dependencies_are_the_imports(stage):
     listed = {Path(dep).name for dep in stages()[stage]["deps"] if dep.startswith("diffcloud/") and not dep.endswith(".py")}
     assert listed == needed_packages(stage)

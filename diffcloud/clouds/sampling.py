@@ -66,24 +66,42 @@ class SurfaceSampler:
         stratum = torch.arange(points, dtype=dtype)
         choice = (stratum + torch.rand(points, dtype=dtype, generator=generator)) / points
         r1, r2 = torch.rand(2, points, dtype=dtype, generator=generator)
-        root = r1.sqrt()
-        barycentric = torch.stack([1 - root, root * (1 - r2), root * r2], dim=-1)
-        return SurfaceSampler(faces, weights, choice.to(device), barycentric.to(device))
+        return SurfaceSampler(faces, weights, choice.to(device), uniform_barycentric(r1, r2).to(device))
 
     def sample(self, positions: Tensor) -> Tensor:
         """[..., V, 3] node positions -> [..., N, 3] points."""
-        lead = positions.shape[:-2]
         flat = positions.reshape(-1, *positions.shape[-2:])
-        with torch.no_grad():
-            corner = flat[:, self.faces]
-            area = torch.linalg.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
-            area = area.square().sum(-1).sqrt().clamp(min=_TINY)
-            if self.weights is not None:
-                area = area * self.weights
-            cumulative = area.cumsum(-1)
-            choice = self.choice * cumulative[:, -1:]
-            face = torch.searchsorted(cumulative, choice, right=True).clamp(max=len(self.faces) - 1)  # [B, N]
-            nodes = self.faces[face].flatten(1)  # [B, 3N]
-        chosen = flat.gather(1, nodes[..., None].expand(-1, -1, 3)).unflatten(1, (-1, 3))
-        points = (self.barycentric[:, None] @ chosen).squeeze(-2)
-        return points.reshape(*lead, *points.shape[-2:])
+        points = points_on_faces(flat, self.faces, self.choice, self.barycentric, weights=self.weights)
+        return points.reshape(*positions.shape[:-2], *points.shape[-2:])
+
+
+def points_on_faces(
+    positions: Tensor, faces: Tensor, choice: Tensor, barycentric: Tensor, *, weights: Tensor | None = None
+) -> Tensor:
+    """[B, V, 3] node positions -> [B, N, 3] points, on faces picked in proportion to their area.
+
+    Args:
+        faces: [F, 3] node indices.
+        choice: [N] or [B, N] in [0, 1): picks the face.
+        barycentric: [N, 3] or [B, N, 3] place on the face.
+        weights: [F] or [B, F] on top of the area; None for one.
+    """
+    with torch.no_grad():
+        corner = positions[:, faces]
+        area = torch.linalg.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
+        area = area.square().sum(-1).sqrt().clamp(min=_TINY)
+        if weights is not None:
+            area = area * weights
+        cumulative = area.cumsum(-1)
+        face = torch.searchsorted(cumulative, choice * cumulative[:, -1:], right=True)  # [B, N]
+        # rounding may pick the end of the list: the last face that can be picked at all lies where the sum stops growing
+        last = torch.searchsorted(cumulative, cumulative[:, -1:].contiguous())
+        nodes = faces[torch.minimum(face, last)].flatten(1)  # [B, 3N]
+    chosen = positions.gather(1, nodes[..., None].expand(-1, -1, 3)).unflatten(1, (-1, 3))
+    return (barycentric[..., None, :] @ chosen).squeeze(-2)
+
+
+def uniform_barycentric(first: Tensor, second: Tensor) -> Tensor:
+    """Two uniform numbers [...] in [0, 1) -> [..., 3] places (u, v, w), uniform on a triangle."""
+    root = first.sqrt()
+    return torch.stack([1 - root, root * (1 - second), root * second], dim=-1)

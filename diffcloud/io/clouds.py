@@ -5,7 +5,6 @@ PLY goes through trimesh and PCD through open3d, which is imported only when a P
 
 from __future__ import annotations
 
-import ctypes
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
+from diffcloud.io.libusb import load_libusb
 from diffcloud.io.pickles import load_npy
 
 FORMATS = (".npy", ".ply", ".xyz", ".pcd")
@@ -85,10 +85,7 @@ def import_open3d() -> Any:
         EpisodeError: open3d cannot be imported; says what to install.
     """
     try:
-        import libusb_package
-
-        # open3d links to libusb-1.0, which a bare machine lacks; the wheel's own copy serves when loaded first
-        ctypes.CDLL(str(libusb_package.get_library_path()), ctypes.RTLD_GLOBAL)
+        load_libusb()
         import open3d
     except (ImportError, OSError) as error:
         raise EpisodeError(

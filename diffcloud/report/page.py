@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from diffcloud.io.episodes import Episode
 from diffcloud.mesh.topology import SurfaceMesh
+from diffcloud.report.regressors import TrainingEntry, regressor_section, training_data
 
 _DECIMALS = 4
 
@@ -41,13 +42,21 @@ class EpisodeEntry:
 
 
 def build_page(
-    entries: Sequence[EpisodeEntry], *, title: str, overlay_points: int, environment: Mapping[str, str], seed: int = 0
+    entries: Sequence[EpisodeEntry],
+    *,
+    title: str,
+    overlay_points: int,
+    environment: Mapping[str, str],
+    predictions: Sequence[Mapping[str, Any]] = (),
+    trainings: Sequence[TrainingEntry] = (),
+    seed: int = 0,
 ) -> str:
     """The page as HTML text.
 
     Args:
         overlay_points: points of the recorded cloud shown per frame.
         environment: name -> value lines for the last section.
+        predictions: rows of the table of predictions.
         seed: of the choice of shown points.
     """
     from plotly.offline import get_plotlyjs
@@ -61,6 +70,10 @@ def build_page(
         "summary": _summary(entries),
         "parameter_heads": "".join(f"<th>{html.escape(name)}</th>" for name in names),
         "rows": "".join(_table_row(index, entry, names) for index, entry in enumerate(entries)),
+        "regressors": regressor_section(
+            predictions, {(entry.scenario, entry.name): entry.row["rms_mm"] for entry in entries}, trainings
+        ),
+        "trainings": _script_json(training_data(trainings)),
         "failures": _failures(entries),
         "environment": "".join(lines),
         "data": _script_json(data),

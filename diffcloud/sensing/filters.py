@@ -1,14 +1,21 @@
-"""Cleaning a merged cloud: crop, statistical outliers, even thinning."""
+"""Cleaning a merged cloud: crop, outliers, thinning."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from diffcloud.errors import EpisodeError
+from diffcloud.io.clouds import import_open3d
+
+Thinning = Literal["random", "voxel", "farthest"]
+"""At `random`, the point nearest the middle of each occupied `voxel`, or each time the one `farthest` from those kept."""
+
+_BISECTIONS = 20
 
 
 @dataclass(frozen=True)
@@ -27,7 +34,10 @@ def clean_frame(
     crop: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None,
     neighbours: int = 20,
     deviations: float = 2.0,
+    radius_m: float | None = None,
+    radius_neighbours: int = 4,
     limit: int | None = None,
+    thinning: Thinning = "random",
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.int64], FilterReport]:
     """Indices of the points of one frame to keep.
@@ -37,7 +47,9 @@ def clean_frame(
         crop: lowest and highest corner of a box.
         neighbours, deviations: a point is an outlier if its mean distance to this many neighbours exceeds the mean over
             the cloud by this many standard deviations (the rule of PCL's StatisticalOutlierRemoval); 0 neighbours: off.
-        limit: keep at most this many points, drawn at random without repetition.
+        radius_m, radius_neighbours: a point is an outlier if fewer than this many others lie within the radius; None: off.
+        limit: keep at most this many points, none twice.
+        thinning: how the points to keep are chosen.
 
     Raises:
         EpisodeError: nothing is left; says after which filter.
@@ -55,10 +67,49 @@ def clean_frame(
         distance, _ = cKDTree(points[keep]).query(points[keep], k=neighbours + 1)
         mean = distance[:, 1:].mean(axis=1)
         keep = keep[mean <= mean.mean() + deviations * mean.std()]
+    if radius_m is not None:
+        around = cKDTree(points[keep]).query_ball_point(points[keep], radius_m, return_length=True)
+        keep = keep[around > radius_neighbours]  # a point is in its own ball
+        if not len(keep):
+            raise EpisodeError(
+                f"No point has {radius_neighbours} others within {radius_m:g}: the cloud is sparser. Widen the radius."
+            )
     inliers = len(keep)
     if limit is not None and len(keep) > limit:
-        keep = np.sort(rng.choice(keep, limit, replace=False))
+        keep = np.sort(keep[thin(points[keep], limit, thinning, rng)])
     return keep, FilterReport(len(points), cropped, inliers, len(keep))
+
+
+def thin(points: NDArray[np.float32], limit: int, thinning: Thinning, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Indices of at most `limit` of more points [N, 3], none twice; `voxel` may keep some fewer."""
+    if thinning == "random":
+        return rng.choice(len(points), limit, replace=False)
+    if thinning == "farthest":
+        open3d = import_open3d()
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
+        kept = np.asarray(cloud.farthest_point_down_sample(limit).points)
+        return np.unique(cKDTree(points.astype(np.float64)).query(kept)[1])
+    small, large = 0.0, float(np.ptp(points, axis=0).max()) * 1.01 + 1e-9  # one voxel holds all
+    chosen = np.zeros(1, dtype=np.int64)
+    for _ in range(_BISECTIONS):  # for the smallest voxels that are not too many
+        size = 0.5 * (small + large)
+        candidate = _one_per_voxel(points, size)
+        if len(candidate) > limit:
+            small = size
+        else:
+            large, chosen = size, candidate
+    return chosen
+
+
+def _one_per_voxel(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
+    """Index of the point nearest the middle of each occupied voxel."""
+    place = (points.astype(np.float64) - points.min(axis=0)) / size
+    cell = np.floor(place).astype(np.int64)
+    off = np.square(place - cell - 0.5).sum(axis=1)
+    order = np.lexsort((off, cell[:, 2], cell[:, 1], cell[:, 0]))
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = (np.diff(cell[order], axis=0) != 0).any(axis=1)
+    return order[first]
 
 
 def _span(points: NDArray[np.float32]) -> str:

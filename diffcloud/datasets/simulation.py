@@ -1,0 +1,214 @@
+"""A whole simulated set: draw, simulate chunk by chunk, join, write."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+
+from diffcloud.clouds.augmentation import Augmentation, CloudMaker, run_keys
+from diffcloud.datasets.chunks import Chunk, Replaced, SimulatedChunk, chunks_of, simulate_chunk
+from diffcloud.datasets.draws import ParameterDraws
+from diffcloud.datasets.work import WorkFolder
+from diffcloud.errors import ConfigError, DatasetError
+from diffcloud.io.simulated import SimulatedSet, Split, write_simulated
+from diffcloud.scene.scenarios import Scenario
+
+_WORTH_PROCESSES = 8
+"""Chunks from which on several processes save more than the seconds it takes to start them."""
+_ANSWER_S = 10
+"""A scheduler that has not answered by then is not there [s]."""
+
+
+@dataclass(frozen=True)
+class SimulationPlan:
+    """Everything that decides a set's bytes, on one type of processor.
+
+    Raises:
+        ConfigError: no runs.
+    """
+
+    scenario: Scenario
+    draws: ParameterDraws
+    counts: Mapping[Split, int]
+
+    def __post_init__(self) -> None:
+        if sum(self.counts.values()) < 1 or min(self.counts.values()) < 0:
+            raise ConfigError(f"A set needs at least one run, got {dict(self.counts)}.")
+
+
+@dataclass(frozen=True)
+class SimulationOutcome:
+    """What happened."""
+
+    resumed: int
+    """Runs that an earlier, interrupted call had finished."""
+    replaced: dict[Split, list[Replaced]]
+    discarded: bool
+    """Whether the chunks of another plan lay there and were thrown away."""
+
+
+def simulate_set(
+    plan: SimulationPlan,
+    out: Path,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    clouds: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> SimulationOutcome:
+    """Simulate a set into a folder, which takes its name when it is whole.
+
+    Finished chunks are kept in `<out>.partial` and used by the next call with the same plan.
+
+    Args:
+        workers: local processes; 0: in this one. None: one a core where that is worth starting them, else 0.
+        scheduler: address of a Dask scheduler, whose workers have this version of the package; instead of `workers`.
+        clouds: points of each exported cloud; None: none are exported.
+        progress: called with the number of finished runs.
+
+    Raises:
+        ConfigError: no scheduler answers, or the folder holds something else.
+        DatasetError: a run diverges with every draw, or workers die.
+        DiffCloudError: the folder cannot be written.
+    """
+    work = WorkFolder(out, [plan.scenario, plan.draws, dict(plan.counts)])
+    chunks = [chunk for split, count in plan.counts.items() for chunk in chunks_of(plan.draws, split, count)]
+    missing = [chunk for chunk in chunks if work.read(chunk) is None]
+    finished = resumed = sum(len(chunk.parameters) for chunk in chunks) - sum(len(c.parameters) for c in missing)
+    if progress is not None:
+        progress(finished)
+    if workers is None:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        workers = cores if cores > 1 and len(missing) >= _WORTH_PROCESSES else 0
+    for chunk, result in _simulated(plan, missing, workers, scheduler):
+        work.write(chunk, result)
+        finished += len(chunk.parameters)
+        if progress is not None:
+            progress(finished)
+    results: dict[Split, list[SimulatedChunk]] = {split: [] for split, count in plan.counts.items() if count}
+    for chunk in chunks:
+        kept = work.read(chunk)
+        assert kept is not None
+        results[chunk.split].append(kept)
+    work.publish(lambda folder: _write(folder, plan, results, clouds))
+    replaced = {split: [entry for part in parts for entry in part.replaced] for split, parts in results.items()}
+    return SimulationOutcome(resumed, replaced, work.discarded)
+
+
+def _simulated(
+    plan: SimulationPlan, chunks: Sequence[Chunk], workers: int, scheduler: str | None
+) -> Iterator[tuple[Chunk, SimulatedChunk]]:
+    """Chunks as they are finished."""
+    if not chunks:
+        return
+    if scheduler is None and not workers:
+        for chunk in chunks:
+            yield chunk, simulate_chunk(plan.scenario, plan.draws, chunk)
+        return
+    from distributed import Client, KilledWorker, LocalCluster, as_completed  # takes a second to import
+
+    if scheduler is not None:
+        cluster = None
+        try:
+            client = Client(scheduler, timeout=_ANSWER_S)
+        except (OSError, ValueError) as error:
+            raise ConfigError(
+                f"No Dask scheduler answers at {scheduler}: {error}. Start one with `dask scheduler`."
+            ) from error
+    else:
+        cluster = LocalCluster(
+            n_workers=min(workers, len(chunks)),
+            threads_per_worker=1,
+            dashboard_address=":0",  # any port: two sets at once do not quarrel
+            silence_logs=logging.ERROR,
+        )
+        client = Client(cluster)
+        client.run(_ignore_ctrl_c)
+    try:
+        futures = {client.submit(simulate_chunk, plan.scenario, plan.draws, chunk, pure=False): chunk for chunk in chunks}
+        for future, result in as_completed(futures, with_results=True):
+            yield futures[future], result
+            future.release()
+    except KilledWorker as error:
+        raise DatasetError(
+            f"Worker processes ended without a word, perhaps for want of memory ({error}). Finished runs are kept; try "
+            "fewer --workers."
+        ) from error
+    finally:
+        client.close()
+        if cluster is not None:
+            cluster.close()
+
+
+def _ignore_ctrl_c() -> None:
+    """In a worker process: the terminal sends Ctrl-C to it too, but the process that started it tells it to stop."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _write(
+    folder: Path, plan: SimulationPlan, results: Mapping[Split, Sequence[SimulatedChunk]], clouds: int | None
+) -> None:
+    sets = {split: _joined(plan, parts) for split, parts in results.items()}
+    about = {
+        "draws": plan.draws.kind,
+        "seed": plan.draws.seed,
+        "integrator": plan.scenario.scene.integrator,
+        "replaced": sum(len(part.replaced) for parts in results.values() for part in parts),
+    }
+    write_simulated(folder, sets, about=about, replaced=_replaced_table(plan, results))
+    if clouds is not None:
+        for split, simulated in sets.items():
+            export_clouds(folder / "clouds" / split, simulated, points=clouds, seed=plan.draws.seed)
+
+
+def _joined(plan: SimulationPlan, parts: Sequence[SimulatedChunk]) -> SimulatedSet:
+    scenario, scene = plan.scenario, plan.scenario.scene
+    first_frame = round(scenario.first_frame_time / scene.frame_time)
+    frame = scenario.loss_frames[0]
+    bodies = scene.bodies
+    return SimulatedSet(
+        scenario=scenario.name,
+        names=plan.draws.box.names,
+        bounds=plan.draws.box.bounds,
+        parameters=np.concatenate([part.parameters for part in parts]),
+        nodes=np.concatenate([part.nodes for part in parts]),
+        times=np.arange(scenario.frames + 1, dtype=np.float64) * scene.frame_time,
+        faces=scene.mesh.faces,
+        loss_faces=scenario.loss_faces,
+        loss_frame=first_frame + frame if frame >= 0 else scenario.frames + 1 + frame,
+        first_frame=first_frame,
+        obstacle=bodies if len(bodies.faces) else None,
+        length_unit_m=scenario.length_unit_m,
+    )
+
+
+def _replaced_table(plan: SimulationPlan, results: Mapping[Split, Sequence[SimulatedChunk]]) -> str:
+    rows = [
+        [split, entry.run, entry.attempt, *entry.parameters, entry.step, entry.reason]
+        for split, parts in results.items()
+        for part in parts
+        for entry in part.replaced
+    ]
+    columns = ["split", "run", "attempt", *plan.draws.box.names, "step", "reason"]
+    return pd.DataFrame(rows, columns=columns).to_csv(index=False, lineterminator="\n")
+
+
+def export_clouds(folder: Path, simulated: SimulatedSet, *, points: int, seed: int) -> None:
+    """Write the clouds of every run and frame as `<run>/<frame>.npy` float32 [points, 3], the layout of the published data.
+
+    They are the first epoch's of a training with the same seed, number of points and the default augmentation.
+    """
+    maker = CloudMaker.build(simulated, Augmentation(), points=points)
+    for run, nodes in enumerate(simulated.nodes):  # one run's clouds are megabytes
+        clouds = maker.clouds(torch.as_tensor(nodes[None]), run_keys(seed, 0, torch.tensor([run])))[0].numpy()
+        (folder / str(run)).mkdir(parents=True)
+        for frame, cloud in enumerate(clouds):
+            np.save(folder / str(run) / f"{frame:03d}.npy", cloud, allow_pickle=False)

@@ -1,0 +1,319 @@
+"""A Kinova Gen3 through Kinova's own `kortex_api`.
+
+Commands go over TCP, measurements over UDP (`RefreshFeedback`: joints, tool pose, wrench, faults in one datagram). A twist
+keeps the arm moving until the next command, so every exit sends Stop; should the link itself be lost, the arm stops by the
+connection timeout that is set here when the session is opened.
+
+The arm speaks degrees; everything that leaves this module is in radians. Joint angles are continued across the arm's wrap
+at 360 degrees, so that they can be interpolated.
+"""
+
+from __future__ import annotations
+
+import collections
+import collections.abc
+import importlib
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from diffcloud.errors import HardwareError
+from diffcloud.hardware.session import ArmReading
+
+TCP_PORT, UDP_PORT = 10000, 10001
+JOINT_COUNT = 7
+
+_SESSION_TIMEOUT_MS = 10_000
+_CONNECTION_TIMEOUT_MS = 1000
+"""The arm stops by itself when the link has been silent for this long."""
+_CALL_TIMEOUT_MS = 400
+"""Of one call; below the session's watchdog, so that a lost link is reported as one."""
+_FAULTS = {
+    0x10: "joint fault",
+    0x400: "pose out of reach",
+    0x2000: "current too high",
+    0x4000: "voltage too high",
+    0x8000: "voltage too low",
+    0x10000: "tool too fast",
+    0x100000: "force at the tool too high",
+    0x800000: "emergency stop pressed",
+    0x1000000: "emergency line open",
+}
+"""Bits of the base's fault bank A (Base.SafetyIdentifier)."""
+
+
+@dataclass(frozen=True)
+class Kortex:
+    """The parts of kortex_api that are used."""
+
+    TCPTransport: Any
+    UDPTransport: Any
+    RouterClient: Any
+    RouterClientSendOptions: Any
+    SessionManager: Any
+    BaseClient: Any
+    BaseCyclicClient: Any
+    Session_pb2: Any
+    Base_pb2: Any
+    Common_pb2: Any
+
+
+def load_kortex() -> Kortex:
+    """Import kortex_api.
+
+    Raises:
+        HardwareError: it is not installed; says where to get it and how to install it on this Python.
+    """
+    # its generated code needs the pure Python protobuf of today, or protobuf 3.20
+    os.environ.setdefault("PROTOCOL_BUFFERS_PYTHON_IMPLEMENTATION", "python")
+    for name in ("MutableMapping", "MutableSequence"):  # moved in Python 3.10; the protobuf it asks for is older
+        if not hasattr(collections, name):
+            setattr(collections, name, getattr(collections.abc, name))
+    try:
+        router = importlib.import_module("kortex_api.RouterClient")
+        messages = "kortex_api.autogen.messages"
+        stubs = "kortex_api.autogen.client_stubs"
+        return Kortex(
+            importlib.import_module("kortex_api.TCPTransport").TCPTransport,
+            importlib.import_module("kortex_api.UDPTransport").UDPTransport,
+            router.RouterClient,
+            router.RouterClientSendOptions,
+            importlib.import_module("kortex_api.SessionManager").SessionManager,
+            importlib.import_module(f"{stubs}.BaseClientRpc").BaseClient,
+            importlib.import_module(f"{stubs}.BaseCyclicClientRpc").BaseCyclicClient,
+            importlib.import_module(f"{messages}.Session_pb2"),
+            importlib.import_module(f"{messages}.Base_pb2"),
+            importlib.import_module(f"{messages}.Common_pb2"),
+        )
+    except (ImportError, AttributeError, TypeError) as error:
+        raise HardwareError(
+            f"kortex_api cannot be imported ({error}). It is Kinova's own wheel, not on PyPI: download it (see "
+            "https://github.com/Kinovarobotics/Kinova-kortex2_Gen3_G3L, section Python) and install it with "
+            "pip install --no-deps kortex_api-2.*.whl && pip install 'protobuf==3.20.3' deprecated. The protobuf it asks "
+            "for, 3.5.1, does not work on Python 3.10 or later; 3.20.3 does."
+        ) from error
+
+
+class KinovaArm:
+    """A connected arm.
+
+    Args:
+        address: IP address or host name.
+        kortex: the client library; None to import kortex_api.
+
+    Raises:
+        HardwareError: kortex_api is missing, nothing answers, or the password is wrong.
+    """
+
+    joint_count = JOINT_COUNT
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        username: str = "admin",
+        password: str = "admin",
+        kortex: Kortex | None = None,
+        tcp_port: int = TCP_PORT,
+        udp_port: int = UDP_PORT,
+    ) -> None:
+        self.address = address
+        self._kortex = kortex or load_kortex()
+        self._joints: NDArray[np.float64] | None = None
+        self._links: list[tuple[Any, Any, Any]] = []
+        try:
+            self._base = self._kortex.BaseClient(self._link(self._kortex.TCPTransport, tcp_port, username, password))
+            self._cyclic = self._kortex.BaseCyclicClient(
+                self._link(self._kortex.UDPTransport, udp_port, username, password)
+            )
+        except BaseException:
+            self.close()
+            raise
+
+    def describe(self) -> dict[str, Any]:
+        """Model and address."""
+        return {"model": "Kinova Gen3", "gripper": "Robotiq 2F-85", "address": self.address, "joints": JOINT_COUNT}
+
+    def prepare(self) -> None:
+        """Refuse an arm in fault, and take control of it.
+
+        Raises:
+            HardwareError: in fault, or in another mode than ready; says how to clear it.
+        """
+        state = self._call("GetArmState", self._base.GetArmState).active_state
+        names = self._kortex.Common_pb2
+        if state == names.ARMSTATE_IN_FAULT:
+            raise HardwareError(
+                f"The arm at {self.address} is in fault ({self._faults(self._feedback())}). Release the emergency stop, "
+                "look why, then clear it: diffcloud capture --clear-faults, or the arm's web page."
+            )
+        if state not in (names.ARMSTATE_SERVOING_READY, names.ARMSTATE_SERVOING_MANUALLY_CONTROLLED):
+            raise HardwareError(f"The arm at {self.address} is not ready (state {state}); wait, or switch it on again.")
+        mode = self._kortex.Base_pb2.ServoingModeInformation()
+        mode.servoing_mode = self._kortex.Base_pb2.SINGLE_LEVEL_SERVOING
+        self._call("SetServoingMode", self._base.SetServoingMode, mode)
+
+    def clear_faults(self) -> None:
+        """Clear faults; the emergency stop must be released first."""
+        self._call("ClearFaults", self._base.ClearFaults)
+
+    def home(self, timeout_s: float) -> None:
+        """Run the arm's own action named Home, and wait for its end.
+
+        Raises:
+            HardwareError: no such action, aborted, or not done in time; the arm is stopped.
+        """
+        base, messages = self._base, self._kortex.Base_pb2
+        wanted = messages.RequestedActionType()
+        wanted.action_type = messages.REACH_JOINT_ANGLES
+        actions = self._call("ReadAllActions", base.ReadAllActions, wanted).action_list
+        handles = [action.handle for action in actions if action.name == "Home"]
+        if not handles:
+            raise HardwareError(f"The arm at {self.address} has no action named Home; make one on its web page.")
+        events: list[int] = []
+        done = threading.Event()
+
+        def heard(notification: Any) -> None:
+            if notification.action_event in (messages.ACTION_END, messages.ACTION_ABORT):
+                events.append(notification.action_event)
+                done.set()
+
+        topic = self._kortex.Common_pb2.NotificationOptions()
+        # the stub of a topic has no option of this name in every version, so its own timeout holds
+        subscription = self._call("ActionTopic", lambda options: base.OnNotificationActionTopic(heard, topic))
+        arrived = False
+        try:
+            self._call("ExecuteActionFromReference", base.ExecuteActionFromReference, handles[0])
+            arrived = done.wait(timeout_s)
+        finally:
+            if not arrived:
+                self.stop()
+            self._call("Unsubscribe", base.Unsubscribe, subscription)
+        if not arrived:
+            raise HardwareError(f"The arm at {self.address} did not reach home within {timeout_s:g} s; it was stopped.")
+        if events[0] == messages.ACTION_ABORT:
+            raise HardwareError(
+                f"The arm at {self.address} aborted the motion home ({self._faults(self._feedback())}): something is in "
+                "the way, or the emergency stop was pressed."
+            )
+
+    def read(self) -> ArmReading:
+        """Measure joints, tool, wrench and gripper.
+
+        Raises:
+            HardwareError: the arm is in fault (names it), or did not answer.
+        """
+        feedback = self._feedback()
+        base = feedback.base
+        if base.active_state == self._kortex.Common_pb2.ARMSTATE_IN_FAULT or base.fault_bank_a or base.fault_bank_b:
+            raise HardwareError(f"The arm at {self.address} went into fault: {self._faults(feedback)}.")
+        angles = np.array([base.tool_pose_theta_x, base.tool_pose_theta_y, base.tool_pose_theta_z])
+        forces = [getattr(base, f"tool_external_wrench_force_{axis}") for axis in "xyz"]
+        torques = [getattr(base, f"tool_external_wrench_torque_{axis}") for axis in "xyz"]
+        return ArmReading(
+            self._continued(np.deg2rad([actuator.position for actuator in feedback.actuators])),
+            np.array([base.tool_pose_x, base.tool_pose_y, base.tool_pose_z]),
+            # theta: rotations about the fixed x, y, z axes, in this order
+            np.roll(Rotation.from_euler("xyz", angles, degrees=True).as_quat(), 1),
+            self._gripper(),
+            np.array(forces + torques),
+        )
+
+    def send_velocity(self, linear_m_s: NDArray[np.float64]) -> None:
+        """Move the tool with this velocity [3] in the base frame, without turning, until the next command."""
+        command = self._kortex.Base_pb2.TwistCommand()
+        command.reference_frame = self._kortex.Common_pb2.CARTESIAN_REFERENCE_FRAME_BASE
+        command.duration = 0
+        command.twist.linear_x, command.twist.linear_y, command.twist.linear_z = map(float, linear_m_s)
+        self._call("SendTwistCommand", self._base.SendTwistCommand, command)
+
+    def set_gripper(self, position: float) -> None:
+        """Drive the gripper to 0 (open) .. 1 (closed); does not wait."""
+        command = self._kortex.Base_pb2.GripperCommand()
+        command.mode = self._kortex.Base_pb2.GRIPPER_POSITION
+        finger = command.gripper.finger.add()
+        finger.finger_identifier = 1
+        finger.value = float(position)
+        self._call("SendGripperCommand", self._base.SendGripperCommand, command)
+
+    def stop(self) -> None:
+        """Stop all motion."""
+        self._call("Stop", self._base.Stop)
+
+    def emergency_stop(self) -> None:
+        """Stop by the brakes; the arm is in fault afterwards."""
+        self._call("ApplyEmergencyStop", self._base.ApplyEmergencyStop)
+
+    def close(self) -> None:
+        """Close sessions and links; harmless twice, and on a link that is gone."""
+        links, self._links = self._links, []
+        for session, router, transport in reversed(links):
+            for step in (
+                lambda session=session: session.CloseSession(self._options()),
+                lambda router=router: router.SetActivationStatus(False),
+                transport.disconnect,
+            ):
+                try:
+                    step()
+                except Exception:  # a lost link fails here in many ways, and there is nothing left to do about it
+                    continue
+
+    def _link(self, kind: Any, port: int, username: str, password: str) -> Any:
+        transport = kind()
+        router = self._kortex.RouterClient(transport, lambda error: None)
+        session = self._kortex.SessionManager(router)
+        try:
+            transport.connect(self.address, port)
+            self._links.append((session, router, transport))
+            info = self._kortex.Session_pb2.CreateSessionInfo()
+            info.username, info.password = username, password
+            info.session_inactivity_timeout = _SESSION_TIMEOUT_MS
+            info.connection_inactivity_timeout = _CONNECTION_TIMEOUT_MS
+            session.CreateSession(info)
+        except Exception as error:  # the library raises its own kinds, sockets theirs
+            raise HardwareError(
+                f"No arm answers at {self.address}:{port} ({type(error).__name__}: {error}). Check power, cable, that this "
+                "computer is in the arm's network (ping it), and user name and password."
+            ) from error
+        return router
+
+    def _options(self) -> Any:
+        options = self._kortex.RouterClientSendOptions()
+        options.timeout_ms = _CALL_TIMEOUT_MS
+        return options
+
+    def _call(self, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return function(*arguments, options=self._options())
+        except Exception as error:  # KServerException, KClientException, timeouts and socket errors
+            raise HardwareError(
+                f"The arm at {self.address} did not carry out {name} ({type(error).__name__}: {error}): the link is lost, "
+                "or the arm refused."
+            ) from error
+
+    def _feedback(self) -> Any:
+        return self._call("RefreshFeedback", self._cyclic.RefreshFeedback)
+
+    def _gripper(self) -> float | None:
+        request = self._kortex.Base_pb2.GripperRequest()
+        request.mode = self._kortex.Base_pb2.GRIPPER_POSITION
+        fingers = self._call("GetMeasuredGripperMovement", self._base.GetMeasuredGripperMovement, request).finger
+        return float(fingers[0].value) if len(fingers) else None
+
+    def _continued(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The arm reports 0..360 degrees: the first reading comes into (-pi, pi], later ones follow it without a jump."""
+        reference = np.zeros_like(joints) if self._joints is None else self._joints
+        self._joints = reference + (joints - reference + np.pi) % (2 * np.pi) - np.pi
+        return self._joints.copy()
+
+    @staticmethod
+    def _faults(feedback: Any) -> str:
+        bank = int(feedback.base.fault_bank_a)
+        named = [text for bit, text in _FAULTS.items() if bank & bit]
+        return ", ".join(named) if named else f"fault banks {bank:#x} and {int(feedback.base.fault_bank_b):#x}"

@@ -1,0 +1,122 @@
+"""How files describe a camera: its intrinsics and its place, checked on the way in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import DiffCloudError, EpisodeError, unknown_name
+
+Distortion = Literal["none", "brown_conrady", "inverse_brown_conrady"]
+"""`brown_conrady`: OpenCV's, from rays to pixels. `inverse_brown_conrady`: the same polynomial from pixels to rays, which
+RealSense colour cameras state (mostly with zeros)."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera with OpenCV's frame: x right, y down, z forward; pixel centres at whole numbers.
+
+    Raises:
+        EpisodeError: a number that no camera has.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: Distortion = "none"
+    coefficients: tuple[float, ...] = ()
+    """(k1, k2, p1, p2, k3)."""
+
+    def __post_init__(self) -> None:
+        if self.distortion not in get_args(Distortion):
+            raise EpisodeError(unknown_name("distortion model", self.distortion, get_args(Distortion)))
+        if self.distortion == "none" and any(self.coefficients):
+            raise EpisodeError(f"Distortion 'none' takes no coefficients, got {list(self.coefficients)}.")
+        if len(self.coefficients) not in (0, 5):
+            raise EpisodeError(f"Distortion has 5 coefficients (k1, k2, p1, p2, k3), got {len(self.coefficients)}.")
+        numbers = [self.fx, self.fy, self.cx, self.cy, *self.coefficients]
+        if not np.isfinite(numbers).all() or self.width < 1 or self.height < 1:
+            raise EpisodeError(f"Intrinsics must be finite numbers and a size of at least 1 x 1, got {self}.")
+        if not (0.1 * self.width < self.fx < 20 * self.width and 0.1 * self.height < self.fy < 20 * self.height):
+            raise EpisodeError(
+                f"A focal length of {self.fx:g} x {self.fy:g} px does not go with {self.width} x {self.height} pixels; "
+                "focal lengths are in pixels of this resolution."
+            )
+        if not (0 <= self.cx <= self.width and 0 <= self.cy <= self.height):
+            raise EpisodeError(
+                f"The principal point ({self.cx:g}, {self.cy:g}) lies outside the {self.width} x {self.height} image; "
+                "it belongs to another resolution."
+            )
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """[3, 3]."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def same_camera(self, other: Intrinsics) -> bool:
+        """Whether both can describe one camera at one resolution: focal lengths within 1 %, principal point within 5 px."""
+        return (
+            (self.width, self.height) == (other.width, other.height)
+            and abs(self.fx / other.fx - 1) < 0.01
+            and abs(self.fy / other.fy - 1) < 0.01
+            and max(abs(self.cx - other.cx), abs(self.cy - other.cy)) < 5
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        return {**asdict(self), "coefficients": list(self.coefficients)}
+
+    @staticmethod
+    def from_json(value: Any, where: str, error: type[DiffCloudError] = EpisodeError) -> Intrinsics:
+        """From the JSON of a camera or calibration file.
+
+        Raises:
+            error: a field is missing, unknown or wrong; the message starts with `where`.
+        """
+        names = ("width", "height", "fx", "fy", "cx", "cy", "distortion", "coefficients")
+        if not isinstance(value, Mapping):
+            raise error(f"{where}: intrinsics must be an object with {', '.join(names)}.")
+        unknown, missing = sorted(set(value) - set(names)), sorted(set(names[:6]) - set(value))
+        if unknown or missing:
+            raise error(f"{where}: intrinsics lack {missing} and have unknown {unknown}; allowed are {', '.join(names)}.")
+        try:
+            numbers = {name: float(value[name]) for name in names[2:6]}
+            coefficients = tuple(float(number) for number in value.get("coefficients", ()))
+            return Intrinsics(
+                int(value["width"]),
+                int(value["height"]),
+                **numbers,
+                distortion=value.get("distortion", "none"),
+                coefficients=coefficients,
+            )
+        except (TypeError, ValueError) as damage:
+            raise error(f"{where}: intrinsics are not numbers: {damage}.") from damage
+        except EpisodeError as damage:
+            raise error(f"{where}: {damage}") from damage
+
+
+def read_transform(value: Any, where: str, error: type[DiffCloudError] = EpisodeError) -> NDArray[np.float64]:
+    """[4, 4] rigid transform from JSON.
+
+    Raises:
+        error: not 4 x 4, not a rotation, or a translation of more than 20 m (millimetres).
+    """
+    try:
+        matrix = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as damage:
+        raise error(f"{where} must be 4 x 4 numbers: {damage}.") from damage
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise error(f"{where} must be 4 x 4 finite numbers, got shape {list(matrix.shape)}.")
+    rotation = matrix[:3, :3]
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if off > 1e-4 or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
+        raise error(f"{where} is no rigid transform (its rotation is off by {off:.2g}); give [R t; 0 0 0 1], right-handed.")
+    if np.abs(matrix[:3, 3]).max() > 20:
+        raise error(f"{where} puts the camera {np.abs(matrix[:3, 3]).max():.0f} m away; translations are metres.")
+    return matrix

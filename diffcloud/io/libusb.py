@@ -1,0 +1,16 @@
+"""libusb-1.0 for packages whose wheels link to it, on machines that lack it."""
+
+from __future__ import annotations
+
+import ctypes
+
+
+def load_libusb() -> None:
+    """Load the copy in libusb-package; what is imported afterwards and links to libusb-1.0 finds it.
+
+    Raises:
+        ImportError, OSError: the package is missing, or its library cannot be loaded.
+    """
+    import libusb_package
+
+    ctypes.CDLL(str(libusb_package.get_library_path()), ctypes.RTLD_GLOBAL)

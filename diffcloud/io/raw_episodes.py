@@ -1,0 +1,469 @@
+"""Raw episodes: what cameras and arm recorded, as a folder of plain files (DESIGN: data contracts).
+
+    episode.json                      schema version, scenario, labels, rate, cameras, robot, source, units, status
+    cameras/<cam>/camera.json         intrinsics, depth_scale_m, T_world_camera (or a calibration file), serial
+    cameras/<cam>/timestamps.csv      frame, t_s
+    cameras/<cam>/depth/000000.png    16-bit, times depth_scale_m [m], aligned to the colour image
+    cameras/<cam>/color/000000.png
+    robot.csv                         t_s, joint_1.. [rad], gripper [0..1], tool_x..z [m], tool_qw..qz, wrench [N, N·m]
+
+All times are seconds of one clock since the start of the recording. `RawEpisodeWriter` writes while the recording runs: the
+images of a frame first, whole and renamed, then its row in timestamps.csv, flushed to the disk. So a row is a promise, and
+what a crash or power cut leaves is a shorter episode: images without a row and a torn last line are ignored.
+"""
+
+from __future__ import annotations
+
+import datetime
+import errno
+import io
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from diffcloud.errors import DiffCloudError, EpisodeError
+from diffcloud.io.camera_models import Intrinsics, read_transform
+from diffcloud.io.files import read_json, write_json
+from diffcloud.io.images import read_color, read_depth, write_color, write_depth
+
+SCHEMA_VERSION = 1
+UNITS = {"length": "m", "angle": "rad", "time": "s", "force": "N", "torque": "N·m"}
+_TOOL = ("tool_x", "tool_y", "tool_z", "tool_qw", "tool_qx", "tool_qy", "tool_qz")
+_WRENCH = ("wrench_fx", "wrench_fy", "wrench_fz", "wrench_tx", "wrench_ty", "wrench_tz")
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """camera.json."""
+
+    name: str
+    serial: str
+    intrinsics: Intrinsics
+    depth_scale_m: float
+    """Metres per unit of the depth image."""
+    T_world_camera: NDArray[np.float64] | None = None
+    """[4, 4] maps camera points to world points [m]; None: not calibrated yet, or in the calibration file."""
+    calibration: str | None = None
+    """Path of a calibration file, relative to the episode's folder."""
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "serial": self.serial,
+            "intrinsics": self.intrinsics.to_json(),
+            "depth_scale_m": self.depth_scale_m,
+            "T_world_camera": None if self.T_world_camera is None else self.T_world_camera.tolist(),
+            "calibration": self.calibration,
+        }
+
+
+@dataclass(frozen=True)
+class RobotSample:
+    """One row of robot.csv. What a source does not know is None."""
+
+    t_s: float
+    joints_rad: NDArray[np.float64]
+    """[J]."""
+    gripper: float | None = None
+    """0 open to 1 closed, as the arm reports it."""
+    tool_position_m: NDArray[np.float64] | None = None
+    """[3] in the robot's base frame."""
+    tool_quaternion: NDArray[np.float64] | None = None
+    """[4] (w, x, y, z)."""
+    wrench: NDArray[np.float64] | None = None
+    """[6] external force [N] and torque [N·m] at the tool."""
+
+
+@dataclass(frozen=True)
+class RobotLog:
+    """robot.csv: NaN where a source knows nothing."""
+
+    times: NDArray[np.float64]
+    """[N] [s]."""
+    joints_rad: NDArray[np.float64]
+    """[N, J]."""
+    gripper: NDArray[np.float64]
+    """[N] 0..1."""
+    tool_position_m: NDArray[np.float64]
+    """[N, 3]."""
+    tool_quaternion: NDArray[np.float64]
+    """[N, 4] (w, x, y, z)."""
+    wrench: NDArray[np.float64]
+    """[N, 6]."""
+
+
+@dataclass(frozen=True)
+class RawCamera:
+    """One camera of a raw episode; images are read when they are asked for."""
+
+    info: CameraInfo
+    folder: Path
+    frames: NDArray[np.int64]
+    """[T] numbers of the files."""
+    times: NDArray[np.float64]
+    """[T] [s]."""
+
+    def depth(self, index: int) -> NDArray[np.uint16]:
+        """[H, W] of the index-th frame, in units of `depth_scale_m`; 0 is no measurement."""
+        return read_depth(self.folder / "depth" / f"{self.frames[index]:06d}.png")
+
+    def color(self, index: int) -> NDArray[np.uint8] | None:
+        """[H, W, 3] of the index-th frame, or None where no colour was recorded."""
+        path = self.folder / "color" / f"{self.frames[index]:06d}.png"
+        return read_color(path) if path.is_file() else None
+
+
+@dataclass(frozen=True)
+class RawEpisode:
+    """A raw episode on disk."""
+
+    folder: Path
+    description: Mapping[str, Any]
+    cameras: Mapping[str, RawCamera]
+    robot: RobotLog | None
+
+
+def read_raw_episode(folder: Path) -> RawEpisode:
+    """Open a raw episode; `diffcloud.sensing.validation` looks deeper.
+
+    Raises:
+        EpisodeError: a file is missing or damaged, times run backwards, or there is no frame: names file and row.
+    """
+    folder = Path(folder)
+    description = read_description(folder)
+    cameras = {}
+    for name in description["cameras"]:
+        place = folder / "cameras" / name
+        frames, times = read_timestamps(place / "timestamps.csv")
+        _refuse_backwards(times, place / "timestamps.csv")
+        if not len(frames):
+            raise EpisodeError(f"{place / 'timestamps.csv'} lists no frame: the camera delivered nothing.")
+        cameras[name] = RawCamera(read_camera_info(place / "camera.json"), place, frames, times)
+    robot = None
+    if description.get("robot") is not None:
+        robot = read_robot_log(folder / "robot.csv")
+        _refuse_backwards(robot.times, folder / "robot.csv")
+    return RawEpisode(folder, description, cameras, robot)
+
+
+def read_description(folder: Path) -> dict[str, Any]:
+    """episode.json.
+
+    Raises:
+        EpisodeError: missing, damaged, of another schema version, without cameras, or not in SI.
+    """
+    path = Path(folder) / "episode.json"
+    data = read_json(path, error=EpisodeError)
+    if not isinstance(data, dict) or data.get("schema_version") != SCHEMA_VERSION:
+        found = data.get("schema_version") if isinstance(data, dict) else type(data).__name__
+        raise EpisodeError(f"{path} has schema_version {found!r}; this version reads {SCHEMA_VERSION}.")
+    names = data.get("cameras")
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) and _plain(name) for name in names):
+        raise EpisodeError(f"{path}: cameras must list at least one plain folder name, got {names!r}.")
+    units = data.get("units", UNITS)
+    if not isinstance(units, dict) or any(units.get(key, value) != value for key, value in UNITS.items()):
+        raise EpisodeError(f"{path}: units {units!r}; a raw episode is in {UNITS}. Convert when you import.")
+    return data
+
+
+def read_camera_info(path: Path) -> CameraInfo:
+    """camera.json.
+
+    Raises:
+        EpisodeError: missing, damaged, or a number that no camera has; names the field.
+    """
+    data = read_json(Path(path), error=EpisodeError)
+    if not isinstance(data, dict):
+        raise EpisodeError(f"{path} must be a JSON object.")
+    try:
+        scale = float(data["depth_scale_m"])
+        serial = str(data["serial"])
+        intrinsics = Intrinsics.from_json(data["intrinsics"], str(path))
+    except (KeyError, TypeError, ValueError) as error:
+        raise EpisodeError(f"{path}: a field is missing or wrong: {error!r}.") from error
+    if not 1e-6 <= scale <= 0.02:
+        raise EpisodeError(
+            f"{path}: depth_scale_m is {scale:g}; it is metres per unit of the image, for a D435 0.001 (one millimetre)."
+        )
+    pose = data.get("T_world_camera")
+    if pose is not None:
+        pose = read_transform(pose, f"{path}: T_world_camera")
+    calibration = data.get("calibration")
+    return CameraInfo(
+        str(data.get("name", Path(path).parent.name)),
+        serial,
+        intrinsics,
+        scale,
+        pose,
+        None if calibration is None else str(calibration),
+    )
+
+
+def read_timestamps(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """(frame numbers [T], times [T]) of timestamps.csv, in the order of the file.
+
+    Raises:
+        EpisodeError: missing, or not the columns frame and t_s.
+    """
+    table = _read_table(path, ("frame", "t_s"))
+    frames = table["frame"].to_numpy(np.float64)
+    if (frames != np.rint(frames)).any() or (frames < 0).any():
+        raise EpisodeError(f"{path}: frame numbers must be whole and not negative.")
+    return frames.astype(np.int64), table["t_s"].to_numpy(np.float64)
+
+
+def read_robot_log(path: Path) -> RobotLog:
+    """robot.csv; columns other than t_s and the joints may be absent or empty.
+
+    Raises:
+        EpisodeError: missing, not numbers, or without t_s and joints.
+    """
+    table = _read_table(path, ("t_s", "joint_1"))
+    count = 1
+    while f"joint_{count + 1}" in table.columns:
+        count += 1
+    joints = table[[f"joint_{index + 1}" for index in range(count)]].to_numpy(np.float64)
+    if not np.isfinite(joints).all():
+        row = int(np.flatnonzero(~np.isfinite(joints).all(axis=1))[0])
+        raise EpisodeError(f"{path}: row {row + 1} lacks a joint angle.")
+
+    def columns(names: Sequence[str]) -> NDArray[np.float64]:
+        empty = np.full(len(table), np.nan)
+        return np.column_stack([table[name].to_numpy(np.float64) if name in table.columns else empty for name in names])
+
+    tool = columns(_TOOL)
+    return RobotLog(
+        table["t_s"].to_numpy(np.float64), joints, columns(["gripper"])[:, 0], tool[:, :3], tool[:, 3:], columns(_WRENCH)
+    )
+
+
+def first_backwards(times: NDArray[np.float64]) -> int | None:
+    """Index of the first time that does not come after the one before it."""
+    bad = np.flatnonzero(~(np.diff(times) > 0))
+    return int(bad[0]) + 1 if len(bad) else None
+
+
+class RawEpisodeWriter:
+    """Writes a raw episode while it is recorded; a context manager.
+
+    Each camera may be fed from a thread of its own; robot rows come from one thread.
+
+    Args:
+        folder: must not exist yet: raw episodes are never overwritten.
+        cameras: by name.
+        robot: what the arm is (model, address); None without an arm.
+        joint_count: of robot.csv.
+        durable: wait for the disk after each frame, so that a power cut keeps it.
+
+    Raises:
+        EpisodeError: the folder exists, or a name is no plain folder name.
+        DiffCloudError: the system refused a write (a full disk); says how many frames are kept.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        cameras: Mapping[str, CameraInfo],
+        *,
+        rate_hz: float,
+        source: str,
+        robot: Mapping[str, Any] | None = None,
+        joint_count: int = 7,
+        durable: bool = True,
+        meta: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.folder = Path(folder)
+        if not cameras:
+            raise EpisodeError("A raw episode needs at least one camera.")
+        for name in cameras:
+            if not _plain(name):
+                raise EpisodeError(f"A camera is named by a plain word such as overhead, got {name!r}.")
+        try:
+            self.folder.mkdir(parents=True, exist_ok=False)
+        except FileExistsError as error:
+            raise EpisodeError(f"{folder} exists; raw episodes are never overwritten. Choose another name.") from error
+        except OSError as error:
+            raise DiffCloudError(f"Cannot write {folder}: {error.strerror}.") from error
+        self._description: dict[str, Any] = {
+            "schema_version": SCHEMA_VERSION,
+            **(meta or {}),
+            "rate_hz": rate_hz,
+            "cameras": list(cameras),
+            "robot": None if robot is None else dict(robot),
+            "source": source,
+            "units": UNITS,
+            "started_at": datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds"),
+            "status": "recording",
+        }
+        self._durable = durable
+        self._joint_count = joint_count
+        self._cameras = {
+            name: _CameraFiles(self.folder / "cameras" / name, info, durable=durable) for name, info in cameras.items()
+        }
+        self._robot: _Rows | None = None
+        if robot is not None:
+            joints = [f"joint_{index + 1}" for index in range(joint_count)]
+            self._robot = _Rows(self.folder / "robot.csv", ["t_s", *joints, "gripper", *_TOOL, *_WRENCH], durable=durable)
+        self.robot_rows = 0
+        write_json(self.folder / "episode.json", self._description)
+
+    @property
+    def frame_counts(self) -> dict[str, int]:
+        """Finished frames of each camera."""
+        return {name: files.count for name, files in self._cameras.items()}
+
+    def add_frame(self, camera: str, t_s: float, depth: NDArray[np.uint16], color: NDArray[np.uint8] | None = None) -> None:
+        """Write one frame of one camera; it counts once this returns."""
+        self._cameras[camera].add(t_s, depth, color)
+
+    def add_robot(self, sample: RobotSample) -> None:
+        """Write one row of robot.csv."""
+        if self._robot is None:
+            raise EpisodeError("This episode was opened without a robot.")
+        if len(sample.joints_rad) != self._joint_count:
+            raise EpisodeError(f"A robot row has {len(sample.joints_rad)} joints, the log {self._joint_count}.")
+        unknown = np.full(3, np.nan)
+        position = unknown if sample.tool_position_m is None else sample.tool_position_m
+        quaternion = np.full(4, np.nan) if sample.tool_quaternion is None else sample.tool_quaternion
+        wrench = np.full(6, np.nan) if sample.wrench is None else sample.wrench
+        gripper = np.nan if sample.gripper is None else sample.gripper
+        self._robot.append([sample.t_s, *sample.joints_rad, gripper, *position, *quaternion, *wrench])
+        self.robot_rows += 1
+
+    def state_rate(self, rate_hz: float) -> None:
+        """The rate of the frames, where it is known only at the end."""
+        self._description["rate_hz"] = rate_hz
+
+    def close(self, *, stop_reason: str | None = None) -> None:
+        """Finish: the status becomes complete, or stopped with a reason. Twice does no harm."""
+        if self._description["status"] != "recording":
+            return
+        for rows in (*(files.rows for files in self._cameras.values()), *([] if self._robot is None else [self._robot])):
+            rows.close()
+        self._description["status"] = "complete" if stop_reason is None else "stopped"
+        if stop_reason is not None:
+            self._description["stop_reason"] = stop_reason
+        self._description["frames"] = self.frame_counts
+        write_json(self.folder / "episode.json", self._description)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        reason = None if kind is None else f"{kind.__name__}: {error}"
+        try:
+            self.close(stop_reason=reason)
+        except DiffCloudError:
+            if error is None:  # a full disk has already been reported by the error that brought us here
+                raise
+
+
+class _CameraFiles:
+    """The files of one camera."""
+
+    def __init__(self, folder: Path, info: CameraInfo, *, durable: bool) -> None:
+        self._folder, self._durable = folder, durable
+        self._shape = (info.intrinsics.height, info.intrinsics.width)
+        self.count = 0
+        write_json(folder / "camera.json", info.to_json())
+        self.rows = _Rows(folder / "timestamps.csv", ["frame", "t_s"], durable=durable)
+
+    def add(self, t_s: float, depth: NDArray[np.uint16], color: NDArray[np.uint8] | None) -> None:
+        if depth.shape != self._shape or (color is not None and color.shape[:2] != self._shape):
+            raise EpisodeError(f"{self._folder.name}: an image of {list(depth.shape)} where {list(self._shape)} is stated.")
+        try:
+            name = f"{self.count:06d}.png"
+            write_depth(self._folder / "depth" / name, depth, durable=self._durable)
+            if color is not None:
+                write_color(self._folder / "color" / name, color, durable=self._durable)
+            if self._durable:
+                _sync_folder(self._folder / "depth")
+                if color is not None:
+                    _sync_folder(self._folder / "color")
+            self.rows.append([self.count, t_s])
+        except (OSError, DiffCloudError) as error:
+            raise DiffCloudError(
+                f"Frame {self.count} of camera {self._folder.name} could not be written: {error} The {self.count} frames "
+                "before it are kept. Free the disk and record again."
+            ) from error
+        self.count += 1
+
+
+class _Rows:
+    """A CSV that grows by whole, flushed lines."""
+
+    def __init__(self, path: Path, columns: Sequence[str], *, durable: bool) -> None:
+        self._durable, self._path = durable, path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # unbuffered: what a full disk refuses must not come back when the file is closed
+            self._stream = path.open("xb", buffering=0)
+        except OSError as error:
+            raise DiffCloudError(f"Cannot write {path}: {error.strerror}.") from error
+        self._write(",".join(columns))
+
+    def append(self, values: Sequence[float]) -> None:
+        self._write(",".join("" if np.isnan(value) else f"{value:.9g}" for value in values))
+
+    def close(self) -> None:
+        self._stream.close()
+
+    def _write(self, line: str) -> None:
+        try:
+            data = (line + "\n").encode()
+            if self._stream.write(data) != len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            if self._durable:
+                os.fsync(self._stream.fileno())
+        except OSError as error:
+            raise DiffCloudError(f"Cannot write {self._path}: {error.strerror}.") from error
+
+
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _plain(name: str) -> bool:
+    return bool(name) and name not in (".", "..") and all(letter.isalnum() or letter in "_-." for letter in name)
+
+
+def _refuse_backwards(times: NDArray[np.float64], path: Path) -> None:
+    bad = first_backwards(times)
+    if bad is not None:
+        raise EpisodeError(
+            f"{path}: row {bad + 1}: the time runs backwards ({times[bad]:.6f} s after {times[bad - 1]:.6f} s); the clock "
+            "was set while recording, or rows were mixed up."
+        )
+
+
+def _read_table(path: Path, required: Sequence[str]) -> pd.DataFrame:
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise EpisodeError(f"No such file: {path}.") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise EpisodeError(f"{path} is not readable: {error}.") from error
+    # a power cut can leave the last line torn; a whole line ends with a line break
+    text = text[: text.rfind("\n") + 1]
+    try:
+        table = pd.read_csv(io.StringIO(text), skipinitialspace=True)
+        missing = [name for name in required if name not in table.columns]
+        if missing:
+            raise EpisodeError(f"{path}: columns {missing} are missing; it has {list(table.columns)}.")
+        numbers = table.astype(float)
+    except ValueError as error:
+        raise EpisodeError(f"{path} is not a CSV of numbers: {error}.") from error
+    if not np.isfinite(numbers[list(required)].to_numpy()).all():
+        raise EpisodeError(f"{path}: a cell of {', '.join(required)} is empty or infinite.")
+    return numbers

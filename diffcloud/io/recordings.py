@@ -1,0 +1,125 @@
+"""What every import of a recording comes down to: cameras, frames as they come, a joint log; and their way to disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import EpisodeError
+from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter, RobotLog, RobotSample, read_robot_log
+
+_EPOCH_S = 1e8
+"""Times beyond three years are seconds since 1970."""
+
+
+@dataclass(frozen=True)
+class RecordedFrame:
+    """One pair of images of one camera."""
+
+    camera: str
+    time_s: float
+    """Of the recording's clock."""
+    depth: NDArray[np.uint16]
+    """[H, W] in units of the camera's depth scale."""
+    color: NDArray[np.uint8] | None = None
+    """[H, W, 3] red, green, blue, aligned to depth."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording of another tool, ready to be written as a raw episode."""
+
+    cameras: Mapping[str, CameraInfo]
+    frames: Iterable[RecordedFrame]
+    """In order of time for each camera; may be read only once."""
+    source: str
+    robot: RobotLog | None = None
+    """On the frames' clock."""
+
+
+def write_recording(
+    folder: Path, recording: Recording, *, rate_hz: float | None = None, meta: Mapping[str, Any] | None = None
+) -> dict[str, int]:
+    """Write a raw episode; times start at the first frame.
+
+    Args:
+        rate_hz: stated in episode.json; None measures the first camera's.
+
+    Returns:
+        Frames by camera.
+
+    Raises:
+        EpisodeError: no frame at all.
+    """
+    frames = iter(recording.frames)
+    first = next(frames, None)
+    if first is None:
+        raise EpisodeError(f"{recording.source}: no depth image was found.")
+    start = first.time_s
+    robot = recording.robot
+    joint_count = 7 if robot is None else robot.joints_rad.shape[1]
+    writer = RawEpisodeWriter(
+        folder,
+        recording.cameras,
+        rate_hz=rate_hz or 0.0,
+        source=recording.source,
+        robot=None if robot is None else {"joints": joint_count},
+        joint_count=joint_count,
+        durable=False,
+        meta=meta,
+    )
+    times: list[float] = []
+    with writer:
+        for sample in [] if robot is None else _samples(robot, start):
+            writer.add_robot(sample)
+        writer.add_frame(first.camera, 0.0, first.depth, first.color)
+        for frame in frames:
+            if frame.camera == first.camera:
+                times.append(frame.time_s - start)
+            writer.add_frame(frame.camera, frame.time_s - start, frame.depth, frame.color)
+        if not rate_hz and times:
+            writer.state_rate(round(len(times) / times[-1], 3))
+    return writer.frame_counts
+
+
+def read_joint_log(path: Path, *, offset_s: float = 0.0, recording_start_s: float = 0.0) -> RobotLog:
+    """A joint log in the columns of robot.csv, on the recording's clock.
+
+    Args:
+        offset_s: is added to its times.
+        recording_start_s: of the first frame. A log whose times start near 0 is taken to count from there; one with times
+            since 1970 is on the recording's clock already.
+
+    Raises:
+        EpisodeError: missing, damaged, or on another clock than the recording.
+    """
+    log = read_robot_log(path)
+    if not len(log.times):
+        raise EpisodeError(f"{path} is an empty joint log.")
+    own_clock = log.times[0] < _EPOCH_S <= recording_start_s
+    times = log.times + offset_s + (recording_start_s if own_clock else 0.0)
+    if recording_start_s > times[-1] or (log.times[0] >= _EPOCH_S > recording_start_s):
+        raise EpisodeError(
+            f"{path} covers {log.times[0]:.2f} to {log.times[-1]:.2f} s and the recording starts at "
+            f"{recording_start_s:.2f} s: they are on different clocks. Give the difference with --log-offset."
+        )
+    return replace(log, times=times)
+
+
+def _samples(log: RobotLog, start: float) -> Sequence[RobotSample]:
+    return [
+        RobotSample(
+            float(log.times[row] - start),
+            log.joints_rad[row],
+            float(log.gripper[row]),
+            log.tool_position_m[row],
+            log.tool_quaternion[row],
+            log.wrench[row],
+        )
+        for row in range(len(log.times))
+    ]

@@ -1,0 +1,29 @@
+"""Inverse models: networks that look at point clouds and predict simulator parameters (paper, section IV-B).
+
+`training` is not imported here: it brings Lightning, which predictions do without.
+"""
+
+from diffcloud.regressors.checkpoints import Description, Prediction, Regressor
+from diffcloud.regressors.dataset import Augmentation, CloudDataset, SimulatedSet
+from diffcloud.regressors.networks import MODEL_NAMES, ModelName, build_network, frames_seen, layer_sizes
+from diffcloud.regressors.predict import episode_clouds, predict_episode
+from diffcloud.regressors.settings import PROFILE_NAMES, TrainingSettings, profile_settings
+
+__all__ = [
+    "MODEL_NAMES",
+    "PROFILE_NAMES",
+    "Augmentation",
+    "CloudDataset",
+    "Description",
+    "ModelName",
+    "Prediction",
+    "Regressor",
+    "SimulatedSet",
+    "TrainingSettings",
+    "build_network",
+    "episode_clouds",
+    "frames_seen",
+    "layer_sizes",
+    "predict_episode",
+    "profile_settings",
+]

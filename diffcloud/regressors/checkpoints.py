@@ -1,0 +1,233 @@
+"""A trained regressor, and its file: weights as safetensors with a JSON description in the header.
+
+Nothing in such a file is executed when it is read. The description holds all that a prediction needs: which frames, how
+clouds are centred and scaled, and what the outputs stand for.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from diffcloud.errors import CheckpointError
+from diffcloud.io.files import atomic_path
+from diffcloud.regressors.grouping import Order
+from diffcloud.regressors.networks import ModelName, build_network
+from diffcloud.regressors.settings import Target
+
+_KEY = "diffcloud"
+_LARGEST_BYTES = 2**30
+_WIDEST = 5.0
+"""Bound of the logarithm of a predicted width: what is beyond is an accident of the last layer."""
+Count = Annotated[int, Field(ge=1, le=10**6)]
+
+
+class Description(BaseModel):
+    """What a checkpoint says about itself."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    version: Literal[1] = 1
+    model: ModelName
+    scenario: str
+    names: Annotated[tuple[str, ...], Field(min_length=1, max_length=100)]
+    """k parameters."""
+    bounds: tuple[tuple[float, float], ...]
+    target: Target = "linear"
+    heteroscedastic: bool = False
+    times: Annotated[tuple[float, ...], Field(min_length=1, max_length=10**4)]
+    """Of the frames that it sees, since the start of the motion [s]."""
+    frame_time: Annotated[float, Field(gt=0)]
+    """Between frames [s]."""
+    points: Count
+    """Per frame."""
+    centre: tuple[float, float, float]
+    """Taken from clouds before they are scaled [length unit]."""
+    length: Annotated[float, Field(gt=0)]
+    """The scenario's length: clouds are divided by it [length unit]."""
+    length_unit_m: Annotated[float, Field(gt=0)] = 1.0
+    order: Order = "cloud"
+    density: Annotated[float, Field(gt=0, le=1)] = 1.0
+    spread: tuple[float, ...]
+    """Laplace width of each parameter's error, as a fraction on the target's scale; with a heteroscedastic head, the
+    factor on the width that it predicts. From the validation draws."""
+    training: dict[str, Any] = {}
+    """Settings of the training, and versions."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if not len(self.names) == len(self.bounds) == len(self.spread):
+            raise ValueError(
+                f"{len(self.names)} names need as many bounds and spreads, got {len(self.bounds)} and {len(self.spread)}"
+            )
+        for name, (low, high) in zip(self.names, self.bounds, strict=True):
+            if not low < high or (self.target == "logarithmic" and low <= 0):
+                raise ValueError(f"bounds of {name} must be in order (and positive if logarithmic), got {[low, high]}")
+        return self
+
+    @property
+    def outputs(self) -> int:
+        return len(self.names) * (2 if self.heteroscedastic else 1)
+
+    def build(self, *, dropout: float | None = None) -> nn.Module:
+        """The network with fresh weights."""
+        return build_network(
+            self.model, self.outputs, frames=len(self.times), dropout=dropout, order=self.order, density=self.density
+        )
+
+
+@dataclass(frozen=True)
+class OutputScale:
+    """From a network's outputs to parameters and back."""
+
+    bounds: Tensor
+    """[k, 2]"""
+    target: Target
+
+    def values(self, fractions: Tensor) -> Tensor:
+        """[..., k] fractions of the way between the bounds -> parameters in their own units; not clipped."""
+        low, high = self.bounds.unbind(-1)
+        if self.target == "logarithmic":
+            return low * (high / low) ** fractions
+        return low + (high - low) * fractions
+
+    def from_linear(self, fractions: Tensor) -> Tensor:
+        """[..., k] linear fractions, as data sets have them -> fractions on this scale."""
+        if self.target == "linear":
+            return fractions
+        low, high = self.bounds.unbind(-1)
+        return torch.log((low + (high - low) * fractions) / low) / torch.log(high / low)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Parameters of a batch of clouds."""
+
+    names: tuple[str, ...]
+    values: Tensor
+    """[B, k] as predicted; may lie outside the bounds."""
+    fractions: Tensor
+    """[B, k] on the scale of the target."""
+    width: Tensor
+    """[B, k] Laplace width on that scale."""
+    scale: OutputScale
+
+    @property
+    def inside(self) -> Tensor:
+        """bool [B, k]: within the bounds."""
+        low, high = self.scale.bounds.unbind(-1)
+        return (self.values >= low) & (self.values <= high)
+
+    @property
+    def clipped(self) -> Tensor:
+        """[B, k] brought to the bounds: what a simulation takes."""
+        low, high = self.scale.bounds.unbind(-1)
+        return self.values.clamp(low, high)
+
+    def interval(self, level: float) -> tuple[Tensor, Tensor]:
+        """[B, k] lower and upper end that hold the truth with this probability, if the widths are right."""
+        reach = laplace_reach(level) * self.width
+        return self.scale.values(self.fractions - reach), self.scale.values(self.fractions + reach)
+
+
+def laplace_reach(level: float) -> float:
+    """Half the length of the central interval of a Laplace distribution, in widths: P(|x| <= reach) = level."""
+    return -math.log1p(-level)
+
+
+def split_outputs(outputs: Tensor, parameters: int) -> tuple[Tensor, Tensor]:
+    """[B, k or 2k] -> fractions [B, k] and logarithms of widths [B, k] (zero without a heteroscedastic head)."""
+    fractions = outputs[:, :parameters]
+    if outputs.shape[1] == parameters:
+        return fractions, torch.zeros_like(fractions)
+    return fractions, outputs[:, parameters:].clamp(-_WIDEST, _WIDEST)
+
+
+@dataclass(frozen=True)
+class Regressor:
+    """A network with all that turns clouds into parameters."""
+
+    description: Description
+    network: nn.Module
+
+    @property
+    def scale(self) -> OutputScale:
+        return OutputScale(torch.tensor(self.description.bounds), self.description.target)
+
+    @torch.no_grad()
+    def predict(self, clouds: Tensor) -> Prediction:
+        """Parameters of clouds.
+
+        Args:
+            clouds: [B, T, P, 3] in the frame and length unit of the scenario's scene; T frames as the model sees them.
+        """
+        told = self.description
+        parameter = next(self.network.parameters())
+        clouds = clouds.to(parameter)
+        self.network.eval()
+        outputs = self.network((clouds - clouds.new_tensor(told.centre)) / told.length).float().cpu()
+        fractions, log_width = split_outputs(outputs, len(told.names))
+        scale = self.scale
+        width = log_width.exp() * torch.tensor(told.spread)
+        return Prediction(told.names, scale.values(fractions), fractions, width, scale)
+
+    def write(self, path: Path) -> None:
+        """Write atomically; the same regressor gives the same bytes."""
+        tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in self.network.state_dict().items()}
+        with atomic_path(path) as temporary:
+            save_file(tensors, temporary, metadata={_KEY: self.description.model_dump_json()})
+
+    @staticmethod
+    def read(path: Path) -> Regressor:
+        """Read and check a checkpoint.
+
+        Raises:
+            CheckpointError: missing, damaged, or not a regressor of this project; names the file and the field.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise CheckpointError(f"No such checkpoint: {path}. Make one with `diffcloud train`.")
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise CheckpointError(f"{path} has {path.stat().st_size} bytes; at most {_LARGEST_BYTES} are read.")
+        try:
+            with safe_open(path, framework="pt") as file:
+                text = (file.metadata() or {}).get(_KEY)
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+        except (SafetensorError, OSError, ValueError) as error:
+            raise CheckpointError(f"{path} is not a readable checkpoint: {error}. Train again.") from error
+        if text is None:
+            raise CheckpointError(f"{path} lacks the description of a regressor; it was not written by `diffcloud train`.")
+        try:
+            described = Description.model_validate_json(text)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(map(str, first["loc"])) or "description"
+            raise CheckpointError(f"{path}: {where}: {first['msg']}, got {first['input']!r}.") from error
+        with torch.device("meta"):
+            network = described.build()
+        _check_tensors(path, network, tensors)
+        network.load_state_dict(tensors, assign=True)
+        return Regressor(described, network.eval())
+
+
+def _check_tensors(path: Path, network: nn.Module, tensors: dict[str, Tensor]) -> None:
+    wanted = network.state_dict()
+    differing = sorted(wanted.keys() ^ tensors.keys())
+    if differing:
+        raise CheckpointError(f"{path}: the weights do not belong to its model: {differing[0]} is missing or too much.")
+    for name, tensor in tensors.items():
+        if tensor.shape != wanted[name].shape or tensor.dtype != wanted[name].dtype:
+            raise CheckpointError(
+                f"{path}: {name} must be {wanted[name].dtype} {list(wanted[name].shape)}, got {tensor.dtype} "
+                f"{list(tensor.shape)}."
+            )
+        if not bool(torch.isfinite(tensor).all()):
+            raise CheckpointError(f"{path}: {name} holds NaN or infinite numbers. Train again, at a lower learning rate.")

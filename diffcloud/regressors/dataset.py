@@ -1,0 +1,81 @@
+"""Training data: clouds drawn from a simulated set as they are needed, and the parameters behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from diffcloud.clouds.augmentation import Augmentation, CloudMaker, run_keys
+from diffcloud.errors import ConfigError, unknown_name
+from diffcloud.io.simulated import SimulatedSet
+
+__all__ = ["Augmentation", "CloudDataset", "Frames", "SimulatedSet"]
+
+Frames = Literal["loss", "all"]
+
+
+class CloudDataset(Dataset[tuple[Tensor, Tensor]]):
+    """Clouds and parameters of the runs of a simulated set; the same for the same (seed, epoch, run), whatever the batch.
+
+    An item is (clouds float32 [T', points, 3], parameters float32 [k]), the parameters scaled so that the bounds are 0 and
+    1. A `DataLoader` fetches whole batches at once; `batch` gives them without one.
+    """
+
+    def __init__(
+        self,
+        simulated: SimulatedSet,
+        augmentation: Augmentation | None = None,
+        *,
+        frames: Frames = "loss",
+        points: int = 3500,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """
+        Args:
+            augmentation: default the paper's; `Augmentation.none()` for whole surfaces without noise.
+            frames: "loss": the frame of the scenario's loss, T' = 1; "all": those of a recorded episode.
+            points: of each cloud.
+            device: where clouds are made.
+
+        Raises:
+            ConfigError: no points, or an unknown choice of frames.
+        """
+        if frames not in ("loss", "all"):
+            raise ConfigError(unknown_name("choice of frames", frames, ("loss", "all")))
+        self.simulated, self.seed, self.epoch = simulated, seed, 0
+        chosen = (
+            slice(simulated.first_frame, None) if frames == "all" else slice(simulated.loss_frame, simulated.loss_frame + 1)
+        )
+        self.times = torch.as_tensor(simulated.times[chosen])
+        """[T'] of the clouds since the start [s]."""
+        augmentation = Augmentation() if augmentation is None else augmentation
+        self._maker = CloudMaker.build(simulated, augmentation, points=points, device=device)
+        self._nodes = torch.as_tensor(simulated.nodes[:, chosen], device=device)
+        low, high = torch.as_tensor(simulated.bounds).T
+        scaled = (torch.as_tensor(simulated.parameters) - low) / (high - low)
+        self._parameters = scaled.to(device=device, dtype=torch.float32)
+
+    def __len__(self) -> int:
+        return len(self.simulated)
+
+    def set_epoch(self, epoch: int) -> None:
+        """New random numbers for every run; a persistent worker of a `DataLoader` has its own copy and does not see it."""
+        self.epoch = epoch
+
+    def batch(self, runs: Sequence[int] | Tensor) -> tuple[Tensor, Tensor]:
+        """(clouds [B, T', points, 3], parameters [B, k]) of runs [B]."""
+        index = torch.as_tensor(runs, dtype=torch.int64, device=self._nodes.device)
+        return self._maker.clouds(self._nodes[index], run_keys(self.seed, self.epoch, index)), self._parameters[index]
+
+    def __getitem__(self, run: int) -> tuple[Tensor, Tensor]:
+        clouds, parameters = self.batch([run])
+        return clouds[0], parameters[0]
+
+    def __getitems__(self, runs: list[int]) -> list[tuple[Tensor, Tensor]]:
+        """What a `DataLoader` calls for a batch."""
+        return list(zip(*self.batch(runs), strict=True))

@@ -1,0 +1,93 @@
+"""Building blocks of the regressors: shared layers, set abstractions, and the head.
+
+A layer is linear, batch normalisation, ReLU; "shared" means that it acts on the last axis, alike for every point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from diffcloud.regressors.grouping import gather_points
+
+
+class Layer(nn.Module):
+    """Linear, batch normalisation over all leading axes, ReLU: [..., inputs] -> [..., outputs]."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(inputs, outputs)
+        self.norm = nn.BatchNorm1d(outputs)
+
+    def activate(self, linear: Tensor) -> Tensor:
+        """What follows the linear part."""
+        return functional.relu(self.norm(linear.flatten(0, -2))).view_as(linear)
+
+    def forward(self, values: Tensor) -> Tensor:
+        return self.activate(self.linear(values))
+
+
+def shared_layers(inputs: int, widths: Sequence[int]) -> nn.Sequential:
+    """Layers in a row."""
+    return nn.Sequential(*(Layer(a, b) for a, b in zip((inputs, *widths), widths, strict=False)))
+
+
+class LocalNetwork(nn.Module):
+    """A PointNet of each group: layers shared by all neighbours, then the maximum over them."""
+
+    def __init__(self, relative: int, features: int, widths: Sequence[int]) -> None:
+        """
+        Args:
+            relative: channels that tell where a neighbour is from its centroid (3; 4 with time).
+            features: channels of a point; 0 for none.
+            widths: outputs of the layers.
+        """
+        super().__init__()
+        self.relative = relative
+        self.first = Layer(relative + features, widths[0])
+        self.rest = shared_layers(widths[0], widths[1:])
+
+    def forward(self, relative: Tensor, features: Tensor | None, index: Tensor) -> Tensor:
+        """[B, M, K, relative], [B, N, features] or None, [B, M, K] indices -> [B, M, widths[-1]]."""
+        linear = self.first.linear
+        first = functional.linear(relative, linear.weight[:, : self.relative], linear.bias)
+        if features is not None:
+            # the first layer's product with a point's features is the same in every group that has the point: it is
+            # taken before the grouping, which saves most of its cost and changes nothing else
+            first = first + gather_points(functional.linear(features, linear.weight[:, self.relative :]), index)
+        return self.rest(self.first.activate(first)).max(2).values
+
+
+class GlobalAbstraction(nn.Module):
+    """The last set abstraction: all points are one group around the origin."""
+
+    def __init__(self, features: int, widths: Sequence[int]) -> None:
+        super().__init__()
+        self.layers = shared_layers(3 + features, widths)
+
+    def forward(self, points: Tensor, features: Tensor) -> Tensor:
+        """[B, N, 3], [B, N, features] -> [B, widths[-1]]."""
+        values: Tensor = self.layers(torch.cat([points, features], dim=-1)).max(1).values
+        return values
+
+
+class Head(nn.Sequential):
+    """Fully connected 512 and 256, then the outputs: [B, inputs] -> [B, outputs]."""
+
+    def __init__(self, inputs: int, outputs: int, *, dropout: Sequence[float]) -> None:
+        """
+        Args:
+            dropout: after each of the two hidden layers.
+        """
+        parts: list[nn.Module] = []
+        for (a, b), rate in zip(((inputs, 512), (512, 256)), dropout, strict=True):
+            parts += [Layer(a, b), nn.Dropout(rate)]  # also at rate 0: names of weights must not depend on it
+        super().__init__(*parts, nn.Linear(256, outputs))
+
+
+def thinned(counts: Sequence[int], density: float) -> tuple[int, ...]:
+    """Numbers of centroids or neighbours at a fraction of the published ones; at least four."""
+    return tuple(max(4, round(density * count)) for count in counts)

@@ -1,0 +1,26 @@
+"""The paper's MLP: a PointNet without its transforms (paper, section IV-B; Qi et al. 2017, "PointNet").
+
+shared 64, 64, 64, 128, 1024 -> maximum over the points -> 512 -> 256 -> dropout -> outputs
+"""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from diffcloud.regressors.layers import Head, shared_layers
+
+WIDTHS = (64, 64, 64, 128, 1024)
+
+
+class MLP(nn.Module):
+    """Points of one frame -> outputs."""
+
+    def __init__(self, outputs: int, *, dropout: float = 0.3) -> None:
+        super().__init__()
+        self.points = shared_layers(3, WIDTHS)
+        self.head = Head(WIDTHS[-1], outputs, dropout=(0.0, dropout))
+
+    def forward(self, clouds: Tensor) -> Tensor:
+        """[B, T, P, 3] -> [B, outputs]; the points of all frames are one set."""
+        outputs: Tensor = self.head(self.points(clouds.flatten(1, 2)).max(1).values)
+        return outputs

@@ -1,0 +1,489 @@
+"""Training of a regressor with Lightning: L1 on the parameters, Adam, the best weights by validation (paper, section IV-B).
+
+The test draws are divided: the first part chooses the best epoch and sets the widths of the intervals, the rest is held
+out and only measured. A training is a function of its settings and data: the random numbers of every epoch come from
+(seed, epoch), so that one that was interrupted and taken up again ends as if it had not been.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import pickle
+import platform
+import signal
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning.pytorch as lightning
+import numpy as np
+import torch
+from lightning.fabric.utilities.warnings import PossibleUserWarning
+from lightning.pytorch.callbacks import EarlyStopping
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+import diffcloud
+from diffcloud.errors import ConfigError, TrainingError
+from diffcloud.io.files import atomic_path, write_json
+from diffcloud.regressors.checkpoints import Description, OutputScale, Regressor, laplace_reach, split_outputs
+from diffcloud.regressors.dataset import Augmentation, CloudDataset, SimulatedSet
+from diffcloud.regressors.networks import ModelName, frames_seen
+from diffcloud.regressors.settings import Loss, TrainingSettings
+
+Device = Literal["auto", "cpu", "gpu"]
+LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+"""Probabilities whose intervals are checked."""
+_VALIDATION = 0.4
+"""Part of the test draws that chooses the epoch; of the paper's 375, 225 are left to measure."""
+_SCALE_SAMPLES = 64
+"""Training clouds that set the centre and the length."""
+_SAVE_EVERY_S = 10.0
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """What a progress display gets after each epoch."""
+
+    epoch: int
+    """Done so far."""
+    train_loss: float
+    validation_loss: float
+    best: float
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """A finished training."""
+
+    regressor: Regressor
+    summary: dict[str, Any]
+    """Settings, history, held-out errors, calibration: what is written beside the checkpoint."""
+    seconds: float
+    resumed_from: int
+    """Epochs that an interrupted run had already done."""
+
+
+def train_regressor(
+    model: ModelName,
+    train: SimulatedSet,
+    test: SimulatedSet,
+    settings: TrainingSettings,
+    out: Path,
+    *,
+    device: Device = "auto",
+    workers: int = 0,
+    progress: Callable[[TrainingProgress], None] | None = None,
+) -> TrainingResult:
+    """Train, keep the best weights, measure them on held-out draws, and write all that.
+
+    Writes `out` (the checkpoint) and a folder of the same name without suffix: `training.json`, and DVCLive's metrics. The
+    state after the last whole epoch lies in a hidden file beside `out` until the end; the same call takes it up.
+
+    Args:
+        workers: processes that sample clouds; 0 for none. They change nothing but the time.
+
+    Raises:
+        ConfigError: sets that do not belong together or are too small.
+        TrainingError: a loss that is no number any more.
+        KeyboardInterrupt: interrupted; the same call goes on from the last whole epoch.
+    """
+    began = time.perf_counter()
+    _check_sets(train, test, settings)
+    clouds = _Clouds.build(model, train, test, settings)
+    centre, length = _centre_and_length(clouds.train)
+    told = Description(
+        model=model,
+        scenario=train.scenario,
+        names=train.names,
+        bounds=tuple((float(low), float(high)) for low, high in train.bounds),
+        target=settings.target,
+        heteroscedastic=settings.heteroscedastic,
+        times=tuple(clouds.train.times.tolist()),
+        frame_time=float(np.diff(train.times).min()),
+        points=settings.points,
+        centre=centre,
+        length=length,
+        length_unit_m=train.length_unit_m,
+        order=settings.order,
+        density=settings.density,
+        spread=(1.0,) * len(train.names),
+        training={"settings": asdict(settings), "draws": clouds.draws, "versions": _versions()},
+    )
+    torch.manual_seed(settings.seed)
+    module = _Training(told, settings, told.build(dropout=settings.dropout))
+    state = _resume_path(out, told, train, test)
+    live = out.with_suffix("")
+    recorder = _Recorder(live, progress)
+    resumed_from = _fit(module, clouds, recorder, settings, state, device=device, workers=workers)
+    assert recorder.weights is not None
+    module.network.load_state_dict(recorder.weights)
+    network = module.network.cpu()
+    regressor = Regressor(told, network)
+    spread, _ = _errors(regressor, clouds.test, clouds.validation)
+    regressor = Regressor(told.model_copy(update={"spread": tuple(spread.mean(0).tolist())}), network)
+    summary = {
+        "description": regressor.description.model_dump(mode="json"),
+        "best_epoch": recorder.best_epoch,
+        "history": recorder.history,
+        "held_out": _held_out(regressor, clouds),
+    }
+    write_json(live / "training.json", summary)
+    regressor.write(out)
+    for left in out.parent.glob(f".{out.stem}.*.resume"):
+        left.unlink(missing_ok=True)
+    return TrainingResult(regressor, summary, time.perf_counter() - began, resumed_from)
+
+
+def _check_sets(train: SimulatedSet, test: SimulatedSet, settings: TrainingSettings) -> None:
+    if train.names != test.names or train.scenario != test.scenario or train.nodes.shape[1:] != test.nodes.shape[1:]:
+        raise ConfigError("The train and test draws are of different scenarios or parameters; simulate them together.")
+    if len(train) < 2 or len(test) < 4:
+        raise ConfigError(f"Training needs at least 2 train and 4 test draws, got {len(train)} and {len(test)}.")
+    if settings.target == "logarithmic" and (train.bounds <= 0).any():
+        raise ConfigError("A logarithmic target needs positive bounds; use target: linear.")
+
+
+@dataclass(frozen=True)
+class _Clouds:
+    """The data of one training."""
+
+    train: CloudDataset
+    test: CloudDataset
+    draws: int
+    """Of the training set that are used."""
+    validation: list[int]
+    held_out: list[int]
+
+    @staticmethod
+    def build(model: ModelName, train: SimulatedSet, test: SimulatedSet, settings: TrainingSettings) -> _Clouds:
+        augmentation = Augmentation() if settings.augment else Augmentation.none()
+        frames = frames_seen(model)
+        # the test clouds stay the same in all epochs, and have random numbers of their own
+        sets = [
+            CloudDataset(simulated, augmentation, frames=frames, points=settings.points, seed=seed)
+            for simulated, seed in ((train, settings.seed), (test, settings.seed + 1))
+        ]
+        split = max(1, round(_VALIDATION * len(sets[1])))
+        draws = min(len(sets[0]), settings.draws or len(sets[0]))
+        return _Clouds(sets[0], sets[1], draws, list(range(split)), list(range(split, len(sets[1]))))
+
+
+def _centre_and_length(dataset: CloudDataset) -> tuple[tuple[float, float, float], float]:
+    """The mean of some training clouds, and the largest distance from it: scaled clouds fill the unit sphere, for which the
+    published radii are."""
+    clouds, _ = dataset.batch(range(min(_SCALE_SAMPLES, len(dataset))))
+    points = clouds.flatten(0, 2).double()
+    centre = points.mean(0)
+    x, y, z = centre.tolist()
+    return (x, y, z), float((points - centre).norm(dim=-1).max())
+
+
+class _Batches(Dataset[tuple[Tensor, Tensor]]):
+    """Whole batches by (epoch, indices)."""
+
+    def __init__(self, dataset: CloudDataset) -> None:
+        self.dataset = dataset
+
+    def __getitem__(self, item: tuple[int, Sequence[int]]) -> tuple[Tensor, Tensor]:
+        epoch, indices = item
+        self.dataset.set_epoch(epoch)
+        return self.dataset.batch(indices)
+
+
+class _Order(Sampler[tuple[int, list[int]]]):
+    """Batches of one epoch; shuffled ones leave out what is over, since a small batch would upset the normalisation."""
+
+    def __init__(self, indices: Sequence[int], batch_size: int, *, shuffle_seed: int | None) -> None:
+        self.indices, self.batch_size, self.seed = list(indices), min(batch_size, len(indices)), shuffle_seed
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Called by Lightning."""
+        self.epoch = epoch if self.seed is not None else 0
+
+    def __len__(self) -> int:
+        size = len(self.indices)
+        return size // self.batch_size if self.seed is not None else math.ceil(size / self.batch_size)
+
+    def __iter__(self) -> Iterator[tuple[int, list[int]]]:
+        order = np.array(self.indices)
+        if self.seed is not None:
+            order = np.random.default_rng([self.seed, self.epoch]).permutation(order)
+        for begin in range(0, len(self) * self.batch_size, self.batch_size):
+            yield self.epoch, order[begin : begin + self.batch_size].tolist()
+
+
+class _Training(lightning.LightningModule):
+    """Loss and optimiser."""
+
+    def __init__(self, told: Description, settings: TrainingSettings, network: nn.Module) -> None:
+        super().__init__()
+        self.told, self.settings, self.network = told, settings, network
+        self.train_losses: list[Tensor] = []
+        self.validation_losses: list[tuple[Tensor, int]] = []
+
+    def loss(self, batch: tuple[Tensor, Tensor]) -> Tensor:
+        clouds, parameters = batch
+        outputs = self.network((clouds - clouds.new_tensor(self.told.centre)) / self.told.length).float()
+        scale = OutputScale(parameters.new_tensor(self.told.bounds), self.told.target)
+        return parameter_loss(outputs, parameters, scale, loss=self.settings.loss)
+
+    def on_train_epoch_start(self) -> None:
+        torch.manual_seed(int(np.random.SeedSequence([self.settings.seed, self.current_epoch]).generate_state(1)[0]))
+        self.train_losses, self.validation_losses = [], []
+
+    def training_step(self, batch: tuple[Tensor, Tensor], _: int) -> Tensor:
+        loss = self.loss(batch)
+        self.train_losses.append(loss.detach())
+        return loss
+
+    def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
+        self.validation_losses.append((self.loss(batch), len(batch[0])))
+
+    def on_validation_epoch_end(self) -> None:
+        losses, counts = zip(*self.validation_losses, strict=True)
+        weights = torch.tensor(counts, dtype=losses[0].dtype, device=losses[0].device)
+        self.log("validation_loss", (torch.stack(losses) * weights).sum() / weights.sum())
+
+    def configure_optimizers(self) -> Any:
+        optimiser = torch.optim.Adam(self.network.parameters(), lr=self.settings.learning_rate)
+        if self.settings.schedule == "constant":
+            return optimiser
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, int(self.trainer.estimated_stepping_batches))
+        return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def parameter_loss(outputs: Tensor, parameters: Tensor, scale: OutputScale, *, loss: Loss) -> Tensor:
+    """Mean L1 between predicted and true parameters, or its likelihood if the outputs have widths.
+
+    Args:
+        outputs: [B, k], or [B, 2k] with logarithms of Laplace widths b: then mean(|error| / b + log b), which is L1 where b
+            is one.
+        parameters: [B, k] linear fractions of the bounds.
+        loss: `normalised` on the scale of the target, `raw` in the parameters' units.
+    """
+    fractions, log_width = split_outputs(outputs, parameters.shape[1])
+    true = scale.from_linear(parameters)
+    error = (fractions - true) if loss == "normalised" else (scale.values(fractions) - scale.values(true))
+    return (error.abs() * torch.exp(-log_width) + log_width).mean()
+
+
+class _Recorder(lightning.Callback):
+    """History and best weights; part of the saved state."""
+
+    def __init__(self, live: Path, progress: Callable[[TrainingProgress], None] | None) -> None:
+        self.folder, self.progress = live, progress
+        self.history: list[dict[str, float]] = []
+        self.best, self.best_epoch = math.inf, -1
+        self.weights: dict[str, Tensor] | None = None
+        self._live: Any = None
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "history": self.history,
+            "best": self.best,
+            "best_epoch": self.best_epoch,
+            "weights": self.weights,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.history, self.best = state_dict["history"], state_dict["best"]
+        self.best_epoch, self.weights = state_dict["best_epoch"], state_dict["weights"]
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        self._live = _metrics_writer(self.folder)
+        for row in self.history:
+            self._log(row)
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        assert isinstance(pl_module, _Training)
+        row = {
+            "train_loss": float(torch.stack(pl_module.train_losses).mean()),
+            "validation_loss": float(trainer.callback_metrics["validation_loss"]),
+        }
+        if not all(map(math.isfinite, row.values())):
+            raise TrainingError(
+                f"The losses of epoch {len(self.history) + 1} are {row['train_loss']:g} (training) and "
+                f"{row['validation_loss']:g} (validation). Try a learning rate below {pl_module.settings.learning_rate:g}."
+            )
+        self.history.append(row)
+        if row["validation_loss"] < self.best:
+            self.best, self.best_epoch = row["validation_loss"], len(self.history)
+            self.weights = {name: tensor.cpu().clone() for name, tensor in pl_module.network.state_dict().items()}
+        self._log(row)
+        if self.progress is not None:
+            self.progress(TrainingProgress(len(self.history), row["train_loss"], row["validation_loss"], self.best))
+
+    def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+        if self._live is not None:
+            self._live.end()
+
+    def _log(self, row: Mapping[str, float]) -> None:
+        for name, value in row.items():
+            self._live.log_metric(name, value)
+        self._live.next_step()
+
+
+def _metrics_writer(folder: Path) -> Any:
+    """DVCLive's metrics files and nothing else: experiments, dvc.yaml and reports are the project's own."""
+    from dvclive import Live  # type: ignore[attr-defined]
+
+    class Metrics(Live):  # type: ignore[misc]
+        def _init_dvc(self) -> None:
+            # Left out: it opens the Git repository around the current folder without closing it, and makes one that is not
+            # under DVC a DVC repository. The files need neither.
+            pass
+
+    return Metrics(str(folder), report=None, save_dvc_exp=False, dvcyaml=None)
+
+
+class _Saver(lightning.Callback):
+    """Writes the whole state now and then, so that a kill costs little."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.last = path, time.monotonic()
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        if time.monotonic() - self.last >= _SAVE_EVERY_S:
+            self.save(trainer)
+
+    def save(self, trainer: lightning.Trainer) -> None:
+        with atomic_path(self.path) as temporary:
+            trainer.save_checkpoint(temporary)
+        self.last = time.monotonic()
+
+
+def _fit(
+    module: _Training,
+    clouds: _Clouds,
+    recorder: _Recorder,
+    settings: TrainingSettings,
+    state: Path,
+    *,
+    device: Device,
+    workers: int,
+) -> int:
+    """Run the epochs; returns how many an earlier run had done."""
+    earlier = _readable_state(state)
+    shuffled = _Order(range(clouds.draws), settings.batch_size, shuffle_seed=settings.seed)
+    shuffled.set_epoch(earlier)  # Lightning, which tells later ones, asks for the first batch before that
+    in_order = _Order(clouds.validation, settings.batch_size, shuffle_seed=None)
+    train, validation = (
+        # a generator of its own: a loader draws a number when it starts, which is not at the same place in a resumed run
+        DataLoader(_Batches(dataset), sampler=order, batch_size=None, num_workers=workers, generator=torch.Generator())
+        for dataset, order in ((clouds.train, shuffled), (clouds.test, in_order))
+    )
+    on_gpu = device == "gpu" or (device == "auto" and torch.cuda.is_available())
+    callbacks: list[lightning.Callback] = [recorder]
+    if settings.patience is not None:
+        callbacks.append(EarlyStopping("validation_loss", patience=settings.patience))
+    callbacks.append(_Saver(state))  # last: what the others know is then in the state
+    with _quiet():
+        trainer = lightning.Trainer(
+            accelerator="gpu" if on_gpu else "cpu",
+            devices=1,
+            precision="bf16-mixed" if on_gpu else "32-true",
+            max_epochs=settings.epochs,
+            callbacks=callbacks,
+            num_sanity_val_steps=0,
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+        )
+        handler = signal.getsignal(signal.SIGINT)
+        try:
+            trainer.fit(module, train, validation, ckpt_path=str(state) if earlier else None, weights_only=True)
+        except SystemExit as exit_:
+            # Lightning turns Ctrl-C into an exit, and Ctrl-C off
+            signal.signal(signal.SIGINT, handler)
+            raise KeyboardInterrupt from exit_
+    return earlier
+
+
+def _readable_state(path: Path) -> int:
+    """Epochs done in a saved state; 0 for none, or one that is damaged and must not stop a training."""
+    try:
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+        return int(saved["epoch"]) + 1
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError, EOFError, pickle.UnpicklingError):
+        path.unlink(missing_ok=True)
+        return 0
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Lightning's announcements: the commands have a progress display of their own."""
+    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric", "dvclive")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PossibleUserWarning)  # that more workers may be quicker
+            warnings.filterwarnings("ignore", message=".*LeafSpec", module="lightning")  # Lightning's use of torch's trees
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+def _resume_path(out: Path, told: Description, train: SimulatedSet, test: SimulatedSet) -> Path:
+    """A hidden file whose name tells settings and data, so that no training takes up another one's state."""
+    digest = hashlib.sha256(told.model_dump_json().encode())
+    for array in (train.parameters, train.nodes, test.parameters, test.nodes):
+        digest.update(np.ascontiguousarray(array).data)
+    return out.parent / f".{out.stem}.{digest.hexdigest()[:12]}.resume"
+
+
+def _errors(regressor: Regressor, dataset: CloudDataset, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Of some draws: |error| in widths, and values in the parameters' units minus the true ones, [n, k] each."""
+    dataset.set_epoch(0)
+    in_widths, off = [], []
+    step = regressor.description.training["settings"]["batch_size"]
+    for begin in range(0, len(indices), step):
+        clouds, parameters = dataset.batch(indices[begin : begin + step])
+        found = regressor.predict(clouds)
+        in_widths.append((found.fractions - found.scale.from_linear(parameters)).abs() / found.width)
+        low, high = found.scale.bounds.unbind(-1)
+        off.append(found.values - (low + (high - low) * parameters))
+    return torch.cat(in_widths), torch.cat(off)
+
+
+def _held_out(regressor: Regressor, clouds: _Clouds) -> dict[str, Any]:
+    """Errors on the draws that nothing was chosen by, beside those of always predicting the training's mean or median."""
+    names = regressor.description.names
+    in_widths, off = (tensor.double().numpy() for tensor in _errors(regressor, clouds.test, clouds.held_out))
+    true = clouds.test.simulated.parameters[clouds.held_out]
+    trained = clouds.train.simulated.parameters[: clouds.draws]
+    span = np.ptp(clouds.train.simulated.bounds, axis=1)
+    coverage = [(in_widths <= laplace_reach(level)).mean(axis=0) for level in LEVELS]
+    return {
+        "draws": len(true),
+        "parameters": {
+            name: {
+                "median_relative_error": float(np.median(np.abs(off[:, index]) / true[:, index])),
+                "median_relative_error_of_mean": float(
+                    np.median(np.abs(trained[:, index].mean() - true[:, index]) / true[:, index])
+                ),
+                "mean_error_of_range": float(np.abs(off[:, index]).mean() / span[index]),
+                "mean_error_of_range_of_median": float(
+                    np.abs(np.median(trained[:, index]) - true[:, index]).mean() / span[index]
+                ),
+                "coverage": [float(row[index]) for row in coverage],
+            }
+            for index, name in enumerate(names)
+        },
+        "levels": list(LEVELS),
+    }
+
+
+def _versions() -> dict[str, str]:
+    return {"diffcloud": diffcloud.__version__, "torch": torch.__version__, "python": platform.python_version()}

@@ -1,0 +1,89 @@
+"""Pixels, rays and points of a pinhole camera with Brown–Conrady distortion.
+
+The camera's frame is OpenCV's: x right, y down, z forward; pixel centres at whole numbers. Two conventions of the same
+polynomial are met: OpenCV's `brown_conrady` maps ideal to distorted coordinates, librealsense's `inverse_brown_conrady`
+distorted to ideal ones. Either way one direction is closed and the other is found by fixed-point iteration.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.io.camera_models import Intrinsics
+
+Floats = NDArray[np.float64]
+
+_ITERATIONS = 30
+"""Of the fixed point; lenses of depth cameras converge to 1e-12 px in about ten."""
+
+
+def project(points: Floats, intrinsics: Intrinsics) -> Floats:
+    """Pixels [..., 2] (column, row) of camera points [..., 3] [m]."""
+    ideal = points[..., :2] / points[..., 2:]
+    if intrinsics.distortion == "brown_conrady":
+        ideal = _polynomial(ideal, intrinsics.coefficients)
+    elif intrinsics.distortion == "inverse_brown_conrady":
+        ideal = _invert(ideal, intrinsics.coefficients)
+    return ideal * [intrinsics.fx, intrinsics.fy] + [intrinsics.cx, intrinsics.cy]
+
+
+def rays(pixels: Floats, intrinsics: Intrinsics) -> Floats:
+    """Rays [..., 3] with z = 1 through pixels [..., 2]: times the depth they are camera points."""
+    plane = (pixels - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy]
+    if intrinsics.distortion == "brown_conrady":
+        plane = _invert(plane, intrinsics.coefficients)
+    elif intrinsics.distortion == "inverse_brown_conrady":
+        plane = _polynomial(plane, intrinsics.coefficients)
+    return np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
+
+
+def depth_points(
+    depth: NDArray[np.uint16], intrinsics: Intrinsics, depth_scale_m: float, *, step: int = 1
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Camera points [P, 3] [m] and their pixels [P, 2] of every `step`-th valid measurement of a depth image [H, W]."""
+    row, column = np.nonzero(depth[::step, ::step])
+    pixels = np.column_stack([column, row]) * step
+    z = depth[pixels[:, 1], pixels[:, 0]] * depth_scale_m
+    return rays(pixels.astype(np.float64), intrinsics) * z[:, None], pixels
+
+
+def transform(matrix: Floats, points: Floats) -> Floats:
+    """Rigid transforms [..., 4, 4] of points [..., P, 3]."""
+    return points @ np.swapaxes(matrix[..., :3, :3], -1, -2) + matrix[..., None, :3, 3]
+
+
+def inverse(matrix: Floats) -> Floats:
+    """Inverse of rigid transforms [..., 4, 4]."""
+    result = np.zeros_like(matrix)
+    rotation = np.swapaxes(matrix[..., :3, :3], -1, -2)
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = -(rotation @ matrix[..., :3, 3:])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def _polynomial(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
+    if not any(coefficients):
+        return xy
+    radial, tangential = _terms(xy, coefficients)
+    return xy * radial + tangential
+
+
+def _invert(target: Floats, coefficients: tuple[float, ...]) -> Floats:
+    if not any(coefficients):
+        return target
+    xy = target
+    for _ in range(_ITERATIONS):
+        radial, tangential = _terms(xy, coefficients)
+        xy = (target - tangential) / radial
+    return xy
+
+
+def _terms(xy: Floats, coefficients: tuple[float, ...]) -> tuple[Floats, Floats]:
+    k1, k2, p1, p2, k3 = coefficients
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    tangential = np.stack([2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], axis=-1)
+    return radial[..., None], tangential

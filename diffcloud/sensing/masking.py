@@ -1,0 +1,269 @@
+"""Which pixels of a depth image show the robot, or are spoilt by it.
+
+The links' surfaces, moved outwards by a margin that covers calibration, the description's errors and the joint log's
+lag, are cast into the camera. What is measured at or behind that surface is robot. Stereo needs both of its eyes: a
+point that the robot hides from the other one lies in its occlusion shadow, where a camera guesses. At borders it may
+average foreground and background: such flying pixels are found by their few neighbours in depth, whatever made the
+border.
+
+Each link has a ray-casting structure of its own, built once in the link's frame; a frame moves the rays, not the
+triangles, and casts only the pixels whose rays can meet the link. (Rebuilding one structure of all links costs four
+times as much a frame.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import EpisodeError
+from diffcloud.io.camera_models import Intrinsics
+from diffcloud.io.clouds import import_open3d
+from diffcloud.io.raw_episodes import RobotLog
+from diffcloud.io.urdf import LinkMesh
+from diffcloud.sensing.cameras import inverse, rays, transform
+from diffcloud.sensing.robot import Robot
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_LONGEST_MITRE = 2.0
+"""A vertex moves by at most this many margins; a box's corner needs 1.73."""
+_NEAREST_M = 0.01
+_OUTSIDE_S = 0.1
+"""Joints are held this long beyond the ends of their log."""
+_FEWEST_SUPPORTING = 3
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera in its place."""
+
+    intrinsics: Intrinsics
+    T_world_camera: Floats
+    """[4, 4] maps camera points to world points [m]."""
+
+    @cached_property
+    def directions(self) -> Floats:
+        """[H, W, 3] rays with z = 1 through the pixels."""
+        row, column = np.mgrid[: self.intrinsics.height, : self.intrinsics.width]
+        return rays(np.stack([column, row], axis=-1).astype(np.float64), self.intrinsics)
+
+    @cached_property
+    def _columns(self) -> Floats:
+        """[2, W] least and greatest x of the rays of each column."""
+        return np.stack([self.directions[..., 0].min(axis=0), self.directions[..., 0].max(axis=0)])
+
+    @cached_property
+    def _rows(self) -> Floats:
+        """[2, H] least and greatest y of the rays of each row."""
+        return np.stack([self.directions[..., 1].min(axis=1), self.directions[..., 1].max(axis=1)])
+
+    def window(self, low: Floats, high: Floats) -> tuple[slice, slice]:
+        """Rows and columns of all rays with (x, y) between `low` [2] and `high` [2]."""
+        rows = np.flatnonzero((self._rows[1] >= low[1]) & (self._rows[0] <= high[1]))
+        columns = np.flatnonzero((self._columns[1] >= low[0]) & (self._columns[0] <= high[0]))
+        if not len(rows) or not len(columns):
+            return slice(0, 0), slice(0, 0)
+        return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+class RobotMask:
+    """A robot's inflated surface, ready to be cast into cameras.
+
+    Args:
+        inflation_m: margin around every link [m].
+    """
+
+    def __init__(self, robot: Robot, *, inflation_m: float = 0.01) -> None:
+        self.robot = robot
+        self._links: list[tuple[int, Any, Floats]] = []
+        """(place among the robot's links, its ray-casting scene, the corners [8, 3] of its box)."""
+        open3d = import_open3d()
+        for name, mesh in robot.description.meshes.items():
+            solid = inflate(mesh, inflation_m)
+            scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # threads cost more than they gain on these few rays
+            scene.add_triangles(solid.vertices.astype(np.float32), solid.faces.astype(np.uint32))
+            ends = np.stack([solid.vertices.min(axis=0), solid.vertices.max(axis=0)])
+            corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(8, 3)
+            self._links.append((robot.links.index(name), scene, corners))
+
+    def surface(self, view: View, poses: Floats) -> NDArray[np.float32]:
+        """z-depth [H, W] [m] of the inflated robot, infinite beside it.
+
+        Args:
+            poses: [L, 4, 4] T_world_link.
+        """
+        depth = np.full(view.directions.shape[:2], np.inf, dtype=np.float32)
+        for scene, T_link_camera, low, high in self._placed(view.T_world_camera, poses, np.zeros(3)):
+            window = view.window(low, high)
+            directions = view.directions[window]
+            if directions.size:
+                hit = _cast(scene, T_link_camera, np.zeros(3), directions)  # rays have z = 1: their length is z-depth
+                depth[window] = np.minimum(depth[window], hit)
+        return depth
+
+    def hides(
+        self, points: Floats, T_world_camera: Floats, poses: Floats, *, eye: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> Mask:
+        """Whether the inflated robot stands between an eye and points, or holds them.
+
+        Args:
+            points: [N, 3] in the camera's frame [m].
+            poses: [L, 4, 4] T_world_link.
+            eye: [3] in the camera's frame [m].
+
+        Returns:
+            [N].
+        """
+        from_eye = points - eye
+        plane = from_eye[:, :2] / np.maximum(from_eye[:, 2:], _NEAREST_M)
+        hidden = np.zeros(len(points), dtype=bool)
+        for scene, T_link_camera, low, high in self._placed(T_world_camera, poses, np.asarray(eye)):
+            near = np.flatnonzero(((plane >= low) & (plane <= high)).all(axis=1) & ~hidden)
+            if len(near):
+                hidden[near] = _cast(scene, T_link_camera, np.asarray(eye), from_eye[near]) <= 1.0
+        return hidden
+
+    def _placed(self, T_world_camera: Floats, poses: Floats, eye: Floats) -> Iterator[tuple[Any, Floats, Floats, Floats]]:
+        """(scene, T_link_camera, least and greatest (x, y) of rays from the eye that can meet it) of each link in view."""
+        for index, scene, corners in self._links:  # links have trees of their own
+            T_link_camera = inverse(poses[index]) @ T_world_camera
+            seen = transform(inverse(T_link_camera), corners) - eye
+            if (seen[:, 2] < _NEAREST_M).all():
+                continue
+            plane = seen[:, :2] / np.maximum(seen[:, 2:], _NEAREST_M)
+            low, high = plane.min(axis=0), plane.max(axis=0)
+            if (seen[:, 2] < _NEAREST_M).any():  # reaches behind the camera: its picture may be anywhere
+                low, high = np.full(2, -np.inf), np.full(2, np.inf)
+            yield scene, T_link_camera, low, high
+
+
+@dataclass(frozen=True)
+class Spoilt:
+    """What masking found in one depth image; each [H, W], and no pixel without depth is in any."""
+
+    robot: Mask
+    """At or behind the robot's inflated surface."""
+    shadow: Mask
+    """Hidden from one of the camera's eyes by the robot."""
+    flying: Mask
+    """Between foreground and background."""
+
+    @property
+    def any(self) -> Mask:
+        return self.robot | self.shadow | self.flying
+
+
+def spoilt_pixels(
+    depth_m: NDArray[np.floating[Any]],
+    view: View,
+    mask: RobotMask | None = None,
+    poses: Floats | None = None,
+    *,
+    within: Mask | None = None,
+    eyes_m: Sequence[float] = (0.05,),
+    flying_m: float = 0.01,
+) -> Spoilt:
+    """Pixels that show no cloth because of the robot, or of a border.
+
+    Args:
+        depth_m: [H, W] z-depth [m]; 0 is no measurement.
+        mask, poses: the robot and its [L, 4, 4] T_world_link; None without a robot.
+        within: [H, W] pixels that matter, such as those in the workspace; the others are in no set. None: all.
+        eyes_m: places of the stereo pair's other eyes along the image's x [m]; a D435's second imager is at 0.05 of its
+            depth image.
+        flying_m: see `flying_pixels`; 0 leaves them.
+    """
+    valid = depth_m > 0 if within is None else (depth_m > 0) & within
+    robot, shadow = np.zeros_like(valid), np.zeros_like(valid)
+    if mask is not None and poses is not None:
+        robot = valid & (depth_m >= mask.surface(view, poses))
+        free = valid & ~robot
+        points = view.directions[free] * depth_m[free][:, None]
+        hidden = np.zeros(len(points), dtype=bool)
+        for x in eyes_m:
+            hidden |= mask.hides(points, view.T_world_camera, poses, eye=(x, 0.0, 0.0))
+        shadow[free] = hidden
+    flying = flying_pixels(depth_m, flying_m) & valid & ~robot & ~shadow if flying_m > 0 else np.zeros_like(valid)
+    return Spoilt(robot, shadow, flying)
+
+
+def flying_pixels(depth_m: NDArray[np.floating[Any]], step_m: float) -> Mask:
+    """Measured pixels [H, W] of which fewer than 3 of the 8 neighbours lie within `step_m` in depth."""
+    padded = np.pad(depth_m, 1)
+    height, width = depth_m.shape
+    supporting = np.zeros(depth_m.shape, dtype=np.uint8)
+    for row, column in ((r, c) for r in range(3) for c in range(3) if (r, c) != (1, 1)):  # eight shifted images
+        neighbour = padded[row : row + height, column : column + width]
+        supporting += (neighbour > 0) & (np.abs(neighbour - depth_m) <= step_m)
+    return (depth_m > 0) & (supporting < _FEWEST_SUPPORTING)
+
+
+def inflate(mesh: LinkMesh, margin_m: float) -> LinkMesh:
+    """The surface with every face moved outwards by `margin_m`, together with the surface itself.
+
+    Vertices move along the mean normal of their faces, farther at edges so that the faces move by the whole margin. The
+    original is kept because a scanned mesh may have faces that are turned inside out.
+    """
+    if margin_m == 0:
+        return mesh
+    corner, same = np.unique(np.round(mesh.vertices, 7), axis=0, return_inverse=True)  # STL repeats its vertices
+    faces = same.reshape(-1)[mesh.faces]
+    normal = np.cross(corner[faces[:, 1]] - corner[faces[:, 0]], corner[faces[:, 2]] - corner[faces[:, 0]])
+    length = np.linalg.norm(normal, axis=1)
+    faces, normal = faces[length > 0], normal[length > 0] / length[length > 0, None]
+    # weighted by the angle at the vertex, so that how a plane is cut into triangles does not matter
+    edge = corner[np.roll(faces, -1, axis=1)] - corner[faces]
+    edge /= np.maximum(np.linalg.norm(edge, axis=2, keepdims=True), 1e-12)
+    angle = np.arccos(np.clip(-(edge * np.roll(edge, 1, axis=1)).sum(axis=2), -1.0, 1.0))
+    mean = np.zeros_like(corner)
+    np.add.at(mean, faces, angle[..., None] * normal[:, None])
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    cosine = np.ones(len(corner))
+    np.minimum.at(cosine, faces, (mean[faces] * normal[:, None]).sum(axis=2))
+    moved = corner + margin_m * mean / np.maximum(cosine, 1 / _LONGEST_MITRE)[:, None]
+    return LinkMesh(np.concatenate([corner, moved]), np.concatenate([faces, faces + len(corner)]))
+
+
+def joints_at(log: RobotLog, times: Floats, *, lag_s: float = 0.0) -> tuple[Floats, Floats]:
+    """The arm when images were taken, between rows linearly: joints [T, J] [rad], gripper [T] 0..1 or NaN.
+
+    Args:
+        times: [T] of the images, on the log's clock [s].
+        lag_s: how much later than the truth the log's times are.
+
+    Raises:
+        EpisodeError: the log is empty or does not cover the images.
+    """
+    if not len(log.times):
+        raise EpisodeError(
+            "The joint log is empty; without it the robot cannot be masked. Record again, or go without a mask."
+        )
+    clock = log.times - lag_s
+    if times[0] < clock[0] - _OUTSIDE_S or times[-1] > clock[-1] + _OUTSIDE_S:
+        raise EpisodeError(
+            f"The joint log covers {clock[0]:.2f} to {clock[-1]:.2f} s, the images {times[0]:.2f} to {times[-1]:.2f} s: "
+            "where the robot was is not known for all of them. Cut the video, or import the whole log (--log-offset)."
+        )
+    continuous = np.unwrap(log.joints_rad, axis=0)  # arms report angles within one turn
+    joints = np.stack([np.interp(times, clock, column) for column in continuous.T], axis=1)
+    known = np.isfinite(log.gripper)
+    if not known.any():
+        return joints, np.full(len(times), np.nan)
+    return joints, np.interp(times, clock[known], log.gripper[known])
+
+
+def _cast(scene: Any, T_link_camera: Floats, eye: Floats, directions: Floats) -> NDArray[np.float32]:
+    """[...] of the first hit in lengths of `directions` [..., 3], which start at `eye` in the camera's frame."""
+    rotated = directions @ T_link_camera[:3, :3].T
+    bundle = np.empty((*directions.shape[:-1], 6), dtype=np.float32)
+    bundle[..., :3] = T_link_camera[:3, :3] @ eye + T_link_camera[:3, 3]
+    bundle[..., 3:] = rotated
+    hit: NDArray[np.float32] = scene.cast_rays(bundle, nthreads=1)["t_hit"].numpy()
+    return hit

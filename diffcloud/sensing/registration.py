@@ -1,0 +1,84 @@
+"""Registering a camera by a checkerboard whose corners the robot knows: the paper's method.
+
+The camera's corner points come from its depth image. Their depth is noisy, so z is first replaced by the least-squares
+plane z = a x + b y + c (vertical, not orthogonal distances: that is what the published calibration does), then the rigid
+motion onto the robot's points follows in closed form (Kabsch 1976).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import CalibrationError
+from diffcloud.sensing.cameras import transform
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A registered camera."""
+
+    T_world_camera: Floats
+    """[4, 4] maps camera points to the robot's base frame [m]."""
+    residual_m: Floats
+    """[N] distance of each corner, moved from the plane, to where the robot says it is."""
+    scale: float
+    """Size of the robot's board over that of the camera's: 1 for a right depth scale. The motion does not apply it."""
+
+    @property
+    def rms_m(self) -> float:
+        return float(np.sqrt((self.residual_m**2).mean()))
+
+
+def register_checkerboard(camera_points: Floats, robot_points: Floats) -> Registration:
+    """Where a camera stands, from corners it saw and the same corners in the robot's frame.
+
+    Args:
+        camera_points: [N, 3] in the camera's frame [m].
+        robot_points: [N, 3] in the base frame [m], in the same order.
+
+    Raises:
+        CalibrationError: shapes differ, fewer than 4 corners, corners on a line, or numbers that are not finite.
+    """
+    if camera_points.shape != robot_points.shape or camera_points.ndim != 2 or camera_points.shape[1] != 3:
+        raise CalibrationError(
+            f"Camera and robot must give the same corners [N, 3], got {list(camera_points.shape)} and "
+            f"{list(robot_points.shape)}."
+        )
+    if len(camera_points) < 4:
+        raise CalibrationError(f"A registration needs at least 4 corners, got {len(camera_points)}.")
+    if not (np.isfinite(camera_points).all() and np.isfinite(robot_points).all()):
+        raise CalibrationError("A corner is NaN or infinite: depth was missing there. Leave such corners out.")
+    if np.abs(camera_points).max() > 20 or np.abs(robot_points).max() > 20:
+        raise CalibrationError("A corner is more than 20 m away: these are millimetres; divide by 1000.")
+    flat = onto_plane(camera_points)
+    matrix = rigid_motion(flat, robot_points)
+    residual = np.linalg.norm(transform(matrix, flat) - robot_points, axis=1)
+    spread = [np.linalg.norm(points - points.mean(axis=0)) for points in (robot_points, flat)]
+    return Registration(matrix, residual, float(spread[0] / spread[1]))
+
+
+def onto_plane(points: Floats) -> Floats:
+    """Points [N, 3] with z replaced by their least-squares plane z = a x + b y + c."""
+    design = np.column_stack([points[:, :2], np.ones(len(points))])
+    coefficients, _, rank, _ = np.linalg.lstsq(design, points[:, 2], rcond=None)
+    if rank < 3:
+        raise CalibrationError("The corners lie on a line in the image; a plane needs a grid.")
+    return np.column_stack([points[:, :2], design @ coefficients])
+
+
+def rigid_motion(source: Floats, target: Floats) -> Floats:
+    """[4, 4] rotation and translation that bring `source` [N, 3] nearest to `target` [N, 3], in closed form."""
+    centres = source.mean(axis=0), target.mean(axis=0)
+    u, singular, vt = np.linalg.svd((source - centres[0]).T @ (target - centres[1]))
+    if singular[1] < 1e-9 * singular[0]:
+        raise CalibrationError("The corners lie on a line; a rotation about it cannot be found.")
+    handed = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
+    matrix = np.eye(4)
+    matrix[:3, :3] = vt.T @ handed @ u.T
+    matrix[:3, 3] = centres[1] - matrix[:3, :3] @ centres[0]
+    return matrix

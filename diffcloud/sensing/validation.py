@@ -1,0 +1,435 @@
+"""What is wrong with a raw episode: every fault with the place, what was found, and what to try.
+
+Each check looks at one thing and yields findings; none stops the others, so that one run explains a whole recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from diffcloud.errors import CalibrationError, EpisodeError
+from diffcloud.io.calibrations import Calibration, read_calibration
+from diffcloud.io.images import png_size, read_color, read_depth
+from diffcloud.io.raw_episodes import (
+    CameraInfo,
+    RobotLog,
+    first_backwards,
+    read_camera_info,
+    read_description,
+    read_robot_log,
+    read_timestamps,
+)
+from diffcloud.sensing.cameras import depth_points, transform
+
+_GAP = 2.5
+"""A gap is this many times the median interval."""
+_NEAREST_M, _FARTHEST_M = 0.1, 8.0
+"""Median depth of a table-top scene lies between."""
+_LONGEST_REACH_M = 3.0
+"""No arm of this kind reaches farther."""
+_SPARSE = 0.02
+"""Fewer valid pixels than this are a warning."""
+_SWAP_POINTS = 3000
+_SWAP_M = 0.02
+"""Views that disagree by more than this, and agree when exchanged, are exchanged."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong, or doubtful."""
+
+    severity: Literal["fault", "warning"]
+    """A fault makes what follows wrong; a warning is worth a look."""
+    code: str
+    """A word to filter by, such as clock_gap."""
+    place: str
+    message: str
+
+
+@dataclass(frozen=True)
+class _Camera:
+    name: str
+    folder: Path
+    info: CameraInfo | None
+    frames: NDArray[np.int64]
+    times: NDArray[np.float64]
+
+
+def validate_raw_episode(folder: Path, *, calibration: Path | None = None) -> list[Finding]:
+    """All findings about a raw episode, faults first.
+
+    Args:
+        calibration: a calibration file the cameras should be in; those that camera.json names are read anyway.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        return [Finding("fault", "missing", str(folder), "No such folder.")]
+    try:
+        description = read_description(folder)
+    except EpisodeError as error:
+        return [Finding("fault", "description", "episode.json", str(error))]
+    findings: list[Finding] = []
+    if description.get("status") == "recording":
+        findings.append(
+            Finding(
+                "warning",
+                "unfinished",
+                "episode.json",
+                "The recording was never closed (a crash, a power cut, a full disk); the frames that "
+                "timestamps.csv lists are whole.",
+            )
+        )
+    cameras = []
+    for name in description["cameras"]:
+        camera, found = _open_camera(folder / "cameras" / name, name)
+        findings += found
+        if camera is not None:
+            cameras.append(camera)
+    for camera in cameras:
+        findings += [*_clock(camera, description), *_images(camera), *_calibrated(camera, folder, calibration)]
+    findings += _exchanged(cameras, folder, calibration)
+    if description.get("robot") is not None:
+        try:
+            log = read_robot_log(folder / "robot.csv")
+        except EpisodeError as error:
+            findings.append(Finding("fault", "robot_log", "robot.csv", str(error)))
+        else:
+            findings += [*_robot(log), *_coverage(log, cameras)]
+    return sorted(findings, key=lambda finding: finding.severity != "fault")
+
+
+def _open_camera(folder: Path, name: str) -> tuple[_Camera | None, list[Finding]]:
+    findings = []
+    info = None
+    try:
+        info = read_camera_info(folder / "camera.json")
+    except EpisodeError as error:
+        findings.append(Finding("fault", "camera", f"cameras/{name}/camera.json", str(error)))
+    try:
+        frames, times = read_timestamps(folder / "timestamps.csv")
+    except EpisodeError as error:
+        return None, [*findings, Finding("fault", "timestamps", f"cameras/{name}/timestamps.csv", str(error))]
+    if not len(frames):
+        message = "No frame was finished: the camera delivered nothing, or stopped at once."
+        return None, [*findings, Finding("fault", "no_frames", f"cameras/{name}", message)]
+    return _Camera(name, folder, info, frames, times), findings
+
+
+def _clock(camera: _Camera, description: dict[str, Any]) -> Iterator[Finding]:
+    place = f"cameras/{camera.name}/timestamps.csv"
+    times = camera.times
+    bad = first_backwards(times)
+    if bad is not None:
+        yield Finding(
+            "fault",
+            "clock_backwards",
+            place,
+            f"Row {bad + 1}: the time runs backwards ({times[bad]:.6f} s after {times[bad - 1]:.6f} s). The clock was set "
+            "while recording, or rows were mixed up; sort the frames or record again.",
+        )
+        return
+    skipped = np.flatnonzero(np.diff(camera.frames) != 1)
+    if len(skipped):
+        first = int(camera.frames[skipped[0]])
+        yield Finding(
+            "fault",
+            "missing_frames",
+            place,
+            f"Frame {first} is followed by frame {int(camera.frames[skipped[0] + 1])} ({len(skipped)} such places): frames "
+            "were deleted. Times still hold; renumber, or copy the recording again.",
+        )
+    if len(times) < 3:
+        return
+    intervals = np.diff(times)
+    usual = float(np.median(intervals))
+    gaps = np.flatnonzero(intervals > _GAP * usual)
+    if len(gaps):
+        worst = int(gaps[np.argmax(intervals[gaps])])
+        yield Finding(
+            "fault",
+            "clock_gap",
+            place,
+            f"{len(gaps)} gaps; the longest is {intervals[worst]:.3f} s after frame {int(camera.frames[worst])}, where "
+            f"{usual:.3f} s is usual. Computer, disk or USB link were too slow: lower the frame rate, use USB 3.",
+        )
+    rate = description.get("rate_hz")
+    if isinstance(rate, int | float) and rate > 0 and not 0.75 < usual * rate < 1.33:
+        yield Finding(
+            "warning",
+            "rate",
+            place,
+            f"Frames come every {usual:.4f} s, but episode.json states {rate:g} Hz"
+            + (": these times are milliseconds." if 750 < usual * rate < 1330 else "."),
+        )
+
+
+def _images(camera: _Camera) -> Iterator[Finding]:
+    place = f"cameras/{camera.name}"
+    if list((camera.folder / "depth").glob("*.[jJ][pP]*[gG]")):
+        yield Finding(
+            "fault",
+            "jpeg_depth",
+            f"{place}/depth",
+            "Depth is stored as JPEG, which changes it by centimetres at every border and cannot be repaired: record "
+            "16-bit PNG.",
+        )
+        return
+    empty: list[int] = []
+    sparse: list[int] = []
+    medians: list[float] = []
+    for frame in camera.frames:  # one image after the other, each checked whole
+        path = camera.folder / "depth" / f"{frame:06d}.png"
+        where = f"{place}/depth/{path.name}"
+        try:
+            depth = read_depth(path)
+        except EpisodeError as error:
+            yield Finding("fault", _image_code(path, str(error)), where, str(error))
+            continue
+        if camera.info is not None and depth.shape != (camera.info.intrinsics.height, camera.info.intrinsics.width):
+            stated = camera.info.intrinsics
+            yield Finding(
+                "fault",
+                "image_size",
+                where,
+                f"{depth.shape[1]} x {depth.shape[0]} pixels, but camera.json states {stated.width} x {stated.height}: the "
+                "intrinsics belong to another resolution.",
+            )
+            return
+        valid = depth[depth > 0]
+        if not len(valid):
+            empty.append(int(frame))
+        else:
+            if len(valid) < _SPARSE * depth.size:
+                sparse.append(int(frame))
+            medians.append(float(np.median(valid)))
+    yield from _colour(camera)
+    if empty:
+        yield Finding(
+            "fault",
+            "no_depth",
+            f"{place}/depth",
+            f"{_numbers(empty)} 0 valid depth (every pixel is 0): lens covered, emitter off, nearer than 0.2 m, or "
+            "the depth stream was not enabled.",
+        )
+    if sparse:
+        yield Finding("warning", "sparse_depth", f"{place}/depth", f"{_numbers(sparse)} depth in under 2 % of the pixels.")
+    if medians and camera.info is not None:
+        distance = float(np.median(medians)) * camera.info.depth_scale_m
+        if not _NEAREST_M <= distance <= _FARTHEST_M:
+            factor = 1000 if distance > _FARTHEST_M else 0.001
+            hint = f"; depth_scale_m is off by a factor of {factor:g} (millimetres for metres)"
+            plausible = _NEAREST_M <= distance / factor <= _FARTHEST_M
+            yield Finding(
+                "fault",
+                "depth_unit",
+                f"{place}/camera.json",
+                f"The median depth is {distance:.3g} m with depth_scale_m = {camera.info.depth_scale_m:g}"
+                + (hint if plausible else "")
+                + f". A table-top scene lies between {_NEAREST_M} and {_FARTHEST_M} m.",
+            )
+
+
+def _image_code(path: Path, message: str) -> str:
+    if not path.is_file():
+        return "missing_frames"
+    for word, code in (("truncated", "truncated_image"), ("JPEG", "jpeg_depth"), ("damaged", "damaged_image")):
+        if word in message:
+            return code
+    return "image"
+
+
+def _colour(camera: _Camera) -> Iterator[Finding]:
+    folder = camera.folder / "color"
+    place = f"cameras/{camera.name}/color"
+    if not folder.is_dir():
+        yield Finding("warning", "no_colour", place, "No colour images: masks and pictures will do without.")
+        return
+    for frame in camera.frames:
+        path = folder / f"{frame:06d}.png"
+        try:
+            read_color(path)
+            size = png_size(path)
+        except EpisodeError as error:
+            yield Finding("fault", _image_code(path, str(error)), f"{place}/{path.name}", str(error))
+            continue
+        if camera.info is not None and size != (camera.info.intrinsics.width, camera.info.intrinsics.height):
+            message = f"{size[0]} x {size[1]} pixels; depth and colour of an episode are aligned and of one size."
+            yield Finding("fault", "image_size", f"{place}/{path.name}", message)
+            return
+
+
+def _calibration_of(camera: _Camera, folder: Path, calibration: Path | None) -> Calibration | None:
+    if calibration is not None:
+        return read_calibration(calibration)
+    if camera.info is None or camera.info.calibration is None:
+        return None
+    return read_calibration(folder / camera.info.calibration)
+
+
+def _calibrated(camera: _Camera, folder: Path, calibration: Path | None) -> Iterator[Finding]:
+    place = f"cameras/{camera.name}/camera.json"
+    if camera.info is None:
+        return
+    try:
+        held = _calibration_of(camera, folder, calibration)
+        if held is None:
+            if camera.info.T_world_camera is None:
+                message = "Not calibrated: neither T_world_camera nor a calibration file. Run diffcloud calibrate."
+                yield Finding("warning", "uncalibrated", place, message)
+            return
+        entry = held.camera(camera.info.serial, name=camera.name)
+    except CalibrationError as error:
+        yield Finding("fault", "other_calibration", place, str(error))
+        return
+    if not entry.intrinsics.same_camera(camera.info.intrinsics):
+        yield Finding(
+            "fault",
+            "other_calibration",
+            place,
+            f"The calibration of serial {camera.info.serial} has other intrinsics ({_brief(entry)} against "
+            f"{_brief(camera.info)}): it was made at another resolution or with another camera.",
+        )
+    if entry.name and entry.name != camera.name and any(other.name == camera.name for other in held.cameras.values()):
+        yield Finding(
+            "fault",
+            "swapped_cameras",
+            place,
+            f"Serial {camera.info.serial} is {entry.name!r} in the calibration, but {camera.name!r} here: the cameras were "
+            "swapped when the capture was started. Exchange the folder names, or calibrate again if they were moved.",
+        )
+
+
+def _brief(camera: Any) -> str:
+    held = camera.intrinsics
+    return f"{held.width} x {held.height}, f {held.fx:.1f}, c ({held.cx:.1f}, {held.cy:.1f})"
+
+
+def _pose(camera: _Camera, folder: Path, calibration: Path | None) -> NDArray[np.float64] | None:
+    if camera.info is None:
+        return None
+    try:
+        held = _calibration_of(camera, folder, calibration)
+        if held is not None:
+            return held.camera(camera.info.serial).T_world_camera
+    except CalibrationError:
+        return None
+    return camera.info.T_world_camera
+
+
+def _exchanged(cameras: list[_Camera], folder: Path, calibration: Path | None) -> Iterator[Finding]:
+    """Two views of one scene must agree; where they do so only with each other's pose, the poses are exchanged."""
+    for index, first in enumerate(cameras):
+        for second in cameras[index + 1 :]:
+            poses = [_pose(camera, folder, calibration) for camera in (first, second)]
+            clouds = [_first_points(camera) for camera in (first, second)]
+            if poses[0] is None or poses[1] is None or clouds[0] is None or clouds[1] is None:
+                continue
+            stated = _disagreement(transform(poses[0], clouds[0]), transform(poses[1], clouds[1]))
+            exchanged = _disagreement(transform(poses[1], clouds[0]), transform(poses[0], clouds[1]))
+            if stated > _SWAP_M and exchanged < 0.5 * stated:
+                yield Finding(
+                    "fault",
+                    "swapped_cameras",
+                    f"cameras/{first.name}, cameras/{second.name}",
+                    f"The two views disagree by {1000 * stated:.0f} mm, and by {1000 * exchanged:.0f} mm when each takes "
+                    "the other's pose: the cameras or their calibrations are swapped.",
+                )
+
+
+def _first_points(camera: _Camera) -> NDArray[np.float64] | None:
+    if camera.info is None:
+        return None
+    try:
+        depth = read_depth(camera.folder / "depth" / f"{camera.frames[0]:06d}.png")
+        step = max(1, int(np.sqrt(depth.size / _SWAP_POINTS)))
+        points, _ = depth_points(depth, camera.info.intrinsics, camera.info.depth_scale_m, step=step)
+    except (EpisodeError, IndexError):
+        return None
+    return points if len(points) > 50 else None
+
+
+def _disagreement(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Lower quartile of the distances both ways: half of each view may see what the other does not."""
+    there, _ = cKDTree(second).query(first)
+    back, _ = cKDTree(first).query(second)
+    return float(max(np.quantile(there, 0.25), np.quantile(back, 0.25)))
+
+
+def _robot(log: RobotLog) -> Iterator[Finding]:
+    place = "robot.csv"
+    if not len(log.times):
+        yield Finding("fault", "robot_log", place, "The joint log is empty.")
+        return
+    bad = first_backwards(log.times)
+    if bad is not None:
+        message = f"Row {bad + 1}: the time runs backwards ({log.times[bad]:.6f} s after {log.times[bad - 1]:.6f} s)."
+        yield Finding("fault", "clock_backwards", place, message)
+    largest = float(np.abs(log.joints_rad).max())
+    if largest > 2.5 * np.pi:
+        unit = "these are degrees" if largest <= 450 else "no joint turns that far"
+        yield Finding(
+            "fault",
+            "angle_unit",
+            place,
+            f"A joint angle of {largest:.1f} in radians: {unit}. Multiply by pi / 180 (the arm itself reports degrees).",
+        )
+    reach = _largest(log.tool_position_m)
+    if reach > _LONGEST_REACH_M:
+        yield Finding(
+            "fault",
+            "length_unit",
+            place,
+            f"The tool is {reach:.0f} m from the base: these are millimetres. Divide by 1000.",
+        )
+    grip = log.gripper[np.isfinite(log.gripper)]
+    if len(grip) and (grip.min() < -0.05 or grip.max() > 1.05):
+        unit = "percent" if grip.max() <= 105 else "another unit"
+        message = f"The gripper lies between {grip.min():g} and {grip.max():g}; it is 0 (open) to 1 (closed), not {unit}."
+        yield Finding("fault", "gripper_unit", place, message)
+    length = np.linalg.norm(log.tool_quaternion, axis=1)
+    length = length[np.isfinite(length)]
+    if len(length) and np.abs(length - 1).max() > 0.01:
+        message = f"A tool quaternion has length {length[np.abs(length - 1).argmax()]:.3f}, not 1; order is w, x, y, z."
+        yield Finding("fault", "quaternion", place, message)
+    if bad is None and len(log.times) > 3:
+        intervals = np.diff(log.times)
+        usual = float(np.median(intervals))
+        if intervals.max() > max(_GAP * usual, 0.25):
+            worst = int(intervals.argmax())
+            message = f"A gap of {intervals[worst]:.3f} s after {log.times[worst]:.3f} s, where {usual:.3f} s is usual."
+            yield Finding("warning", "clock_gap", place, message)
+
+
+def _coverage(log: RobotLog, cameras: list[_Camera]) -> Iterator[Finding]:
+    if not len(log.times):
+        return
+    usual = float(np.median(np.diff(log.times))) if len(log.times) > 1 else 0.0
+    slack = max(2 * usual, 0.05)
+    for camera in cameras:
+        outside = (camera.times < log.times.min() - slack) | (camera.times > log.times.max() + slack)
+        if outside.any():
+            yield Finding(
+                "fault",
+                "short_robot_log",
+                "robot.csv",
+                f"The joint log covers {log.times.min():.2f} to {log.times.max():.2f} s, camera {camera.name} "
+                f"{camera.times.min():.2f} to {camera.times.max():.2f} s: {int(outside.sum())} of {len(outside)} frames "
+                "have no joint angles. Start the log before the cameras and stop it after; check that both use one clock.",
+            )
+
+
+def _largest(values: NDArray[np.float64]) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.abs(finite).max()) if len(finite) else 0.0
+
+
+def _numbers(frames: list[int]) -> str:
+    shown = ", ".join(map(str, frames[:5])) + (", ..." if len(frames) > 5 else "")
+    return f"Frames {shown} ({len(frames)} in all) have" if len(frames) > 1 else f"Frame {shown} has"

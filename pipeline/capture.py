@@ -1,0 +1,174 @@
+"""`diffcloud capture`: record a raw episode with depth cameras and an arm."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.markup import escape
+
+from diffcloud.errors import ConfigError
+from diffcloud.hardware import CaptureSettings, Limits, ToolTrajectory, capture, check_trajectory, read_trajectory
+from diffcloud.hardware.kinova import KinovaArm
+from diffcloud.hardware.realsense import RealSenseCamera
+from diffcloud.io.calibrations import read_calibration
+from pipeline.console import JsonFlag, errors, finish, warn
+
+
+def open_arm(address: str) -> KinovaArm:
+    """The arm at an address; user and password come from DIFFCLOUD_ARM_USER and DIFFCLOUD_ARM_PASSWORD."""
+    user, password = (os.environ.get(f"DIFFCLOUD_ARM_{name}", "admin") for name in ("USER", "PASSWORD"))
+    return KinovaArm(address, username=user, password=password)
+
+
+def make_camera(name: str, serial: str, **options: Any) -> RealSenseCamera:
+    """A camera, not yet open."""
+    return RealSenseCamera(name, serial, **options)
+
+
+def record(
+    out: Annotated[Path, typer.Option(help="Folder of the episode, such as raw/episodes/lift_tan1; must not exist.")],
+    camera: Annotated[list[str], typer.Option(help="NAME=SERIAL; one or more.")],
+    trajectory: Annotated[
+        Path | None, typer.Option(help="CSV (t_s, x, y, z[, gripper]) or NPY [T, 3]: tool in the base frame, metres.")
+    ] = None,
+    arm: Annotated[str | None, typer.Option(help="Address of the arm.")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Without an arm: how long to record.")] = None,
+    rate_hz: Annotated[float, typer.Option("--rate", help="Of control, of keyframes without times, and of frames.")] = 10.0,
+    fps: Annotated[int, typer.Option(help="Of the cameras; frames beyond --rate are not written.")] = 30,
+    size: Annotated[str, typer.Option(help="Of the images, WIDTHxHEIGHT.")] = "640x480",
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file; its poses go into camera.json.")] = None,
+    box: Annotated[str | None, typer.Option(help="Workspace: x0,y0,z0,x1,y1,z1 in metres.")] = None,
+    speed: Annotated[float, typer.Option(help="Limit, m/s.")] = Limits.speed_m_s,
+    acceleration: Annotated[float, typer.Option(help="Limit, m/s².")] = Limits.acceleration_m_s2,
+    force: Annotated[float, typer.Option(help="Limit, N.")] = Limits.force_N,
+    torque: Annotated[float, typer.Option(help="Limit, N·m.")] = Limits.torque_Nm,
+    stretch_time: Annotated[float, typer.Option(help="2: half as fast.")] = 1.0,
+    home: Annotated[bool, typer.Option(help="Move to the arm's home position first.")] = False,
+    clear_faults: Annotated[bool, typer.Option(help="Clear the arm's faults first.")] = False,
+    keep_recording: Annotated[bool, typer.Option(help="Also keep the SDK's own .db3, beside the episode.")] = False,
+    scenario: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
+    fabric: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
+    dry_run: Annotated[bool, typer.Option(help="Print the plan and check it; open nothing.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.")] = False,
+    json: JsonFlag = False,
+) -> None:
+    """Drive the arm along a trajectory, record cameras and arm, write while it runs.
+
+    The arm is stopped whatever ends the capture: the end, a limit, a fault, a lost camera, Ctrl-C. What was recorded so
+    far stays.
+    """
+    limits = _limits(box, speed, acceleration, force, torque)
+    path = None if trajectory is None else read_trajectory(trajectory, rate_hz=rate_hz, stretch_time=stretch_time)
+    serials = _serials(camera)
+    width, height = _size(size)
+    calibrated = {} if calibration is None else read_calibration(calibration).cameras
+    for name, serial in serials.items():
+        if calibration is not None and serial not in calibrated:
+            warn(f"{calibration} has no camera {name} ({serial}); its pose is left open.")
+    plan = _plan(path, serials, arm, limits)
+    if path is not None:
+        check_trajectory(path, limits)
+    if dry_run:
+        errors.print("Dry run: nothing was opened, nothing moved.")
+        finish({"dry_run": True, "plan": plan}, json)
+        return
+    if arm is not None and not yes:
+        typer.confirm("Is the workspace clear, and a hand on the emergency stop? The arm will move", abort=True, err=True)
+    options: dict[str, Any] = {"width": width, "height": height, "fps": fps, "warm_up": fps // 2}
+    cameras = [
+        make_camera(name, serial, record_to=out.parent / f"{out.name}_{name}.db3" if keep_recording else None, **options)
+        for name, serial in serials.items()
+    ]
+    settings = CaptureSettings(rate_hz=rate_hz, keep_every=max(1, round(fps / rate_hz)), go_home=home)
+    opened = None if arm is None else open_arm(arm)
+    try:
+        if opened is not None and clear_faults:
+            opened.clear_faults()
+        report = capture(
+            out,
+            cameras,
+            arm=opened,
+            trajectory=path,
+            limits=limits,
+            settings=settings,
+            seconds=seconds,
+            meta={key: value for key, value in (("scenario", scenario), ("fabric", fabric)) if value is not None}
+            | ({"trajectory": trajectory.name} if trajectory is not None else {}),
+            T_world_camera={serial: entry.T_world_camera for serial, entry in calibrated.items()},
+            tell=lambda text: errors.print(escape(text)),
+        )
+    except BaseException:
+        if (out / "episode.json").is_file():
+            errors.print(
+                f"What was recorded so far is in {escape(str(out))}; diffcloud episode validate {escape(str(out))}"
+            )
+        raise
+    finally:
+        if opened is not None:
+            opened.close()
+    dropped = {camera.name: camera.dropped for camera in cameras}
+    if any(dropped.values()):
+        warn(f"Frames that the cameras lost: {dropped}. Use USB 3, a controller for each camera, or a lower --fps.")
+    errors.print(
+        f"{report.frames} frames and {report.robot_rows} robot rows in {report.seconds:.1f} s to {escape(str(out))}."
+    )
+    result = {"out": str(out), "frames": report.frames, "robot_rows": report.robot_rows, "seconds": report.seconds}
+    finish(result | {"largest_error_m": report.largest_error_m, "dropped": dropped}, json)
+
+
+def _limits(box: str | None, speed: float, acceleration: float, force: float, torque: float) -> Limits:
+    limits = Limits(speed_m_s=speed, acceleration_m_s2=acceleration, force_N=force, torque_Nm=torque)
+    if box is None:
+        return limits
+    try:
+        x0, y0, z0, x1, y1, z1 = map(float, box.split(","))
+    except ValueError as error:
+        raise ConfigError(f"--box takes x0,y0,z0,x1,y1,z1 in metres, got {box!r}.") from error
+    return replace(limits, box_low_m=(x0, y0, z0), box_high_m=(x1, y1, z1))
+
+
+def _serials(cameras: list[str]) -> dict[str, str]:
+    serials: dict[str, str] = {}
+    for item in cameras:
+        name, equals, serial = item.partition("=")
+        if not (name and equals and serial) or name in serials or serial in serials.values():
+            raise ConfigError(f"--camera takes NAME=SERIAL, each name and serial once, got {item!r}.")
+        serials[name] = serial
+    return serials
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise ConfigError(f"--size takes WIDTHxHEIGHT, got {text!r}.")
+    return int(width), int(height)
+
+
+def _plan(path: ToolTrajectory | None, serials: dict[str, str], arm: str | None, limits: Limits) -> dict[str, Any]:
+    """Print and return what is going to happen."""
+    plan: dict[str, Any] = {"cameras": serials, "arm": arm}
+    errors.print(f"Cameras: {', '.join(f'{name} ({serial})' for name, serial in serials.items())}. Arm: {arm or 'none'}.")
+    if path is not None:
+        plan |= {
+            "keyframes": len(path.times),
+            "seconds": path.duration_s,
+            "low_m": path.positions.min(axis=0).tolist(),
+            "high_m": path.positions.max(axis=0).tolist(),
+            "speed_m_s": float(np.linalg.norm(path.velocities, axis=1).max()),
+            "acceleration_m_s2": float(np.linalg.norm(path.accelerations, axis=1).max()),
+        }
+        errors.print(
+            f"{plan['keyframes']} keyframes in {plan['seconds']:.1f} s from {path.positions[0].round(3).tolist()} to "
+            f"{path.positions[-1].round(3).tolist()} m, within {np.round(plan['low_m'], 3).tolist()} to "
+            f"{np.round(plan['high_m'], 3).tolist()} (box {limits.box_low_m} to {limits.box_high_m}); at most "
+            f"{plan['speed_m_s']:.2f} of {limits.speed_m_s:g} m/s, {plan['acceleration_m_s2']:.2f} of "
+            f"{limits.acceleration_m_s2:g} m/s²; stopped beyond {limits.force_N:g} N or {limits.torque_Nm:g} N·m.",
+            markup=False,
+            soft_wrap=True,
+        )
+    return plan

@@ -1,0 +1,81 @@
+"""`diffcloud predict`: parameters of recorded episodes by a trained network, in milliseconds."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from diffcloud.errors import ConfigError, EpisodeError
+from diffcloud.io.episodes import Episode, read_episode
+from diffcloud.regressors import MODEL_NAMES, Regressor, predict_episode
+from pipeline.console import JsonFlag, episode_files, errors, finish, show
+
+REGRESSORS = Path("data/regressors")
+"""Where the pipeline keeps checkpoints: <scenario>/<model>.safetensors."""
+
+
+def predict(
+    episodes: Annotated[list[Path], typer.Argument(help="Episode files, or folders of them.")],
+    checkpoint: Annotated[Path, typer.Option(help="Written by `diffcloud train`.")],
+    level: Annotated[float, typer.Option(min=0.01, max=0.99, help="Probability of the intervals shown.")] = 0.9,
+    seed: Annotated[int, typer.Option(help="Of the choice of points.")] = 0,
+    json: JsonFlag = False,
+) -> None:
+    """Predict the parameters of episodes. Values outside the bounds are shown as they are, and said to be outside."""
+    regressor = Regressor.read(checkpoint)
+    names = regressor.description.names
+    found: dict[str, dict[str, Any]] = {}
+    outside: list[str] = []
+    seconds = []
+    table = Table("episode", *names, f"{100 * level:.0f} % interval")
+    for path in episode_files(episodes):
+        episode = read_episode(path)
+        began = time.perf_counter()
+        try:
+            prediction = predict_episode(regressor, episode, seed=seed)
+        except EpisodeError as error:
+            raise EpisodeError(f"{path}: {error}") from error
+        seconds.append(time.perf_counter() - began)
+        values = dict(zip(names, prediction.values[0].tolist(), strict=True))
+        low, high = (end[0].tolist() for end in prediction.interval(level))
+        inside = dict(zip(names, prediction.inside[0].tolist(), strict=True))
+        beyond = [name for name in names if not inside[name]]
+        outside += [f"{path.stem}: {name} {values[name]:.3g}" for name in beyond]
+        clipped = dict(zip(names, prediction.clipped[0].tolist(), strict=True))
+        interval = {name: [low[i], high[i]] for i, name in enumerate(names)}
+        found[path.stem] = {**values, "outside": beyond, "clipped": clipped, "interval": interval}
+        ranges = ", ".join(f"{name} {a:.2f} to {b:.2f}" for name, a, b in zip(names, low, high, strict=True))
+        table.add_row(path.stem, *(f"{value:.3f}{'' if inside[name] else ' !'}" for name, value in values.items()), ranges)
+    show(table, json)
+    if outside:
+        bounds = ", ".join(f"{n} {list(b)}" for n, b in zip(names, regressor.description.bounds, strict=True))
+        errors.print(f"Outside the bounds ({bounds}), clipped only for a simulation: {'; '.join(outside)}.", markup=False)
+    if not json:
+        errors.print(f"{1e3 * sorted(seconds)[len(seconds) // 2]:.0f} ms an episode.")
+    finish(found, json)
+
+
+def predicted_start(name: str, scenario: str, episode: Episode) -> dict[str, float]:
+    """Parameter -> value within the bounds, for a fit to start from.
+
+    Args:
+        name: a model, for the pipeline's own checkpoint of the scenario, or the path of a checkpoint.
+
+    Raises:
+        ConfigError, CheckpointError, EpisodeError: no such checkpoint, one of another scenario, or an episode that lacks
+            the frames that it sees.
+    """
+    path = REGRESSORS / scenario / f"{name}.safetensors" if name in MODEL_NAMES else Path(name)
+    if name not in MODEL_NAMES and not path.is_file():
+        raise ConfigError(
+            f"A start is middle, PARAMETER=VALUE,..., {', '.join(MODEL_NAMES)} or a checkpoint, got {name!r}."
+        )
+    regressor = Regressor.read(path)
+    if regressor.description.scenario != scenario:
+        raise ConfigError(f"{path} was trained for {regressor.description.scenario}, not for {scenario}.")
+    prediction = predict_episode(regressor, episode)
+    return dict(zip(prediction.names, prediction.clipped[0].tolist(), strict=True))

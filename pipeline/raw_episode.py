@@ -1,0 +1,43 @@
+"""`diffcloud episode`: raw episodes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from diffcloud.sensing.validation import validate_raw_episode
+from pipeline.console import JsonFlag, errors, finish, output
+
+app = typer.Typer(no_args_is_help=True, help="Raw episodes: what cameras and arm recorded.")
+
+
+@app.callback()
+def episode() -> None:
+    """Raw episodes: what cameras and arm recorded."""
+
+
+@app.command()
+def validate(
+    folder: Annotated[Path, typer.Argument(help="Raw episode: holds episode.json, cameras/, robot.csv.")],
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file its cameras should be in.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Explain each fault of a raw episode; exit status 1 if there is one."""
+    findings = validate_raw_episode(folder, calibration=calibration)
+    faults = [finding for finding in findings if finding.severity == "fault"]
+    screen = errors if json else output
+    for finding in findings:
+        color = "red" if finding.severity == "fault" else "yellow"
+        place = escape(finding.place)
+        screen.print(
+            f"[bold {color}]{finding.severity}[/] {finding.code} in {place}: {escape(finding.message)}", soft_wrap=True
+        )
+    if not findings:
+        screen.print(f"{escape(str(folder))}: nothing wrong.")
+    finish({"episode": str(folder), "valid": not faults, "findings": [asdict(finding) for finding in findings]}, json)
+    if faults:
+        raise typer.Exit(1)

@@ -1,0 +1,104 @@
+"""`diffcloud simulate`: a set of simulated runs with drawn parameters, to train the regressors on."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from diffcloud.datasets import ParameterBox, ParameterDraws, SimulationPlan, simulate_set
+from pipeline.config import load_config, updated
+from pipeline.console import JsonFlag, ParamsFile, errors, finish, progress_bar, show, warn
+from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
+
+_INTERRUPTED = 130
+
+
+def simulate(
+    out: Annotated[Path, typer.Option(help="Folder of the set; an interrupted call is taken up again from OUT.partial.")],
+    scenario: ScenarioName = None,
+    scene: SceneFile = None,
+    params: ParamsFile = None,
+    train: Annotated[int | None, typer.Option(help="Runs to train on.")] = None,
+    test: Annotated[int | None, typer.Option(help="Runs to test on.")] = None,
+    draws: Annotated[str | None, typer.Option(help="uniform, sobol, or modes (the published mixture).")] = None,
+    parameters: Annotated[str | None, typer.Option(help="Comma-separated, e.g. stretch,mass.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the draws and of exported clouds.")] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=0, help="Local processes; 0: in this one. Default: one a core for more than a few runs, else 0."),
+    ] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, e.g. tcp://host:8786.")] = None,
+    export_clouds: Annotated[
+        bool, typer.Option("--export-clouds", help="Write every cloud too, to OUT/clouds/<split>/<run>/<frame>.npy.")
+    ] = False,
+    json: JsonFlag = False,
+) -> None:
+    """Simulate runs with drawn parameters. Ctrl-C keeps what is finished; the same call goes on from there."""
+    settings = updated(
+        load_config(params).simulate,
+        parameters=None if parameters is None else [name.strip() for name in parameters.split(",")],
+        draws=draws,
+        train=train,
+        test=test,
+        seed=seed,
+    )
+    chosen = choose_scenario(scenario, scene)
+    box = ParameterBox.build(settings.parameters, chosen.bounds)
+    plan = SimulationPlan(
+        chosen,
+        ParameterDraws(box, settings.draws, chosen.name, settings.seed),
+        {"train": settings.train, "test": settings.test},
+    )
+    begin = time.perf_counter()
+    with progress_bar(f"simulating {chosen.name}", settings.train + settings.test) as update:
+        try:
+            outcome = simulate_set(
+                plan,
+                out,
+                workers=workers,
+                scheduler=scheduler,
+                clouds=chosen.points if export_clouds else None,
+                progress=lambda done: update(done, ""),
+            )
+        except KeyboardInterrupt:
+            errors.print(f"Interrupted: finished runs are kept in {out}.partial; the same command goes on from there.")
+            raise typer.Exit(_INTERRUPTED) from None
+    if outcome.discarded:
+        warn(f"{out}.partial belonged to other settings or other code; it was started again.")
+    seconds = time.perf_counter() - begin
+    megabytes = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6
+    replaced = {split: len(entries) for split, entries in outcome.replaced.items()}
+    for split, count in replaced.items():
+        if count:
+            warn(f"{count} draws of {split} diverged and were replaced; {out / 'replaced.csv'} says which and why.")
+    table = Table("scenario", "train", "test", "draws", "parameters", "taken up", "seconds", "MB")
+    table.add_row(
+        chosen.name,
+        str(settings.train),
+        str(settings.test),
+        settings.draws,
+        ", ".join(box.names),
+        str(outcome.resumed),
+        f"{seconds:.1f}",
+        f"{megabytes:.1f}",
+    )
+    show(table, json)
+    finish(
+        {
+            "out": str(out),
+            "scenario": chosen.name,
+            "train": settings.train,
+            "test": settings.test,
+            "draws": settings.draws,
+            "parameters": list(box.names),
+            "resumed": outcome.resumed,
+            "replaced": replaced,
+            "seconds": seconds,
+            "megabytes": megabytes,
+        },
+        json,
+    )

@@ -1,0 +1,160 @@
+"""The capture code on two software D435s: alignment, recording, playback, and a camera that stops mid-run."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from diffcloud.errors import HardwareError
+from diffcloud.hardware import CaptureSettings, capture
+from diffcloud.hardware.realsense import RealSenseCamera, connected_cameras, import_realsense, play_recording
+from diffcloud.io.raw_episodes import read_raw_episode
+from diffcloud.sensing.validation import validate_raw_episode
+from tests.hardware.simulated import PointArm, short_path
+from tests.hardware.software_cameras import CX, CY, DEPTH_SCALE, FPS, FX, FY, HEIGHT, WIDTH, Cameras, numbered_depth
+
+try:
+    rs = import_realsense()
+except HardwareError as error:
+    pytest.skip(f"pyrealsense2 is not installed (pip install diffcloud[hardware]): {error}", allow_module_level=True)
+
+
+@pytest.fixture
+def make_cameras():
+    made = []
+
+    def make(**options):
+        made.append(Cameras(rs, **options))
+        return made[-1]
+
+    yield make
+    for cameras in made:
+        cameras.stop()
+
+
+def opened(cameras, recordings=None):
+    size = {"width": WIDTH, "height": HEIGHT, "fps": FPS}
+    return [
+        RealSenseCamera(name, serial, context=cameras.context, record_to=(recordings or {}).get(name), **size)
+        for name, serial in zip(("overhead", "side"), cameras.SERIALS, strict=True)
+    ]
+
+
+def test_connected_cameras_are_listed(make_cameras):
+    found = connected_cameras(make_cameras().context)
+    assert [camera["serial"] for camera in found] == ["111111111111", "222222222222"]
+    assert found[0]["name"] == "Intel RealSense D435"
+
+
+def test_a_serial_that_is_not_there(make_cameras):
+    camera = RealSenseCamera("side", "999", context=make_cameras().context)
+    with pytest.raises(HardwareError, match="no serial 999; connected are 111111111111, 222222222222"):
+        camera.open()
+    with pytest.raises(HardwareError, match="not open"):
+        camera.read(0.1)
+
+
+def test_a_hundred_pairs_recorded_written_and_played_back_bit_by_bit(tmp_path, make_cameras):
+    """Line by line: alignment, recording to .db3, the episode's PNGs, playback; nothing lost, nothing changed."""
+    cameras = make_cameras()
+    recordings = {name: tmp_path / f"{name}.db3" for name in ("overhead", "side")}
+    devices = opened(cameras, recordings)
+
+    def feed_once_recording(text):
+        if text == "recording":
+            cameras.feed(count=104)
+
+    settings = CaptureSettings(rate_hz=60.0, camera_timeout_s=1.5, durable=False)
+    with pytest.raises(HardwareError, match="delivered no frame"):  # once all 104 have come, however busy the machine is
+        capture(tmp_path / "e", devices, seconds=60, tell=feed_once_recording, settings=settings)
+    assert [device.dropped for device in devices] == [0, 0]
+    episode = read_raw_episode(tmp_path / "e")
+    for index, (name, camera) in enumerate(episode.cameras.items()):
+        info = camera.info
+        assert info.depth_scale_m == DEPTH_SCALE
+        held = info.intrinsics
+        assert (held.fx, held.fy, held.cx, held.cy) == pytest.approx((FX, FY, CX, CY), rel=1e-6)
+        assert (held.width, held.height) == (WIDTH, HEIGHT)
+        numbers = [int(camera.depth(frame)[0, 0]) for frame in range(len(camera.frames))]
+        assert len(numbers) == 104
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))  # none lost
+        for frame in (0, 50, 99):
+            np.testing.assert_array_equal(camera.depth(frame), numbered_depth(numbers[frame], index))
+            assert (camera.color(frame) == numbers[frame] % 256).all()
+        np.testing.assert_allclose(np.diff(camera.times), 1 / FPS, atol=2e-3)
+
+        with play_recording(recordings[name], name) as (played, frames):
+            assert (played.serial, played.depth_scale_m) == (info.serial, DEPTH_SCALE)
+            assert played.intrinsics == held
+            again = []
+            for frame in frames:
+                number = int(frame.depth[0, 0])
+                np.testing.assert_array_equal(frame.depth, numbered_depth(number, index))
+                again.append(number)
+        assert again == numbers
+
+
+def test_the_usual_scale_comes_back_exactly(tmp_path, make_cameras):
+    cameras = make_cameras(depth_scale=0.001)
+    camera = opened(cameras, {"overhead": tmp_path / "a.db3"})[0]
+    assert camera.open().depth_scale_m == 0.001
+    for number in range(1, 4):
+        cameras.cameras[0].push_numbered(number, time.time() * 1000 + 17 * number)
+    camera.read(2.0)
+    camera.close()
+    with play_recording(tmp_path / "a.db3", "overhead") as (info, frames):
+        assert info.depth_scale_m == 0.001
+        assert len(list(frames)) >= 1
+
+
+def test_depth_is_aligned_to_a_colour_camera_beside_it(make_cameras):
+    """Colour 15 mm to the side: a wall's left edge moves by f b / z pixels."""
+    cameras = make_cameras(baseline_m=0.015)
+    camera = opened(cameras)[0]
+    camera.open()
+    try:
+        depth = np.zeros((HEIGHT, WIDTH), np.uint16)
+        depth[:, 100:300] = 40
+        color = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        for number in range(1, 4):
+            cameras.cameras[0].push(number, depth, color, time.time() * 1000 + 33 * number)
+        frame = camera.read(2.0)
+    finally:
+        camera.close()
+    columns = np.flatnonzero(frame.depth[120] > 0)
+    assert columns[0] - 100 == pytest.approx(FX * 0.015 / (40 * DEPTH_SCALE), abs=1.0)
+    assert (frame.depth[120][columns] == 40).all()
+
+
+def test_a_camera_that_stops_mid_run_ends_the_capture_and_stops_the_arm(tmp_path, make_cameras):
+    cameras = make_cameras()
+    cameras.feed(dies_after=40)
+    arm = PointArm()
+    settings = CaptureSettings(rate_hz=10.0, hold_s=5.0, camera_timeout_s=0.7, durable=False)
+    with pytest.raises(HardwareError, match=r"Camera side \(222222222222\) delivered no frame for 0.7 s: unplugged"):
+        capture(tmp_path / "e", opened(cameras), arm=arm, trajectory=short_path(0.05, 0.8), settings=settings)
+    assert arm.stopped
+    assert "twist" in arm.events
+    cameras.stop()
+    episode = read_raw_episode(tmp_path / "e")
+    assert episode.description["status"] == "stopped"
+    side = episode.cameras["side"]
+    numbers = [int(side.depth(index)[0, 0]) for index in range(len(side.frames))]
+    assert numbers[-1] == 40  # all frames so far
+    faults = {finding.code for finding in validate_raw_episode(tmp_path / "e") if finding.severity == "fault"}
+    assert "truncated_image" not in faults
+
+
+def test_what_is_no_recording(tmp_path):
+    (tmp_path / "x.db3").write_bytes(b"nothing")
+    with (
+        pytest.raises(HardwareError, match="not a RealSense recording"),
+        play_recording(tmp_path / "x.db3", "side"),
+    ):
+        pass
+    with pytest.raises(HardwareError, match="No such recording"), play_recording(tmp_path / "none.db3", "side"):
+        pass
+    with pytest.raises(HardwareError, match=r"writes recordings as \.db3"):
+        RealSenseCamera("side", "1", record_to=tmp_path / "x.bag", context=Cameras(rs).context).open()

@@ -1,0 +1,270 @@
+"""Whatever ends a capture, the arm is stopped and what was recorded is kept."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from diffcloud.errors import DiffCloudError, EpisodeError, HardwareError, LimitError
+from diffcloud.hardware import CaptureSettings, Limits, capture
+from diffcloud.hardware.trajectory import ToolTrajectory
+from diffcloud.io.raw_episodes import read_raw_episode
+from diffcloud.sensing.validation import validate_raw_episode
+from tests.hardware.simulated import START, PointArm, TestCard, short_path
+
+BESIDE = np.add(START, [0.02, 0, 0])
+QUICK = CaptureSettings(rate_hz=50.0, hold_s=0.05, durable=False, watchdog_s=0.3)
+
+
+def run(folder, arm, *, cameras=None, path=None, limits=None, settings=QUICK):
+    cameras = [TestCard()] if cameras is None else cameras
+    return capture(folder, cameras, arm=arm, trajectory=path or short_path(), limits=limits, settings=settings)
+
+
+def test_a_capture_to_its_end(tmp_path):
+    arm, cameras = PointArm(), [TestCard("side"), TestCard("overhead")]
+    report = run(tmp_path / "e", arm, cameras=cameras)
+    assert arm.stopped
+    assert "close" not in arm.events  # the arm was lent
+    assert all(camera.events == ["open", "close"] for camera in cameras)
+    assert report.largest_error_m < 0.02
+    episode = read_raw_episode(tmp_path / "e")
+    assert episode.description["status"] == "complete"
+    for name, camera in episode.cameras.items():
+        assert report.frames[name] == len(camera.frames) > 10
+        numbers = [int(camera.depth(index)[0, 0]) for index in range(len(camera.frames))]
+        assert np.diff(numbers).tolist() == [1] * (len(numbers) - 1)  # none lost
+    log = episode.robot
+    assert np.interp(0.2, log.times, log.tool_position_m[:, 2]) == pytest.approx(START[2] + 0.02, abs=0.01)
+    assert log.tool_position_m[-1, 2] == pytest.approx(START[2] + 0.02, abs=0.002)
+    codes = {finding.code for finding in validate_raw_episode(tmp_path / "e")}
+    assert not codes & {"short_robot_log", "clock_backwards", "missing_frames"}
+
+
+def test_every_third_frame(tmp_path):
+    camera = TestCard(fps=200)
+    settings = CaptureSettings(rate_hz=50.0, hold_s=0.05, keep_every=3, durable=False)
+    run(tmp_path / "e", PointArm(), cameras=[camera], settings=settings)
+    kept = read_raw_episode(tmp_path / "e").cameras["side"]
+    assert {int(kept.depth(index)[0, 0] - kept.depth(index - 1)[0, 0]) for index in range(1, len(kept.frames))} == {3}
+
+
+def test_cameras_alone(tmp_path):
+    report = capture(tmp_path / "e", [TestCard()], seconds=0.1, settings=QUICK)
+    assert report.robot_rows == 0
+    assert read_raw_episode(tmp_path / "e").robot is None
+
+
+def test_the_start_is_approached_slowly_then_recorded(tmp_path):
+    arm = PointArm()
+    path = ToolTrajectory(np.array([0.0, 0.1]), np.array([BESIDE, np.add(BESIDE, [0, 0, 0.005])]))
+    run(tmp_path / "e", arm, path=path)
+    log = read_raw_episode(tmp_path / "e").robot
+    np.testing.assert_allclose(log.tool_position_m[0], BESIDE, atol=2e-3)
+
+
+def test_home_and_gripper(tmp_path):
+    arm = PointArm()
+    base = short_path()
+    path = ToolTrajectory(base.times, base.positions, np.array([0.0, 0, 1, 1, 1]))
+    run(tmp_path / "e", arm, path=path, settings=CaptureSettings(rate_hz=50, hold_s=0.05, go_home=True, durable=False))
+    assert arm.events[:3] == ["prepare", "home", "gripper 0"]
+    assert arm.events.count("gripper 1") == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"path": short_path(distance=0.9)}, "outside the workspace box"),
+        ({"path": short_path(distance=0.2)}, "moves at 1.000 m/s"),
+    ],
+)
+def test_refused_before_anything_opens_or_moves(tmp_path, changes, message):
+    arm, camera = PointArm(), TestCard()
+    with pytest.raises(LimitError, match=message):
+        run(tmp_path / "e", arm, cameras=[camera], **changes)
+    assert arm.events == camera.events == []
+    assert not (tmp_path / "e").exists()
+
+
+def test_other_refusals(tmp_path):
+    with pytest.raises(HardwareError, match="at least one camera"):
+        capture(tmp_path / "e", [], seconds=1)
+    with pytest.raises(HardwareError, match="--seconds"):
+        capture(tmp_path / "e", [TestCard()])
+    with pytest.raises(HardwareError, match="needs a trajectory"):
+        capture(tmp_path / "e", [TestCard()], arm=PointArm())
+    (tmp_path / "e").mkdir()
+    arm = PointArm()
+    with pytest.raises(EpisodeError, match="never overwritten"):
+        run(tmp_path / "e", arm)
+    assert arm.events == []
+
+
+def test_a_tool_outside_the_box_is_not_moved(tmp_path):
+    arm = PointArm()
+    with pytest.raises(LimitError, match=r"The tool is at .* outside the workspace box"):
+        run(tmp_path / "e", arm, limits=Limits(box_low_m=(0.4, -0.3, 0.315)), path=short_path_above())
+    assert "twist" not in arm.events
+
+
+def short_path_above():
+    base = short_path()
+    return ToolTrajectory(base.times, np.add(base.positions, [0, 0, 0.02]))
+
+
+def push(arm):
+    arm.wrench[2] = 50.0
+
+
+def twist_hard(arm):
+    arm.wrench[4] = 11.0
+
+
+def hold(arm):
+    arm.hold = True
+
+
+def throw(arm):
+    arm._position = np.add(arm._position, [0.0, 0.5, 0.0])
+
+
+def fail(arm):
+    raise HardwareError("the arm went into fault")
+
+
+def interrupt(arm):
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.05)
+
+
+def terminate(arm):
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(0.05)
+
+
+def bug(arm):
+    raise ZeroDivisionError("a bug")
+
+
+@pytest.mark.parametrize(
+    ("trouble", "kind", "message"),
+    [
+        (push, LimitError, "felt 50.0 N"),
+        (twist_hard, LimitError, "11.0 N·m"),
+        (throw, LimitError, "left the workspace box"),
+        (fail, HardwareError, "went into fault"),
+        (interrupt, KeyboardInterrupt, None),
+        (terminate, KeyboardInterrupt, "SIGTERM"),
+        (bug, ZeroDivisionError, "a bug"),
+    ],
+)
+def test_every_exit_stops_the_arm_and_keeps_the_data(tmp_path, trouble, kind, message):
+    arm = PointArm({9: trouble})
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(kind, match=message):
+        run(tmp_path / "e", arm)
+    assert arm.stopped
+    assert "twist" in arm.events
+    assert signal.getsignal(signal.SIGTERM) == before
+    episode = read_raw_episode(tmp_path / "e")
+    assert episode.description["status"] == "stopped"
+    assert len(episode.robot.times) >= 7
+    assert len(episode.cameras["side"].frames) >= 1
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith(("side", "watchdog"))]
+
+
+def test_an_arm_that_is_held_is_noticed_by_its_distance(tmp_path):
+    arm = PointArm({3: hold})
+    with pytest.raises(LimitError, match="mm from the trajectory"):
+        run(tmp_path / "e", arm, path=short_path(0.05, 0.2), limits=Limits(tracking_error_m=0.02, acceleration_m_s2=9))
+    assert arm.stopped
+
+
+def test_a_camera_that_dies(tmp_path):
+    arm = PointArm()
+    cameras = [TestCard("overhead"), TestCard("side", dies_after=6)]
+    with pytest.raises(HardwareError, match="Camera side delivered no frame"):
+        run(tmp_path / "e", arm, cameras=cameras)
+    assert arm.stopped
+    assert all("close" in camera.events for camera in cameras)
+    kept = read_raw_episode(tmp_path / "e").cameras["side"]
+    assert [int(kept.depth(index)[0, 0]) for index in range(len(kept.frames))] == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_full_disk_stops_the_arm(tmp_path, monkeypatch):
+    replace, count = os.replace, []
+
+    def full(source, target):
+        if str(target).endswith(".png"):
+            count.append(target)
+            if len(count) > 8:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    arm = PointArm()
+    with pytest.raises(DiffCloudError, match=r"Frame 4 of camera side could not be written.*No space left"):
+        run(tmp_path / "e", arm)
+    assert arm.stopped
+    episode = read_raw_episode(tmp_path / "e")
+    assert len(episode.cameras["side"].frames) == 4
+    assert "No space left" in episode.description["stop_reason"]
+
+
+def test_a_loop_that_hangs_is_stopped_by_the_watchdog(tmp_path):
+    stops = []
+
+    def hang(arm):
+        start = time.monotonic()
+        while time.monotonic() - start < 2 and "stop" not in arm.events:
+            time.sleep(0.01)
+        stops.append(time.monotonic() - start)
+
+    arm = PointArm({9: hang})
+    with pytest.raises(HardwareError, match="watchdog stopped the arm"):
+        run(tmp_path / "e", arm)
+    assert 0.2 < stops[0] < 1.0
+    assert arm.stopped
+
+
+def test_a_stop_that_fails_is_tried_again(tmp_path):
+    class Deaf(PointArm):
+        failures = 2
+
+        def stop(self):
+            if self.failures:
+                self.failures -= 1
+                raise HardwareError("no answer")
+            super().stop()
+
+    arm = Deaf({9: fail})
+    with pytest.raises(HardwareError, match="went into fault"):
+        run(tmp_path / "e", arm)
+    assert arm.stopped
+
+
+def test_a_closed_terminal_stops_the_arm(tmp_path):
+    """SIGHUP in a process of its own, whose default would be to die at once."""
+    code = """
+import os, signal, sys
+from diffcloud.hardware import CaptureSettings, capture
+from tests.hardware.simulated import PointArm, TestCard, short_path
+arm = PointArm({9: lambda arm: os.kill(os.getpid(), signal.SIGHUP)})
+try:
+    capture(sys.argv[1], [TestCard()], arm=arm, trajectory=short_path(), settings=CaptureSettings(rate_hz=50.0))
+except KeyboardInterrupt:
+    print("stopped" if arm.stopped else "moving")
+"""
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "e"], env=env, capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "stopped", done.stderr

@@ -1,0 +1,37 @@
+"""Commands in this process: a second instead of several, and hardware can be put in their way."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from typer.testing import CliRunner
+
+from diffcloud.errors import DiffCloudError
+from pipeline.app import app
+
+
+@dataclass(frozen=True)
+class Invoked:
+    """What a command printed."""
+
+    result: dict[str, Any]
+    """The JSON object, empty if there is none."""
+    errors: str
+    """Standard error, and the message of the project's own error, in one line."""
+
+
+def invoke(*arguments: object, code: int = 0, answer: str | None = None) -> Invoked:
+    """Run with --json and check the exit status; `answer` is typed at prompts."""
+    done = CliRunner().invoke(app, [*map(str, arguments), "--json"], input=answer)
+    errors = done.stderr
+    status = done.exit_code
+    if isinstance(done.exception, DiffCloudError):  # as pipeline.app.main reports it
+        errors += str(done.exception)
+    elif done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    assert status == code, f"status {status}\n{done.stdout}\n{errors}"
+    lines = done.stdout.strip().splitlines()
+    result = json.loads(lines[-1]) if lines and lines[-1].startswith("{") else {}
+    return Invoked(result, " ".join(errors.split()))

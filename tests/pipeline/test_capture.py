@@ -1,0 +1,125 @@
+"""`diffcloud capture` and `diffcloud doctor` as a person runs them, with a loopback arm and test cards for cameras."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from diffcloud.hardware import installed
+from diffcloud.hardware.kinova import KinovaArm
+from diffcloud.io.calibrations import Calibration, CameraCalibration, write_calibration
+from diffcloud.io.raw_episodes import read_raw_episode
+from pipeline import capture
+from tests.hardware.kortex.client import MINIMAL
+from tests.hardware.kortex.server import HOME_M, FakeArm
+from tests.hardware.simulated import SMALL, TestCard
+from tests.pipeline.invoke import invoke
+
+
+class Card(TestCard):
+    dropped = 0
+
+
+@pytest.fixture
+def server(monkeypatch):
+    with FakeArm(start=HOME_M) as arm:
+        monkeypatch.setattr(
+            capture,
+            "open_arm",
+            lambda address: KinovaArm(address, kortex=MINIMAL, tcp_port=arm.tcp_port, udp_port=arm.udp_port),
+        )
+        monkeypatch.setattr(capture, "make_camera", lambda name, serial, **options: Card(name, fps=60))
+        yield arm
+
+
+@pytest.fixture
+def path(tmp_path):
+    rows = np.column_stack([np.arange(6) / 10, np.tile(HOME_M, (6, 1)) + np.arange(6)[:, None] * [0.0, 0.0, 0.004]])
+    np.savetxt(tmp_path / "up.csv", rows, delimiter=",", header="t_s,x,y,z", comments="")
+    return tmp_path / "up.csv"
+
+
+BOTH = ("--camera", "overhead=1", "--camera", "side=2")
+
+
+def test_a_capture_is_written_and_valid(tmp_path, server, path):
+    cameras = {"serial-side": CameraCalibration("serial-side", SMALL, np.eye(4))}
+    write_calibration(tmp_path / "c.json", Calibration(cameras, "charuco"))
+    done = invoke(
+        "capture", "--out", tmp_path / "e", "--trajectory", path, "--arm", "127.0.0.1", *BOTH, "--yes",
+        "--calibration", tmp_path / "c.json", "--scenario", "lift", "--rate", 20, "--fps", 60,
+    )  # fmt: skip
+    assert server.stopped_after_last_twist()
+    assert server.sessions_open == 0
+    assert done.result["largest_error_m"] < 0.02
+    episode = read_raw_episode(tmp_path / "e")
+    assert {name: len(camera.frames) for name, camera in episode.cameras.items()} == done.result["frames"]
+    assert episode.description["scenario"] == "lift"
+    assert episode.description["trajectory"] == "up.csv"
+    np.testing.assert_array_equal(episode.cameras["side"].info.T_world_camera, np.eye(4))
+
+
+def test_a_dry_run_prints_the_plan_and_opens_nothing(tmp_path, server, path):
+    done = invoke("capture", "--out", tmp_path / "e", "--trajectory", path, "--arm", "a", *BOTH, "--dry-run")
+    assert done.result["plan"]["keyframes"] == 6
+    assert "Dry run: nothing was opened" in done.errors
+    assert "0.04 of 0.5 m/s" in done.errors
+    assert server.calls == []
+    assert not (tmp_path / "e").exists()
+
+
+def test_it_asks_before_the_arm_moves(tmp_path, server, path):
+    arguments = ("capture", "--out", tmp_path / "e", "--trajectory", path, "--arm", "127.0.0.1", "--camera", "side=2")
+    assert "The arm will move" in invoke(*arguments, answer="n\n", code=1).errors
+    assert server.calls == []
+    invoke(*arguments, answer="y\n")
+    assert "SendTwistCommand" in server.names()
+
+
+def test_one_camera_without_an_arm(tmp_path, server):
+    done = invoke("capture", "--out", tmp_path / "e", "--camera", "side=2", "--seconds", 0.2)
+    assert done.result["robot_rows"] == 0
+    assert done.result["frames"]["side"] >= 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--camera", "side"), "--camera takes NAME=SERIAL"),
+        (("--camera", "side=1", "--camera", "side=2"), "each name and serial once"),
+        (("--camera", "side=1", "--box", "1,2,3"), "--box takes x0,y0,z0,x1,y1,z1"),
+        (("--camera", "side=1", "--size", "big"), "--size takes WIDTHxHEIGHT"),
+        (("--camera", "side=1"), "say how long to record"),
+        (("--camera", "side=1", "--arm", "127.0.0.1", "--yes"), "An arm needs a trajectory"),
+        (("--camera", "side=1", "--box", "0.4,-0.3,0.1,0.9,0.3,0.44", "--trajectory", "up.csv"), "outside the workspace"),
+    ],
+)
+def test_bad_options(tmp_path, server, path, arguments, message, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert message in invoke("capture", "--out", "e", *arguments, code=1).errors
+    assert not (tmp_path / "e").exists()
+    assert "SendTwistCommand" not in server.names()
+
+
+def test_trouble_names_what_is_kept(tmp_path, server, path):
+    server.at_twist[4] = server.fault
+    done = invoke("capture", "--out", tmp_path / "e", "--trajectory", path, "--arm", "a.invalid", *BOTH, "--yes", code=1)
+    assert "No arm answers" in done.errors
+    done = invoke("capture", "--out", tmp_path / "e", "--trajectory", path, "--arm", "127.0.0.1", *BOTH, "--yes", code=1)
+    assert "went into fault: joint fault" in done.errors
+    assert "What was recorded so far is in" in done.errors
+    assert json.loads((tmp_path / "e" / "episode.json").read_text())["status"] == "stopped"
+
+
+def test_doctor_says_what_is_missing(server):
+    done = invoke("doctor", "--arm", "127.0.0.1")
+    states = {check["name"]: check["state"] for check in done.result["checks"]}
+    assert states["opencv-contrib-python-headless"] == "ok"
+    assert {"kortex_api", "disk", "arm"} <= set(states)
+    checks = {check.name: check for check in installed.check_installation(arm="127.0.0.1", arm_port=server.tcp_port)}
+    assert checks["arm"].state == "ok"
+    server.cut()
+    checks = {check.name: check for check in installed.check_installation(arm="127.0.0.1", arm_port=server.tcp_port)}
+    assert "does not answer" in checks["arm"].detail

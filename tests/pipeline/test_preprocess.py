@@ -1,0 +1,60 @@
+"""`diffcloud preprocess` on raw episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from diffcloud.io.episodes import read_episode
+from tests.pipeline.invoke import invoke
+from tests.sensing.cloth_scene import SETTINGS, write_cloth_episode
+
+
+@pytest.fixture
+def params(tmp_path) -> Path:
+    path = tmp_path / "params.yaml"
+    raw = {"flying_m": SETTINGS["flying_m"], "workspace_m": [list(corner) for corner in SETTINGS["workspace_m"]]}
+    settings = {"scenarios": ["lift"], "preprocess": {"raw": raw, "points": 800, "thinning": "voxel", "radius_m": 0.03}}
+    path.write_text(yaml.safe_dump(settings), encoding="utf-8")
+    return path
+
+
+def test_raw_episode_to_episode(tmp_path, params):
+    raw = write_cloth_episode(tmp_path / "raw" / "lift" / "blue1", frames=2).folder
+    done = invoke("preprocess", tmp_path / "raw", "--out", tmp_path / "episodes", "--params", params)
+    assert done.result["points"].keys() == {"blue1"}
+    episode = read_episode(tmp_path / "episodes" / "lift" / "blue1.npz")
+    assert episode.frame_count == 2
+    assert (np.diff(episode.offsets) <= 800).all()
+    assert episode.meta["quality"].keys() >= {
+        "points_per_view",
+        "masked_fraction",
+        "overlap_m",
+        "recorded",
+        "inliers",
+        "kept",
+    }
+    assert len(np.unique(episode.points[: episode.offsets[1]], axis=0)) == episode.offsets[1]
+    single = invoke("preprocess", raw, "--out", tmp_path / "single", "--params", params)  # by itself: the same
+    assert single.result["points"] == done.result["points"]
+    same = (tmp_path / "single" / "lift" / "blue1.npz").read_bytes()
+    assert same == (tmp_path / "episodes" / "lift" / "blue1.npz").read_bytes()
+
+
+def test_bad_robots_and_places(tmp_path, params):
+    raw = write_cloth_episode(tmp_path / "raw" / "blue1", frames=1).folder
+    common = (raw, "--out", tmp_path / "episodes", "--params", params)
+    assert "No such robot description" in invoke("preprocess", *common, "--urdf", tmp_path / "gone.urdf", code=1).errors
+    urdf = tmp_path / "robot.urdf"
+    urdf.write_text(
+        '<robot name="r"><link name="b"><visual><geometry><mesh filename="gone.stl"/></geometry></visual></link></robot>',
+        encoding="utf-8",
+    )
+    assert "gone.stl' is missing" in invoke("preprocess", *common, "--urdf", urdf, code=1).errors
+    description = raw / "episode.json"
+    description.write_text(description.read_text().replace('"lift"', '"../lift"'), encoding="utf-8")
+    assert "names no scenario" in invoke("preprocess", *common, code=1).errors
+    assert not (tmp_path / "episodes").exists()

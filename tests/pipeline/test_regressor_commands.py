@@ -1,0 +1,155 @@
+"""Training, predicting, and what takes predictions up, through the command line."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+
+import pandas as pd
+import pytest
+import yaml
+from click.testing import Result
+from typer.testing import CliRunner
+
+from diffcloud.errors import DiffCloudError
+from diffcloud.io.episodes import write_episode
+from diffcloud.io.simulated import write_simulated
+from diffcloud.regressors import Regressor
+from pipeline.app import app
+from tests.conftest import small_lift
+from tests.fit.test_fit import clouds_of
+from tests.pipeline.test_commands import DIFFCLOUD, ROOT, SMALL
+from tests.regressors.simulated import sagging_sheet
+from tests.regressors.test_checkpoints import regressor
+
+CHECKPOINT = "data/regressors/small/mlp.safetensors"
+TRAIN = ("train", "--scenario", "small", "--model", "mlp", "--data", "sim", "--out", CHECKPOINT, "--params", "params.yaml")
+
+
+def run(*arguments: object, code: int = 0) -> Result:
+    """A command in this process: what it imports takes seconds."""
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    raised = isinstance(done.exception, DiffCloudError)  # `main` makes a message and status 1 of it
+    assert (1 if raised else done.exit_code) == code, f"{done.output}\n{done.exception!r}"
+    return done
+
+
+def result(done: Result) -> dict:
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+@pytest.fixture
+def work(tmp_path, monkeypatch):
+    """A folder with two episodes of a small lift, made-up draws of it, and a regressor that knows nothing."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "raw" / "scenes").mkdir(parents=True)
+    (tmp_path / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump(SMALL))
+    params = {
+        "scenarios": ["small"],
+        "train": {"profile": "quick", "epochs": 2, "points": 24},
+        "fit": {"iterations": 1},
+        "evaluate": {"draws": 1},
+    }
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump(params))
+    for number in (1, 2):
+        clouds = clouds_of(small_lift(), stretch=0.7 * number, mass=1.0)
+        write_episode(tmp_path / "data" / "episodes" / "small" / f"e{number}.npz", clouds)
+    sets = {"train": sagging_sheet(24, scenario="small"), "test": sagging_sheet(10, seed=1, scenario="small")}
+    write_simulated(tmp_path / "sim", sets, about={}, replaced="")
+    regressor(scenario="small").write(tmp_path / CHECKPOINT)
+    return tmp_path
+
+
+def test_train_then_predict(work):
+    trained = result(run(*TRAIN, "--seed", 5, "--json"))
+    assert trained["epochs"] == 2
+    assert set(trained["held_out"]["parameters"]) == {"stretch", "mass"}
+    summary = json.loads((work / "data/regressors/small/mlp/training.json").read_text())
+    assert summary["history"] == trained["history"]
+    assert Regressor.read(work / CHECKPOINT).description.training["settings"]["seed"] == 5
+    done = run("predict", "--checkpoint", CHECKPOINT, "--json", "data/episodes/small")
+    found = result(done)
+    assert set(found) == {"e1", "e2"}
+    for values in found.values():
+        low, high = values["interval"]["mass"]
+        assert low < values["mass"] < high
+        assert 0.1 <= values["clipped"]["stretch"] <= 10
+        assert values["outside"] == [name for name in ("stretch", "mass") if not 0.1 <= values[name] <= 10]
+
+
+def test_values_outside_the_bounds_are_shown_and_told(work):
+    beyond = regressor(scenario="small")
+    beyond.network.head[-1].bias.data += 3
+    beyond.write(work / CHECKPOINT)
+    done = run("predict", "--checkpoint", CHECKPOINT, "--json", "data/episodes/small/e1.npz")
+    values = result(done)["e1"]
+    assert values["stretch"] > 10
+    assert values["clipped"] == {"stretch": 10, "mass": 10}
+    assert values["outside"] == ["stretch", "mass"]
+    assert "Outside the bounds" in done.stderr
+
+
+def test_a_fit_starts_from_a_prediction_and_the_report_shows_both(work):
+    episodes = "data/episodes/small"
+    predicted = result(run("predict", "--checkpoint", CHECKPOINT, "--json", episodes))
+    fit = ("fit", "--params", "params.yaml", "--scenario", "small", "--out", "data/fits/small", episodes)
+    run(*fit, "--init", "mlp")
+    for name, values in predicted.items():
+        start = json.loads((work / "data/fits/small" / f"{name}.json").read_text())["start"]
+        assert start == pytest.approx(values["clipped"], rel=1e-5)
+    done = run("evaluate", "--params", "params.yaml", "--json")
+    table = pd.read_csv(work / "reports/tables/predictions.csv")
+    assert table[["episode", "model"]].to_numpy().tolist() == [["e1", "mlp"], ["e2", "mlp"]]
+    assert table["predicted_mass"].tolist() == pytest.approx([values["mass"] for values in predicted.values()], rel=1e-5)
+    fits = pd.read_csv(work / "reports/tables/fits.csv")
+    assert table["loss"].tolist() == pytest.approx(fits["loss_start"].tolist(), rel=1e-4)  # the same simulation
+    assert result(done)["metrics"]["regressors"]["small"]["mlp"]["loss"] == pytest.approx(table["loss"].mean())
+    run(*TRAIN)  # for the curves
+    run("report", "--params", "params.yaml")
+    page = (work / "reports/index.html").read_text()
+    head, *scripts = page.split("<script>")
+    assert "Predictions of the regressors" in head
+    assert '"small / mlp"' in scripts[-1]
+    assert "{{" not in head + scripts[-1]
+
+
+def test_an_interrupted_training_goes_on(work):
+    options = ("--epochs", "4000", "--patience", "4000")
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    (work / CHECKPOINT).unlink()
+    process = subprocess.Popen([*DIFFCLOUD, *TRAIN, *options], cwd=work, env=env, stderr=subprocess.PIPE, text=True)
+    metrics = work / "data/regressors/small/mlp/metrics.json"
+    assert "Training mlp for small" in process.stderr.readline()
+    while process.poll() is None and not metrics.exists():  # until an epoch is done
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert errors.strip() == "Interrupted; the same command goes on from the last saved epoch."
+    assert "Traceback" not in errors
+    assert not (work / CHECKPOINT).exists()
+
+
+class TestBadInput:
+    def test_names_and_files(self, work):
+        episode = "data/episodes/small/e1.npz"
+        (work / "bad.safetensors").write_bytes(b"nothing")
+        regressor(scenario="fold").write(work / "fold.safetensors")
+        fit = ("fit", "--scenario", "small", "--out", "fits", episode, "--init")
+        for arguments, message in (
+            (("predict", "--checkpoint", "bad.safetensors", episode), "bad.safetensors is not a readable checkpoint"),
+            ((*fit, "meteornet"), "No such checkpoint: data/regressors/small/meteornet.safetensors"),
+            (
+                (*fit, "best"),
+                "A start is middle, PARAMETER=VALUE,..., mlp, pointnet2, meteornet or a checkpoint, got 'best'",
+            ),
+            ((*fit, "fold.safetensors"), "fold.safetensors was trained for fold, not for small"),
+            ((*TRAIN, "--scenario", "lift"), "sim holds draws of small, not of lift"),
+            ((*TRAIN, "--profile", "fast"), "profile: Input should be 'quick', 'reduced' or 'paper'"),
+        ):
+            done = run(*arguments, code=1)
+            assert message in str(done.exception)
+        assert not (work / "fits").exists()

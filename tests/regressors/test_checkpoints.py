@@ -1,0 +1,145 @@
+"""Files of weights: round trip, and what a damaged one says."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from diffcloud.errors import CheckpointError, EpisodeError
+from diffcloud.io.episodes import Episode
+from diffcloud.regressors import MODEL_NAMES, Description, Regressor, predict_episode
+from diffcloud.regressors.checkpoints import OutputScale, Prediction, laplace_reach
+
+
+def regressor(model="mlp", **changes):
+    torch.manual_seed(0)
+    told = Description(
+        **{
+            "model": model,
+            "scenario": "lift",
+            "names": ("stretch", "mass"),
+            "bounds": ((0.1, 10.0), (0.1, 10.0)),
+            "times": (0.3, 0.4, 0.5) if model == "meteornet" else (0.5,),
+            "frame_time": 0.1,
+            "points": 30,
+            "centre": (0.1, 0.2, 0.3),
+            "length": 2.0,
+            "order": "nearest",
+            "density": 0.125,
+            "spread": (0.1, 0.2),
+            **changes,
+        }
+    )
+    return Regressor(told, told.build().eval())
+
+
+def episode(frames=6, points=50, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    clouds = [torch.rand(points, 3, generator=generator).numpy() for _ in range(frames)]
+    return Episode.from_frames(clouds, torch.arange(frames).double().mul(0.1).numpy())
+
+
+@pytest.mark.parametrize("model", MODEL_NAMES)
+@pytest.mark.parametrize("heteroscedastic", [False, True])
+def test_a_regressor_comes_back_as_it_was(tmp_path, model, heteroscedastic):
+    first = regressor(model, heteroscedastic=heteroscedastic)
+    first.write(tmp_path / "a.safetensors")
+    second = Regressor.read(tmp_path / "a.safetensors")
+    assert second.description == first.description
+    a, b = predict_episode(first, episode()), predict_episode(second, episode())
+    assert torch.equal(a.values, b.values)
+    assert torch.equal(a.width, b.width)
+    second.write(tmp_path / "b.safetensors")
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+
+
+def test_frames_are_found_by_time(tmp_path):
+    """A recording at twice the rate that begins later gives the same prediction as the frames of the training."""
+    one = regressor("meteornet")
+    whole = episode(frames=6, points=30)  # as many as the network takes: the choice of points is a permutation
+    frames = [whole.frame(index) for index in range(6)]
+    quick = Episode.from_frames(
+        [frame for frame in frames[2:] for _ in (0, 1)], torch.arange(4, 12).double().mul(0.05).numpy()
+    )
+    torch.testing.assert_close(predict_episode(one, quick).values, predict_episode(one, whole).values, atol=1e-5, rtol=0)
+    with pytest.raises(EpisodeError, match=r"looks at 0.5 s, but the episode's 4 frames run from 0 to 0.3 s"):
+        predict_episode(one, Episode.from_frames(frames[:4], whole.times[:4]))
+
+
+def test_clouds_of_any_size_are_taken():
+    for points in (3, 5000):
+        assert predict_episode(regressor(), episode(points=points)).values.shape == (1, 2)
+
+
+def test_values_outside_are_told_and_clipped_only_for_a_simulation():
+    scale = OutputScale(torch.tensor([[0.1, 10.0], [1.0, 3.0]]), "linear")
+    fractions = torch.tensor([[0.5, 1.25]])
+    found = Prediction(("stretch", "mass"), scale.values(fractions), fractions, torch.ones(1, 2), scale)
+    torch.testing.assert_close(found.values, torch.tensor([[5.05, 3.5]]))
+    assert found.inside.tolist() == [[True, False]]
+    torch.testing.assert_close(found.clipped, torch.tensor([[5.05, 3.0]]))
+
+
+@pytest.mark.parametrize("target", ["linear", "logarithmic"])
+def test_scales_go_there_and_back(target):
+    scale = OutputScale(torch.tensor([[0.1, 10.0], [1.0, 3.0]]), target)
+    linear = torch.rand(5, 2)
+    low, high = scale.bounds.unbind(-1)
+    torch.testing.assert_close(scale.values(scale.from_linear(linear)), low + (high - low) * linear)
+    assert scale.values(torch.zeros(2)).tolist() == pytest.approx([0.1, 1.0])
+    assert scale.values(torch.ones(2)).tolist() == pytest.approx([10.0, 3.0])
+
+
+def test_intervals_of_a_laplace_distribution_hold_what_they_say():
+    draws = torch.distributions.Laplace(0.0, 2.0).sample((100_000,))
+    for level in (0.1, 0.5, 0.9):
+        assert float((draws.abs() <= 2.0 * laplace_reach(level)).float().mean()) == pytest.approx(level, abs=0.01)
+
+
+def damaged(path, change):
+    """Write a good checkpoint, changed."""
+    regressor().write(path)
+    tensors = load_file(path)
+    described = json.loads(regressor().description.model_dump_json())
+    change(tensors, described)
+    save_file(tensors, path, metadata={"diffcloud": json.dumps(described)})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda tensors, _: tensors.pop("head.0.norm.weight"), "head.0.norm.weight is missing or too much"),
+        (lambda tensors, _: tensors.update({"points.0.linear.weight": torch.zeros(64, 4)}), r"must be .* \[64, 3\], got"),
+        (lambda tensors, _: tensors["points.0.linear.bias"].fill_(float("nan")), "holds NaN"),
+        (lambda _, told: told.update(model="resnet"), "model: Input should be 'mlp'"),
+        (lambda _, told: told.update(points=10**9), "points: Input should be less than or equal to 1000000"),
+        (lambda _, told: told.update(spread=[1.0]), "2 names need as many bounds and spreads"),
+        (lambda _, told: told.update(bounds=[[1, 0], [0, 1]]), "bounds of stretch must be in order"),
+        (lambda _, told: told.update(extra=1), "extra: Extra inputs are not permitted"),
+    ],
+)  # fmt: skip
+def test_a_changed_file_is_refused_by_field(tmp_path, change, message):
+    damaged(tmp_path / "a.safetensors", change)
+    with pytest.raises(CheckpointError, match=message):
+        Regressor.read(tmp_path / "a.safetensors")
+
+
+def test_other_files_are_refused(tmp_path):
+    path = tmp_path / "a.safetensors"
+    with pytest.raises(CheckpointError, match="No such checkpoint"):
+        Regressor.read(path)
+    regressor().write(path)
+    whole = path.read_bytes()
+    for content in (b"", b"nothing", whole[:1000], whole[:-10], b"\xff" * 100):
+        path.write_bytes(content)
+        with pytest.raises(CheckpointError, match="not a readable checkpoint"):
+            Regressor.read(path)
+    torch.save({"model": 1}, path)
+    with pytest.raises(CheckpointError, match="not a readable checkpoint"):
+        Regressor.read(path)
+    save_file({"x": torch.zeros(1)}, path)
+    with pytest.raises(CheckpointError, match="lacks the description"):
+        Regressor.read(path)
