@@ -19,11 +19,14 @@ $(STAMP): pyproject.toml
 repro: venv
 	dvc repro
 
+# one process per core, each with one thread: a simulation step gains nothing from a second one
+TESTS := python -m pytest -n auto --maxprocesses 8 --dist worksteal
+
 test: lint
-	python -m pytest
+	$(TESTS)
 
 test-slow: venv
-	python -m pytest -m slow
+	$(TESTS) -m slow
 
 lint: venv
 	ruff check .

@@ -15,6 +15,7 @@ from pipeline.capture import record
 from pipeline.console import errors
 from pipeline.doctor import doctor
 from pipeline.episodes import episodes
+from pipeline.gradients import gradients
 from pipeline.predict import predict
 from pipeline.preprocess import preprocess
 from pipeline.simulate import simulate
@@ -38,6 +39,7 @@ app.command()(predict)
 app.command()(report.report)
 app.command()(rollout.rollout)
 app.command()(visibility)
+app.command()(gradients)
 app.command()(bench.bench)
 app.command("capture")(record)
 app.command()(calibrate)

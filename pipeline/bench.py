@@ -11,23 +11,31 @@ import torch
 import typer
 from rich.table import Table
 
-from diffcloud.fit.benchmark import time_episode
+from diffcloud.fit.benchmark import time_contact, time_episode
 from diffcloud.scene.scenarios import GridScenario, Scenario, built_in, grid_scenario
 from pipeline.console import JsonFlag, finish, progress_bar, show
 from pipeline.scenario_options import SceneFile, choose_scenario
 
 _BATCHES = (1, 16, 64)
 _SIDES = (7, 16, 32)
+_CONTACT_SIDES = (10, 14, 20, 28, 40)
 HEAD = ("scenario", "nodes", "steps", "batch", "forward s", "forward + backward s", "per episode s")
+CONTACT_HEAD = ("nodes", "contacts", "free ms a step", "on a sphere ms a step", "ms a contact")
 
 
 def bench(
     scene: SceneFile = None,
     repeats: Annotated[int, typer.Option(min=1, help="The fastest of these counts.")] = 3,
+    contact: Annotated[bool, typer.Option(help="What contacts cost instead: finer and finer cloths on a sphere.")] = False,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     json: JsonFlag = False,
 ) -> None:
     """Time lift episodes; with --scene the published lift too (25 steps)."""
+    if contact:
+        costs = contact_benchmarks(repeats=repeats)
+        show(contact_table(costs), json)
+        finish({"threads": torch.get_num_threads(), "timings": costs}, json)
+        return
     published = {} if scene is None else {"release_lift": scene}
     timings = run_benchmarks(published, repeats=repeats, device=device)
     show(benchmark_table(timings), json)
@@ -56,6 +64,37 @@ def run_benchmarks(published: Mapping[str, Path], *, repeats: int, device: str) 
                 {"scenario": name, **asdict(time_episode(scenario, batch=batch, repeats=repeats, device=device))}
             )
     return timings
+
+
+def contact_benchmarks(*, repeats: int) -> list[dict[str, Any]]:
+    """What one contact costs, over mesh sizes, in one run."""
+    timings = []
+    with progress_bar("bench", len(_CONTACT_SIDES)) as update:
+        for index, side in enumerate(_CONTACT_SIDES):
+            update(index, f"{side} x {side}")
+            timing = time_contact(side, repeats=repeats)
+            timings.append({**asdict(timing), "per_contact": timing.per_contact})
+    return timings
+
+
+def contact_table(timings: list[dict[str, Any]]) -> Table:
+    table = Table(*CONTACT_HEAD)
+    for row in contact_rows(timings):
+        table.add_row(*row)
+    return table
+
+
+def contact_rows(timings: list[dict[str, Any]]) -> list[list[str]]:
+    """The cells under `CONTACT_HEAD`, one row a timing."""
+    return [
+        [
+            str(entry["nodes"]),
+            f"{entry['contacts']:.0f}",
+            *(f"{1e3 * entry[key] / entry['steps']:.1f}" for key in ("free", "touching")),
+            f"{1e3 * entry['per_contact']:.2f}",
+        ]
+        for entry in timings
+    ]
 
 
 def benchmark_table(timings: list[dict[str, Any]]) -> Table:

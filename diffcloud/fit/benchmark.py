@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
+from diffcloud.mesh import grid_cloth, sphere_surface
 from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.build import Surrounding, build_system
+from diffcloud.sim.contact import ContactSettings, ReferenceContact
+from diffcloud.sim.energies import Handles
+from diffcloud.sim.materials import preset
+from diffcloud.sim.properties import scaled_properties
 from diffcloud.sim.simulate import rollout
+from diffcloud.sim.state import System
 
 
 @dataclass(frozen=True)
@@ -50,4 +58,58 @@ def time_episode(scenario: Scenario, *, batch: int, repeats: int = 3, device: st
         batch=batch,
         forward=min(once(False) for _ in range(repeats)),
         forward_backward=min(once(True) for _ in range(repeats)),
+    )
+
+
+@dataclass(frozen=True)
+class ContactTiming:
+    """Seconds of a cloth that falls onto a sphere, forward and with gradient, and of one that falls through the air."""
+
+    nodes: int
+    steps: int
+    contacts: float
+    """Repelling pairs, the mean over the steps."""
+    touching: float
+    free: float
+
+    @property
+    def per_contact(self) -> float:
+        """Seconds that one contact adds to one step, with its gradient."""
+        return (self.touching - self.free) / (self.steps * self.contacts)
+
+
+def time_contact(side: int, *, steps: int = 25, repeats: int = 3) -> ContactTiming:
+    """Time a square cloth of side x side nodes, half a metre wide, that is dropped on a sphere of 0.3 m.
+
+    The same cloth, sphere and steps for all sides; only the mesh is finer.
+    """
+    mesh = grid_cloth(side, side, 0.5, 0.5)
+    mesh = replace(mesh, nodes=mesh.nodes + np.array([0.0, 0.0, 0.005]))
+    sphere = sphere_surface((0.0, 0.0, -0.15), 0.15, subdivisions=3)
+
+    def build(surrounding: Surrounding) -> System:
+        return build_system(mesh, preset("basis-knit"), time_step=0.01, handles=Handles(()), surrounding=surrounding)
+
+    contact = ContactSettings(1e5, 0.004, 0.0004)
+    touching = build(Surrounding(obstacles=(sphere,), contact=contact, reference_contact=ReferenceContact()))
+    free = build(Surrounding())
+
+    def once(system: System) -> float:
+        values = {name: torch.ones(1, dtype=system.dtype, requires_grad=True) for name in ("stretch", "mass")}
+        begin = time.perf_counter()
+        properties = scaled_properties(system.properties, values, faces=system.stretching.elements.nodes)
+        rollout(system, steps, properties=properties).positions[:, -1].square().mean().backward()
+        return time.perf_counter() - begin
+
+    with torch.no_grad():
+        positions = rollout(touching, steps).positions[0]
+    assert touching.contact is not None
+    near = touching.contact.near(positions)  # all steps as a batch
+    contacts = 0 if near is None else len(near.pairs)
+    return ContactTiming(
+        nodes=len(mesh.nodes),
+        steps=steps,
+        contacts=contacts / len(positions),
+        touching=min(once(touching) for _ in range(repeats)),
+        free=min(once(free) for _ in range(repeats)),
     )

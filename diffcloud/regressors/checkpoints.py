@@ -214,7 +214,8 @@ class Regressor:
         with torch.device("meta"):
             network = described.build()
         _check_tensors(path, network, tensors)
-        network.load_state_dict(tensors, assign=True)
+        # copies, since kernels take other paths, with other last bits, where memory is not aligned as torch aligns it
+        network.load_state_dict({name: tensor.clone() for name, tensor in tensors.items()}, assign=True)
         return Regressor(described, network.eval())
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -59,6 +59,10 @@ class Scene:
                 [np.zeros((0, 3), np.int64), *(body.faces + n for body, n in zip(bodies, first[:-1], strict=True))]
             ),
         )
+
+    def implicit(self) -> Scene:
+        """The same scene with the implicit integrator, whose contact is its own."""
+        return replace(self, integrator="implicit", surrounding=replace(self.surrounding, reference_contact=None))
 
     def build(self, *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> tuple[System, State]:
         """(System, State at time zero with batch 1)."""

@@ -205,17 +205,18 @@ class ImplicitStep:
             size = direction.abs().amax((1, 2)) / speed
             rough = active & (size > _REUSE)
             bad = rough & (downhill <= 0)
-            if not bool(bad.any()):
-                trial, remaining, short = self._search(here, direction, downhill, start, room, active, rough)
+            going = active & ~bad  # the others wait for a better direction, without holding these up
+            if bool(going.any()):
+                trial, remaining, short = self._search(here, direction, downhill, start, room, going, rough & going)
                 arrived = (trial.scenery == self.scenery[1]).flatten(1).all(1)
-                before, change = change, torch.where(active, size, change)
+                before, change = change, torch.where(going, size, change)
                 expected = torch.where(before.isfinite(), change * (change / before).clamp(max=1.0), change)
                 settled = (expected < _TOLERANCE) | ((change < _ROUNDING) & (change > 0.3 * before))
                 here, residual = trial, remaining
-                active = active & ~(settled & arrived)
+                active = active & ~(going & settled & arrived)
                 if not bool(active.any()):
                     return here.u, room.near
-                bad = short
+                bad = bad | short
                 if not bool(bad.any()) and not bool(rough.any()) and bool((caution == 0).all()):
                     continue
             factor = None
@@ -280,7 +281,7 @@ class ImplicitStep:
         """`here` + α direction with the longest α up to the given [B] that has no collision on the way."""
         contact = self.setup.contact
         final = self.scenery[1]
-        for halving in range(_HALVINGS + 1):
+        for halving in range(_HALVINGS + 2):
             step = alpha[:, None, None]
             u = here.u + step * direction
             scenery = torch.where(step == 1, final, here.scenery + step * (final - here.scenery))
@@ -295,7 +296,8 @@ class ImplicitStep:
             if bool((fraction == 1).all()):
                 return _Place(u, scenery, points, self.setup.contact.measure(room.near, points))
             # what is straight in u is not quite straight in space where bodies turn: look again at the shorter step
-            alpha = alpha * torch.where(fraction < 1, fraction * (0.9 if halving else 1.0), 1.0)
+            shorter = fraction * (0.9 if halving else 1.0) if halving < _HALVINGS else torch.zeros_like(fraction)
+            alpha = alpha * torch.where(fraction < 1, shorter, 1.0)
         return here  # no step this way is free of collisions
 
     # --- forces ------------------------------------------------------------------------------------------------------

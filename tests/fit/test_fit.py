@@ -8,6 +8,8 @@ import torch
 
 from diffcloud.errors import ConfigError, DivergedError, EpisodeError
 from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
+from diffcloud.fit.agreement import Agreement, gradient_agreement, random_parameters
+from diffcloud.fit.benchmark import time_contact
 from diffcloud.fit.objective import track_displacement
 from diffcloud.fit.result import describe_fit, read_fit, write_fit
 from diffcloud.fit.visibility import visibility_map
@@ -270,3 +272,29 @@ def test_the_box_of_parameters_is_visible_at_camera_noise(name, linear):
     """At least 80 % of neighbouring pairs of a 5 x 5 grid differ by more than 4 mm RMS at the loss frame."""
     found = visibility_map(load_scenario(name), size=5, linear=linear)
     assert found.visible_fraction(4.0) >= 0.8
+
+
+class TestGradientAgreement:
+    def test_smooth_losses_agree(self, monkeypatch):
+        """In the air, where only truncation is between them."""
+        monkeypatch.setattr("diffcloud.fit.agreement.STEP", 1e-4)
+        scenario = small_lift(gap_m=0.5)
+        (found,) = gradient_agreement(scenario, np.array([[0.5, 0.3], [2.0, 1.5], [1.2, 0.8]]))
+        assert found.same_sign.all()
+        np.testing.assert_allclose(found.gradient, found.difference, rtol=1e-4)
+
+    def test_a_wrong_gradient_is_seen(self):
+        difference = np.array([[1.0, 1.0], [1.0, 0.0]])
+        found = Agreement(np.ones((2, 2)), np.array([[0.6, -1.0], [2.5, 0.0]]), difference)
+        assert found.same_sign.tolist() == [[True, False], [True, False]]
+        assert found.same_size.tolist() == [[True, False], [False, False]]
+
+    def test_more_pairs_begin_with_the_same(self):
+        scenario = small_lift()
+        assert (random_parameters(scenario, 5, seed=1)[:3] == random_parameters(scenario, 3, seed=1)).all()
+
+
+def test_contacts_of_a_cloth_on_a_sphere_cost_time():
+    timing = time_contact(8, steps=12, repeats=1)
+    assert timing.contacts > 0
+    assert timing.touching > timing.free

@@ -25,10 +25,9 @@ class Invoked:
 def invoke(*arguments: object, code: int = 0, answer: str | None = None) -> Invoked:
     """Run with --json and check the exit status; `answer` is typed at prompts."""
     done = CliRunner().invoke(app, [*map(str, arguments), "--json"], input=answer)
-    errors = done.stderr
-    status = done.exit_code
+    errors, status = done.stderr, done.exit_code
     if isinstance(done.exception, DiffCloudError):  # as pipeline.app.main reports it
-        errors += str(done.exception)
+        errors, status = errors + str(done.exception), 1
     elif done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
     assert status == code, f"status {status}\n{done.stdout}\n{errors}"

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
+from diffcloud.fit import Objective
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.obj import read_cloth
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
+from tests.pipeline.invoke import Invoked, invoke
 
-DIFFCLOUD = [sys.executable, "-m", "pipeline.app"]
 ROOT = Path(__file__).parents[2]
 SMALL = {
     "base": "lift",
@@ -31,16 +31,9 @@ SMALL = {
 }
 
 
-def run(*arguments: object, cwd: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([*DIFFCLOUD, *map(str, arguments)], cwd=cwd, env=env, capture_output=True, text=True, timeout=120)
-    assert done.returncode == code, f"status {done.returncode}\n{done.stdout}\n{done.stderr}"
-    assert "Traceback" not in done.stderr
-    return done
-
-
-def result(done: subprocess.CompletedProcess[str]) -> dict:
-    return json.loads(done.stdout.strip().splitlines()[-1])
+def run(*arguments: object, cwd: Path, code: int = 0) -> Invoked:
+    with contextlib.chdir(cwd):
+        return invoke(*arguments, code=code)
 
 
 @pytest.fixture
@@ -53,7 +46,7 @@ def work(tmp_path):
 def test_rollout_writes_the_contract_and_exports(work):
     done = run(
         "rollout", "--scenario", "small.yaml", "--set", "stretch=0.5", "--set", "mass=5", "--frames", 3, "--out", "run.npz",
-        "--obj", "obj", "--ply", "ply", "--json", cwd=work,
+        "--obj", "obj", "--ply", "ply", cwd=work,
     )  # fmt: skip
     with np.load(work / "run.npz") as data:
         assert data["nodes"].shape == (4, 25, 3)
@@ -61,26 +54,26 @@ def test_rollout_writes_the_contract_and_exports(work):
         assert data["faces"].dtype == np.int64
         assert data["times"].tolist() == pytest.approx([0, 0.1, 0.2, 0.3])
         last = data["nodes"][-1]
-    assert result(done)["parameters"] == {"stretch": 0.5, "mass": 5.0}
+    assert done.result["parameters"] == {"stretch": 0.5, "mass": 5.0}
     np.testing.assert_array_equal(read_cloth(work / "obj" / "003.obj").nodes, last)
     assert len(list((work / "ply").iterdir())) == 4
 
 
 def test_fit_then_replay_and_measure(work):
     done = run(
-        "fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 3, "--starts", 2, "--fix", "mass=1.0", "--json",
+        "fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 3, "--starts", 2, "--fix", "mass=1.0",
         "e1.npz", cwd=work,
     )  # fmt: skip
     summary = json.loads((work / "fits" / "e1.json").read_text())
-    assert result(done)["fits"]["e1"]["loss"] == summary["loss"]
+    assert done.result["fits"]["e1"]["loss"] == summary["loss"]
     assert {"loss", "loss_start", "iterations", "seconds", "stop_reason", "parameters"} <= set(summary)
     assert {"value", "unit"} <= set(summary["parameters"]["stretch"])
     value = summary["parameters"]["stretch"]["value"]
     measured = run(
-        "evaluate", "loss", "--scenario", "small.yaml", "--set", f"stretch={value!r}", "--set", "mass=1.0", "--json",
+        "evaluate", "loss", "--scenario", "small.yaml", "--set", f"stretch={value!r}", "--set", "mass=1.0",
         "e1.npz", cwd=work,
     )  # fmt: skip
-    assert result(measured)["loss"] == pytest.approx(summary["loss"], rel=1e-9)  # same metric, same points
+    assert measured.result["loss"] == pytest.approx(summary["loss"], rel=1e-9)  # same metric, same points
     run("rollout", "--scenario", "small.yaml", "--fit", "fits/e1.json", "--episode", "e1.npz", "--out", "r.npz", cwd=work)
     with np.load(work / "r.npz") as replay, np.load(work / "fits" / "e1.npz") as fitted:
         np.testing.assert_allclose(replay["nodes"], fitted["nodes"], atol=1e-12)
@@ -93,16 +86,28 @@ def test_joint_fit_gives_one_result(work):
     assert sorted(path.name for path in (work / "fits").iterdir()) == ["joint.json", "joint.npz"]
 
 
-def test_interrupted_fit_leaves_the_best_so_far(work):
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [*DIFFCLOUD, "fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", "100000", "e1.npz"]
-    process = subprocess.Popen(command, cwd=work, env=env, stderr=subprocess.PIPE, text=True)
-    assert "Fitting e1" in process.stderr.readline()
-    time.sleep(3)  # an iteration takes milliseconds
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130, errors
-    assert "best so far" in errors
+def test_a_process_says_what_is_wrong_without_a_traceback(work):
+    command = [sys.executable, "-m", "pipeline.app", "fit", "--scenario", "nothing", "--out", "fits", "e1.npz"]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=work, env=env, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    assert done.stderr.startswith("Error: ")
+    assert "Traceback" not in done.stderr
+
+
+def test_interrupted_fit_leaves_the_best_so_far(work, monkeypatch):
+    calls = []
+
+    def evaluate(self, *arguments):
+        calls.append(0)
+        if len(calls) == 4:
+            raise KeyboardInterrupt  # as Ctrl-C does
+        return evaluated(self, *arguments)
+
+    evaluated = Objective.__call__
+    monkeypatch.setattr(Objective, "__call__", evaluate)
+    done = run("fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 100, "e1.npz", cwd=work, code=130)
+    assert "best so far" in done.errors
     summary = json.loads((work / "fits" / "e1.json").read_text())
     assert summary["stop_reason"] == "interrupted"
     assert summary["loss"] <= summary["loss_start"]
@@ -171,7 +176,7 @@ def test_simulated_targets_are_whole_uniform_and_left_as_they_are(work):
     flags = [word for value in values for word in ("--set", value)]
     done = run("evaluate", "loss", "--scenario", "v", *flags, "--json", "episodes/v/v_hidden3.npz", cwd=work)
     area = float(built_in_mesh("vest_hang").face_area.sum())
-    assert result(done)["loss"] < 2 * area / (np.pi * 900)  # twice the mean squared distance to the nearest of 900 points
+    assert done.result["loss"] < 2 * area / (np.pi * 900)  # twice the mean squared distance to the nearest of 900 points
 
 
 def test_rollouts_carry_the_bodies_to_draw(work):
@@ -209,20 +214,20 @@ class TestBadInput:
         done = run(
             "fit", "--params", "params.yaml", "--scenario", "small.yaml", "--out", "fits", "e1.npz", cwd=work, code=1
         )
-        assert message in done.stderr.replace("\n", " ")
+        assert message in done.errors
         assert not (work / "fits").exists()
 
     def test_a_damaged_last_episode_costs_nothing(self, work):
         (work / "e2.npz").write_bytes(b"nothing")
         done = run("fit", "--scenario", "small.yaml", "--out", "fits", "e1.npz", "e2.npz", cwd=work, code=1)
-        assert "e2.npz is not a readable episode" in done.stderr
+        assert "e2.npz is not a readable episode" in done.errors
         assert not (work / "fits").exists()
 
     def test_an_episode_that_is_too_short(self, work):
         short = Episode.from_frames([np.zeros((3, 3))] * 2, np.array([0.0, 0.1]))
         write_episode(work / "short.npz", short)
         done = run("fit", "--scenario", "small.yaml", "--out", "f", "--frame", 5, "short.npz", cwd=work, code=1)
-        assert "Frame 5 is missing: the episode has 2 frames" in done.stderr
+        assert "Frame 5 is missing: the episode has 2 frames" in done.errors
 
     def test_unknown_names_and_numbers(self, work):
         for arguments, message in (
@@ -233,16 +238,25 @@ class TestBadInput:
             (("--scene", "none.json"), "No such file"),
         ):
             done = run("rollout", *arguments, "--out", "r.npz", cwd=work, code=1)
-            assert message in done.stderr
+            assert message in done.errors
             assert not (work / "r.npz").exists()
 
     def test_a_diverged_rollout_names_step_and_parameters(self, work):
         done = run("rollout", "--scenario", "small.yaml", "--set", "stretch=-1e9", "--out", "r.npz", cwd=work, code=1)
-        assert "diverged at step" in done.stderr
-        assert "stretch=-1e+09" in done.stderr
+        assert "diverged at step" in done.errors
+        assert "stretch=-1e+09" in done.errors
         assert not (work / "r.npz").exists()
 
     def test_a_disk_that_cannot_be_written(self, work):
         (work / "file").write_text("")
         done = run("rollout", "--scenario", "small.yaml", "--out", "file/r.npz", cwd=work, code=1)
-        assert "Cannot write" in done.stderr
+        assert "Cannot write" in done.errors
+
+
+def test_a_study_of_gradients_goes_on_where_it_stopped(work):
+    options = ["gradients", "--scenario", "small.yaml", "--out", "pairs.csv"]
+    run(*options, "--pairs", 2, cwd=work)
+    first = (work / "pairs.csv").read_text().splitlines()
+    assert run(*options, "--pairs", 3, cwd=work).result["pairs"] == 3
+    assert (work / "pairs.csv").read_text().splitlines()[:3] == first
+    assert "other pairs" in run(*options, "--pairs", 3, "--seed", 1, cwd=work, code=1).errors

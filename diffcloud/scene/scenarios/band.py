@@ -28,7 +28,7 @@ class BandScenario(ScenarioOptions):
     contact_thickness_m: Positive = 0.008
     contact_stiffness: NonNegative = 1e6
     circumference_m: Positive = 1.75
-    width_m: Positive = 0.05
+    width_m: Positive = 0.12
     nodes: tuple[Annotated[int, Field(ge=4)], Annotated[int, Field(ge=2)]] = (32, 2)
     """Node counts along the band and across it."""
     center_m: tuple[float, float, float] = (0.0, 0.0, 1.0)

@@ -1,0 +1,74 @@
+"""`diffcloud gradients`: how often the simulator's derivatives agree with finite differences at random parameters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import pandas as pd
+import typer
+from numpy.typing import NDArray
+from rich.table import Table
+
+from diffcloud.errors import ConfigError
+from diffcloud.fit.agreement import NAMES, Agreement, gradient_agreement, random_parameters
+from diffcloud.io.files import write_text
+from pipeline.console import JsonFlag, finish, progress_bar, show
+from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
+
+_COLUMNS = [f"{kind}{name}" for kind in ("", "gradient_", "difference_") for name in NAMES]
+
+
+def gradients(
+    scenario: ScenarioName = None,
+    scene: SceneFile = None,
+    implicit: Annotated[bool, typer.Option("--implicit", help="Instead of the scenario's own integrator.")] = False,
+    pairs: Annotated[int, typer.Option(min=1, help="Random (stretch, mass), uniform over their bounds.")] = 50,
+    seed: Annotated[int, typer.Option(min=0, help="Of the pairs.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="CSV of all pairs; one that is there is gone on with.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Sign and size of d loss/d parameter against the central difference of ±1 %; the loss is the mean squared node
+    distance at the loss frame to the run at (1, 1)."""
+    chosen = choose_scenario(scenario, scene)
+    if implicit:
+        chosen = replace(chosen, scene=chosen.scene.implicit())
+    drawn = random_parameters(chosen, pairs, seed=seed)
+    done = _read(out, drawn)
+    with progress_bar("gradients", pairs) as update:
+        update(len(done), "")
+        for found in gradient_agreement(chosen, drawn[len(done) :]):
+            done = np.concatenate([done, np.hstack([found.parameters, found.gradient, found.difference])])
+            if out is not None:
+                write_text(out, pd.DataFrame(done, columns=_COLUMNS).to_csv(index=False))
+            update(len(done), "")
+    agreement = Agreement(*np.split(done[:pairs], 3, axis=1))
+    table = Table("parameter", "pairs", "sign %", "within 2 %")
+    shares = {}
+    for index, name in enumerate(NAMES):
+        shares[name] = {
+            "sign": float(agreement.same_sign[:, index].mean()),
+            "within_2": float(agreement.same_size[:, index].mean()),
+        }
+        table.add_row(name, str(pairs), *(f"{100 * share:.0f}" for share in shares[name].values()))
+    show(table, json)
+    finish({"scenario": chosen.name, "integrator": chosen.scene.integrator, "pairs": pairs, "shares": shares}, json)
+
+
+def _read(path: Path | None, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[n, 6] rows of an earlier run of the same pairs."""
+    if path is None or not path.exists():
+        return np.empty((0, len(_COLUMNS)))
+    try:
+        table = pd.read_csv(path)
+        rows = table[_COLUMNS].to_numpy(dtype=np.float64)
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(
+            f"{path} is not a table that `diffcloud gradients` wrote: {error}. Choose another --out."
+        ) from error
+    common = min(len(rows), len(drawn))
+    if not np.allclose(rows[:common, : len(NAMES)], drawn[:common], rtol=1e-12):
+        raise ConfigError(f"{path} holds other pairs (another seed or scenario). Choose another --out.")
+    return rows[: len(drawn)]
