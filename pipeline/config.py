@@ -115,6 +115,8 @@ class FitConfig(Section):
     learning_rate: Positive | None = None
     """The scenario's own if not given."""
     starts: Count = 1
+    screen: Annotated[int, Field(ge=0)] = 0
+    """Candidates simulated once to choose the starts after the first from; 0: these are spread over the box."""
     smoothing: NonNegative = 0.5
     """Standard deviation, on the sigmoid's axis, of the first start's perturbed copies, whose gradients are averaged; 0:
     the plain gradient, as the paper has it."""

@@ -35,6 +35,7 @@ def fit(
     iterations: Annotated[int | None, typer.Option(help="Updates at most.")] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Default: the scenario's.")] = None,
     starts: Annotated[int | None, typer.Option(help="Starts fitted together; the first is --init.")] = None,
+    screen: Annotated[int | None, typer.Option(help="Simulate this many candidates and start from the best.")] = None,
     init: Annotated[
         str,
         typer.Option(
@@ -61,6 +62,7 @@ def fit(
         iterations=iterations,
         learning_rate=learning_rate,
         starts=starts,
+        screen=screen,
         smoothing=smoothing,
         threshold=threshold,
         points=points,
@@ -94,6 +96,7 @@ def fit(
         iterations=settings.iterations,
         threshold=chosen.threshold if settings.threshold is None else settings.threshold,
         starts=settings.starts,
+        screen=settings.screen,
         seed=settings.seed,
         resample=settings.resample,
         smoothing=settings.smoothing,

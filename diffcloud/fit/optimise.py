@@ -42,6 +42,10 @@ class AdamSettings:
     """Perturbed copies of the first start, in antithetic pairs; even."""
     init: Mapping[str, float] = field(default_factory=dict)
     """Values of the first start; the middle of the range where not given."""
+    screen: int = 0
+    """Candidates that are simulated once, without gradients; the further starts are the best of them. 0: starts are spread
+    over the box unseen. Where the loss is rough or has many valleys, a start near the right one is worth more than
+    many iterations from elsewhere, and a simulation without gradient costs less than half."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +111,7 @@ def fit_adam(
     """
     began = time.perf_counter()
     device, dtype = objective.system.device, objective.system.dtype
-    start_values, logarithmic = space.starts(settings.starts, seed=settings.seed, first=settings.init)
-    start_values, logarithmic = start_values.to(device, dtype), logarithmic.to(device)
+    start_values, logarithmic, evaluations = _starts(objective, space, settings)
     unbounded = space.unbounded(start_values, logarithmic).requires_grad_(True)
     optimiser = torch.optim.Adam([unbounded], lr=settings.learning_rate)
     generator = torch.Generator().manual_seed(settings.seed)
@@ -117,7 +120,6 @@ def fit_adam(
     failures: list[str] = []
     best = _Best(float("inf"), 0, start_values[0])
     reason: StopReason = "iterations"
-    evaluations = 0
     try:
         for iteration in range(settings.iterations + 1):
             if settings.resample and iteration:
@@ -190,6 +192,36 @@ class _Best:
     start: int
     values: Tensor
     """[k]"""
+
+
+def _starts(objective: Objective, space: FitSpace, settings: AdamSettings) -> tuple[Tensor, Tensor, int]:
+    """Initial values [B, k], which scale each uses [B], and how many simulations it took to choose them."""
+    system = objective.system
+    screened = settings.starts > 1 and settings.screen >= settings.starts
+    count = 1 + settings.screen if screened else settings.starts
+    values, logarithmic = space.starts(count, seed=settings.seed, first=settings.init)
+    values, logarithmic = values.to(system.device, system.dtype), logarithmic.to(system.device)
+    if not screened:
+        return values, logarithmic, 0
+    order = _losses(objective, space, values[1:]).argsort()[: settings.starts - 1] + 1
+    chosen = torch.cat([order.new_zeros(1), order])
+    return values[chosen], logarithmic[chosen], settings.screen
+
+
+@torch.no_grad()
+def _losses(objective: Objective, space: FitSpace, values: Tensor) -> Tensor:
+    """[B] losses of values [B, k]; infinite where the simulation diverges."""
+    losses = torch.full_like(values[:, 0], torch.inf)
+    left = torch.arange(len(values), device=values.device)
+    while len(left):
+        try:
+            losses[left] = objective(*space.split(values[left]))
+            break
+        except DivergedError as error:
+            keep = torch.ones(len(left), dtype=torch.bool, device=left.device)
+            keep[error.entries] = False
+            left = left[keep]
+    return losses
 
 
 def _trials(settings: AdamSettings, unbounded: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:

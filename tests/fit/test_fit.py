@@ -274,6 +274,19 @@ def test_the_box_of_parameters_is_visible_at_camera_noise(name, linear):
     assert found.visible_fraction(4.0) >= 0.8
 
 
+def test_screened_starts_are_the_best_candidates():
+    scenario = small_lift()
+    objective = Objective(scenario, [clouds_of(scenario, stretch=0.4, mass=1.5)])
+    space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
+    outcome = fit_adam(objective, space, AdamSettings(starts=4, screen=15, iterations=0))
+    candidates, _ = space.starts(16, seed=0)
+    with torch.no_grad():
+        losses = objective(*space.split(candidates))
+    expected = torch.cat([losses[:1], losses[1:].sort().values[:3]])
+    assert torch.allclose(outcome.history.losses[0], expected, rtol=1e-9)
+    assert outcome.evaluations == 15 + 4
+
+
 class TestGradientAgreement:
     def test_smooth_losses_agree(self, monkeypatch):
         """In the air, where only truncation is between them."""

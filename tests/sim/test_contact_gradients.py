@@ -125,6 +125,7 @@ def test_forward_mode_agrees_with_reverse_mode(case):
         assert float(found[row]) == pytest.approx(reverse[name], rel=1e-8, abs=1e-12), name
 
 
+@pytest.mark.slow  # 104 episodes
 def test_central_differences_agree(case):
     """The step is swept; what is left is truncation and rounding."""
     system, weights, values, directions, reverse = case
