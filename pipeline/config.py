@@ -9,6 +9,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from diffcloud.errors import ConfigError
+from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
 from diffcloud.regressors.settings import Loss, Profile, Target
 from diffcloud.scene.schema import NonNegative, Positive, explain
 from diffcloud.sensing.filters import Thinning
@@ -161,11 +162,29 @@ class TrainConfig(Section):
 
 
 class EvaluateConfig(Section):
-    """Measuring fits."""
+    """Comparing methods, and what can be known of the parameters."""
 
     draws: Count = 4
     """Fresh point samples that a loss is averaged over."""
     seed: int = 1000
+    rivals: list[Rival] = list(RIVALS)
+    """Methods beside the fits and the networks; searches may simulate as often as a fit from one start."""
+    identifiability: bool = True
+    landscapes: Annotated[int, Field(ge=0)] = 1
+    """Episodes of each scenario, the first ones by name, whose loss landscape is simulated."""
+    landscape_size: Annotated[int, Field(ge=2)] = 7
+    """Places along each of its axes."""
+    workers: Count = 1
+    """Processes, one episode each; they change nothing but the time."""
+
+    def comparison(self, *, landscape: bool) -> ComparisonSettings:
+        return ComparisonSettings(
+            rivals=tuple(self.rivals),
+            draws=self.draws,
+            seed=self.seed,
+            identifiability=self.identifiability,
+            landscape_size=self.landscape_size if landscape else 0,
+        )
 
 
 class ReportConfig(Section):

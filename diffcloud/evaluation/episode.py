@@ -129,19 +129,19 @@ def compare_episode(
 
 def _run(rival: Rival, objective: Objective, space: FitSpace, fit: Mapping[str, Any], seed: int) -> Estimate | Gap:
     """One rival with the budget of a single-start fit; a gap if its simulations fail."""
-    search = {"simulations": int(fit["iterations"]) + 1, "threshold": float(fit["threshold"]), "seed": seed}
+    simulations, threshold = int(fit["iterations"]) + 1, float(fit["threshold"])
     objective.reseed(int(fit["seed"]))
     try:
         if rival == "middle":
             return methods.middle(space)
         if rival == "random_search":
-            return methods.random_search(objective, space, **search)
+            return methods.random_search(objective, space, simulations=simulations, threshold=threshold, seed=seed)
         if rival == "cma_es":
-            return methods.cma_es(objective, space, **search)
+            return methods.cma_es(objective, space, simulations=simulations, threshold=threshold, seed=seed)
         adam = AdamSettings(
             learning_rate=float(fit["learning_rate"]),
             iterations=int(fit["iterations"]),
-            threshold=float(fit["threshold"]),
+            threshold=threshold,
             seed=int(fit["seed"]),
             resample=bool(fit["resample"]),
         )

@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -103,7 +104,7 @@ def identify(
     eigenvalues, directions = np.maximum(eigenvalues[order], 0.0), _signed(columns[:, order].T)
     limit = 0.5 * noise  # one standard deviation
     predicted = np.sqrt(limit / np.maximum(eigenvalues, 1e-300))
-    interval, open_, lowest = _scan(probe, centre, directions, limit)
+    interval, open_ends, lowest = _scan(probe, centre, directions, limit)
     widths = interval.max(axis=1)
     half_widths = np.sqrt(((directions * widths[:, None]) ** 2).sum(axis=0))
     names = list(space.names)
@@ -115,7 +116,7 @@ def identify(
         "directions": directions.tolist(),
         "predicted": [_finite(value) for value in predicted],
         "interval": interval.tolist(),
-        "open": open_.tolist(),
+        "open": open_ends.tolist(),
         "half_widths": dict(zip(names, half_widths.tolist(), strict=True)),
         "check": _check(probe, centre, directions, interval, noise),
         "lower": lowest,
@@ -147,7 +148,7 @@ def verdicts(
     """
     near = math.log(IDENTIFIED_WITHIN)
     # a parameter has its part in a combination that is known: more than a third of the direction's length
-    shared = ((np.abs(directions) > 1 / 3) & (widths <= near)[:, None]).any(axis=0)
+    shared: NDArray[np.bool_] = np.any((np.abs(directions) > 1 / 3) & (widths <= near)[:, None], axis=0)
     found: list[Verdict] = []
     for index, name in enumerate(names):
         if half_widths[index] <= near:
@@ -178,7 +179,8 @@ class _Probe:
         count, draws = len(next(iter(parameters.values()))), draws or self.draws
         seeds = range(self.seed + first, self.seed + first + draws)
 
-        def losses(index: Tensor) -> Tensor:
+        def losses(part: Tensor, kept: Tensor) -> Tensor:
+            index = part[kept]
             run = self._objective.simulate({name: value[index] for name, value in parameters.items()})
             shift = {name: value[index] for name, value in offset.items()}
             rows = []
@@ -191,7 +193,7 @@ class _Probe:
         with torch.no_grad():
             for begin in range(0, count, _CHUNK):
                 part = torch.arange(begin, min(begin + _CHUNK, count))
-                rows, kept, _ = without_diverged(len(part), lambda index, part=part: losses(part[index]))
+                rows, kept, _ = without_diverged(len(part), partial(losses, part))
                 if rows is not None:
                     found[:, part[kept].numpy()] = rows.numpy()
         return found
@@ -300,7 +302,7 @@ def _check(
     flat = np.concatenate([centre[None], places.reshape(-1, len(centre))])
     losses = probe.losses(flat, first=10_000).mean(axis=0)
     rise = (losses[1:] - losses[0]).reshape(places.shape[:3])
-    inside = ((places >= low - 1e-9) & (places <= high + 1e-9)).all(axis=-1)
+    inside: NDArray[np.bool_] = np.all((places >= low - 1e-9) & (places <= high + 1e-9), axis=-1)
     return [
         {
             "direction": int(index),
@@ -334,7 +336,7 @@ def _scale(
     if not {"stretch", "mass"} <= set(space.names) or "stretch" in objective.scenario.node_sets:
         return None
     scaled = (("stretch", "mass"), ("stretch", "mass", "bending"), ("stretch", "bending", "drag", "density", "body_mass"))
-    base = {name: 1.0 for name in scaled[1] + scaled[2]} | dict(values) | dict(space.fixed)
+    base = dict.fromkeys(scaled[1] + scaled[2], 1.0) | dict(values) | dict(space.fixed)
     sets = [base] + [base | {name: factor * base[name] for name in group} for group in scaled for factor in (0.5, 2.0)]
     tensors = {name: objective.system.gravity.new_tensor([one[name] for one in sets]) for name in base}
     offset = {name: tensors.pop(name) for name in NUISANCE if name in tensors}

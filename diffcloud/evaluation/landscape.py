@@ -29,9 +29,7 @@ def loss_landscape(
     if len(space.variables) < 2:
         return None
     first, second = space.variables[:2]
-    axes = [
-        np.geomspace(v.low, v.high, size) if v.low > 0 else np.linspace(v.low, v.high, size) for v in (first, second)
-    ]
+    axes = [np.geomspace(v.low, v.high, size) if v.low > 0 else np.linspace(v.low, v.high, size) for v in (first, second)]
     x, y = np.meshgrid(*axes)
     places = np.tile([values[name] for name in space.names], (size * size, 1))
     places[:, 0], places[:, 1] = x.ravel(), y.ravel()

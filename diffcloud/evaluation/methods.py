@@ -115,9 +115,7 @@ def random_search(
     return search.estimate("random_search")
 
 
-def cma_es(
-    objective: Objective, space: FitSpace, *, simulations: int, threshold: float = 0.0, seed: int = 0
-) -> Estimate:
+def cma_es(objective: Objective, space: FitSpace, *, simulations: int, threshold: float = 0.0, seed: int = 0) -> Estimate:
     """Covariance matrix adaptation (Hansen 2016) from the middle, on the logarithmic scale, a generation at a time.
 
     Raises:

@@ -31,6 +31,8 @@ PREDICTORS = ("mlp", "pointnet2", "meteornet", "published_mlp", "published_point
 _CLEARLY = 2.0
 """Standard deviations by which losses of two methods must differ to count as different."""
 Records = Sequence[Mapping[str, Any]]
+Tables = Mapping[str, pd.DataFrame]
+"""Of `tables`."""
 
 
 def label(method: str) -> str:
@@ -188,7 +190,7 @@ def against_reference(table: pd.DataFrame, *, within: float = 0.05) -> tuple[int
     return int((known["loss"] <= (1 + within) * known["reference_loss"]).sum()), len(known)
 
 
-def metrics(told: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
+def metrics(told: Tables) -> dict[str, Any]:
     """Numbers for `metrics.json`: scenario -> method -> means; who wins; what is identified. No wall times."""
     by_scenario: dict[str, Any] = {}
     for row in told["means"].to_dict("records"):
@@ -203,23 +205,22 @@ def metrics(told: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
         found["against_reference"] = {"within_5_percent": reference[0], "episodes": reference[1]}
     table = told["identifiability"]
     if not table.empty:
-        counts = table.groupby(["scenario", "parameter", "verdict"], sort=False).size()
         verdicts: dict[str, Any] = {}
-        for (scenario, parameter, verdict), count in counts.items():
-            verdicts.setdefault(scenario, {}).setdefault(parameter, {})[verdict] = int(count)
+        for (scenario, parameter), group in table.groupby(["scenario", "parameter"], sort=False):
+            counts = group["verdict"].value_counts(sort=False)
+            verdicts.setdefault(str(scenario), {})[str(parameter)] = {str(key): int(n) for key, n in counts.items()}
         ends = table.drop_duplicates(["scenario", "episode"])
         found["identifiability"] = verdicts
         found["checked_ends"] = {"agree": int(ends["ends_agree"].sum()), "all": int(ends["ends_checked"].sum())}
     return found
 
 
-def sentences(told: Mapping[str, pd.DataFrame]) -> list[str]:
+def sentences(told: Tables) -> list[str]:
     """The comparison in plain words, the most important first."""
-    found = [*_winners(told), *_success(told), *_identified(told["identifiability"])]
-    return found + [*_repeats(told)]
+    return [*_winners(told), *_success(told), *_identified(told["identifiability"]), *_repeats(told)]
 
 
-def _winners(told: Mapping[str, pd.DataFrame]) -> list[str]:
+def _winners(told: Tables) -> list[str]:
     found = []
     for scenario, group in told["means"].groupby("scenario", sort=False):
         ranked = group.sort_values("loss", kind="stable")
@@ -246,15 +247,13 @@ def _winners(told: Mapping[str, pd.DataFrame]) -> list[str]:
     return found
 
 
-def _success(told: Mapping[str, pd.DataFrame]) -> list[str]:
+def _success(told: Tables) -> list[str]:
     means = told["means"]
     if "success_rate" not in means:
         return []
     found = []
     for scenario, group in means[means["success_rate"].notna()].groupby("scenario", sort=False):
-        rates = ", ".join(
-            f"{label(row['method'])} {100 * row['success_rate']:.0f} %" for row in group.to_dict("records")
-        )
+        rates = ", ".join(f"{label(row['method'])} {100 * row['success_rate']:.0f} %" for row in group.to_dict("records"))
         found.append(f"{scenario}, simulated targets below the paper's threshold: {rates}.")
     return found
 
@@ -265,7 +264,9 @@ def _identified(table: pd.DataFrame) -> list[str]:
     found = []
     for (scenario, name), group in table.groupby(["scenario", "parameter"], sort=False):
         counts = ", ".join(f"{verdict} in {count}" for verdict, count in group["verdict"].value_counts().items())
-        found.append(f"{scenario}: {name} is {counts} of {len(group)} episodes (median factor {group['factor'].median():.2g}).")
+        found.append(
+            f"{scenario}: {name} is {counts} of {len(group)} episodes (median factor {group['factor'].median():.2g})."
+        )
     ends = table.drop_duplicates(["scenario", "episode"])
     found.append(
         f"Direct check of the intervals with fresh points: {int(ends['ends_agree'].sum())} of "
@@ -275,7 +276,7 @@ def _identified(table: pd.DataFrame) -> list[str]:
         for scenario, group in ends[ends["scale_everything"].notna()].groupby("scenario", sort=False):
             fitted, everything = group["scale_fitted"].median(), group["scale_everything"].median()
             text = (
-                f"{scenario}: doubling or halving stretch and mass together moves the loss by {fitted:.2g} times the "
+                f"{scenario!s}: doubling or halving stretch and mass together moves the loss by {fitted:.2g} times the "
                 f"resampling noise (median); with bending, air and all masses along, by {everything:.2g} times. "
             )
             if everything > 1 and everything > 0.5 * fitted:
@@ -283,14 +284,14 @@ def _identified(table: pd.DataFrame) -> list[str]:
             elif everything > 1:
                 text += "Part of what identifies the scale is an artefact of soft handles and contact stiffness."
             elif fitted > 1:
-                text += "The scale is tied down by what stays fixed (bending, air, nodes without a multiplier), not by the cloth."
+                text += "The scale is tied down by what no multiplier moves: bending, air, other nodes."
             else:
                 text += "The scale of stretch and mass is not seen at all: only their ratio is."
             found.append(text)
     return found
 
 
-def _repeats(told: Mapping[str, pd.DataFrame]) -> list[str]:
+def _repeats(told: Tables) -> list[str]:
     found = []
     for scenario, group in told["repeatability"].groupby("scenario", sort=False):
         factors = group.groupby("parameter", sort=False)["factor"].median()

@@ -56,14 +56,6 @@ def measure_fit(
     return row
 
 
-def measure_parameters(
-    scenario: Scenario, episode: Episode, sets: Sequence[Mapping[str, float]], *, draws: int, seed: int
-) -> list[dict[str, float]]:
-    """Loss of parameter sets on an episode, in squared length units and as RMS in millimetres, as of `measure_fit`."""
-    losses = _mean_losses(Objective(scenario, [episode]), sets, draws, seed)
-    return [{"loss": loss, "rms_mm": 1e3 * scenario.length_unit_m * loss**0.5} for loss in losses]
-
-
 def _mean_losses(objective: Objective, sets: Sequence[Mapping[str, float]], draws: int, seed: int) -> list[float]:
     """Losses of parameter sets [len(sets)], averaged over fresh points."""
     names = list(sets[0])

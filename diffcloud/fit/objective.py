@@ -124,9 +124,7 @@ class Objective:
         """The recorded clouds of the L loss frames."""
         return self._targets[episode].clouds
 
-    def frame_losses(
-        self, run: Rollout, offset: Mapping[str, Tensor] | None = None, *, episode: int = 0
-    ) -> Tensor:
+    def frame_losses(self, run: Rollout, offset: Mapping[str, Tensor] | None = None, *, episode: int = 0) -> Tensor:
         """[B, L] one-sided Chamfer loss of a rollout at each loss frame."""
         points = self.points(run, offset, episode=episode)
         clouds = self.clouds(episode=episode)

@@ -335,7 +335,7 @@ def _metrics_writer(folder: Path) -> Any:
     """DVCLive's metrics files and nothing else: experiments, dvc.yaml and reports are the project's own."""
     from dvclive import Live  # type: ignore[attr-defined]
 
-    class Metrics(Live):  # type: ignore[misc]
+    class Metrics(Live):
         def _init_dvc(self) -> None:
             # Left out: it opens the Git repository around the current folder without closing it, and makes one that is not
             # under DVC a DVC repository. The files need neither.
