@@ -120,13 +120,15 @@ def write_evaluation(
             **told,
         },
     )
-    write_json(out / "tables" / "comparison.json", {"records": comparison.records, "failures": comparison.failures})
+    known = [[*key, loss] for key, loss in (references or {}).items()]
+    whole = {"records": comparison.records, "failures": comparison.failures, "references": known}
+    write_json(out / "tables" / "comparison.json", whole)
     write_json(out / "metrics.json", metrics)
     by_episode = {"/".join(key): value for key, value in comparison.seconds.items()}
     write_json(out / "timings.json", {"fit_seconds": seconds, "methods": by_episode})
     for table in printed(told):
         show(table, as_json)
-    for sentence in sentences(told):
+    for sentence in (line for lines in sentences(told).values() for line in lines):
         errors.print(sentence, markup=False, soft_wrap=True)
     errors.print(f"Wrote {out / 'metrics.json'} and {out / 'tables'}.")
     return metrics

@@ -17,7 +17,7 @@ from diffcloud.io.imports import release_episodes
 from pipeline.acceptance import SCENES
 from pipeline.comparison import FitJob, compare, comparison_jobs, run_all
 from pipeline.config import Config, load_config, updated
-from pipeline.console import JsonFlag, errors, finish, output
+from pipeline.console import JsonFlag, errors, finish
 from pipeline.evaluate import AllowMissing, stop_if_missing, write_evaluation
 from pipeline.report import report
 
@@ -81,8 +81,6 @@ def release(
     if markdown is not None:
         told = tables(comparison.records, comparison.seconds, references)
         write_text(markdown, comparison_page(told, comparison.missing))
-        if not json:
-            output.print(markdown.read_text(encoding="utf-8"), markup=False)
     if comparison.records:
         report(
             out=out / "index.html",

@@ -17,7 +17,7 @@ def comparison_page(told: Tables, missing: Sequence[str]) -> str:
         told: of `summary.tables`.
         missing: what should be there and is not.
     """
-    parts = ["# Comparison of methods", "", *(f"- {sentence}" for sentence in sentences(told)), ""]
+    parts = ["# Comparison of methods", "", *(f"- {line}" for lines in sentences(told).values() for line in lines), ""]
     parts += [
         "## Loss per episode",
         "",

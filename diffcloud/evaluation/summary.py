@@ -123,6 +123,8 @@ def identifiability_table(records: Records) -> pd.DataFrame:
             row |= {"parameter": name, "value": fit["clipped"][name], "factor": _factor(told["half_widths"][name])}
             row |= {"verdict": told["verdicts"][name], "ratio_factor": _factor(told.get("ratio_half_width"))}
             row |= {"combination": told["combination"], "ends_checked": len(agrees), "ends_agree": sum(agrees)}
+            row["ends_at_bounds"] = sum(not entry["farther_within_bounds"] for entry in told["check"])
+            row["lower_loss_near"] = told["lower"] is not None
             row |= {f"scale_{key}": value for key, value in (told["scale"] or {}).items()}
             rows.append(row)
     return pd.DataFrame(rows)
@@ -215,9 +217,35 @@ def metrics(told: Tables) -> dict[str, Any]:
     return found
 
 
-def sentences(told: Tables) -> list[str]:
-    """The comparison in plain words, the most important first."""
-    return [*_winners(told), *_success(told), *_identified(told["identifiability"]), *_repeats(told)]
+def sentences(told: Tables) -> dict[str, list[str]]:
+    """The comparison in plain words, by topic: winners, success, identifiability, repeats."""
+    return {
+        "winners": _winners(told),
+        "success": _success(told),
+        "identifiability": _identified(told["identifiability"]),
+        "repeats": _repeats(told),
+    }
+
+
+def overview(told: Tables) -> pd.DataFrame:
+    """One row per scenario: the methods with the lowest and the next mean loss, the middle of the range, how far
+    DiffCloud's mean is below the best predictor's, and the verdict that most episodes give on each parameter."""
+    below = {row["scenario"]: row["below"] for row in against_predictors(told["methods"]).to_dict("records")}
+    verdicts = told["identifiability"]
+    rows = []
+    for scenario, group in told["means"].groupby("scenario", sort=False):
+        ranked = group.sort_values("loss", kind="stable").to_dict("records")
+        row: dict[str, Any] = {"scenario": str(scenario), "episodes": max(int(one["episodes"]) for one in ranked)}
+        for place, one in zip(("first", "second"), ranked, strict=False):
+            row |= {place: label(one["method"]), f"{place}_mm": one["rms_mm"]}
+        row["middle_mm"] = next((one["rms_mm"] for one in ranked if one["method"] == "middle"), None)
+        row["below_predictor"] = below.get(scenario)
+        if not verdicts.empty:
+            for name, part in verdicts[verdicts["scenario"] == scenario].groupby("parameter", sort=False):
+                verdict, count = next(iter(part["verdict"].value_counts().items()))
+                row[f"verdict_{name}"] = f"{verdict} ({count} of {len(part)})"
+        rows.append(row)
+    return pd.DataFrame(rows)
 
 
 def _winners(told: Tables) -> list[str]:
@@ -270,8 +298,14 @@ def _identified(table: pd.DataFrame) -> list[str]:
     ends = table.drop_duplicates(["scenario", "episode"])
     found.append(
         f"Direct check of the intervals with fresh points: {int(ends['ends_agree'].sum())} of "
-        f"{int(ends['ends_checked'].sum())} ends agree."
+        f"{int(ends['ends_checked'].sum())} ends agree; for {int(ends['ends_at_bounds'].sum())} of all ends three times as "
+        "far lies beyond the bounds."
     )
+    if ends["lower_loss_near"].any():
+        found.append(
+            f"In {int(ends['lower_loss_near'].sum())} of {len(ends)} episodes a scan along these directions met a clearly "
+            "lower loss than the fit: that fit has not found its minimum, and its intervals are about where it stopped."
+        )
     if "scale_everything" in ends:
         for scenario, group in ends[ends["scale_everything"].notna()].groupby("scenario", sort=False):
             fitted, everything = group["scale_fitted"].median(), group["scale_everything"].median()
@@ -298,12 +332,12 @@ def _repeats(told: Tables) -> list[str]:
         text = ", ".join(f"{name} {_times(value)}" for name, value in factors.items())
         found.append(f"{scenario}: repeats of one fabric differ, in the median, by {text}.")
     known = told["transfer"]
-    known = known[known["gain"].notna()]
-    for scenario, group in known.groupby("scenario", sort=False):
+    for scenario, group in known[known[["loss_own", "loss_middle"]].notna().all(axis=1)].groupby("scenario", sort=False):
         better = int((group["loss"] < group["loss_middle"]).sum())
         found.append(
             f"{scenario}: parameters of one repeat predict another better than the middle of the range in {better} of "
-            f"{len(group)} cases, and go {100 * group['gain'].median():.0f} % of the way to its own fit (median)."
+            f"{len(group)} cases; their loss is {(group['loss'] / group['loss_own']).median():.2g} times that of its own "
+            f"fit, the middle's {(group['loss_middle'] / group['loss_own']).median():.2g} times (medians)."
         )
     for (first, second), group in told["consistency"].groupby(["first", "second"], sort=False):
         factors = group.groupby("parameter", sort=False)["factor"].median()
