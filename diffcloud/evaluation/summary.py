@@ -243,7 +243,7 @@ def overview(told: Tables) -> pd.DataFrame:
         if not verdicts.empty:
             for name, part in verdicts[verdicts["scenario"] == scenario].groupby("parameter", sort=False):
                 verdict, count = next(iter(part["verdict"].value_counts().items()))
-                row[f"verdict_{name}"] = f"{verdict} ({count} of {len(part)})"
+                row[f"verdict_{name}"] = f"{verdict} ({count}/{len(part)})"
         rows.append(row)
     return pd.DataFrame(rows)
 

@@ -19,8 +19,10 @@ _OVERVIEW = {
     "first_mm": "mm",
     "second": "next",
     "second_mm": "mm",
+}
+_OVERVIEW_END = {
     "middle_mm": "middle of the range, mm",
-    "below_predictor": "DiffCloud's loss below best network's",
+    "below_predictor": "DiffCloud's loss against the best network's",
     "episodes": "episodes",
 }
 _MEANS = {
@@ -49,7 +51,8 @@ _IDENTIFIED = {
     "scale_fitted": "scale moves",
     "scale_everything": "artefact",
 }
-_SHARES = ("success_rate", "below_predictor")
+_PIXELS_PER_INCH = 92
+"""Of the page per inch of a figure."""
 _REPEATS = {
     "scenario": "scenario",
     "fabric": "fabric",
@@ -102,7 +105,7 @@ def comparison_summary(entry: ComparisonEntry) -> str:
         else ""
     )
     return (
-        f'{note}<div class="scroll">{_table(table, {**_OVERVIEW, **verdicts})}</div>'
+        f'{note}<div class="scroll">{_table(table, {**_OVERVIEW, **verdicts, **_OVERVIEW_END})}</div>'
         '<p class="caption">Mean distance from the simulated to the recorded cloth [mm]. '
         '<a href="#comparison">All methods</a> · <a href="#identifiability">what “identified” means</a> · '
         '<a href="#repeats">what repeats say</a>.</p>'
@@ -184,11 +187,12 @@ def _figure(figure: Figure, command: str) -> str:
     # identifiers inside are made unique: several figures share one page
     svg = figure.svg[figure.svg.index("<svg") :]
     svg = re.sub(r'(id="|url\(#|href="#)', rf"\g<1>{figure.name}-", svg).replace(INK, "currentColor")
-    svg = re.sub(r'<svg ([^>]*?)width="[^"]*" height="[^"]*"|<svg height="[^"]*" ([^>]*?)width="[^"]*"', r"<svg \1\2", svg)
+    svg = re.sub(r' (width|height)="[\d.]+pt"', "", svg, count=2)
+    svg = svg.replace("<svg", f'<svg style="max-width: {_PIXELS_PER_INCH * figure.width:.0f}px"', 1)
     # names of the standard, fetched by nobody; inside HTML they are not needed
     svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.S))
     return (
-        f'<figure id="{html.escape(figure.name)}"><h3>{html.escape(figure.title)}</h3>{svg}'
+        f'<figure id="figure-{html.escape(figure.name)}"><h3>{html.escape(figure.title)}</h3>{svg}'
         f'<figcaption class="caption">{html.escape(figure.caption)} Source: <code>{html.escape(figure.source)}</code>; '
         f"made by <code>{html.escape(command)}</code> and <code>diffcloud report</code>.</figcaption></figure>"
     )
@@ -231,10 +235,7 @@ def _cell(name: str, value: Any) -> str:
         return f"<td>{html.escape(label(str(value)))}</td>"
     if isinstance(value, bool):
         return f"<td>{'yes' if value else 'no'}</td>"
-    if isinstance(value, float):
-        return f'<td data-value="{value}">{100 * value:.0f} %</td>' if name in _SHARES else _number(value)
+    if isinstance(value, int | float):
+        shares = {"success_rate": f"{100 * value:.0f} %", "below_predictor": f"{-100 * value:+.0f} %"}
+        return f'<td data-value="{value}">{shares.get(name, f"{value:.4g}")}</td>'
     return f"<td>{html.escape(str(value))}</td>"
-
-
-def _number(value: float) -> str:
-    return f'<td data-value="{value}">{value:.3g}</td>'

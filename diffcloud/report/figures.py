@@ -40,6 +40,8 @@ class Figure:
     """Table that it was drawn from."""
     svg: str
     png: bytes
+    width: float
+    """[inch]"""
 
 
 def comparison_figures(
@@ -74,7 +76,7 @@ def _losses(told: Tables) -> Figure | None:
             mean = group.loc[group["method"] == method, "rms_mm"].mean()
             axis.plot([mean, mean], [place - 0.38, place + 0.38], color=INK, linewidth=1.6)
         axis.set_yticks(range(len(methods)), [label(name) for name in methods])
-        axis.set_xscale("log")
+        axis.set_xlim(left=0)
         axis.set_xlabel("RMS distance [mm]")
         axis.set_title(scenario)
         axis.invert_yaxis()
@@ -315,7 +317,7 @@ def _finished(canvas: Canvas, name: str, title: str, caption: str, source: str) 
     with matplotlib.rc_context({"svg.hashsalt": name, "svg.fonttype": "none"}):
         canvas.savefig(svg, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     canvas.savefig(png, format="png", dpi=150, facecolor="white", metadata={"Software": None})
-    return Figure(name, title, caption, source, svg.getvalue(), png.getvalue())
+    return Figure(name, title, caption, source, svg.getvalue(), png.getvalue(), canvas.get_figwidth())
 
 
 def _ordered(table: pd.DataFrame, column: str) -> list[str]:
