@@ -12,7 +12,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from diffcloud.errors import ConfigError
+from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.evaluation.summary import PREDICTORS, label, sentences, tables
 from diffcloud.evaluation.summary import metrics as summary_metrics
 from diffcloud.fit import Objective, read_fit
@@ -174,10 +174,11 @@ def _fits(
             assert scenario is not None
             summary = read_fit(path)
             recorded = [read_episode(episodes / name / f"{member}.npz") for member in summary["episodes"]]
-            rows.append(
-                {"scenario": name, "episode": path.stem}
-                | measure_fit(scenario, recorded, summary, draws=config.evaluate.draws, seed=config.evaluate.seed)
-            )
+            try:
+                measured = measure_fit(scenario, recorded, summary, draws=config.evaluate.draws, seed=config.evaluate.seed)
+            except DivergedError:
+                continue  # the comparison names it as missing
+            rows.append({"scenario": name, "episode": path.stem} | measured)
             curves += [
                 {"scenario": name, "episode": path.stem, "iteration": i, "loss": min(filter(None, row))}
                 for i, row in enumerate(summary["history"]["loss"])

@@ -99,6 +99,7 @@ def compare_episode(
             gaps.append(Gap(f"transfer from {source}", measured.diverged[index]))
         else:
             transferred.append({"source": source, "clipped": sets[index], **measured.rows[index]})
+    seconds = {estimate.method: dict(estimate.seconds) for estimate in estimates}
     best = {key: value for key, value in sets[0].items() if key not in NUISANCE}
     meta = episode.meta
     record: dict[str, Any] = {
@@ -118,13 +119,15 @@ def compare_episode(
         "identifiability": None,
         "landscape": None,
     }
+    if 0 in measured.diverged:  # the fit itself: there is no optimum to look around
+        return EpisodeRecord(record, seconds)
     if settings.identifiability:
         record["identifiability"] = identify(objective, space, best, draws=settings.draws)
         record["identifiability"]["note"] = node_set_note(scenario)
     objective.reseed(int(fit["seed"]))
     if settings.landscape_size:
         record["landscape"] = loss_landscape(objective, space, best, summary["history"], size=settings.landscape_size)
-    return EpisodeRecord(record, {estimate.method: dict(estimate.seconds) for estimate in estimates})
+    return EpisodeRecord(record, seconds)
 
 
 def _run(rival: Rival, objective: Objective, space: FitSpace, fit: Mapping[str, Any], seed: int) -> Estimate | Gap:

@@ -1,7 +1,8 @@
 """Figures of the comparison as SVG and PNG: the paper's, remade from data, and those that it leaves out.
 
-Colours are told apart by the colour-blind (Okabe and Ito 2008). Text and axes are drawn in one grey-blue of their own,
-which the page replaces by its text colour, so that a figure is readable on light and dark.
+Colours are told apart by the colour-blind (after Okabe and Ito 2008, the blue lighter for dark pages). Text and axes are
+drawn in one grey-blue of their own, which the page replaces by its text colour, so that a figure is readable on light and
+dark.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 INK = "#5b6676"
 """Text and axes: readable on white and on black; the page puts its own colour in its place."""
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999")
+_COLOURS = ("#2b8ccb", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999")
 _CATEGORIES = ("highly deformable", "medium", "shape retaining")
 
 
@@ -187,7 +188,7 @@ def _curves(histories: Mapping[tuple[str, str], Mapping[str, Any]]) -> Figure | 
         for (owner, _), history in histories.items():
             if owner == scenario:
                 lowest = [min((value for value in row if value is not None), default=np.nan) for row in history["loss"]]
-                axis.plot(np.fmin.accumulate(lowest), color=_COLOURS[0], alpha=0.5, linewidth=1)
+                axis.plot(np.fmin.accumulate(lowest), color=_COLOURS[0], alpha=0.8, linewidth=1)
         axis.set_yscale("log")
         axis.set_xlabel("iteration")
         axis.set_ylabel("lowest loss so far")
