@@ -189,7 +189,7 @@ def comparison_jobs(
     others = other_repeats({name: episode.meta for name, episode in recorded.items()}, values)
     networks = _networks(config, scenario, regressors, simulated)
     jobs = []
-    for index, (fit, name, summary) in enumerate(fitted):
+    for fit, name, summary in fitted:
         label = name if fit == name else f"{fit}-{name}"  # a joint fit has several episodes
         real = not recorded[name].meta.get("truth")
         jobs.append(
@@ -202,7 +202,7 @@ def comparison_jobs(
                 predictions=[network.of(recorded[name]) for network in networks],
                 # simulated targets share labels, not parameters
                 transfers=others[name] if real else {},
-                settings=config.evaluate.comparison(landscape=index < config.evaluate.landscapes),
+                settings=config.evaluate.comparison(f"{scenario}/{label}"),
                 kept=kept / scenario / f"{label}.json",
             )
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Annotated, Literal, Self, TypeVar
 
@@ -169,21 +170,27 @@ class EvaluateConfig(Section):
     seed: int = 1000
     rivals: list[Rival] = list(RIVALS)
     """Methods beside the fits and the networks; searches may simulate as often as a fit from one start."""
-    identifiability: bool = True
-    landscapes: Annotated[int, Field(ge=0)] = 1
-    """Episodes of each scenario, the first ones by name, whose loss landscape is simulated."""
+    identifiability: list[str] = ["*"]
+    """Patterns of <scenario>/<episode> of which it is measured what they tell: 70 simulations each."""
+    landscapes: list[str] = []
+    """Patterns of <scenario>/<episode> whose loss landscape is simulated."""
     landscape_size: Annotated[int, Field(ge=2)] = 7
     """Places along each of its axes."""
     workers: Count = 1
     """Processes, one episode each; they change nothing but the time."""
 
-    def comparison(self, *, landscape: bool) -> ComparisonSettings:
+    def comparison(self, episode: str) -> ComparisonSettings:
+        """For <scenario>/<episode>."""
+
+        def chosen(patterns: list[str]) -> bool:
+            return any(fnmatch(episode, pattern) for pattern in patterns)
+
         return ComparisonSettings(
             rivals=tuple(self.rivals),
             draws=self.draws,
             seed=self.seed,
-            identifiability=self.identifiability,
-            landscape_size=self.landscape_size if landscape else 0,
+            identifiability=chosen(self.identifiability),
+            landscape_size=self.landscape_size if chosen(self.landscapes) else 0,
         )
 
 

@@ -69,7 +69,7 @@ def compare_episode(
     space = methods.space_of(summary)
     objective = Objective(scenario, [episode], frames=frames, points=points, seed=int(fit["seed"]))
     told: list[Estimate | Gap] = [methods.fitted(summary)]
-    told += [_run(rival, objective, space, fit, settings.seed) for rival in settings.rivals]
+    told += [_run(rival, objective, space, summary, settings.seed) for rival in settings.rivals]
     told += [*predictions, *methods.published(episode.meta)]
     estimates = [entry for entry in told if isinstance(entry, Estimate)]
     gaps = [entry for entry in told if isinstance(entry, Gap)]
@@ -130,8 +130,9 @@ def compare_episode(
     return EpisodeRecord(record, seconds)
 
 
-def _run(rival: Rival, objective: Objective, space: FitSpace, fit: Mapping[str, Any], seed: int) -> Estimate | Gap:
+def _run(rival: Rival, objective: Objective, space: FitSpace, summary: Mapping[str, Any], seed: int) -> Estimate | Gap:
     """One rival with the budget of a single-start fit; a gap if its simulations fail."""
+    fit = summary["settings"]
     simulations, threshold = int(fit["iterations"]) + 1, float(fit["threshold"])
     objective.reseed(int(fit["seed"]))
     try:
@@ -141,6 +142,9 @@ def _run(rival: Rival, objective: Objective, space: FitSpace, fit: Mapping[str, 
             return methods.random_search(objective, space, simulations=simulations, threshold=threshold, seed=seed)
         if rival == "cma_es":
             return methods.cma_es(objective, space, simulations=simulations, threshold=threshold, seed=seed)
+        known = methods.first_start(summary, space)
+        if known is not None:
+            return known
         adam = AdamSettings(
             learning_rate=float(fit["learning_rate"]),
             iterations=int(fit["iterations"]),

@@ -100,6 +100,24 @@ def single_start(objective: Objective, space: FitSpace, settings: AdamSettings) 
     )
 
 
+def first_start(summary: Mapping[str, Any], space: FitSpace) -> Estimate | None:
+    """What the paper's setting gives, if it is a part of the fit: its first start, from the middle with plain gradients.
+
+    Starts do not touch one another, so it need not be run again. Its own wall time is not known then. None if the fit was
+    smoothed, began elsewhere, was stopped by another start, or changed its points.
+    """
+    settings, history = summary["settings"], summary["history"]
+    losses = [row[0] for row in history["loss"]]
+    begin = dict(zip(history["names"], history["values"][0][0], strict=True))
+    same = all(math.isclose(begin[name] or math.nan, value, rel_tol=1e-6) for name, value in middle(space).values.items())
+    ended = summary["stop_reason"] == "iterations" and None not in losses
+    if not (same and ended and set(begin) == set(space.names)) or settings["smoothing"] or settings["resample"]:
+        return None
+    lowest = losses.index(min(losses))
+    values = dict(zip(history["names"], history["values"][lowest][0], strict=True))
+    return Estimate("single_start", values, simulations=len(losses), gradients=True)
+
+
 def random_search(
     objective: Objective, space: FitSpace, *, simulations: int, threshold: float = 0.0, seed: int = 0
 ) -> Estimate:

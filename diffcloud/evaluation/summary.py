@@ -253,7 +253,7 @@ def _winners(told: Tables) -> list[str]:
     for scenario, group in told["means"].groupby("scenario", sort=False):
         ranked = group.sort_values("loss", kind="stable")
         first, middle = ranked.iloc[0], group[group["method"] == "middle"]
-        text = f"{scenario}: {label(first['method'])} has the lowest mean loss over {int(first['episodes'])} episodes, "
+        text = f"{scenario}: {label(first['method'])} has the lowest mean loss over {_count(int(first['episodes']))}, "
         text += f"{first['rms_mm']:.1f} mm (RMS)"
         if len(ranked) > 1:
             second = ranked.iloc[1]
@@ -293,7 +293,8 @@ def _identified(table: pd.DataFrame) -> list[str]:
     for (scenario, name), group in table.groupby(["scenario", "parameter"], sort=False):
         counts = ", ".join(f"{verdict} in {count}" for verdict, count in group["verdict"].value_counts().items())
         found.append(
-            f"{scenario}: {name} is {counts} of {len(group)} episodes (median factor {group['factor'].median():.2g})."
+            f"{scenario}: verdict on {name}: {counts} of {_count(len(group))}; the loss tells it within a factor of "
+            f"{group['factor'].median():.2g} (median)."
         )
     ends = table.drop_duplicates(["scenario", "episode"])
     found.append(
@@ -344,6 +345,10 @@ def _repeats(told: Tables) -> list[str]:
         text = ", ".join(f"{name} {_times(value)}" for name, value in factors.items())
         found.append(f"{first} and {second} of one fabric disagree, in the median, by {text}.")
     return found
+
+
+def _count(episodes: int) -> str:
+    return f"{episodes} episode{'' if episodes == 1 else 's'}"
 
 
 def _mean(group: pd.DataFrame, name: str) -> float | None:

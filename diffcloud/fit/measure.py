@@ -65,7 +65,9 @@ def _mean_losses(objective: Objective, sets: Sequence[Mapping[str, float]], draw
     nuisance = {name: tensors.pop(name) for name in names if name in NUISANCE}
     found = []
     with torch.no_grad():
+        runs = [objective.simulate(tensors, episode=index) for index in range(objective.episode_count)]
         for draw in range(draws):
             objective.reseed(seed + draw)
-            found.append(objective(tensors, nuisance).numpy())
+            losses = [objective.frame_losses(run, nuisance, episode=index).mean(-1) for index, run in enumerate(runs)]
+            found.append(torch.stack(losses).mean(0).numpy())
     return [float(value) for value in np.mean(found, axis=0)]

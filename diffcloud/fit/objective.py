@@ -68,6 +68,10 @@ class Objective:
         last = max(float(target.times.max()) for target in self._targets)
         self._steps = min(int(np.ceil(last / self.system.time_step - 1e-6)), scenario.steps)
 
+    @property
+    def episode_count(self) -> int:
+        return len(self._targets)
+
     def reseed(self, seed: int) -> None:
         """Draw the common random numbers anew."""
         subset = self.scenario.loss_faces

@@ -96,7 +96,7 @@ def comparison_summary(entry: ComparisonEntry) -> str:
     """Which method wins, by how much, and what is identified: for the top of the page."""
     table = overview(entry.told)
     names = [str(name) for name in table]
-    verdicts = {name: f"{name.removeprefix('verdict_')} is" for name in names if name.startswith("verdict_")}
+    verdicts = {name: f"verdict on {name.removeprefix('verdict_')}" for name in names if name.startswith("verdict_")}
     gaps = comparison_failures(entry)
     note = (
         f"<p><b>Incomplete:</b> {len(gaps)} {'thing is' if len(gaps) == 1 else 'things are'} missing; "

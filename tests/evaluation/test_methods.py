@@ -12,6 +12,7 @@ from diffcloud.evaluation.methods import (
     batch_losses,
     clipped,
     cma_es,
+    first_start,
     middle,
     published,
     random_search,
@@ -25,6 +26,14 @@ from tests.evaluation.bowls import SPACE, Bowl
 
 def loss_of(bowl, values):
     return float(bowl({name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}))
+
+
+def summary_of(outcome):
+    """The parts of a fit's file that matter here."""
+    history = outcome.history
+    told = {"names": list(history.names), "loss": [row.tolist() for row in history.losses]}
+    told["values"] = [row.tolist() for row in history.values]
+    return {"settings": {"smoothing": 0.0, "resample": False}, "stop_reason": outcome.stop_reason, "history": told}
 
 
 SEARCHES = [random_search, cma_es]
@@ -72,9 +81,16 @@ def test_one_start_is_the_first_of_many():
     settings = AdamSettings(iterations=12, starts=4)
     alone = single_start(Bowl(), SPACE, settings)
     many = fit_adam(Bowl(), SPACE, settings)
-    first = torch.stack(many.history.losses)[:, 0]
     assert alone.simulations == 13
-    assert loss_of(Bowl(), alone.values) == pytest.approx(float(first.min()), rel=1e-12)
+    summary = summary_of(many)
+    found = first_start(summary, SPACE)
+    assert found.values == pytest.approx(alone.values, rel=1e-12)
+    assert found.simulations == 13
+    for change in ({"smoothing": 0.5}, {"resample": True}):
+        assert first_start({**summary, "settings": {**summary["settings"], **change}}, SPACE) is None
+    assert first_start({**summary, "stop_reason": "threshold"}, SPACE) is None
+    elsewhere = fit_adam(Bowl(), SPACE, AdamSettings(iterations=2, init={"mass": 1.0}))
+    assert first_start(summary_of(elsewhere), SPACE) is None
 
 
 def test_an_interrupted_start_is_no_result(monkeypatch):

@@ -85,7 +85,7 @@ class TestWords:
     def test_sentences_say_who_wins_and_what_is_known(self, told):
         said = sentences(told)
         assert "DiffCloud has the lowest mean loss over 2 episodes" in said["winners"][0]
-        assert any("stretch is only the ratio in 2 of 2" in line for line in said["identifiability"])
+        assert any("verdict on stretch: only the ratio in 2 of 2 episodes" in line for line in said["identifiability"])
         assert any("7 of 8 ends agree" in line for line in said["identifiability"])
         assert any("artefact" in line for line in said["identifiability"])
         assert any("stretch a factor of 2" in line for line in said["repeats"])

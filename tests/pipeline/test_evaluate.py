@@ -23,7 +23,7 @@ PARAMS = {
     "scenarios": ["small"],
     "train": {"scenarios": ["other"], "models": ["mlp"]},
     "fit": {"iterations": 3, "starts": 2, "smoothing": 0},
-    "evaluate": {"draws": 2, "landscape_size": 3},
+    "evaluate": {"draws": 2, "landscapes": ["*/tan1"], "landscape_size": 3},
     "report": {"overlay_points": 50},
 }
 
