@@ -18,7 +18,7 @@ from diffcloud.evaluation import ComparisonSettings, EpisodeRecord, Estimate, Ga
 from diffcloud.evaluation.methods import predicted
 from diffcloud.evaluation.repeats import other_repeats
 from diffcloud.evaluation.summary import PREDICTORS
-from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam, read_fit, write_fit
+from diffcloud.fit import FitSpace, Objective, fit_adam, read_fit, write_fit
 from diffcloud.fit.result import describe_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import read_json, write_json, write_text
@@ -98,15 +98,7 @@ class FitJob:
         scenario, config = choose_scenario(self.scenario, self.scene), self.settings
         objective = Objective(scenario, [self.episode], frames=config.frames, points=config.points, seed=config.seed)
         space = FitSpace.build(config.parameters, bounds={**scenario.bounds, **config.bounds}, fixed=config.fixed)
-        adam = AdamSettings(
-            learning_rate=config.learning_rate or scenario.learning_rate,
-            iterations=config.iterations,
-            threshold=scenario.threshold if config.threshold is None else config.threshold,
-            starts=config.starts,
-            seed=config.seed,
-            resample=config.resample,
-            smoothing=config.smoothing,
-        )
+        adam = config.adam(scenario)
         outcome = fit_adam(objective, space, adam)
         if outcome.stop_reason == "interrupted":
             raise KeyboardInterrupt  # begun again next time

@@ -11,7 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
+from diffcloud.fit import AdamSettings
 from diffcloud.regressors.settings import Loss, Profile, Target
+from diffcloud.scene.scenarios import Scenario
 from diffcloud.scene.schema import NonNegative, Positive, explain
 from diffcloud.sensing.filters import Thinning
 from diffcloud.sensing.fusion import FusionSettings
@@ -133,6 +135,18 @@ class FitConfig(Section):
         for name, pair in self.bounds.items():
             _check_bounds(f"bounds.{name}", pair)
         return self
+
+    def adam(self, scenario: Scenario) -> AdamSettings:
+        """With what the scenario says where nothing is given."""
+        return AdamSettings(
+            learning_rate=self.learning_rate or scenario.learning_rate,
+            iterations=self.iterations,
+            threshold=scenario.threshold if self.threshold is None else self.threshold,
+            starts=self.starts,
+            seed=self.seed,
+            resample=self.resample,
+            smoothing=self.smoothing,
+        )
 
 
 class TrainConfig(Section):
