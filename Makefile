@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: venv repro test test-slow lint format bench acceptance clean
+.PHONY: venv repro test test-slow lint format bench acceptance comparison clean
 
 venv: $(STAMP)
 
@@ -16,7 +16,9 @@ $(STAMP): pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
 	touch $@
 
+# PROFILE: a file of parameters that takes the place of params.yaml, such as profiles/paper.yaml
 repro: venv
+	$(if $(PROFILE),cp "$(PROFILE)" params.yaml)
 	dvc repro
 
 # one process per core, each with one thread: a simulation step gains nothing from a second one
@@ -46,6 +48,11 @@ REFERENCE ?= $(wildcard $(RELEASE)/../../diffsim)
 acceptance: venv
 	@test -n "$(RELEASE)" || { echo "Usage: make acceptance RELEASE=DIR [REFERENCE=DIR]"; exit 2; }
 	diffcloud acceptance --release "$(RELEASE)" $(if $(REFERENCE),--reference "$(REFERENCE)") --out docs/results
+
+# the published data, all methods: RELEASE as above, REFERENCE_FITS a JSON with the reference simulator's own fits
+comparison: venv
+	@test -n "$(RELEASE)" || { echo "Usage: make comparison RELEASE=DIR [REFERENCE_FITS=FILE]"; exit 2; }
+	diffcloud evaluate release "$(RELEASE)" $(if $(REFERENCE_FITS),--reference "$(REFERENCE_FITS)") --markdown docs/results/comparison.md
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

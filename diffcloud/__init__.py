@@ -6,6 +6,7 @@ Imports run one way (a test holds this):
     clouds    <-  mesh, io
     fit       <-  sim, scene, clouds
     datasets  <-  sim, scene, clouds
+    evaluation <- fit, scene, clouds
     regressors <- mesh, clouds, io
     sensing   <-  mesh, clouds, io
     hardware  <-  sensing, io                  (cameras and arm; their packages are imported when one is opened)

@@ -15,6 +15,7 @@ from pipeline.capture import record
 from pipeline.console import errors
 from pipeline.doctor import doctor
 from pipeline.episodes import episodes
+from pipeline.evaluate_release import release
 from pipeline.gradients import gradients
 from pipeline.predict import predict
 from pipeline.preprocess import preprocess
@@ -29,6 +30,7 @@ app = typer.Typer(
 )
 app.add_typer(importing.app, name="import")
 app.add_typer(evaluate.app, name="evaluate")
+evaluate.app.command("release")(release)
 app.add_typer(raw_episode.app, name="episode")
 app.command()(episodes)
 app.command()(preprocess)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Annotated, Literal, Self, TypeVar
 
@@ -9,7 +10,10 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from diffcloud.errors import ConfigError
+from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
+from diffcloud.fit import AdamSettings
 from diffcloud.regressors.settings import Loss, Profile, Target
+from diffcloud.scene.scenarios import Scenario
 from diffcloud.scene.schema import NonNegative, Positive, explain
 from diffcloud.sensing.filters import Thinning
 from diffcloud.sensing.fusion import FusionSettings
@@ -134,6 +138,19 @@ class FitConfig(Section):
             _check_bounds(f"bounds.{name}", pair)
         return self
 
+    def adam(self, scenario: Scenario) -> AdamSettings:
+        """With what the scenario says where nothing is given."""
+        return AdamSettings(
+            learning_rate=self.learning_rate or scenario.learning_rate,
+            iterations=self.iterations,
+            threshold=scenario.threshold if self.threshold is None else self.threshold,
+            starts=self.starts,
+            screen=self.screen,
+            seed=self.seed,
+            resample=self.resample,
+            smoothing=self.smoothing,
+        )
+
 
 class TrainConfig(Section):
     """Regressors. What is not given (null) is the profile's (`diffcloud.regressors.settings`)."""
@@ -163,11 +180,35 @@ class TrainConfig(Section):
 
 
 class EvaluateConfig(Section):
-    """Measuring fits."""
+    """Comparing methods, and what can be known of the parameters."""
 
     draws: Count = 4
     """Fresh point samples that a loss is averaged over."""
     seed: int = 1000
+    rivals: list[Rival] = list(RIVALS)
+    """Methods beside the fits and the networks; searches may simulate as often as a fit from one start."""
+    identifiability: list[str] = ["*"]
+    """Patterns of <scenario>/<episode> of which it is measured what they tell: 70 simulations each."""
+    landscapes: list[str] = []
+    """Patterns of <scenario>/<episode> whose loss landscape is simulated."""
+    landscape_size: Annotated[int, Field(ge=2)] = 7
+    """Places along each of its axes."""
+    workers: Count = 1
+    """Processes, one episode each; they change nothing but the time."""
+
+    def comparison(self, episode: str) -> ComparisonSettings:
+        """For <scenario>/<episode>."""
+
+        def chosen(patterns: list[str]) -> bool:
+            return any(fnmatch(episode, pattern) for pattern in patterns)
+
+        return ComparisonSettings(
+            rivals=tuple(self.rivals),
+            draws=self.draws,
+            seed=self.seed,
+            identifiability=chosen(self.identifiability),
+            landscape_size=self.landscape_size if chosen(self.landscapes) else 0,
+        )
 
 
 class ReportConfig(Section):

@@ -1,27 +1,34 @@
-"""`diffcloud evaluate`: the loss of given parameters, and the tables over all fits."""
+"""`diffcloud evaluate`: the loss of given parameters, and the comparison of all methods."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import pandas as pd
 import torch
 import typer
+from rich.markup import escape
 from rich.table import Table
 
-from diffcloud.errors import ConfigError
+from diffcloud.errors import ConfigError, DivergedError
+from diffcloud.evaluation.summary import PREDICTORS, label, sentences, tables
+from diffcloud.evaluation.summary import metrics as summary_metrics
 from diffcloud.fit import Objective, read_fit
-from diffcloud.fit.measure import measure_fit, measure_parameters
+from diffcloud.fit.measure import measure_fit
 from diffcloud.fit.parameters import NUISANCE
 from diffcloud.io.episodes import read_episode
-from diffcloud.io.files import write_json, write_text
-from diffcloud.regressors import Regressor, predict_episode
-from pipeline.config import EvaluateConfig, load_config
-from pipeline.console import JsonFlag, ParamsFile, assignments, errors, finish, output, progress_bar
+from diffcloud.io.files import write_json
+from pipeline.comparison import Comparison, compare, comparison_jobs, write_tables
+from pipeline.config import Config, load_config
+from pipeline.console import JsonFlag, ParamsFile, assignments, errors, finish, output, show
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 
-app = typer.Typer(help="Measure parameters and fits.")
+app = typer.Typer(help="Measure parameters, and compare methods.")
+AllowMissing = Annotated[
+    bool, typer.Option("--allow-missing", help="Exit with status 0 although a method or an episode is missing.")
+]
 
 
 @app.command()
@@ -56,78 +63,142 @@ def evaluate(
     regressors: Annotated[Path, typer.Option(help="Folder with <scenario>/<model>.safetensors; may lack any.")] = Path(
         "data/regressors"
     ),
+    simulated: Annotated[Path, typer.Option(help="Folder with <scenario>.timings.json of the data sets.")] = Path(
+        "data/simulated"
+    ),
     out: Annotated[Path, typer.Option(help="Folder for metrics.json, timings.json and tables/.")] = Path("reports"),
+    allow_missing: AllowMissing = False,
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
-    """Measure every fit, and what regressors predict, on its episode: metrics.json, timings.json, and tables."""
+    """Compare all methods on all episodes: metrics.json, timings.json, and tables. Ctrl-C keeps finished episodes."""
     if context.invoked_subcommand is not None:
         return
     config = load_config(params)
+    if not any((fits / name).glob("*.json") for name in config.scenarios if (fits / name).is_dir()):
+        raise ConfigError(f"{fits} holds no fits of {', '.join(config.scenarios)}; run `diffcloud fit` first.")
+    jobs = [
+        job
+        for name in config.scenarios
+        for job in comparison_jobs(
+            config, name, fits=fits, episodes=episodes, regressors=regressors, simulated=simulated, kept=out / "episodes"
+        )
+    ]
+    comparison = compare(jobs, config.evaluate.workers)
+    metrics = write_evaluation(config, comparison, {}, fits=fits, episodes=episodes, out=out, as_json=json)
+    finish({"metrics": metrics, "missing": comparison.missing}, json)
+    stop_if_missing(comparison, allow_missing)
+
+
+def write_evaluation(
+    config: Config,
+    comparison: Comparison,
+    scenes: Mapping[str, Path],
+    *,
+    fits: Path,
+    episodes: Path,
+    out: Path,
+    as_json: bool,
+    references: Mapping[tuple[str, str], float] | None = None,
+) -> dict[str, Any]:
+    """Write metrics, timings and tables, print the main ones, and return the metrics.
+
+    Args:
+        scenes: scenario -> scene file, of those that need one.
+        references: see `summary.method_table`.
+    """
+    rows, curves, seconds = _fits(config, scenes, fits, episodes)
+    predictions = _predictions(comparison.records)
+    told = tables(comparison.records, comparison.seconds, references)
+    metrics = _metrics(rows, predictions) | {"comparison": summary_metrics(told)}
+    write_tables(
+        out / "tables",
+        {
+            "fits": pd.DataFrame(rows),
+            "losses": pd.DataFrame(curves),
+            "predictions": pd.DataFrame(predictions, columns=_columns(predictions)),
+            **told,
+        },
+    )
+    known = [[*key, loss] for key, loss in (references or {}).items()]
+    whole = {"records": comparison.records, "failures": comparison.failures, "references": known}
+    write_json(out / "tables" / "comparison.json", whole)
+    write_json(out / "metrics.json", metrics)
+    by_episode = {"/".join(key): value for key, value in comparison.seconds.items()}
+    write_json(out / "timings.json", {"fit_seconds": seconds, "methods": by_episode})
+    for table in printed(told):
+        show(table, as_json)
+    for sentence in (line for lines in sentences(told).values() for line in lines):
+        errors.print(sentence, markup=False, soft_wrap=True)
+    errors.print(f"Wrote {out / 'metrics.json'} and {out / 'tables'}.")
+    return metrics
+
+
+def stop_if_missing(comparison: Comparison, allow_missing: bool) -> None:
+    """Name what is missing; then exit status 1, unless that is allowed."""
+    for line in comparison.missing:
+        errors.print(f"[yellow]Missing:[/] {escape(line)}", soft_wrap=True)
+    if comparison.missing and not allow_missing:
+        errors.print("The tables have labelled gaps; --allow-missing accepts them.")
+        raise typer.Exit(1)
+
+
+def printed(told: Mapping[str, pd.DataFrame]) -> list[Table]:
+    """Means per scenario and method, and fits per episode, for a terminal."""
+    means = Table("scenario", "method", "episodes", "loss", "rms mm", "other frames mm", "two-sided", "best", "runs")
+    for row in told["means"].to_dict("records"):
+        cells = (row[key] for key in ("rms_mm", "rms_other_frames_mm", "two_sided", "best", "simulations"))
+        means.add_row(
+            str(row["scenario"]), label(row["method"]), str(row["episodes"]), f"{row['loss']:.3e}", *map(_cell, cells)
+        )
+    methods = told["methods"][told["methods"]["status"] == "ok"]
+    names = list(dict.fromkeys(methods["method"]))
+    losses = Table("scenario", "episode", *(label(name) for name in names))
+    for (scenario, episode), group in methods.groupby(["scenario", "episode"], sort=False):
+        known = dict(zip(group["method"], group["loss"], strict=True))
+        losses.add_row(str(scenario), str(episode), *(f"{known[name]:.3e}" if name in known else "–" for name in names))
+    return [losses, means]
+
+
+def _fits(
+    config: Config, scenes: Mapping[str, Path], fits: Path, episodes: Path
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, float]]:
+    """Rows of the table of fits, their loss curves, and their wall times."""
     rows: list[dict[str, Any]] = []
     curves: list[dict[str, Any]] = []
     seconds: dict[str, float] = {}
-    files = [path for name in config.scenarios for path in sorted((fits / name).glob("*.json"))]
-    if not files:
-        raise ConfigError(f"{fits} holds no fits of {', '.join(config.scenarios)}; run `diffcloud fit` first.")
-    with progress_bar("evaluate", len(files)) as update:
-        for index, path in enumerate(files):
+    for name in config.scenarios:
+        files = sorted((fits / name).glob("*.json"))
+        scenario = choose_scenario(name, scenes.get(name)) if files else None
+        for path in files:
+            assert scenario is not None
             summary = read_fit(path)
-            scenario = choose_scenario(path.parent.name)
-            recorded = [read_episode(episodes / path.parent.name / f"{name}.npz") for name in summary["episodes"]]
-            rows.append(
-                {"scenario": path.parent.name, "episode": path.stem}
-                | measure_fit(scenario, recorded, summary, draws=config.evaluate.draws, seed=config.evaluate.seed)
-            )
+            recorded = [read_episode(episodes / name / f"{member}.npz") for member in summary["episodes"]]
+            try:
+                measured = measure_fit(scenario, recorded, summary, draws=config.evaluate.draws, seed=config.evaluate.seed)
+            except DivergedError:
+                continue  # the comparison names it as missing
+            rows.append({"scenario": name, "episode": path.stem} | measured)
             curves += [
-                {"scenario": path.parent.name, "episode": path.stem, "iteration": i, "loss": min(filter(None, row))}
+                {"scenario": name, "episode": path.stem, "iteration": i, "loss": min(filter(None, row))}
                 for i, row in enumerate(summary["history"]["loss"])
                 if any(value is not None for value in row)
             ]
-            seconds[f"{path.parent.name}/{path.stem}"] = summary["seconds"]
-            update(index + 1, path.stem)
-    predictions = [
-        row for name in config.scenarios for row in _predictions(regressors / name, episodes / name, config.evaluate)
+            seconds[f"{name}/{path.stem}"] = summary["seconds"]
+    return rows, curves, seconds
+
+
+def _predictions(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each network and episode: what is predicted, and the loss of the simulation with it."""
+    return [
+        {"scenario": record["scenario"], "episode": record["episode"], "model": row["method"]}
+        | {f"predicted_{name}": value for name, value in row["values"].items()}
+        | {f"true_{name}": record["truth"][name] for name in row["values"] if name in record["truth"]}
+        | {key: row[key] for key in ("inside", "loss", "rms_mm")}
+        for record in records
+        for row in record["methods"]
+        if row["method"] in PREDICTORS
     ]
-    metrics = _metrics(rows, predictions)
-    table = pd.DataFrame(rows)
-    write_text(out / "tables" / "fits.csv", table.to_csv(index=False))
-    write_text(out / "tables" / "losses.csv", pd.DataFrame(curves).to_csv(index=False))
-    write_text(
-        out / "tables" / "predictions.csv", pd.DataFrame(predictions, columns=_columns(predictions)).to_csv(index=False)
-    )
-    write_json(out / "metrics.json", metrics)
-    write_json(out / "timings.json", {"fit_seconds": seconds})
-    if not json:
-        _print(rows, ("rms_start_mm", "rms_mm", "rms_other_frames_mm"), "fitted_")
-        _print(predictions, ("model", "rms_mm"), "predicted_")
-    errors.print(f"Wrote {out / 'metrics.json'} and {out / 'tables'}.")
-    finish({"metrics": metrics}, json)
-
-
-def _predictions(checkpoints: Path, episodes: Path, config: EvaluateConfig) -> list[dict[str, Any]]:
-    """A row for each model and episode of a scenario: what is predicted, and the loss of the simulation with it."""
-    found = {path.stem: Regressor.read(path) for path in sorted(checkpoints.glob("*.safetensors"))}
-    if not found:
-        return []
-    scenario = choose_scenario(checkpoints.name)
-    rows: list[dict[str, Any]] = []
-    for path in sorted(episodes.glob("*.npz")):
-        episode = read_episode(path)
-        predicted = {model: predict_episode(regressor, episode) for model, regressor in found.items()}
-        clipped = [dict(zip(p.names, p.clipped[0].tolist(), strict=True)) for p in predicted.values()]
-        measured = measure_parameters(scenario, episode, clipped, draws=config.draws, seed=config.seed)
-        truth = episode.meta.get("truth") or {}
-        for (model, prediction), losses in zip(predicted.items(), measured, strict=True):
-            values = dict(zip(prediction.names, prediction.values[0].tolist(), strict=True))
-            rows.append(
-                {"scenario": checkpoints.name, "episode": path.stem, "model": model}
-                | {f"predicted_{name}": value for name, value in values.items()}
-                | {f"true_{name}": float(truth[name]) for name in values if name in truth}
-                | {"inside": bool(prediction.inside.all())}
-                | losses
-            )
-    return rows
 
 
 def _columns(predictions: list[dict[str, Any]]) -> list[str]:
@@ -155,14 +226,5 @@ def _metrics(rows: list[dict[str, Any]], predictions: list[dict[str, Any]]) -> d
     return {"scenarios": by_scenario, "episodes": episodes, "regressors": by_model}
 
 
-def _print(rows: list[dict[str, Any]], columns: tuple[str, ...], prefix: str) -> None:
-    if rows:
-        shown = ("episode", *columns, *(key for key in rows[0] if key.startswith(prefix)))
-        table = Table(*shown)
-        for row in rows:
-            table.add_row(*(_cell(row.get(key)) for key in shown))
-        output.print(table)
-
-
-def _cell(value: object) -> str:
-    return f"{value:.2f}" if isinstance(value, float) else str(value)
+def _cell(value: float | int | None) -> str:
+    return "–" if value is None or value != value else f"{value:.3g}"

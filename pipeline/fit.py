@@ -91,16 +91,7 @@ def fit(
         offset=settings.offset,
         offset_range=(0.02 / chosen.length_unit_m, 0.1),
     )
-    adam = AdamSettings(
-        learning_rate=settings.learning_rate or chosen.learning_rate,
-        iterations=settings.iterations,
-        threshold=chosen.threshold if settings.threshold is None else settings.threshold,
-        starts=settings.starts,
-        screen=settings.screen,
-        seed=settings.seed,
-        resample=settings.resample,
-        smoothing=settings.smoothing,
-    )
+    adam = settings.adam(chosen)
     table = Table("episode", "start", "final", "rms mm", *space.names, "iterations", "seconds", "stopped by")
     results: dict[str, Any] = {}
     for name, members in jobs:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import platform
+import subprocess
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,11 +15,19 @@ import typer
 
 import diffcloud
 from diffcloud.errors import ConfigError
+from diffcloud.evaluation.summary import tables as comparison_tables
 from diffcloud.fit import read_fit
 from diffcloud.io.episodes import read_episode
-from diffcloud.io.files import write_text
+from diffcloud.io.files import atomic_path, read_json, write_text
 from diffcloud.mesh import SurfaceMesh
-from diffcloud.report import EpisodeEntry, TrainingEntry, build_page
+from diffcloud.report import (
+    ComparisonEntry,
+    EpisodeEntry,
+    TrainingEntry,
+    build_page,
+    comparison_figures,
+    overlay_figure,
+)
 from pipeline.config import load_config
 from pipeline.console import JsonFlag, ParamsFile, errors, finish
 
@@ -67,10 +77,19 @@ def report(
         "commands": "diffcloud episodes, preprocess, simulate, fit, train, evaluate, report (dvc.yaml)",
         "parameters": "params.yaml" if params is None else str(params),
         "seed of the fits": str(config.fit.seed),
+        "seed of the comparison": str(config.evaluate.seed),
+        "git revision": _revision(),
         "diffcloud": diffcloud.__version__,
         "torch": torch.__version__,
+        "numpy": np.__version__,
         "python": platform.python_version(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} processors",
     }
+    comparison = _comparison(tables, entries)
+    for figure in comparison.figures:
+        write_text(out.parent / "figures" / f"{figure.name}.svg", figure.svg)
+        with atomic_path(out.parent / "figures" / f"{figure.name}.png") as temporary:
+            temporary.write_bytes(figure.png)
     page = build_page(
         entries,
         title=config.report.title,
@@ -78,10 +97,43 @@ def report(
         environment=environment,
         predictions=_rows(tables / "predictions.csv"),
         trainings=trainings,
+        comparison=comparison,
     )
     write_text(out, page)
     errors.print(f"Wrote {out} ({len(page) / 1e6:.1f} MB).")
     finish({"out": str(out), "episodes": len(entries), "bytes": len(page.encode())}, json)
+
+
+def _comparison(folder: Path, entries: list[EpisodeEntry]) -> ComparisonEntry:
+    """What `diffcloud evaluate` has left, with its figures.
+
+    Raises:
+        ConfigError: it has left nothing, or something else.
+    """
+    whole = read_json(folder / "comparison.json", error=ConfigError)
+    timings = read_json(folder.parent / "timings.json", error=ConfigError)
+    try:
+        records, failures = whole["records"], whole["failures"]
+        references = {(str(scenario), str(name)): float(loss) for scenario, name, loss in whole["references"]}
+        seconds = {(key.split("/")[0], key.split("/", 1)[1]): told for key, told in timings["methods"].items()}
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise ConfigError(
+            f"{folder} was not written by this version's `diffcloud evaluate` ({error!r}); run it."
+        ) from error
+    told = comparison_tables(records, seconds, references)
+    histories = {(entry.scenario, entry.name): entry.fit["history"] for entry in entries}
+    figures = comparison_figures(told, records, histories)
+    overlays = overlay_figure(entries)
+    return ComparisonEntry(told, records, failures, [*figures, *([overlays] if overlays else [])])
+
+
+def _revision() -> str:
+    """Of the source tree, where there is one."""
+    command = ["git", "-C", str(Path(diffcloud.__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
 
 
 def _rows(table: Path) -> list[dict[str, Any]]:

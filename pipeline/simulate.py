@@ -10,6 +10,7 @@ import typer
 from rich.table import Table
 
 from diffcloud.datasets import ParameterBox, ParameterDraws, SimulationPlan, simulate_set
+from diffcloud.io.files import write_json
 from pipeline.config import load_config, updated
 from pipeline.console import JsonFlag, ParamsFile, errors, finish, progress_bar, show, warn
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
@@ -70,6 +71,8 @@ def simulate(
     if outcome.discarded:
         warn(f"{out}.partial belonged to other settings or other code; it was started again.")
     seconds = time.perf_counter() - begin
+    # beside the set, not in it: the same draws have the same bytes, whatever they took
+    write_json(out.with_name(f"{out.name}.timings.json"), {"seconds": seconds, "resumed": outcome.resumed})
     megabytes = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6
     replaced = {split: len(entries) for split, entries in outcome.replaced.items()}
     for split, count in replaced.items():

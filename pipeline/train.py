@@ -9,6 +9,7 @@ import typer
 from rich.table import Table
 
 from diffcloud.errors import ConfigError
+from diffcloud.io.files import write_json
 from diffcloud.regressors import MODEL_NAMES, PROFILE_NAMES, ModelName, SimulatedSet, TrainingSettings, profile_settings
 from pipeline.config import load_config, updated
 from pipeline.console import JsonFlag, ParamsFile, errors, finish, progress_bar, show
@@ -91,6 +92,8 @@ def train(
         except KeyboardInterrupt:
             errors.print("Interrupted; the same command goes on from the last saved epoch.")
             raise typer.Exit(_INTERRUPTED) from None
+    # beside the outputs, which have the same bytes for the same seed
+    write_json(out.with_suffix(".timings.json"), {"seconds": result.seconds, "resumed": result.resumed_from})
     held_out = result.summary["held_out"]
     show(_table(held_out), json)
     if result.resumed_from:

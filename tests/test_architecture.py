@@ -18,9 +18,10 @@ ALLOWED = {
     "datasets": {"mesh", "io", "sim", "scene", "clouds"},
     "fit": {"mesh", "io", "sim", "scene", "clouds"},
     "regressors": {"mesh", "io", "clouds"},
+    "evaluation": {"mesh", "io", "sim", "scene", "clouds", "fit"},
     "sensing": {"mesh", "io", "clouds"},
     "hardware": {"mesh", "io", "clouds", "sensing"},
-    "report": {"mesh", "io", "sim", "scene", "clouds", "fit", "regressors", "sensing"},
+    "report": {"mesh", "io", "sim", "scene", "clouds", "fit", "regressors", "sensing", "evaluation"},
 }
 """Sub-package -> the sub-packages it may import; all may import errors."""
 
@@ -65,6 +66,8 @@ def needed_packages(stage: str) -> set[str]:
     """Sub-packages a stage's command reaches, through whatever those import."""
     seen: set[str] = set()
     todo = packages(ROOT / "pipeline" / f"{stage}.py") & ALLOWED.keys()
+    if "pipeline.comparison" in imported(ROOT / "pipeline" / f"{stage}.py"):
+        todo |= packages(ROOT / "pipeline" / "comparison.py") & ALLOWED.keys()
     if "scenario_options" in (ROOT / "pipeline" / f"{stage}.py").read_text(encoding="utf-8"):
         todo |= {"scene"}
     while todo:

@@ -6,22 +6,20 @@ including this package's source, says whether its chunks may be used.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields, is_dataclass
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-import diffcloud
 from diffcloud.datasets.chunks import Chunk, Replaced, SimulatedChunk
 from diffcloud.errors import ConfigError, DatasetError
 from diffcloud.io.files import atomic_path, read_json, write_json
+from diffcloud.io.fingerprints import fingerprint
 
 _CODE = ("mesh", "sim", "scene", "datasets")
 """Packages whose source decides the numbers."""
@@ -47,7 +45,7 @@ class WorkFolder:
             )
         self.out, self.path = out, out.with_name(f"{out.name}.partial")
         self.discarded = False
-        mark = {"fingerprint": _fingerprint(plan)}
+        mark = {"fingerprint": fingerprint(plan, packages=_CODE)}
         if self.path.exists() and self._mark() != mark:
             self.discarded = True
             shutil.rmtree(self.path)
@@ -101,25 +99,3 @@ class WorkFolder:
             return read_json(self.path / "plan.json", error=DatasetError)
         except DatasetError:
             return None
-
-
-def _fingerprint(plan: Any) -> str:
-    digest = hashlib.sha256()
-    for package in _CODE:
-        for source in sorted((Path(diffcloud.__file__).parent / package).rglob("*.py")):
-            digest.update(source.read_bytes())
-    digest.update(json.dumps([torch.__version__, np.__version__, _described(plan)], sort_keys=True).encode())
-    return digest.hexdigest()
-
-
-def _described(value: Any) -> Any:
-    """Plain JSON that is equal where the values are."""
-    if isinstance(value, np.ndarray):
-        return [str(value.dtype), value.shape, hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()]
-    if is_dataclass(value) and not isinstance(value, type):
-        return [type(value).__name__, {field.name: _described(getattr(value, field.name)) for field in fields(value)}]
-    if isinstance(value, Mapping):
-        return {str(key): _described(entry) for key, entry in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_described(entry) for entry in value]
-    return repr(value)

@@ -56,14 +56,6 @@ def measure_fit(
     return row
 
 
-def measure_parameters(
-    scenario: Scenario, episode: Episode, sets: Sequence[Mapping[str, float]], *, draws: int, seed: int
-) -> list[dict[str, float]]:
-    """Loss of parameter sets on an episode, in squared length units and as RMS in millimetres, as of `measure_fit`."""
-    losses = _mean_losses(Objective(scenario, [episode]), sets, draws, seed)
-    return [{"loss": loss, "rms_mm": 1e3 * scenario.length_unit_m * loss**0.5} for loss in losses]
-
-
 def _mean_losses(objective: Objective, sets: Sequence[Mapping[str, float]], draws: int, seed: int) -> list[float]:
     """Losses of parameter sets [len(sets)], averaged over fresh points."""
     names = list(sets[0])
@@ -73,7 +65,9 @@ def _mean_losses(objective: Objective, sets: Sequence[Mapping[str, float]], draw
     nuisance = {name: tensors.pop(name) for name in names if name in NUISANCE}
     found = []
     with torch.no_grad():
+        runs = [objective.simulate(tensors, episode=index) for index in range(objective.episode_count)]
         for draw in range(draws):
             objective.reseed(seed + draw)
-            found.append(objective(tensors, nuisance).numpy())
+            losses = [objective.frame_losses(run, nuisance, episode=index).mean(-1) for index, run in enumerate(runs)]
+            found.append(torch.stack(losses).mean(0).numpy())
     return [float(value) for value in np.mean(found, axis=0)]

@@ -68,6 +68,10 @@ class Objective:
         last = max(float(target.times.max()) for target in self._targets)
         self._steps = min(int(np.ceil(last / self.system.time_step - 1e-6)), scenario.steps)
 
+    @property
+    def episode_count(self) -> int:
+        return len(self._targets)
+
     def reseed(self, seed: int) -> None:
         """Draw the common random numbers anew."""
         subset = self.scenario.loss_faces
@@ -110,14 +114,29 @@ class Objective:
         track = None if track is None else track[:, :steps]
         return rollout(self.system, steps, properties=properties, track=track)
 
-    def _loss(self, episode: int, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor]) -> Tensor:
+    def points(self, run: Rollout, offset: Mapping[str, Tensor] | None = None, *, episode: int = 0) -> Tensor:
+        """[B, L, N, 3] points sampled on a rollout's cloth at the times of the loss frames.
+
+        Args:
+            offset: name -> [B] rigid offset of the target, by which the points are displaced.
+        """
         target = self._targets[episode]
+        points = self.sampler.sample(run.at(target.times))
+        return _displaced(points, target.centre, offset) if offset else points
+
+    def clouds(self, *, episode: int = 0) -> tuple[NeighbourIndex, ...]:
+        """The recorded clouds of the L loss frames."""
+        return self._targets[episode].clouds
+
+    def frame_losses(self, run: Rollout, offset: Mapping[str, Tensor] | None = None, *, episode: int = 0) -> Tensor:
+        """[B, L] one-sided Chamfer loss of a rollout at each loss frame."""
+        points = self.points(run, offset, episode=episode)
+        clouds = self.clouds(episode=episode)
+        return torch.stack([one_sided_chamfer(points[:, index], cloud) for index, cloud in enumerate(clouds)], dim=-1)
+
+    def _loss(self, episode: int, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor]) -> Tensor:
         run = self.simulate(parameters, episode=episode, steps=self._steps)
-        points = self.sampler.sample(run.at(target.times))  # [B, L, N, 3]
-        if offset:
-            points = _displaced(points, target.centre, offset)
-        terms = [one_sided_chamfer(points[:, index], cloud) for index, cloud in enumerate(target.clouds)]
-        return torch.stack(terms).mean(0)
+        return self.frame_losses(run, offset, episode=episode).mean(-1)
 
     def _target(self, episode: Episode) -> _Target:
         system = self.system

@@ -133,9 +133,9 @@ class FitSpace:
     def split(self, values: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """[B, k] -> (parameters of the simulator incl. the fixed ones, offset of the target), name -> [B]."""
         columns = dict(zip(self.names, values.unbind(-1), strict=True))
+        columns |= {name: torch.full_like(values[:, 0], value) for name, value in self.fixed.items()}
         offset = {name: columns.pop(name) for name in NUISANCE if name in columns}
-        fixed = {name: torch.full_like(values[:, 0], value) for name, value in self.fixed.items()}
-        return {**columns, **fixed}, offset
+        return columns, offset
 
     def _bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
         low = [variable.low for variable in self.variables]

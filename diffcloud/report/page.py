@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from diffcloud.io.episodes import Episode
 from diffcloud.mesh.topology import SurfaceMesh
+from diffcloud.report.comparison import ComparisonEntry, comparison_failures, comparison_section, comparison_summary
 from diffcloud.report.regressors import TrainingEntry, regressor_section, training_data
 
 _DECIMALS = 4
@@ -49,6 +50,7 @@ def build_page(
     environment: Mapping[str, str],
     predictions: Sequence[Mapping[str, Any]] = (),
     trainings: Sequence[TrainingEntry] = (),
+    comparison: ComparisonEntry | None = None,
     seed: int = 0,
 ) -> str:
     """The page as HTML text.
@@ -57,6 +59,7 @@ def build_page(
         overlay_points: points of the recorded cloud shown per frame.
         environment: name -> value lines for the last section.
         predictions: rows of the table of predictions.
+        comparison: of all methods; left out if not given.
         seed: of the choice of shown points.
     """
     from plotly.offline import get_plotlyjs
@@ -67,14 +70,15 @@ def build_page(
     lines = (f"<tr><td>{html.escape(key)}</td><td>{html.escape(value)}</td></tr>" for key, value in environment.items())
     parts = {
         "title": html.escape(title),
-        "summary": _summary(entries),
+        "summary": _summary(entries) + (comparison_summary(comparison) if comparison else ""),
+        "comparison": comparison_section(comparison) if comparison else "",
         "parameter_heads": "".join(f"<th>{html.escape(name)}</th>" for name in names),
         "rows": "".join(_table_row(index, entry, names) for index, entry in enumerate(entries)),
         "regressors": regressor_section(
             predictions, {(entry.scenario, entry.name): entry.row["rms_mm"] for entry in entries}, trainings
         ),
         "trainings": _script_json(training_data(trainings)),
-        "failures": _failures(entries),
+        "failures": _failures(entries, comparison_failures(comparison) if comparison else []),
         "environment": "".join(lines),
         "data": _script_json(data),
         "plotly": get_plotlyjs(),
@@ -182,10 +186,10 @@ def _number(value: float, digits: int, *, strong: bool = False) -> str:
     return f'<td data-value="{value}">{f"<b>{text}</b>" if strong else text}</td>'
 
 
-def _failures(entries: Sequence[EpisodeEntry]) -> str:
-    lines = [f"{entry.name}: {text}" for entry in entries for text in entry.fit["failures"]]
+def _failures(entries: Sequence[EpisodeEntry], missing: Sequence[str]) -> str:
+    lines = [*missing, *(f"{entry.name}: {text}" for entry in entries for text in entry.fit["failures"])]
     if not lines:
-        return "<p>No start of any fit diverged.</p>"
+        return "<p>No start of any fit diverged, and no method is missing.</p>"
     return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>"
 
 

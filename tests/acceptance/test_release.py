@@ -145,3 +145,34 @@ def test_a_single_start_fit_beats_every_published_prediction(release, kind):
         published = objective(values)
     assert outcome.loss < outcome.loss_start
     assert outcome.loss <= float(published.min()), label
+
+
+@pytest.mark.slow
+def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypatch):
+    """A few iterations on two repeats: every table and the page are there, and a second call finds all of it finished."""
+    from pathlib import Path
+
+    import yaml
+
+    import pipeline.comparison
+    from tests.pipeline.invoke import invoke
+
+    monkeypatch.chdir(tmp_path)
+    profile = yaml.safe_load((Path(__file__).parents[2] / "profiles" / "release.yaml").read_text(encoding="utf-8"))
+    profile["fit"] |= {"iterations": 2, "starts": 2, "smoothing": 0}
+    profile["evaluate"] |= {"draws": 2, "landscapes": [], "workers": 1}
+    Path("quick.yaml").write_text(yaml.safe_dump(profile))
+    command = ("evaluate", "release", release, "--params", "quick.yaml", "--only", "*/fold_tan*", "--markdown", "c.md")
+    found = invoke(*command).result["metrics"]["comparison"]
+    assert set(found["methods"]["release_fold"]) >= {"diffcloud", "cma_es", "published_mlp", "published_meteornet"}
+    assert found["checked_ends"]["all"] == 8
+    assert "fold_tan2" in Path("c.md").read_text(encoding="utf-8")
+    assert Path("reports/release/index.html").is_file()
+
+    def never(*arguments, **options):
+        raise AssertionError("fitted or compared again")
+
+    monkeypatch.setattr(pipeline.comparison, "fit_adam", never)
+    monkeypatch.setattr(pipeline.comparison, "compare_episode", never)
+    assert invoke(*command).result["metrics"]["comparison"] == found
+    assert "No published episode matches" in invoke("evaluate", "release", release, "--only", "shirt*", code=1).errors

@@ -1,0 +1,20 @@
+"""Comparing methods on equal terms, and what can be known of the parameters."""
+
+from diffcloud.evaluation.episode import RIVALS, ComparisonSettings, EpisodeRecord, compare_episode
+from diffcloud.evaluation.identifiability import identify
+from diffcloud.evaluation.landscape import loss_landscape
+from diffcloud.evaluation.methods import Estimate, Gap, Rival
+from diffcloud.evaluation.metrics import EpisodeMeter
+
+__all__ = [
+    "RIVALS",
+    "ComparisonSettings",
+    "EpisodeMeter",
+    "EpisodeRecord",
+    "Estimate",
+    "Gap",
+    "Rival",
+    "compare_episode",
+    "identify",
+    "loss_landscape",
+]

@@ -1,0 +1,364 @@
+"""What an episode says about the parameters: Gauss-Newton matrix, intervals measured on the loss itself, and a verdict.
+
+The loss is the mean of d_i², d_i the distance of sampled point i to the nearest recorded point. With u the logarithms of
+the parameters (of those whose lower bound is zero: the value as a part of its range),
+
+    loss(u + δ) - loss(u)  ≈  δᵀ H δ,      H = mean_i J_i J_iᵀ,      J_i = ∂d_i / ∂u
+
+near an optimum: the Gauss-Newton matrix of the residuals d_i. Distances, not vectors to the nearest points: a cloth that
+slides along itself changes the vectors, but no camera sees it. J is a central difference of batched simulations over a
+few per cent, not a derivative: after contact the loss is rough, and its exact slope is right in the small only.
+
+H gives directions and how fast the loss should rise along each. How far one can really go before the loss tells is
+measured: a batch of simulations along each eigenvector, both ways, out to the bounds. The interval ends where the rise
+comes to one standard deviation of what new sampled points change for the last time, and not before a third of where it
+comes to two. The check then simulates the ends, and three times as far, with points that were not used before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloud.evaluation.methods import without_diverged
+from diffcloud.fit import FitSpace, Objective
+from diffcloud.fit.parameters import NUISANCE
+from diffcloud.scene.scenarios import Scenario
+
+Verdict = Literal["identified", "only the ratio", "only a combination", "not identified"]
+IDENTIFIED_WITHIN = 1.5
+"""A parameter or ratio counts as identified if the interval ends within this factor of the fitted value."""
+_STEP = 0.05
+"""Of the central differences, in logarithms."""
+_SHORTEST = 0.005
+"""First step of the scan along a direction, in logarithms."""
+_LENGTHS = 12
+_FARTHER = 3.0
+"""How many intervals away the loss must be clearly higher."""
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Logarithms of the fitted parameters, or parts of the range where the lower bound is zero."""
+
+    space: FitSpace
+
+    def of(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        """name -> value to [k]."""
+        return np.array(
+            [
+                math.log(values[v.name]) if v.low > 0 else (values[v.name] - v.low) / (v.high - v.low)
+                for v in self.space.variables
+            ]
+        )
+
+    def values(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[B, k] coordinates to values."""
+        columns = [
+            np.exp(column) if v.low > 0 else v.low + (v.high - v.low) * np.maximum(column, 0.0)
+            for v, column in zip(self.space.variables, places.T, strict=True)
+        ]
+        return np.stack(columns, axis=-1)
+
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """[k] lowest and highest coordinates."""
+        low, high = ({v.name: getattr(v, end) for v in self.space.variables} for end in ("low", "high"))
+        return self.of(low), self.of(high)
+
+
+def identify(
+    objective: Objective, space: FitSpace, values: Mapping[str, float], *, draws: int = 4, seed: int = 2000
+) -> dict[str, Any]:
+    """What the loss at the optimum says about the parameters.
+
+    Args:
+        objective: of the fit, on one episode.
+        space: the fitted parameters.
+        values: the fitted ones.
+        draws: of sampled points that the scan averages over; the noise takes four times as many.
+        seed: of the first draw.
+
+    Returns (all plain numbers):
+        noise: what new points change: two standard deviations of the mean loss over `draws`;
+        matrix [k][k], eigenvalues [k] (descending) and directions [k][k] (rows) in coordinates;
+        predicted [k]: half-widths that the eigenvalues predict;
+        interval [k][2]: measured, against and along each direction; open [k][2]: whether it ends at a bound;
+        check: rises at the interval and at three times as far, and whether they agree;
+        half_widths, verdicts: by parameter; ratio_half_width; combination; lower: the lowest loss met, if it is lower;
+        scale: see `_scale`.
+    """
+    probe = _Probe(objective, space, draws, seed)
+    coordinates = Coordinates(space)
+    centre = coordinates.of(values)
+    noise, matrix = probe.noise(centre), _gauss_newton(probe, coordinates, centre)
+    eigenvalues, columns = np.linalg.eigh(matrix)
+    order = np.argsort(eigenvalues)[::-1]
+    eigenvalues, directions = np.maximum(eigenvalues[order], 0.0), _signed(columns[:, order].T)
+    limit = 0.5 * noise  # one standard deviation
+    predicted = np.sqrt(limit / np.maximum(eigenvalues, 1e-300))
+    interval, open_ends, lowest = _scan(probe, centre, directions, limit)
+    widths = interval.max(axis=1)
+    half_widths = np.sqrt(((directions * widths[:, None]) ** 2).sum(axis=0))
+    names = list(space.names)
+    told: dict[str, Any] = {
+        "parameters": names,
+        "noise": noise,
+        "matrix": matrix.tolist(),
+        "eigenvalues": eigenvalues.tolist(),
+        "directions": directions.tolist(),
+        "predicted": [_finite(value) for value in predicted],
+        "interval": interval.tolist(),
+        "open": open_ends.tolist(),
+        "half_widths": dict(zip(names, half_widths.tolist(), strict=True)),
+        "check": _check(probe, centre, directions, interval, noise),
+        "lower": lowest,
+        "scale": _scale(objective, space, values, probe, noise),
+    }
+    if {"stretch", "mass"} <= set(names):
+        row = directions[:, names.index("stretch")] - directions[:, names.index("mass")]
+        told["ratio_half_width"] = float(np.sqrt(((row * widths) ** 2).sum()))
+    told["combination"] = _combination(names, directions[0])
+    found = verdicts(names, half_widths, directions, widths, told.get("ratio_half_width"))
+    told["verdicts"] = dict(zip(names, found, strict=True))
+    return told
+
+
+def verdicts(
+    names: Sequence[str],
+    half_widths: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    widths: NDArray[np.float64],
+    ratio: float | None,
+) -> list[Verdict]:
+    """A verdict per parameter from half-widths in logarithms.
+
+    Args:
+        half_widths: [k] of the parameters.
+        directions: [k, k] eigenvectors, in rows.
+        widths: [k] of the directions.
+        ratio: of stretch to mass, if both are fitted.
+    """
+    near = math.log(IDENTIFIED_WITHIN)
+    # a parameter has its part in a combination that is known: more than a third of the direction's length
+    shared: NDArray[np.bool_] = np.any((np.abs(directions) > 1 / 3) & (widths <= near)[:, None], axis=0)
+    found: list[Verdict] = []
+    for index, name in enumerate(names):
+        if half_widths[index] <= near:
+            found.append("identified")
+        elif name in ("stretch", "mass") and ratio is not None and ratio <= near:
+            found.append("only the ratio")
+        else:
+            found.append("only a combination" if shared[index] else "not identified")
+    return found
+
+
+class _Probe:
+    """Mean losses of many places, over the same draws of points."""
+
+    def __init__(self, objective: Objective, space: FitSpace, draws: int, seed: int) -> None:
+        self._objective, self.space, self.draws, self.seed = objective, space, draws, seed
+        self._coordinates = Coordinates(space)
+
+    def losses(self, places: NDArray[np.float64], *, first: int = 0, draws: int | None = None) -> NDArray[np.float64]:
+        """[draws, B] at coordinates [B, k]; infinite where the simulation diverges. `first`: draw to begin with."""
+        values = torch.as_tensor(self._coordinates.values(places)).to(self._objective.system.gravity)
+        return self.losses_of(*self.space.split(values), first=first, draws=draws)
+
+    def losses_of(
+        self, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor], *, first: int = 0, draws: int | None = None
+    ) -> NDArray[np.float64]:
+        """[draws, B] of parameter sets and rigid offsets of the target."""
+        count, draws = len(next(iter(parameters.values()))), draws or self.draws
+        seeds = range(self.seed + first, self.seed + first + draws)
+
+        def losses(part: Tensor, kept: Tensor) -> Tensor:
+            index = part[kept]
+            run = self._objective.simulate({name: value[index] for name, value in parameters.items()})
+            shift = {name: value[index] for name, value in offset.items()}
+            rows = []
+            for seed in seeds:
+                self._objective.reseed(seed)
+                rows.append(self._objective.frame_losses(run, shift).mean(-1))
+            return torch.stack(rows)
+
+        found = np.full((draws, count), np.inf)
+        with torch.no_grad():
+            for begin in range(0, count, _CHUNK):
+                part = torch.arange(begin, min(begin + _CHUNK, count))
+                rows, kept, _ = without_diverged(len(part), partial(losses, part))
+                if rows is not None:
+                    found[:, part[kept].numpy()] = rows.numpy()
+        return found
+
+    def distances(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[B, N] distance of every sampled point to its nearest recorded one, of all frames and draws."""
+        values = torch.as_tensor(self._coordinates.values(places)).to(self._objective.system.gravity)
+        found = []
+        with torch.no_grad():
+            parameters, offset = self.space.split(values)
+            run = self._objective.simulate(parameters)
+            for seed in range(self.seed, self.seed + self.draws):
+                self._objective.reseed(seed)
+                points = self._objective.points(run, offset)
+                for frame, cloud in enumerate(self._objective.clouds()):
+                    found.append((points[:, frame] - cloud.nearest(points[:, frame])).norm(dim=-1))
+        return torch.cat(found, dim=-1).numpy()
+
+    def noise(self, centre: NDArray[np.float64]) -> float:
+        """Two standard deviations of the mean loss over `draws` draws."""
+        losses = self.losses(centre[None], draws=4 * self.draws)[:, 0]
+        return float(2.0 * losses.std(ddof=1) / math.sqrt(self.draws))
+
+
+_CHUNK = 20
+"""Parameter sets simulated together, as in `Objective`."""
+
+
+def _gauss_newton(probe: _Probe, coordinates: Coordinates, centre: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[k, k]"""
+    count = len(centre)
+    places = np.concatenate([centre + _STEP * np.eye(count), centre - _STEP * np.eye(count)])
+    # what was clamped at a lower bound of zero has moved less
+    moved = [coordinates.of(dict(zip(coordinates.space.names, row, strict=True))) for row in coordinates.values(places)]
+    width = (np.stack(moved[:count]) - np.stack(moved[count:])).diagonal()
+    distances = probe.distances(places)
+    jacobian = (distances[:count] - distances[count:]) / width[:, None]  # [k, N]
+    return jacobian @ jacobian.T / jacobian.shape[1]
+
+
+def _signed(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The largest component positive: the same direction has one name."""
+    largest = np.abs(directions).argmax(axis=1)
+    return directions * np.sign(directions[np.arange(len(directions)), largest])[:, None]
+
+
+def _reach(centre: NDArray[np.float64], direction: NDArray[np.float64], coordinates: Coordinates) -> float:
+    """How far one can go along a direction within the bounds."""
+    low, high = coordinates.bounds()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.where(direction > 0, (high - centre) / direction, (low - centre) / direction)
+    return max(0.0, float(ends[np.abs(direction) > 1e-12].min()))
+
+
+def _scan(
+    probe: _Probe, centre: NDArray[np.float64], directions: NDArray[np.float64], limit: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], dict[str, float] | None]:
+    """[k, 2] intervals against and along each direction, whether each ends at a bound, and the lowest loss if it is lower
+    than the centre's by more than the noise."""
+    coordinates = Coordinates(probe.space)
+    rays = np.stack([-directions, directions], axis=1)  # [k, 2, k]
+    reach = np.array([[_reach(centre, ray, coordinates) for ray in pair] for pair in rays])
+    steps = np.geomspace(_SHORTEST, np.maximum(reach, _SHORTEST), _LENGTHS, axis=-1)  # [k, 2, lengths]
+    steps = np.minimum(steps, reach[..., None])
+    places = centre + steps[..., None] * rays[:, :, None]
+    losses = probe.losses(np.concatenate([centre[None], places.reshape(-1, len(centre))])).mean(axis=0)
+    rise = (losses[1:] - losses[0]).reshape(steps.shape)
+    # the outermost place that the loss hardly tells from the centre; beyond a third of the first place after which all are
+    # clearly told, since that is what the interval promises
+    hardly, clearly = _outermost(rise <= limit), _outermost(rise <= 2 * limit) + 1
+    near = np.where(hardly >= 0, _at(steps, hardly), 0.0)
+    interval = np.where(clearly < _LENGTHS, np.maximum(near, _at(steps, clearly) / _FARTHER), near)
+    lowest = int(losses.argmin())
+    lower = None
+    if losses[lowest] < losses[0] - 2 * limit:
+        place = np.concatenate([centre[None], places.reshape(-1, len(centre))])[lowest]
+        found = coordinates.values(place[None])[0]
+        lower = {"loss": float(losses[lowest]), "loss_fitted": float(losses[0])}
+        lower |= dict(zip(probe.space.names, found.tolist(), strict=True))
+    return interval, hardly == _LENGTHS - 1, lower
+
+
+def _outermost(hidden: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """[..., n] -> [...] index of the last place that is hidden; -1: none is."""
+    last: NDArray[np.int64] = hidden.shape[-1] - 1 - hidden[..., ::-1].argmax(-1)
+    return np.where(hidden.any(-1), last, -1)
+
+
+def _at(steps: NDArray[np.float64], index: NDArray[np.int64]) -> NDArray[np.float64]:
+    """[..., n] at [...] of them, brought into the range."""
+    return np.take_along_axis(steps, np.clip(index, 0, steps.shape[-1] - 1)[..., None], -1)[..., 0]
+
+
+def _check(
+    probe: _Probe,
+    centre: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    interval: NDArray[np.float64],
+    noise: float,
+) -> list[dict[str, Any]]:
+    """Rises at both ends of every interval and three times as far, with points that nothing above has seen."""
+    coordinates = Coordinates(probe.space)
+    low, high = coordinates.bounds()
+    ends = np.stack([-interval[:, 0], interval[:, 1]], axis=1)  # [k, 2], signed
+    places = centre + np.stack([ends, _FARTHER * ends], axis=-1)[..., None] * directions[:, None, None]  # [k, 2, 2, k]
+    flat = np.concatenate([centre[None], places.reshape(-1, len(centre))])
+    losses = probe.losses(flat, first=10_000).mean(axis=0)
+    rise = (losses[1:] - losses[0]).reshape(places.shape[:3])
+    inside: NDArray[np.bool_] = np.all((places >= low - 1e-9) & (places <= high + 1e-9), axis=-1)
+    return [
+        {
+            "direction": int(index),
+            "end": float(ends[index, side]),
+            "rise": _finite(rise[index, side, 0]),
+            "rise_farther": _finite(rise[index, side, 1]),
+            "farther_within_bounds": bool(inside[index, side, 1]),
+            "agrees": bool(
+                ends[index, side] != 0
+                and rise[index, side, 0] <= noise
+                and (rise[index, side, 1] > noise or not inside[index, side, 1])
+            ),
+        }
+        for index, side in np.ndindex(*ends.shape)
+    ]
+
+
+def _scale(
+    objective: Objective, space: FitSpace, values: Mapping[str, float], probe: _Probe, noise: float
+) -> dict[str, float] | None:
+    """What doubling and halving everything that has mass in its unit changes, in units of the noise.
+
+    Under gravity and Coulomb friction the motion of a cloth held by rigid grippers does not change if its stiffnesses, its
+    mass and the air are all multiplied by one factor. What still changes the loss then has a stiffness of its own: the
+    soft handles, and the contact. An identification of the scale that rests on it is an artefact of the simulator.
+
+    Returns:
+        fitted: only stretch and mass together; with_bending: bending along; everything: with air and with the mass of all
+        nodes. None unless stretch and mass are fitted.
+    """
+    if not {"stretch", "mass"} <= set(space.names) or "stretch" in objective.scenario.node_sets:
+        return None
+    scaled = (("stretch", "mass"), ("stretch", "mass", "bending"), ("stretch", "bending", "drag", "density", "body_mass"))
+    base = dict.fromkeys(scaled[1] + scaled[2], 1.0) | dict(values) | dict(space.fixed)
+    sets = [base] + [base | {name: factor * base[name] for name in group} for group in scaled for factor in (0.5, 2.0)]
+    tensors = {name: objective.system.gravity.new_tensor([one[name] for one in sets]) for name in base}
+    offset = {name: tensors.pop(name) for name in NUISANCE if name in tensors}
+    losses = probe.losses_of(tensors, offset).mean(axis=0)
+    change = np.abs(losses[1:] - losses[0]).reshape(3, 2).max(axis=1) / max(noise, 1e-300)
+    labels = ("fitted", "with_bending", "everything")
+    return {label: float(min(value, 1e9)) for label, value in zip(labels, change, strict=True)}
+
+
+def _combination(names: Sequence[str], direction: NDArray[np.float64]) -> str:
+    """The best-seen direction as a product of powers, the largest power 1."""
+    powers = direction / np.abs(direction).max()
+    return " · ".join(f"{name}^{power:+.2f}" for name, power in zip(names, powers, strict=True) if abs(power) > 0.05)
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) and value < 1e100 else None
+
+
+def node_set_note(scenario: Scenario) -> str:
+    """Why the ratio is not what a motion identifies where the mass multiplier acts on a part of the cloth; else empty."""
+    nodes = scenario.node_sets.get("mass")
+    if nodes is None:
+        return ""
+    return f"mass multiplies {len(nodes)} of {len(scenario.scene.mesh.nodes)} nodes, so stretch / mass is no exact scale"

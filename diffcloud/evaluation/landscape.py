@@ -1,0 +1,46 @@
+"""The loss over two parameters, simulated on a logarithmic grid in batches, and the optimiser's path on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from diffcloud.evaluation.methods import batch_losses
+from diffcloud.fit import FitSpace, Objective
+
+
+def loss_landscape(
+    objective: Objective, space: FitSpace, values: Mapping[str, float], history: Mapping[str, Any], *, size: int
+) -> dict[str, Any] | None:
+    """Losses over the first two fitted parameters, the others as fitted.
+
+    Args:
+        values: the fitted ones.
+        history: of `fit.result.read_fit`.
+        size: n places along each axis, between the bounds.
+
+    Returns:
+        names; x, y: [n] of the first and the second parameter; loss: [n][n], rows of y, None where a run diverged; paths:
+        for each start [iterations][2]; fitted: [2]. None if fewer than two parameters are fitted.
+    """
+    if len(space.variables) < 2:
+        return None
+    first, second = space.variables[:2]
+    axes = [np.geomspace(v.low, v.high, size) if v.low > 0 else np.linspace(v.low, v.high, size) for v in (first, second)]
+    x, y = np.meshgrid(*axes)
+    places = np.tile([values[name] for name in space.names], (size * size, 1))
+    places[:, 0], places[:, 1] = x.ravel(), y.ravel()
+    losses = batch_losses(objective, space, torch.as_tensor(places).to(objective.system.gravity)).reshape(size, size)
+    columns = [list(history["names"]).index(variable.name) for variable in (first, second)]
+    paths = np.array(history["values"], dtype=np.float64)[:, :, columns]  # [N, B, 2]; None is NaN
+    return {
+        "names": [first.name, second.name],
+        "x": axes[0].tolist(),
+        "y": axes[1].tolist(),
+        "loss": [[value if np.isfinite(value) else None for value in row] for row in losses.tolist()],
+        "paths": [path[np.isfinite(path).all(axis=1)].tolist() for path in paths.swapaxes(0, 1)],
+        "fitted": [values[first.name], values[second.name]],
+    }

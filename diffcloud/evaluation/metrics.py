@@ -1,0 +1,119 @@
+"""What a parameter set is worth on an episode: distances to the recorded clouds, success, error of known parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from diffcloud.clouds.losses import chamfer
+from diffcloud.evaluation.methods import without_diverged
+from diffcloud.fit import Objective
+from diffcloud.fit.parameters import NUISANCE
+from diffcloud.io.episodes import Episode
+from diffcloud.scene.scenarios import PAPER_THRESHOLD, RELEASE_UNIT_M, Scenario
+
+
+def success_threshold(scenario: Scenario) -> float:
+    """The paper's 0.0005 squared release units, in the scenario's squared length unit."""
+    return PAPER_THRESHOLD * (RELEASE_UNIT_M / scenario.length_unit_m) ** 2
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The metrics of a batch of parameter sets."""
+
+    rows: list[dict[str, Any]]
+    """Metric -> value of each set, empty where one diverged; see `EpisodeMeter.measure`."""
+    diverged: dict[int, str]
+    """Set -> message."""
+
+
+class EpisodeMeter:
+    """Measures parameter sets on one episode, all with the same simulator, frames and sampled points.
+
+    The points are drawn anew: no method has seen them.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        episode: Episode,
+        *,
+        frames: Sequence[int],
+        points: int | None = None,
+        draws: int = 4,
+        seed: int = 1000,
+    ) -> None:
+        """
+        Args:
+            frames: those that the fit used; negative ones count from the end.
+            points: sampled per frame; the scenario's if not given.
+            draws: of points, over which distances at the fit's frames are averaged.
+            seed: of the first draw.
+        """
+        self.scenario, self.episode = scenario, episode
+        used = [frame % episode.frame_count for frame in frames]
+        last = scenario.steps * scenario.scene.time_step + 1e-6
+        # frame 0 is before the motion and the same for all parameters
+        others = [f for f in range(1, episode.frame_count) if f not in used and episode.times[f] <= last]
+        self._own = Objective(scenario, [episode], frames=used, points=points, seed=seed)
+        self._others = Objective(scenario, [episode], frames=others, points=points, seed=seed) if others else None
+        self._seeds = range(seed, seed + draws)
+
+    def measure(self, sets: Sequence[Mapping[str, float]]) -> Measured:
+        """Metrics of parameter sets, each within its bounds.
+
+        Returns rows with
+            loss, loss_deviation: one-sided Chamfer at the fit's frames [squared length unit], its mean over the draws and
+                their standard deviation (of one draw);
+            rms_mm: its root in millimetres;
+            loss_other_frames, rms_other_frames_mm: at the frames that the fit did not use, of one draw; absent without any;
+            two_sided: Chamfer in both directions at the fit's frames, of one draw;
+            and of episodes with known parameters: success, error_<parameter> (relative), error_ratio (of stretch to mass).
+        """
+        with torch.no_grad():
+            found, kept, diverged = without_diverged(len(sets), lambda index: self._distances([sets[i] for i in index]))
+        rows: list[dict[str, Any]] = [{} for _ in sets]
+        for index, distances in zip(kept.tolist(), found or [], strict=True):
+            rows[index] = distances | self._against_truth(sets[index], distances["loss"])
+        return Measured(rows, diverged)
+
+    def _distances(self, sets: Sequence[Mapping[str, float]]) -> list[dict[str, Any]]:
+        own, like = self._own, self._own.system.gravity
+        names = dict.fromkeys(name for values in sets for name in values)
+        tensors = {name: like.new_tensor([values.get(name, 0.0) for values in sets]) for name in names}
+        offset = {name: tensors.pop(name) for name in names if name in NUISANCE}
+        run = own.simulate(tensors)
+        own.reseed(self._seeds[0])
+        points = own.points(run, offset)  # [B, L, N, 3]
+        both = [chamfer(points[:, frame], [cloud] * len(sets)) for frame, cloud in enumerate(own.clouds())]
+        losses = []
+        for seed in self._seeds:
+            own.reseed(seed)
+            losses.append(own.frame_losses(run, offset).mean(-1))
+        every = torch.stack(losses)  # [draws, B]
+        to_mm = 1e3 * self.scenario.length_unit_m
+        columns = {
+            "loss": every.mean(0),
+            "loss_deviation": every.std(0, correction=1 if len(losses) > 1 else 0),
+            "rms_mm": to_mm * every.mean(0).sqrt(),
+            "two_sided": torch.stack(both).mean(0),
+        }
+        if self._others is not None:
+            others = self._others.frame_losses(run, offset).mean(-1)
+            columns |= {"loss_other_frames": others, "rms_other_frames_mm": to_mm * others.sqrt()}
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        return [dict(zip(columns, row, strict=True)) for row in rows]
+
+    def _against_truth(self, values: Mapping[str, float], loss: float) -> dict[str, Any]:
+        truth = {name: float(value) for name, value in (self.episode.meta.get("truth") or {}).items() if name in values}
+        if not truth:
+            return {}
+        row: dict[str, Any] = {"success": bool(loss < success_threshold(self.scenario))}
+        row |= {f"error_{name}": abs(values[name] / value - 1) for name, value in truth.items() if value}
+        if {"stretch", "mass"} <= truth.keys():
+            row["error_ratio"] = abs(values["stretch"] * truth["mass"] / (values["mass"] * truth["stretch"]) - 1)
+        return row

@@ -1,0 +1,367 @@
+"""Tables over all episodes, who wins, and the sentences that say so."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from diffcloud.evaluation.methods import PHASES
+from diffcloud.evaluation.repeats import consistency, fit_table, repeatability, transfer
+
+LABELS = {
+    "diffcloud": "DiffCloud",
+    "single_start": "DiffCloud, one start",
+    "mlp": "MLP",
+    "pointnet2": "PointNet++",
+    "meteornet": "MeteorNet",
+    "published_mlp": "published MLP",
+    "published_pointnet2": "published PointNet++",
+    "published_meteornet": "published MeteorNet",
+    "middle": "middle of the range",
+    "random_search": "random search",
+    "cma_es": "CMA-ES",
+}
+"""Method -> what a person reads."""
+PREDICTORS = ("mlp", "pointnet2", "meteornet", "published_mlp", "published_pointnet2", "published_meteornet")
+"""Methods that have learned."""
+_CLEARLY = 2.0
+"""Standard deviations by which losses of two methods must differ to count as different."""
+Records = Sequence[Mapping[str, Any]]
+Tables = Mapping[str, pd.DataFrame]
+"""Of `tables`."""
+
+
+def label(method: str) -> str:
+    return LABELS.get(method, method)
+
+
+def method_table(records: Records, references: Mapping[tuple[str, str], float] | None = None) -> pd.DataFrame:
+    """One row per episode and method: labels, metrics, parameters; gaps have a `status` that is not `ok` and a reason.
+
+    Args:
+        references: (scenario, episode) -> loss of the reference simulator's own fit, as it was measured there; the column
+            `reference_loss`.
+    """
+    rows: list[dict[str, Any]] = []
+    for record in records:
+        shared = {key: record[key] for key in ("scenario", "episode", "fabric", "category", "repeat")}
+        known = (references or {}).get((record["scenario"], record["episode"]))
+        if known is not None:
+            shared["reference_loss"] = known
+        for method in record["methods"]:
+            row = {key: value for key, value in method.items() if key not in ("values", "clipped")}
+            row |= {f"value_{name}": value for name, value in method["clipped"].items()}
+            rows.append({**shared, "status": "ok", "reason": "", **row})
+        for gap in record["gaps"]:
+            status = "missing" if gap["expected"] else "not asked for"
+            rows.append({**shared, "status": status, "method": gap["method"], "reason": gap["reason"]})
+    return pd.DataFrame(rows)
+
+
+def method_means(table: pd.DataFrame) -> pd.DataFrame:
+    """One row per scenario and method, over the episodes where it says something: means of distances and simulations,
+    medians of errors, success rate, and in how many episodes no other has a clearly lower loss (`best`)."""
+    measured = table[table["status"] == "ok"]
+    lowest = measured.groupby(["scenario", "episode"])["loss"].transform("min")
+    best = measured["loss"] <= lowest + _CLEARLY * measured["loss_deviation"]
+    rows = []
+    for (scenario, method), group in measured.assign(best=best).groupby(["scenario", "method"], sort=False):
+        row: dict[str, Any] = {"scenario": scenario, "method": method, "episodes": len(group)}
+        for name in ("loss", "rms_mm", "rms_other_frames_mm", "two_sided", "simulations"):
+            row[name] = _mean(group, name)
+        row["best"] = int(group["best"].sum())
+        if "success" in group and group["success"].notna().any():
+            row["success_rate"] = float(group["success"].dropna().astype(float).mean())
+        for name in (str(column) for column in group.columns if str(column).startswith("error_")):
+            if group[name].notna().any():
+                row[f"median_{name}"] = float(group[name].median())
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def category_means(table: pd.DataFrame) -> pd.DataFrame:
+    """Mean loss and RMS distance per scenario, category and method, of episodes with a category."""
+    measured = table[(table["status"] == "ok") & table["category"].notna()]
+    if measured.empty:
+        return pd.DataFrame(columns=["scenario", "category", "method", "episodes", "loss", "rms_mm"])
+    grouped = measured.groupby(["scenario", "category", "method"], sort=False)
+    return grouped.agg(episodes=("loss", "size"), loss=("loss", "mean"), rms_mm=("rms_mm", "mean")).reset_index()
+
+
+def seconds_table(seconds: Mapping[tuple[str, str], Mapping[str, Mapping[str, float]]]) -> pd.DataFrame:
+    """One row per episode and method with its wall time in each phase and in all [s].
+
+    Args:
+        seconds: (scenario, episode) -> method -> phase -> seconds.
+    """
+    rows = [
+        {"scenario": scenario, "episode": episode, "method": method, **{phase: told.get(phase) for phase in PHASES}}
+        for (scenario, episode), methods in seconds.items()
+        for method, told in methods.items()
+        if told
+    ]
+    table = pd.DataFrame(rows, columns=["scenario", "episode", "method", *PHASES])
+    return table.assign(total=table[list(PHASES)].astype(float).sum(axis=1))
+
+
+def identifiability_table(records: Records) -> pd.DataFrame:
+    """One row per episode and parameter: fitted value, the factor within which the loss does not tell, the verdict, and
+    whether the direct check agrees at all ends; `scale` columns in units of the resampling noise."""
+    rows = []
+    for record in records:
+        told = record["identifiability"]
+        fit = next((row for row in record["methods"] if row["method"] == "diffcloud"), None)
+        if told is None or fit is None:
+            continue
+        agrees = [entry["agrees"] for entry in told["check"]]
+        for name in told["parameters"]:
+            row: dict[str, Any] = {"scenario": record["scenario"], "episode": record["episode"], "fabric": record["fabric"]}
+            row |= {"parameter": name, "value": fit["clipped"][name], "factor": _factor(told["half_widths"][name])}
+            row |= {"verdict": told["verdicts"][name], "ratio_factor": _factor(told.get("ratio_half_width"))}
+            row |= {"combination": told["combination"], "ends_checked": len(agrees), "ends_agree": sum(agrees)}
+            row["ends_at_bounds"] = sum(not entry["farther_within_bounds"] for entry in told["check"])
+            row["lower_loss_near"] = told["lower"] is not None
+            row |= {f"scale_{key}": value for key, value in (told["scale"] or {}).items()}
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def tables(
+    records: Records,
+    seconds: Mapping[tuple[str, str], Mapping[str, Mapping[str, float]]],
+    references: Mapping[tuple[str, str], float] | None = None,
+) -> dict[str, pd.DataFrame]:
+    """All tables of the comparison by file name; `seconds` alone holds wall times."""
+    methods = method_table(records, references)
+    fits = fit_table(records)
+    return {
+        "methods": methods,
+        "means": method_means(methods),
+        "categories": category_means(methods),
+        "identifiability": identifiability_table(records),
+        "repeatability": repeatability(fits),
+        "transfer": transfer(records),
+        "consistency": consistency(fits),
+        "parameters": fits,
+        "seconds": seconds_table(seconds),
+    }
+
+
+def against_predictors(table: pd.DataFrame) -> pd.DataFrame:
+    """DiffCloud against the best learned or published predictor.
+
+    Returns:
+        scenario, episodes, lowest: in how many DiffCloud's loss is the lowest within the sampling noise; loss: its mean;
+        predictor: the one with the lowest mean; predictor_loss; below: by how much of it DiffCloud's mean is lower.
+    """
+    measured = table[table["status"] == "ok"]
+    rows = []
+    for scenario, group in measured.groupby("scenario", sort=False):
+        losses = group.pivot_table(index="episode", columns="method", values="loss", sort=False)
+        noise = group.pivot_table(index="episode", columns="method", values="loss_deviation", sort=False)
+        predictors = [name for name in PREDICTORS if name in losses]
+        if "diffcloud" not in losses or not predictors:
+            continue
+        both = losses[losses["diffcloud"].notna() & losses[predictors].notna().any(axis=1)]
+        means = both[predictors].mean()
+        lowest = both["diffcloud"] <= both[predictors].min(axis=1) + _CLEARLY * noise.loc[both.index, "diffcloud"]
+        rows.append(
+            {
+                "scenario": scenario,
+                "episodes": len(both),
+                "lowest": int(lowest.sum()),
+                "loss": float(both["diffcloud"].mean()),
+                "predictor": str(means.idxmin()),
+                "predictor_loss": float(means.min()),
+                "below": float(1 - both["diffcloud"].mean() / means.min()),
+            }
+        )
+    columns = ["scenario", "episodes", "lowest", "loss", "predictor", "predictor_loss", "below"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def against_reference(table: pd.DataFrame, *, within: float = 0.05) -> tuple[int, int] | None:
+    """(episodes where DiffCloud's loss is at most that part above the reference simulator's own fit, episodes with one)."""
+    if "reference_loss" not in table:
+        return None
+    known = table[(table["method"] == "diffcloud") & (table["status"] == "ok") & table["reference_loss"].notna()]
+    return int((known["loss"] <= (1 + within) * known["reference_loss"]).sum()), len(known)
+
+
+def metrics(told: Tables) -> dict[str, Any]:
+    """Numbers for `metrics.json`: scenario -> method -> means; who wins; what is identified. No wall times."""
+    by_scenario: dict[str, Any] = {}
+    for row in told["means"].to_dict("records"):
+        entry = {str(key): value for key, value in row.items() if key not in ("scenario", "method") and not _unknown(value)}
+        by_scenario.setdefault(row["scenario"], {})[row["method"]] = entry
+    found: dict[str, Any] = {"methods": by_scenario}
+    found["against_predictors"] = {
+        row.pop("scenario"): row for row in against_predictors(told["methods"]).to_dict("records")
+    }
+    reference = against_reference(told["methods"])
+    if reference is not None:
+        found["against_reference"] = {"within_5_percent": reference[0], "episodes": reference[1]}
+    table = told["identifiability"]
+    if not table.empty:
+        verdicts: dict[str, Any] = {}
+        for (scenario, parameter), group in table.groupby(["scenario", "parameter"], sort=False):
+            counts = group["verdict"].value_counts(sort=False)
+            verdicts.setdefault(str(scenario), {})[str(parameter)] = {str(key): int(n) for key, n in counts.items()}
+        ends = table.drop_duplicates(["scenario", "episode"])
+        found["identifiability"] = verdicts
+        found["checked_ends"] = {"agree": int(ends["ends_agree"].sum()), "all": int(ends["ends_checked"].sum())}
+    return found
+
+
+def sentences(told: Tables) -> dict[str, list[str]]:
+    """The comparison in plain words, by topic: winners, success, identifiability, repeats."""
+    return {
+        "winners": _winners(told),
+        "success": _success(told),
+        "identifiability": _identified(told["identifiability"]),
+        "repeats": _repeats(told),
+    }
+
+
+def overview(told: Tables) -> pd.DataFrame:
+    """One row per scenario: the methods with the lowest and the next mean loss, the middle of the range, how far
+    DiffCloud's mean is below the best predictor's, and the verdict that most episodes give on each parameter."""
+    below = {row["scenario"]: row["below"] for row in against_predictors(told["methods"]).to_dict("records")}
+    verdicts = told["identifiability"]
+    rows = []
+    for scenario, group in told["means"].groupby("scenario", sort=False):
+        ranked = group.sort_values("loss", kind="stable").to_dict("records")
+        row: dict[str, Any] = {"scenario": str(scenario), "episodes": max(int(one["episodes"]) for one in ranked)}
+        for place, one in zip(("first", "second"), ranked, strict=False):
+            row |= {place: label(one["method"]), f"{place}_mm": one["rms_mm"]}
+        row["middle_mm"] = next((one["rms_mm"] for one in ranked if one["method"] == "middle"), None)
+        row["below_predictor"] = below.get(scenario)
+        if not verdicts.empty:
+            for name, part in verdicts[verdicts["scenario"] == scenario].groupby("parameter", sort=False):
+                verdict, count = next(iter(part["verdict"].value_counts().items()))
+                row[f"verdict_{name}"] = f"{verdict} ({count}/{len(part)})"
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _winners(told: Tables) -> list[str]:
+    found = []
+    for scenario, group in told["means"].groupby("scenario", sort=False):
+        ranked = group.sort_values("loss", kind="stable")
+        first, middle = ranked.iloc[0], group[group["method"] == "middle"]
+        text = f"{scenario}: {label(first['method'])} has the lowest mean loss over {_count(int(first['episodes']))}, "
+        text += f"{first['rms_mm']:.1f} mm (RMS)"
+        if len(ranked) > 1:
+            second = ranked.iloc[1]
+            text += f"; next {label(second['method'])}, {second['rms_mm']:.1f} mm"
+        if len(middle):
+            text += f"; the middle of the range, {middle['rms_mm'].iloc[0]:.1f} mm"
+        found.append(text + ".")
+    for row in against_predictors(told["methods"]).to_dict("records"):
+        comparison = f"{100 * abs(row['below']):.0f} % {'below' if row['below'] >= 0 else 'above'}"
+        found.append(
+            f"{row['scenario']}: against predictors DiffCloud is lowest, within the sampling noise, in {row['lowest']} of "
+            f"{row['episodes']} episodes; its mean loss is {comparison} that of the best one, {label(row['predictor'])}."
+        )
+    reference = against_reference(told["methods"])
+    if reference is not None:
+        found.append(
+            f"Within 5 % of the reference simulator's own fits, or below: {reference[0]} of {reference[1]} episodes."
+        )
+    return found
+
+
+def _success(told: Tables) -> list[str]:
+    means = told["means"]
+    if "success_rate" not in means:
+        return []
+    found = []
+    for scenario, group in means[means["success_rate"].notna()].groupby("scenario", sort=False):
+        rates = ", ".join(f"{label(row['method'])} {100 * row['success_rate']:.0f} %" for row in group.to_dict("records"))
+        found.append(f"{scenario}, simulated targets below the paper's threshold: {rates}.")
+    return found
+
+
+def _identified(table: pd.DataFrame) -> list[str]:
+    if table.empty:
+        return []
+    found = []
+    for (scenario, name), group in table.groupby(["scenario", "parameter"], sort=False):
+        counts = ", ".join(f"{verdict} in {count}" for verdict, count in group["verdict"].value_counts().items())
+        found.append(
+            f"{scenario}: verdict on {name}: {counts} of {_count(len(group))}; the loss tells it within a factor of "
+            f"{group['factor'].median():.2g} (median)."
+        )
+    ends = table.drop_duplicates(["scenario", "episode"])
+    found.append(
+        f"Direct check of the intervals with fresh points: {int(ends['ends_agree'].sum())} of "
+        f"{int(ends['ends_checked'].sum())} ends agree; for {int(ends['ends_at_bounds'].sum())} of all ends three times as "
+        "far lies beyond the bounds."
+    )
+    if ends["lower_loss_near"].any():
+        found.append(
+            f"In {int(ends['lower_loss_near'].sum())} of {len(ends)} episodes a scan along these directions met a clearly "
+            "lower loss than the fit: that fit has not found its minimum, and its intervals are about where it stopped."
+        )
+    if "scale_everything" in ends:
+        for scenario, group in ends[ends["scale_everything"].notna()].groupby("scenario", sort=False):
+            fitted, everything = group["scale_fitted"].median(), group["scale_everything"].median()
+            text = (
+                f"{scenario!s}: doubling or halving stretch and mass together moves the loss by {fitted:.2g} times the "
+                f"resampling noise (median); with bending, air and all masses along, by {everything:.2g} times. "
+            )
+            if everything > 1 and everything > 0.5 * fitted:
+                text += "What seems to identify the scale is an artefact of soft handles and contact stiffness."
+            elif everything > 1:
+                text += "Part of what identifies the scale is an artefact of soft handles and contact stiffness."
+            elif fitted > 1:
+                text += "The scale is tied down by what no multiplier moves: bending, air, other nodes."
+            else:
+                text += "The scale of stretch and mass is not seen at all: only their ratio is."
+            found.append(text)
+    return found
+
+
+def _repeats(told: Tables) -> list[str]:
+    found = []
+    for scenario, group in told["repeatability"].groupby("scenario", sort=False):
+        factors = group.groupby("parameter", sort=False)["factor"].median()
+        text = ", ".join(f"{name} {_times(value)}" for name, value in factors.items())
+        found.append(f"{scenario}: repeats of one fabric differ, in the median, by {text}.")
+    known = told["transfer"]
+    for scenario, group in known[known[["loss_own", "loss_middle"]].notna().all(axis=1)].groupby("scenario", sort=False):
+        better = int((group["loss"] < group["loss_middle"]).sum())
+        found.append(
+            f"{scenario}: parameters of one repeat predict another better than the middle of the range in {better} of "
+            f"{len(group)} cases; their loss is {(group['loss'] / group['loss_own']).median():.2g} times that of its own "
+            f"fit, the middle's {(group['loss_middle'] / group['loss_own']).median():.2g} times (medians)."
+        )
+    for (first, second), group in told["consistency"].groupby(["first", "second"], sort=False):
+        factors = group.groupby("parameter", sort=False)["factor"].median()
+        text = ", ".join(f"{name} {_times(value)}" for name, value in factors.items())
+        found.append(f"{first} and {second} of one fabric disagree, in the median, by {text}.")
+    return found
+
+
+def _count(episodes: int) -> str:
+    return f"{episodes} episode{'' if episodes == 1 else 's'}"
+
+
+def _mean(group: pd.DataFrame, name: str) -> float | None:
+    return float(group[name].mean()) if name in group and group[name].notna().any() else None
+
+
+def _factor(half_width: float | None) -> float | None:
+    return None if half_width is None else float(np.exp(half_width))
+
+
+def _times(value: float) -> str:
+    return f"a factor of {value:.2g}" if value < 1000 else "more than 1000"
+
+
+def _unknown(value: Any) -> bool:
+    return value is None or (isinstance(value, float) and math.isnan(value))

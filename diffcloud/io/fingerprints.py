@@ -1,0 +1,43 @@
+"""Fingerprints: whether a result kept on disk still belongs to what decides its numbers, source code included."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import diffcloud
+
+
+def fingerprint(plan: Any, *, packages: Sequence[str]) -> str:
+    """Hexadecimal digest that is equal where the plan, the sources and the versions of torch and numpy are.
+
+    Args:
+        plan: dataclasses, mappings, sequences, arrays, numbers, strings.
+        packages: sub-packages of diffcloud whose source decides the numbers.
+    """
+    digest = hashlib.sha256()
+    for package in packages:
+        for source in sorted((Path(diffcloud.__file__).parent / package).rglob("*.py")):
+            digest.update(source.read_bytes())
+    digest.update(json.dumps([torch.__version__, np.__version__, _described(plan)], sort_keys=True).encode())
+    return digest.hexdigest()
+
+
+def _described(value: Any) -> Any:
+    """Plain JSON that is equal where the values are."""
+    if isinstance(value, np.ndarray):
+        return [str(value.dtype), value.shape, hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()]
+    if is_dataclass(value) and not isinstance(value, type):
+        return [type(value).__name__, {field.name: _described(getattr(value, field.name)) for field in fields(value)}]
+    if isinstance(value, Mapping):
+        return {str(key): _described(entry) for key, entry in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_described(entry) for entry in value]
+    return repr(value)

@@ -1,0 +1,347 @@
+"""Figures of the comparison as SVG and PNG: the paper's, remade from data, and those that it leaves out.
+
+Colours are told apart by the colour-blind (after Okabe and Ito 2008, the blue lighter for dark pages). Text and axes are
+drawn in one grey-blue of their own, which the page replaces by its text colour, so that a figure is readable on light and
+dark.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from diffcloud.evaluation.methods import PHASES
+from diffcloud.evaluation.summary import Tables, label
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+
+    from diffcloud.report.page import EpisodeEntry
+
+INK = "#5b6676"
+"""Text and axes: readable on white and on black; the page puts its own colour in its place."""
+_COLOURS = ("#2b8ccb", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999")
+_CATEGORIES = ("highly deformable", "medium", "shape retaining")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture with what a reader needs to believe it."""
+
+    name: str
+    title: str
+    caption: str
+    source: str
+    """Table that it was drawn from."""
+    svg: str
+    png: bytes
+    width: float
+    """[inch]"""
+
+
+def comparison_figures(
+    told: Tables, records: Sequence[Mapping[str, Any]], histories: Mapping[tuple[str, str], Mapping[str, Any]]
+) -> list[Figure]:
+    """All figures for which there is data.
+
+    Args:
+        told: of `evaluation.summary.tables`.
+        records: of `evaluation.compare_episode`.
+        histories: (scenario, episode) -> history of the fit.
+    """
+    makers = [_losses(told), _seconds(told), _parameters(told), _success(told), _curves(histories)]
+    makers += [_landscape(record) for record in records]
+    return [figure for figure in makers if figure is not None]
+
+
+def _losses(told: Tables) -> Figure | None:
+    measured = told["methods"][told["methods"]["status"] == "ok"]
+    if measured.empty:
+        return None
+    scenarios, methods = _ordered(measured, "scenario"), _ordered(measured, "method")
+    canvas, axes = _canvas(len(scenarios), height=0.9 + 0.32 * len(methods))
+    for axis, scenario in zip(axes, scenarios, strict=True):
+        group = measured[measured["scenario"] == scenario]
+        categories = _categories(group)
+        for shift, (category, colour) in zip(_spread(len(categories)), categories.items(), strict=True):
+            part = group[group["category"].fillna("") == category]
+            places = [methods.index(method) + shift for method in part["method"]]
+            axis.scatter(part["rms_mm"], places, s=16, color=colour, alpha=0.8, linewidths=0, label=category or None)
+        for place, method in enumerate(methods):
+            mean = group.loc[group["method"] == method, "rms_mm"].mean()
+            axis.plot([mean, mean], [place - 0.38, place + 0.38], color=INK, linewidth=1.6)
+        axis.set_yticks(range(len(methods)), [label(name) for name in methods])
+        axis.set_xlim(left=0)
+        axis.set_xlabel("RMS distance [mm]")
+        axis.set_title(scenario)
+        axis.invert_yaxis()
+        if any(categories):
+            axis.legend(fontsize=7, frameon=False, labelcolor=INK)
+    return _finished(
+        canvas,
+        "losses",
+        "Distance per method and fabric category",
+        "One dot per episode, a bar at the mean. One-sided Chamfer at the fit's frames as a root mean square, fresh "
+        "points, the same simulator for all.",
+        "tables/methods.csv",
+    )
+
+
+def _seconds(told: Tables) -> Figure | None:
+    table = told["seconds"]
+    if table.empty:
+        return None
+    means = table.groupby("method", sort=False)[[*PHASES, "total"]].mean()
+    canvas, (axis,) = _canvas(1, height=0.9 + 0.32 * len(means))
+    methods = list(means.index)
+    axis.barh(range(len(methods)), means["total"].clip(lower=1e-3), color=_COLOURS[5], alpha=0.35, label="all")
+    for phase, marker, colour in zip(PHASES, "sDo^", _COLOURS, strict=False):
+        known = means[phase].notna()
+        places = np.flatnonzero(known)
+        axis.scatter(means.loc[known, phase].clip(lower=1e-3), places, marker=marker, color=colour, s=28, label=phase)
+    axis.set_yticks(range(len(methods)), [label(name) for name in methods])
+    axis.invert_yaxis()
+    axis.set_xscale("log")
+    axis.set_xlabel("seconds")
+    axis.legend(fontsize=7, frameon=False, labelcolor=INK)
+    return _finished(
+        canvas,
+        "seconds",
+        "Compute time per method",
+        "Wall time in each phase, mean over episodes. Data set and training are paid once for a scenario, inference and "
+        "optimisation for each episode. Measured where the run was made, possibly beside other work.",
+        "tables/seconds.csv",
+    )
+
+
+def _parameters(told: Tables) -> Figure | None:
+    fits = told["parameters"]
+    if fits.empty or not {"stretch", "mass"} <= set(fits.columns):
+        return None
+    scenarios = _ordered(fits, "scenario")
+    canvas, axes = _canvas(len(scenarios), height=3.2)
+    for axis, scenario in zip(axes, scenarios, strict=True):
+        group = fits[fits["scenario"] == scenario]
+        for category, colour in _categories(group).items():
+            part = group[group["category"].fillna("") == category]
+            axis.scatter(part["stretch"], part["mass"], s=22, color=colour, alpha=0.6, linewidths=0, label=category or None)
+            if category:
+                axis.scatter(part["stretch"].median(), part["mass"].median(), s=110, color=colour, marker="D", alpha=0.9)
+        _log_axes(axis, "stretch", "mass")
+        axis.set_title(scenario)
+        if group["category"].notna().any():
+            axis.legend(fontsize=7, frameon=False, labelcolor=INK)
+    return _finished(
+        canvas,
+        "parameters",
+        "Fitted parameters per category",
+        "Multipliers of the basis material, one dot per episode, a diamond at the median of a category. Dots on the frame "
+        "lie at a bound.",
+        "tables/parameters.csv",
+    )
+
+
+def _success(told: Tables) -> Figure | None:
+    means = told["means"]
+    if "success_rate" not in means or not means["success_rate"].notna().any():
+        return None
+    known = means[means["success_rate"].notna()]
+    scenarios, methods = _ordered(known, "scenario"), _ordered(known, "method")
+    canvas, axes = _canvas(len(scenarios), height=0.9 + 0.3 * len(methods))
+    for axis, scenario in zip(axes, scenarios, strict=True):
+        group = known[known["scenario"] == scenario].set_index("method")
+        rates = [100 * float(group["success_rate"].get(method, np.nan)) for method in methods]
+        axis.barh(
+            range(len(methods)), rates, color=[_COLOURS[0] if name == "diffcloud" else _COLOURS[5] for name in methods]
+        )
+        for place, (method, rate) in enumerate(zip(methods, rates, strict=True)):
+            text = "not measured" if np.isnan(rate) else f"{rate:.0f} % of {int(group['episodes'].get(method, 0))}"
+            axis.text(0 if np.isnan(rate) else rate, place, f" {text}", va="center", fontsize=7, color=INK)
+        axis.set_yticks(range(len(methods)), [label(name) for name in methods])
+        axis.set_xlim(0, 125)
+        axis.set_xticks([0, 50, 100])
+        axis.set_xlabel("below the threshold [%]")
+        axis.set_title(scenario)
+        axis.invert_yaxis()
+    return _finished(
+        canvas,
+        "success",
+        "Success on simulated targets",
+        "Episodes with known parameters whose loss is below 0.0005 squared release units (6.1e-5 m²). A loss below it is "
+        "no identification: see the errors of the parameters.",
+        "tables/means.csv",
+    )
+
+
+def _curves(histories: Mapping[tuple[str, str], Mapping[str, Any]]) -> Figure | None:
+    scenarios = list(dict.fromkeys(scenario for scenario, _ in histories))
+    if not scenarios:
+        return None
+    canvas, axes = _canvas(len(scenarios), height=2.8)
+    for axis, scenario in zip(axes, scenarios, strict=True):
+        for (owner, _), history in histories.items():
+            if owner == scenario:
+                lowest = [min((value for value in row if value is not None), default=np.nan) for row in history["loss"]]
+                axis.plot(np.fmin.accumulate(lowest), color=_COLOURS[0], alpha=0.8, linewidth=1)
+        axis.set_yscale("log")
+        axis.set_xlabel("iteration")
+        axis.set_ylabel("lowest loss so far")
+        axis.set_title(scenario)
+    return _finished(
+        canvas,
+        "curves",
+        "Loss curves",
+        "Lowest loss so far of each fit, all its starts together [squared length unit].",
+        "tables/losses.csv",
+    )
+
+
+def overlay_figure(entries: Sequence[EpisodeEntry]) -> Figure | None:
+    """Recorded cloud with the cloth at the start of the fit and after it, at the loss frame of each scenario's first
+    episode, seen from the side: the horizontal axis along which the cloud is widest, and the vertical."""
+    first = {entry.scenario: entry for entry in reversed(entries)}
+    if not first:
+        return None
+    shown = [first[name] for name in dict.fromkeys(entry.scenario for entry in entries)]
+    canvas, axes = _canvas(2 * len(shown), height=2.9)
+    for index, entry in enumerate(shown):
+        frame = entry.fit["settings"]["frames"][0] % entry.episode.frame_count
+        state = int(np.abs(entry.times - entry.episode.times[frame]).argmin())
+        cloud = entry.episode.frame(frame).astype(float)
+        flat = cloud[:, :2] - cloud[:, :2].mean(axis=0)
+        wide = np.linalg.svd(flat, full_matrices=False)[2][0]
+        for axis, nodes, name, colour in zip(
+            axes[2 * index : 2 * index + 2],
+            (entry.start_nodes[state], entry.nodes[state]),
+            ("start of the fit", "fitted"),
+            (_COLOURS[6], _COLOURS[0]),
+            strict=True,
+        ):
+            axis.scatter(cloud[::4, :2] @ wide, cloud[::4, 2], s=2, color=_COLOURS[2], linewidths=0, rasterized=True)
+            axis.triplot(nodes[:, :2] @ wide, nodes[:, 2], entry.faces, color=colour, linewidth=0.9)
+            axis.set_title(f"{entry.scenario} / {entry.name}, {name}")
+            axis.set_aspect("equal", adjustable="datalim")
+    return _finished(
+        canvas,
+        "overlays",
+        "Target, start and fitted cloth",
+        "Recorded points (green) with the mesh at the start of the fit (left) and after it (right), from the side, at the "
+        "loss frame of the first episode of each scenario [length unit].",
+        "data/fits and data/episodes",
+    )
+
+
+def _landscape(record: Mapping[str, Any]) -> Figure | None:
+    told = record["landscape"]
+    if told is None:
+        return None
+    canvas, (axis,) = _canvas(1, height=4.0, width=5.4)
+    loss = np.array(told["loss"], dtype=float)
+    x, y = np.array(told["x"]), np.array(told["y"])
+    picture = axis.contourf(x, y, np.log10(np.maximum(loss, 1e-30)), levels=18, cmap="viridis")
+    bar = canvas.colorbar(picture, ax=axis)
+    bar.set_label("log₁₀ loss", color=INK)
+    bar.ax.tick_params(colors=INK, labelsize=8)
+    for index, path in enumerate(told["paths"]):
+        places = np.array(path)
+        name = "optimiser, one line a start" if index == 0 else None
+        axis.plot(places[:, 0], places[:, 1], color="white", linewidth=1, alpha=0.8, label=name)
+        axis.plot(places[0, 0], places[0, 1], "o", color="white", markersize=3)
+    axis.plot(*told["fitted"], "*", color=_COLOURS[1], markersize=13, markeredgecolor="white", label="fitted")
+    if truth := record["truth"]:
+        axis.plot(*(truth[name] for name in told["names"]), "X", color="white", markersize=9, label="true")
+    _draw_ellipse(axis, record)
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    axis.set_xlim(x[0], x[-1])
+    axis.set_ylim(y[0], y[-1])
+    axis.set_xlabel(told["names"][0])
+    axis.set_ylabel(told["names"][1])
+    axis.set_title(f"{record['scenario']} / {record['episode']}")
+    axis.legend(fontsize=7, facecolor="#444444", labelcolor="white", edgecolor="none")
+    name = f"landscape_{record['scenario']}_{record['episode']}"
+    return _finished(
+        canvas,
+        name,
+        f"Loss landscape of {record['scenario']} / {record['episode']}",
+        f"{len(x)} × {len(y)} simulations on a logarithmic grid, common random points. The ellipse is what the "
+        "Gauss-Newton matrix says one standard deviation of resampling noise cannot tell; where it is small it "
+        "is within the star.",
+        "tables/comparison.json",
+    )
+
+
+def _draw_ellipse(axis: Axes, record: Mapping[str, Any]) -> None:
+    told, names = record["identifiability"], record["landscape"]["names"]
+    if told is None or told["parameters"] != names or None in told["predicted"]:
+        return
+    turn = np.linspace(0, 2 * np.pi, 200)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1) * np.array(told["predicted"])
+    centre = np.log(np.array(record["landscape"]["fitted"]))
+    places = np.exp(np.clip(centre + circle @ np.array(told["directions"]), -20, 20))
+    axis.plot(places[:, 0], places[:, 1], color=_COLOURS[1], linewidth=1.5, label="Gauss-Newton ellipse")
+
+
+def _canvas(count: int, *, height: float, width: float | None = None) -> tuple[Canvas, list[Axes]]:
+    """One axis a scenario, two in a row."""
+    from matplotlib.figure import Figure as Canvas  # takes half a second to import; no window, no pyplot
+
+    columns = min(count, 2)
+    rows = -(-count // columns)
+    canvas = Canvas(figsize=(width or 5.2 * columns, height * rows), layout="constrained")
+    axes = np.atleast_1d(canvas.subplots(rows, columns, squeeze=False)).ravel().tolist()
+    for spare in axes[count:]:
+        spare.set_axis_off()
+    for axis in axes[:count]:
+        axis.tick_params(which="both", colors=INK, labelsize=8)
+        axis.set_facecolor("none")
+        for part in (axis.title, axis.xaxis.label, axis.yaxis.label):
+            part.set_color(INK)
+            part.set_fontsize(9)
+        for side, spine in axis.spines.items():
+            spine.set_color(INK)
+            spine.set_visible(side in ("left", "bottom"))
+    return canvas, axes[:count]
+
+
+def _finished(canvas: Canvas, name: str, title: str, caption: str, source: str) -> Figure:
+    import matplotlib
+
+    svg, png = io.StringIO(), io.BytesIO()
+    # without a date and with a fixed salt the same data gives the same bytes; text stays text
+    with matplotlib.rc_context({"svg.hashsalt": name, "svg.fonttype": "none"}):
+        canvas.savefig(svg, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    canvas.savefig(png, format="png", dpi=150, facecolor="white", metadata={"Software": None})
+    return Figure(name, title, caption, source, svg.getvalue(), png.getvalue(), canvas.get_figwidth())
+
+
+def _ordered(table: pd.DataFrame, column: str) -> list[str]:
+    return [str(name) for name in dict.fromkeys(table[column])]
+
+
+def _categories(table: pd.DataFrame) -> dict[str, str]:
+    """Category -> colour, in the paper's order; the empty one where there is none."""
+    names = _ordered(table.assign(category=table["category"].fillna("")), "category")
+    known = [name for name in _CATEGORIES if name in names]
+    order = [*known, *(name for name in names if name not in known)]
+    return dict(zip(order, _COLOURS * (1 + len(order) // len(_COLOURS)), strict=False))
+
+
+def _spread(count: int) -> list[float]:
+    """Places side by side around zero."""
+    return [0.22 * (index - (count - 1) / 2) for index in range(count)]
+
+
+def _log_axes(axis: Axes, first: str, second: str) -> None:
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    axis.set_xlim(0.09, 11)
+    axis.set_ylim(0.09, 11)
+    axis.set_xlabel(f"{first} [× basis]")
+    axis.set_ylabel(f"{second} [× basis]")

@@ -1,0 +1,132 @@
+"""`diffcloud evaluate release`: the whole comparison on the published data by one command."""
+
+from __future__ import annotations
+
+import fnmatch
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from diffcloud.errors import ConfigError
+from diffcloud.evaluation.markdown import comparison_page
+from diffcloud.evaluation.summary import tables
+from diffcloud.io.episodes import Episode, write_episode
+from diffcloud.io.files import read_json, write_text
+from diffcloud.io.imports import release_episodes
+from pipeline.acceptance import SCENES
+from pipeline.comparison import FitJob, compare, comparison_jobs, run_all
+from pipeline.config import Config, load_config, updated
+from pipeline.console import JsonFlag, errors, finish
+from pipeline.evaluate import AllowMissing, stop_if_missing, write_evaluation
+from pipeline.report import report
+
+_PROFILE = Path(__file__).parents[1] / "profiles" / "release.yaml"
+
+
+def release(
+    folder: Annotated[Path, typer.Argument(help="The published data: holds lift_real_pcls/, conf/ and so on.")],
+    params: Annotated[Path, typer.Option("--params", help="Profile; a file of parameters.")] = _PROFILE,
+    data: Annotated[Path, typer.Option(help="Folder for imported episodes and fits.")] = Path("data/release"),
+    out: Annotated[Path, typer.Option(help="Folder for metrics, tables, figures and the page.")] = Path("reports/release"),
+    markdown: Annotated[Path | None, typer.Option(help="Write the tables to this Markdown file too.")] = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="JSON with the reference simulator's own fits, scenario -> episode -> loss.")
+    ] = None,
+    only: Annotated[str, typer.Option(help="Pattern of <scenario>/<episode>, such as 'release_lift/*'.")] = "*",
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; the profile says how many if not given.")] = None,
+    allow_missing: AllowMissing = False,
+    json: JsonFlag = False,
+) -> None:
+    """Import, fit, compare and report every published episode. Ctrl-C keeps what is finished; the same command goes on."""
+    if not (folder / "conf").is_dir():
+        raise ConfigError(f"{folder} has no conf/; give the folder with lift_real_pcls/ and conf/.")
+    config = load_config(params)
+    config = config.model_copy(update={"evaluate": updated(config.evaluate, workers=workers)})
+    scenes = {name: folder / "conf" / "rigidcloth" / SCENES[name] for name in SCENES}
+    chosen = [item for item in release_episodes(folder) if fnmatch.fnmatch(f"{item[0]}/{item[1]}", only)]
+    config = config.model_copy(update={"scenarios": [name for name in SCENES if any(item[0] == name for item in chosen)]})
+    if not chosen:
+        raise ConfigError(f"No published episode matches {only!r}; patterns are such as 'release_lift/*' or '*/lift_tan'.")
+    _import(chosen, data / "episodes")
+    failures = _fit(config, chosen, scenes, data / "fits")
+    jobs = [
+        job
+        for name in config.scenarios
+        for job in comparison_jobs(
+            config,
+            name,
+            fits=data / "fits",
+            episodes=data / "episodes",
+            regressors=data / "regressors",
+            simulated=data / "simulated",
+            kept=out / "episodes",
+            scene=scenes[name],
+        )
+        if fnmatch.fnmatch(f"{name}/{job.name}", only)
+    ]
+    comparison = compare(jobs, config.evaluate.workers)
+    comparison.failures[:0] = failures
+    references = {} if reference is None else _references(reference)
+    metrics = write_evaluation(
+        config,
+        comparison,
+        scenes,
+        fits=data / "fits",
+        episodes=data / "episodes",
+        out=out,
+        as_json=json,
+        references=references,
+    )
+    if markdown is not None:
+        told = tables(comparison.records, comparison.seconds, references)
+        write_text(markdown, comparison_page(told, comparison.missing))
+    if comparison.records:
+        report(
+            out=out / "index.html",
+            fits=data / "fits",
+            episodes=data / "episodes",
+            regressors=data / "regressors",
+            tables=out / "tables",
+            params=params,
+        )
+    finish({"metrics": metrics, "missing": comparison.missing}, json)
+    stop_if_missing(comparison, allow_missing)
+
+
+def _import(chosen: list[tuple[str, str, Episode]], folder: Path) -> None:
+    for name, label, episode in chosen:
+        write_episode(folder / name / f"{label}.npz", episode)
+
+
+def _fit(config: Config, chosen: list[tuple[str, str, Episode]], scenes: dict[str, Path], folder: Path) -> list[str]:
+    """Fit what is not fitted yet; messages of those that failed."""
+    jobs = [
+        FitJob(scenario=name, scene=scenes[name], name=label, episode=episode, settings=config.fit, folder=folder / name)
+        for name, label, episode in chosen
+    ]
+    failures = []
+    for job, _, error in run_all("fit", jobs, config.evaluate.workers):
+        errors.print(f"fitted {job.scenario}/{job.name}" if error is None else f"{job.scenario}/{job.name}: {error}")
+        if error is not None:
+            failures.append(f"{job.scenario}/{job.name}: {error}")
+    return failures
+
+
+def _references(path: Path) -> dict[tuple[str, str], float]:
+    """(scenario, episode) -> loss of the reference simulator's own fit, averaged over fresh points.
+
+    Raises:
+        ConfigError: not such a file.
+    """
+    told: Any = read_json(path, error=ConfigError)
+    try:
+        return {
+            (f"release_{scenario}", str(episode)): float(entry["loss_best_resampled_mean"])
+            for scenario, episodes in told.items()
+            for episode, entry in episodes.items()
+        }
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"{path} must hold scenario -> episode -> loss_best_resampled_mean, a number ({error!r})."
+        ) from error

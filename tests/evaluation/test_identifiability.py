@@ -1,0 +1,85 @@
+"""Identifiability against residuals whose matrix is known, and the words that follow from it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from diffcloud.evaluation.identifiability import Coordinates, identify
+from diffcloud.fit import FitSpace
+from tests.evaluation.bowls import SPACE, KnownResiduals
+
+OPTIMUM = {"stretch": 1.0, "mass": 1.0}
+RATIO, SCALE = np.array([1.0, -1.0]) / math.sqrt(2), np.array([1.0, 1.0]) / math.sqrt(2)
+
+
+def told(ratio, scale, **options):
+    """Residuals of slope `ratio` and `scale` along these directions, in equal shares."""
+    return identify(KnownResiduals([ratio * RATIO, scale * SCALE], OPTIMUM, **options), SPACE, OPTIMUM)
+
+
+class TestMatrix:
+    def test_is_the_mean_of_the_outer_products(self):
+        found = told(3.0, 0.5)
+        expected = 0.5 * (9.0 * np.outer(RATIO, RATIO) + 0.25 * np.outer(SCALE, SCALE))
+        np.testing.assert_allclose(found["matrix"], expected, rtol=1e-6)
+        np.testing.assert_allclose(found["eigenvalues"], [4.5, 0.125], rtol=1e-6)
+        np.testing.assert_allclose(np.abs(np.array(found["directions"]) @ RATIO), [1.0, 0.0], atol=1e-6)
+
+    def test_predicts_the_measured_intervals_of_a_quadratic_loss(self):
+        found = told(3.0, 0.5)
+        for predicted, ends in zip(found["predicted"], found["interval"], strict=True):
+            for end in ends:
+                assert predicted / 2 < end < predicted * 1.3  # the scan goes in steps
+
+    def test_noise_is_that_of_the_mean_loss(self):
+        """The loss is about 100 + 20 ε: its mean over 800 points and 4 draws has 2 · 20 · 0.02 / sqrt(3200) twice over."""
+        assert told(3.0, 0.5)["noise"] == pytest.approx(2 * 20 * 0.02 / math.sqrt(3200), rel=0.5)
+
+
+class TestVerdicts:
+    @pytest.mark.parametrize(
+        ("ratio", "scale", "verdict"),
+        [
+            (30.0, 30.0, "identified"),
+            (30.0, 0.001, "only the ratio"),
+            (0.001, 30.0, "only a combination"),
+            (0.001, 0.001, "not identified"),
+        ],
+    )
+    def test_in_words(self, ratio, scale, verdict):
+        assert set(told(ratio, scale, noise=0.2)["verdicts"].values()) == {verdict}
+
+    def test_each_parameter_has_its_own(self):
+        found = identify(KnownResiduals([[30.0, 0.0], [0.0, 0.001]], OPTIMUM), SPACE, OPTIMUM)
+        assert found["verdicts"] == {"stretch": "identified", "mass": "not identified"}
+        assert found["combination"] == "stretch^+1.00"
+
+    def test_open_ends_lie_at_the_bounds(self):
+        found = told(30.0, 0.001)
+        assert found["open"] == [[False, False], [True, True]]
+        assert found["interval"][1][1] == pytest.approx(math.sqrt(2) * math.log(10), rel=1e-6)
+
+
+class TestCheck:
+    def test_fresh_points_agree(self):
+        check = told(3.0, 0.5)["check"]
+        assert len(check) == 4
+        assert all(entry["agrees"] for entry in check)
+
+    def test_a_lower_loss_beside_the_fit_is_told(self):
+        objective = KnownResiduals([3.0 * RATIO, 0.5 * SCALE], {"stretch": 2.0, "mass": 0.5})
+        found = identify(objective, SPACE, OPTIMUM)
+        assert found["lower"]["loss"] < found["lower"]["loss_fitted"]
+        assert found["lower"]["stretch"] == pytest.approx(2.0, rel=0.4)
+        assert told(3.0, 0.5)["lower"] is None
+
+
+def test_coordinates_are_logarithms_or_parts_of_the_range():
+    coordinates = Coordinates(FitSpace.build(["stretch", "friction_obstacle"]))
+    place = coordinates.of({"stretch": 2.0, "friction_obstacle": 0.3})
+    np.testing.assert_allclose(place, [math.log(2.0), 0.2])
+    np.testing.assert_allclose(coordinates.values(place[None]), [[2.0, 0.3]])
+    np.testing.assert_allclose(coordinates.values(np.array([[0.0, -0.1]])), [[1.0, 0.0]])  # no negative friction

@@ -1,0 +1,156 @@
+"""Rivals: budgets, bounds, repeatability, divergence; what counts as a method's parameters."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from diffcloud.errors import DivergedError
+from diffcloud.evaluation.methods import (
+    batch_losses,
+    clipped,
+    cma_es,
+    first_start,
+    middle,
+    published,
+    random_search,
+    single_start,
+    space_of,
+    without_diverged,
+)
+from diffcloud.fit import AdamSettings, FitSpace, fit_adam
+from tests.evaluation.bowls import SPACE, Bowl
+
+
+def loss_of(bowl, values):
+    return float(bowl({name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}))
+
+
+def summary_of(outcome):
+    """The parts of a fit's file that matter here."""
+    history = outcome.history
+    told = {"names": list(history.names), "loss": [row.tolist() for row in history.losses]}
+    told["values"] = [row.tolist() for row in history.values]
+    return {"settings": {"smoothing": 0.0, "resample": False}, "stop_reason": outcome.stop_reason, "history": told}
+
+
+SEARCHES = [random_search, cma_es]
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+class TestSearch:
+    def test_spends_its_budget_and_no_more(self, search):
+        for simulations in (1, 5, 23):
+            assert search(Bowl(), SPACE, simulations=simulations).simulations == simulations
+
+    def test_improves_with_its_budget_and_stays_within_the_bounds(self, search):
+        found = [search(Bowl(), SPACE, simulations=n, seed=3) for n in (6, 120)]
+        assert loss_of(Bowl(), found[1].values) < loss_of(Bowl(), found[0].values)
+        assert loss_of(Bowl(), found[1].values) < 0.2 * loss_of(Bowl(), middle(SPACE).values)
+        assert all(0.1 <= value <= 10 for one in found for value in one.values.values())
+
+    def test_the_same_seed_gives_the_same_values(self, search):
+        first, second, other = (search(Bowl(), SPACE, simulations=12, seed=seed).values for seed in (0, 0, 1))
+        assert first == second != other
+
+    def test_stops_below_the_threshold(self, search):
+        assert search(Bowl(), SPACE, simulations=500, threshold=1e3).simulations <= 16
+
+    def test_goes_on_where_some_diverge_and_fails_where_all_do(self, search):
+        found = search(Bowl(diverges_above=4.0), SPACE, simulations=40)
+        assert max(found.values.values()) <= 4.0
+        with pytest.raises(DivergedError, match=r"all \d parameter sets"):
+            search(Bowl(diverges_above=0.0), SPACE, simulations=8)
+
+    def test_one_variable_with_a_known_other(self, search):
+        space = FitSpace.build(["stretch"], fixed={"mass": 2.0})
+        found = search(Bowl(), space, simulations=60)
+        assert set(found.values) == {"stretch"}
+        assert found.values["stretch"] == pytest.approx(0.7, rel=0.2)
+
+
+def test_cma_es_beats_random_search_in_a_bowl():
+    losses = {search: loss_of(Bowl(), search(Bowl(), SPACE, simulations=100).values) for search in SEARCHES}
+    assert losses[cma_es] < 0.1 * losses[random_search]
+
+
+def test_one_start_is_the_first_of_many():
+    """Starts do not touch one another, so the paper's setting is what the first of nine starts does."""
+    settings = AdamSettings(iterations=12, starts=4)
+    alone = single_start(Bowl(), SPACE, settings)
+    many = fit_adam(Bowl(), SPACE, settings)
+    assert alone.simulations == 13
+    summary = summary_of(many)
+    found = first_start(summary, SPACE)
+    assert found.values == pytest.approx(alone.values, rel=1e-12)
+    assert found.simulations == 13
+    for change in ({"smoothing": 0.5}, {"resample": True}):
+        assert first_start({**summary, "settings": {**summary["settings"], **change}}, SPACE) is None
+    assert first_start({**summary, "stop_reason": "threshold"}, SPACE) is None
+    elsewhere = fit_adam(Bowl(), SPACE, AdamSettings(iterations=2, init={"mass": 1.0}))
+    assert first_start(summary_of(elsewhere), SPACE) is None
+
+
+def test_an_interrupted_start_is_no_result(monkeypatch):
+    def interrupt(self, parameters, offset=None):
+        self.calls += 1
+        if self.calls == 3:
+            raise KeyboardInterrupt
+        return real(self, parameters, offset)
+
+    real = Bowl.__call__
+    monkeypatch.setattr(Bowl, "__call__", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        single_start(Bowl(), SPACE, AdamSettings(iterations=10))
+
+
+def test_batches_without_the_diverged_are_the_single_ones():
+    bowl = Bowl(diverges_above=3.0)
+    values = torch.tensor([[0.5, 1.0], [5.0, 1.0], [2.0, 2.0], [1.0, 4.0]]).double()
+    losses = batch_losses(bowl, SPACE, values)
+    assert losses.isinf().tolist() == [False, True, False, True]
+    for row in (0, 2):
+        torch.testing.assert_close(losses[row : row + 1], bowl(SPACE.split(values[row : row + 1])[0]))
+
+
+def test_every_lost_entry_has_its_own_message():
+    def run(index):
+        bad = [place for place, entry in enumerate(index.tolist()) if entry in (1, 4)][:1]
+        if bad:
+            raise DivergedError(7, bad, "test")
+        return index * 10
+
+    found, kept, lost = without_diverged(6, run)
+    assert found.tolist() == [0, 20, 30, 50]
+    assert kept.tolist() == [0, 2, 3, 5]
+    assert set(lost) == {1, 4}
+
+
+class TestValues:
+    SUMMARY = {  # noqa: RUF012
+        "parameters": {
+            "stretch": {"value": 2.0, "fixed": False, "bounds": [0.5, 4.0]},
+            "mass": {"value": 1.2, "fixed": True, "bounds": None},
+            "offset_x": {"value": 0.01, "fixed": False, "bounds": [-0.02, 0.02]},
+        }
+    }
+
+    def test_what_was_given_and_the_offset_hold_for_all_methods(self):
+        space = space_of(self.SUMMARY)
+        assert space.names == ("stretch",)
+        parameters, offset = space.split(torch.tensor([[2.0]]).double())
+        assert {name: float(value) for name, value in parameters.items()} == {"stretch": 2.0, "mass": 1.2}
+        assert {name: float(value) for name, value in offset.items()} == {"offset_x": 0.01}
+
+    @pytest.mark.parametrize(("told", "value"), [({"stretch": 9.0}, 4.0), ({"stretch": -3.0}, 0.5), ({}, 2.25)])
+    def test_clipped_to_the_bounds(self, told, value):
+        found = clipped({**told, "mass": 7.0}, space_of(self.SUMMARY))
+        assert found == {"stretch": value, "mass": 1.2, "offset_x": 0.01}
+
+    def test_published_predictions(self):
+        told = published({"predictions": {"mlp": {"stretch": -1.0, "mass": 3.0}}})
+        assert [(one.method, one.values) for one in told] == [("published_mlp", {"stretch": -1.0, "mass": 3.0})]
+        assert published({}) == []
+        assert math.isclose(middle(SPACE).values["mass"], 5.05)

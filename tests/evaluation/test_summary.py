@@ -1,0 +1,116 @@
+"""Tables and sentences from made-up records with known answers."""
+
+from __future__ import annotations
+
+import math
+
+import pandas as pd
+import pytest
+
+from diffcloud.evaluation.markdown import comparison_page
+from diffcloud.evaluation.repeats import consistency, fit_table, other_repeats, repeatability, transfer
+from diffcloud.evaluation.summary import against_predictors, against_reference, metrics, overview, sentences, tables
+from diffcloud.io.fingerprints import fingerprint
+from tests.evaluation.records import record, records
+
+
+@pytest.fixture
+def told():
+    return tables(records(), {("lift", "tan1"): {"diffcloud": {"optimisation": 3.0}, "mlp": {"training": 10.0}}})
+
+
+def test_means_and_who_is_best(told):
+    means = told["means"].set_index(["scenario", "method"])
+    assert means.loc[("lift", "diffcloud"), "loss"] == pytest.approx(0.0015)
+    assert means.loc[("lift", "diffcloud"), "best"] == 2
+    assert means.loc[("lift", "mlp"), "best"] == 1  # its loss on tan1 is within the noise of the lowest
+    assert means.loc[("lift", "middle"), "best"] == 0
+
+
+def test_against_predictors_compares_means_of_the_same_episodes(told):
+    row = against_predictors(told["methods"]).set_index("scenario").loc["lift"]
+    assert (row["lowest"], row["episodes"], row["predictor"]) == (2, 2, "mlp")
+    assert row["below"] == pytest.approx(1 - 0.0015 / 0.00252)
+
+
+def test_reference_fits_are_a_column_with_a_tolerance_of_five_percent():
+    references = {("lift", "tan1"): 0.00096, ("lift", "tan2"): 0.0019}
+    table = tables(records(), {}, references)["methods"]
+    assert against_reference(table) == (1, 2)
+    assert against_reference(tables(records(), {})["methods"]) is None
+
+
+def test_gaps_have_a_row_and_a_reason(told):
+    gaps = told["methods"][told["methods"]["status"] == "missing"]
+    assert gaps[["episode", "method", "reason"]].to_numpy().tolist() == [["tan1", "meteornet", "no checkpoint"]]
+
+
+def test_metrics_are_plain_numbers(told):
+    found = metrics(told)
+    assert found["methods"]["lift"]["diffcloud"]["episodes"] == 2
+    assert not any(isinstance(value, float) and math.isnan(value) for value in found["methods"]["lift"]["mlp"].values())
+    assert found["identifiability"]["lift"]["stretch"] == {"only the ratio": 2}
+    assert found["checked_ends"] == {"agree": 7, "all": 8}
+
+
+class TestRepeats:
+    def test_repeatability_is_the_largest_over_the_smallest(self):
+        table = repeatability(fit_table(records())).set_index(["scenario", "parameter"])
+        assert table.loc[("lift", "stretch"), "factor"] == pytest.approx(2.0)
+        assert table.loc[("lift", "ratio"), "factor"] == pytest.approx(2.0)
+        assert ("fold", "stretch") not in table.index  # one recording has no spread
+
+    def test_transfer_between_own_fit_and_middle(self):
+        (row,) = transfer(records()).to_dict("records")
+        assert (row["source"], row["target"]) == ("tan2", "tan1")
+        assert row["gain"] == pytest.approx((0.01 - 0.004) / (0.01 - 0.001))
+
+    def test_consistency_compares_geometric_means(self):
+        table = consistency(fit_table(records())).set_index("parameter")
+        assert table.loc["stretch", "value_first"] == pytest.approx(math.sqrt(2.0))
+        assert table.loc["stretch", "factor"] == pytest.approx(8.0 / math.sqrt(2.0))
+
+    def test_labels_of_simulated_targets_name_no_cloth(self):
+        simulated = [record("lift", "a", fabric="hidden1", truth={"stretch": 1.0}), record("fold", "b", fabric="hidden1")]
+        assert consistency(fit_table(simulated)).empty
+
+    def test_other_repeats_are_of_the_same_fabric(self):
+        metas = {"a": {"fabric": "tan"}, "b": {"fabric": "tan"}, "c": {"fabric": "navy"}, "d": {}, "e": {}}
+        fits = {name: {"stretch": 1.0} for name in metas}
+        found = other_repeats(metas, fits)
+        assert {name: list(others) for name, others in found.items()} == {"a": ["b"], "b": ["a"], "c": [], "d": [], "e": []}
+
+
+class TestWords:
+    def test_sentences_say_who_wins_and_what_is_known(self, told):
+        said = sentences(told)
+        assert "DiffCloud has the lowest mean loss over 2 episodes" in said["winners"][0]
+        assert any("verdict on stretch: only the ratio in 2 of 2 episodes" in line for line in said["identifiability"])
+        assert any("7 of 8 ends agree" in line for line in said["identifiability"])
+        assert any("artefact" in line for line in said["identifiability"])
+        assert any("stretch a factor of 2" in line for line in said["repeats"])
+
+    def test_overview_has_a_row_per_scenario(self, told):
+        row = overview(told).iloc[0]
+        assert (row["first"], row["second"], row["verdict_stretch"]) == ("DiffCloud", "MLP", "only the ratio (2/2)")
+
+    def test_markdown_has_every_table_and_what_is_missing(self, told):
+        page = comparison_page(told, ["lift/tan1: meteornet: no checkpoint"])
+        for heading in ("Loss per episode", "Means", "What is identified", "Transfer between repeats", "What is missing"):
+            assert f"## {heading}" in page
+        assert "nan" not in page.lower()
+
+    def test_nothing_at_all(self):
+        told = tables([record("lift", "e", methods={"diffcloud": 0.1}, identifiability=False)], {})
+        assert sentences(told)["repeats"] == []
+        assert isinstance(overview(told), pd.DataFrame)
+        assert "None." in comparison_page(told, [])
+
+
+def test_fingerprints_tell_inputs_apart():
+    import numpy as np
+
+    one = fingerprint([{"a": np.arange(3)}, "x"], packages=["io"])
+    assert one == fingerprint([{"a": np.arange(3)}, "x"], packages=["io"])
+    assert one != fingerprint([{"a": np.arange(4)}, "x"], packages=["io"])
+    assert one != fingerprint([{"a": np.arange(3)}, "x"], packages=["mesh"])

@@ -1,0 +1,179 @@
+"""The comparison through the command line: the same twice, gaps told, finished episodes kept, a page that stands alone."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+import yaml
+
+import pipeline.comparison
+from diffcloud.io.episodes import write_episode
+from tests.conftest import small_lift
+from tests.fit.test_fit import clouds_of
+from tests.pipeline.invoke import invoke
+from tests.pipeline.test_commands import SMALL
+
+PARAMS = {
+    "scenarios": ["small"],
+    "train": {"scenarios": ["other"], "models": ["mlp"]},
+    "fit": {"iterations": 3, "starts": 2, "smoothing": 0},
+    "evaluate": {"draws": 2, "landscapes": ["*/tan1"], "landscape_size": 3},
+    "report": {"overlay_points": 50},
+}
+
+
+def recording(repeat, *, stretch=0.7):
+    """As of a real fabric: its parameters are not told."""
+    told = {"fabric": "tan", "category": "medium", "repeat": repeat}
+    return replace(clouds_of(small_lift(), seed=repeat, stretch=stretch, mass=1.0), meta=told)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Two recordings of one fabric, fitted and evaluated."""
+    folder = tmp_path_factory.mktemp("evaluate")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        (folder / "raw" / "scenes").mkdir(parents=True)
+        (folder / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump(SMALL))
+        (folder / "params.yaml").write_text(yaml.safe_dump(PARAMS))
+        for repeat in (1, 2):
+            write_episode(folder / "data" / "episodes" / "small" / f"tan{repeat}.npz", recording(repeat))
+        invoke("fit", "--params", "params.yaml", "--scenario", "small", "--out", "data/fits/small", "data/episodes/small")
+        invoke("evaluate", "--params", "params.yaml")
+    return folder
+
+
+@pytest.fixture
+def work(finished, tmp_path, monkeypatch):
+    """A copy, to change."""
+    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def results(folder):
+    names = [path for path in sorted((folder / "reports").rglob("*")) if path.suffix in (".json", ".csv")]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in names}
+
+
+def test_twice_gives_the_same_but_for_wall_times(work):
+    first = results(work)
+    shutil.rmtree(work / "reports")
+    invoke("evaluate", "--params", "params.yaml")
+    second = results(work)
+    assert set(first) == set(second)
+    differing = {name for name in first if first[name] != second[name]}
+    assert all("seconds" in name or "timings" in name or name.startswith("reports/episodes/") for name in differing)
+
+
+def test_tables_hold_methods_repeats_and_transfer(work):
+    tables = {
+        path.stem: pd.read_csv(path) for path in (work / "reports" / "tables").glob("*.csv") if path.stat().st_size > 1
+    }
+    methods = tables["methods"][tables["methods"]["status"] == "ok"]
+    assert set(methods["method"]) == {"diffcloud", "single_start", "middle", "random_search", "cma_es"}
+    assert tables["transfer"][["source", "target"]].to_numpy().tolist() == [["tan2", "tan1"], ["tan1", "tan2"]]
+    assert set(tables["repeatability"]["parameter"]) == {"stretch", "mass", "ratio"}
+    assert len(tables["identifiability"]) == 4
+    metrics = json.loads((work / "reports" / "metrics.json").read_text())
+    assert metrics["comparison"]["methods"]["small"]["cma_es"]["simulations"] == 4
+
+
+def test_finished_episodes_are_kept_until_their_inputs_change(work, monkeypatch):
+    def never(*arguments, name, **options):
+        raise AssertionError(f"{name} was compared again")
+
+    monkeypatch.setattr(pipeline.comparison, "compare_episode", never)
+    before = results(work)
+    invoke("evaluate", "--params", "params.yaml")
+    assert results(work) == before
+    write_episode(work / "data/episodes/small/tan2.npz", recording(2, stretch=0.9))
+    with pytest.raises(AssertionError, match="tan2 was compared again"):
+        invoke("evaluate", "--params", "params.yaml")
+
+
+@pytest.mark.slow
+def test_two_processes_give_what_one_gives(work):
+    one = results(work)
+    shutil.rmtree(work / "reports")
+    (work / "params.yaml").write_text(yaml.safe_dump(PARAMS | {"evaluate": {**PARAMS["evaluate"], "workers": 2}}))
+    invoke("evaluate", "--params", "params.yaml")
+    assert results(work)["reports/metrics.json"] == one["reports/metrics.json"]
+
+
+def test_a_missing_network_is_a_labelled_gap(work):
+    (work / "params.yaml").write_text(yaml.safe_dump(PARAMS | {"train": {"scenarios": ["small"], "models": ["mlp"]}}))
+    failed = invoke("evaluate", "--params", "params.yaml", code=1)
+    assert "small/tan1: mlp: no checkpoint data/regressors/small/mlp.safetensors" in failed.errors
+    table = pd.read_csv(work / "reports/tables/methods.csv")
+    gap = table[(table["method"] == "mlp")]
+    assert gap["status"].tolist() == ["missing", "missing"]
+    allowed = invoke("evaluate", "--params", "params.yaml", "--allow-missing")
+    assert len(allowed.result["missing"]) == 2
+    invoke("report", "--params", "params.yaml")
+    page = (work / "reports" / "index.html").read_text()
+    assert "2 things are missing" in page
+    assert "small/tan1: MLP: no checkpoint" in page
+
+
+def test_a_fit_that_cannot_be_simulated_is_told_and_the_others_go_on(work):
+    path = work / "data/fits/small/tan1.json"
+    fit = json.loads(path.read_text())
+    fit["parameters"]["mass"] |= {"value": -1e9, "bounds": [-1e10, 10]}
+    path.write_text(json.dumps(fit))
+    failed = invoke("evaluate", "--params", "params.yaml", code=1)
+    assert "small/tan1" in failed.errors
+    assert "diverged" in failed.errors
+    assert "small/tan2" not in failed.errors
+
+
+def test_profiles_are_whole_parameter_files():
+    from pathlib import Path
+
+    from pipeline.config import load_config
+
+    root = Path(__file__).parents[2]
+    assert load_config(root / "profiles" / "release.yaml").fit.starts == 9
+    paper = load_config(root / "profiles" / "paper.yaml")
+    assert (paper.simulate.train, paper.simulate.test, paper.episodes.per_scenario) == (1500, 375, 10)
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on PATH: the page is not opened in a browser")
+def test_the_page_runs_in_a_browser_without_errors_and_asks_nobody(work):
+    invoke("report", "--params", "params.yaml")
+    page = work / "reports" / "index.html"
+    assert page.stat().st_size < 25e6
+    assert {path.suffix for path in (work / "reports" / "figures").iterdir()} == {".svg", ".png"}
+    # a last script, of the test's own: sort a table that is not the first, and say how it went
+    probe = """<script>addEventListener("load", () => {
+      const table = document.querySelector("#comparison table"), head = table.tHead.rows[0].cells;
+      const column = [...head].findIndex(cell => cell.textContent === "mean mm"); head[column].click();
+      const values = [...table.tBodies[0].rows].map(row => +row.cells[column].dataset.value);
+      const sorted = values.every((value, i) => i === 0 || values[i - 1] <= value);
+      document.title = `sorted ${sorted}, faults ${JSON.stringify(faults)}`;
+    });</script></body>"""
+    watch = """<script>const faults = []; console.error = (...words) => faults.push(words.join(" "));
+    addEventListener("error", event => faults.push(event.message), true);
+    addEventListener("securitypolicyviolation", event => faults.push(event.blockedURI));</script>"""
+    text = page.read_text().replace("<head>", "<head>" + watch).replace("</body>", probe)
+    page.write_text(text)
+    command = [
+        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run",
+        f"--user-data-dir={work / 'profile'}", "--virtual-time-budget=8000", "--window-size=800,600", "--dump-dom",
+        page.as_uri(),
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert "<title>sorted true, faults []</title>" in done.stdout, re.search(r"<title>.*?</title>", done.stdout)
+    # what the browser does not let out, no script of the page can ask for
+    assert "Content-Security-Policy" in text
+    assert not re.search(r"connect-src|https?:", re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1])

@@ -1,0 +1,98 @@
+"""Figures and sections of the comparison from made-up records."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from xml.etree import ElementTree
+
+import pytest
+
+from diffcloud.evaluation.summary import tables
+from diffcloud.report import ComparisonEntry, comparison_figures
+from diffcloud.report.comparison import comparison_failures, comparison_section, comparison_summary
+from tests.evaluation.records import record, records
+
+SECONDS = {
+    ("lift", "tan1"): {
+        "diffcloud": {"optimisation": 30.0},
+        "mlp": {"dataset": 900.0, "training": 100.0, "inference": 0.01},
+        "middle": {},
+    }
+}
+HISTORIES = {("lift", "tan1"): {"loss": [[0.1, 0.2], [None, 0.15], [0.05, None]]}}
+
+
+@pytest.fixture(scope="module")
+def told():
+    simulated = record("band", "0", truth={"stretch": 1.0, "mass": 1.0}, methods={"diffcloud": 3e-5, "middle": 0.1})
+    return tables([*records(), simulated], SECONDS)
+
+
+@pytest.fixture(scope="module")
+def figures(told):
+    return comparison_figures(told, records(), HISTORIES)
+
+
+@pytest.fixture(scope="module")
+def page(told, figures):
+    entry = ComparisonEntry(told, records(), ["fold/x: no fit <b>"], figures)
+    return comparison_summary(entry) + comparison_section(entry)
+
+
+def test_every_figure_is_there_with_caption_and_source(figures):
+    names = [figure.name for figure in figures]
+    assert names == ["losses", "seconds", "parameters", "success", "curves", "landscape_lift_tan1"]
+    for figure in figures:
+        assert figure.caption
+        assert figure.source
+        assert figure.png.startswith(b"\x89PNG")
+        ElementTree.fromstring(figure.svg)
+
+
+def test_the_same_data_gives_the_same_bytes(told, figures):
+    again = comparison_figures(told, records(), HISTORIES)
+    assert [(figure.svg, figure.png) for figure in again] == [(figure.svg, figure.png) for figure in figures]
+
+
+def test_nothing_is_drawn_of_nothing():
+    told = tables([record("lift", "e", methods={"diffcloud": 0.1}, identifiability=False)], {})
+    assert [figure.name for figure in comparison_figures(told, [], {})] == ["losses", "parameters"]
+
+
+def test_the_page_has_no_address_and_unique_identifiers(page):
+    assert "http" not in page
+    identifiers = re.findall(r'\bid="([^"]+)"', page)
+    assert len(identifiers) == len(set(identifiers))
+    for target in re.findall(r'(?:url\(#|href="#)([^")]+)', page):
+        assert target in [*identifiers, "failures"], target
+
+
+def test_the_page_is_well_formed(page):
+    open_tags: list[str] = []
+
+    class Balance(HTMLParser):
+        def handle_starttag(self, tag, attrs):
+            open_tags.append(tag)
+
+        def handle_startendtag(self, tag, attrs):
+            pass
+
+        def handle_endtag(self, tag):
+            assert open_tags.pop() == tag
+
+    Balance().feed(page)
+    assert open_tags == []
+
+
+def test_the_summary_tells_winner_verdict_and_gaps(told, page):
+    summary = page[: page.index("Methods on equal terms")]
+    assert "DiffCloud" in summary
+    assert "only the ratio (2/2)" in summary
+    assert "2 things are missing" in summary
+    assert comparison_failures(ComparisonEntry(told, records(), ["a"])) == ["a", "lift/tan1: MeteorNet: no checkpoint"]
+
+
+def test_numbers_sort_as_numbers(page):
+    assert re.search(r'<td data-value="[\d.]+">', page)
+    assert 'data-value="nan"' not in page
