@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: venv repro test test-slow lint format bench acceptance clean
+.PHONY: venv repro test test-slow lint format bench acceptance recordings clean
 
 venv: $(STAMP)
 
@@ -43,6 +43,15 @@ REFERENCE ?= $(wildcard $(RELEASE)/../../diffsim)
 acceptance: venv
 	@test -n "$(RELEASE)" || { echo "Usage: make acceptance RELEASE=DIR [REFERENCE=DIR]"; exit 2; }
 	diffcloud acceptance --release "$(RELEASE)" $(if $(REFERENCE),--reference "$(REFERENCE)") --out docs/results
+
+# Synthetic raw recordings against their truth, as clouds and through fits.
+RECORDINGS := build/recordings
+RECORDINGS_PARAMS := docs/results/raw-recordings.yaml
+recordings: venv
+	diffcloud episodes --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/raw
+	diffcloud preprocess --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/clouds $(RECORDINGS)/raw
+	diffcloud recordings --params $(RECORDINGS_PARAMS) --recorded $(RECORDINGS)/raw --episodes $(RECORDINGS)/clouds \
+	    --out docs/results/raw-recordings.md
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

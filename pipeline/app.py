@@ -17,6 +17,7 @@ from pipeline.doctor import doctor
 from pipeline.episodes import episodes
 from pipeline.predict import predict
 from pipeline.preprocess import preprocess
+from pipeline.recordings import recordings
 from pipeline.simulate import simulate
 from pipeline.train import train
 from pipeline.visibility import visibility
@@ -43,6 +44,7 @@ app.command("capture")(record)
 app.command()(calibrate)
 app.command()(doctor)
 app.command()(acceptance.acceptance)
+app.command()(recordings)
 
 
 def main() -> None:

@@ -6,7 +6,7 @@ import html
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from diffcloud.io.episodes import Episode
 from diffcloud.mesh.topology import SurfaceMesh
+from diffcloud.report.recordings import recording_section
 from diffcloud.report.regressors import TrainingEntry, regressor_section, training_data
 
 _DECIMALS = 4
@@ -39,6 +40,8 @@ class EpisodeEntry:
     """[T + 1] [s]"""
     bodies: SurfaceMesh
     """Fixed bodies around the cloth; may be empty."""
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
+    """Caption -> PNG, of episodes made from raw recordings."""
 
 
 def build_page(
@@ -74,6 +77,7 @@ def build_page(
             predictions, {(entry.scenario, entry.name): entry.row["rms_mm"] for entry in entries}, trainings
         ),
         "trainings": _script_json(training_data(trainings)),
+        "recordings": recording_section(entries),
         "failures": _failures(entries),
         "environment": "".join(lines),
         "data": _script_json(data),
