@@ -50,6 +50,8 @@ _COLORS = np.array([[60, 60, 60], [126, 114, 100], [0, 0, 0], [205, 205, 208]], 
 _CABLE_COLOR = np.array([30.0, 30.0, 30.0])
 _COLOR_NOISE = 4.0
 _LIGHT = np.array([0.3, -0.4, 0.866])
+_SAME = 2e-3
+"""A hit this part of the way before a point is the point itself."""
 _BEFORE_S = 0.5
 """The joint log starts this long before the first image and ends so long after the last."""
 
@@ -224,8 +226,7 @@ class _Scene:
         loose = [SurfaceMesh(nodes, self._faces)]
         if self._settings.with_cable:
             loose.append(cable(self._robot, poses))
-        self._loose = caster(loose)
-        """Rebuilt for each frame; the links' and the table's structures are not."""
+        self._loose = caster(loose)  # rebuilt for each frame; the links' and the table's structures are not
 
     def render(self, view: View, rng: np.random.Generator) -> tuple[Floats, NDArray[np.uint16], NDArray[np.uint8]]:
         """(z-depth [H, W] [m], labels [H, W], colour [H, W, 3])."""
@@ -263,10 +264,6 @@ class _Scene:
         hidden = np.zeros(depth_m.shape, dtype=bool)
         hidden[seen] = lost
         return hidden
-
-
-_SAME = 2e-3
-"""A hit this part of the way before a point is the point itself."""
 
 
 def caster(meshes: Sequence[SurfaceMesh]) -> Any:
