@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: venv repro test test-slow lint format bench acceptance comparison clean
+.PHONY: venv repro test test-slow lint format bench acceptance comparison recordings clean
 
 venv: $(STAMP)
 
@@ -53,6 +53,15 @@ acceptance: venv
 comparison: venv
 	@test -n "$(RELEASE)" || { echo "Usage: make comparison RELEASE=DIR [REFERENCE_FITS=FILE]"; exit 2; }
 	diffcloud evaluate release "$(RELEASE)" $(if $(REFERENCE_FITS),--reference "$(REFERENCE_FITS)") --markdown docs/results/comparison.md
+
+# Synthetic raw recordings against their truth, as clouds and through fits.
+RECORDINGS := build/recordings
+RECORDINGS_PARAMS := docs/results/raw-recordings.yaml
+recordings: venv
+	diffcloud episodes --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/raw
+	diffcloud preprocess --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/clouds $(RECORDINGS)/raw
+	diffcloud recordings --params $(RECORDINGS_PARAMS) --recorded $(RECORDINGS)/raw --episodes $(RECORDINGS)/clouds \
+	    --out docs/results/raw-recordings.md
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

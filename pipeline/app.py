@@ -19,6 +19,7 @@ from pipeline.evaluate_release import release
 from pipeline.gradients import gradients
 from pipeline.predict import predict
 from pipeline.preprocess import preprocess
+from pipeline.recordings import recordings
 from pipeline.simulate import simulate
 from pipeline.train import train
 from pipeline.visibility import visibility
@@ -47,6 +48,7 @@ app.command("capture")(record)
 app.command()(calibrate)
 app.command()(doctor)
 app.command()(acceptance.acceptance)
+app.command()(recordings)
 
 
 def main() -> None:

@@ -12,11 +12,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
 from diffcloud.fit import AdamSettings
+from diffcloud.io.raw_episodes import ScenePlacement
 from diffcloud.regressors.settings import Loss, Profile, Target
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.scene.schema import NonNegative, Positive, explain
+from diffcloud.sensing.depth_camera import DepthNoise
 from diffcloud.sensing.filters import Thinning
 from diffcloud.sensing.fusion import FusionSettings
+from diffcloud.sensing.recorder import RecorderSettings
 
 Count = Annotated[int, Field(ge=1)]
 Bounds = tuple[float, float]
@@ -38,13 +41,24 @@ class EpisodesConfig(Section):
     """Where episodes come from."""
 
     source: str = "synthetic"
-    """`synthetic`, or a folder with <scenario>/<episode>.npz (see `diffcloud import`)."""
+    """`synthetic`, or a folder with <scenario>/<episode>.npz or raw <scenario>/<episode>/ (see `diffcloud import`)."""
     per_scenario: Count = 2
     """Synthetic episodes of each scenario."""
     seed: int = 0
     hidden_range: Bounds = (0.3, 3.0)
     """Hidden multipliers of camera recordings are drawn log-uniformly from it; fully observed scenarios (`recorder:
     whole_surface`) draw uniformly over the bounds of a fit, as the paper does."""
+    image_size: tuple[Count, Count] = (424, 240)
+    """Columns and rows of camera recordings; a D435 offers 424 x 240, 640 x 480, 848 x 480 and more."""
+    subpixel_px: NonNegative = DepthNoise.subpixel_px
+    """Deviation of the cameras' disparity [px of their imagers]."""
+    lag_s: NonNegative = RecorderSettings.lag_s
+    """How late the joint log is."""
+    extrinsic_error: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    """(millimetres, degrees) by which the stated place of each camera but the first is off."""
+
+    def recorder(self) -> RecorderSettings:
+        return RecorderSettings(lag_s=self.lag_s, extrinsic_error=self.extrinsic_error)
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -59,23 +73,37 @@ class RawConfig(Section):
 
     robot: str | None = "gen3"
     """Whose pixels are masked: `gen3`, the package's own description, or the path of a URDF; null: nobody's."""
-    inflation_m: NonNegative = 0.01
+    inflation_m: NonNegative = 0.007
     """Margin around the robot."""
     workspace_m: tuple[Point, Point] = FusionSettings.workspace_m
     eyes_m: tuple[float, ...] = FusionSettings.eyes_m
     flying_m: NonNegative = FusionSettings.flying_m
+    refine: bool = FusionSettings.refine
     lag_s: float = FusionSettings.lag_s
     table: bool = FusionSettings.table
     clearance_m: Positive = FusionSettings.clearance_m
     color_difference: Positive = FusionSettings.color_difference
+    smoothing_px: Annotated[int, Field(ge=0)] = FusionSettings.smoothing_px
+    cluster_gap_m: NonNegative = FusionSettings.cluster_gap_m
+    least_cluster: Annotated[float, Field(ge=0, le=1)] = FusionSettings.least_cluster
     subpixel_px: Positive = FusionSettings.subpixel_px
+    imager_focal_px: Positive = FusionSettings.imager_focal_px
     baseline_m: Positive = FusionSettings.baseline_m
-    origin_m: Point = FusionSettings.origin_m
-    yaw_rad: float = FusionSettings.yaw_rad
-    length_unit_m: Positive = FusionSettings.length_unit_m
+    origin_m: Point | None = None
+    """The scene's origin in the base frame; with `yaw_rad` and `length_unit_m` in place of what episode.json says."""
+    yaw_rad: float = 0.0
+    length_unit_m: Positive = 1.0
 
     def fusion(self) -> FusionSettings:
-        return FusionSettings(**self.model_dump(exclude={"robot", "inflation_m"}))
+        placement = None if self.origin_m is None else ScenePlacement(self.origin_m, self.yaw_rad, self.length_unit_m)
+        own = {"robot", "inflation_m", "origin_m", "yaw_rad", "length_unit_m"}
+        return FusionSettings(**self.model_dump(exclude=own), placement=placement)
+
+    @model_validator(mode="after")
+    def _placed(self) -> Self:
+        if self.origin_m is None and (self.yaw_rad != 0.0 or self.length_unit_m != 1.0):
+            raise ValueError("yaw_rad and length_unit_m go with origin_m: give all three, or none")
+        return self
 
 
 class PreprocessConfig(Section):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,9 +13,12 @@ import typer
 from numpy.typing import NDArray
 
 from diffcloud.errors import ConfigError
-from diffcloud.io.episodes import Episode, read_episode, write_episode
+from diffcloud.io.episodes import read_episode, write_episode
+from diffcloud.io.raw_episodes import read_description, read_raw_episode
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sensing import default_cameras, record, sample_surface
+from diffcloud.sensing import sample_surface
+from diffcloud.sensing.depth_camera import DepthNoise, published_cameras
+from diffcloud.sensing.recorder import ClothMotion, record
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import rollout
 from pipeline.config import EpisodesConfig, load_config
@@ -24,7 +29,7 @@ _HIDDEN = ("stretch", "mass")
 
 
 def episodes(
-    out: Annotated[Path, typer.Option(help="Folder; episodes go to OUT/<scenario>/<episode>.npz.")],
+    out: Annotated[Path, typer.Option(help="Folder; episodes go to OUT/<scenario>/<episode>, raw or .npz.")],
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
@@ -35,19 +40,24 @@ def episodes(
         for index, name in enumerate(config.scenarios):
             scenario = choose_scenario(name)
             if config.episodes.source == "synthetic":
-                found = _synthetic(scenario, config.episodes, index)
+                tell = _teller(update, index, name)
+                written[name] = _synthetic(scenario, config.episodes, index, out / name, tell)
             else:
-                found = _own(Path(config.episodes.source) / name)
-            for episode_name, episode in found.items():
-                write_episode(out / name / f"{episode_name}.npz", episode)
-            written[name] = list(found)
+                written[name] = _own(Path(config.episodes.source) / name, out / name)
             update(index + 1, name)
     for name, names in written.items():
         errors.print(f"{name}: {', '.join(names)}")
     finish({"out": str(out), "episodes": written}, json)
 
 
-def _synthetic(scenario: Scenario, config: EpisodesConfig, index: int) -> dict[str, Episode]:
+def _teller(update: Callable[[int, str], None], done: int, name: str) -> Callable[[int, str], None]:
+    return lambda _, text: update(done, f"{name}, {text}")
+
+
+def _synthetic(
+    scenario: Scenario, config: EpisodesConfig, index: int, out: Path, tell: Callable[[int, str], None]
+) -> list[str]:
+    """Simulate cloths of hidden parameters and record them: by depth cameras as raw episodes, or by their whole surface."""
     rng = np.random.default_rng([config.seed, index])
     hidden = _hidden(scenario, config, rng)
     system, _ = scenario.scene.build()
@@ -56,27 +66,38 @@ def _synthetic(scenario: Scenario, config: EpisodesConfig, index: int) -> dict[s
         run = rollout(system, scenario.steps, properties=properties)
     nodes = run.positions[:, :: scenario.scene.frame_steps].numpy()
     times = run.times[:: scenario.scene.frame_steps].numpy()
-    centre = nodes[0].reshape(-1, 3).mean(axis=0)
-    cameras = default_cameras((float(centre[0]), float(centre[1]), float(centre[2]) + 0.1))
-    obstacles = scenario.scene.surrounding.obstacles
-    made = {}
+    obstacles, faces = scenario.scene.surrounding.obstacles, system.mesh.faces
+    names = []
     for repeat in range(config.per_scenario):
+        name, seed = f"{scenario.name}_hidden{repeat + 1}", int(rng.integers(2**31))
         meta: dict[str, Any] = {
             "scenario": scenario.name,
             "fabric": f"hidden{repeat + 1}",
             "repeat": 1,
-            "source": "synthetic",
-            "truth": {name: float(values[repeat]) for name, values in hidden.items()},
+            "truth": {key: float(values[repeat]) for key, values in hidden.items()},
         }
-        seed, faces = int(rng.integers(2**31)), system.mesh.faces
         if scenario.recorder == "whole_surface":
             obstacle = obstacles[0] if obstacles else None
+            meta["source"] = "synthetic"
             episode = sample_surface(nodes[repeat], faces, times, obstacle, points=scenario.points, seed=seed, meta=meta)
+            write_episode(out / f"{name}.npz", episode)
         else:
-            meta["cameras"] = [camera.name for camera in cameras]
-            episode = record(nodes[repeat], faces, times, cameras, grasped=scenario.grasped, seed=seed, meta=meta)
-        made[f"{scenario.name}_hidden{repeat + 1}"] = episode
-    return made
+            _clear(out / name)
+            height = float(obstacles[0].nodes[:, 2].max()) if obstacles else float(nodes[:, 0, :, 2].min())
+            motion = ClothMotion(nodes[repeat], faces, times, scenario.grasped, height)
+            cameras = published_cameras(*config.image_size, noise=DepthNoise(subpixel_px=config.subpixel_px))
+            record(out / name, motion, cameras, settings=config.recorder(), seed=seed, meta=meta, tell=tell)
+        names.append(name)
+    return names
+
+
+def _clear(folder: Path) -> None:
+    """Remove a synthetic recording that an earlier run left; never anything else."""
+    if not folder.exists():
+        return
+    if not (folder / "episode.json").is_file() or read_description(folder).get("source") != "synthetic":
+        raise ConfigError(f"{folder} exists and is no synthetic recording; choose another --out, or move it away.")
+    shutil.rmtree(folder)
 
 
 def _hidden(scenario: Scenario, config: EpisodesConfig, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
@@ -90,10 +111,17 @@ def _hidden(scenario: Scenario, config: EpisodesConfig, rng: np.random.Generator
     return {name: np.exp(rng.uniform(low, high, config.per_scenario)) for name in _HIDDEN}
 
 
-def _own(folder: Path) -> dict[str, Episode]:
-    files = sorted(folder.glob("*.npz"))
-    if not files:
+def _own(folder: Path, out: Path) -> list[str]:
+    """Check a person's episodes, raw or not, and copy them."""
+    files, raw = sorted(folder.glob("*.npz")), sorted(path.parent for path in folder.glob("*/episode.json"))
+    if not files and not raw:
         raise ConfigError(
-            f"{folder} holds no episodes (*.npz). Make them with `diffcloud import`, or set episodes.source: synthetic."
+            f"{folder} holds no episodes (*.npz, or raw episodes). Make them with `diffcloud import` or `diffcloud "
+            "capture`, or set episodes.source: synthetic."
         )
-    return {path.stem: read_episode(path) for path in files}
+    for path in files:
+        write_episode(out / path.name, read_episode(path))
+    for path in raw:
+        read_raw_episode(path)
+        shutil.copytree(path, out / path.name, dirs_exist_ok=True)
+    return [path.stem for path in files] + [path.name for path in raw]

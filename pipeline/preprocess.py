@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,12 +11,14 @@ import numpy as np
 import typer
 
 from diffcloud.errors import ConfigError, EpisodeError
-from diffcloud.io.calibrations import Calibration, read_calibration
+from diffcloud.io.calibrations import read_calibration
 from diffcloud.io.episodes import Episode, read_episode, write_episode
-from diffcloud.io.raw_episodes import read_description, read_raw_episode
+from diffcloud.io.images import write_color
+from diffcloud.io.raw_episodes import RawEpisode, read_description, read_raw_episode
 from diffcloud.sensing import clean_frame
-from diffcloud.sensing.fusion import fuse
+from diffcloud.sensing.fusion import Seen, fuse
 from diffcloud.sensing.masking import RobotMask
+from diffcloud.sensing.pictures import cloud_picture, mask_picture
 from diffcloud.sensing.robot import Robot, gen3
 from pipeline.config import PreprocessConfig, RawConfig, load_config, updated
 from pipeline.console import JsonFlag, ParamsFile, episode_files, errors, finish, progress_bar
@@ -47,11 +49,19 @@ def preprocess(
         for index, (scenario, path) in enumerate(sources):
             tell = _teller(update, index, path.name)
             try:
-                episode = _fused(path, robot, settings.raw, calibrated, tell) if path.is_dir() else read_episode(path)
+                if path.is_dir():
+                    pictures = _Pictures(read_raw_episode(path))
+                    episode = fuse(
+                        pictures.raw, robot, settings.raw.fusion(), calibration=calibrated, tell=tell, watch=pictures
+                    )
+                else:
+                    pictures, episode = None, read_episode(path)
                 episode = _clean(episode, settings)
             except EpisodeError as error:
                 raise EpisodeError(f"{path}: {error}") from error
             write_episode(out / scenario / f"{_stem(path)}.npz", episode)
+            if pictures is not None:
+                pictures.write(out / scenario, _stem(path), episode)
             kept[_stem(path)] = {"recorded": episode.meta["quality"]["recorded"], "kept": episode.meta["quality"]["kept"]}
             update(index + 1, path.name)
     errors.print(f"Cleaned {len(sources)} episodes into {out}.")
@@ -106,10 +116,20 @@ def _teller(update: Callable[[int, str], None], done: int, name: str) -> Callabl
     return lambda _, text: update(done, f"{name}, {text}")
 
 
-def _fused(
-    path: Path, mask: RobotMask | None, raw: RawConfig, calibration: Calibration | None, tell: Callable[[int, str], None]
-) -> Episode:
-    return fuse(read_raw_episode(path), mask, raw.fusion(), calibration=calibration, tell=tell)
+class _Pictures:
+    """Two pictures of a raw episode's middle frame: <episode>.mask.png and <episode>.cloud.png."""
+
+    def __init__(self, raw: RawEpisode) -> None:
+        self.raw = raw
+        self._frame = len(next(iter(raw.cameras.values())).frames) // 2
+
+    def __call__(self, frame: int, parts: Mapping[str, Seen]) -> None:
+        if frame == self._frame:
+            self._mask = mask_picture(self.raw.cameras, parts)
+
+    def write(self, folder: Path, name: str, episode: Episode) -> None:
+        write_color(folder / f"{name}.mask.png", self._mask)
+        write_color(folder / f"{name}.cloud.png", cloud_picture(episode, self._frame))
 
 
 def _clean(episode: Episode, config: PreprocessConfig) -> Episode:

@@ -53,6 +53,7 @@ def report(
         scenario, name = str(known["scenario"]), str(known["episode"])
         fit = read_fit(fits / scenario / f"{name}.json")
         known.setdefault("rms_other_frames_mm", float("nan"))
+        source = fit["episodes"][0]
         with np.load(fits / scenario / f"{name}.npz", allow_pickle=False) as run:
             entries.append(
                 EpisodeEntry(
@@ -60,12 +61,13 @@ def report(
                     name=name,
                     row=known,
                     fit=fit,
-                    episode=read_episode(episodes / scenario / f"{fit['episodes'][0]}.npz"),
+                    episode=read_episode(episodes / scenario / f"{source}.npz"),
                     nodes=run["nodes"],
                     start_nodes=run["start_nodes"],
                     faces=run["faces"],
                     times=run["times"],
                     bodies=SurfaceMesh(run["obstacle_nodes"], run["obstacle_faces"]),
+                    pictures=_pictures(episodes / scenario, source),
                 )
             )
     trainings = [
@@ -134,6 +136,13 @@ def _revision() -> str:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return "unknown"
+
+
+def _pictures(folder: Path, name: str) -> dict[str, bytes]:
+    """Of a raw episode, as `diffcloud preprocess` left them; none of other episodes."""
+    kinds = {"mask": "masked (red) and kept as cloth (green)", "cloud": "merged cloud from above, along y and along x"}
+    files = {caption: folder / f"{name}.{kind}.png" for kind, caption in kinds.items()}
+    return {caption: path.read_bytes() for caption, path in files.items() if path.is_file()}
 
 
 def _rows(table: Path) -> list[dict[str, Any]]:

@@ -121,6 +121,29 @@ class RawCamera:
 
 
 @dataclass(frozen=True)
+class ScenePlacement:
+    """Where a scenario's scene lies in the robot's base frame: p_scene = Rz(yaw) (p_base - origin) / length_unit."""
+
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The scene's origin in the base frame."""
+    yaw_rad: float = 0.0
+    length_unit_m: float = 1.0
+
+    def to_scene(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Base-frame points [..., 3] [m] in the scene's frame and length unit."""
+        return (points - np.array(self.origin_m)) @ self._turn.T / self.length_unit_m
+
+    def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Scene points [..., 3] in the base frame [m]."""
+        return self.length_unit_m * points @ self._turn + np.array(self.origin_m)
+
+    @property
+    def _turn(self) -> NDArray[np.float64]:
+        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
 class RawEpisode:
     """A raw episode on disk."""
 
@@ -128,6 +151,29 @@ class RawEpisode:
     description: Mapping[str, Any]
     cameras: Mapping[str, RawCamera]
     robot: RobotLog | None
+
+    @property
+    def placement(self) -> ScenePlacement:
+        """`scene_in_world` of episode.json; without it the scene's frame is the base frame.
+
+        Raises:
+            EpisodeError: not an origin of three numbers, a yaw and a positive length unit.
+        """
+        stated = self.description.get("scene_in_world", {})
+        try:
+            x, y, z = (float(value) for value in stated.get("origin_m", (0.0, 0.0, 0.0)))
+            placement = ScenePlacement(
+                (x, y, z), float(stated.get("yaw_rad", 0.0)), float(stated.get("length_unit_m", 1.0))
+            )
+        except (AttributeError, TypeError, ValueError) as error:
+            raise EpisodeError(f"{self.folder / 'episode.json'}: scene_in_world is damaged: {error}.") from error
+        numbers = [*placement.origin_m, placement.yaw_rad, placement.length_unit_m]
+        if not np.isfinite(numbers).all() or placement.length_unit_m <= 0:
+            raise EpisodeError(
+                f"{self.folder / 'episode.json'}: scene_in_world must be an origin_m [x, y, z], a yaw_rad and a positive "
+                f"length_unit_m, got {stated!r}."
+            )
+        return placement
 
 
 def read_raw_episode(folder: Path) -> RawEpisode:
@@ -261,6 +307,7 @@ class RawEpisodeWriter:
         robot: what the arm is (model, address); None without an arm.
         joint_count: of robot.csv.
         durable: wait for the disk after each frame, so that a power cut keeps it.
+        started_at: ISO 8601; by default now.
 
     Raises:
         EpisodeError: the folder exists, or a name is no plain folder name.
@@ -278,6 +325,7 @@ class RawEpisodeWriter:
         joint_count: int = 7,
         durable: bool = True,
         meta: Mapping[str, Any] | None = None,
+        started_at: str | None = None,
     ) -> None:
         self.folder = Path(folder)
         if not cameras:
@@ -299,7 +347,7 @@ class RawEpisodeWriter:
             "robot": None if robot is None else dict(robot),
             "source": source,
             "units": UNITS,
-            "started_at": datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds"),
+            "started_at": started_at or datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds"),
             "status": "recording",
         }
         self._durable = durable

@@ -102,7 +102,7 @@ def read_urdf(path: Path) -> RobotDescription:
         shapes = [_shape(shape, path, loaded) for shape in element.findall("visual") or element.findall("collision")]
         if shapes:
             name = element.attrib["name"]
-            meshes[name] = _joined(shapes)
+            meshes[name] = joined(shapes)
             extent = float(np.abs(meshes[name].vertices).max())
             if not extent < _LARGEST_M:
                 raise RobotError(
@@ -290,15 +290,16 @@ def _read_collada(data: bytes, path: Path) -> LinkMesh:
             shapes.append(LinkMesh(np.asarray(triangles.vertex, np.float64), np.asarray(triangles.vertex_index, np.int64)))
     if not shapes:
         raise RobotError(f"{path} holds no triangles.")
-    joined = _joined(shapes)
-    return LinkMesh(joined.vertices * float(document.assetInfo.unitmeter or 1.0), joined.faces)
+    whole = joined(shapes)
+    return LinkMesh(whole.vertices * float(document.assetInfo.unitmeter or 1.0), whole.faces)
 
 
 def _of(mesh: Any) -> LinkMesh:
     return LinkMesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
 
 
-def _joined(shapes: list[LinkMesh]) -> LinkMesh:
+def joined(shapes: list[LinkMesh]) -> LinkMesh:
+    """All of them as one mesh."""
     starts = np.cumsum([0, *(len(shape.vertices) for shape in shapes)])
     return LinkMesh(
         np.concatenate([shape.vertices for shape in shapes]),

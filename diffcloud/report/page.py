@@ -6,7 +6,7 @@ import html
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from diffcloud.io.episodes import Episode
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.report.comparison import ComparisonEntry, comparison_failures, comparison_section, comparison_summary
+from diffcloud.report.recordings import recording_section
 from diffcloud.report.regressors import TrainingEntry, regressor_section, training_data
 
 _DECIMALS = 4
@@ -40,6 +41,8 @@ class EpisodeEntry:
     """[T + 1] [s]"""
     bodies: SurfaceMesh
     """Fixed bodies around the cloth; may be empty."""
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
+    """Caption -> PNG, of episodes made from raw recordings."""
 
 
 def build_page(
@@ -79,6 +82,7 @@ def build_page(
         ),
         "trainings": _script_json(training_data(trainings)),
         "failures": _failures(entries, comparison_failures(comparison) if comparison else []),
+        "recordings": recording_section(entries),
         "environment": "".join(lines),
         "data": _script_json(data),
         "plotly": get_plotlyjs(),

@@ -8,7 +8,7 @@ distorted to ideal ones. Either way one direction is closed and the other is fou
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from diffcloud.io.camera_models import Intrinsics
 
@@ -51,6 +51,18 @@ def depth_points(
 def transform(matrix: Floats, points: Floats) -> Floats:
     """Rigid transforms [..., 4, 4] of points [..., P, 3]."""
     return points @ np.swapaxes(matrix[..., :3, :3], -1, -2) + matrix[..., None, :3, 3]
+
+
+def looking_at(position: ArrayLike, target: ArrayLike) -> Floats:
+    """[4, 4] T_world_camera of an upright camera at `position` [3] that looks at `target` [3] [m]."""
+    forward = np.subtract(target, position)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(right) < 1e-6 else right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = position
+    return pose
 
 
 def inverse(matrix: Floats) -> Floats:

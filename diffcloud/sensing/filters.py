@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from diffcloud.errors import EpisodeError
@@ -99,6 +101,24 @@ def thin(points: NDArray[np.float32], limit: int, thinning: Thinning, rng: np.ra
         else:
             large, chosen = size, candidate
     return chosen
+
+
+def in_large_clusters(points: NDArray[np.floating[Any]], gap: float, least_part: float) -> NDArray[np.bool_]:
+    """[N] whether a point belongs to a cluster that holds at least `least_part` of the largest one's points.
+
+    Points of voxels of side `gap` that touch, also at corners, are of one cluster: clusters are at least `gap` apart.
+    """
+    if not len(points):
+        return np.zeros(0, dtype=bool)
+    cell = np.floor(points / gap).astype(np.int64)
+    voxels, place = np.unique(cell, axis=0, return_inverse=True)
+    pairs = cKDTree(voxels).query_pairs(1.8, output_type="ndarray")  # between 3 ** 0.5 and 2
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(voxels), len(voxels)))
+    _, label = connected_components(graph, directed=False)
+    cluster = label[place.reshape(-1)]
+    size = np.bincount(cluster)
+    kept: NDArray[np.bool_] = size[cluster] >= least_part * size.max()
+    return kept
 
 
 def _one_per_voxel(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:

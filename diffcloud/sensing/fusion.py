@@ -8,7 +8,7 @@ is found by its colour.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,9 +19,12 @@ from scipy.spatial import cKDTree
 from diffcloud.errors import EpisodeError
 from diffcloud.io.calibrations import Calibration, read_calibration
 from diffcloud.io.episodes import Episode
-from diffcloud.io.raw_episodes import CameraInfo, RawCamera, RawEpisode
-from diffcloud.sensing.cameras import transform
+from diffcloud.io.raw_episodes import CameraInfo, RawCamera, RawEpisode, ScenePlacement
+from diffcloud.sensing.cameras import inverse, transform
+from diffcloud.sensing.filters import in_large_clusters
 from diffcloud.sensing.masking import RobotMask, Spoilt, View, joints_at, spoilt_pixels
+from diffcloud.sensing.refinement import Sight, refine_extrinsics
+from diffcloud.sensing.smoothing import smooth_depth
 
 Floats = NDArray[np.float64]
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -33,6 +36,9 @@ _STEEPEST = 0.94
 _TABLE_POINTS = 4000
 _TABLE_TRIALS = 300
 _TABLE_FRAMES = 5
+_ON_TABLE_M = 0.005
+_REFINED_FRAMES = 10
+_REFINED_POINTS = 1000
 _LEAST_TABLE = 0.15
 """A plane with a smaller part of the points is no table."""
 
@@ -43,9 +49,9 @@ class FusionSettings:
 
     workspace_m: Box = ((0.3, -0.5, -0.05), (1.0, 0.5, 0.7))
     """Lowest and highest corner in the base frame; what lies outside is dropped."""
-    eyes_m: tuple[float, ...] = (0.05,)
+    eyes_m: tuple[float, ...] = (0.015, 0.065)
     """See `masking.spoilt_pixels`."""
-    flying_m: float = 0.01
+    flying_m: float = 0.02
     lag_s: float = 0.0
     """How much later than the truth the joint log's times are."""
     table: bool = True
@@ -54,20 +60,34 @@ class FusionSettings:
     """Above the plane by this much a point stays, whatever its colour; so much below, it goes."""
     color_difference: float = 30.0
     """Of 255, in any channel: a point within the clearance that differs more from the table's colour stays."""
+    smoothing_px: int = 2
+    """Radius of the smoothing of depth (`smoothing`); 0: none."""
+    cluster_gap_m: float = 0.03
+    """Clusters of the merged cloud are this far apart; 0: no cluster is dropped."""
+    least_cluster: float = 0.05
+    """A cluster with a smaller part of the points of the largest one is no cloth: it is dropped."""
     subpixel_px: float = 0.08
-    """Deviation of the stereo disparity, for the points' `sigma`."""
+    """Deviation of the stereo disparity, in pixels of the camera's infrared imagers."""
+    imager_focal_px: float = 425.0
+    """Focal length of these imagers, whatever the image's size: a D435's at 848 columns."""
     baseline_m: float = 0.05
-    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """The scene's origin in the base frame."""
-    yaw_rad: float = 0.0
-    """p_scene = Rz(yaw) (p_base - origin) / length_unit."""
-    length_unit_m: float = 1.0
+    refine: bool = True
+    """Find the other cameras' places relative to the first one's from the recording (`refinement`)."""
+    placement: ScenePlacement | None = None
+    """Where the scene lies; None: as episode.json says."""
+
+    @property
+    def sigma_per_m(self) -> float:
+        """Deviation of inverse depth [1/m], the same at all distances: σ_z = z² σ_px / (f · baseline)."""
+        return self.subpixel_px / (self.imager_focal_px * self.baseline_m)
 
 
 @dataclass(frozen=True)
-class _Cloud:
-    """Points of one camera at one time, in the base frame."""
+class Seen:
+    """What is left of one image: points in the base frame."""
 
+    image: int
+    """Which of the camera's."""
     points: Floats
     pixels: NDArray[np.int64]
     colors: NDArray[np.uint8] | None
@@ -75,6 +95,16 @@ class _Cloud:
     spoilt: Spoilt
     measured: int
     """Valid pixels in the workspace."""
+
+    def select(self, kept: NDArray[np.bool_]) -> Seen:
+        """The points [P] that are kept."""
+        return replace(
+            self,
+            points=self.points[kept],
+            pixels=self.pixels[kept],
+            colors=None if self.colors is None else self.colors[kept],
+            depth_m=self.depth_m[kept],
+        )
 
 
 @dataclass(frozen=True)
@@ -100,6 +130,7 @@ def fuse(
     *,
     calibration: Calibration | None = None,
     tell: Callable[[int, str], None] = lambda done, text: None,
+    watch: Callable[[int, Mapping[str, Seen]], None] = lambda frame, parts: None,
 ) -> Episode:
     """The clouds of a raw episode in the scene's frame, with camera, pixel and deviation of each point.
 
@@ -109,49 +140,39 @@ def fuse(
         mask: of the robot; None leaves it in.
         calibration: poses by serial; without it camera.json's own, or the file it names.
         tell: called with (frames done, text).
+        watch: called with each frame and what is left of each camera's image.
 
     Returns:
         An episode whose meta holds `quality`, figures for each frame: `points_per_view` and `masked_fraction` by camera,
-        `overlap_m` (median distance of the second view's points to the first's where they overlap; None without any).
+        `overlap_m` (median distance of the second view's points to the first's where they overlap; None without any), and
+        `refinement`, what was found about the cameras' places, the arm's skin and the log's lag.
 
     Raises:
         EpisodeError: no robot log though a mask is asked for, a log that does not cover the video, a camera that is not
             calibrated, an image without depth, or a frame of which nothing is left.
     """
+    if mask is not None and raw.robot is None:
+        raise EpisodeError("The recording has no joint log (robot.csv), so the robot cannot be masked: go without a mask.")
     views = {
         name: View(camera.info.intrinsics, _pose(camera.info, raw, calibration)) for name, camera in raw.cameras.items()
     }
-    first = next(iter(raw.cameras.values()))
-    poses = None
-    if mask is not None:
-        if raw.robot is None:
-            raise EpisodeError(
-                "The recording has no joint log (robot.csv), so the robot cannot be masked: go without a mask."
-            )
-        # of all images of all cameras at once
-        poses = {
-            name: mask.robot.forward_kinematics(
-                mask.robot.configuration(*joints_at(raw.robot, camera.times, lag_s=settings.lag_s))
-            )
-            for name, camera in raw.cameras.items()
+    cameras, quality = _Cameras(raw, views, mask, settings), _Quality(list(raw.cameras))
+    if settings.refine and len(raw.cameras) > 1:
+        tell(0, "refining the cameras' places")
+        arm = None if mask is None else RobotMask(mask.robot, inflation_m=0.0)
+        found = refine_extrinsics(raw, views, arm, cameras.sight(), sigma_per_m=settings.sigma_per_m, lag_s=settings.lag_s)
+        quality.figures["refinement"] = {
+            "shift_m": {name: round(shift, 6) for name, shift in found.shift_m.items()},
+            "T_world_camera": {name: pose.tolist() for name, pose in found.T_world_camera.items()},
+            "skin_m": round(found.skin_m, 6),
+            "lag_s": round(found.lag_s, 6),
         }
-
-    def cloud(name: str, index: int) -> _Cloud:
-        placed = None if poses is None else poses[name][index]
-        return _cloud(raw.cameras[name], index, views[name], mask, placed, settings)
-
-    tables: dict[str, Table | None] = dict.fromkeys(raw.cameras)
-    if settings.table:
-        for name, camera in raw.cameras.items():
-            chosen = np.unique(np.linspace(0, len(camera.frames) - 1, _TABLE_FRAMES).astype(int))
-            tables[name] = fit_table([_sample(cloud(name, int(index))) for index in chosen])
-    frames, quality = [], _Quality(list(raw.cameras))
-    for index, time in enumerate(first.times):  # images are read one after the other
-        parts = {}
-        for name, camera in raw.cameras.items():
-            nearest = int(np.abs(camera.times - time).argmin())
-            if abs(camera.times[nearest] - time) <= 0.5 * _interval(camera.times) + 1e-6:
-                parts[name] = _without_table(cloud(name, nearest), tables[name], settings)
+        settings = replace(settings, lag_s=found.lag_s)
+        views = {name: replace(view, T_world_camera=found.T_world_camera[name]) for name, view in views.items()}
+        cameras = _Cameras(raw, views, mask, settings)
+    frames = []
+    for index in range(len(cameras.times)):  # images are read one after the other
+        parts = cameras.cloth(index)
         if not sum(len(part.points) for part in parts.values()):
             seen = ", ".join(
                 f"{name}: {part.measured} in the workspace, {int(part.spoilt.any.sum())} of them masked"
@@ -162,9 +183,80 @@ def fuse(
                 f"{settings.workspace_m}, the calibration, and the table's clearance of {settings.clearance_m:g} m."
             )
         quality.add(parts)
+        watch(index, parts)
         frames.append(parts)
         tell(index + 1, f"frame {index}")
-    return _episode(raw, frames, views, mask, quality, settings)
+    return _episode(raw, frames, mask, quality, settings)
+
+
+class _Cameras:
+    """The cameras of a recording in their places, the arm before them, the table under it."""
+
+    def __init__(
+        self, raw: RawEpisode, views: Mapping[str, View], mask: RobotMask | None, settings: FusionSettings
+    ) -> None:
+        self._raw, self._views, self._mask, self._settings = raw, views, mask, settings
+        self.times = next(iter(raw.cameras.values())).times
+        """[T] of the frames: the first camera's."""
+        self._poses: dict[str, Floats] = {}
+        if mask is not None and raw.robot is not None:  # of all images of all cameras at once
+            self._poses = {
+                name: mask.robot.forward_kinematics(
+                    mask.robot.configuration(*joints_at(raw.robot, camera.times, lag_s=settings.lag_s))
+                )
+                for name, camera in raw.cameras.items()
+            }
+        self._tables: dict[str, Table | None] = dict.fromkeys(raw.cameras)
+        if settings.table:
+            for name, camera in raw.cameras.items():
+                chosen = _spread(len(camera.frames), _TABLE_FRAMES)
+                self._tables[name] = fit_table([_sample(self._cloud(name, index)) for index in chosen])
+
+    def cloth(self, frame: int) -> dict[str, Seen]:
+        """What is left in each camera's image of a frame; cameras without an image near its time are absent."""
+        parts = {
+            name: _without_table(self._cloud(name, index), self._tables[name], self._settings)
+            for name, index in self._images(frame).items()
+        }
+        return _without_scraps(parts, self._settings)
+
+    def sight(self) -> Sight:
+        """What a few frames show, for the refinement."""
+        whole = [frame for frame in range(len(self.times)) if len(self._images(frame)) == len(self._views)]
+        frames = [whole[place] for place in _spread(len(whole), _REFINED_FRAMES)]
+        images = [self._images(frame) for frame in frames]
+        parts = [self.cloth(frame) for frame in frames]
+        to_camera = {name: inverse(view.T_world_camera) for name, view in self._views.items()}
+        return Sight(
+            frames={name: [image[name] for image in images] for name in self._views},
+            cloth={
+                name: [transform(to_camera[name], _few(part[name].points, _REFINED_POINTS)) for part in parts]
+                for name in self._views
+            },
+            table={name: transform(to_camera[name], self._on_table(name)) for name in self._views},
+        )
+
+    def _on_table(self, name: str) -> Floats:
+        table = self._tables[name]
+        if table is None:
+            return np.zeros((0, 3))
+        points = np.concatenate(
+            [_sample(self._cloud(name, index))[0] for index in _spread(len(self._raw.cameras[name].frames), _TABLE_FRAMES)]
+        )
+        return _few(points[np.abs(table.height(points)) < _ON_TABLE_M], _TABLE_POINTS)
+
+    def _images(self, frame: int) -> dict[str, int]:
+        """Of each camera the image nearest in time, where one is within half a frame."""
+        time, near = self.times[frame], {}
+        for name, camera in self._raw.cameras.items():
+            index = int(np.abs(camera.times - time).argmin())
+            if abs(camera.times[index] - time) <= 0.5 * _interval(camera.times) + 1e-6:
+                near[name] = index
+        return near
+
+    def _cloud(self, name: str, index: int) -> Seen:
+        placed = self._poses[name][index] if self._poses else None
+        return _cloud(self._raw.cameras[name], index, self._views[name], self._mask, placed, self._settings)
 
 
 def fit_table(samples: list[tuple[Floats, NDArray[np.uint8] | None]]) -> Table | None:
@@ -187,24 +279,24 @@ def fit_table(samples: list[tuple[Floats, NDArray[np.uint8] | None]]) -> Table |
     level = (np.abs(normal[:, 2]) > _STEEPEST) & (length > 1e-6)
     if not level.any():
         return None
-    near = np.abs(few @ normal[level].T - (normal * a).sum(axis=1)[level]) < 0.005
+    near = np.abs(few @ normal[level].T - (normal * a).sum(axis=1)[level]) < _ON_TABLE_M
     best = near.sum(axis=0).argmax()
     if near[:, best].mean() < _LEAST_TABLE:
         return None
     up, offset = normal[level][best], float((normal * a).sum(axis=1)[level][best])
     for _ in range(2):
-        held = points[np.abs(points @ up - offset) < 0.005]
+        held = points[np.abs(points @ up - offset) < _ON_TABLE_M]
         centre = held.mean(axis=0)
         up = np.linalg.svd(held - centre, full_matrices=False)[2][2]
         offset = float(centre @ up)
     up, offset = (up, offset) if up[2] > 0 else (-up, -offset)
-    colors = [color[np.abs(sample @ up - offset) < 0.005] for sample, color in samples if color is not None]
+    colors = [color[np.abs(sample @ up - offset) < _ON_TABLE_M] for sample, color in samples if color is not None]
     return Table(up, offset, np.median(np.concatenate(colors), axis=0) if colors and sum(map(len, colors)) else None)
 
 
 def _cloud(
     camera: RawCamera, index: int, view: View, mask: RobotMask | None, poses: Floats | None, settings: FusionSettings
-) -> _Cloud:
+) -> Seen:
     depth_m: Floats = camera.depth(index).astype(np.float64) * camera.info.depth_scale_m
     if depth_m.shape != view.directions.shape[:2]:
         raise EpisodeError(
@@ -219,21 +311,43 @@ def _cloud(
     world = transform(view.T_world_camera, (view.directions * depth_m[..., None]).reshape(-1, 3)).reshape(*depth_m.shape, 3)
     low, high = settings.workspace_m
     within = (depth_m > 0) & ((world >= low) & (world <= high)).all(axis=-1)
-    spoilt = spoilt_pixels(depth_m, view, mask, poses, within=within, eyes_m=settings.eyes_m, flying_m=settings.flying_m)
+    spoilt = spoilt_pixels(
+        depth_m,
+        view,
+        mask,
+        poses,
+        within=within,
+        eyes_m=settings.eyes_m,
+        flying_m=settings.flying_m,
+        sigma_per_m=settings.sigma_per_m,
+    )
     kept = within & ~spoilt.any
+    if settings.smoothing_px > 0:
+        depth_m = smooth_depth(depth_m, kept, settings.smoothing_px, settings.sigma_per_m)
+    world = transform(view.T_world_camera, view.directions[kept] * depth_m[kept][:, None])
     row, column = np.nonzero(kept)
     color = camera.color(index)
     colors = None if color is None or color.shape[:2] != depth_m.shape else color[kept]
-    return _Cloud(world[kept], np.column_stack([column, row]), colors, depth_m[kept], spoilt, int(within.sum()))
+    return Seen(index, world, np.column_stack([column, row]), colors, depth_m[kept], spoilt, int(within.sum()))
 
 
-def _sample(cloud: _Cloud) -> tuple[Floats, NDArray[np.uint8] | None]:
+def _spread(count: int, wanted: int) -> list[int]:
+    """At most so many indices, from the first to the last."""
+    return [int(index) for index in np.unique(np.linspace(0, count - 1, wanted).astype(int))] if count else []
+
+
+def _few(points: Floats, wanted: int) -> Floats:
+    """At most about so many of points [N, 3]."""
+    return points[:: max(1, len(points) // wanted)]
+
+
+def _sample(cloud: Seen) -> tuple[Floats, NDArray[np.uint8] | None]:
     """Every few points: a plane needs no more."""
     step = max(1, len(cloud.points) // (5 * _TABLE_POINTS))
     return cloud.points[::step], None if cloud.colors is None else cloud.colors[::step]
 
 
-def _without_table(cloud: _Cloud, table: Table | None, settings: FusionSettings) -> _Cloud:
+def _without_table(cloud: Seen, table: Table | None, settings: FusionSettings) -> Seen:
     if table is None:
         return cloud
     height = table.height(cloud.points)
@@ -241,8 +355,18 @@ def _without_table(cloud: _Cloud, table: Table | None, settings: FusionSettings)
     if cloud.colors is not None and table.color is not None:
         other = np.abs(cloud.colors - table.color).max(axis=1) > settings.color_difference
         kept |= other & (height > -settings.clearance_m)
-    colors = None if cloud.colors is None else cloud.colors[kept]
-    return replace(cloud, points=cloud.points[kept], pixels=cloud.pixels[kept], colors=colors, depth_m=cloud.depth_m[kept])
+    return cloud.select(kept)
+
+
+def _without_scraps(parts: dict[str, Seen], settings: FusionSettings) -> dict[str, Seen]:
+    """Views without small clusters of their union: bits of table and robot that slipped through."""
+    if settings.cluster_gap_m == 0:
+        return parts
+    kept = in_large_clusters(
+        np.concatenate([part.points for part in parts.values()]), settings.cluster_gap_m, settings.least_cluster
+    )
+    ends = np.cumsum([len(part.points) for part in parts.values()])
+    return {name: part.select(mine) for (name, part), mine in zip(parts.items(), np.split(kept, ends[:-1]), strict=True)}
 
 
 class _Quality:
@@ -256,7 +380,7 @@ class _Quality:
             "overlap_m": [],
         }
 
-    def add(self, parts: dict[str, _Cloud]) -> None:
+    def add(self, parts: dict[str, Seen]) -> None:
         for name in self._names:
             part = parts.get(name)
             self.figures["points_per_view"][name].append(0 if part is None else len(part.points))
@@ -276,8 +400,7 @@ def _overlap(first: Floats, second: Floats) -> float | None:
 
 def _episode(
     raw: RawEpisode,
-    frames: list[dict[str, _Cloud]],
-    views: dict[str, View],
+    frames: list[dict[str, Seen]],
     mask: RobotMask | None,
     quality: _Quality,
     settings: FusionSettings,
@@ -285,45 +408,35 @@ def _episode(
     names = list(raw.cameras)
     parts = [(names.index(name), part) for frame in frames for name, part in frame.items()]
     sizes = [sum(len(part.points) for part in frame.values()) for frame in frames]
-    per_metre = [
-        settings.subpixel_px / (views[names[index]].intrinsics.fx * settings.baseline_m) for index, _ in parts
-    ]  # σ_z = z² σ_px / (f · baseline)
+    placement = settings.placement or raw.placement
     times = raw.cameras[names[0]].times
-    labels = {key: raw.description[key] for key in ("scenario", "fabric", "category", "repeat") if key in raw.description}
+    tool = _tool(raw, times, mask, settings)
+    labels = {
+        key: raw.description[key] for key in ("scenario", "fabric", "category", "repeat", "truth") if key in raw.description
+    }
     return Episode(
-        points=to_scene(np.concatenate([part.points for _, part in parts]), settings).astype(np.float32),
+        points=placement.to_scene(np.concatenate([part.points for _, part in parts])).astype(np.float32),
         offsets=np.cumsum([0, *sizes], dtype=np.int64),
         times=times - times[0],
-        gripper=_gripper(raw, times, mask, settings),
+        gripper=None if tool is None else placement.to_scene(tool),
         camera=np.concatenate([np.full(len(part.points), index, dtype=np.uint8) for index, part in parts]),
         pixel=np.concatenate([part.pixels for _, part in parts]).astype(np.uint16),
-        sigma=np.concatenate([part.depth_m**2 * factor for factor, (_, part) in zip(per_metre, parts, strict=True)]).astype(
-            np.float32
-        ),
+        sigma=np.concatenate([part.depth_m**2 * settings.sigma_per_m for _, part in parts]).astype(np.float32),
         meta={**labels, "source": "raw episode", "cameras": names, "quality": quality.figures},
     )
 
 
-def _gripper(raw: RawEpisode, times: Floats, mask: RobotMask | None, settings: FusionSettings) -> Floats | None:
-    """[T, 3] of the tool in the scene's frame: as the arm reported it, else by its joints; None where neither is known."""
+def _tool(raw: RawEpisode, times: Floats, mask: RobotMask | None, settings: FusionSettings) -> Floats | None:
+    """[T, 3] of the tool in the base frame: as the arm reported it, else by its joints; None where neither is known."""
     log = raw.robot
     if log is None or not len(log.times):
         return None
-    clock = log.times - settings.lag_s
     if np.isfinite(log.tool_position_m).all():
-        tool = np.stack([np.interp(times, clock, column) for column in log.tool_position_m.T], axis=1)
-    elif mask is not None:
-        tool = mask.robot.tool_pose(joints_at(log, times, lag_s=settings.lag_s)[0])[:, :3, 3]
-    else:
-        return None
-    return to_scene(tool, settings)
-
-
-def to_scene(points: Floats, settings: FusionSettings) -> Floats:
-    """Base-frame points [..., 3] [m] in the scene's frame and length unit."""
-    c, s = np.cos(settings.yaw_rad), np.sin(settings.yaw_rad)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return (points - np.array(settings.origin_m)) @ turn.T / settings.length_unit_m
+        clock = log.times - settings.lag_s
+        return np.stack([np.interp(times, clock, column) for column in log.tool_position_m.T], axis=1)
+    if mask is not None:
+        return mask.robot.tool_pose(joints_at(log, times, lag_s=settings.lag_s)[0])[:, :3, 3]
+    return None
 
 
 def _pose(info: CameraInfo, raw: RawEpisode, calibration: Calibration | None) -> Floats:

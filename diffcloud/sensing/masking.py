@@ -25,7 +25,7 @@ from diffcloud.errors import EpisodeError
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.clouds import import_open3d
 from diffcloud.io.raw_episodes import RobotLog
-from diffcloud.io.urdf import LinkMesh
+from diffcloud.io.urdf import LinkMesh, joined
 from diffcloud.sensing.cameras import inverse, rays, transform
 from diffcloud.sensing.robot import Robot
 
@@ -38,6 +38,7 @@ _NEAREST_M = 0.01
 _OUTSIDE_S = 0.1
 """Joints are held this long beyond the ends of their log."""
 _FEWEST_SUPPORTING = 3
+_NOISE_DEVIATIONS = 2.0
 
 
 @dataclass(frozen=True)
@@ -99,14 +100,20 @@ class RobotMask:
         Args:
             poses: [L, 4, 4] T_world_link.
         """
+        return self.first_hits(view, poses)[0]
+
+    def first_hits(self, view: View, poses: Floats) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """(z-depth [H, W] [m] of the inflated robot, which of its links is hit [H, W]); infinite and -1 beside it."""
         depth = np.full(view.directions.shape[:2], np.inf, dtype=np.float32)
-        for scene, T_link_camera, low, high in self._placed(view.T_world_camera, poses, np.zeros(3)):
+        link = np.full(depth.shape, -1)
+        for index, scene, T_link_camera, low, high in self._placed(view.T_world_camera, poses, np.zeros(3)):
             window = view.window(low, high)
             directions = view.directions[window]
             if directions.size:
                 hit = _cast(scene, T_link_camera, np.zeros(3), directions)  # rays have z = 1: their length is z-depth
-                depth[window] = np.minimum(depth[window], hit)
-        return depth
+                nearer = hit < depth[window]
+                depth[window][nearer], link[window][nearer] = hit[nearer], index
+        return depth, link
 
     def hides(
         self, points: Floats, T_world_camera: Floats, poses: Floats, *, eye: Sequence[float] = (0.0, 0.0, 0.0)
@@ -122,16 +129,18 @@ class RobotMask:
             [N].
         """
         from_eye = points - eye
-        plane = from_eye[:, :2] / np.maximum(from_eye[:, 2:], _NEAREST_M)
+        x, y = np.ascontiguousarray((from_eye[:, :2] / np.maximum(from_eye[:, 2:], _NEAREST_M)).T)
         hidden = np.zeros(len(points), dtype=bool)
-        for scene, T_link_camera, low, high in self._placed(T_world_camera, poses, np.asarray(eye)):
-            near = np.flatnonzero(((plane >= low) & (plane <= high)).all(axis=1) & ~hidden)
+        for _, scene, T_link_camera, low, high in self._placed(T_world_camera, poses, np.asarray(eye)):
+            near = np.flatnonzero((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1]) & ~hidden)
             if len(near):
                 hidden[near] = _cast(scene, T_link_camera, np.asarray(eye), from_eye[near]) <= 1.0
         return hidden
 
-    def _placed(self, T_world_camera: Floats, poses: Floats, eye: Floats) -> Iterator[tuple[Any, Floats, Floats, Floats]]:
-        """(scene, T_link_camera, least and greatest (x, y) of rays from the eye that can meet it) of each link in view."""
+    def _placed(
+        self, T_world_camera: Floats, poses: Floats, eye: Floats
+    ) -> Iterator[tuple[int, Any, Floats, Floats, Floats]]:
+        """(link, scene, T_link_camera, least and greatest (x, y) of rays from the eye that can meet it) of each link."""
         for index, scene, corners in self._links:  # links have trees of their own
             T_link_camera = inverse(poses[index]) @ T_world_camera
             seen = transform(inverse(T_link_camera), corners) - eye
@@ -141,7 +150,7 @@ class RobotMask:
             low, high = plane.min(axis=0), plane.max(axis=0)
             if (seen[:, 2] < _NEAREST_M).any():  # reaches behind the camera: its picture may be anywhere
                 low, high = np.full(2, -np.inf), np.full(2, np.inf)
-            yield scene, T_link_camera, low, high
+            yield index, scene, T_link_camera, low, high
 
 
 @dataclass(frozen=True)
@@ -169,6 +178,7 @@ def spoilt_pixels(
     within: Mask | None = None,
     eyes_m: Sequence[float] = (0.05,),
     flying_m: float = 0.01,
+    sigma_per_m: float = 0.0,
 ) -> Spoilt:
     """Pixels that show no cloth because of the robot, or of a border.
 
@@ -179,11 +189,13 @@ def spoilt_pixels(
         eyes_m: places of the stereo pair's other eyes along the image's x [m]; a D435's second imager is at 0.05 of its
             depth image.
         flying_m: see `flying_pixels`; 0 leaves them.
+        sigma_per_m: standard deviation of the inverse depth [1/m]. What is measured before the robot by no more than noise
+            explains is robot.
     """
     valid = depth_m > 0 if within is None else (depth_m > 0) & within
     robot, shadow = np.zeros_like(valid), np.zeros_like(valid)
     if mask is not None and poses is not None:
-        robot = valid & (depth_m >= mask.surface(view, poses))
+        robot = valid & (depth_m + _NOISE_DEVIATIONS * sigma_per_m * depth_m**2 >= mask.surface(view, poses))
         free = valid & ~robot
         points = view.directions[free] * depth_m[free][:, None]
         hidden = np.zeros(len(points), dtype=bool)
@@ -213,6 +225,12 @@ def inflate(mesh: LinkMesh, margin_m: float) -> LinkMesh:
     """
     if margin_m == 0:
         return mesh
+    moved = offset(mesh, margin_m)
+    return joined([mesh, moved])
+
+
+def offset(mesh: LinkMesh, margin_m: float) -> LinkMesh:
+    """The surface with every face moved outwards by `margin_m` (inwards where negative), equal vertices made one."""
     corner, same = np.unique(np.round(mesh.vertices, 7), axis=0, return_inverse=True)  # STL repeats its vertices
     faces = same.reshape(-1)[mesh.faces]
     normal = np.cross(corner[faces[:, 1]] - corner[faces[:, 0]], corner[faces[:, 2]] - corner[faces[:, 0]])
@@ -227,8 +245,7 @@ def inflate(mesh: LinkMesh, margin_m: float) -> LinkMesh:
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
     cosine = np.ones(len(corner))
     np.minimum.at(cosine, faces, (mean[faces] * normal[:, None]).sum(axis=2))
-    moved = corner + margin_m * mean / np.maximum(cosine, 1 / _LONGEST_MITRE)[:, None]
-    return LinkMesh(np.concatenate([corner, moved]), np.concatenate([faces, faces + len(corner)]))
+    return LinkMesh(corner + margin_m * mean / np.maximum(cosine, 1 / _LONGEST_MITRE)[:, None], faces)
 
 
 def joints_at(log: RobotLog, times: Floats, *, lag_s: float = 0.0) -> tuple[Floats, Floats]:

@@ -1,94 +1,320 @@
-"""Recorders without hardware: what depth cameras would have seen of a known motion, and its whole surface."""
+"""Synthetic raw episodes: an arm moves a simulated cloth over a table before depth cameras.
+
+What is written is a raw episode like any other. Beside it, in the folder `truth`, lies what no recording knows: which pixel
+shows what, where the cloth was, where the cameras stood. Nothing that reads raw episodes looks there.
+
+    truth/cloth.npz                   nodes [T, V, 3] [m] in the world, faces [F, 3], times [T] [s]
+    truth/cameras.json                T_world_camera of each camera
+    truth/<cam>/000000.png            16-bit [H, W] labels: NOTHING, TABLE, CLOTH, ROBOT
+
+What is rendered is not what a mask is made of (`arm_body`), and the joint log is late: the mask has something to prove.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from diffcloud.clouds.sampling import SurfaceSampler
-from diffcloud.io.episodes import Episode
+from diffcloud.errors import EpisodeError
+from diffcloud.io.camera_models import Intrinsics
+from diffcloud.io.clouds import import_open3d
+from diffcloud.io.files import atomic_path, read_json, write_json
+from diffcloud.io.images import read_depth, write_depth
+from diffcloud.io.raw_episodes import RawEpisodeWriter, RobotSample, ScenePlacement
 from diffcloud.mesh.topology import SurfaceMesh
+from diffcloud.sensing.arm_body import cable, lookalike
+from diffcloud.sensing.cameras import transform
 from diffcloud.sensing.depth_camera import DepthCamera
+from diffcloud.sensing.masking import RobotMask, View
+from diffcloud.sensing.robot import Robot, gen3
 
-_SURFACE_POINTS = 60_000
-"""Several per pixel of a hand-sized cloth, so that the z-buffer has no holes."""
+Floats = NDArray[np.float64]
+
+NOTHING, TABLE, CLOTH, ROBOT = range(4)
+STARTED_AT = "2000-01-01T00:00:00.000+00:00"
+"""Of every synthetic episode, so that the same seed gives the same bytes."""
+
+_DOWN = np.diag([1.0, -1.0, -1.0])
+"""The gripper points down, its fingers on both sides of the cloth along x."""
+_GRASP_M = 0.071
+"""From the tool's frame to where the fingers' ends hold the cloth, along the tool's z."""
+_GRIPPER_CLOSED = 1.0
+_COLORS = np.array([[60, 60, 60], [126, 114, 100], [0, 0, 0], [205, 205, 208]], dtype=np.float64)
+"""Of NOTHING (the floor), TABLE, CLOTH (given) and ROBOT; red, green, blue."""
+_CABLE_COLOR = np.array([30.0, 30.0, 30.0])
+_COLOR_NOISE = 4.0
+_LIGHT = np.array([0.3, -0.4, 0.866])
+_SAME = 2e-3
+"""A hit this part of the way before a point is the point itself."""
+_BEFORE_S = 0.5
+"""The joint log starts this long before the first image and ends so long after the last."""
+
+
+_IN_REACH = ScenePlacement((0.5, 0.04, 0.0), float(np.pi / 2))
+"""The cloth before the arm; turned as in the published experiments."""
+
+
+@dataclass(frozen=True)
+class RecorderSettings:
+    """What the synthetic set-up is like."""
+
+    placement: ScenePlacement = _IN_REACH
+    joint_rate_hz: float = 40.0
+    lag_s: float = 0.02
+    """The joint log's times are late by this much."""
+    largest_growth_m: float = 0.003
+    """The rendered arm is larger than its description by at most this."""
+    with_cable: bool = True
+    extrinsic_error: tuple[float, float] = (0.0, 0.0)
+    """(millimetres, degrees) by which the stated place of each camera but the first is off, in a direction drawn for the
+    episode."""
+    table_size_m: tuple[float, float] = (1.1, 1.3)
+    """Along x and y of the base frame, its middle under the scene's origin."""
+
+
+@dataclass(frozen=True)
+class ClothMotion:
+    """What there is to see, in the scene's frame."""
+
+    nodes: Floats
+    """[T, V, 3] at each frame."""
+    faces: NDArray[np.int64]
+    """[F, 3]."""
+    times: Floats
+    """[T] [s]."""
+    grasped: Sequence[int]
+    """Nodes whose mean the gripper holds."""
+    table_height: float = 0.0
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What no recording knows."""
+
+    nodes: Floats
+    """[T, V, 3] of the cloth in the world [m]."""
+    faces: NDArray[np.int64]
+    T_world_camera: Mapping[str, Floats]
+    folder: Path
+
+    def labels(self, camera: str, index: int) -> NDArray[np.uint16]:
+        """[H, W] NOTHING, TABLE, CLOTH or ROBOT."""
+        return read_depth(self.folder / camera / f"{index:06d}.png")
+
+    def visible_cloth(self, camera: str, intrinsics: Intrinsics, index: int) -> tuple[Floats, NDArray[np.int64]]:
+        """World points [P, 3] [m] and pixels [P, 2] of the cloth that a faultless camera sees."""
+        view = View(intrinsics, self.T_world_camera[camera])
+        seen = self.labels(camera, index) == CLOTH
+        row, column = np.nonzero(seen)
+        depth, _, _ = _cast(caster([SurfaceMesh(self.nodes[index], self.faces)]), view, np.zeros(3), view.directions[seen])
+        hit = np.isfinite(depth)  # single precision may pass the rim on its other side
+        points = transform(view.T_world_camera, view.directions[seen][hit] * depth[hit, None])
+        return points, np.column_stack([column, row])[hit]
+
+
+def read_truth(folder: Path) -> Truth:
+    """The truth beside a synthetic raw episode.
+
+    Raises:
+        EpisodeError: the episode is not synthetic, or a file is damaged.
+    """
+    place = Path(folder) / "truth"
+    if not place.is_dir():
+        raise EpisodeError(f"{folder} has no folder truth: only synthetic recordings know the truth.")
+    poses = read_json(place / "cameras.json", error=EpisodeError)
+    try:
+        with np.load(place / "cloth.npz", allow_pickle=False) as cloth:
+            nodes, faces = cloth["nodes"], cloth["faces"]
+    except (OSError, ValueError, KeyError) as error:
+        raise EpisodeError(f"{place / 'cloth.npz'} is not readable: {error}.") from error
+    return Truth(nodes, faces, {name: np.array(pose) for name, pose in poses.items()}, place)
 
 
 def record(
-    nodes: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    times: NDArray[np.float64],
-    cameras: tuple[DepthCamera, ...],
+    folder: Path,
+    motion: ClothMotion,
+    cameras: Sequence[DepthCamera],
     *,
-    grasped: list[int],
+    settings: RecorderSettings | None = None,
+    cloth_color: tuple[int, int, int] = (40, 70, 170),
     seed: int,
     meta: Mapping[str, Any],
-) -> Episode:
-    """Record a motion.
+    tell: Callable[[int, str], None] = lambda done, text: None,
+) -> None:
+    """Write a synthetic raw episode and its truth.
 
     Args:
-        nodes: [T, V, 3] of the cloth at each frame [m].
-        faces: [F, 3].
-        times: [T] [s].
-        grasped: nodes whose mean is the gripper's position.
-        seed: of all noise.
+        folder: must not exist yet.
+        cloth_color: red, green, blue in full light.
+        seed: of the noise, the arm's shape, and the extrinsic error.
+        meta: scenario, fabric and such, for episode.json.
+        tell: called with (frames done, text).
+
+    Raises:
+        EpisodeError: the folder exists.
+        RobotError: the cloth's path is out of the arm's reach.
     """
+    settings = settings or RecorderSettings()
     rng = np.random.default_rng(seed)
-    generator = torch.Generator().manual_seed(seed)
-    sampler = SurfaceSampler.build(torch.as_tensor(faces), _SURFACE_POINTS, generator=generator)
-    frames, camera_ids, pixels, sigmas = [], [], [], []
-    for frame in nodes:  # images are taken one after the other; each is vectorised
-        surface = sampler.sample(torch.as_tensor(frame)).numpy()
-        views = [camera.see(surface, rng) for camera in cameras]
-        frames.append(np.concatenate([points for points, _, _ in views]))
-        camera_ids.append(np.repeat(np.arange(len(cameras), dtype=np.uint8), [len(points) for points, _, _ in views]))
-        pixels += [pixel for _, pixel, _ in views]
-        sigmas += [sigma for _, _, sigma in views]
-    return Episode(
-        points=np.concatenate(frames).astype(np.float32),
-        offsets=np.cumsum([0, *(len(frame) for frame in frames)], dtype=np.int64),
-        times=times,
-        gripper=nodes[:, grasped].mean(axis=1),
-        camera=np.concatenate(camera_ids),
-        pixel=np.concatenate(pixels),
-        sigma=np.concatenate(sigmas),
-        meta=meta,
-    )
+    robot = gen3()
+    nodes = settings.placement.to_world(motion.nodes)
+    held = nodes[:, list(motion.grasped)].mean(axis=1)
+    joints = robot.inverse_kinematics(held - _GRASP_M * _DOWN[:, 2], rotations=_DOWN)
+    poses = robot.forward_kinematics(robot.configuration(joints, _GRIPPER_CLOSED))
+    scene = _Scene(robot, motion.faces, _table(motion, settings), settings, np.array(cloth_color, dtype=np.float64), rng)
+    stated = {
+        camera.name: _off(camera.view.T_world_camera, *(settings.extrinsic_error if index else (0.0, 0.0)), nodes, rng)
+        for index, camera in enumerate(cameras)
+    }
+    interval = float(np.median(np.diff(motion.times))) if len(motion.times) > 1 else 1.0
+    described = {
+        **meta,
+        "scene_in_world": asdict(settings.placement),
+    }
+    with RawEpisodeWriter(
+        folder,
+        {camera.name: camera.info(stated[camera.name]) for camera in cameras},
+        rate_hz=round(1 / interval, 6),
+        source="synthetic",
+        robot={"model": "Kinova Gen3, Robotiq 2F-85 (synthetic)"},
+        durable=False,
+        meta=described,
+        started_at=STARTED_AT,
+    ) as writer:
+        _write_log(writer, robot, motion.times, joints, settings)
+        for index, time in enumerate(motion.times):  # images are taken one after the other; each is vectorised
+            scene.place(nodes[index], poses[index])
+            for camera in cameras:
+                depth_m, labels, color = scene.render(camera.view, rng)
+                hidden = scene.hidden(camera, depth_m, labels)
+                writer.add_frame(camera.name, float(time), camera.measure(depth_m, hidden, rng), color)
+                write_depth(folder / "truth" / camera.name / f"{index:06d}.png", labels)
+            tell(index + 1, f"frame {index}")
+    write_json(folder / "truth" / "cameras.json", {camera.name: camera.view.T_world_camera.tolist() for camera in cameras})
+    with atomic_path(folder / "truth" / "cloth.npz") as temporary:
+        np.savez(temporary, allow_pickle=False, nodes=nodes, faces=motion.faces, times=motion.times)
 
 
-def sample_surface(
-    nodes: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    times: NDArray[np.float64],
-    obstacle: SurfaceMesh | None,
-    *,
-    points: int,
-    seed: int,
-    meta: Mapping[str, Any],
-) -> Episode:
-    """A fully observed episode without noise, as the paper's simulated targets are.
+class _Scene:
+    """Cloth, arm and table, ready to be cast into cameras."""
 
-    Points are drawn anew in every frame, uniformly by area, on the cloth and the obstacle together; also where nothing
-    could see them. The episode carries no gripper track, so that a fit moves the handles exactly as the scene does.
+    def __init__(
+        self,
+        robot: Robot,
+        faces: NDArray[np.int64],
+        table: SurfaceMesh,
+        settings: RecorderSettings,
+        cloth_color: Floats,
+        rng: np.random.Generator,
+    ) -> None:
+        self._robot, self._faces, self._settings = robot, faces, settings
+        self._arm = RobotMask(lookalike(robot, rng, largest_growth_m=settings.largest_growth_m), inflation_m=0.0)
+        self._table = caster([table])
+        self._colors = _COLORS.copy()
+        self._colors[CLOTH] = cloth_color
+        self._grain = rng.normal(size=(64, 64))
+
+    def place(self, nodes: Floats, poses: Floats) -> None:
+        """Move cloth [V, 3] and links [L, 4, 4]."""
+        self._poses = poses
+        loose = [SurfaceMesh(nodes, self._faces)]
+        if self._settings.with_cable:
+            loose.append(cable(self._robot, poses))
+        self._loose = caster(loose)  # rebuilt for each frame; the links' and the table's structures are not
+
+    def render(self, view: View, rng: np.random.Generator) -> tuple[Floats, NDArray[np.uint16], NDArray[np.uint8]]:
+        """(z-depth [H, W] [m], labels [H, W], colour [H, W, 3])."""
+        table, _, _ = _cast(self._table, view, np.zeros(3), view.directions)
+        loose, which, normal = _cast(self._loose, view, np.zeros(3), view.directions)
+        arm = self._arm.surface(view, self._poses).astype(np.float64)
+        depth = np.minimum(np.minimum(table, loose), arm)
+        labels = np.full(depth.shape, NOTHING, dtype=np.uint16)
+        labels[np.isfinite(table) & (table <= depth)] = TABLE
+        labels[np.isfinite(depth) & (arm <= depth)] = ROBOT
+        front = np.isfinite(depth) & (loose <= depth)
+        labels[front] = np.where(which[front] == 0, CLOTH, ROBOT)
+        color = self._colors[labels]
+        color[front & (labels == ROBOT)] = _CABLE_COLOR
+        cloth = labels == CLOTH
+        lambert = np.abs(normal[cloth] @ _LIGHT)  # a cloth has two sides
+        color[cloth] *= (0.55 + 0.45 * lambert)[:, None]
+        row, column = np.indices(depth.shape)
+        color *= (1 + 0.03 * self._grain[row % 64, column % 64])[..., None]
+        noisy = color + _COLOR_NOISE * rng.standard_normal(color.shape)
+        return depth, labels, np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+    def hidden(self, camera: DepthCamera, depth_m: Floats, labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
+        """[H, W] pixels whose point one of the camera's imagers does not see."""
+        view = camera.view
+        seen = (labels == CLOTH) | (labels == TABLE)  # what the arm hides of itself is left: it is robot either way
+        points = view.directions[seen] * depth_m[seen][:, None]
+        lost = np.zeros(len(points), dtype=bool)
+        for x in camera.eyes_m:
+            eye = np.array([x, 0.0, 0.0])
+            between, _, _ = _cast(self._loose, view, eye, points - eye)
+            lost |= between < 1 - _SAME
+            free = np.flatnonzero(~lost)
+            lost[free] = self._arm.hides(points[free], view.T_world_camera, self._poses, eye=eye.tolist())
+        hidden = np.zeros(depth_m.shape, dtype=bool)
+        hidden[seen] = lost
+        return hidden
+
+
+def caster(meshes: Sequence[SurfaceMesh]) -> Any:
+    """A ray-casting structure of meshes in the world."""
+    open3d = import_open3d()
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    for mesh in meshes:
+        scene.add_triangles(mesh.nodes.astype(np.float32), mesh.faces.astype(np.uint32))
+    return scene
+
+
+def _cast(scene: Any, view: View, eye: Floats, directions: Floats) -> tuple[Floats, NDArray[np.uint32], Floats]:
+    """(first hit in lengths of `directions` [..., 3], which mesh, its normal in the world).
 
     Args:
-        nodes: [T, V, 3] of the cloth at each frame [m].
-        faces: [F, 3].
-        times: [T] [s].
-        obstacle: a fixed body beside the cloth; None for the cloth alone.
-        points: in each frame.
-        seed: of the points.
+        eye: [3] where the rays start, in the camera's frame, as the directions are.
     """
-    generator = torch.Generator().manual_seed(seed)
-    if obstacle is not None:
-        faces = np.concatenate([faces, obstacle.faces + nodes.shape[1]])
-        nodes = np.concatenate([nodes, np.broadcast_to(obstacle.nodes, (len(nodes), *obstacle.nodes.shape))], axis=1)
-    surface = torch.as_tensor(faces)
-    clouds = [
-        SurfaceSampler.build(surface, points, generator=generator).sample(torch.as_tensor(frame)).numpy() for frame in nodes
-    ]
-    return Episode.from_frames(clouds, times, meta={**meta, "noise_free": True})
+    pose = view.T_world_camera
+    bundle = np.empty((*directions.shape[:-1], 6), dtype=np.float32)
+    bundle[..., :3] = transform(pose, eye[None])[0]
+    bundle[..., 3:] = directions @ pose[:3, :3].T
+    hit = scene.cast_rays(bundle, nthreads=1)
+    return hit["t_hit"].numpy().astype(np.float64), hit["geometry_ids"].numpy(), hit["primitive_normals"].numpy()
+
+
+def _table(motion: ClothMotion, settings: RecorderSettings) -> SurfaceMesh:
+    half = 0.5 * np.array(settings.table_size_m)
+    x, y, z = settings.placement.to_world(np.array([0.0, 0.0, motion.table_height]))
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half + [x, y]
+    return SurfaceMesh(np.column_stack([corners, np.full(4, z)]), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def _off(pose: Floats, millimetres: float, degrees: float, nodes: Floats, rng: np.random.Generator) -> Floats:
+    """A pose turned about the scene's middle and moved, by these amounts in directions drawn at random."""
+    turn_axis, direction = rng.normal(size=(2, 3))
+    turn = Rotation.from_rotvec(np.deg2rad(degrees) * turn_axis / np.linalg.norm(turn_axis)).as_matrix()
+    middle = nodes.reshape(-1, 3).mean(axis=0)
+    shifted = pose.copy()
+    shifted[:3, :3] = turn @ pose[:3, :3]
+    shifted[:3, 3] = turn @ (pose[:3, 3] - middle) + middle
+    shifted[:3, 3] += 1e-3 * millimetres * direction / np.linalg.norm(direction)
+    return shifted
+
+
+def _write_log(writer: RawEpisodeWriter, robot: Robot, times: Floats, joints: Floats, settings: RecorderSettings) -> None:
+    """The joint log at its own rate: what the arm did `lag_s` before each row's time."""
+    start, end = times[0] - _BEFORE_S, times[-1] + _BEFORE_S
+    clock = start + np.arange(int(np.ceil((end - start) * settings.joint_rate_hz)) + 1) / settings.joint_rate_hz
+    continuous = np.unwrap(joints, axis=0)
+    logged = np.stack([np.interp(clock - settings.lag_s, times, column) for column in continuous.T], axis=1)
+    tool = robot.tool_pose(logged)
+    quaternion = np.roll(Rotation.from_matrix(tool[:, :3, :3]).as_quat(), 1, axis=-1)
+    for row in range(len(clock)):  # a file is written row by row
+        writer.add_robot(RobotSample(clock[row], logged[row], _GRIPPER_CLOSED, tool[row, :3, 3], quaternion[row]))

@@ -17,7 +17,7 @@ from diffcloud.io import images, raw_episodes
 from diffcloud.io.calibrations import Calibration, CameraCalibration, read_calibration, write_calibration
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.images import read_color, read_depth, write_color, write_depth
-from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter, read_raw_episode
+from diffcloud.io.raw_episodes import CameraInfo, RawEpisode, RawEpisodeWriter, ScenePlacement, read_raw_episode
 from tests.sensing.table_scene import INTRINSICS, camera_infos, poses, robot_sample, table_depth, write_table_episode
 
 
@@ -238,3 +238,23 @@ def test_jpeg_is_never_depth():
     with pytest.raises(EpisodeError, match="uint16"):
         write_depth("x.png", np.zeros((3, 3)))
     assert isinstance(CameraInfo("a", "1", INTRINSICS, 0.001).to_json(), dict)
+
+
+def test_where_the_scene_lies(tmp_path):
+    def placed(stated: object) -> ScenePlacement:
+        return RawEpisode(tmp_path, {} if stated is None else {"scene_in_world": stated}, {}, None).placement
+
+    assert placed(None) == ScenePlacement()
+    placement = placed({"origin_m": [0.5, 0.1, 0.0], "yaw_rad": 0.3, "length_unit_m": 0.35})
+    points = np.arange(12.0).reshape(4, 3)
+    np.testing.assert_allclose(placement.to_scene(placement.to_world(points)), points, atol=1e-12)
+    np.testing.assert_allclose(placement.to_world(np.zeros(3)), [0.5, 0.1, 0.0])
+    for damaged in (
+        "here",
+        {"origin_m": [0, 0]},
+        {"yaw_rad": "east"},
+        {"length_unit_m": 0},
+        {"length_unit_m": float("nan")},
+    ):
+        with pytest.raises(EpisodeError, match="scene_in_world"):
+            placed(damaged)

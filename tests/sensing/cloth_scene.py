@@ -10,7 +10,7 @@ import numpy as np
 
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter, RobotSample
-from diffcloud.sensing.depth_camera import DepthCamera
+from diffcloud.sensing.cameras import looking_at
 from diffcloud.sensing.masking import RobotMask, View
 from diffcloud.sensing.robot import gen3
 
@@ -36,9 +36,7 @@ class ClothScene:
 
 def views() -> dict[str, View]:
     target = (0.58, 0.0, 0.05)
-    return {
-        name: View(INTRINSICS, DepthCamera.looking_at(name, place, target).T_world_camera) for name, place in PLACES.items()
-    }
+    return {name: View(INTRINSICS, looking_at(place, target)) for name, place in PLACES.items()}
 
 
 def cloth_height(x: np.ndarray, y: np.ndarray) -> np.ndarray:

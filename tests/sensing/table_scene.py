@@ -8,8 +8,7 @@ import numpy as np
 
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter, RobotSample
-from diffcloud.sensing import DepthCamera
-from diffcloud.sensing.cameras import rays
+from diffcloud.sensing.cameras import looking_at, rays
 
 INTRINSICS = Intrinsics(160, 120, 154.0, 154.0, 79.5, 59.5)
 BOXES = (((0.50, -0.05, 0.0), (0.60, 0.05, 0.12)), ((0.68, 0.10, 0.0), (0.80, 0.14, 0.05)))
@@ -19,8 +18,8 @@ HOME_RAD = np.deg2rad([0.0, 15.0, 180.0, -130.0, 0.0, 55.0, 90.0])
 
 def poses() -> dict[str, np.ndarray]:
     return {
-        "overhead": DepthCamera.looking_at("o", (1.1, 0.05, 0.8), (0.62, 0.0, 0.0)).T_world_camera,
-        "side": DepthCamera.looking_at("s", (0.7, -0.8, 0.4), (0.62, 0.0, 0.0)).T_world_camera,
+        "overhead": looking_at((1.1, 0.05, 0.8), (0.62, 0.0, 0.0)),
+        "side": looking_at((0.7, -0.8, 0.4), (0.62, 0.0, 0.0)),
     }
 
 

@@ -12,10 +12,10 @@ from diffcloud.errors import CalibrationError, EpisodeError
 from diffcloud.io.calibrations import Calibration, CameraCalibration
 from diffcloud.io.episodes import Episode
 from diffcloud.io.images import write_depth
-from diffcloud.io.raw_episodes import read_raw_episode
+from diffcloud.io.raw_episodes import ScenePlacement, read_raw_episode
 from diffcloud.sensing.cameras import inverse, project, transform
 from diffcloud.sensing.filters import clean_frame, thin
-from diffcloud.sensing.fusion import FusionSettings, fit_table, fuse, to_scene
+from diffcloud.sensing.fusion import FusionSettings, fit_table, fuse
 from diffcloud.sensing.masking import RobotMask
 from diffcloud.sensing.robot import gen3
 from tests.sensing.cloth_scene import (
@@ -31,7 +31,7 @@ from tests.sensing.cloth_scene import (
     write_cloth_episode,
 )
 
-PLAIN = FusionSettings(**SETTINGS)
+PLAIN = FusionSettings(**SETTINGS, refine=False)
 
 
 @pytest.fixture(scope="module")
@@ -100,11 +100,12 @@ def test_without_a_mask_the_robot_stays(scene):
 
 def test_the_gripper_follows_the_joints_into_the_scene(scene, fused, mask):
     np.testing.assert_allclose(fused.gripper, TOOL_M + np.arange(3)[:, None] * STEP_M, atol=5e-5)
-    settings = replace(PLAIN, origin_m=(0.55, 0.1, 0.02), yaw_rad=np.pi / 2, length_unit_m=0.35)
-    moved = fuse(read_raw_episode(scene.folder), mask, settings)
-    np.testing.assert_allclose(moved.points, to_scene(fused.points.astype(float), settings), atol=1e-5)
-    np.testing.assert_allclose(moved.gripper, to_scene(fused.gripper, settings), atol=1e-12)
-    np.testing.assert_allclose(to_scene(np.array([0.55, 0.1 + 0.35, 0.02]), settings), [-1.0, 0.0, 0.0], atol=1e-12)
+    placement = ScenePlacement((0.55, 0.1, 0.02), np.pi / 2, 0.35)
+    moved = fuse(read_raw_episode(scene.folder), mask, replace(PLAIN, placement=placement))
+    np.testing.assert_allclose(moved.points, placement.to_scene(fused.points.astype(float)), atol=1e-5)
+    np.testing.assert_allclose(moved.gripper, placement.to_scene(fused.gripper), atol=1e-12)
+    np.testing.assert_allclose(placement.to_scene(np.array([0.55, 0.1 + 0.35, 0.02])), [-1.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(placement.to_world(moved.gripper), fused.gripper, atol=1e-12)
 
 
 def test_flat_cloth_needs_colour(scene, mask, tmp_path):

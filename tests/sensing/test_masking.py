@@ -9,8 +9,7 @@ from diffcloud.errors import EpisodeError
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import RobotLog
 from diffcloud.io.urdf import Joint, LinkMesh, RobotDescription
-from diffcloud.sensing.cameras import inverse, project, transform
-from diffcloud.sensing.depth_camera import DepthCamera
+from diffcloud.sensing.cameras import inverse, looking_at, project, transform
 from diffcloud.sensing.masking import RobotMask, View, flying_pixels, inflate, joints_at, spoilt_pixels
 from diffcloud.sensing.robot import GEN3_HOME_RAD, Robot, gen3
 
@@ -52,8 +51,8 @@ def poses(robot: Robot) -> np.ndarray:
 def test_the_arm_is_where_brute_force_sees_it(distortion, inflation):
     robot = gen3()
     coefficients = () if distortion == "none" else (0.1, -0.05, 0.002, -0.001, 0.01)
-    camera = DepthCamera.looking_at("c", (1.4, -0.6, 0.9), (0.3, 0.0, 0.4))
-    view = View(Intrinsics(40, 30, 38.0, 38.0, 19.5, 14.5, distortion, coefficients), camera.T_world_camera)
+    place = looking_at((1.4, -0.6, 0.9), (0.3, 0.0, 0.4))
+    view = View(Intrinsics(40, 30, 38.0, 38.0, 19.5, 14.5, distortion, coefficients), place)
     placed = robot.forward_kinematics(robot.configuration(GEN3_HOME_RAD, 0.5))
     expected = np.full((30, 40), np.inf)
     for name, mesh in robot.description.meshes.items():
@@ -83,8 +82,8 @@ def test_inflation_moves_every_face_of_a_box_by_the_margin():
 def test_rays_that_pass_within_the_margin_are_masked(rng):
     robot = gen3()
     placed = robot.forward_kinematics(robot.configuration(GEN3_HOME_RAD))
-    camera = DepthCamera.looking_at("c", (1.4, -0.6, 0.9), (0.3, 0.0, 0.4))
-    view = View(Intrinsics(160, 120, 150.0, 150.0, 79.5, 59.5), camera.T_world_camera)
+    place = looking_at((1.4, -0.6, 0.9), (0.3, 0.0, 0.4))
+    view = View(Intrinsics(160, 120, 150.0, 150.0, 79.5, 59.5), place)
     masked = np.isfinite(RobotMask(robot, inflation_m=0.02).surface(view, placed))
     near = []
     for name, mesh in robot.description.meshes.items():

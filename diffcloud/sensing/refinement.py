@@ -1,0 +1,302 @@
+"""Where the cameras stand relative to each other, found again from the recording itself.
+
+A calibration is off by millimetres once a camera has been touched. The recording knows better: both cameras saw the arm,
+whose place its joints tell, the same table, and in part the same cloth. The pose of every camera but the first is
+refined by Gauss–Newton on distances along normals, over several frames at once:
+
+- arm: from each measured point to the described surface on its ray. How much thicker each link is than its description
+  (its *skin*) and how late the joint log is are unknown too; the first camera, which stays where it is, helps to find them.
+- table: from the other camera's points to the first camera's plane.
+- cloth: from the other camera's points to the first camera's points nearby.
+
+Weights come from the depth's own noise, and fall off for outliers by Tukey's function of the residuals' median deviation.
+Neighbouring points share the errors of a surface's description, so they count as few. The calibration is the prior: what
+nothing in the recording constrains stays as it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from diffcloud.io.camera_models import Intrinsics
+from diffcloud.io.raw_episodes import RawEpisode, RobotLog
+from diffcloud.sensing.cameras import inverse, transform
+from diffcloud.sensing.masking import RobotMask, View, joints_at
+
+Floats = NDArray[np.float64]
+
+_ITERATIONS = 10
+_CONVERGED = 2e-5
+"""Metres and radians of a step."""
+_COLUMNS = 212
+"""Images are thinned to about this many columns: there are more points than the surface has shape."""
+_GATE_M = 0.03
+"""Farther from the described surface a measurement is of something else: three times what a usable calibration is off."""
+_CLOTH_GATE_M = 0.02
+_TUKEY = 4.685
+"""Of the residuals' standard deviation: 95 % efficient on normal noise."""
+_SHAPE_M = 0.002
+"""By which surfaces differ from their descriptions beyond a common skin, and depth is off beyond its noise."""
+_SHARED = 36
+"""So many thinned pixels lie on one patch of 4 cm at a metre, over which the errors of a description are alike."""
+_PRIOR_M, _PRIOR_RAD = 0.005, np.deg2rad(0.5)
+"""How far calibrations tend to be off, along and about each axis."""
+_PRIOR_SKIN_M, _PRIOR_LAG_S = 0.005, 0.1
+_LAG_STEP_S = 0.01
+_STEEPEST = 0.35
+"""Cosine between ray and normal below which a surface is seen too flatly."""
+_NEIGHBOURS = 12
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the frames that are looked at show, each camera's points in its own frame."""
+
+    frames: Mapping[str, Sequence[int]]
+    """Indices of the images of each camera; those at one place in the lists belong together."""
+    cloth: Mapping[str, Sequence[Floats]]
+    """[P, 3] of the cloth in each of these images, in the camera's frame [m]."""
+    table: Mapping[str, Floats]
+    """[P, 3] on the table, in the camera's frame [m]; empty without a table."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """The recording's own calibration."""
+
+    T_world_camera: Mapping[str, Floats]
+    """The first camera's is as it was."""
+    skin_m: float
+    """By which the arm is thicker than described, as the median over the links that were seen; 0 without an arm."""
+    lag_s: float
+    """By which the joint log's times are late."""
+    shift_m: Mapping[str, float]
+    """How far each camera's picture of the middle of what was seen has moved."""
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Linearised residuals of one camera."""
+
+    J: Floats
+    """[N, 7 + L] by rotation (3), translation (3), lag, and the skin of each link."""
+    r: Floats
+    """[N] [m]."""
+    sigma: Floats
+    """[N] their deviation [m]."""
+
+
+def refine_extrinsics(
+    raw: RawEpisode, views: Mapping[str, View], arm: RobotMask | None, sight: Sight, *, sigma_per_m: float, lag_s: float
+) -> Refinement:
+    """Refine all cameras but the first.
+
+    Args:
+        views: by camera, at the calibration's poses.
+        arm: the described surface, without inflation; None without an arm.
+        sigma_per_m: standard deviation of the inverse depth [1/m].
+        lag_s: of the joint log, to start from.
+    """
+    names, log = list(views), raw.robot
+    first = names[0]
+    poses = {name: view.T_world_camera for name, view in views.items()}
+    seen = [
+        transform(poses[name], points)
+        for name in names
+        for points in [*sight.cloth[name], sight.table[name]]
+        if len(points)
+    ]
+    if not seen:
+        return Refinement(poses, 0.0, lag_s, dict.fromkeys(names, 0.0))
+    centre = np.concatenate(seen).mean(axis=0)
+    plane = _plane(transform(poses[first], sight.table[first]))
+    surfaces = [_with_normals(transform(poses[first], points)) for points in sight.cloth[first]]
+    images = {} if arm is None else {name: _thinned(raw, name, views[name], sight.frames[name]) for name in names}
+    poses_end, links = 6 * len(names), 0 if arm is None else len(arm.robot.links)
+    prior = np.concatenate(
+        [
+            np.tile([1 / _PRIOR_RAD**2] * 3 + [1 / _PRIOR_M**2] * 3, len(names)),
+            [1 / _PRIOR_LAG_S**2],
+            np.full(links, 1 / _PRIOR_SKIN_M**2),
+        ]
+    )
+    found = np.zeros(len(prior))
+    """Corrections of the poses, of the lag, and the skins."""
+    free = np.arange(6, len(prior))  # the first camera stays
+    for _ in range(_ITERATIONS):
+        information, right = np.diag(prior), -prior * found
+        for index, name in enumerate(names):
+            groups = []
+            if arm is not None and log is not None:
+                view = replace(images[name].view, T_world_camera=poses[name])
+                lag, skin = lag_s + float(found[poses_end]), found[poses_end + 1 :]
+                groups.append(_arm_rows(log, arm, images[name], view, centre, skin, lag, sigma_per_m))
+            if index:
+                if plane is not None and len(sight.table[name]):
+                    groups.append(_table_rows(sight.table[name], poses[name], plane, centre, sigma_per_m))
+                groups.append(_cloth_rows(sight.cloth[name], poses[name], surfaces, centre, sigma_per_m))
+            for rows in groups:
+                width = rows.J.shape[1]
+                columns = np.concatenate([6 * index + np.arange(6), poses_end + np.arange(width - 6)])
+                weighted = rows.J * (_tukey(rows) / rows.sigma**2 / _SHARED)[:, None]
+                information[np.ix_(columns, columns)] += weighted.T @ rows.J
+                right[columns] -= weighted.T @ rows.r
+        step = np.zeros(len(prior))
+        step[free] = np.linalg.solve(information[np.ix_(free, free)], right[free])
+        found += step
+        for index, name in enumerate(names):
+            poses[name] = _moved(poses[name], step[6 * index : 6 * index + 6], centre)
+        if np.abs(step[:poses_end]).max() < _CONVERGED:
+            break
+    skins = found[poses_end + 1 :]
+    skin_m = float(np.median(skins[skins != 0])) if skins.any() else 0.0
+    shift = {
+        name: float(np.linalg.norm(transform(poses[name] @ inverse(views[name].T_world_camera), centre[None])[0] - centre))
+        for name in names
+    }
+    return Refinement(poses, skin_m, lag_s + float(found[poses_end]), shift)
+
+
+@dataclass(frozen=True)
+class _Images:
+    """Thinned depth images of one camera."""
+
+    view: View
+    depth_m: Floats
+    """[F, h, w]."""
+    times: Floats
+    """[F] [s]."""
+
+
+def _thinned(raw: RawEpisode, name: str, view: View, frames: Sequence[int]) -> _Images:
+    camera, full = raw.cameras[name], view.intrinsics
+    step = max(1, full.width // _COLUMNS)
+    depth: Floats = np.stack([camera.depth(index)[::step, ::step] for index in frames]).astype(np.float64)
+    depth *= camera.info.depth_scale_m
+    height, width = depth.shape[1:]
+    thin = Intrinsics(
+        width, height, full.fx / step, full.fy / step, full.cx / step, full.cy / step, full.distortion, full.coefficients
+    )
+    return _Images(View(thin, view.T_world_camera), depth, camera.times[list(frames)])
+
+
+def _arm_rows(
+    log: RobotLog, arm: RobotMask, images: _Images, view: View, centre: Floats, skin: Floats, lag: float, sigma_per_m: float
+) -> _Rows:
+    """From each measurement near the described arm to its surface on the same ray."""
+    robot = arm.robot
+    places = [
+        robot.forward_kinematics(robot.configuration(*joints_at(log, images.times, lag_s=value)))
+        for value in (lag, lag + _LAG_STEP_S)
+    ]
+    rotation = view.T_world_camera[:3, :3]
+    parts = []
+    for index, depth_m in enumerate(images.depth_m):  # a handful of images, each vectorised
+        (surface, link), (later, _) = (arm.first_hits(view, place[index]) for place in places)
+        solid = np.isfinite(surface)
+        points = view.directions * np.where(solid, surface, 0.0)[..., None]
+        normal, facing = _image_normals(points, solid, view.directions)
+        off = depth_m - np.where(solid, surface, 0.0)
+        moved = np.where(solid & np.isfinite(later), later, np.inf) - np.where(solid, surface, 0.0)
+        use = solid & (depth_m > 0) & (np.abs(off) < _GATE_M) & (facing > _STEEPEST) & (np.abs(moved) < 0.01)
+        along = (view.directions[use] * normal[use]).sum(axis=-1)  # negative: normals look at the camera
+        world = transform(view.T_world_camera, view.directions[use] * depth_m[use][:, None])
+        n = normal[use] @ rotation.T
+        J = np.zeros((len(n), 7 + len(skin)))
+        J[:, :3], J[:, 3:6], J[:, 6] = np.cross(world - centre, n), n, -along * moved[use] / _LAG_STEP_S
+        J[np.arange(len(n)), 7 + link[use]] = -1.0
+        sigma = np.hypot(sigma_per_m * depth_m[use] ** 2 * np.abs(along), _SHAPE_M)
+        parts.append(_Rows(J, off[use] * along - skin[link[use]], sigma))
+    return _Rows(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("J", "r", "sigma")))
+
+
+def _table_rows(points: Floats, pose: Floats, plane: tuple[Floats, float], centre: Floats, sigma_per_m: float) -> _Rows:
+    world = transform(pose, points)
+    normal, offset = plane
+    return _plane_rows(world, np.broadcast_to(normal, world.shape), world @ normal - offset, points, centre, sigma_per_m)
+
+
+def _cloth_rows(
+    clouds: Sequence[Floats], pose: Floats, surfaces: Sequence[tuple[Floats, Floats]], centre: Floats, sigma_per_m: float
+) -> _Rows:
+    """From points to the tangent planes of the first camera's points nearby."""
+    worlds, normals, offsets, own = [], [], [], []
+    for cloud, (points, normal) in zip(clouds, surfaces, strict=True):
+        if not len(cloud) or not len(points):
+            continue
+        world = transform(pose, cloud)
+        distance, nearest = cKDTree(points).query(world, distance_upper_bound=_CLOTH_GATE_M)
+        near = np.isfinite(distance)
+        worlds.append(world[near])
+        normals.append(normal[nearest[near]])
+        offsets.append(((world[near] - points[nearest[near]]) * normal[nearest[near]]).sum(axis=1))
+        own.append(cloud[near])
+    if not worlds:
+        return _Rows(np.zeros((0, 6)), np.zeros(0), np.ones(0))
+    world, normal, off, points = (np.concatenate(part) for part in (worlds, normals, offsets, own))
+    return _plane_rows(world, normal, off, points, centre, sigma_per_m)
+
+
+def _plane_rows(world: Floats, normal: Floats, r: Floats, points: Floats, centre: Floats, sigma_per_m: float) -> _Rows:
+    """Distances `r` of points along normals that stand still."""
+    return _Rows(
+        np.hstack([np.cross(world - centre, normal), normal]), r, np.hypot(sigma_per_m * points[:, 2] ** 2, _SHAPE_M)
+    )
+
+
+def _tukey(rows: _Rows) -> Floats:
+    """[N] weights 0..1."""
+    if not len(rows.r):
+        return np.zeros(0)
+    u = rows.r / rows.sigma
+    scale = 1.4826 * float(np.median(np.abs(u))) + 1e-9
+    weight: Floats = np.square(1 - np.minimum(np.abs(u) / (_TUKEY * scale), 1.0) ** 2)
+    return weight
+
+
+def _image_normals(points: Floats, solid: NDArray[np.bool_], directions: Floats) -> tuple[Floats, Floats]:
+    """Normals [H, W, 3] of an image of points, towards the camera, and the cosine [H, W] to the rays; 0 at borders."""
+    across = np.zeros_like(points)
+    down = np.zeros_like(points)
+    across[:, 1:-1] = points[:, 2:] - points[:, :-2]
+    down[1:-1] = points[2:] - points[:-2]
+    whole = np.zeros_like(solid)
+    whole[1:-1, 1:-1] = solid[1:-1, 1:-1] & solid[1:-1, 2:] & solid[1:-1, :-2] & solid[2:, 1:-1] & solid[:-2, 1:-1]
+    normal = np.cross(across, down)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    cosine = (normal * directions).sum(axis=-1) / np.linalg.norm(directions, axis=-1)
+    normal *= -np.sign(cosine)[..., None]
+    return normal, np.where(whole, np.abs(cosine), 0.0)
+
+
+def _with_normals(points: Floats) -> tuple[Floats, Floats]:
+    """Points [P, 3] and the normals [P, 3] of the planes through their neighbours; both empty for too few."""
+    if len(points) <= _NEIGHBOURS:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    _, nearest = cKDTree(points).query(points, k=_NEIGHBOURS)
+    around = points[nearest] - points[nearest].mean(axis=1, keepdims=True)
+    _, vectors = np.linalg.eigh(np.swapaxes(around, 1, 2) @ around)
+    return points, vectors[..., 0]
+
+
+def _plane(points: Floats) -> tuple[Floats, float] | None:
+    if len(points) < 3:
+        return None
+    centre = points.mean(axis=0)
+    normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
+    return normal, float(centre @ normal)
+
+
+def _moved(pose: Floats, step: Floats, centre: Floats) -> Floats:
+    """A pose turned about `centre` by a rotation vector step[:3], then moved by step[3:]."""
+    turn = Rotation.from_rotvec(step[:3]).as_matrix()
+    moved = pose.copy()
+    moved[:3, :3] = turn @ pose[:3, :3]
+    moved[:3, 3] = turn @ (pose[:3, 3] - centre) + centre + step[3:]
+    return moved

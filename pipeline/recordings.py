@@ -1,0 +1,193 @@
+"""`diffcloud recordings`: synthetic raw recordings against their truth, as clouds and through a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+
+from diffcloud.errors import ConfigError
+from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
+from diffcloud.io.episodes import Episode, read_episode
+from diffcloud.io.files import write_text
+from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sensing.evaluation import CloudFigures, evaluate_clouds, visible_clouds
+from diffcloud.sensing.recorder import Truth, read_truth
+from pipeline.config import FitConfig, load_config
+from pipeline.console import JsonFlag, ParamsFile, finish, output, progress_bar
+from pipeline.scenario_options import choose_scenario
+
+_RATIOS = np.geomspace(0.15, 6.5, 9)
+"""Of stretch to mass: a fit starts from the best of them."""
+
+
+def recordings(
+    recorded: Annotated[Path, typer.Option(help="Folder with raw <scenario>/<episode>/ of `diffcloud episodes`.")],
+    episodes: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.npz of `diffcloud preprocess`.")],
+    out: Annotated[Path, typer.Option(help="Markdown file.")],
+    fits: Annotated[bool, typer.Option(help="Also fit each: raw clouds, noise-free clouds, one camera.")] = True,
+    params: ParamsFile = None,
+    json: JsonFlag = False,
+) -> None:
+    """Measure masks, clouds and fits of synthetic raw recordings against what was recorded; writes Markdown tables."""
+    config = load_config(params)
+    found = [
+        (name, path.parent)
+        for name in config.scenarios
+        for path in sorted((recorded / name).glob("*/episode.json"))
+        if (path.parent / "truth").is_dir()
+    ]
+    if not found:
+        raise ConfigError(f"{recorded} holds no synthetic raw episodes of {', '.join(config.scenarios)}.")
+    measured: list[tuple[str, CloudFigures, Mapping[str, Any]]] = []
+    fitted: list[_Fits] = []
+    with progress_bar("recordings", len(found)) as update:
+        for index, (name, folder) in enumerate(found):
+            update(index, folder.name)
+            raw, truth = read_raw_episode(folder), read_truth(folder)
+            episode = read_episode(episodes / name / f"{folder.name}.npz")
+            measured.append((folder.name, evaluate_clouds(episode, raw, truth), episode.meta["quality"]))
+            if fits:
+                fitted.append(_fit_all(choose_scenario(name), folder.name, episode, raw, truth, config.fit))
+                write_text(out, _page(measured, fitted, config.fit))  # what is done is kept
+    page = _page(measured, fitted, config.fit)
+    write_text(out, page)
+    if not json:
+        output.print(page, markup=False)
+    finish({"out": str(out), "episodes": len(measured), **_summary(measured, fitted)}, json)
+
+
+@dataclass(frozen=True)
+class _Fits:
+    """Ratios of stretch to mass that fits found."""
+
+    episode: str
+    true: float
+    raw: float
+    noise_free: float
+    overhead: float
+
+
+def _fit_all(scenario: Scenario, name: str, episode: Episode, raw: RawEpisode, truth: Truth, config: FitConfig) -> _Fits:
+    hidden = episode.meta["truth"]
+    held = raw.placement.to_scene(truth.nodes[:, scenario.grasped].mean(axis=1))
+    clouds = [raw.placement.to_scene(cloud) for cloud in visible_clouds(raw, truth)]
+    noise_free = Episode.from_frames(clouds, episode.times, gripper=held)
+    ratios = [_ratio(scenario, cloud, hidden["mass"], config) for cloud in (episode, noise_free, _of_first_camera(episode))]
+    return _Fits(name, hidden["stretch"] / hidden["mass"], *ratios)
+
+
+def _ratio(scenario: Scenario, episode: Episode, mass: float, config: FitConfig) -> float:
+    """Fitted stretch over the weighed mass. With both free, bending and air hardly tell them apart (docs/concepts.md)."""
+    objective = Objective(scenario, [episode], points=config.points, seed=config.seed)
+    space = FitSpace.build(["stretch"], bounds={**scenario.bounds, **config.bounds}, fixed={"mass": mass})
+    low, high = space.variables[0].low, space.variables[0].high
+    tried = np.clip(_RATIOS * mass, 1.05 * low, 0.95 * high)  # a bound itself is infinitely far away for a fit
+    with torch.no_grad():
+        losses = objective({"stretch": torch.as_tensor(tried), "mass": torch.full((len(tried),), mass).double()})
+    settings = AdamSettings(
+        learning_rate=config.learning_rate or scenario.learning_rate,
+        iterations=config.iterations,
+        smoothing=config.smoothing,
+        seed=config.seed,
+        init={"stretch": float(tried[int(losses.argmin())])},
+    )
+    return fit_adam(objective, space, settings).values["stretch"] / mass
+
+
+def _of_first_camera(episode: Episode) -> Episode:
+    assert episode.camera is not None  # clouds of raw episodes say so
+    frames = [
+        episode.frame(index)[episode.camera[episode.offsets[index] : episode.offsets[index + 1]] == 0]
+        for index in range(episode.frame_count)
+    ]
+    return Episode.from_frames(frames, episode.times, gripper=episode.gripper)
+
+
+def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: list[_Fits], config: FitConfig) -> str:
+    lines = [
+        "# Raw recordings against their truth",
+        "",
+        "Synthetic raw episodes (`diffcloud episodes`), made into clouds by `diffcloud preprocess`, compared with the "
+        "truth that only the recorder knows. Robot and table: part of the merged clouds' points that show them. Lost: part "
+        "of the visible cloth's measurements that is not in the cloud, over frames in which the cloth moves, and in which "
+        "it lies flat. Distances are RMS over a frame: mean and greatest over the frames. Command: `make recordings`.",
+        "",
+        "| episode | points | robot % | table % | lost % | lost flat % | cloud to cloth mm | cloth to cloud mm | "
+        "camera moved mm | arm thicker mm | log late ms |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, figures, quality in measured:
+        part = _parts(figures)
+        refined = quality.get("refinement")
+        shifts = "–" if refined is None else ", ".join(f"{1e3 * v:.1f}" for v in list(refined["shift_m"].values())[1:])
+        tail = "– | –" if refined is None else f"{1e3 * refined['skin_m']:.1f} | {1e3 * refined['lag_s']:.0f}"
+        lines.append(
+            f"| {name} | {figures.points.min()}–{figures.points.max()} | {100 * part['robot']:.2f} | "
+            f"{100 * part['table']:.2f} | {100 * part['lost']:.1f} | {100 * part['lost_flat']:.1f} | "
+            f"{_millimetres(figures.cloud_to_cloth_m)} | {_millimetres(figures.cloth_to_cloud_m)} | {shifts} | {tail} |"
+        )
+    if fitted:
+        lines += [
+            "",
+            "## Fits",
+            "",
+            "Stretch-to-mass ratio of a cloth that has been weighed (mass fixed at its truth): the best of "
+            f"{len(_RATIOS)} ratios, then {config.iterations} Adam iterations over the stretching stiffness from there. "
+            "The noise-free cloud is what both cameras see of the cloth, without noise, holes or masks; the gripper is "
+            "then where it truly was.",
+            "",
+            "| episode | true | noise-free | raw | raw, overhead only |",
+            "|---|---|---|---|---|",
+            *(
+                f"| {fit.episode} | {fit.true:.3f} | {_off(fit.noise_free, fit)} | {_off(fit.raw, fit)} | "
+                f"{_off(fit.overhead, fit)} |"
+                for fit in fitted
+            ),
+            "",
+            *(f"- {text}" for text in _counts(fitted)),
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _parts(figures: CloudFigures) -> dict[str, float]:
+    points, flat = figures.points.sum(), figures.flat
+    return {
+        "robot": float(figures.robot.sum() / points),
+        "table": float(figures.table.sum() / points),
+        "lost": float(figures.lost[~flat].mean()) if (~flat).any() else float("nan"),
+        "lost_flat": float(figures.lost[flat].mean()) if flat.any() else float("nan"),
+    }
+
+
+def _millimetres(values: Any) -> str:
+    return f"{1e3 * values.mean():.1f}, {1e3 * values.max():.1f}"
+
+
+def _off(ratio: float, fit: _Fits) -> str:
+    return f"{ratio:.3f} ({100 * (ratio / fit.true - 1):+.0f} %)"
+
+
+def _near(ratio: float, fit: _Fits, part: float) -> bool:
+    return abs(ratio / fit.true - 1) <= part
+
+
+def _counts(fitted: list[_Fits]) -> list[str]:
+    known = [fit for fit in fitted if _near(fit.noise_free, fit, 0.1)]
+    return [
+        f"noise-free within 10 %: {len(known)} of {len(fitted)}",
+        f"of these, raw within 20 %: {sum(_near(fit.raw, fit, 0.2) for fit in known)} of {len(known)}",
+        f"of these, raw of the overhead camera alone within 20 %: {sum(_near(fit.overhead, fit, 0.2) for fit in known)} of "
+        f"{len(known)}",
+    ]
+
+
+def _summary(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: list[_Fits]) -> dict[str, Any]:
+    figures = {name: _parts(found) for name, found, _ in measured}
+    return {"clouds": figures, "fits": _counts(fitted) if fitted else []}

@@ -1,0 +1,114 @@
+"""Synthetic raw recordings through the commands: recorded, made into clouds, fitted, measured, reported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from diffcloud.io.episodes import read_episode
+from diffcloud.io.images import png_size, write_depth
+from diffcloud.sensing.recorder import read_truth
+from tests.pipeline.invoke import invoke
+
+SMALL = {
+    "base": "lift",
+    "nodes": [5, 5],
+    "frames": 3,
+    "steps_per_frame": 2,
+    "points": 200,
+    "path": [[0, 0, 0, 0], [0.3, 0, -0.05, 0.15]],
+}
+PARAMS = {
+    "scenarios": ["small"],
+    "episodes": {"per_scenario": 1},
+    "preprocess": {"raw": {"flying_m": 0.03}, "outlier_deviations": 5},
+    "fit": {"iterations": 1, "smoothing": 0},
+    "evaluate": {"draws": 1},
+}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("pipeline")
+    (folder / "raw" / "scenes").mkdir(parents=True)
+    (folder / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump(SMALL), encoding="utf-8")
+    (folder / "params.yaml").write_text(yaml.safe_dump(PARAMS), encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        invoke("episodes", "--params", "params.yaml", "--out", "recorded")
+        invoke("preprocess", "--params", "params.yaml", "--out", "episodes", "recorded")
+    return folder
+
+
+@pytest.fixture
+def work(place, monkeypatch) -> Path:
+    monkeypatch.chdir(place)
+    return place
+
+
+def test_recordings_are_raw_and_become_clouds_with_pictures(work):
+    assert (work / "recorded" / "small" / "small_hidden1" / "robot.csv").is_file()
+    episode = read_episode(work / "episodes" / "small" / "small_hidden1.npz")
+    assert episode.frame_count == 4
+    assert np.diff(episode.offsets).min() >= 1500
+    assert episode.meta["truth"].keys() == {"stretch", "mass"}
+    assert np.abs(episode.points[:, :2]).max() < 0.25  # in the scene's frame, not the arm's
+    truth = read_truth(work / "recorded" / "small" / "small_hidden1")
+    lifted = truth.nodes[..., 2].max(axis=1)
+    np.testing.assert_allclose(np.ptp(episode.gripper[:, 2]), lifted[3] - lifted[0], atol=0.004)
+    assert png_size(work / "episodes" / "small" / "small_hidden1.mask.png") == (2 * 424, 240)
+    assert png_size(work / "episodes" / "small" / "small_hidden1.cloud.png") == (720, 240)
+
+
+def test_measured_against_the_truth_and_reported(work):
+    done = invoke(
+        "recordings", "--recorded", "recorded", "--episodes", "episodes", "--out", "table.md", "--params", "params.yaml"
+    )  # fmt: skip
+    figures = done.result["clouds"]["small_hidden1"]
+    assert figures["robot"] <= 0.002
+    assert len(done.result["fits"]) == 3
+    assert "| small_hidden1 |" in (work / "table.md").read_text(encoding="utf-8")
+    invoke("fit", "--params", "params.yaml", "--scenario", "small", "--out", "fits/small", "episodes/small")
+    invoke("evaluate", "--params", "params.yaml", "--fits", "fits", "--episodes", "episodes", "--out", "reports")
+    invoke(
+        "report", "--params", "params.yaml", "--fits", "fits", "--episodes", "episodes", "--tables", "reports/tables",
+        "--out", "reports/index.html",
+    )  # fmt: skip
+    page = (work / "reports" / "index.html").read_text(encoding="utf-8")
+    assert page.count("<figure><figcaption>small_hidden1") == 2
+    assert "overhead" in page
+
+
+def test_again_replaces_only_what_is_synthetic(work):
+    invoke("episodes", "--params", "params.yaml", "--out", "recorded")
+    own = work / "own" / "small" / "small_hidden1"
+    own.mkdir(parents=True)
+    (own / "notes.txt").write_text("mine", encoding="utf-8")
+    assert "no synthetic recording" in invoke("episodes", "--params", "params.yaml", "--out", "own", code=1).errors
+    assert (own / "notes.txt").is_file()
+
+
+def test_own_raw_episodes_are_copied(work):
+    settings = {**PARAMS, "episodes": {"source": "recorded"}}
+    (work / "own.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
+    done = invoke("episodes", "--params", "own.yaml", "--out", "copied")
+    assert done.result["episodes"] == {"small": ["small_hidden1"]}
+    assert (work / "copied" / "small" / "small_hidden1" / "episode.json").is_file()
+
+
+def test_a_truncated_image_and_one_without_depth_are_named(work):
+    raw = work / "copied_for_damage" / "small" / "small_hidden1"
+    (work / "own.yaml").write_text(yaml.safe_dump({**PARAMS, "episodes": {"source": "recorded"}}), encoding="utf-8")
+    invoke("episodes", "--params", "own.yaml", "--out", "copied_for_damage")
+    common = ("preprocess", raw, "--params", "params.yaml", "--out", "damaged")
+    image = raw / "cameras" / "side" / "depth" / "000002.png"
+    whole = image.read_bytes()
+    image.write_bytes(whole[: len(whole) // 2])
+    assert "000002.png is truncated" in invoke(*common, code=1).errors
+    image.write_bytes(whole)
+    write_depth(raw / "cameras" / "overhead" / "depth" / "000001.png", np.zeros((240, 424), np.uint16))
+    assert "overhead, frame 1: 0 valid depth" in invoke(*common, code=1).errors
+    assert not (work / "damaged" / "small").exists()

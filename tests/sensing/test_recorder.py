@@ -1,0 +1,160 @@
+"""The synthetic recorder writes raw episodes like any other, and preprocessing finds back what it hid."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from diffcloud.errors import EpisodeError, RobotError
+from diffcloud.io.raw_episodes import read_raw_episode
+from diffcloud.io.urdf import Joint, LinkMesh, RobotDescription
+from diffcloud.sensing.arm_body import cable, lookalike
+from diffcloud.sensing.cameras import inverse, transform
+from diffcloud.sensing.evaluation import evaluate_clouds, visible_clouds
+from diffcloud.sensing.fusion import FusionSettings, fuse
+from diffcloud.sensing.masking import RobotMask, joints_at
+from diffcloud.sensing.recorder import CLOTH, ROBOT, TABLE, read_truth
+from diffcloud.sensing.robot import GEN3_HOME_RAD, Robot, gen3
+from diffcloud.sensing.validation import validate_raw_episode
+from tests.sensing.recorded_scene import FRAMES, motion, write_recorded_episode
+
+SETTINGS = FusionSettings(flying_m=0.03)
+ERROR = (5.0, 0.5)
+
+
+@pytest.fixture(scope="module")
+def mask() -> RobotMask:
+    return RobotMask(gen3(), inflation_m=0.007)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return write_recorded_episode(tmp_path_factory.mktemp("recorded") / "lift_blue1")
+
+
+@pytest.fixture(scope="module")
+def shifted(tmp_path_factory) -> Path:
+    return write_recorded_episode(tmp_path_factory.mktemp("shifted") / "lift_blue1", extrinsic_error=ERROR)
+
+
+def box_robot() -> Robot:
+    import trimesh
+
+    box = trimesh.creation.box(extents=(0.1, 0.2, 0.3))
+    still = Joint("j", "revolute", "base", "tool_frame", np.eye(4), np.array([0.0, 0.0, 1.0]), -1.0, 1.0)
+    return Robot(
+        RobotDescription("box", "base", (still,), {"base": LinkMesh(np.asarray(box.vertices), np.asarray(box.faces))})
+    )
+
+
+def off_by(truth, found: np.ndarray, name: str) -> float:
+    """Greatest distance by which a camera's pose misplaces the cloth [m]."""
+    nodes = truth.nodes.reshape(-1, 3)
+    return float(np.linalg.norm(transform(found @ inverse(truth.T_world_camera[name]), nodes) - nodes, axis=1).max())
+
+
+class TestArmBody:
+    def test_a_box_becomes_rounder_and_at_most_3_mm_larger(self, rng):
+        robot = box_robot()
+        vertices = lookalike(robot, rng, largest_growth_m=0.003).description.meshes["base"].vertices
+        growth = np.abs(vertices).max(axis=0) - [0.05, 0.1, 0.15]
+        assert (growth > -0.0005).all()  # a ball of 42 points is a little smaller than a ball
+        assert (growth <= 0.003).all()
+        corner = np.linalg.norm(np.abs(vertices) - [0.05, 0.1, 0.15], axis=1)
+        assert corner.min() > 0.001  # no vertex is where the box had its corner
+
+    def test_the_cable_runs_along_the_arm(self):
+        robot = gen3()
+        poses = robot.forward_kinematics(robot.configuration(GEN3_HOME_RAD))
+        found = cable(robot, poses)
+        origins = poses[:, :3, 3]
+        assert np.linalg.norm(found.nodes[:, None] - origins, axis=2).min(axis=1).max() < 0.25
+        with pytest.raises(RobotError, match="has no links"):
+            cable(box_robot(), np.eye(4)[None])
+
+
+class TestRecording:
+    def test_it_is_a_raw_episode_without_a_fault(self, folder):
+        assert [finding for finding in validate_raw_episode(folder) if finding.severity == "fault"] == []
+        raw = read_raw_episode(folder)
+        assert {name: len(camera.frames) for name, camera in raw.cameras.items()} == {"overhead": FRAMES, "side": FRAMES}
+        assert raw.description["source"] == "synthetic"
+        assert raw.description["scene_in_world"]["length_unit_m"] == 1.0
+
+    def test_labels_say_what_depth_shows(self, folder):
+        raw, truth = read_raw_episode(folder), read_truth(folder)
+        for name, camera in raw.cameras.items():
+            labels = truth.labels(name, FRAMES - 1)
+            assert {TABLE, CLOTH, ROBOT} <= set(np.unique(labels))
+            cloth, pixels = truth.visible_cloth(name, camera.info.intrinsics, FRAMES - 1)
+            assert len(cloth) > 1000
+            z = transform(inverse(truth.T_world_camera[name]), cloth)[:, 2]
+            depth = camera.depth(FRAMES - 1)[pixels[:, 1], pixels[:, 0]] * 0.001
+            off = (depth - z)[depth > 0]
+            assert abs(np.median(off)) < 0.001
+            assert 1.4826 * np.median(np.abs(off)) < 0.008  # the noise at a metre
+
+    def test_the_arm_holds_the_cloth_and_its_log_is_late(self, folder):
+        raw, truth = read_raw_episode(folder), read_truth(folder)
+        held = truth.nodes[:, motion().grasped[0]]
+        times = raw.cameras["overhead"].times
+        stated, corrected = (
+            gen3().tool_pose(joints_at(raw.robot, times, lag_s=lag)[0])[:, :3, 3] - held for lag in (0.0, 0.02)
+        )
+        np.testing.assert_allclose(
+            corrected, np.tile([0, 0, 0.071], (FRAMES, 1)), atol=2e-3
+        )  # rows are 25 ms apart, the corner starts at once
+        assert np.linalg.norm(stated - corrected, axis=1)[1:].min() > 0.005
+
+    def test_the_same_seed_gives_the_same_bytes(self, folder, tmp_path):
+        again = write_recorded_episode(tmp_path / "again")
+        files = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file() and path.suffix != ".npz")
+        assert files == sorted(
+            path.relative_to(again) for path in again.rglob("*") if path.is_file() and path.suffix != ".npz"
+        )
+        assert all((folder / file).read_bytes() == (again / file).read_bytes() for file in files)
+
+    def test_an_episode_is_never_overwritten(self, folder):
+        with pytest.raises(EpisodeError, match="never overwritten"):
+            write_recorded_episode(folder)
+
+    def test_only_synthetic_episodes_know_the_truth(self, tmp_path):
+        with pytest.raises(EpisodeError, match="only synthetic recordings know"):
+            read_truth(tmp_path)
+
+
+class TestFoundBack:
+    def test_the_cloth_is_left_and_the_robot_is_gone(self, folder, mask):
+        raw, truth = read_raw_episode(folder), read_truth(folder)
+        figures = evaluate_clouds(fuse(raw, mask, SETTINGS), raw, truth)
+        assert figures.robot.sum() <= 0.002 * figures.points.sum()
+        assert figures.table.sum() <= 0.01 * figures.points.sum()
+        assert figures.lost.max() <= 0.1  # it lies on the table but for the corner that the fingers hold
+        assert figures.cloud_to_cloth_m.mean() <= 0.004
+        assert figures.cloth_to_cloud_m.mean() <= 0.004
+        assert figures.flat.tolist() == [True] + [False] * (FRAMES - 1)
+
+    def test_what_faultless_cameras_see_lies_on_the_cloth(self, folder):
+        raw, truth = read_raw_episode(folder), read_truth(folder)
+        for cloud, nodes in zip(visible_clouds(raw, truth), truth.nodes, strict=True):
+            assert (cloud.min(axis=0) >= nodes.min(axis=0) - 1e-5).all()
+            assert (cloud.max(axis=0) <= nodes.max(axis=0) + 1e-5).all()
+
+    def test_extrinsics_are_recovered_within_2_mm(self, shifted, mask):
+        raw, truth = read_raw_episode(shifted), read_truth(shifted)
+        assert off_by(truth, raw.cameras["side"].info.T_world_camera, "side") > 0.004
+        found = fuse(raw, mask, SETTINGS).meta["quality"]["refinement"]
+        assert off_by(truth, np.array(found["T_world_camera"]["side"]), "side") < 0.002
+        assert found["shift_m"]["overhead"] == 0.0
+
+    def test_right_extrinsics_are_not_made_worse(self, folder, mask):
+        raw, truth = read_raw_episode(folder), read_truth(folder)
+        refined, plain = (fuse(raw, mask, replace(SETTINGS, refine=refine, lag_s=0.02)) for refine in (True, False))
+        found = refined.meta["quality"]["refinement"]
+        assert off_by(truth, np.array(found["T_world_camera"]["side"]), "side") < 0.0015
+        assert 0 < found["skin_m"] < 0.003  # drawn from 0 to 3 mm
+        distances = [evaluate_clouds(episode, raw, truth).cloud_to_cloth_m.mean() for episode in (refined, plain)]
+        assert distances[0] < distances[1] + 0.0003
