@@ -1,15 +1,22 @@
-"""Commands in this process: a second instead of several, and hardware can be put in their way."""
+"""Commands in this process, a second instead of several, where hardware can be put in their way; and as processes."""
 
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from typer.testing import CliRunner
 
 from diffcloud.errors import DiffCloudError
 from pipeline.app import app
+
+DIFFCLOUD = [sys.executable, "-m", "pipeline.app"]
+ROOT = Path(__file__).parents[2]
 
 
 @dataclass(frozen=True)
@@ -34,3 +41,12 @@ def invoke(*arguments: object, code: int = 0, answer: str | None = None) -> Invo
     lines = done.stdout.strip().splitlines()
     result = json.loads(lines[-1]) if lines and lines[-1].startswith("{") else {}
     return Invoked(result, " ".join(errors.split()))
+
+
+def run_process(*arguments: object, cwd: Path) -> dict[str, Any]:
+    """Run as a person does, with --json; the JSON object."""
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [*DIFFCLOUD, *map(str, arguments), "--json"]
+    done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, f"status {done.returncode}\n{done.stdout}\n{done.stderr}"
+    return dict(json.loads(done.stdout.strip().splitlines()[-1]))

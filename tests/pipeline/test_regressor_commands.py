@@ -21,7 +21,8 @@ from diffcloud.regressors import Regressor
 from pipeline.app import app
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
-from tests.pipeline.test_commands import DIFFCLOUD, ROOT, SMALL
+from tests.pipeline.invoke import DIFFCLOUD, ROOT
+from tests.pipeline.test_commands import SMALL
 from tests.regressors.simulated import sagging_sheet
 from tests.regressors.test_checkpoints import regressor
 

@@ -21,9 +21,10 @@ from diffcloud.io.simulated import SimulatedSet
 from diffcloud.regressors.dataset import Augmentation, CloudDataset
 from pipeline.app import app
 from tests.datasets.test_simulation import contents
-from tests.pipeline.test_commands import DIFFCLOUD, ROOT, SMALL, result, run
+from tests.pipeline.invoke import DIFFCLOUD, ROOT, run_process
+from tests.pipeline.test_commands import SMALL
 
-SET = ("simulate", "--scenario", "small.yaml", "--train", 36, "--test", 18, "--json")
+SET = ("simulate", "--scenario", "small.yaml", "--train", 36, "--test", 18)
 """Five chunks."""
 
 
@@ -36,8 +37,7 @@ def work(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(work) -> Path:
-    done = run(*SET, "--workers", 0, "--out", "whole", cwd=work)
-    said = result(done)
+    said = run_process(*SET, "--workers", 0, "--out", "whole", cwd=work)
     assert (said["train"], said["test"], said["resumed"], said["parameters"]) == (36, 18, 0, ["stretch", "mass"])
     assert said["replaced"] == {"train": 0, "test": 0}
     return work / "whole"
@@ -68,15 +68,15 @@ def test_sets_are_read_back(whole):
 
 
 def test_processes_give_the_same_bytes(whole, work):
-    run(*SET, "--workers", 2, "--out", "processes", cwd=work)
+    run_process(*SET, "--workers", 2, "--out", "processes", cwd=work)
     assert contents(work / "processes") == contents(whole)
 
 
 def test_a_killed_set_ends_with_the_same_bytes(whole, work):
     status, _ = interrupted(work, "killed", signal.SIGKILL)
     assert status == -signal.SIGKILL
-    done = run(*SET, "--workers", 0, "--out", "killed", cwd=work)
-    assert 16 <= result(done)["resumed"] < 54
+    done = run_process(*SET, "--workers", 0, "--out", "killed", cwd=work)
+    assert 16 <= done["resumed"] < 54
     assert contents(work / "killed") == contents(whole)
     assert not (work / "killed.partial").exists()
 
@@ -91,11 +91,11 @@ def test_ctrl_c_says_how_to_go_on(work):
 def test_settings_come_from_the_parameter_file_and_options_win(work):
     section = {"train": 2, "test": 5, "draws": "sobol", "parameters": ["mass", "bending"], "scenarios": ["small.yaml"]}
     (work / "params.yaml").write_text(yaml.safe_dump({"simulate": section}))
-    done = run(
-        "simulate", "--params", "params.yaml", "--scenario", "small.yaml", "--test", 0, "--export-clouds", "--json",
+    done = run_process(
+        "simulate", "--params", "params.yaml", "--scenario", "small.yaml", "--test", 0, "--export-clouds",
         "--out", "few", cwd=work,
     )  # fmt: skip
-    assert {key: result(done)[key] for key in ("train", "test", "draws", "parameters")} == {
+    assert {key: done[key] for key in ("train", "test", "draws", "parameters")} == {
         "train": 2, "test": 0, "draws": "sobol", "parameters": ["mass", "bending"],
     }  # fmt: skip
     assert np.load(work / "few" / "clouds" / "train" / "1" / "005.npy").shape == (200, 3)
