@@ -14,6 +14,7 @@ from diffcloud.clouds.losses import one_sided_chamfer
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import ConfigError
+from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
 from diffcloud.io.files import atomic_path, write_text
 from diffcloud.io.imports import release_episodes
@@ -147,7 +148,7 @@ def _fit_report(fits: list[_Fit], starts: int) -> str:
         f"perturbed copies (`--smoothing {FitConfig().smoothing}`, the default). The last columns are the losses of the "
         "published predictions, clipped to the bounds, under the same simulator, metric and points.",
         "",
-        *_markdown(head, rows),
+        *markdown_table(head, rows),
         "",
         f"- below the start: {int((single < start).sum())} of {len(fits)}",
         f"- one start at or below every published prediction: {int((single <= best).sum())} of {len(fits)}; within "
@@ -204,7 +205,7 @@ def _simulated_clouds(release: Path) -> str:
         f"- at most {PAPER_THRESHOLD:g} at the loss frame: {at_loss} of {len(rows)}",
         f"- on every frame: {always} of {len(rows)}",
     ]
-    return "\n".join(["# Published simulated clouds", "", note, "", *_markdown(head, rows), "", *counts, ""])
+    return "\n".join(["# Published simulated clouds", "", note, "", *markdown_table(head, rows), "", *counts, ""])
 
 
 def _simulated_fits(release: Path) -> str:
@@ -234,7 +235,7 @@ def _simulated_fits(release: Path) -> str:
         f"One Adam start from the middle of the bounds with the paper's settings, stopped below {PAPER_THRESHOLD:g}. A "
         "loss below the threshold is no identification: stretch and mass trade off against each other."
     )
-    return "\n".join(["# Fits of the published simulated clouds", "", note, "", *_markdown(head, rows), ""])
+    return "\n".join(["# Fits of the published simulated clouds", "", note, "", *markdown_table(head, rows), ""])
 
 
 def _trajectories(release: Path, reference: Path) -> str:
@@ -269,7 +270,7 @@ def _trajectories(release: Path, reference: Path) -> str:
             "Node distances in release units to recorded reference runs. After contact the reference is chaotic: which of "
             "two nearly simultaneous impacts comes first, and which of two equally near nodes is pushed, decides branches.",
             "",
-            *_markdown(head, rows),
+            *markdown_table(head, rows),
             "",
         ]
     )
@@ -286,19 +287,20 @@ def _speed(timings: list[dict[str, Any]], costs: list[dict[str, Any]]) -> str:
         "",
         note,
         "",
-        *_markdown(list(HEAD), benchmark_rows(timings)),
+        *markdown_table(list(HEAD), benchmark_rows(timings)),
         "",
         "## What a contact costs",
         "",
         contact,
     ]
-    lines += ["", *_markdown(list(CONTACT_HEAD), contact_rows(costs)), "", f"![Cost over contacts]({CONTACT_FIGURE})", ""]
+    lines += [
+        "",
+        *markdown_table(list(CONTACT_HEAD), contact_rows(costs)),
+        "",
+        f"![Cost over contacts]({CONTACT_FIGURE})",
+        "",
+    ]
     return "\n".join(lines)
-
-
-def _markdown(head: list[str], rows: list[list[str]]) -> list[str]:
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return lines + ["| " + " | ".join(row) + " |" for row in rows]
 
 
 def _scene(release: Path, name: str) -> Path:

@@ -28,8 +28,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloud.evaluation.methods import without_diverged
 from diffcloud.fit import FitSpace, Objective
+from diffcloud.fit.batches import without_diverged
 from diffcloud.fit.parameters import NUISANCE
 from diffcloud.scene.scenarios import Scenario
 

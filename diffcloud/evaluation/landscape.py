@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from diffcloud.evaluation.methods import batch_losses
 from diffcloud.fit import FitSpace, Objective
+from diffcloud.fit.batches import batch_losses
 
 
 def loss_landscape(

@@ -82,7 +82,7 @@ def _losses(table: pd.DataFrame) -> list[str]:
         known = dict(zip(group["method"], group["loss"], strict=True))
         cells: list[object] = [scenario, episode, *(known.get(name) for name in names)]
         rows.append(cells + ([group["reference_loss"].iloc[0]] if reference else []))
-    return _rows(head, rows)
+    return markdown_table(head, rows)
 
 
 def _means(table: pd.DataFrame) -> list[str]:
@@ -123,10 +123,11 @@ def _identified(table: pd.DataFrame) -> list[str]:
 def _table(head: Sequence[str], table: pd.DataFrame) -> list[str]:
     if table.empty:
         return ["None."]
-    return _rows(head, table.to_numpy(dtype=object).tolist())
+    return markdown_table(head, table.to_numpy(dtype=object).tolist())
 
 
-def _rows(head: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
+    """Lines of a Markdown table; a missing value is a dash."""
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     return lines + ["| " + " | ".join(_cell(value) for value in row) + " |" for row in rows]
 

@@ -9,21 +9,20 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from diffcloud.errors import DivergedError
 from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
+from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.parameters import NUISANCE, Variable
 
 Rival = Literal["single_start", "middle", "random_search", "cma_es"]
 """What the comparison can run by itself."""
-T = TypeVar("T")
 Phase = Literal["dataset", "training", "inference", "optimisation"]
 PHASES: tuple[Phase, ...] = ("dataset", "training", "inference", "optimisation")
 _EDGE = 1e-9
@@ -176,38 +175,6 @@ def clipped(values: Mapping[str, float], space: FitSpace) -> dict[str, float]:
         value = float(values.get(variable.name, found[variable.name]))
         found[variable.name] = min(max(value, variable.low), variable.high)
     return found
-
-
-def without_diverged(count: int, run: Callable[[Tensor], T]) -> tuple[T | None, Tensor, dict[int, str]]:
-    """Run a batch, without the entries that diverge.
-
-    Args:
-        count: B entries.
-        run: takes the indices [b] of the entries still in the batch; raises DivergedError.
-
-    Returns:
-        What `run` gave (None if nothing is left), the indices [b] that it was given, and entry -> message of the others.
-    """
-    kept, lost = torch.arange(count), dict[int, str]()
-    while len(kept):
-        try:
-            return run(kept), kept, lost
-        except DivergedError as error:
-            gone = torch.zeros(len(kept), dtype=torch.bool)
-            gone[error.entries] = True
-            lost |= {int(entry): str(error) for entry in kept[gone]}
-            kept = kept[~gone]
-    return None, kept, lost
-
-
-def batch_losses(objective: Objective, space: FitSpace, values: Tensor) -> Tensor:
-    """[B, k] values -> [B] losses; infinite where the simulation diverges."""
-    losses = torch.full((len(values),), math.inf, dtype=values.dtype)
-    with torch.no_grad():
-        found, kept, _ = without_diverged(len(values), lambda index: objective(*space.split(values[index])))
-    if found is not None:
-        losses[kept] = found.to(losses)
-    return losses
 
 
 class _Search:

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from diffcloud.clouds.losses import chamfer
-from diffcloud.evaluation.methods import without_diverged
 from diffcloud.fit import Objective
+from diffcloud.fit.batches import without_diverged
 from diffcloud.fit.parameters import NUISANCE
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import PAPER_THRESHOLD, RELEASE_UNIT_M, Scenario

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from diffcloud.errors import DivergedError
+from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 
@@ -203,25 +204,9 @@ def _starts(objective: Objective, space: FitSpace, settings: AdamSettings) -> tu
     values, logarithmic = values.to(system.device, system.dtype), logarithmic.to(system.device)
     if not screened:
         return values, logarithmic, 0
-    order = _losses(objective, space, values[1:]).argsort()[: settings.starts - 1] + 1
+    order = batch_losses(objective, space, values[1:]).argsort()[: settings.starts - 1] + 1
     chosen = torch.cat([order.new_zeros(1), order])
     return values[chosen], logarithmic[chosen], settings.screen
-
-
-@torch.no_grad()
-def _losses(objective: Objective, space: FitSpace, values: Tensor) -> Tensor:
-    """[B] losses of values [B, k]; infinite where the simulation diverges."""
-    losses = torch.full_like(values[:, 0], torch.inf)
-    left = torch.arange(len(values), device=values.device)
-    while len(left):
-        try:
-            losses[left] = objective(*space.split(values[left]))
-            break
-        except DivergedError as error:
-            keep = torch.ones(len(left), dtype=torch.bool, device=left.device)
-            keep[error.entries] = False
-            left = left[keep]
-    return losses
 
 
 def _trials(settings: AdamSettings, unbounded: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,6 @@ import torch
 
 from diffcloud.errors import DivergedError
 from diffcloud.evaluation.methods import (
-    batch_losses,
     clipped,
     cma_es,
     first_start,
@@ -18,9 +17,9 @@ from diffcloud.evaluation.methods import (
     random_search,
     single_start,
     space_of,
-    without_diverged,
 )
 from diffcloud.fit import AdamSettings, FitSpace, fit_adam
+from diffcloud.fit.batches import batch_losses, without_diverged
 from tests.evaluation.bowls import SPACE, Bowl
 
 
