@@ -218,12 +218,13 @@ def metrics(told: Tables) -> dict[str, Any]:
 
 
 def sentences(told: Tables) -> dict[str, list[str]]:
-    """The comparison in plain words, by topic: winners, success, identifiability, repeats."""
+    """The comparison in plain words, by topic: winners, success, identifiability, repeats, credibility."""
     return {
         "winners": _winners(told),
         "success": _success(told),
         "identifiability": _identified(told["identifiability"]),
         "repeats": _repeats(told),
+        "credibility": _credibility(told),
     }
 
 
@@ -293,8 +294,8 @@ def _identified(table: pd.DataFrame) -> list[str]:
     for (scenario, name), group in table.groupby(["scenario", "parameter"], sort=False):
         counts = ", ".join(f"{verdict} in {count}" for verdict, count in group["verdict"].value_counts().items())
         found.append(
-            f"{scenario}: verdict on {name}: {counts} of {_count(len(group))}; the loss tells it within a factor of "
-            f"{group['factor'].median():.2g} (median)."
+            f"{scenario}: verdict on {name}: {counts} of {_count(len(group))}; the loss tells it within "
+            f"{_times(group['factor'].median())} (median)."
         )
     ends = table.drop_duplicates(["scenario", "episode"])
     found.append(
@@ -347,6 +348,39 @@ def _repeats(told: Tables) -> list[str]:
     return found
 
 
+_FAR = 1.25
+"""Disagreement, over the interval of one recording, from which a number is not called a property of the fabric."""
+
+
+def _credibility(told: Tables) -> list[str]:
+    """What one recording promises about a parameter beside what repeats and another motion of the same fabric say."""
+    promised, repeats, motions = told["identifiability"], told["repeatability"], told["consistency"]
+    if promised.empty or repeats.empty:
+        return []
+    found = []
+    for (scenario, name), group in repeats.groupby(["scenario", "parameter"], sort=False):
+        own = promised[(promised["scenario"] == scenario) & (promised["parameter"] == name)]["factor"].dropna()
+        if own.empty:
+            continue
+        spreads = {"repeats of a fabric differ by": group["factor"]}
+        if not motions.empty:
+            other = motions[motions[["first", "second"]].eq(scenario).any(axis=1) & (motions["parameter"] == name)]
+            if len(other):
+                spreads["another motion of it by"] = other["factor"]
+        text = f"{scenario}: one recording's loss pins {name} to {_times(float(own.median()))} (median); "
+        text += ", ".join(
+            f"{what} {_times(float(factors.median()))}, at most {float(factors.max()):.3g}"
+            for what, factors in spreads.items()
+        )
+        # the worst fabric decides: the next one may be like it
+        if max(float(factors.max()) for factors in spreads.values()) > _FAR * float(own.median()):
+            text += ": the number explains its own recording and is no property of the fabric to that precision"
+        else:
+            text += ": the number holds beyond its own recording"
+        found.append(f"{text}.")
+    return found
+
+
 def _count(episodes: int) -> str:
     return f"{episodes} episode{'' if episodes == 1 else 's'}"
 
@@ -360,7 +394,7 @@ def _factor(half_width: float | None) -> float | None:
 
 
 def _times(value: float) -> str:
-    return f"a factor of {value:.2g}" if value < 1000 else "more than 1000"
+    return f"a factor of {value:.3g}" if value < 1000 else "more than 1000"
 
 
 def _unknown(value: Any) -> bool:

@@ -145,7 +145,7 @@ def comparison_section(entry: ComparisonEntry) -> str:
             "Parameters of the cloth come out again when it is recorded again.",
             _table(told["repeatability"], _REPEATS),
             "repeatability",
-            said["repeats"],
+            said["repeats"] + said["credibility"],
         ),
         _section(
             "transfer",

@@ -108,6 +108,9 @@ def _seconds(told: Tables) -> Figure | None:
     axis.set_yticks(range(len(methods)), [label(name) for name in methods])
     axis.invert_yaxis()
     axis.set_xscale("log")
+    # whole decades: a range within one has labels at minor ticks, which run into each other
+    low, high = means["total"].clip(lower=1e-3).min(), means["total"].max()
+    axis.set_xlim(10 ** np.floor(np.log10(low) - 1e-9), 10 ** np.ceil(np.log10(max(high, 1e-3)) + 1e-9))
     axis.set_xlabel("seconds")
     axis.legend(fontsize=7, frameon=False, labelcolor=INK)
     return _finished(

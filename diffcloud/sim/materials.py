@@ -126,8 +126,8 @@ _FOAM_SOURCE = (
     "over half a metre, as in a thick sheet of foam; then both multipliers show in the shape (docs/scenarios.md)"
 )
 _STIFFENING_FOAM_SOURCE = (
-    f"{_FOAM_SOURCE}; it stiffens as it stretches and is damped, because a cloth that its own weight draws out to many times "
-    "its length slides over a hook in jumps, and 1 % of a parameter then moves it by centimetres"
+    f"{_FOAM_SOURCE}; it stiffens as it stretches and is damped, because a cloth that its own weight draws out to many "
+    "times its length slides over a hook in jumps, and 1 % of a parameter then moves it by centimetres"
 )
 _KES_SOURCE = (
     "order of magnitude from published KES-F / ASTM D1388 ranges for this kind of fabric (e.g. Kawabata, The "

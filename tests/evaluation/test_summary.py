@@ -90,6 +90,14 @@ class TestWords:
         assert any("artefact" in line for line in said["identifiability"])
         assert any("stretch a factor of 2" in line for line in said["repeats"])
 
+    def test_credibility_holds_one_recording_against_repeats_and_another_motion(self, told):
+        said = sentences(told)["credibility"]
+        stretch = next(line for line in said if "stretch" in line)
+        assert "differ by a factor of 2, at most 2, another motion of it by a factor of 5.66, at most 5.66" in stretch
+        assert "no property of the fabric" in stretch
+        mass = next(line for line in said if "mass" in line)
+        assert "holds beyond its own recording" in mass
+
     def test_overview_has_a_row_per_scenario(self, told):
         row = overview(told).iloc[0]
         assert (row["first"], row["second"], row["verdict_stretch"]) == ("DiffCloud", "MLP", "only the ratio (2/2)")
