@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: venv repro test test-slow lint format bench acceptance comparison recordings clean
+.PHONY: venv repro test test-slow lint format bench acceptance comparison simulated recordings clean
 
 venv: $(STAMP)
 
@@ -53,6 +53,24 @@ acceptance: venv
 comparison: venv
 	@test -n "$(RELEASE)" || { echo "Usage: make comparison RELEASE=DIR [REFERENCE_FITS=FILE]"; exit 2; }
 	diffcloud evaluate release "$(RELEASE)" $(if $(REFERENCE_FITS),--reference "$(REFERENCE_FITS)") --markdown docs/results/comparison.md
+
+# The paper's simulated experiment on the built-in band and vest: ten targets each, networks, every method.
+SIMULATED := build/simulated
+SIMULATED_PARAMS := profiles/simulated.yaml
+simulated: venv
+	diffcloud episodes --params $(SIMULATED_PARAMS) --out $(SIMULATED)/episodes
+	set -e; for scenario in band_stretch vest_hang; do \
+	    diffcloud fit --params $(SIMULATED_PARAMS) --scenario $$scenario --out $(SIMULATED)/fits/$$scenario \
+	        $(SIMULATED)/episodes/$$scenario; \
+	    diffcloud simulate --params $(SIMULATED_PARAMS) --scenario $$scenario --out $(SIMULATED)/sets/$$scenario; \
+	    for model in mlp pointnet2 meteornet; do \
+	        diffcloud train --params $(SIMULATED_PARAMS) --scenario $$scenario --model $$model \
+	            --data $(SIMULATED)/sets/$$scenario --out $(SIMULATED)/regressors/$$scenario/$$model.safetensors; \
+	    done; \
+	done
+	diffcloud evaluate --params $(SIMULATED_PARAMS) --fits $(SIMULATED)/fits --episodes $(SIMULATED)/episodes \
+	    --regressors $(SIMULATED)/regressors --simulated $(SIMULATED)/sets --out $(SIMULATED)/reports \
+	    --markdown docs/results/simulated-experiment.md
 
 # Synthetic raw recordings against their truth, as clouds and through fits.
 RECORDINGS := build/recordings

@@ -13,13 +13,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from diffcloud.errors import ConfigError, DivergedError
+from diffcloud.evaluation.markdown import comparison_page
 from diffcloud.evaluation.summary import PREDICTORS, label, sentences, tables
 from diffcloud.evaluation.summary import metrics as summary_metrics
 from diffcloud.fit import Objective, read_fit
 from diffcloud.fit.measure import measure_fit
 from diffcloud.fit.parameters import NUISANCE
 from diffcloud.io.episodes import read_episode
-from diffcloud.io.files import write_json
+from diffcloud.io.files import write_json, write_text
 from pipeline.comparison import Comparison, compare, comparison_jobs, write_tables
 from pipeline.config import Config, load_config
 from pipeline.console import JsonFlag, ParamsFile, assignments, errors, finish, output, show
@@ -29,6 +30,7 @@ app = typer.Typer(help="Measure parameters, and compare methods.")
 AllowMissing = Annotated[
     bool, typer.Option("--allow-missing", help="Exit with status 0 although a method or an episode is missing.")
 ]
+MarkdownFile = Annotated[Path | None, typer.Option("--markdown", help="Write the tables to this Markdown file too.")]
 
 
 @app.command()
@@ -67,6 +69,7 @@ def evaluate(
         "data/simulated"
     ),
     out: Annotated[Path, typer.Option(help="Folder for metrics.json, timings.json and tables/.")] = Path("reports"),
+    markdown: MarkdownFile = None,
     allow_missing: AllowMissing = False,
     params: ParamsFile = None,
     json: JsonFlag = False,
@@ -85,7 +88,9 @@ def evaluate(
         )
     ]
     comparison = compare(jobs, config.evaluate.workers)
-    metrics = write_evaluation(config, comparison, {}, fits=fits, episodes=episodes, out=out, as_json=json)
+    metrics = write_evaluation(
+        config, comparison, {}, fits=fits, episodes=episodes, out=out, markdown=markdown, as_json=json
+    )
     finish({"metrics": metrics, "missing": comparison.missing}, json)
     stop_if_missing(comparison, allow_missing)
 
@@ -98,6 +103,7 @@ def write_evaluation(
     fits: Path,
     episodes: Path,
     out: Path,
+    markdown: Path | None,
     as_json: bool,
     references: Mapping[tuple[str, str], float] | None = None,
 ) -> dict[str, Any]:
@@ -105,6 +111,7 @@ def write_evaluation(
 
     Args:
         scenes: scenario -> scene file, of those that need one.
+        markdown: a page of the tables, if wanted.
         references: see `summary.method_table`.
     """
     rows, curves, seconds = _fits(config, scenes, fits, episodes)
@@ -126,6 +133,8 @@ def write_evaluation(
     write_json(out / "metrics.json", metrics)
     by_episode = {"/".join(key): value for key, value in comparison.seconds.items()}
     write_json(out / "timings.json", {"fit_seconds": seconds, "methods": by_episode})
+    if markdown is not None:
+        write_text(markdown, comparison_page(told, comparison.missing))
     for table in printed(told):
         show(table, as_json)
     for sentence in (line for lines in sentences(told).values() for line in lines):

@@ -9,16 +9,14 @@ from typing import Annotated, Any
 import typer
 
 from diffcloud.errors import ConfigError
-from diffcloud.evaluation.markdown import comparison_page
-from diffcloud.evaluation.summary import tables
 from diffcloud.io.episodes import Episode, write_episode
-from diffcloud.io.files import read_json, write_text
+from diffcloud.io.files import read_json
 from diffcloud.io.imports import release_episodes
 from pipeline.acceptance import SCENES
 from pipeline.comparison import FitJob, compare, comparison_jobs, run_all
 from pipeline.config import Config, load_config, updated
 from pipeline.console import JsonFlag, errors, finish
-from pipeline.evaluate import AllowMissing, stop_if_missing, write_evaluation
+from pipeline.evaluate import AllowMissing, MarkdownFile, stop_if_missing, write_evaluation
 from pipeline.report import report
 
 _PROFILE = Path(__file__).parents[1] / "profiles" / "release.yaml"
@@ -29,7 +27,7 @@ def release(
     params: Annotated[Path, typer.Option("--params", help="Profile; a file of parameters.")] = _PROFILE,
     data: Annotated[Path, typer.Option(help="Folder for imported episodes and fits.")] = Path("data/release"),
     out: Annotated[Path, typer.Option(help="Folder for metrics, tables, figures and the page.")] = Path("reports/release"),
-    markdown: Annotated[Path | None, typer.Option(help="Write the tables to this Markdown file too.")] = None,
+    markdown: MarkdownFile = None,
     reference: Annotated[
         Path | None, typer.Option(help="JSON with the reference simulator's own fits, scenario -> episode -> loss.")
     ] = None,
@@ -75,12 +73,10 @@ def release(
         fits=data / "fits",
         episodes=data / "episodes",
         out=out,
+        markdown=markdown,
         as_json=json,
         references=references,
     )
-    if markdown is not None:
-        told = tables(comparison.records, comparison.seconds, references)
-        write_text(markdown, comparison_page(told, comparison.missing))
     if comparison.records:
         report(
             out=out / "index.html",

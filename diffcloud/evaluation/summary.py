@@ -364,7 +364,9 @@ def _credibility(told: Tables) -> list[str]:
             continue
         spreads = {"repeats of a fabric differ by": group["factor"]}
         if not motions.empty:
-            other = motions[motions[["first", "second"]].eq(scenario).any(axis=1) & (motions["parameter"] == name)]
+            other = motions[
+                ((motions["first"] == scenario) | (motions["second"] == scenario)) & (motions["parameter"] == name)
+            ]
             if len(other):
                 spreads["another motion of it by"] = other["factor"]
         text = f"{scenario}: one recording's loss pins {name} to {_times(float(own.median()))} (median); "

@@ -92,8 +92,9 @@ def test_finished_episodes_are_kept_until_their_inputs_change(work, monkeypatch)
 
     monkeypatch.setattr(pipeline.comparison, "compare_episode", never)
     before = results(work)
-    invoke("evaluate", "--params", "params.yaml")
+    invoke("evaluate", "--params", "params.yaml", "--markdown", "page.md")
     assert results(work) == before
+    assert "| small | tan2 |" in (work / "page.md").read_text()
     write_episode(work / "data/episodes/small/tan2.npz", recording(2, stretch=0.9))
     with pytest.raises(AssertionError, match="tan2 was compared again"):
         invoke("evaluate", "--params", "params.yaml")
@@ -141,6 +142,7 @@ def test_profiles_are_whole_parameter_files():
 
     root = Path(__file__).parents[2]
     assert load_config(root / "profiles" / "release.yaml").fit.starts == 9
+    assert load_config(root / "profiles" / "simulated.yaml").episodes.per_scenario == 10
     paper = load_config(root / "profiles" / "paper.yaml")
     assert (paper.simulate.train, paper.simulate.test, paper.episodes.per_scenario) == (1500, 375, 10)
 
