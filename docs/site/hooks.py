@@ -17,13 +17,13 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
-from reference import address, command_of, command_pages, navigation
+from reference import address, command_of, command_pages, navigation, title
 
 ROOT = Path(__file__).parents[2]
 OUTSIDE = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 """Files of the repository that are pages -> their address."""
 _COMPARISON = "results/comparison.md"
-_LINK = re.compile(r"(\]\()([^)\s:#]+)(#[^)]*)?\)")
+_LINK = re.compile(r"\[([^\]]*)\]\(([^)\s:#]+)(#[^)]*)?\)")
 _CODE = re.compile(r"(?<!<pre>)(?<!</span>)<code>(diffcloud\s[^<]*)</code>(?!</a>)")
 
 
@@ -48,8 +48,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, **_: Any) -> str:
-    """Turn links between docs/ and the files that become pages."""
+def on_page_markdown(markdown: str, page: Page, files: Files, **_: Any) -> str:
+    """Turn links between docs/ and the files that become pages; a link that shows a file's name shows the page's title."""
     if page.file.src_uri.startswith("commands/"):
         return markdown
     inside = {place: name for name, place in OUTSIDE.items()}
@@ -61,7 +61,12 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, **_: Any) 
         if (ROOT / target).is_dir() and target.startswith("docs/"):
             target += "/index.md"  # as GitHub shows a folder
         place = OUTSIDE.get(target, target.removeprefix("docs/") if target.startswith("docs/") else None)
-        return match[0] if place is None else f"{match[1]}{posixpath.relpath(place, here or '.')}{match[3] or ''})"
+        if place is None:
+            return match[0]
+        file = files.get_file_from_path(place)
+        named = file is not None and file.is_documentation_page() and match[1].endswith((match[2], ".md"))
+        shown = title(file.content_string) if file is not None and named else match[1]
+        return f"[{shown}]({posixpath.relpath(place, here or '.')}{match[3] or ''})"
 
     return _LINK.sub(turned, markdown)
 

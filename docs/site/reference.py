@@ -74,7 +74,7 @@ def command_pages(guides: Mapping[str, str]) -> dict[str, str]:
             path = command_of(match[0])
             if path is not None and source not in shown.setdefault(path, []):
                 shown[path].append(source)
-    titles = {source: "Home" if source == "index.md" else _title(text) for source, text in guides.items()}
+    titles = {source: "Home" if source == "index.md" else title(text) for source, text in guides.items()}
     pages = {}
     rows = []
     for path, command in commands().items():
@@ -98,7 +98,8 @@ def navigation() -> list[dict[str, str] | str]:
     return own + [{" ".join(path): address(path)} for path in sorted(commands())]
 
 
-def _title(text: str) -> str:
+def title(text: str) -> str:
+    """Of a page, from its Markdown."""
     return next(line.removeprefix("# ") for line in text.splitlines() if line.startswith("# "))
 
 

@@ -17,7 +17,7 @@ from tests.docs.examples import Example, examples, read
 from tests.io.test_recordings import bag
 from tests.pipeline.invoke import invoke
 from tests.sensing.charuco_scene import gripper_poses
-from tests.sensing.cloth_scene import INTRINSICS, write_cloth_episode
+from tests.sensing.cloth_scene import INTRINSICS, views, write_cloth_episode
 from tests.sensing.table_scene import SERIALS, poses, write_table_episode
 from tests.sensing.test_calibration import write_board_episode
 
@@ -76,7 +76,13 @@ def lab(folder: Path) -> None:
     """A trajectory, a calibration, raw episodes, and recordings of other tools."""
     params(folder)
     (folder / "lift.csv").write_text("t_s,x,y,z\n0,0.5,0,0.2\n2,0.5,0,0.3\n")
-    cameras = {serial: CameraCalibration(serial, INTRINSICS, poses()[name], name=name) for name, serial in SERIALS.items()}
+    ros = {name: f"ros/{name}/aligned_depth_to_color/image_raw" for name in SERIALS}
+    table = {serial: (name, poses()[name]) for names in (SERIALS, ros) for name, serial in names.items()}
+    cloth = {f"00{index}": (name, view.T_world_camera) for index, (name, view) in enumerate(views().items())}
+    cameras = {
+        serial: CameraCalibration(serial, INTRINSICS, pose, name=name)
+        for serial, (name, pose) in {**table, **cloth}.items()
+    }
     write_calibration(folder / "raw/calibration/lab.json", Calibration(cameras, "charuco"))
     write_cloth_episode(folder / "raw/episodes/lift_tan1")
     bag(folder, "mcap").rename(folder / "run.mcap")
