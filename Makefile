@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: venv repro test test-slow lint format bench acceptance comparison simulated recordings clean
+.PHONY: venv repro test test-slow lint format bench acceptance comparison simulated recordings docs clean
 
 venv: $(STAMP)
 
@@ -80,6 +80,10 @@ recordings: venv
 	diffcloud preprocess --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/clouds $(RECORDINGS)/raw
 	diffcloud recordings --params $(RECORDINGS_PARAMS) --recorded $(RECORDINGS)/raw --episodes $(RECORDINGS)/clouds \
 	    --out docs/results/raw-recordings.md
+
+# The site of docs/, README and all commands, as files that open from disk: build/site/index.html.
+docs: venv
+	NO_MKDOCS_2_WARNING=1 mkdocs build --strict
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

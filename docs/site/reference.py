@@ -1,0 +1,213 @@
+"""Generated pages: one for each command, from the commands themselves, and one for the settings of params.yaml.
+
+They are made when the site is built and not kept, so they cannot be out of date.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import re
+import textwrap
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from diffcloud.sensing.fusion import FusionSettings
+from pipeline import config as settings
+from pipeline.app import app
+
+ROOT = Path(__file__).parents[2]
+
+STATUS = {
+    0: "done",
+    1: "an error, said in one line that begins with `Error:`",
+    2: "options or arguments that the command does not have, or that do not convert",
+    130: "Ctrl-C",
+}
+_SECTIONS = {"episodes", "preprocess", "simulate", "fit", "train", "evaluate", "report"}
+_FACTS = re.compile(r"\s*\[((?:default|required|x|\d)[^\]]*)\]$")
+
+
+@cache
+def commands() -> dict[tuple[str, ...], Any]:
+    """Words of the command line -> its command, groups before their members: ("evaluate",), ("evaluate", "loss"), ..."""
+    found: dict[tuple[str, ...], Any] = {}
+
+    def walk(command: Any, path: tuple[str, ...]) -> None:
+        if path:
+            found[path] = command
+        for name, member in getattr(command, "commands", {}).items():
+            walk(member, (*path, name))
+
+    walk(typer.main.get_command(app), ())
+    return found
+
+
+def command_of(text: str) -> tuple[str, ...] | None:
+    """The command that a text such as `diffcloud evaluate loss --set ...` is of."""
+    words = text.split()
+    if words[:1] != ["diffcloud"]:
+        return None
+    known = commands()
+    return next((tuple(words[1:end]) for end in (3, 2) if tuple(words[1:end]) in known and len(words) >= end), None)
+
+
+def address(path: tuple[str, ...]) -> str:
+    """Of a command's page, in the site's source."""
+    return f"commands/{'-'.join(path)}.md"
+
+
+def command_pages(guides: Mapping[str, str]) -> dict[str, str]:
+    """Address -> Markdown of all commands' pages.
+
+    Args:
+        guides: address -> Markdown of the hand-written pages; a command's page links to those that show it.
+    """
+    shown: dict[tuple[str, ...], list[str]] = {}
+    for source, text in guides.items():
+        for match in re.finditer(r"\bdiffcloud\s+[a-z]+(?:\s+[a-z]+)?", text):
+            path = command_of(match[0])
+            if path is not None and source not in shown.setdefault(path, []):
+                shown[path].append(source)
+    titles = {source: "Home" if source == "index.md" else title(text) for source, text in guides.items()}
+    pages = {}
+    rows = []
+    for path, command in commands().items():
+        links = [f"[{titles[source]}](../{source})" for source in shown.get(path, ())]
+        pages[address(path)] = _command_page(path, command, links)
+        rows.append(f"| [`diffcloud {' '.join(path)}`]({address(path).removeprefix('commands/')}) | {_summary(command)} |")
+    statuses = "\n".join(f"| {status} | {meaning} |" for status, meaning in STATUS.items())
+    pages["commands/index.md"] = (
+        "# Commands\n\n| | |\n|---|---|\n" + "\n".join(rows) + "\n\n"
+        "All take `--help`, and `--json`: the last line of standard output is then one JSON object. Progress, tables and\n"
+        "messages then go to standard error. Stages of the pipeline take `--params`, a file of [settings](settings.md).\n\n"
+        f"## Exit status\n\n| | |\n|---|---|\n{statuses}\n"
+    )
+    pages["commands/settings.md"] = settings_page()
+    return pages
+
+
+def navigation() -> list[dict[str, str] | str]:
+    """Entries of the site's section of commands."""
+    own: list[dict[str, str] | str] = ["commands/index.md", {"Settings": "commands/settings.md"}]
+    return own + [{" ".join(path): address(path)} for path in sorted(commands())]
+
+
+def title(text: str) -> str:
+    """Of a page, from its Markdown."""
+    return next(line.removeprefix("# ") for line in text.splitlines() if line.startswith("# "))
+
+
+def _summary(command: Any) -> str:
+    return _flat(command.help or "").split(". ")[0].rstrip(".")
+
+
+def _command_page(path: tuple[str, ...], command: Any, guides: list[str]) -> str:
+    name = f"diffcloud {' '.join(path)}"
+    context = command.make_context(name, [], resilient_parsing=True)
+    described = inspect.cleandoc(command.callback.__doc__ if command.callback else command.help or "")
+    usage = context.get_usage().removeprefix("Usage: ")
+    parts = [f"# {name}", described, f"```text\n{usage}\n```"]
+    if guides:
+        parts.append(f"Shown in: {', '.join(guides)}.")
+    members = getattr(command, "commands", {})
+    if members:
+        rows = [
+            f"| [`{name} {member}`]({'-'.join((*path, member))}.md) | {_summary(members[member])} |" for member in members
+        ]
+        parts.append("## Commands\n\n| | |\n|---|---|\n" + "\n".join(rows))
+    for kind, heading in (("argument", "Arguments"), ("option", "Options")):
+        rows = [_row(parameter, context) for parameter in command.params if parameter.param_type_name == kind]
+        if rows:
+            head = "| | | default |\n|---|---|---|"
+            parts.append(f"## {heading}\n\n{head}\n" + "\n".join(rows))
+    if any(parameter.name == "params" for parameter in command.params) and path[0] in _SECTIONS:
+        anchor = "evaluate" if path[0] == "evaluate" else path[0]
+        parts.append(f"`--params`: settings are in the section [`{anchor}`](settings.md#{anchor}).")
+    parts.append("## Exit status\n\n0, or as [for all commands](index.md#exit-status).")
+    return "\n\n".join(parts) + "\n"
+
+
+def _row(parameter: Any, context: Any) -> str:
+    declared, text = parameter.get_help_record(context)
+    repeats = " (repeatable)" if parameter.multiple else ""
+    declared = re.sub(r"<list\[(\w+)\]>", lambda match: f"<{match[1].lower()}>", declared)
+    facts: list[str] = []
+    while match := _FACTS.search(text):
+        facts = match[1].split("; ") + facts
+        text = text[: match.start()]
+    default = next((f"`{fact.removeprefix('default: ')}`" for fact in facts if fact.startswith("default: ")), "")
+    default = default.replace(f"{ROOT}/", "")
+    limits = [fact for fact in facts if not fact.startswith("default: ") and fact != "required"]
+    if "required" in facts:
+        default = "**required**"
+    meaning = _flat(text) + (f" ({', '.join(limits)})" if limits else "")
+    return f"| `{_cell(declared)}`{repeats} | {_cell(_escaped(meaning))} | {_cell(default)} |"
+
+
+def _flat(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def _escaped(text: str) -> str:
+    """As it stands, but for what is between backquotes."""
+    parts = text.split("`")
+    return "`".join(part if index % 2 else re.sub(r"([<*_\[\]])", r"\\\1", part) for index, part in enumerate(parts))
+
+
+def settings_page() -> str:
+    """Markdown of all settings of params.yaml."""
+    parts = [
+        "# Settings",
+        "What `params.yaml`, and any file for `--params`, can hold. Unknown keys and bad values are errors. What is not "
+        "given has the default here; options of a command win over the file.",
+        "`scenarios` lists those that the pipeline goes through: " + _value(settings.Config().scenarios) + ".",
+    ]
+    for name, field in settings.Config.model_fields.items():
+        section = field.default
+        if isinstance(section, settings.Section):
+            parts += [f"## {name}", _flat(type(section).__doc__ or ""), _settings_table(section)]
+            for key in type(section).model_fields:
+                inner = getattr(section, key)
+                if isinstance(inner, settings.Section):
+                    parts += [f"## {name}.{key}", _flat(type(inner).__doc__ or ""), _settings_table(inner)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _settings_table(section: settings.Section) -> str:
+    meanings = attribute_docs(FusionSettings) | attribute_docs(type(section))
+    rows = []
+    for key in type(section).model_fields:
+        value = getattr(section, key)
+        if not isinstance(value, settings.Section):
+            rows.append(f"| `{key}` | {_value(value)} | {_cell(_escaped(_flat(meanings.get(key, ''))))} |")
+    return "| | default | meaning |\n|---|---|---|\n" + "\n".join(rows)
+
+
+def _value(value: Any) -> str:
+    return f"`{json.dumps(value)}`"
+
+
+def attribute_docs(described: type) -> dict[str, str]:
+    """Attribute -> the string below it in a class's source."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(described))).body[0]
+    assert isinstance(body, ast.ClassDef)
+    found = {}
+    for node, after in zip(body.body, body.body[1:], strict=False):
+        if (
+            isinstance(node, ast.AnnAssign)
+            and isinstance(node.target, ast.Name)
+            and isinstance(after, ast.Expr)
+            and isinstance(after.value, ast.Constant)
+        ):
+            found[node.target.id] = str(after.value.value)
+    return found

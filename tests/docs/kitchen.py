@@ -1,0 +1,131 @@
+"""What the pages assume to be there: recordings, clouds and settings, small, under the names that the pages use."""
+
+from __future__ import annotations
+
+import shutil
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from diffcloud.io.calibrations import Calibration, CameraCalibration, write_calibration
+from diffcloud.io.clouds import write_ply
+from diffcloud.io.episodes import Episode, write_episode
+from diffcloud.sensing.cameras import inverse
+from tests.docs.examples import Example, examples, read
+from tests.io.test_recordings import bag
+from tests.pipeline.invoke import invoke
+from tests.sensing.charuco_scene import gripper_poses
+from tests.sensing.cloth_scene import INTRINSICS, views, write_cloth_episode
+from tests.sensing.table_scene import SERIALS, poses, write_table_episode
+from tests.sensing.test_calibration import write_board_episode
+
+PARAMS = {
+    "scenarios": ["lift"],
+    "episodes": {"per_scenario": 1, "image_size": [106, 60]},
+    "preprocess": {"raw": {"refine": False, "flying_m": 0.1}, "points": 300},
+    "fit": {"iterations": 1, "smoothing": 0, "points": 200},
+    "train": {"scenarios": ["fold"]},
+    "evaluate": {"draws": 1, "rivals": ["middle"], "identifiability": [], "workers": 1},
+}
+"""In place of params.yaml and the profiles."""
+QUICK = {"base": "lift", "nodes": [5, 5], "frames": 5, "steps_per_frame": 1, "recorder": "whole_surface", "points": 200}
+
+
+def params(folder: Path, name: str = "params.yaml") -> None:
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_text(yaml.safe_dump(PARAMS))
+
+
+def own_clouds(folder: Path) -> None:
+    """my_clouds/ and gripper.csv of the README's towel: its nodes, where a run puts them."""
+    towel = next(example for example in examples(read("README.md")) if example.words == ("towel.yaml",))
+    write(towel, folder)
+    invoke("rollout", "--scenario", "towel.yaml", "--out", "true.npz")
+    with np.load("true.npz") as run:
+        nodes, times = run["nodes"], run["times"]
+    for index, frame in enumerate(nodes):
+        write_ply(folder / "my_clouds" / f"{index:03d}.ply", frame)
+    track = np.column_stack([times, nodes[:, -1]])
+    np.savetxt("gripper.csv", track, delimiter=",", header="t_s,x,y,z", comments="")
+
+
+def lift_episode(folder: Path) -> None:
+    """my_episode.npz of a lift that takes a moment."""
+    quick(folder)
+    invoke("rollout", "--scenario", "quick", "--out", "run.npz")
+    with np.load("run.npz") as run:
+        write_episode(folder / "my_episode.npz", Episode.from_frames(list(run["nodes"]), run["times"]))
+
+
+def board(folder: Path) -> None:
+    """The gripper with a ChArUco board, and a checkerboard's points of two cameras."""
+    rng = np.random.default_rng(0)
+    write_board_episode(folder / "raw/episodes/board", gripper_poses(15, rng), rng)
+    for name, pose in poses().items():
+        place = folder / "PATH" / f"calib_{name}"
+        place.mkdir(parents=True)
+        robot = rng.uniform((0.5, -0.2, 0.0), (0.7, 0.2, 0.3), (40, 3))
+        seen = (np.c_[robot, np.ones(40)] @ inverse(pose).T)[:, :3]
+        np.save(place / "robot_chessboard.npy", robot)
+        np.save(place / "cam_chessboard.npy", seen)
+        np.save(place / "intrinsics.npy", np.array([615.0, 615.0, 320.0, 240.0]))
+
+
+def lab(folder: Path) -> None:
+    """A trajectory, a calibration, raw episodes, and recordings of other tools."""
+    params(folder)
+    (folder / "lift.csv").write_text("t_s,x,y,z\n0,0.5,0,0.2\n2,0.5,0,0.3\n")
+    ros = {name: f"ros/{name}/aligned_depth_to_color/image_raw" for name in SERIALS}
+    table = {serial: (name, poses()[name]) for names in (SERIALS, ros) for name, serial in names.items()}
+    cloth = {f"00{index}": (name, view.T_world_camera) for index, (name, view) in enumerate(views().items())}
+    cameras = {
+        serial: CameraCalibration(serial, INTRINSICS, pose, name=name)
+        for serial, (name, pose) in {**table, **cloth}.items()
+    }
+    write_calibration(folder / "raw/calibration/lab.json", Calibration(cameras, "charuco"))
+    write_cloth_episode(folder / "raw/episodes/lift_tan1")
+    bag(folder, "mcap").rename(folder / "run.mcap")
+    source = write_table_episode(folder / "elsewhere")
+    for name, place in (("overhead", "a"), ("side", "b")):
+        shutil.copytree(source / "cameras" / name, folder / "png" / place)
+        (folder / "png" / place / "timestamps.csv").unlink()
+    shutil.copy(source / "robot.csv", folder / "joints.csv")
+    (folder / "raw/robot").mkdir()
+    urdf = next(path for path in files("diffcloud.sensing").iterdir() if path.name.endswith(".urdf"))
+    (folder / "raw/robot/mine.urdf").write_text(urdf.read_text())
+
+
+def fitted(folder: Path) -> None:
+    """Episodes and fits of the pipeline, of a lift that takes a moment."""
+    quick(folder)
+    invoke("episodes", "--params", "params.yaml", "--out", "data/recorded")
+    invoke("preprocess", "--params", "params.yaml", "--out", "data/episodes", "data/recorded")
+    invoke("fit", "--params", "params.yaml", "--scenario", "quick", "--out", "data/fits/quick", "data/episodes/quick")
+    params(folder, "profiles/release.yaml")
+
+
+def write(example: Example, folder: Path) -> None:
+    """The file that a page shows, a towel with fewer nodes and steps."""
+    (folder / example.words[0]).write_text(example.text.replace("nodes: [9, 7]", "nodes: [4, 3]\nsteps_per_frame: 2"))
+
+
+def quick(folder: Path) -> None:
+    """Settings, and a lift that takes a moment."""
+    (folder / "raw/scenes").mkdir(parents=True)
+    (folder / "raw/scenes/quick.yaml").write_text(yaml.safe_dump(QUICK))
+    (folder / "params.yaml").write_text(yaml.safe_dump({**PARAMS, "scenarios": ["quick"]}))
+
+
+PREPARED = {
+    "README.md": own_clouds,
+    "docs/calibration.md": board,
+    "docs/capture.md": lab,
+    "docs/evaluation.md": fitted,
+    "docs/pipeline.md": quick,
+    "docs/regressors.md": lift_episode,
+}
+"""Page -> what puts its files into the empty, current folder."""
+STAND_INS = {"docs/pipeline.md": {"lift": "quick"}, "docs/regressors.md": {"lift": "quick"}}
+"""Page -> word on the page -> what takes its place."""
