@@ -16,7 +16,7 @@ $(STAMP): pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
 	touch $@
 
-# PROFILE: a file of parameters that takes the place of params.yaml, such as profiles/paper.yaml
+# PROFILE: a file of parameters that takes the place of params.yaml, such as pipeline/profiles/paper.yaml
 repro: venv
 	$(if $(PROFILE),cp "$(PROFILE)" params.yaml)
 	dvc repro
@@ -56,7 +56,7 @@ comparison: venv
 
 # The paper's simulated experiment on the built-in band and vest: ten targets each, networks, every method.
 SIMULATED := build/simulated
-SIMULATED_PARAMS := profiles/simulated.yaml
+SIMULATED_PARAMS := pipeline/profiles/simulated.yaml
 simulated: venv
 	diffcloud episodes --params $(SIMULATED_PARAMS) --out $(SIMULATED)/episodes
 	set -e; for scenario in band_stretch vest_hang; do \

@@ -19,7 +19,7 @@ from pipeline.console import JsonFlag, errors, finish
 from pipeline.evaluate import AllowMissing, MarkdownFile, stop_if_missing, write_evaluation
 from pipeline.report import report
 
-_PROFILE = Path(__file__).parents[1] / "profiles" / "release.yaml"
+_PROFILE = Path(__file__).parent / "profiles" / "release.yaml"
 
 
 def release(

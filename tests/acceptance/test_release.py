@@ -158,7 +158,9 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
     from tests.pipeline.invoke import invoke
 
     monkeypatch.chdir(tmp_path)
-    profile = yaml.safe_load((Path(__file__).parents[2] / "profiles" / "release.yaml").read_text(encoding="utf-8"))
+    profile = yaml.safe_load(
+        (Path(__file__).parents[2] / "pipeline" / "profiles" / "release.yaml").read_text(encoding="utf-8")
+    )
     profile["fit"] |= {"iterations": 2, "starts": 2, "smoothing": 0}
     profile["evaluate"] |= {"draws": 2, "landscapes": [], "workers": 1}
     Path("quick.yaml").write_text(yaml.safe_dump(profile))

@@ -103,7 +103,7 @@ def fitted(folder: Path) -> None:
     invoke("episodes", "--params", "params.yaml", "--out", "data/recorded")
     invoke("preprocess", "--params", "params.yaml", "--out", "data/episodes", "data/recorded")
     invoke("fit", "--params", "params.yaml", "--scenario", "quick", "--out", "data/fits/quick", "data/episodes/quick")
-    params(folder, "profiles/release.yaml")
+    params(folder, "pipeline/profiles/release.yaml")
 
 
 def write(example: Example, folder: Path) -> None:

@@ -117,5 +117,5 @@ def test_links_and_file_names_of_a_page_hold(page):
         if not parts.scheme and parts.path:
             assert (ROOT / page).parent.joinpath(parts.path).exists(), f"{page} links to {target}"
     prose = re.sub(r"^ *(?:\d+\. )?```.*?^ *```$", "", text, flags=re.MULTILINE | re.DOTALL)
-    for name in re.findall(r"(?<![\w/.])((?:docs|diffcloud|pipeline|tests|profiles)/[\w./-]*\w)", prose):
+    for name in re.findall(r"(?<![\w/.])((?:docs|diffcloud|pipeline|tests)/[\w./-]*\w)", prose):
         assert (ROOT / name).exists(), f"{page} names {name}"

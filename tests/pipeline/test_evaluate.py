@@ -141,9 +141,9 @@ def test_profiles_are_whole_parameter_files():
     from pipeline.config import load_config
 
     root = Path(__file__).parents[2]
-    assert load_config(root / "profiles" / "release.yaml").fit.starts == 9
-    assert load_config(root / "profiles" / "simulated.yaml").episodes.per_scenario == 10
-    paper = load_config(root / "profiles" / "paper.yaml")
+    assert load_config(root / "pipeline" / "profiles" / "release.yaml").fit.starts == 9
+    assert load_config(root / "pipeline" / "profiles" / "simulated.yaml").episodes.per_scenario == 10
+    paper = load_config(root / "pipeline" / "profiles" / "paper.yaml")
     assert (paper.simulate.train, paper.simulate.test, paper.episodes.per_scenario) == (1500, 375, 10)
 
 
