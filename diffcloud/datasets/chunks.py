@@ -18,7 +18,7 @@ from diffcloud.io.simulated import Split
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import rollout
 
-CHUNK = 16
+CHUNK = 32
 """Runs simulated together: where time per run stops falling for cloths of 50 to 80 nodes on a CPU (docs/datasets.md)."""
 _ATTEMPTS = 20
 """Draws of one run that may diverge."""

@@ -22,18 +22,15 @@ from reference import address, command_of, command_pages, navigation, title
 ROOT = Path(__file__).parents[2]
 OUTSIDE = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 """Files of the repository that are pages -> their address."""
-_COMPARISON = "results/comparison.md"
 _LINK = re.compile(r"\[([^\]]*)\]\(([^)\s:#]+)(#[^)]*)?\)")
 _CODE = re.compile(r"(?<!<pre>)(?<!</span>)<code>(diffcloud\s[^<]*)</code>(?!</a>)")
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Fill in what the navigation has of generated and optional pages."""
+    """Fill in the navigation's generated pages."""
     for entry in config.nav or []:
         if "Commands" in entry:
             entry["Commands"] = navigation()
-        elif "Results" in entry and (Path(config.docs_dir) / _COMPARISON).is_file():
-            entry["Results"][1:1] = [{"Comparison with the paper": _COMPARISON}]
     return config
 
 

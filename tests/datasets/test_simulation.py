@@ -53,10 +53,10 @@ def test_runs_are_those_of_a_plain_rollout(whole):
     scenario = small_lift()
     read = SimulatedSet.read(whole, "train")
     system, _ = scenario.scene.build()
-    values = {name: torch.as_tensor(read.parameters[16:, i]) for i, name in enumerate(read.names)}
+    values = {name: torch.as_tensor(read.parameters[CHUNK:, i]) for i, name in enumerate(read.names)}
     run = rollout(system, scenario.steps, properties=scenario.properties(system, values))
     expected = run.positions[:, :: scenario.scene.frame_steps].to(torch.float32)
-    np.testing.assert_array_equal(read.nodes[16:], expected.numpy())
+    np.testing.assert_array_equal(read.nodes[CHUNK:], expected.numpy())
     assert read.nodes.shape == (CHUNK + 4, scenario.frames + 1, 25, 3)
     assert read.loss_frame == scenario.frames
     np.testing.assert_allclose(read.times, run.times[:: scenario.scene.frame_steps])
@@ -89,7 +89,7 @@ def test_an_interrupted_set_ends_with_the_same_bytes_and_redoes_nothing(whole, t
     with pytest.raises(Stop):
         simulate_set(plan(), out, workers=0, progress=stop_after(CHUNK))
     assert not out.exists()
-    (damaged := tmp_path / "set.partial" / "train-000016.npz").write_bytes(b"half")
+    (damaged := tmp_path / "set.partial" / f"train-{CHUNK:06d}.npz").write_bytes(b"half")
     assert damaged.exists()
     simulated = []
     monkeypatch.setattr(chunks, "rollout", lambda *a, **k: simulated.append(k["properties"].batch) or rollout(*a, **k))
@@ -143,19 +143,19 @@ def diverging(*doomed: float):
 def test_diverged_draws_are_recorded_and_replaced(whole, tmp_path, monkeypatch):
     draws = plan().draws
     first = draws.first("train", CHUNK + 4)
-    doomed = [first[2, 0], draws.again("train", 2, 1)[0], first[17, 0]]  # run 2 fails twice
+    doomed = [first[2, 0], draws.again("train", 2, 1)[0], first[CHUNK + 1, 0]]  # run 2 fails twice
     monkeypatch.setattr(chunks, "rollout", diverging(*doomed))
     for out in (tmp_path / "a", tmp_path / "b"):
         outcome = simulate_set(plan(), out, workers=0)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
-    assert [(entry.run, entry.attempt) for entry in outcome.replaced["train"]] == [(2, 0), (2, 1), (17, 0)]
+    assert [(entry.run, entry.attempt) for entry in outcome.replaced["train"]] == [(2, 0), (2, 1), (CHUNK + 1, 0)]
     table = pd.read_csv(tmp_path / "a" / "replaced.csv")
     assert table[["split", "run", "attempt", "step", "reason"]].to_numpy().tolist() == [
-        ["train", 2, 0, 3, "on purpose"], ["train", 2, 1, 3, "on purpose"], ["train", 17, 0, 3, "on purpose"],
+        ["train", 2, 0, 3, "on purpose"], ["train", 2, 1, 3, "on purpose"], ["train", CHUNK + 1, 0, 3, "on purpose"],
     ]  # fmt: skip
     np.testing.assert_allclose(table["stretch"], doomed, rtol=1e-12)
     expected = first.copy()
-    expected[2], expected[17] = draws.again("train", 2, 2), draws.again("train", 17, 1)
+    expected[2], expected[CHUNK + 1] = draws.again("train", 2, 2), draws.again("train", CHUNK + 1, 1)
     np.testing.assert_array_equal(SimulatedSet.read(tmp_path / "a", "train").parameters, expected)
     test, before = (SimulatedSet.read(folder, "test") for folder in (tmp_path / "a", whole))
     np.testing.assert_array_equal(test.nodes, before.nodes)  # nobody else changes

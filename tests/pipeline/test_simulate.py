@@ -15,7 +15,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from diffcloud.datasets import simulation
+from diffcloud.datasets import CHUNK, simulation
 from diffcloud.errors import DiffCloudError
 from diffcloud.io.simulated import SimulatedSet
 from diffcloud.regressors.dataset import Augmentation, CloudDataset
@@ -24,8 +24,8 @@ from tests.datasets.test_simulation import contents
 from tests.pipeline.invoke import DIFFCLOUD, ROOT, run_process
 from tests.pipeline.test_commands import SMALL
 
-SET = ("simulate", "--scenario", "small.yaml", "--train", 36, "--test", 18)
-"""Five chunks."""
+SET = ("simulate", "--scenario", "small.yaml", "--train", 2 * CHUNK + 8, "--test", 18)
+"""Four chunks."""
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def work(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def whole(work) -> Path:
     said = run_process(*SET, "--workers", 0, "--out", "whole", cwd=work)
-    assert (said["train"], said["test"], said["resumed"], said["parameters"]) == (36, 18, 0, ["stretch", "mass"])
+    assert (said["train"], said["test"], said["resumed"], said["parameters"]) == (2 * CHUNK + 8, 18, 0, ["stretch", "mass"])
     assert said["replaced"] == {"train": 0, "test": 0}
     return work / "whole"
 
@@ -76,7 +76,7 @@ def test_a_killed_set_ends_with_the_same_bytes(whole, work):
     status, _ = interrupted(work, "killed", signal.SIGKILL)
     assert status == -signal.SIGKILL
     done = run_process(*SET, "--workers", 0, "--out", "killed", cwd=work)
-    assert 16 <= done["resumed"] < 54
+    assert CHUNK <= done["resumed"] < 2 * CHUNK + 26
     assert contents(work / "killed") == contents(whole)
     assert not (work / "killed.partial").exists()
 
