@@ -108,7 +108,19 @@ def comparison_summary(entry: ComparisonEntry) -> str:
         f'{note}<div class="scroll">{_table(table, {**_OVERVIEW, **verdicts, **_OVERVIEW_END})}</div>'
         '<p class="caption">Mean distance from the simulated to the recorded cloth [mm]. '
         '<a href="#comparison">All methods</a> · <a href="#identifiability">what “identified” means</a> · '
-        '<a href="#repeats">what repeats say</a>.</p>'
+        f'<a href="#repeats">what repeats say</a>.</p>{_caution(entry.told)}'
+    )
+
+
+def _caution(told: Tables) -> str:
+    """A verdict looks at one recording; what others of the same fabric gave belongs beside it."""
+    apart = [told[name]["factor"].max() for name in ("repeatability", "consistency") if len(told[name])]
+    if not sentences(told)["credibility"] or not apart:
+        return ""
+    return (
+        "<p>Verdicts are about one recording each. Another recording or motion of the same fabric gave a value up to "
+        f'<b>{max(apart):.3g} times</b> as large: see <a href="#repeats">repeats</a> before you take a number for a '
+        "property of the fabric.</p>"
     )
 
 

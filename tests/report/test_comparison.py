@@ -93,6 +93,12 @@ def test_the_summary_tells_winner_verdict_and_gaps(told, page):
     assert comparison_failures(ComparisonEntry(told, records(), ["a"])) == ["a", "lift/tan1: MeteorNet: no checkpoint"]
 
 
+def test_verdicts_stand_beside_what_other_recordings_gave(told, page):
+    assert "a value up to <b>5.66 times</b> as large" in page
+    alone = dict(told) | {"repeatability": told["repeatability"][:0]}
+    assert "Verdicts are about" not in comparison_summary(ComparisonEntry(alone, records()))
+
+
 def test_numbers_sort_as_numbers(page):
     assert re.search(r'<td data-value="[\d.]+">', page)
     assert 'data-value="nan"' not in page
