@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,6 +17,10 @@ from diffcloud.scene.scenarios import Scenario, built_in, grid_scenario
 
 if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(1)  # as the commands do: beside another busy process spinning threads cost tenfold
+
+# a shell without job control starts background jobs deaf to Ctrl-C, and processes inherit that; tests press it
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture
