@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
@@ -187,6 +188,7 @@ def capture(
         raise EpisodeError(f"{folder} exists; raw episodes are never overwritten. Choose another name.")
     if trajectory is not None:
         check_trajectory(trajectory, limits)
+    import_module("cv2")  # encodes the images; imported at the first of them it would hold the control loop up
     opened: list[Camera] = []
     try:
         infos = {}

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from diffcloud.errors import DiffCloudError, EpisodeError, HardwareError, LimitError
-from diffcloud.hardware import CaptureSettings, Limits, capture
+from diffcloud.hardware import CaptureSettings, Limits, capture, session
 from diffcloud.hardware.trajectory import ToolTrajectory
 from diffcloud.io.raw_episodes import read_raw_episode
 from diffcloud.sensing.validation import validate_raw_episode
@@ -50,6 +50,16 @@ def test_a_capture_to_its_end(tmp_path):
     assert log.tool_position_m[-1, 2] == pytest.approx(START[2] + 0.02, abs=0.002)
     codes = {finding.code for finding in validate_raw_episode(tmp_path / "e")}
     assert not codes & {"short_robot_log", "clock_backwards", "missing_frames"}
+
+
+def test_what_encodes_images_is_there_before_anything_opens(tmp_path, monkeypatch):
+    order = []
+    monkeypatch.setattr(session, "import_module", lambda name: order.append(name))
+    camera = TestCard()
+    opened = camera.open
+    monkeypatch.setattr(camera, "open", lambda: order.append("open") or opened())
+    capture(tmp_path / "e", [camera], seconds=0.1, settings=QUICK)
+    assert order == ["cv2", "open"]
 
 
 def test_every_third_frame(tmp_path):
