@@ -292,8 +292,6 @@ def _speed(timings: list[dict[str, Any]], costs: list[dict[str, Any]]) -> str:
         "## What a contact costs",
         "",
         contact,
-    ]
-    lines += [
         "",
         *markdown_table(list(CONTACT_HEAD), contact_rows(costs)),
         "",

@@ -23,13 +23,12 @@ from diffcloud.scene.scenarios import Scenario
 
 _WORTH_PROCESSES = 8
 """Chunks from which on several processes save more than the seconds it takes to start them."""
-_WORKER_ENVIRONMENT = {
-    **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"),
-    # Dask lets glibc give freed memory back after 64 KiB: a fifth of the time goes into getting it again
-    "MALLOC_TRIM_THRESHOLD_": str(1 << 30),
-    "MALLOC_MMAP_THRESHOLD_": str(1 << 25),
+_WORKER_MEMORY = {
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": str(1 << 30),
+    "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": str(1 << 25),
 }
-"""Of the processes started here."""
+"""Dask's settings, by which its processes keep memory that they freed. By default they give it back after 64 KiB, and a
+quarter of the time goes into getting it again."""
 _ANSWER_S = 10
 """A scheduler that has not answered by then is not there [s]."""
 
@@ -132,7 +131,7 @@ def _simulated(
                 f"No Dask scheduler answers at {scheduler}: {error}. Start one with `dask scheduler`."
             ) from error
     else:
-        with dask.config.set({"distributed.nanny.pre-spawn-environ": _WORKER_ENVIRONMENT}):
+        with dask.config.set(_WORKER_MEMORY):
             cluster = LocalCluster(
                 n_workers=min(workers, len(chunks)),
                 threads_per_worker=1,

@@ -30,6 +30,8 @@ PREDICTORS = ("mlp", "pointnet2", "meteornet", "published_mlp", "published_point
 """Methods that have learned."""
 _CLEARLY = 2.0
 """Standard deviations by which losses of two methods must differ to count as different."""
+_FAR = 1.25
+"""Disagreement, over the interval of one recording, from which a number is not called a property of the fabric."""
 Records = Sequence[Mapping[str, Any]]
 Tables = Mapping[str, pd.DataFrame]
 """Of `tables`."""
@@ -348,10 +350,6 @@ def _repeats(told: Tables) -> list[str]:
     return found
 
 
-_FAR = 1.25
-"""Disagreement, over the interval of one recording, from which a number is not called a property of the fabric."""
-
-
 def _credibility(told: Tables) -> list[str]:
     """What one recording promises about a parameter beside what repeats and another motion of the same fabric say."""
     promised, repeats, motions = told["identifiability"], told["repeatability"], told["consistency"]
@@ -359,8 +357,8 @@ def _credibility(told: Tables) -> list[str]:
         return []
     found = []
     for (scenario, name), group in repeats.groupby(["scenario", "parameter"], sort=False):
-        own = promised[(promised["scenario"] == scenario) & (promised["parameter"] == name)]["factor"].dropna()
-        if own.empty:
+        own = promised[(promised["scenario"] == scenario) & (promised["parameter"] == name)]["factor"].median()
+        if math.isnan(own):
             continue
         spreads = {"repeats of a fabric differ by": group["factor"]}
         if not motions.empty:
@@ -369,13 +367,12 @@ def _credibility(told: Tables) -> list[str]:
             ]
             if len(other):
                 spreads["another motion of it by"] = other["factor"]
-        text = f"{scenario}: one recording's loss pins {name} to {_times(float(own.median()))} (median); "
+        text = f"{scenario}: one recording's loss pins {name} to {_times(own)} (median); "
         text += ", ".join(
-            f"{what} {_times(float(factors.median()))}, at most {float(factors.max()):.3g}"
-            for what, factors in spreads.items()
+            f"{what} {_times(factors.median())}, at most {factors.max():.3g}" for what, factors in spreads.items()
         )
         # the worst fabric decides: the next one may be like it
-        if max(float(factors.max()) for factors in spreads.values()) > _FAR * float(own.median()):
+        if max(factors.max() for factors in spreads.values()) > _FAR * own:
             text += ": the number explains its own recording and is no property of the fabric to that precision"
         else:
             text += ": the number holds beyond its own recording"

@@ -282,7 +282,7 @@ def _camera_info(rs: Any, name: str, serial: str, profile: Any) -> CameraInfo:
         held.fy,
         held.ppx,
         held.ppy,
-        distortion=models[held.model] if distorted else "none",  # type: ignore[arg-type]
+        distortion=models[held.model] if distorted else "none",  # type: ignore[arg-type]  # str, of the literals above
         coefficients=tuple(held.coeffs) if distorted else (),
     )
     # 0.001 arrives as a float32

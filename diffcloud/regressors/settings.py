@@ -96,4 +96,4 @@ def profile_settings(profile: str, model: str, **changes: object) -> TrainingSet
     if model not in MODEL_NAMES:
         raise ConfigError(unknown_name("model", model, MODEL_NAMES))
     given = {name: value for name, value in changes.items() if value is not None}
-    return replace(PROFILES[profile][model], **given)  # type: ignore[index,arg-type]
+    return replace(PROFILES[profile][model], **given)  # type: ignore[index,arg-type]  # names and values are checked

@@ -333,7 +333,7 @@ class _Recorder(lightning.Callback):
 
 def _metrics_writer(folder: Path) -> Any:
     """DVCLive's metrics files and nothing else: experiments, dvc.yaml and reports are the project's own."""
-    from dvclive import Live  # type: ignore[attr-defined]
+    from dvclive import Live  # type: ignore[attr-defined]  # does not declare what it exports
 
     class Metrics(Live):
         def _init_dvc(self) -> None:

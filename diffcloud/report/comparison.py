@@ -114,9 +114,9 @@ def comparison_summary(entry: ComparisonEntry) -> str:
 
 def _caution(told: Tables) -> str:
     """A verdict looks at one recording; what others of the same fabric gave belongs beside it."""
-    apart = [told[name]["factor"].max() for name in ("repeatability", "consistency") if len(told[name])]
-    if not sentences(told)["credibility"] or not apart:
+    if told["identifiability"].empty or told["repeatability"].empty:
         return ""
+    apart = [told[name]["factor"].max() for name in ("repeatability", "consistency") if len(told[name])]
     return (
         "<p>Verdicts are about one recording each. Another recording or motion of the same fabric gave a value up to "
         f'<b>{max(apart):.3g} times</b> as large: see <a href="#repeats">repeats</a> before you take a number for a '

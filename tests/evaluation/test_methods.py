@@ -128,7 +128,7 @@ def test_every_lost_entry_has_its_own_message():
 
 
 class TestValues:
-    SUMMARY = {  # noqa: RUF012
+    SUMMARY = {  # noqa: RUF012 - nothing changes it
         "parameters": {
             "stretch": {"value": 2.0, "fixed": False, "bounds": [0.5, 4.0]},
             "mass": {"value": 1.2, "fixed": True, "bounds": None},
