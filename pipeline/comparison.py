@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import torch
 
-from diffcloud.errors import CheckpointError, ConfigError, DiffCloudError, EpisodeError
+from diffcloud.errors import CheckpointError, ConfigError, EpisodeError
 from diffcloud.evaluation import ComparisonSettings, EpisodeRecord, Estimate, Gap, compare_episode
 from diffcloud.evaluation.methods import predicted
 from diffcloud.evaluation.repeats import other_repeats
 from diffcloud.evaluation.summary import PREDICTORS
-from diffcloud.fit import FitSpace, Objective, fit_adam, read_fit, write_fit
-from diffcloud.fit.result import describe_fit
+from diffcloud.fit import read_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import read_json, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.regressors import Regressor, predict_episode
-from pipeline.config import Config, FitConfig
-from pipeline.console import progress_bar
-from pipeline.scenario_options import choose_scenario
+from diffcloud.scene.scenarios import Scenario
+from pipeline.config import Config
+from pipeline.workers import Tell, run_all
 
 _CODE = ("mesh", "io", "sim", "scene", "clouds", "fit", "evaluation")
 """Packages whose source decides the numbers of a finished episode."""
@@ -36,8 +32,9 @@ _CODE = ("mesh", "io", "sim", "scene", "clouds", "fit", "evaluation")
 class Job:
     """One episode to compare; what it needs travels to another process."""
 
-    scenario: str
-    scene: Path | None
+    scenario: Scenario
+    group: str
+    """Folder of the scenario's episodes and fits."""
     name: str
     episode: Episode
     summary: Mapping[str, Any]
@@ -47,7 +44,11 @@ class Job:
     kept: Path
     """Where the finished record is kept."""
 
-    def run(self) -> EpisodeRecord:
+    @property
+    def label(self) -> str:
+        return f"{self.group}/{self.name}"
+
+    def run(self, tell: Tell) -> EpisodeRecord:
         """The record, from the file if that belongs to the same inputs and code.
 
         Raises:
@@ -56,13 +57,13 @@ class Job:
         # seconds of predictions differ from run to run, and change nothing in the record
         told = [(entry.method, entry.values if isinstance(entry, Estimate) else entry.reason) for entry in self.predictions]
         inputs = [self.name, self.episode, self.summary, told, self.transfers, self.settings]
-        mark = fingerprint([self.scenario, *inputs], packages=_CODE)
+        mark = fingerprint([self.scenario, self.group, *inputs], packages=_CODE)
         if self.kept.is_file():
             known = read_json(self.kept)
             if isinstance(known, dict) and known.get("fingerprint") == mark:
                 return EpisodeRecord(known["record"], known["seconds"])
         found = compare_episode(
-            choose_scenario(self.scenario, self.scene),
+            self.scenario,
             self.episode,
             self.summary,
             name=self.name,
@@ -72,39 +73,6 @@ class Job:
         )
         write_json(self.kept, {"fingerprint": mark, "record": found.record, "seconds": found.seconds})
         return found
-
-
-@dataclass(frozen=True)
-class FitJob:
-    """One episode to fit, kept as `diffcloud fit` keeps it."""
-
-    scenario: str
-    scene: Path | None
-    name: str
-    episode: Episode
-    settings: FitConfig
-    folder: Path
-
-    def run(self) -> Path:
-        """Fit, unless the same fit is there.
-
-        Raises:
-            DiffCloudError: every start diverged.
-        """
-        mark = fingerprint([self.scenario, self.name, self.episode, self.settings.model_dump()], packages=_CODE[:-1])
-        path = self.folder / f"{self.name}.json"
-        if path.is_file() and read_fit(path).get("fingerprint") == mark:
-            return path
-        scenario, config = choose_scenario(self.scenario, self.scene), self.settings
-        objective = Objective(scenario, [self.episode], frames=config.frames, points=config.points, seed=config.seed)
-        space = FitSpace.build(config.parameters, bounds={**scenario.bounds, **config.bounds}, fixed=config.fixed)
-        adam = config.adam(scenario)
-        outcome = fit_adam(objective, space, adam)
-        if outcome.stop_reason == "interrupted":
-            raise KeyboardInterrupt  # begun again next time
-        result = describe_fit(objective, space, adam, outcome, episodes=[self.name])
-        result.summary["fingerprint"] = mark
-        return write_fit(self.folder, self.name, result)
 
 
 @dataclass
@@ -128,58 +96,46 @@ class Comparison:
         return self.failures + gaps
 
 
-def run_all(label: str, jobs: Sequence[Job | FitJob], workers: int) -> Iterable[tuple[Job | FitJob, Any, str | None]]:
-    """(job, what it gave, message of its error) in the order of the jobs. Ctrl-C ends the processes; what is finished is
-    kept."""
-    with progress_bar(label, len(jobs)) as update:
-        if workers == 1 or len(jobs) < 2:
-            for index, job in enumerate(jobs):
-                update(index, f"{job.scenario} {job.name}")
-                yield (job, *_attempt(job))
-            return
-        # spawned, not forked: a fork of a process with torch's threads may hang
-        with multiprocessing.get_context("spawn").Pool(min(workers, len(jobs)), _quiet) as pool:
-            for index, (job, found) in enumerate(zip(jobs, pool.imap(_attempt, jobs), strict=True)):
-                update(index + 1, f"{job.scenario} {job.name}")
-                yield (job, *found)
-
-
 def compare(jobs: Sequence[Job], workers: int) -> Comparison:
     """All episodes."""
     comparison = Comparison()
     for job, found, error in run_all("evaluate", jobs, workers):
         if error is not None:
-            comparison.failures.append(f"{job.scenario}/{job.name}: {error}")
+            comparison.failures.append(f"{job.label}: {error}")
         else:
             comparison.records.append(found.record)
-            comparison.seconds[job.scenario, job.name] = {method: dict(told) for method, told in found.seconds.items()}
+            comparison.seconds[job.group, job.name] = {method: dict(told) for method, told in found.seconds.items()}
     return comparison
 
 
 def comparison_jobs(
     config: Config,
-    scenario: str,
+    group: str,
+    scenario: Scenario,
     *,
     fits: Path,
     episodes: Path,
     regressors: Path,
     simulated: Path,
     kept: Path,
-    scene: Path | None = None,
 ) -> list[Job]:
     """The episodes of one scenario, in the order of their fits.
+
+    Args:
+        group: folder of its episodes, fits and networks.
+        kept: folder of finished episodes.
 
     Raises:
         ConfigError, EpisodeError: a damaged fit or episode.
     """
-    summaries = {path: read_fit(path) for path in sorted((fits / scenario).glob("*.json"))}
+    summaries = {path: read_fit(path) for path in sorted((fits / group).glob("*.json"))}
     fitted = [(path.stem, name, summary) for path, summary in summaries.items() for name in summary["episodes"]]
-    recorded = {name: read_episode(episodes / scenario / f"{name}.npz") for _, name, _ in fitted}
+    recorded = {name: read_episode(episodes / group / f"{name}.npz") for _, name, _ in fitted}
     values = {
         name: {key: float(entry["value"]) for key, entry in summary["parameters"].items()} for _, name, summary in fitted
     }
     others = other_repeats({name: episode.meta for name, episode in recorded.items()}, values)
-    networks = _networks(config, scenario, regressors, simulated)
+    networks = _networks(config, group, regressors, simulated)
     jobs = []
     for fit, name, summary in fitted:
         label = name if fit == name else f"{fit}-{name}"  # a joint fit has several episodes
@@ -187,15 +143,15 @@ def comparison_jobs(
         jobs.append(
             Job(
                 scenario=scenario,
-                scene=scene,
+                group=group,
                 name=label,
                 episode=recorded[name],
                 summary=summary,
                 predictions=[network.of(recorded[name]) for network in networks],
                 # simulated targets share labels, not parameters
                 transfers=others[name] if real else {},
-                settings=config.evaluate.comparison(f"{scenario}/{label}"),
-                kept=kept / scenario / f"{label}.json",
+                settings=config.evaluate.comparison(f"{group}/{label}"),
+                kept=kept / group / f"{label}.json",
             )
         )
     return jobs
@@ -262,16 +218,3 @@ def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame]) -> None:
     """One CSV each."""
     for name, table in tables.items():
         write_text(folder / f"{name}.csv", table.to_csv(index=False))
-
-
-def _attempt(job: Job | FitJob) -> tuple[Any, str | None]:
-    try:
-        return job.run(), None
-    except DiffCloudError as error:
-        return None, str(error)
-
-
-def _quiet() -> None:
-    """Of a worker: Ctrl-C is the parent's, and one thread is its share of the cores."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)

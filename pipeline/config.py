@@ -129,8 +129,9 @@ class SimulateConfig(Section):
     scenarios: Annotated[list[str], Field(min_length=1)] = ["lift", "fold"]
     """Those that the pipeline makes sets of."""
     parameters: Annotated[list[str], Field(min_length=1)] = ["stretch", "mass"]
-    draws: Literal["uniform", "modes", "sobol"] = "uniform"
-    """Over the bounds, `sobol`, or `modes`: the published code's mixture of soft, medium and stiff cloths."""
+    draws: Literal["uniform", "sobol", "logarithmic", "modes"] = "uniform"
+    """Over the bounds: `uniform`, `sobol`, or `logarithmic` (uniform in the logarithms); or `modes`: the published code's
+    mixture of soft, medium and stiff cloths."""
     train: Annotated[int, Field(ge=0)] = 1500
     test: Annotated[int, Field(ge=0)] = 375
     seed: Annotated[int, Field(ge=0)] = 0
@@ -159,6 +160,8 @@ class FitConfig(Section):
     resample: bool = False
     offset: bool = False
     joint: bool = False
+    workers: Count = 1
+    """Processes, one fit each; they change nothing but the time."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -51,7 +51,7 @@ def warn(message: str) -> None:
 
 
 @contextmanager
-def progress_bar(label: str, total: int) -> Iterator[Callable[[int, str], None]]:
+def progress_bar(label: str, total: int) -> Iterator[Callable[[float, str], None]]:
     """A bar on standard error; call with (done, text)."""
     columns = (
         TextColumn("[bold]{task.description}"),
@@ -63,7 +63,7 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[int, str], None]]
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
         task = progress.add_task(label, total=total, text="")
 
-        def update(done: int, text: str = "") -> None:
+        def update(done: float, text: str = "") -> None:
             progress.update(task, completed=done, text=text)
 
         yield update

@@ -84,7 +84,14 @@ def evaluate(
         job
         for name in config.scenarios
         for job in comparison_jobs(
-            config, name, fits=fits, episodes=episodes, regressors=regressors, simulated=simulated, kept=out / "episodes"
+            config,
+            name,
+            choose_scenario(name),
+            fits=fits,
+            episodes=episodes,
+            regressors=regressors,
+            simulated=simulated,
+            kept=out / "episodes",
         )
     ]
     comparison = compare(jobs, config.evaluate.workers)

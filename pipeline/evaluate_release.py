@@ -12,12 +12,16 @@ from diffcloud.errors import ConfigError
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.files import read_json
 from diffcloud.io.imports import release_episodes
+from diffcloud.scene.scenarios import Scenario
 from pipeline.acceptance import SCENES
-from pipeline.comparison import FitJob, compare, comparison_jobs, run_all
+from pipeline.comparison import compare, comparison_jobs
 from pipeline.config import Config, load_config, updated
 from pipeline.console import JsonFlag, errors, finish
 from pipeline.evaluate import AllowMissing, MarkdownFile, stop_if_missing, write_evaluation
+from pipeline.fit import FitJob
 from pipeline.report import report
+from pipeline.scenario_options import choose_scenario
+from pipeline.workers import run_all
 
 _PROFILE = Path(__file__).parent / "profiles" / "release.yaml"
 
@@ -41,25 +45,26 @@ def release(
         raise ConfigError(f"{folder} has no conf/; give the folder with lift_real_pcls/ and conf/.")
     config = load_config(params)
     config = config.model_copy(update={"evaluate": updated(config.evaluate, workers=workers)})
-    scenes = {name: folder / "conf" / "rigidcloth" / SCENES[name] for name in SCENES}
     chosen = [item for item in release_episodes(folder) if fnmatch.fnmatch(f"{item[0]}/{item[1]}", only)]
     config = config.model_copy(update={"scenarios": [name for name in SCENES if any(item[0] == name for item in chosen)]})
     if not chosen:
         raise ConfigError(f"No published episode matches {only!r}; patterns are such as 'release_lift/*' or '*/lift_tan'.")
+    scenes = {name: folder / "conf" / "rigidcloth" / SCENES[name] for name in config.scenarios}
+    scenarios = {name: choose_scenario(name, scene) for name, scene in scenes.items()}
     _import(chosen, data / "episodes")
-    failures = _fit(config, chosen, scenes, data / "fits")
+    failures = _fit(config, chosen, scenarios, data / "fits")
     jobs = [
         job
-        for name in config.scenarios
+        for name, scenario in scenarios.items()
         for job in comparison_jobs(
             config,
             name,
+            scenario,
             fits=data / "fits",
             episodes=data / "episodes",
             regressors=data / "regressors",
             simulated=data / "simulated",
             kept=out / "episodes",
-            scene=scenes[name],
         )
         if fnmatch.fnmatch(f"{name}/{job.name}", only)
     ]
@@ -95,17 +100,14 @@ def _import(chosen: list[tuple[str, str, Episode]], folder: Path) -> None:
         write_episode(folder / name / f"{label}.npz", episode)
 
 
-def _fit(config: Config, chosen: list[tuple[str, str, Episode]], scenes: dict[str, Path], folder: Path) -> list[str]:
+def _fit(config: Config, chosen: list[tuple[str, str, Episode]], scenarios: dict[str, Scenario], folder: Path) -> list[str]:
     """Fit what is not fitted yet; messages of those that failed."""
-    jobs = [
-        FitJob(scenario=name, scene=scenes[name], name=label, episode=episode, settings=config.fit, folder=folder / name)
-        for name, label, episode in chosen
-    ]
+    jobs = [FitJob(scenarios[name], label, {label: episode}, config.fit, folder / name) for name, label, episode in chosen]
     failures = []
-    for job, _, error in run_all("fit", jobs, config.evaluate.workers):
-        errors.print(f"fitted {job.scenario}/{job.name}" if error is None else f"{job.scenario}/{job.name}: {error}")
+    for job, _, error in run_all("fit", jobs, config.evaluate.workers, patient=True):
+        errors.print(f"fitted {job.label}" if error is None else f"{job.label}: {error}")
         if error is not None:
-            failures.append(f"{job.scenario}/{job.name}: {error}")
+            failures.append(f"{job.label}: {error}")
     return failures
 
 

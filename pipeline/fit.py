@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
-from diffcloud.errors import ConfigError
-from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam, write_fit
-from diffcloud.fit.optimise import FitOutcome, Progress
+from diffcloud.errors import ConfigError, DiffCloudError
+from diffcloud.fit import FitSpace, Objective, fit_adam, read_fit, write_fit
+from diffcloud.fit.optimise import Progress
 from diffcloud.fit.result import describe_fit
 from diffcloud.io.episodes import Episode, read_episode
+from diffcloud.io.fingerprints import fingerprint
 from diffcloud.scene.scenarios import Scenario
-from pipeline.config import load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, assignments, episode_files, errors, finish, progress_bar, show
+from pipeline.config import FitConfig, load_config, updated
+from pipeline.console import JsonFlag, ParamsFile, assignments, episode_files, errors, finish, show
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
+from pipeline.workers import Tell, check_interrupt, run_all
 
 _INTERRUPTED = 130
+_SHOWN = ("loss", "loss_start", "loss_resampled", "iterations", "seconds", "stop_reason", "parameters")
+_CODE = ("mesh", "io", "sim", "scene", "clouds", "fit")
+"""Packages whose source decides the numbers of a fit."""
 
 
 def fit(
@@ -50,9 +57,10 @@ def fit(
     resample: Annotated[bool | None, typer.Option(help="New points in each iteration.")] = None,
     offset: Annotated[bool | None, typer.Option(help="Fit a rigid offset of the target along.")] = None,
     joint: Annotated[bool | None, typer.Option("--joint", help="One parameter set for all episodes.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Fits at once, each in a process with one thread.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Fit episodes. Ctrl-C writes the best so far and stops."""
+    """Fit episodes. Ctrl-C writes the best so far and stops; the same command keeps what is finished and goes on."""
     settings = updated(
         load_config(params).fit,
         parameters=None if parameters is None else [name.strip() for name in parameters.split(",")],
@@ -71,58 +79,128 @@ def fit(
         resample=resample,
         offset=offset,
         joint=joint,
+        workers=workers,
     )
     chosen = choose_scenario(scenario, scene)
     files = episode_files(episodes)
     # everything is read before anything is fitted: a damaged last file must not cost the first ones' time
     recorded = {path.stem: read_episode(path) for path in files}
-    jobs = [("joint", list(recorded))] if settings.joint else [(name, [name]) for name in recorded]
-    firsts = {name: _first_start(init, chosen, [recorded[m] for m in members]) for name, members in jobs}
-    objectives = {
-        name: Objective(
-            chosen, [recorded[m] for m in members], frames=settings.frames, points=settings.points, seed=settings.seed
-        )
-        for name, members in jobs
-    }
-    space = FitSpace.build(
-        settings.parameters,
-        bounds={**chosen.bounds, **settings.bounds},
-        fixed=settings.fixed,
-        offset=settings.offset,
-        offset_range=(0.02 / chosen.length_unit_m, 0.1),
-    )
-    adam = settings.adam(chosen)
+    groups = {"joint": recorded} if settings.joint else {name: {name: episode} for name, episode in recorded.items()}
+    jobs = [
+        FitJob(chosen, name, members, settings, out, _first_start(init, chosen, list(members.values())))
+        for name, members in groups.items()
+    ]
+    for job in jobs:
+        job.objective()
+    space = jobs[0].space
     table = Table("episode", "start", "final", "rms mm", *space.names, "iterations", "seconds", "stopped by")
     results: dict[str, Any] = {}
-    for name, members in jobs:
-        started = replace(adam, init=firsts[name])
-        outcome = _run(name, objectives[name], space, started)
-        result = describe_fit(objectives[name], space, started, outcome, episodes=members)
-        write_fit(out, name, result)
-        results[name] = {key: result.summary[key] for key in _SHOWN}
-        table.add_row(name, *_row(outcome, chosen, space))
-        for failure in outcome.failures:
-            errors.print(f"[yellow]{name}:[/] {failure}", soft_wrap=True)
-        if outcome.stop_reason == "interrupted":
-            show(table, json)
-            errors.print(f"Interrupted: the best so far is in {out / name}.json.")
-            raise typer.Exit(_INTERRUPTED)
+    failures: list[str] = []
+
+    def add(name: str, summary: Mapping[str, Any]) -> None:
+        results[name] = {key: summary[key] for key in _SHOWN}
+        table.add_row(name, *_row(summary, space))
+        for failure in summary["failures"]:
+            errors.print(f"[yellow]{name}:[/] {escape(failure)}", soft_wrap=True)
+
+    try:
+        for job, summary, error in run_all("fit", jobs, settings.workers, patient=True):
+            if error is None:
+                add(job.name, summary)
+            else:
+                failures.append(f"{job.name}: {error}")
+    except KeyboardInterrupt:
+        for job in jobs:
+            if job.name not in results and (best := job.known()) is not None:
+                add(job.name, best)
+        show(table, json)
+        errors.print(f"Interrupted: {out} has the best so far of each. The same command keeps finished fits and goes on.")
+        raise typer.Exit(_INTERRUPTED) from None
     show(table, json)
     finish({"out": str(out), "fits": results}, json)
+    if failures:
+        raise DiffCloudError("\n".join(failures))
 
 
-_SHOWN = ("loss", "loss_start", "loss_resampled", "iterations", "seconds", "stop_reason", "parameters")
+@dataclass(frozen=True)
+class FitJob:
+    """One parameter set for one or several episodes. A finished fit of the same inputs by the same code is kept."""
 
+    scenario: Scenario
+    name: str
+    episodes: Mapping[str, Episode]
+    settings: FitConfig
+    folder: Path
+    init: Mapping[str, float] = field(default_factory=dict)
+    """Values of the first start; the middle of the range where not given."""
 
-def _run(name: str, objective: Objective, space: FitSpace, adam: AdamSettings) -> FitOutcome:
-    errors.print(f"Fitting {name} ...")
-    with progress_bar(name, adam.iterations) as update:
+    @property
+    def label(self) -> str:
+        return f"{self.scenario.name}/{self.name}"
+
+    @property
+    def space(self) -> FitSpace:
+        """
+        Raises:
+            ConfigError: bounds or fixed values that do not fit the parameters.
+        """
+        settings, scenario = self.settings, self.scenario
+        return FitSpace.build(
+            settings.parameters,
+            bounds={**scenario.bounds, **settings.bounds},
+            fixed=settings.fixed,
+            offset=settings.offset,
+            offset_range=(0.02 / scenario.length_unit_m, 0.1),
+        )
+
+    def objective(self) -> Objective:
+        """
+        Raises:
+            ConfigError, EpisodeError: the episodes lack the frames of the loss, or an unknown frame.
+        """
+        settings = self.settings
+        recorded = list(self.episodes.values())
+        return Objective(self.scenario, recorded, frames=settings.frames, points=settings.points, seed=settings.seed)
+
+    def known(self) -> dict[str, Any] | None:
+        """The summary that this job, or an earlier one of the same inputs and code, has left; maybe interrupted."""
+        path = self.folder / f"{self.name}.json"
+        try:
+            summary = read_fit(path)
+        except ConfigError:  # none, or a damaged one: fitted again
+            return None
+        return summary if summary.get("fingerprint") == self._fingerprint() else None
+
+    def run(self, tell: Tell) -> dict[str, Any]:
+        """Fit, write, and return the summary.
+
+        Raises:
+            DivergedError: every start diverged.
+            KeyboardInterrupt: Ctrl-C; the best so far is written.
+        """
+        known = self.known()
+        if known is not None and known["stop_reason"] != "interrupted":
+            return known
 
         def show_progress(progress: Progress) -> None:
+            check_interrupt()
             values = "  ".join(f"{key} {value:.3g}" for key, value in progress.values.items())
-            update(progress.iteration, f"loss {progress.loss:.3e}  best {progress.best:.3e}  {values}")
+            done = progress.iteration / max(settings.iterations, 1)
+            tell(done, f"{progress.iteration}/{settings.iterations}  best {progress.best:.3e}  {values}")
 
-        return fit_adam(objective, space, adam, progress=show_progress)
+        objective, space = self.objective(), self.space
+        settings = replace(self.settings.adam(self.scenario), init=self.init)
+        outcome = fit_adam(objective, space, settings, progress=show_progress)
+        result = describe_fit(objective, space, settings, outcome, episodes=list(self.episodes))
+        result.summary["fingerprint"] = self._fingerprint()
+        write_fit(self.folder, self.name, result)
+        if outcome.stop_reason == "interrupted":
+            raise KeyboardInterrupt
+        return result.summary
+
+    def _fingerprint(self) -> str:
+        settings = self.settings.model_dump(exclude={"workers"})
+        return fingerprint([self.scenario, self.name, self.episodes, settings, self.init], packages=_CODE)
 
 
 def _first_start(init: str, scenario: Scenario, episodes: list[Episode]) -> dict[str, float]:
@@ -138,15 +216,15 @@ def _first_start(init: str, scenario: Scenario, episodes: list[Episode]) -> dict
     return {name: sum(values[name] for values in found) / len(found) for name in found[0]}
 
 
-def _row(outcome: FitOutcome, scenario: Scenario, space: FitSpace) -> list[str]:
+def _row(summary: Mapping[str, Any], space: FitSpace) -> list[str]:
     return [
-        f"{outcome.loss_start:.3e}",
-        f"{outcome.loss:.3e}",
-        f"{1e3 * scenario.length_unit_m * outcome.loss**0.5:.1f}",
-        *(f"{outcome.values[name]:.3f}" for name in space.names),
-        str(outcome.iterations),
-        f"{outcome.seconds:.1f}",
-        outcome.stop_reason,
+        f"{summary['loss_start']:.3e}",
+        f"{summary['loss']:.3e}",
+        f"{summary['rms_mm']:.1f}",
+        *(f"{summary['parameters'][name]['value']:.3f}" for name in space.names),
+        str(summary["iterations"]),
+        f"{summary['seconds']:.1f}",
+        summary["stop_reason"],
     ]
 
 

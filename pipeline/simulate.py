@@ -25,7 +25,7 @@ def simulate(
     params: ParamsFile = None,
     train: Annotated[int | None, typer.Option(help="Runs to train on.")] = None,
     test: Annotated[int | None, typer.Option(help="Runs to test on.")] = None,
-    draws: Annotated[str | None, typer.Option(help="uniform, sobol, or modes (the published mixture).")] = None,
+    draws: Annotated[str | None, typer.Option(help="uniform, sobol, logarithmic, or modes (as published).")] = None,
     parameters: Annotated[str | None, typer.Option(help="Comma-separated, e.g. stretch,mass.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of the draws and of exported clouds.")] = None,
     workers: Annotated[

@@ -62,11 +62,17 @@ def test_physics_has_no_torch_in_mesh_and_no_cloth_in_adjoint():
     assert not any(name.startswith("diffcloud") for name in imported(ROOT / "diffcloud" / "sim" / "adjoint.py"))
 
 
+def pipeline_modules(stage: str) -> set[str]:
+    """What a stage's command imports, itself or by the comparison."""
+    own = imported(ROOT / "pipeline" / f"{stage}.py")
+    return own | imported(ROOT / "pipeline" / "comparison.py") if "pipeline.comparison" in own else own
+
+
 def needed_packages(stage: str) -> set[str]:
     """Sub-packages a stage's command reaches, through whatever those import."""
     seen: set[str] = set()
     todo = packages(ROOT / "pipeline" / f"{stage}.py") & ALLOWED.keys()
-    if "pipeline.comparison" in imported(ROOT / "pipeline" / f"{stage}.py"):
+    if "pipeline.comparison" in pipeline_modules(stage):
         todo |= packages(ROOT / "pipeline" / "comparison.py") & ALLOWED.keys()
     if "scenario_options" in (ROOT / "pipeline" / f"{stage}.py").read_text(encoding="utf-8"):
         todo |= {"scene"}
@@ -86,7 +92,8 @@ def stages() -> dict:
 def test_stage_dependencies_are_the_imports(stage):
     listed = {Path(dep).name for dep in stages()[stage]["deps"] if dep.startswith("diffcloud/") and not dep.endswith(".py")}
     assert listed == needed_packages(stage)
-    assert f"pipeline/{stage}.py" in stages()[stage]["deps"]
+    modules = [stage, *(name for name in ("comparison", "workers") if f"pipeline.{name}" in pipeline_modules(stage))]
+    assert {f"pipeline/{name}.py" for name in modules} <= set(stages()[stage]["deps"])
 
 
 def test_stage_parameters_are_sections_of_the_configuration():

@@ -1,4 +1,4 @@
-"""Parameters of simulated runs: uniform, by a Sobol sequence, or as the published code draws them.
+"""Parameters of simulated runs: uniform, uniform in the logarithms, by a Sobol sequence, or as published.
 
 The published code picks one of four modes for each run (soft, medium, stiff, random) and then stretch and mass uniformly in
 the mode's ranges (PHYSICS: experiments). Draws outside of the bounds are rejected.
@@ -19,7 +19,7 @@ from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.io.simulated import SPLITS, Split
 from diffcloud.sim.properties import PARAMETERS
 
-Draws = Literal["uniform", "modes", "sobol"]
+Draws = Literal["uniform", "sobol", "logarithmic", "modes"]
 
 _MIXED = ("stretch", "mass")
 _TRIES = 64
@@ -99,6 +99,19 @@ class ParameterBox:
         points = qmc.Sobol(len(self.names), rng=rng).random_base2(math.ceil(math.log2(max(count, 1))))[:count]
         return np.asarray(low + (high - low) * points)
 
+    def logarithmic(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """[count, k] uniform in the logarithms: as many from 0.1 to 0.2 as from 5 to 10, which suits regressors that are
+        measured by relative errors. A longer draw begins with a shorter one.
+
+        Raises:
+            ConfigError: a bound that is not positive.
+        """
+        low, high = self.bounds.T
+        if (low <= 0).any():
+            raise ConfigError(f"Logarithmic draws need positive bounds, got {self.bounds.tolist()}; draw uniformly.")
+        drawn = np.exp(rng.uniform(np.log(low), np.log(high), (count, len(self.names))))
+        return np.clip(drawn, low, high)  # which rounding may have left
+
     def mixture(self, modes: Sequence[Mode], rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """[count, 2] of the modes, inside the bounds; a longer draw begins with a shorter one.
 
@@ -133,7 +146,8 @@ class ParameterDraws:
     def __post_init__(self) -> None:
         if self.kind == "modes" and self.scenario not in MODES:
             raise ConfigError(
-                f"The published modes are for {', '.join(MODES)}, not for {self.scenario!r}; use --draws uniform or sobol."
+                f"The published modes are for {', '.join(MODES)}, not for {self.scenario!r}; "
+                "use --draws uniform, sobol or logarithmic."
             )
         if self.kind == "modes" and set(self.box.names) != set(_MIXED):
             raise ConfigError(f"The published modes draw {' and '.join(_MIXED)}, not {', '.join(self.box.names)}.")
@@ -153,5 +167,7 @@ class ParameterDraws:
                 return self.box.uniform(rng, count)
             case "sobol":
                 return self.box.sobol(rng, count)
+            case "logarithmic":
+                return self.box.logarithmic(rng, count)
             case "modes":
                 return self.box.mixture(MODES[self.scenario], rng, count)

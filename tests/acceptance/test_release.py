@@ -155,6 +155,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
     import yaml
 
     import pipeline.comparison
+    import pipeline.fit
     from tests.pipeline.invoke import invoke
 
     monkeypatch.chdir(tmp_path)
@@ -174,7 +175,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
     def never(*arguments, **options):
         raise AssertionError("fitted or compared again")
 
-    monkeypatch.setattr(pipeline.comparison, "fit_adam", never)
+    monkeypatch.setattr(pipeline.fit, "fit_adam", never)
     monkeypatch.setattr(pipeline.comparison, "compare_episode", never)
     assert invoke(*command).result["metrics"]["comparison"] == found
     assert "No published episode matches" in invoke("evaluate", "release", release, "--only", "shirt*", code=1).errors

@@ -15,7 +15,7 @@ def draws(kind, scenario="band_stretch", *, box=BOX, seed=0) -> ParameterDraws:
     return ParameterDraws(box, kind, scenario, seed)
 
 
-@pytest.mark.parametrize("kind", ["uniform", "sobol", "modes"])
+@pytest.mark.parametrize("kind", ["uniform", "sobol", "logarithmic", "modes"])
 def test_draws_are_inside_seeded_and_unlike_each_other(kind):
     first = draws(kind).first("train", 300)
     assert first.shape == (300, 2)
@@ -30,6 +30,17 @@ def test_draws_are_inside_seeded_and_unlike_each_other(kind):
 def test_both_fill_the_box_evenly(kind):
     quarters = (draws(kind).first("train", 1024) > 5.05) @ [1, 2]
     assert np.bincount(quarters) == pytest.approx([256] * 4, abs=1 if kind == "sobol" else 60)
+
+
+def test_logarithmic_draws_fill_every_factor_alike():
+    halves = (draws("logarithmic").first("train", 1024) > 1) @ [1, 2]  # 1 is the middle of [0.1, 10]
+    assert np.bincount(halves) == pytest.approx([256] * 4, abs=60)
+
+
+def test_logarithmic_draws_need_positive_bounds():
+    box = ParameterBox.build(["mass"], {"mass": (0.0, 3.0)})
+    with pytest.raises(ConfigError, match="positive bounds"):
+        draws("logarithmic", box=box).first("train", 3)
 
 
 @pytest.mark.parametrize("scenario", MODES)
@@ -57,7 +68,7 @@ def test_columns_follow_the_names():
     np.testing.assert_array_equal(swapped[:, ::-1], draws("modes").first("train", 50))
 
 
-@pytest.mark.parametrize("kind", ["uniform", "sobol", "modes"])
+@pytest.mark.parametrize("kind", ["uniform", "sobol", "logarithmic", "modes"])
 def test_a_replacement_depends_on_run_and_attempt(kind):
     again = draws(kind).again("train", 7, 1)
     assert again.shape == (2,)

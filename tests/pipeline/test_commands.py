@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import subprocess
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -93,22 +96,64 @@ def test_a_process_says_what_is_wrong_without_a_traceback(work):
     assert "Traceback" not in done.stderr
 
 
-def test_interrupted_fit_leaves_the_best_so_far(work, monkeypatch):
+def test_interrupted_fit_leaves_the_best_so_far_and_goes_on(work, monkeypatch):
     calls = []
 
     def evaluate(self, *arguments):
         calls.append(0)
-        if len(calls) == 4:
+        if len(calls) == 20:
             raise KeyboardInterrupt  # as Ctrl-C does
         return evaluated(self, *arguments)
 
     evaluated = Objective.__call__
     monkeypatch.setattr(Objective, "__call__", evaluate)
-    done = run("fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 100, "e1.npz", cwd=work, code=130)
+    write_episode(work / "e2.npz", clouds_of(small_lift(), stretch=1.7, mass=1.0))
+    command = ("fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 10, "e1.npz", "e2.npz")
+    done = run(*command, cwd=work, code=130)
     assert "best so far" in done.errors
-    summary = json.loads((work / "fits" / "e1.json").read_text())
-    assert summary["stop_reason"] == "interrupted"
-    assert summary["loss"] <= summary["loss_start"]
+    first, second = (json.loads((work / "fits" / f"{name}.json").read_text()) for name in ("e1", "e2"))
+    assert (first["stop_reason"], second["stop_reason"]) == ("iterations", "interrupted")
+    assert second["loss"] <= second["loss_start"]
+    calls[:] = [0] * 20  # no more interrupts
+    assert run(*command, cwd=work).result["fits"]["e1"]["seconds"] == first["seconds"]  # kept
+    assert json.loads((work / "fits" / "e2.json").read_text())["iterations"] == 10
+    begun = len(calls)
+    run(*command, "--seed", 1, cwd=work)  # another fit
+    assert len(calls) > begun
+
+
+def test_processes_give_the_same_fits(work):
+    write_episode(work / "e2.npz", clouds_of(small_lift(), stretch=1.7, mass=1.0))
+    found = {}
+    for workers in (1, 2):
+        run(
+            "fit", "--scenario", "small.yaml", "--out", f"by{workers}", "--iterations", 2, "--workers", workers,
+            "e1.npz", "e2.npz", cwd=work,
+        )  # fmt: skip
+        summaries = [json.loads((work / f"by{workers}" / f"{name}.json").read_text()) for name in ("e1", "e2")]
+        found[workers] = [{**summary, "seconds": 0} for summary in summaries]
+    assert found[1] == found[2]
+
+
+def test_ctrl_c_stops_fits_in_processes_and_keeps_their_best(work):
+    write_episode(work / "easy.npz", clouds_of(small_lift(), stretch=5.05, mass=5.05))  # below the threshold at once
+    moved = clouds_of(small_lift(), stretch=1.7, mass=1.0)
+    write_episode(work / "e2.npz", replace(moved, points=moved.points + 0.03))  # out of reach
+    command = [*DIFFCLOUD, "fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", "1000000", "--workers", "2"]
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(
+        [*command, "--threshold", "5e-5", "easy.npz", "e2.npz"], cwd=work, env=env, stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 60
+    while not (work / "fits" / "easy.json").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(3)  # the other process began when this one did
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert "Traceback" not in said
+    reasons = [json.loads((work / "fits" / f"{name}.json").read_text())["stop_reason"] for name in ("easy", "e2")]
+    assert reasons == ["threshold", "interrupted"]
 
 
 def test_import_own_clouds_end_to_end(work):

@@ -106,7 +106,7 @@ def test_settings_come_from_the_parameter_file_and_options_win(work):
     ("arguments", "message"),
     [
         (("--parameters", "weight"), "Unknown parameter 'weight'"),
-        (("--draws", "gauss"), "draws: Input should be 'uniform', 'modes' or 'sobol'"),
+        (("--draws", "gauss"), "draws: Input should be 'uniform', 'sobol', 'logarithmic' or 'modes'"),
         (("--draws", "modes"), "not for 'small'"),
         (("--train", "-1"), "train: "),
         (("--train", "0", "--test", "0"), "at least one run"),

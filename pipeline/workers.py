@@ -1,0 +1,118 @@
+"""Many independent jobs, in this process or in several."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from multiprocessing.synchronize import Event
+from typing import Any, Protocol, TypeVar
+
+import torch
+
+from diffcloud.errors import DiffCloudError
+from pipeline.console import progress_bar
+
+Tell = Callable[[float, str], None]
+"""What a job may call with (fraction done, text)."""
+
+_stop: Event | None = None
+"""Of a worker: set when Ctrl-C was pressed."""
+
+
+class Job(Protocol):
+    """Travels to another process, and so does what it gives."""
+
+    @property
+    def label(self) -> str:
+        """What a progress display shows."""
+
+    def run(self, tell: Tell) -> Any:
+        """
+        Raises:
+            DiffCloudError: an error of this job alone; the others go on.
+        """
+
+
+AnyJob = TypeVar("AnyJob", bound=Job)
+
+
+def run_all(
+    title: str, jobs: Sequence[AnyJob], workers: int, *, patient: bool = False
+) -> Iterator[tuple[AnyJob, Any, str | None]]:
+    """(job, what it gave, message of its error) in the order of the jobs.
+
+    Args:
+        workers: processes, each with one thread; 1: this one.
+        patient: after Ctrl-C, wait for running jobs, which look at `check_interrupt`; else their processes end at once.
+
+    Raises:
+        DiffCloudError: a process died.
+        KeyboardInterrupt: Ctrl-C.
+    """
+    with progress_bar(title, len(jobs)) as update:
+        if workers == 1 or len(jobs) < 2:
+            for index, job in enumerate(jobs):
+                update(index, job.label)
+                yield (job, *_attempt(job, partial(_tell, update, index, job.label)))
+            return
+        context = multiprocessing.get_context("spawn")  # not forked: a fork of a process with torch's threads may hang
+        stop = context.Event()
+        with ProcessPoolExecutor(
+            min(workers, len(jobs)), mp_context=context, initializer=_begin, initargs=(stop, patient)
+        ) as pool:
+            results = [pool.submit(_attempt, job) for job in jobs]
+            try:
+                for index, (job, result) in enumerate(zip(jobs, results, strict=True)):
+                    found = result.result()
+                    update(index + 1, job.label)
+                    yield (job, *found)
+            except BrokenProcessPool as error:
+                raise DiffCloudError(
+                    "A worker process died, as one does that gets no more memory. Try fewer --workers."
+                ) from error
+            except BaseException:  # Ctrl-C, or nobody wants the rest
+                stop.set()
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+
+def check_interrupt() -> None:
+    """For a job in a worker, now and then.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C was pressed.
+    """
+    if _stop is not None and _stop.is_set():
+        raise KeyboardInterrupt
+
+
+def _attempt(job: Job, tell: Tell = lambda done, text: None) -> tuple[Any, str | None]:
+    try:
+        return job.run(tell), None
+    except DiffCloudError as error:
+        return None, str(error)
+
+
+def _tell(update: Callable[[float, str], None], index: int, label: str, done: float, text: str) -> None:
+    update(index + done, f"{label}  {text}")
+
+
+def _begin(stop: Event, patient: bool) -> None:
+    """Of a worker: Ctrl-C is the parent's, and one thread is its share of the cores."""
+    global _stop
+    _stop = stop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+    if not patient:
+        threading.Thread(target=_end_at, args=(stop,), daemon=True).start()
+
+
+def _end_at(stop: Event) -> None:
+    stop.wait()
+    os._exit(0)
