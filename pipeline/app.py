@@ -17,6 +17,7 @@ from pipeline.doctor import doctor
 from pipeline.episodes import episodes
 from pipeline.evaluate_release import release
 from pipeline.gradients import gradients
+from pipeline.memory import keep_freed_memory
 from pipeline.predict import predict
 from pipeline.preprocess import preprocess
 from pipeline.recordings import recordings
@@ -57,6 +58,7 @@ def main() -> None:
     # spinning costs tenfold. OMP_NUM_THREADS overrides.
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)
+    keep_freed_memory()
     try:
         app()
     except DiffCloudError as error:

@@ -17,6 +17,7 @@ import torch
 
 from diffcloud.errors import DiffCloudError
 from pipeline.console import progress_bar
+from pipeline.memory import keep_freed_memory
 
 Tell = Callable[[float, str], None]
 """What a job may call with (fraction done, text)."""
@@ -109,6 +110,7 @@ def _begin(stop: Event, patient: bool) -> None:
     _stop = stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
+    keep_freed_memory()
     if not patient:
         threading.Thread(target=_end_at, args=(stop,), daemon=True).start()
 
