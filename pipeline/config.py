@@ -198,6 +198,7 @@ class TrainConfig(Section):
     loss: Loss | None = None
     target: Target | None = None
     augment: bool | None = None
+    subtract_background: bool | None = None
     heteroscedastic: bool | None = None
     patience: Count | None = None
     seed: int | None = None

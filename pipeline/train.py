@@ -35,6 +35,7 @@ def train(
     loss: Annotated[str | None, typer.Option(help="normalised: L1 of fractions of the bounds; raw: in own units.")] = None,
     target: Annotated[str | None, typer.Option(help="linear, or logarithmic: errors count by their ratio.")] = None,
     augment: Annotated[bool | None, typer.Option(help="Hide parts of the clouds and add noise.")] = None,
+    subtract_background: Annotated[bool | None, typer.Option(help="Leave the known obstacle out of the clouds.")] = None,
     heteroscedastic: Annotated[
         bool | None, typer.Option("--heteroscedastic", help="Learn a width of each prediction along.")
     ] = None,
@@ -56,6 +57,7 @@ def train(
         loss=loss,
         target=target,
         augment=augment,
+        subtract_background=subtract_background,
         heteroscedastic=heteroscedastic,
         patience=patience,
         seed=seed,

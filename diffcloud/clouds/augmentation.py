@@ -7,12 +7,14 @@ functions of a run's key (`keyed_random`): a cloud does not depend on the batch 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloud.clouds.background import Background
 from diffcloud.clouds.keyed_random import normal, stream_keys, uniform
 from diffcloud.clouds.sampling import points_on_faces, uniform_barycentric
 from diffcloud.errors import ConfigError
@@ -21,6 +23,8 @@ from diffcloud.mesh.topology import SurfaceMesh
 
 _SETTINGS, _NODES, _FACES, _POINTS = range(4)
 """Streams of a run."""
+_SPARE = 1.5
+"""Points drawn for each one needed where some may be the background's; where that is too few, points are repeated."""
 
 
 @dataclass(frozen=True)
@@ -67,14 +71,22 @@ class CloudMaker:
     augmentation: Augmentation
     jitter: float
     """Largest standard deviation of the node noise, in the scene's length unit."""
+    background: Background | None
+    """Left out of the clouds; then the obstacle is not sampled at all."""
 
     @staticmethod
     def build(
-        simulated: SimulatedSet, augmentation: Augmentation, *, points: int, device: torch.device | str = "cpu"
+        simulated: SimulatedSet,
+        augmentation: Augmentation,
+        *,
+        points: int,
+        background: Background | None = None,
+        device: torch.device | str = "cpu",
     ) -> CloudMaker:
         """
         Args:
             points: of each cloud.
+            background: the set's obstacle, if it is to be left out, together with the cloth that touches it.
 
         Raises:
             ConfigError: no points.
@@ -84,7 +96,8 @@ class CloudMaker:
         cloth = simulated.faces
         if simulated.loss_faces is not None and augmentation.loss_faces_only:
             cloth = cloth[simulated.loss_faces]
-        body = simulated.obstacle or SurfaceMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+        nothing = SurfaceMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+        body = simulated.obstacle if simulated.obstacle is not None and background is None else nothing
         faces = np.concatenate([cloth, body.faces + simulated.nodes.shape[2]])
         return CloudMaker(
             torch.as_tensor(faces, device=device),
@@ -93,6 +106,7 @@ class CloudMaker:
             points,
             augmentation,
             augmentation.jitter_m / simulated.length_unit_m,
+            background,
         )
 
     def clouds(self, nodes: Tensor, keys: Tensor) -> Tensor:
@@ -112,11 +126,14 @@ class CloudMaker:
             nodes = nodes + (self.jitter * deviation)[..., None, None] * noise
         body = self.obstacle.expand(batch, frames, -1, -1)
         flat = torch.cat([nodes, body], dim=2).flatten(0, 1)
-        face_number, first, second = uniform(stream_keys(_POINTS, keys), frames * self.points).unbind(-1)
-        place = uniform_barycentric(first, second).view(batch * frames, self.points, 3)
-        choice = face_number.view(batch * frames, self.points)
+        drawn = self.points if self.background is None else math.ceil(_SPARE * self.points)
+        face_number, first, second = uniform(stream_keys(_POINTS, keys), frames * drawn).unbind(-1)
+        place = uniform_barycentric(first, second).view(batch * frames, drawn, 3)
+        choice = face_number.view(batch * frames, drawn)
         weights = self._sampled_faces(fraction, keys, frames)
         found = points_on_faces(flat, self.faces, choice, place, weights=weights.flatten(0, 1))
+        if self.background is not None:
+            found = self.background.first_free(found, self.points)
         return found.view(batch, frames, self.points, 3)
 
     def _sampled_faces(self, fraction: Tensor, keys: Tensor, frames: int) -> Tensor:

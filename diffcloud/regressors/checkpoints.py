@@ -11,14 +11,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from diffcloud.clouds.background import Background
 from diffcloud.errors import CheckpointError
 from diffcloud.io.files import atomic_path
+from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.regressors.grouping import Order
 from diffcloud.regressors.networks import ModelName, build_network
 from diffcloud.regressors.settings import Target
@@ -28,6 +31,31 @@ _LARGEST_BYTES = 2**30
 _WIDEST = 5.0
 """Bound of the logarithm of a predicted width: what is beyond is an accident of the last layer."""
 Count = Annotated[int, Field(ge=1, le=10**6)]
+
+
+class BackgroundBody(BaseModel):
+    """What is left out of clouds before a network sees them."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    nodes: Annotated[tuple[tuple[float, float, float], ...], Field(min_length=3, max_length=10**5)]
+    """[length unit]"""
+    faces: Annotated[tuple[tuple[int, int, int], ...], Field(min_length=1, max_length=10**5)]
+    reach: Annotated[float, Field(gt=0)]
+    """What is nearer is the body's [length unit]."""
+
+    @model_validator(mode="after")
+    def _faces_exist(self) -> Self:
+        if not all(0 <= node < len(self.nodes) for face in self.faces for node in face):
+            raise ValueError(f"faces must name nodes 0 to {len(self.nodes) - 1}")
+        return self
+
+    @staticmethod
+    def of(body: SurfaceMesh, reach: float) -> BackgroundBody:
+        return BackgroundBody(nodes=body.nodes.tolist(), faces=body.faces.tolist(), reach=reach)
+
+    def build(self, device: torch.device | str = "cpu") -> Background:
+        return Background.build(SurfaceMesh(np.array(self.nodes), np.array(self.faces)), self.reach, device=device)
 
 
 class Description(BaseModel):
@@ -54,6 +82,7 @@ class Description(BaseModel):
     length: Annotated[float, Field(gt=0)]
     """The scenario's length: clouds are divided by it [length unit]."""
     length_unit_m: Annotated[float, Field(gt=0)] = 1.0
+    background: BackgroundBody | None = None
     order: Order = "cloud"
     density: Annotated[float, Field(gt=0, le=1)] = 1.0
     spread: tuple[float, ...]

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from diffcloud.clouds.augmentation import Augmentation, CloudMaker, run_keys
+from diffcloud.clouds.background import Background
 from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.io.simulated import SimulatedSet
 
@@ -32,6 +33,7 @@ class CloudDataset(Dataset[tuple[Tensor, Tensor]]):
         *,
         frames: Frames = "loss",
         points: int = 3500,
+        background: Background | None = None,
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -40,6 +42,7 @@ class CloudDataset(Dataset[tuple[Tensor, Tensor]]):
             augmentation: default the paper's; `Augmentation.none()` for whole surfaces without noise.
             frames: "loss": the frame of the scenario's loss, T' = 1; "all": those of a recorded episode.
             points: of each cloud.
+            background: left out of the clouds.
             device: where clouds are made.
 
         Raises:
@@ -54,7 +57,7 @@ class CloudDataset(Dataset[tuple[Tensor, Tensor]]):
         self.times = torch.as_tensor(simulated.times[chosen])
         """[T'] of the clouds since the start [s]."""
         augmentation = Augmentation() if augmentation is None else augmentation
-        self._maker = CloudMaker.build(simulated, augmentation, points=points, device=device)
+        self._maker = CloudMaker.build(simulated, augmentation, points=points, background=background, device=device)
         self._nodes = torch.as_tensor(simulated.nodes[:, chosen], device=device)
         low, high = torch.as_tensor(simulated.bounds).T
         scaled = (torch.as_tensor(simulated.parameters) - low) / (high - low)

@@ -14,9 +14,9 @@ from diffcloud.regressors.checkpoints import Prediction, Regressor
 def episode_clouds(regressor: Regressor, episode: Episode, *, seed: int = 0) -> Tensor:
     """The frames of an episode that a regressor sees, each thinned to its number of points.
 
-    Each is the recorded frame nearest in time, so that recordings of other rates, or that begin with the first moved frame,
-    fit as well. Points are drawn without repeats where there are enough: the order of a recording, by camera and by row,
-    must not decide which points a network groups.
+    What the regressor knows as background is left out. Each is the recorded frame nearest in time, so that recordings of
+    other rates, or that begin with the first moved frame, fit as well. Points are drawn without repeats where there are
+    enough: the order of a recording, by camera and by row, must not decide which points a network groups.
 
     Args:
         seed: of the choice of points.
@@ -38,9 +38,13 @@ def episode_clouds(regressor: Regressor, episode: Episode, *, seed: int = 0) -> 
             f"from {episode.times[0]:.3g} to {episode.times[-1]:.3g} s. Record the whole motion of {told.scenario}."
         )
     rng = np.random.default_rng(seed)
+    background = None if told.background is None else told.background.build()
     clouds = []
     for index in chosen:  # frames are ragged
         cloud = episode.frame(int(index))
+        if background is not None:
+            free = cloud[~background.holds(torch.from_numpy(cloud)).numpy()]
+            cloud = free if len(free) else cloud
         clouds.append(cloud[rng.choice(len(cloud), told.points, replace=len(cloud) < told.points)])
     return torch.from_numpy(np.stack(clouds))[None]
 

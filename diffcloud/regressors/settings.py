@@ -17,6 +17,8 @@ Target = Literal["linear", "logarithmic"]
 weighs errors by their ratio, and keeps predictions positive."""
 Profile = Literal["quick", "reduced", "paper"]
 PROFILE_NAMES: tuple[Profile, ...] = get_args(Profile)
+BACKGROUND_REACH_M = 0.01
+"""What is nearer to the obstacle counts as its [m]: more than a depth camera's noise, less than a fold."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,9 @@ class TrainingSettings:
     augment: bool = True
     patience: int | None = None
     """Stop after so many epochs without a better validation; None: never."""
+    subtract_background: bool = False
+    """Leave out of the clouds what is nearer than 1 cm to the scenario's obstacle (the pole, the hook), whose place is
+    known. Without, most points may show what is the same in every cloud."""
     dropout: float | None = None
     """In the head; None for the model's own."""
     order: Order = "cloud"
@@ -67,7 +72,7 @@ class TrainingSettings:
 
 
 _PAPER = TrainingSettings()
-_SHORT = replace(_PAPER, schedule="cosine", order="nearest", dropout=0.0, batch_size=16)
+_SHORT = replace(_PAPER, schedule="cosine", order="nearest", dropout=0.0, batch_size=16, subtract_background=True)
 PROFILES: Mapping[Profile, Mapping[ModelName, TrainingSettings]] = {
     "quick": {
         "mlp": replace(_SHORT, points=128, epochs=16),

@@ -32,10 +32,17 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 import diffcloud
 from diffcloud.errors import ConfigError, TrainingError
 from diffcloud.io.files import atomic_path, write_json
-from diffcloud.regressors.checkpoints import Description, OutputScale, Regressor, laplace_reach, split_outputs
+from diffcloud.regressors.checkpoints import (
+    BackgroundBody,
+    Description,
+    OutputScale,
+    Regressor,
+    laplace_reach,
+    split_outputs,
+)
 from diffcloud.regressors.dataset import Augmentation, CloudDataset, SimulatedSet
 from diffcloud.regressors.networks import ModelName, frames_seen
-from diffcloud.regressors.settings import Loss, TrainingSettings
+from diffcloud.regressors.settings import BACKGROUND_REACH_M, Loss, TrainingSettings
 
 Device = Literal["auto", "cpu", "gpu"]
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
@@ -111,6 +118,7 @@ def train_regressor(
         centre=centre,
         length=length,
         length_unit_m=train.length_unit_m,
+        background=clouds.background,
         order=settings.order,
         density=settings.density,
         spread=(1.0,) * len(train.names),
@@ -156,6 +164,7 @@ class _Clouds:
 
     train: CloudDataset
     test: CloudDataset
+    background: BackgroundBody | None
     draws: int
     """Of the training set that are used."""
     validation: list[int]
@@ -165,14 +174,17 @@ class _Clouds:
     def build(model: ModelName, train: SimulatedSet, test: SimulatedSet, settings: TrainingSettings) -> _Clouds:
         augmentation = Augmentation() if settings.augment else Augmentation.none()
         frames = frames_seen(model)
+        body = train.obstacle if settings.subtract_background else None
+        described = None if body is None else BackgroundBody.of(body, BACKGROUND_REACH_M / train.length_unit_m)
+        background = None if described is None else described.build()
         # the test clouds stay the same in all epochs, and have random numbers of their own
         sets = [
-            CloudDataset(simulated, augmentation, frames=frames, points=settings.points, seed=seed)
+            CloudDataset(simulated, augmentation, frames=frames, points=settings.points, background=background, seed=seed)
             for simulated, seed in ((train, settings.seed), (test, settings.seed + 1))
         ]
         split = max(1, round(_VALIDATION * len(sets[1])))
         draws = min(len(sets[0]), settings.draws or len(sets[0]))
-        return _Clouds(sets[0], sets[1], draws, list(range(split)), list(range(split, len(sets[1]))))
+        return _Clouds(sets[0], sets[1], described, draws, list(range(split)), list(range(split, len(sets[1]))))
 
 
 def _centre_and_length(dataset: CloudDataset) -> tuple[tuple[float, float, float], float]:

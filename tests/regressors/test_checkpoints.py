@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -143,3 +144,30 @@ def test_other_files_are_refused(tmp_path):
     save_file({"x": torch.zeros(1)}, path)
     with pytest.raises(CheckpointError, match="lacks the description"):
         Regressor.read(path)
+
+
+WALL = {"nodes": ((2.0, -9, -9), (2.0, 9, -9), (2.0, 0, 9)), "faces": ((0, 1, 2),), "reach": 0.1}
+
+
+@pytest.mark.parametrize("model", MODEL_NAMES)
+def test_what_is_background_changes_no_prediction(tmp_path, model):
+    knowing = regressor(model, background=WALL)
+    knowing.write(tmp_path / "a.safetensors")
+    knowing = Regressor.read(tmp_path / "a.safetensors")
+    plain = episode(points=30)
+    frames = [plain.frame(index) for index in range(plain.frame_count)]
+    wall = np.random.default_rng(0).uniform(-1, 1, (70, 3)).astype(np.float32)
+    wall[:, 0] = 2.05
+    walled = Episode.from_frames([np.concatenate([wall, frame]) for frame in frames], plain.times)
+    expected = predict_episode(knowing, plain).values
+    torch.testing.assert_close(predict_episode(knowing, walled).values, expected, rtol=0, atol=1e-5)
+    assert not torch.allclose(predict_episode(regressor(model), walled).values, expected, rtol=0, atol=1e-4)
+
+
+def test_a_background_of_missing_nodes_is_refused(tmp_path):
+    regressor(background=WALL).write(tmp_path / "a.safetensors")
+    metadata = {"diffcloud": json.dumps({**regressor(background=WALL).description.model_dump(), "background": {
+        **WALL, "faces": ((0, 1, 3),)}})}  # fmt: skip
+    save_file(load_file(tmp_path / "a.safetensors"), tmp_path / "b.safetensors", metadata=metadata)
+    with pytest.raises(CheckpointError, match="background: Value error, faces must name nodes 0 to 2"):
+        Regressor.read(tmp_path / "b.safetensors")

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from diffcloud.errors import ConfigError, TrainingError
+from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.regressors import MODEL_NAMES, PROFILE_NAMES, Regressor, TrainingSettings, profile_settings
 from diffcloud.regressors.checkpoints import OutputScale
 from diffcloud.regressors.training import parameter_loss, train_regressor
@@ -181,3 +182,15 @@ def test_a_git_folder_around_it_is_left_alone(tmp_path, monkeypatch):
     train(tmp_path, settings=replace(TINY, epochs=1))
     assert sorted(repository.rglob("*")) == before
     assert (tmp_path / "m" / "plots" / "metrics" / "validation_loss.tsv").exists()
+
+
+def test_the_background_is_learned_without_and_kept_for_predictions(tmp_path):
+    pole = SurfaceMesh(np.array([[5.0, 0, 0], [6, 0, 0], [5, 0, 9]]), np.array([[0, 1, 2]]))
+    sets = [replace(sagging_sheet(runs, seed=seed), obstacle=pole) for runs, seed in ((24, 0), (10, 1))]
+    lengths = {}
+    for subtract in (True, False):
+        settings = replace(TINY, epochs=1, subtract_background=subtract)
+        told = train_regressor("mlp", *sets, settings, tmp_path / "m.safetensors", device="cpu").regressor.description
+        assert (told.background is not None) == subtract
+        lengths[subtract] = told.length
+    assert lengths[True] < 2 < 5 < lengths[False]
