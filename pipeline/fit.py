@@ -106,6 +106,7 @@ def fit(
     try:
         for job, summary, error in run_all("fit", jobs, settings.workers, patient=True):
             if error is None:
+                errors.print(f"{job.label}: loss {summary['loss_start']:.3e} -> {summary['loss']:.3e}")
                 add(job.name, summary)
             else:
                 failures.append(f"{job.name}: {error}")
