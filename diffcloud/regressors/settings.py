@@ -80,7 +80,7 @@ PROFILES: Mapping[Profile, Mapping[ModelName, TrainingSettings]] = {
         "meteornet": replace(_SHORT, points=16, epochs=12, density=0.125),
     },
     "reduced": {
-        "mlp": replace(_SHORT, points=512, epochs=40),
+        "mlp": replace(_SHORT, points=512, epochs=60),
         "pointnet2": replace(_SHORT, points=512, epochs=18, density=0.25),
         "meteornet": replace(_SHORT, points=64, epochs=30, density=0.25),
     },
