@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.io.simulated import SPLITS, Split
@@ -95,6 +94,8 @@ class ParameterBox:
 
     def sobol(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """[count, k] of a scrambled Sobol sequence."""
+        from scipy.stats import qmc  # takes as long to import as all of scipy else
+
         low, high = self.bounds.T
         points = qmc.Sobol(len(self.names), rng=rng).random_base2(math.ceil(math.log2(max(count, 1))))[:count]
         return np.asarray(low + (high - low) * points)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from diffcloud.clouds.losses import one_sided_chamfer
@@ -175,6 +174,8 @@ def track_displacement(episode: Episode, steps: int, time_step: float) -> np.nda
         return np.zeros((steps, 3))
     times, positions = episode.times, episode.gripper
     at = np.clip(np.cumsum(np.full(steps, time_step)), times[0], times[-1])
+    from scipy.interpolate import CubicSpline  # slow to import, and needed for recorded grippers alone
+
     return np.asarray(CubicSpline(times, positions)(at) - positions[0])
 
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.stats import qmc
 from torch import Tensor
 
 from diffcloud.errors import ConfigError, unknown_name
@@ -122,6 +121,8 @@ class FitSpace:
                 middle[index] = np.clip(first[name], low[index], high[index])
         values = np.repeat(middle[None], count, axis=0)
         if count > 1:
+            from scipy.stats import qmc  # takes as long to import as all of scipy else
+
             sobol = qmc.Sobol(len(low), seed=seed).random_base2(math.ceil(math.log2(count)))[: count - 1]
             safe = np.where(low > 0, low, 1.0)
             logs = safe * np.where(low > 0, high / safe, 1.0) ** sobol

@@ -7,7 +7,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from diffcloud.errors import MeshError
 from diffcloud.mesh.topology import ClothMesh, FloatArray, IntArray, SurfaceMesh
@@ -322,6 +321,8 @@ def _on_half_ellipse(arc: FloatArray, depth: float, length: float) -> tuple[Floa
         """[samples] arc length from the top at each angle."""
         speed = np.hypot(semi_axis * np.cos(angle), depth * np.sin(angle))
         return np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(angle))])
+
+    from scipy.optimize import brentq  # slow to import, and needed by few meshes
 
     semi_axis = float(brentq(lambda a: quarter(a)[-1] - length / 2, 1e-3 * length, length))
     at = np.interp(np.abs(arc), quarter(semi_axis), angle)

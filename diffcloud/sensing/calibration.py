@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
 from diffcloud.errors import CalibrationError
@@ -251,6 +250,8 @@ def _refine(
         return np.concatenate(errors)
 
     zero = np.zeros(6 * (len(names) + 1))
+    from scipy.optimize import least_squares  # slow to import
+
     found = least_squares(
         chain, zero, jac=lambda step: _jacobian(chain, step), loss="soft_l1", f_scale=_ROBUST_PX, x_scale="jac"
     )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import CameraInfo
@@ -95,7 +95,7 @@ class DepthCamera:
         measured = np.where(edge & (draw < noise.flying), near + rng.random(z.shape) * (far - near), measured)
         lost = hidden | (edge & (draw > 1 - noise.edge_dropout))
         if noise.holes > 0:
-            lost |= _smooth(rng, z.shape, _HOLE_RADIUS_PX) > norm.isf(noise.holes)
+            lost |= _smooth(rng, z.shape, _HOLE_RADIUS_PX) > -ndtri(noise.holes)
         units = np.rint(measured / DEPTH_SCALE_M)
         return np.where(seen & ~lost, units, 0.0).astype(np.uint16)
 

@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.optimize import nnls
 from torch import Tensor
 
 from diffcloud.errors import UnresolvedContactError
@@ -385,6 +384,8 @@ def _least_distance(matrix: Tensor, right: Tensor) -> tuple[Tensor, bool]:
 
     def active(regular: float) -> tuple[Tensor, float]:
         lower = np.linalg.cholesky(values + regular * np.eye(len(values)))
+        from scipy.optimize import nnls  # slow to import, and seldom needed
+
         force, _ = nnls(lower.T, np.linalg.solve(lower, target), maxiter=30 * len(values))
         return torch.as_tensor(force > 0, device=matrix.device), float((target - values @ force).max())
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -84,6 +83,8 @@ class Bodies:
         """
         points, index, masses, gyrations, centres = [], [], [], [], []
         for number, body in enumerate(bodies):
+            import trimesh  # slow to import, and most scenes have no bodies
+
             solid = trimesh.Trimesh(body.mesh.nodes, body.mesh.faces, process=False)
             if not solid.is_watertight or solid.volume <= 0:
                 raise SceneError(
