@@ -7,6 +7,7 @@ boxes that share a cell are compared; the few boxes much larger than the rest (a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -35,14 +36,27 @@ class Boxes:
         return Boxes(low, high)
 
 
-def overlapping(first: Boxes, second: Boxes) -> tuple[Tensor, Tensor, Tensor]:
+class Eligible(Protocol):
+    """Of which pairs of two lists an overlap matters, whatever their places."""
+
+    def __call__(self, a: Tensor, b: Tensor) -> Tensor:
+        """bool of pairs by their indices in both lists, which are broadcast."""
+
+    @property
+    def table(self) -> Tensor:
+        """bool [N, M] of all pairs: kept, since it is asked for in every step."""
+
+
+def overlapping(first: Boxes, second: Boxes, eligible: Eligible) -> tuple[Tensor, Tensor, Tensor]:
     """(entry [P], index in `first` [P], index in `second` [P]) of the boxes that overlap, in lexicographic order."""
     if first.low.shape[1] * second.low.shape[1] <= _ALL_PAIRS:
-        return _all_pairs(first, second)
-    return _grid_pairs(first, second)
+        return _all_pairs(first, second, eligible.table)
+    entry, a, b = _grid_pairs(first, second)
+    kept = eligible(a, b).nonzero().flatten()
+    return entry[kept], a[kept], b[kept]
 
 
-def _all_pairs(first: Boxes, second: Boxes) -> tuple[Tensor, Tensor, Tensor]:
+def _all_pairs(first: Boxes, second: Boxes, eligible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     # axis by axis in memory, which the comparisons need to be vectorised
     low_a, high_a, low_b, high_b = (t.movedim(-1, 0).contiguous() for t in (first.low, first.high, second.low, second.high))
     together = low_a[0, :, :, None] <= high_b[0, :, None]
@@ -50,6 +64,7 @@ def _all_pairs(first: Boxes, second: Boxes) -> tuple[Tensor, Tensor, Tensor]:
     for axis in (1, 2):
         together &= low_a[axis, :, :, None] <= high_b[axis, :, None]
         together &= low_b[axis, :, None] <= high_a[axis, :, :, None]
+    together &= eligible
     entry, a, b = together.nonzero(as_tuple=True)
     return entry, a, b
 

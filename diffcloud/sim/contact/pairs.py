@@ -76,29 +76,16 @@ def candidates(
         corners = tuple(place[:, primitives.flatten()].view(len(place), *primitives.shape, 3).detach() for place in places)
         return Boxes.around(corners, 0.5 * margin)
 
-    entry, point, face = overlapping(boxes(surface.points[:, None]), boxes(surface.faces))
+    partners = surface.all_partners if among_fixed else surface.partners
+    entry, point, face = overlapping(boxes(surface.points[:, None]), boxes(surface.faces), partners.point_face)
     corner = torch.cat([surface.points[point][:, None], surface.faces[face]], dim=1)
-    keep = _may_touch(surface, corner[:, 0], corner[:, 1], among_fixed) & (corner[:, :1] != corner[:, 1:]).all(-1)
     area = torch.minimum(surface.point_area[point], surface.face_area[face])
-    point_face = Pairs("point_face", entry, corner, torch.stack([point, face], 1), area).where(keep)
+    point_face = Pairs("point_face", entry, corner, torch.stack([point, face], 1), area)
 
-    # of two edges at least one can move, and two that can move are met in both orders
-    moves = surface.movable[surface.owner[surface.edges[:, 0]]] | among_fixed
-    edge_boxes, moving = boxes(surface.edges), moves.nonzero().flatten()
-    entry, first, second = overlapping(Boxes(edge_boxes.low[:, moving], edge_boxes.high[:, moving]), edge_boxes)
+    edge_boxes, moving = boxes(surface.edges), partners.first_edges
+    first_boxes = Boxes(edge_boxes.low[:, moving], edge_boxes.high[:, moving])
+    entry, first, second = overlapping(first_boxes, edge_boxes, partners.edge_edge)
     first = moving[first]
-    once = (first < second) | ~moves[second]
-    entry, first, second = entry[once], first[once], second[once]
     corner = torch.cat([surface.edges[first], surface.edges[second]], dim=1)
-    keep = _may_touch(surface, corner[:, 0], corner[:, 2], among_fixed)
-    keep &= (corner[:, :2, None] != corner[:, None, 2:]).flatten(1).all(-1)
     area = torch.minimum(surface.edge_area[first], surface.edge_area[second])
-    edge_edge = Pairs("edge_edge", entry, corner, torch.stack([first, second], 1), area).where(keep)
-    return point_face, edge_edge
-
-
-def _may_touch(surface: ContactSurface, first: Tensor, second: Tensor, among_fixed: bool) -> Tensor:
-    """Whether contact between the objects of two points [C] has to be looked for."""
-    a, b = surface.owner[first], surface.owner[second]
-    own = (a == 0) & surface.touches_itself
-    return ((a != b) | own) & (surface.movable[a] | surface.movable[b] | among_fixed)
+    return point_face, Pairs("edge_edge", entry, corner, torch.stack([first, second], 1), area)

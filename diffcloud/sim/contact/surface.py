@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -21,6 +22,55 @@ from diffcloud.mesh.topology import ClothMesh, SurfaceMesh, directed_edges
 
 _FLAT = 1e-6
 """Sine of the dihedral angle below which an obstacle's edge counts as flat."""
+
+
+@dataclass(frozen=True)
+class _Eligible:
+    """Pairs of two lists of primitives that contact can bring together; see `broad_phase.Eligible`.
+
+    Pairs that share a point, that lie on one obstacle, or of which neither can move are left out.
+    """
+
+    first: Tensor
+    """[N, n] points."""
+    second: Tensor
+    """[M, m] points."""
+    owners: tuple[Tensor, Tensor]
+    """[N], [M]"""
+    moves: tuple[Tensor, Tensor]
+    """bool [N], [M]"""
+    touches_itself: bool
+    ranks: tuple[Tensor, Tensor] | None = None
+    """[N], [M] numbers in one list: of two primitives that are in both lists, the first has the lower one."""
+
+    def __call__(self, a: Tensor, b: Tensor) -> Tensor:
+        """bool of pairs by their indices in both lists, which are broadcast."""
+        owner_a, owner_b = self.owners[0][a], self.owners[1][b]
+        moves_a, moves_b = self.moves[0][a], self.moves[1][b]
+        own = (owner_a == 0) & self.touches_itself
+        apart = (self.first[a][..., :, None] != self.second[b][..., None, :]).all(-1).all(-1)
+        eligible = ((owner_a != owner_b) | own) & (moves_a | moves_b) & apart
+        if self.ranks is not None:
+            eligible &= (self.ranks[0][a] < self.ranks[1][b]) | ~moves_b
+        return eligible
+
+    @cached_property
+    def table(self) -> Tensor:
+        """bool [N, M] of all pairs."""
+        device = self.first.device
+        return self(torch.arange(len(self.first), device=device)[:, None], torch.arange(len(self.second), device=device))
+
+
+@dataclass(frozen=True)
+class Partners:
+    """What contact can bring together."""
+
+    point_face: _Eligible
+    """Of all points and all faces."""
+    first_edges: Tensor
+    """[N] the edges that can move."""
+    edge_edge: _Eligible
+    """Of these and all edges, each pair once."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +174,34 @@ class ContactSurface:
             corner_share=area_tensor([corner for _, corner in shares]),
             movable=torch.tensor([True, *movable], device=device),
             touches_itself=touches_itself,
+        )
+
+    @cached_property
+    def partners(self) -> Partners:
+        """What contact can bring together."""
+        return self._partners(self.movable)
+
+    @cached_property
+    def all_partners(self) -> Partners:
+        """The same if everything could move: with the pairs of two obstacles."""
+        return self._partners(torch.ones_like(self.movable))
+
+    def _partners(self, movable: Tensor) -> Partners:
+        owners = [self.owner[corners] for corners in (self.points, self.faces[:, 0], self.edges[:, 0])]
+        point, face, edge = ((owner, movable[owner]) for owner in owners)
+        first = edge[1].nonzero().flatten()
+        ranks = torch.arange(len(self.edges), device=first.device)
+        return Partners(
+            _Eligible(self.points[:, None], self.faces, (point[0], face[0]), (point[1], face[1]), self.touches_itself),
+            first,
+            _Eligible(
+                self.edges[first],
+                self.edges,
+                (edge[0][first], edge[0]),
+                (edge[1][first], edge[1]),
+                self.touches_itself,
+                (first, ranks),
+            ),
         )
 
 

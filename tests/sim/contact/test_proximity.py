@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +11,13 @@ import torch
 
 from diffcloud.mesh import SurfaceMesh, grid_cloth
 from diffcloud.mesh.topology import directed_edges
+from diffcloud.sim.contact.pairs import candidates
 from diffcloud.sim.contact.proximity import ProximitySettings, Slots, find_proximity
 from diffcloud.sim.contact.surface import ContactSurface
 from tests.sim.contact.scenes import box
 
 THICKNESS = 0.02
+ALL_PAIRS = "diffcloud.sim.contact.broad_phase._ALL_PAIRS"
 STIFFNESS = 1e5
 DT = 0.02
 MU = (0.3, 0.6)
@@ -29,6 +32,48 @@ def crumpled(rng: np.random.Generator, batch: int) -> tuple[ContactSurface, torc
     points = np.repeat(rest[None], batch, axis=0)
     points[:, :25] += rng.normal(size=(batch, 25, 3)) * [0.05, 0.05, 0.02]
     return surface, torch.as_tensor(points)
+
+
+@pytest.mark.parametrize("most", [0, 10**9], ids=["grid", "all pairs"])
+@pytest.mark.parametrize("among_fixed", [False, True])
+@pytest.mark.parametrize("touches_itself", [False, True])
+@pytest.mark.parametrize("movable", [(False, False), (True, False)])
+def test_candidates_are_all_pairs_that_may_touch_once(rng, monkeypatch, most, among_fixed, touches_itself, movable):
+    monkeypatch.setattr(ALL_PAIRS, most)
+    surface, points = crumpled(rng, 2)
+    surface = replace(surface, movable=torch.tensor([True, *movable]), touches_itself=touches_itself)
+    start, end = points, points + 0.02 * torch.as_tensor(rng.normal(size=points.shape))
+    owner, moves = surface.owner.tolist(), surface.movable.tolist()
+
+    def may_touch(one: list[int], other: list[int]) -> bool:
+        a, b = owner[one[0]], owner[other[0]]
+        apart = not set(one) & set(other)
+        return apart and (a != b or (a == 0 and touches_itself)) and (moves[a] or moves[b] or among_fixed)
+
+    def boxes_meet(entry: int, one: list[int], other: list[int]) -> bool:
+        a, b = (torch.cat([start[entry, corners], end[entry, corners]]) for corners in (one, other))
+        return bool((a.amin(0) - THICKNESS / 2 <= b.amax(0) + THICKNESS / 2).all()) and bool(
+            (b.amin(0) - THICKNESS / 2 <= a.amax(0) + THICKNESS / 2).all()
+        )
+
+    single = [[point] for point in surface.points.tolist()]
+    faces, edges = surface.faces.tolist(), surface.edges.tolist()
+    wanted = {
+        "point_face": itertools.product(enumerate(single), enumerate(faces)),
+        "edge_edge": itertools.combinations(enumerate(edges), 2),
+    }
+    for found in candidates(surface, (start, end), THICKNESS, among_fixed=among_fixed):
+        primitives = found.primitives if found.kind == "point_face" else found.primitives.sort(dim=1).values
+        told = [tuple(row) for row in torch.cat([found.entry[:, None], primitives], dim=1).tolist()]
+        expected = {
+            (entry, i, j)
+            for (i, one), (j, other) in wanted[found.kind]
+            if may_touch(one, other)
+            for entry in range(2)
+            if boxes_meet(entry, one, other)
+        }
+        assert len(told) == len(set(told)), "each pair once"
+        assert set(told) == expected
 
 
 def twin(surface: ContactSurface, points: np.ndarray, smallest: float) -> dict[tuple[int, ...], int]:
