@@ -63,10 +63,8 @@ simulated: venv
 	    diffcloud fit --params $(SIMULATED_PARAMS) --scenario $$scenario --out $(SIMULATED)/fits/$$scenario \
 	        $(SIMULATED)/episodes/$$scenario; \
 	    diffcloud simulate --params $(SIMULATED_PARAMS) --scenario $$scenario --out $(SIMULATED)/sets/$$scenario; \
-	    for model in mlp pointnet2 meteornet; do \
-	        diffcloud train --params $(SIMULATED_PARAMS) --scenario $$scenario --model $$model \
-	            --data $(SIMULATED)/sets/$$scenario --out $(SIMULATED)/regressors/$$scenario/$$model.safetensors; \
-	    done; \
+	    diffcloud train --params $(SIMULATED_PARAMS) --scenario $$scenario --data $(SIMULATED)/sets/$$scenario \
+	        --out $(SIMULATED)/regressors/$$scenario; \
 	done
 	diffcloud evaluate --params $(SIMULATED_PARAMS) --fits $(SIMULATED)/fits --episodes $(SIMULATED)/episodes \
 	    --regressors $(SIMULATED)/regressors --simulated $(SIMULATED)/sets --out $(SIMULATED)/reports \

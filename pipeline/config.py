@@ -203,12 +203,16 @@ class TrainConfig(Section):
     patience: Count | None = None
     seed: int | None = None
     device: Literal["auto", "cpu", "gpu"] = "auto"
-    workers: Annotated[int, Field(ge=0)] = 0
+    loaders: Annotated[int, Field(ge=0)] = 0
     """Processes that sample clouds; they change nothing but the time."""
+    workers: Count = 1
+    """Trainings at once, each in a process with one thread."""
 
     def changes(self) -> dict[str, object]:
         """What differs from the profile."""
-        return self.model_dump(exclude={"scenarios", "models", "profile", "device", "workers"}, exclude_none=True)
+        return self.model_dump(
+            exclude={"scenarios", "models", "profile", "device", "loaders", "workers"}, exclude_none=True
+        )
 
 
 class EvaluateConfig(Section):

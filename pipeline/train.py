@@ -1,30 +1,42 @@
-"""`diffcloud train`: teach a network to tell the parameters from clouds."""
+"""`diffcloud train`: teach networks to tell the parameters from clouds."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import Annotated, Any, cast
 
 import typer
 from rich.table import Table
 
-from diffcloud.errors import ConfigError
-from diffcloud.io.files import write_json
-from diffcloud.regressors import MODEL_NAMES, PROFILE_NAMES, ModelName, SimulatedSet, TrainingSettings, profile_settings
-from pipeline.config import load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, errors, finish, progress_bar, show
-
-if TYPE_CHECKING:
-    from diffcloud.regressors.training import TrainingProgress
+from diffcloud.errors import CheckpointError, ConfigError, DatasetError, DiffCloudError
+from diffcloud.io.files import read_json, write_json
+from diffcloud.io.fingerprints import fingerprint
+from diffcloud.regressors import (
+    MODEL_NAMES,
+    PROFILE_NAMES,
+    ModelName,
+    Regressor,
+    SimulatedSet,
+    TrainingSettings,
+    profile_settings,
+)
+from pipeline.config import TrainConfig, load_config, updated
+from pipeline.console import JsonFlag, ParamsFile, errors, finish, show
+from pipeline.workers import Tell, run_all
 
 _INTERRUPTED = 130
+_CODE = ("mesh", "io", "clouds", "regressors")
+"""Packages whose source decides a training."""
 
 
 def train(
     scenario: Annotated[str, typer.Option(help="Name of the scenario that was simulated.")],
-    model: Annotated[str, typer.Option(help=", ".join(MODEL_NAMES))],
     data: Annotated[Path, typer.Option(help="Folder written by `diffcloud simulate`.")],
-    out: Annotated[Path, typer.Option(help="Checkpoint; curves and errors go to a folder of its name without suffix.")],
+    out: Annotated[Path, typer.Option(help="Folder; <model>.safetensors, and a folder <model> of curves and errors.")],
+    model: Annotated[list[str] | None, typer.Option(help=f"{', '.join(MODEL_NAMES)}; repeatable. Default: all.")] = None,
     params: ParamsFile = None,
     profile: Annotated[str | None, typer.Option(help=", ".join(PROFILE_NAMES))] = None,
     epochs: Annotated[int | None, typer.Option(help="Passes over the training draws.")] = None,
@@ -42,12 +54,14 @@ def train(
     patience: Annotated[int | None, typer.Option(help="Stop after so many epochs without a better validation.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of all random numbers.")] = None,
     device: Annotated[str | None, typer.Option(help="auto, cpu or gpu (mixed precision).")] = None,
-    workers: Annotated[int | None, typer.Option(help="Processes that sample clouds.")] = None,
+    loaders: Annotated[int | None, typer.Option(help="Processes that sample clouds.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Trainings at once, each in a process with one thread.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Train one regressor. After Ctrl-C or a kill the same command goes on from the last saved epoch."""
+    """Train networks. After Ctrl-C or a kill the same command keeps finished ones and goes on from the last saved epoch."""
     config = updated(
         load_config(params).train,
+        models=None if not model else list(dict.fromkeys(model)),
         profile=profile,
         epochs=epochs,
         draws=draws,
@@ -62,57 +76,129 @@ def train(
         patience=patience,
         seed=seed,
         device=device,
+        loaders=loaders,
         workers=workers,
     )
-    settings = profile_settings(config.profile, model, **config.changes())
+    settings = {name: profile_settings(config.profile, name, **config.changes()) for name in config.models}
     train_set, test_set = SimulatedSet.read(data, "train"), SimulatedSet.read(data, "test")
     if train_set.scenario != scenario:
         raise ConfigError(f"{data} holds draws of {train_set.scenario}, not of {scenario}.")
-    # Lightning takes seconds to import, and nothing else needs it
-    from diffcloud.regressors.training import train_regressor
+    jobs = [TrainJob(name, train_set, test_set, settings[name], config, out) for name in config.models]
+    for job in jobs:
+        errors.print(f"Training {job.model} for {scenario}: {_described(job.settings, train_set)} ...")
+    table = Table(
+        "model",
+        "parameter",
+        "held-out draws",
+        "median relative error",
+        "of the mean",
+        "mean error of range",
+        "of the median",
+        "best epoch",
+        "seconds",
+    )
+    results: dict[str, Any] = {}
+    failures: list[str] = []
+    try:
+        for job, told, error in run_all("train", jobs, config.workers):
+            if error is None:
+                results[job.model] = told
+                _add_rows(table, job.model, told)
+                if told["resumed_from"]:
+                    errors.print(f"{job.label}: went on after epoch {told['resumed_from']} of an interrupted run.")
+            else:
+                failures.append(f"{job.label}: {error}")
+    except KeyboardInterrupt:
+        errors.print("Interrupted; the same command keeps finished networks and goes on from the last saved epoch.")
+        raise typer.Exit(_INTERRUPTED) from None
+    show(table, json)
+    if results:
+        errors.print(f"Wrote {', '.join(results)} to {out}.")
+    finish({"out": str(out), "models": results}, json)
+    if failures:
+        raise DiffCloudError("\n".join(failures))
 
-    errors.print(f"Training {model} for {scenario}: {_described(settings, train_set)} ...")
-    with progress_bar(model, settings.epochs) as update:
+
+@dataclass(frozen=True)
+class TrainJob:
+    """One network. A finished one of the same settings and data by the same code is kept."""
+
+    model: str
+    train: SimulatedSet
+    test: SimulatedSet
+    settings: TrainingSettings
+    config: TrainConfig
+    folder: Path
+
+    @property
+    def label(self) -> str:
+        return f"{self.train.scenario}/{self.model}"
+
+    def run(self, tell: Tell) -> dict[str, Any]:
+        """Train, write, and return what there is to tell.
+
+        Raises:
+            ConfigError, TrainingError: sets that are too small, or a loss that is no number any more.
+            KeyboardInterrupt: Ctrl-C; the last saved epoch is kept.
+        """
+        known = self._known()
+        if known is not None:
+            return known
+        # Lightning takes seconds to import, and nothing else needs it
+        from diffcloud.regressors.training import TrainingProgress, train_regressor
 
         def show_progress(progress: TrainingProgress) -> None:
-            update(
-                progress.epoch,
-                f"train {progress.train_loss:.4f}  validation {progress.validation_loss:.4f}  best {progress.best:.4f}",
-            )
+            losses = f"train {progress.train_loss:.4f}  validation {progress.validation_loss:.4f}  best {progress.best:.4f}"
+            tell(progress.epoch / self.settings.epochs, f"{progress.epoch}/{self.settings.epochs}  {losses}")
 
+        self._timings.unlink(missing_ok=True)
+        result = train_regressor(
+            cast(ModelName, self.model),
+            self.train,
+            self.test,
+            self.settings,
+            self._checkpoint,
+            device=self.config.device,
+            workers=self.config.loaders,
+            progress=show_progress,
+        )
+        # apart from the other files, which have the same bytes for the same seed
+        told = {"seconds": result.seconds, "resumed": result.resumed_from, "fingerprint": self._fingerprint}
+        write_json(self._timings, told)
+        return self._told(result.summary, told)
+
+    def _known(self) -> dict[str, Any] | None:
+        """What an earlier run of the same settings, data and code has left."""
         try:
-            result = train_regressor(
-                cast(ModelName, model),
-                train_set,
-                test_set,
-                settings,
-                out,
-                device=config.device,
-                workers=config.workers,
-                progress=show_progress,
-            )
-        except KeyboardInterrupt:
-            errors.print("Interrupted; the same command goes on from the last saved epoch.")
-            raise typer.Exit(_INTERRUPTED) from None
-    # beside the outputs, which have the same bytes for the same seed
-    write_json(out.with_suffix(".timings.json"), {"seconds": result.seconds, "resumed": result.resumed_from})
-    held_out = result.summary["held_out"]
-    show(_table(held_out), json)
-    if result.resumed_from:
-        errors.print(f"Went on after epoch {result.resumed_from} of an interrupted run.")
-    errors.print(f"Wrote {out} and {out.with_suffix('')} after {result.seconds:.1f} s.")
-    finish(
-        {
-            "out": str(out),
-            "epochs": len(result.summary["history"]),
-            "best_epoch": result.summary["best_epoch"],
-            "history": result.summary["history"],
-            "held_out": held_out,
-            "resumed_from": result.resumed_from,
-            "seconds": result.seconds,
-        },
-        json,
-    )
+            told = read_json(self._timings, error=DatasetError)
+            if not isinstance(told, dict) or told.get("fingerprint") != self._fingerprint:
+                return None
+            Regressor.read(self._checkpoint)
+            return self._told(read_json(self._checkpoint.with_suffix("") / "training.json", error=DatasetError), told)
+        except (DatasetError, CheckpointError):  # none, or a damaged one: trained again
+            return None
+
+    def _told(self, summary: Mapping[str, Any], timings: Mapping[str, Any]) -> dict[str, Any]:
+        return {
+            "epochs": len(summary["history"]),
+            "best_epoch": summary["best_epoch"],
+            "history": summary["history"],
+            "held_out": summary["held_out"],
+            "resumed_from": timings["resumed"],
+            "seconds": timings["seconds"],
+        }
+
+    @property
+    def _checkpoint(self) -> Path:
+        return self.folder / f"{self.model}.safetensors"
+
+    @property
+    def _timings(self) -> Path:
+        return self.folder / f"{self.model}.timings.json"
+
+    @cached_property
+    def _fingerprint(self) -> str:
+        return fingerprint([self.model, self.train, self.test, self.settings, self.config.device], packages=_CODE)
 
 
 def _described(settings: TrainingSettings, simulated: SimulatedSet) -> str:
@@ -120,20 +206,15 @@ def _described(settings: TrainingSettings, simulated: SimulatedSet) -> str:
     return f"{draws} draws, {settings.epochs} epochs, {settings.points} points a frame"
 
 
-def _table(held_out: dict[str, Any]) -> Table:
-    table = Table(
-        f"{held_out['draws']} held-out draws",
-        "median relative error",
-        "of the mean",
-        "mean error of range",
-        "of the median",
-    )
-    for name, row in held_out["parameters"].items():
+def _add_rows(table: Table, model: str, told: Mapping[str, Any]) -> None:
+    for name, row in told["held_out"]["parameters"].items():
         keys = (
             "median_relative_error",
             "median_relative_error_of_mean",
             "mean_error_of_range",
             "mean_error_of_range_of_median",
         )
-        table.add_row(name, *(f"{100 * row[key]:.1f} %" for key in keys))
-    return table
+        cells = (f"{100 * row[key]:.1f} %" for key in keys)
+        table.add_row(
+            model, name, str(told["held_out"]["draws"]), *cells, str(told["best_epoch"]), f"{told['seconds']:.0f}"
+        )

@@ -14,10 +14,11 @@ import yaml
 from click.testing import Result
 from typer.testing import CliRunner
 
-from diffcloud.errors import DiffCloudError
+from diffcloud.errors import DiffCloudError, TrainingError
 from diffcloud.io.episodes import write_episode
 from diffcloud.io.simulated import write_simulated
 from diffcloud.regressors import Regressor
+from diffcloud.regressors.training import train_regressor
 from pipeline.app import app
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
@@ -26,8 +27,9 @@ from tests.pipeline.test_commands import SMALL
 from tests.regressors.simulated import sagging_sheet
 from tests.regressors.test_checkpoints import regressor
 
-CHECKPOINT = "data/regressors/small/mlp.safetensors"
-TRAIN = ("train", "--scenario", "small", "--model", "mlp", "--data", "sim", "--out", CHECKPOINT, "--params", "params.yaml")
+NETWORKS = "data/regressors/small"
+CHECKPOINT = f"{NETWORKS}/mlp.safetensors"
+TRAIN = ("train", "--params", "params.yaml", "--scenario", "small", "--model", "mlp", "--data", "sim", "--out", NETWORKS)
 
 
 def run(*arguments: object, code: int = 0) -> Result:
@@ -65,7 +67,7 @@ def work(tmp_path, monkeypatch):
 
 
 def test_train_then_predict(work):
-    trained = result(run(*TRAIN, "--seed", 5, "--json"))
+    trained = result(run(*TRAIN, "--seed", 5, "--json"))["models"]["mlp"]
     assert trained["epochs"] == 2
     assert set(trained["held_out"]["parameters"]) == {"stretch", "mass"}
     summary = json.loads((work / "data/regressors/small/mlp/training.json").read_text())
@@ -129,9 +131,46 @@ def test_an_interrupted_training_goes_on(work):
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
-    assert errors.strip() == "Interrupted; the same command goes on from the last saved epoch."
+    assert errors.strip() == "Interrupted; the same command keeps finished networks and goes on from the last saved epoch."
     assert "Traceback" not in errors
     assert not (work / CHECKPOINT).exists()
+
+
+def test_several_networks_at_once_are_those_of_one_after_another(work):
+    both = (*TRAIN, "--model", "pointnet2", "--json")
+    alone = result(run(*both))
+    written = {file.name: file.read_bytes() for file in (work / NETWORKS).glob("*.safetensors")}
+    assert set(written) == {"mlp.safetensors", "pointnet2.safetensors"}
+    for file in (work / NETWORKS).glob("*.timings.json"):
+        file.unlink()
+    together = result(run(*both, "--workers", 2))
+    assert {file.name: file.read_bytes() for file in (work / NETWORKS).glob("*.safetensors")} == written
+    assert [model["history"] for model in together["models"].values()] == [
+        model["history"] for model in alone["models"].values()
+    ]
+
+
+def test_a_finished_network_is_kept_until_something_changes(work):
+    first = result(run(*TRAIN, "--json"))["models"]["mlp"]
+    assert result(run(*TRAIN, "--json"))["models"]["mlp"] == first  # the same seconds too
+    assert result(run(*TRAIN, "--epochs", 3, "--json"))["models"]["mlp"]["epochs"] == 3
+    again = result(run(*TRAIN, "--json"))["models"]["mlp"]
+    assert again["history"] == first["history"]
+    (work / CHECKPOINT).write_bytes(b"damaged")
+    run(*TRAIN)
+    Regressor.read(work / CHECKPOINT)
+
+
+def test_one_network_that_fails_does_not_stop_the_others(work, monkeypatch):
+    def lost(model: str, *arguments: object, **options: object) -> object:
+        if model == "mlp":
+            raise TrainingError("The losses of epoch 1 are nan.")
+        return train_regressor(model, *arguments, **options)
+
+    monkeypatch.setattr("diffcloud.regressors.training.train_regressor", lost)
+    done = run(*TRAIN, "--model", "meteornet", code=1)
+    assert str(done.exception) == "small/mlp: The losses of epoch 1 are nan."
+    Regressor.read(work / NETWORKS / "meteornet.safetensors")
 
 
 class TestBadInput:
@@ -150,6 +189,7 @@ class TestBadInput:
             ((*fit, "fold.safetensors"), "fold.safetensors was trained for fold, not for small"),
             ((*TRAIN, "--scenario", "lift"), "sim holds draws of small, not of lift"),
             ((*TRAIN, "--profile", "fast"), "profile: Input should be 'quick', 'reduced' or 'paper'"),
+            ((*TRAIN, "--model", "transformer"), "Unknown model 'transformer'"),
         ):
             done = run(*arguments, code=1)
             assert message in str(done.exception)
