@@ -36,6 +36,8 @@ class Job:
     group: str
     """Folder of the scenario's episodes and fits."""
     name: str
+    fit: str
+    """Name of its fit."""
     episode: Episode
     summary: Mapping[str, Any]
     predictions: Sequence[Estimate | Gap]
@@ -56,7 +58,7 @@ class Job:
         """
         # seconds of predictions differ from run to run, and change nothing in the record
         told = [(entry.method, entry.values if isinstance(entry, Estimate) else entry.reason) for entry in self.predictions]
-        inputs = [self.name, self.episode, self.summary, told, self.transfers, self.settings]
+        inputs = [self.name, self.fit, self.episode, self.summary, told, self.transfers, self.settings]
         mark = fingerprint([self.scenario, self.group, *inputs], packages=_CODE)
         if self.kept.is_file():
             known = read_json(self.kept)
@@ -67,6 +69,7 @@ class Job:
             self.episode,
             self.summary,
             name=self.name,
+            fit_name=self.fit,
             predictions=self.predictions,
             transfers=self.transfers,
             settings=self.settings,
@@ -145,6 +148,7 @@ def comparison_jobs(
                 scenario=scenario,
                 group=group,
                 name=label,
+                fit=fit,
                 episode=recorded[name],
                 summary=summary,
                 predictions=[network.of(recorded[name]) for network in networks],

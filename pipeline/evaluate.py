@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,12 +13,11 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from diffcloud.errors import ConfigError, DivergedError
+from diffcloud.errors import ConfigError
 from diffcloud.evaluation.markdown import comparison_page
 from diffcloud.evaluation.summary import PREDICTORS, label, sentences, tables
 from diffcloud.evaluation.summary import metrics as summary_metrics
 from diffcloud.fit import Objective, read_fit
-from diffcloud.fit.measure import measure_fit
 from diffcloud.fit.parameters import NUISANCE
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import write_json, write_text
@@ -95,9 +95,7 @@ def evaluate(
         )
     ]
     comparison = compare(jobs, config.evaluate.workers)
-    metrics = write_evaluation(
-        config, comparison, {}, fits=fits, episodes=episodes, out=out, markdown=markdown, as_json=json
-    )
+    metrics = write_evaluation(config, comparison, fits=fits, out=out, markdown=markdown, as_json=json)
     finish({"metrics": metrics, "missing": comparison.missing}, json)
     stop_if_missing(comparison, allow_missing)
 
@@ -105,10 +103,8 @@ def evaluate(
 def write_evaluation(
     config: Config,
     comparison: Comparison,
-    scenes: Mapping[str, Path],
     *,
     fits: Path,
-    episodes: Path,
     out: Path,
     markdown: Path | None,
     as_json: bool,
@@ -117,18 +113,17 @@ def write_evaluation(
     """Write metrics, timings and tables, print the main ones, and return the metrics.
 
     Args:
-        scenes: scenario -> scene file, of those that need one.
+        fits: folder with <scenario>/<episode>.json.
         markdown: a page of the tables, if wanted.
         references: see `summary.method_table`.
     """
-    rows, curves, seconds = _fits(config, scenes, fits, episodes)
+    curves, seconds = _curves(config, fits)
     predictions = _predictions(comparison.records)
     told = tables(comparison.records, comparison.seconds, references)
-    metrics = _metrics(rows, predictions) | {"comparison": summary_metrics(told)}
+    metrics = _metrics(told["fits"], predictions) | {"comparison": summary_metrics(told)}
     write_tables(
         out / "tables",
         {
-            "fits": pd.DataFrame(rows),
             "losses": pd.DataFrame(curves),
             "predictions": pd.DataFrame(predictions, columns=_columns(predictions)),
             **told,
@@ -176,32 +171,20 @@ def printed(told: Mapping[str, pd.DataFrame]) -> list[Table]:
     return [losses, means]
 
 
-def _fits(
-    config: Config, scenes: Mapping[str, Path], fits: Path, episodes: Path
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, float]]:
-    """Rows of the table of fits, their loss curves, and their wall times."""
-    rows: list[dict[str, Any]] = []
+def _curves(config: Config, fits: Path) -> tuple[list[dict[str, Any]], dict[str, float]]:
+    """Loss curves of all fits, and their wall times."""
     curves: list[dict[str, Any]] = []
     seconds: dict[str, float] = {}
     for name in config.scenarios:
-        files = sorted((fits / name).glob("*.json"))
-        scenario = choose_scenario(name, scenes.get(name)) if files else None
-        for path in files:
-            assert scenario is not None
+        for path in sorted((fits / name).glob("*.json")):
             summary = read_fit(path)
-            recorded = [read_episode(episodes / name / f"{member}.npz") for member in summary["episodes"]]
-            try:
-                measured = measure_fit(scenario, recorded, summary, draws=config.evaluate.draws, seed=config.evaluate.seed)
-            except DivergedError:
-                continue  # the comparison names it as missing
-            rows.append({"scenario": name, "episode": path.stem} | measured)
             curves += [
                 {"scenario": name, "episode": path.stem, "iteration": i, "loss": min(filter(None, row))}
                 for i, row in enumerate(summary["history"]["loss"])
                 if any(value is not None for value in row)
             ]
             seconds[f"{name}/{path.stem}"] = summary["seconds"]
-    return rows, curves, seconds
+    return curves, seconds
 
 
 def _predictions(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -222,9 +205,9 @@ def _columns(predictions: list[dict[str, Any]]) -> list[str]:
     return list(dict.fromkeys(["scenario", "episode", "model", *(key for row in predictions for key in row)]))
 
 
-def _metrics(rows: list[dict[str, Any]], predictions: list[dict[str, Any]]) -> dict[str, Any]:
+def _metrics(fits: pd.DataFrame, predictions: list[dict[str, Any]]) -> dict[str, Any]:
     by_scenario: dict[str, Any] = {}
-    for name, group in pd.DataFrame(rows).groupby("scenario", sort=False):
+    for name, group in fits.groupby("scenario", sort=False):
         by_scenario[str(name)] = {
             "loss_start": float(group["loss_start"].mean()),
             "loss": float(group["loss"].mean()),
@@ -232,7 +215,8 @@ def _metrics(rows: list[dict[str, Any]], predictions: list[dict[str, Any]]) -> d
             "rms_other_frames_mm": float(group["rms_other_frames_mm"].mean()),
         }
     episodes = {
-        f"{row['scenario']}/{row['episode']}": {k: v for k, v in row.items() if isinstance(v, float)} for row in rows
+        f"{row['scenario']}/{row['episode']}": {k: v for k, v in row.items() if isinstance(v, float) and not math.isnan(v)}
+        for row in fits.to_dict("records")
     }
     by_model: dict[str, Any] = {}
     if predictions:

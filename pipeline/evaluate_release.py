@@ -74,9 +74,7 @@ def release(
     metrics = write_evaluation(
         config,
         comparison,
-        scenes,
         fits=data / "fits",
-        episodes=data / "episodes",
         out=out,
         markdown=markdown,
         as_json=json,

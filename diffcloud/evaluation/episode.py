@@ -39,8 +39,9 @@ class EpisodeRecord:
     """What was found."""
 
     record: dict[str, Any]
-    """Plain values, the same for the same inputs: scenario, episode, labels, `methods` (a row each: values, clipped values,
-    metrics, simulations), `gaps`, `transfers`, `identifiability`, `landscape`."""
+    """Plain values, the same for the same inputs: scenario, episode, its fit, labels, `start` (metrics of the fit's start,
+    None if that diverges), `methods` (a row each: values, clipped values, metrics, simulations), `gaps`, `transfers`,
+    `identifiability`, `landscape`."""
     seconds: dict[str, dict[str, float]]
     """Method -> phase -> wall time."""
 
@@ -51,6 +52,7 @@ def compare_episode(
     summary: Mapping[str, Any],
     *,
     name: str,
+    fit_name: str | None = None,
     predictions: Sequence[Estimate | Gap] = (),
     transfers: Mapping[str, Mapping[str, float]] | None = None,
     settings: ComparisonSettings | None = None,
@@ -60,6 +62,7 @@ def compare_episode(
     Args:
         summary: the fit of the episode (`fit.result.read_fit`); its frames, points, bounds, given parameters and number of
             iterations hold for every method.
+        fit_name: of the fit, if it is another than the episode's: a joint fit has several episodes.
         predictions: of networks, and why those that should be there are not.
         transfers: episode -> parameters fitted on it, of other recordings of the same fabric.
     """
@@ -76,7 +79,7 @@ def compare_episode(
     meter = EpisodeMeter(scenario, episode, frames=frames, points=points, draws=settings.draws, seed=settings.seed)
     sources = dict(transfers or {})
     sets = [methods.clipped(values, space) for values in (*(e.values for e in estimates), *sources.values())]
-    measured = meter.measure(sets)
+    measured = meter.measure([*sets, {key: float(value) for key, value in summary["start"].items()}])
     rows, transferred = [], []
     for index, estimate in enumerate(estimates):
         if index in measured.diverged:
@@ -105,6 +108,7 @@ def compare_episode(
     record: dict[str, Any] = {
         "scenario": scenario.name,
         "episode": name,
+        "fit": fit_name or name,
         **{key: meta.get(key) for key in ("fabric", "category", "repeat", "source")},
         "category_assumed": bool(meta.get("category_assumed", False)),
         "truth": {key: float(value) for key, value in (meta.get("truth") or {}).items()},
@@ -112,6 +116,7 @@ def compare_episode(
         "threshold": success_threshold(scenario),
         "frames": frames,
         "starts": int(fit["starts"]),
+        "start": None if len(sets) in measured.diverged else measured.rows[-1],
         "methods": rows,
         "gaps": [{"method": gap.method, "reason": gap.reason, "expected": gap.expected} for gap in gaps],
         "failures": list(summary["failures"]),

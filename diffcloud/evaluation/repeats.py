@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 
-def fit_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """One row per episode: scenario, episode, fabric, category, repeat, loss, and a column per fitted parameter, with
     `ratio` of stretch to mass where both are there."""
     rows = []

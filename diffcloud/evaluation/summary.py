@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from diffcloud.evaluation.methods import PHASES
-from diffcloud.evaluation.repeats import consistency, fit_table, repeatability, transfer
+from diffcloud.evaluation.repeats import consistency, parameter_table, repeatability, transfer
 
 LABELS = {
     "diffcloud": "DiffCloud",
@@ -62,6 +62,46 @@ def method_table(records: Records, references: Mapping[tuple[str, str], float] |
             status = "missing" if gap["expected"] else "not asked for"
             rows.append({**shared, "status": status, "method": gap["method"], "reason": gap["reason"]})
     return pd.DataFrame(rows)
+
+
+def fit_table(records: Records) -> pd.DataFrame:
+    """One row per fit: losses of its start and its end in squared length units and as RMS in millimetres, the means over
+    the episodes of a joint fit; fitted and true parameters; the stretch-to-mass ratio, which a motion identifies best."""
+    fits: dict[tuple[str, str], list[tuple[Mapping[str, Any], Mapping[str, Any]]]] = {}
+    for record in records:
+        fit = _fit_of(record)
+        if fit is not None:
+            fits.setdefault((record["scenario"], record["fit"]), []).append((record, fit))
+    rows = []
+    for (scenario, name), found in fits.items():
+        record, fit = found[0]
+        to_mm = 1e3 * record["length_unit_m"]
+        starts = [record["start"] or {} for record, _ in found]
+        losses = {
+            "loss_start": _mean_of(starts, "loss"),
+            "loss": _mean_of([fit for _, fit in found], "loss"),
+            "loss_other_frames": _mean_of([fit for _, fit in found], "loss_other_frames"),
+        }
+        row: dict[str, Any] = {"scenario": scenario, "episode": name, **losses}
+        row |= {key.replace("loss", "rms") + "_mm": to_mm * value**0.5 for key, value in losses.items()}
+        row |= {f"fitted_{parameter}": value for parameter, value in fit["values"].items()}
+        truth = {parameter: value for parameter, value in record["truth"].items() if parameter in fit["values"]}
+        row |= {f"true_{parameter}": value for parameter, value in truth.items()}
+        for kind, values in (("fitted", fit["values"]), ("true", truth)):
+            if {"stretch", "mass"} <= values.keys():
+                row[f"{kind}_ratio"] = values["stretch"] / values["mass"]
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _mean_of(rows: Sequence[Mapping[str, Any]], name: str) -> float:
+    """Of a metric; not a number if one of the rows lacks it."""
+    return float(np.mean([row.get(name, math.nan) for row in rows]))
+
+
+def _fit_of(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """What was measured of the fit itself; None if it diverges."""
+    return next((row for row in record["methods"] if row["method"] == "diffcloud"), None)
 
 
 def method_means(table: pd.DataFrame) -> pd.DataFrame:
@@ -116,7 +156,7 @@ def identifiability_table(records: Records) -> pd.DataFrame:
     rows = []
     for record in records:
         told = record["identifiability"]
-        fit = next((row for row in record["methods"] if row["method"] == "diffcloud"), None)
+        fit = _fit_of(record)
         if told is None or fit is None:
             continue
         agrees = [entry["agrees"] for entry in told["check"]]
@@ -139,16 +179,17 @@ def tables(
 ) -> dict[str, pd.DataFrame]:
     """All tables of the comparison by file name; `seconds` alone holds wall times."""
     methods = method_table(records, references)
-    fits = fit_table(records)
+    parameters = parameter_table(records)
     return {
+        "fits": fit_table(records),
         "methods": methods,
         "means": method_means(methods),
         "categories": category_means(methods),
         "identifiability": identifiability_table(records),
-        "repeatability": repeatability(fits),
+        "repeatability": repeatability(parameters),
         "transfer": transfer(records),
-        "consistency": consistency(fits),
-        "parameters": fits,
+        "consistency": consistency(parameters),
+        "parameters": parameters,
         "seconds": seconds_table(seconds),
     }
 

@@ -29,7 +29,7 @@ class EpisodeEntry:
     scenario: str
     name: str
     row: Mapping[str, Any]
-    """Of `fit.measure.measure_fit`."""
+    """Of `evaluation.summary.fit_table`."""
     fit: Mapping[str, Any]
     """Of `fit.result.read_fit`."""
     episode: Episode

@@ -69,6 +69,17 @@ class TestCheck:
         assert len(check) == 4
         assert all(entry["agrees"] for entry in check)
 
+    def test_nothing_is_asked_beyond_the_bounds(self, monkeypatch):
+        asked = []
+        real = KnownResiduals.simulate
+        monkeypatch.setattr(KnownResiduals, "simulate", lambda self, values: asked.append(values) or real(self, values))
+        outside = [entry for entry in told(30.0, 0.001)["check"] if not entry["farther_within_bounds"]]
+        assert [entry["rise_farther"] for entry in outside] == [None, None]
+        for name in ("stretch", "mass"):
+            found = np.concatenate([values[name].numpy() for values in asked[:-1]])  # the last is of the scale, at ½ and 2
+            assert found.min() > 0.0999
+            assert found.max() < 10.001
+
     def test_a_lower_loss_beside_the_fit_is_told(self):
         objective = KnownResiduals([3.0 * RATIO, 0.5 * SCALE], {"stretch": 2.0, "mass": 0.5})
         found = identify(objective, SPACE, OPTIMUM)

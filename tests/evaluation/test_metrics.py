@@ -136,6 +136,10 @@ class TestEpisode:
         assert found.seconds["mlp"] == {"inference": 0.1}
         assert found.seconds["diffcloud"] == {"optimisation": summary["seconds"]}
 
+    def test_the_start_is_measured_as_the_methods_are(self, scenario, episode, found, summary):
+        meter = EpisodeMeter(scenario, episode, frames=summary["settings"]["frames"], draws=2)
+        assert found.record["start"] == pytest.approx(meter.measure([summary["start"]]).rows[0])
+
     def test_transfer_is_measured_as_the_methods_are(self, found):
         (row,) = found.record["transfers"]
         assert row["source"] == "e0"

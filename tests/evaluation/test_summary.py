@@ -8,8 +8,16 @@ import pandas as pd
 import pytest
 
 from diffcloud.evaluation.markdown import comparison_page
-from diffcloud.evaluation.repeats import consistency, fit_table, other_repeats, repeatability, transfer
-from diffcloud.evaluation.summary import against_predictors, against_reference, metrics, overview, sentences, tables
+from diffcloud.evaluation.repeats import consistency, other_repeats, parameter_table, repeatability, transfer
+from diffcloud.evaluation.summary import (
+    against_predictors,
+    against_reference,
+    fit_table,
+    metrics,
+    overview,
+    sentences,
+    tables,
+)
 from diffcloud.io.fingerprints import fingerprint
 from tests.evaluation.records import record, records
 
@@ -53,9 +61,26 @@ def test_metrics_are_plain_numbers(told):
     assert found["checked_ends"] == {"agree": 7, "all": 8}
 
 
+def test_a_fit_has_a_row_with_what_its_start_and_its_end_are_worth():
+    truth = {"stretch": 0.5, "mass": 1.0}
+    told = [
+        record("lift", "joint-a", fit="joint", methods={"diffcloud": 0.001}, truth=truth, start=0.02),
+        record("lift", "joint-b", fit="joint", methods={"diffcloud": 0.003}, truth=truth, start=0.04),
+        record("fold", "a", stretch=8.0, methods={"diffcloud": 0.004}, start=None),  # whose start diverges
+        record("fold", "b", methods={"middle": 0.004}),  # whose fit diverges
+    ]
+    table = fit_table(told)
+    assert table[["scenario", "episode"]].to_numpy().tolist() == [["lift", "joint"], ["fold", "a"]]
+    assert table["loss"].tolist() == pytest.approx([0.002, 0.004])
+    assert table["rms_mm"].tolist() == pytest.approx([1e3 * 0.002**0.5, 1e3 * 0.004**0.5])
+    assert table["loss_start"].tolist() == pytest.approx([0.03, math.nan], nan_ok=True)
+    assert table["fitted_ratio"].tolist() == pytest.approx([1.0, 8.0])
+    assert table["true_ratio"].tolist() == pytest.approx([0.5, math.nan], nan_ok=True)
+
+
 class TestRepeats:
     def test_repeatability_is_the_largest_over_the_smallest(self):
-        table = repeatability(fit_table(records())).set_index(["scenario", "parameter"])
+        table = repeatability(parameter_table(records())).set_index(["scenario", "parameter"])
         assert table.loc[("lift", "stretch"), "factor"] == pytest.approx(2.0)
         assert table.loc[("lift", "ratio"), "factor"] == pytest.approx(2.0)
         assert ("fold", "stretch") not in table.index  # one recording has no spread
@@ -66,13 +91,13 @@ class TestRepeats:
         assert row["gain"] == pytest.approx((0.01 - 0.004) / (0.01 - 0.001))
 
     def test_consistency_compares_geometric_means(self):
-        table = consistency(fit_table(records())).set_index("parameter")
+        table = consistency(parameter_table(records())).set_index("parameter")
         assert table.loc["stretch", "value_first"] == pytest.approx(math.sqrt(2.0))
         assert table.loc["stretch", "factor"] == pytest.approx(8.0 / math.sqrt(2.0))
 
     def test_labels_of_simulated_targets_name_no_cloth(self):
         simulated = [record("lift", "a", fabric="hidden1", truth={"stretch": 1.0}), record("fold", "b", fabric="hidden1")]
-        assert consistency(fit_table(simulated)).empty
+        assert consistency(parameter_table(simulated)).empty
 
     def test_other_repeats_are_of_the_same_fabric(self):
         metas = {"a": {"fabric": "tan"}, "b": {"fabric": "tan"}, "c": {"fabric": "navy"}, "d": {}, "e": {}}
