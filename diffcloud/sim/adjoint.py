@@ -72,7 +72,8 @@ class _Implicit(torch.autograd.Function):
         with torch.enable_grad():
             residual = problem.residual(u, *inputs)
             adjoint = ctx.factor.solve(gradient, transposed=True)
-            found = iter(torch.autograd.grad(residual, chosen, -adjoint, allow_unused=True))
+            # of a number: checking the shape of given output gradients makes torch import sympy, a second or more
+            found = iter(torch.autograd.grad(-(residual * adjoint).sum(), chosen, allow_unused=True))
         return (None, *(next(found) if want else None for want in wanted))
 
 
