@@ -6,6 +6,7 @@ has the same runs, in one batch, on one thread.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +68,7 @@ def chunks_of(draws: ParameterDraws, split: Split, count: int) -> list[Chunk]:
 
 
 def simulate_chunk(scenario: Scenario, draws: ParameterDraws, chunk: Chunk) -> SimulatedChunk:
-    """Simulate a chunk; draws that diverge are replaced and the whole chunk is simulated again.
+    """Simulate a chunk, and after it, as a batch of their own, draws in the place of those that diverged.
 
     Raises:
         DatasetError: a run diverged with 20 draws.
@@ -82,31 +83,32 @@ def simulate_chunk(scenario: Scenario, draws: ParameterDraws, chunk: Chunk) -> S
 
 def _simulate(scenario: Scenario, draws: ParameterDraws, chunk: Chunk) -> SimulatedChunk:
     parameters = chunk.parameters.copy()
-    attempts = np.zeros(len(parameters), dtype=int)
-    replaced: list[Replaced] = []
-    while True:
+    nodes = np.empty((len(parameters), scenario.frames + 1, len(scenario.scene.mesh.nodes), 3), dtype=np.float32)
+    missing, replaced = np.arange(len(parameters)), list[Replaced]()
+    for attempt in range(_ATTEMPTS):
         try:
-            return SimulatedChunk(parameters, _nodes(scenario, draws.box.names, parameters), tuple(replaced))
+            nodes[missing], diverged = _nodes(scenario, draws.box.names, parameters[missing])
         except DivergedError as error:
-            if not error.entries:
-                raise DatasetError(f"Runs from {chunk.start} of {chunk.split}: {error}") from error
-            for entry in sorted(set(error.entries)):  # rare
-                run = chunk.start + entry
-                replaced.append(
-                    Replaced(run, int(attempts[entry]), tuple(parameters[entry].tolist()), error.step, error.reason)
-                )
-                attempts[entry] += 1
-                if attempts[entry] == _ATTEMPTS:
-                    raise DatasetError(
-                        f"{chunk.split} run {run} of {scenario.name} diverged with {_ATTEMPTS} draws, the last at step "
-                        f"{error.step}: {error.reason}. Try a smaller time step (steps_per_frame) or other parameters."
-                    ) from error
-                parameters[entry] = draws.again(chunk.split, run, int(attempts[entry]))
+            raise DatasetError(f"Runs from {chunk.start} of {chunk.split}: {error}") from error
+        missing = missing[sorted(diverged)]
+        for entry, (_, failure) in zip(missing, sorted(diverged.items()), strict=True):  # rare
+            run = chunk.start + int(entry)
+            replaced.append(Replaced(run, attempt, tuple(parameters[entry].tolist()), failure.step, failure.reason))
+            parameters[entry] = draws.again(chunk.split, run, attempt + 1)
+        if not len(missing):
+            return SimulatedChunk(parameters, nodes, tuple(sorted(replaced, key=lambda one: (one.run, one.attempt))))
+    raise DatasetError(
+        f"{chunk.split} run {replaced[-1].run} of {scenario.name} diverged with {_ATTEMPTS} draws, the last at step "
+        f"{replaced[-1].step}: {replaced[-1].reason}. Try a smaller time step (steps_per_frame) or other parameters."
+    )
 
 
-def _nodes(scenario: Scenario, names: tuple[str, ...], parameters: NDArray[np.float64]) -> NDArray[np.float32]:
+def _nodes(
+    scenario: Scenario, names: tuple[str, ...], parameters: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], Mapping[int, DivergedError]]:
+    """Nodes [b, T+1, V, 3] of runs with parameters [b, k], and those that diverged."""
     system, _ = scenario.scene.build()
     values = {name: torch.as_tensor(parameters[:, column]) for column, name in enumerate(names)}
     with torch.no_grad():
-        run = rollout(system, scenario.steps, properties=scenario.properties(system, values))
-    return run.positions[:, :: scenario.scene.frame_steps].to(torch.float32).numpy()
+        run = rollout(system, scenario.steps, properties=scenario.properties(system, values), drop_diverged=True)
+    return run.positions[:, :: scenario.scene.frame_steps].to(torch.float32).numpy(), run.diverged

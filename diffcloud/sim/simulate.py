@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -33,6 +33,8 @@ class Rollout:
     """[S + 1] [s]"""
     bodies: BodyState | None = None
     """Of rigid bodies, its fields stacked [B, S + 1, N, ...]."""
+    diverged: Mapping[int, DivergedError] = field(default_factory=dict)
+    """Batch entries that diverged, if `rollout` was to drop them: from that step on their positions are NaN."""
 
     def at(self, times: Tensor) -> Tensor:
         """[B, T, V, 3] positions at times [T], linear between steps."""
@@ -190,6 +192,7 @@ def rollout(
     state: State | None = None,
     track: Tensor | None = None,
     copies: int = 1,
+    drop_diverged: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Rollout:
     """Simulate `steps` steps.
@@ -200,11 +203,14 @@ def rollout(
         track: [B or 1, S, 3] displacement of the gripper since the start at the end of each step [m]; then the moving
             handles follow it instead of the scene's own motion.
         copies: see `adjoint.implicit_solve`.
+        drop_diverged: go on without batch entries that diverge, and name them in `Rollout.diverged`; not with copies.
         progress: called with the number of finished steps.
 
     Raises:
         DivergedError: names the step and the batch entries.
     """
+    if drop_diverged and copies > 1:
+        raise ValueError(f"Entries of {copies} copies cannot be dropped.")
     properties = system.properties if properties is None else properties
     times = np.cumsum(np.full(steps, system.time_step))  # repeated addition, as the reference accumulates time
     if track is not None:
@@ -218,19 +224,53 @@ def rollout(
         state = replace(state, anchors=state.positions[:, system.handles.nodes])
     if state.bodies is None and system.implicit is not None:
         state = replace(state, bodies=init(system, len(state.positions)).bodies)
-    positions, poses = [state.positions], [state.bodies]
-    for finished in range(steps):
-        state = step(system, properties, schedule, state, copies=copies)
+    kept = torch.arange(len(state.positions), device=system.device)
+    positions, poses, entries = [state.positions], [state.bodies], [kept]
+    diverged: dict[int, DivergedError] = {}
+    while len(kept) and len(positions) <= steps:
+        try:
+            state = step(system, properties, schedule, state, copies=copies)
+        except DivergedError as error:
+            if not drop_diverged or not error.entries:
+                raise
+            lost = kept[sorted(set(error.entries))].tolist()
+            diverged |= {entry: DivergedError(error.step, [entry], error.reason) for entry in lost}
+            rest = (~torch.isin(kept, torch.tensor(lost, device=kept.device))).nonzero().flatten()
+            kept = kept[rest]
+            properties, schedule, state = _only(rest, properties, schedule, state)
+            continue
         positions.append(state.positions)
         poses.append(state.bodies)
+        entries.append(kept)
         if progress is not None:
-            progress(finished + 1)
+            progress(len(positions) - 1)
     all_times = torch.as_tensor(np.concatenate([[0.0], times]), dtype=system.dtype, device=system.device)
     bodies = None
     if poses[0] is not None and poses[0].centre.shape[1]:
         columns = zip(*(pose.tensors() for pose in poses if pose is not None), strict=True)
-        bodies = BodyState(*(torch.stack(column, dim=1) for column in columns))
-    return Rollout(torch.stack(positions, dim=1), all_times, bodies)
+        bodies = BodyState(*(_over_time(column, entries, steps) for column in columns))
+    return Rollout(_over_time(positions, entries, steps), all_times, bodies, diverged)
+
+
+def _only(
+    rest: Tensor, properties: Properties, schedule: HandleSchedule, state: State
+) -> tuple[Properties, HandleSchedule, State]:
+    """Of the batch entries `rest` alone."""
+    if len(schedule.translation) > 1:
+        schedule = replace(schedule, translation=schedule.translation[rest])
+    bodies = None if state.bodies is None else BodyState(*(tensor[rest] for tensor in state.bodies.tensors()))
+    state = State(state.positions[rest], state.velocities[rest], state.anchors[rest], state.step, bodies)
+    return Properties(*(tensor[rest] for tensor in properties.tensors())), schedule, state
+
+
+def _over_time(parts: Sequence[Tensor], entries: Sequence[Tensor], steps: int) -> Tensor:
+    """[B, S + 1, ...] of what is known at each time [b, ...] of the batch entries [b], NaN where nothing is."""
+    batch = len(parts[0])
+    if len(parts) == steps + 1 and len(parts[-1]) == batch:
+        return torch.stack(list(parts), dim=1)
+    nothing = torch.full_like(parts[0], torch.nan)
+    whole = [nothing.index_copy(0, kept, part) for kept, part in zip(entries, parts, strict=True)]
+    return torch.stack(whole + [nothing] * (steps + 1 - len(whole)), dim=1)
 
 
 def _take_anchors(system: System, schedule: HandleSchedule, state: State) -> State:

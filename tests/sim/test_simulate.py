@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from diffcloud.errors import DivergedError, SceneError
-from diffcloud.mesh import SurfaceMesh, grid_cloth
+from diffcloud.mesh import SurfaceMesh, box_surface, grid_cloth
 from diffcloud.sim import Rollout, init, rollout
 from diffcloud.sim.build import Surrounding, build_system
 from diffcloud.sim.contact import ContactSettings
@@ -17,6 +17,8 @@ from diffcloud.sim.energies import Handles
 from diffcloud.sim.energies.handles import Handle
 from diffcloud.sim.materials import isotropic
 from diffcloud.sim.motion import Keyframe, Motion
+from diffcloud.sim.rigid import RigidBody
+from diffcloud.sim.simulate import step
 from tests.conftest import small_lift
 
 MATERIAL = isotropic("test", density=0.2, stretching=50.0, bending=1e-5, shear=20.0)
@@ -223,6 +225,60 @@ class TestDivergence:
         state = init(system, 2, velocities=velocities)
         with pytest.raises(DivergedError, match=r"entries \[1\]"):
             rollout(system, 3, properties=system.properties.repeated(2), state=state)
+
+    def test_the_others_go_on_if_asked(self):
+        """Of five, one fails at once, and one at the second step, when its gripper leaves the numbers."""
+        scenario = small_lift()
+        system, _ = scenario.scene.build()
+        stretch = torch.tensor([1.0, 2.0, float("nan"), 4.0, 5.0]).double()
+        track = torch.zeros(5, 4, 3, dtype=torch.float64)
+        track[:, :, 2] = torch.arange(1.0, 6.0)[:, None] * torch.linspace(0.001, 0.004, 4)
+        track[1, 1:] = torch.nan
+        run = rollout(
+            system, 4, properties=scenario.properties(system, {"stretch": stretch}), track=track, drop_diverged=True
+        )
+        assert {entry: error.step for entry, error in run.diverged.items()} == {2: 1, 1: 2}
+        assert [error.entries for error in run.diverged.values()] == [[2], [1]]
+        finite = run.positions.isfinite().flatten(2).all(-1)
+        assert finite.tolist() == [[True] * 5, [True] * 2 + [False] * 3, [True] + [False] * 4, [True] * 5, [True] * 5]
+        rest = [0, 3, 4]
+        alone = rollout(system, 4, properties=scenario.properties(system, {"stretch": stretch[rest]}), track=track[rest])
+        torch.testing.assert_close(run.positions[rest], alone.positions, rtol=1e-9, atol=1e-11)
+        assert not alone.diverged
+
+    def test_bodies_go_on_too(self, monkeypatch):
+        def fragile(system, properties, schedule, state, **options):
+            if state.step == 1 and properties.batch == 3:
+                raise DivergedError(2, [1], "on purpose")
+            return step(system, properties, schedule, state, **options)
+
+        box = box_surface((-0.05, -0.05, -0.9), (0.05, 0.05, -0.85))
+        mesh = grid_cloth(5, 5, 0.2, 0.2)
+        surrounding = Surrounding(bodies=(RigidBody(box, mass=0.1),), contact=ContactSettings(1e5, 2e-3, 2e-4))
+        system = build_system(
+            mesh, MATERIAL, time_step=0.01, handles=Handles(()), surrounding=surrounding, integrator="implicit"
+        )
+        whole = rollout(system, 3)
+        monkeypatch.setattr("diffcloud.sim.simulate.step", fragile)
+        run = rollout(system, 3, properties=system.properties.repeated(3), drop_diverged=True)
+        assert sorted(run.diverged) == [1]
+        torch.testing.assert_close(run.bodies.centre[::2], whole.bodies.centre.expand(2, -1, -1, -1))
+        torch.testing.assert_close(run.bodies.centre[1, :2], whole.bodies.centre[0, :2])
+        assert run.bodies.centre[1, 2:].isnan().all()
+
+    def test_all_may_fail(self):
+        scenario = small_lift()
+        system, _ = scenario.scene.build()
+        properties = scenario.properties(system, {"stretch": torch.full((2,), float("nan")).double()})
+        run = rollout(system, 3, properties=properties, drop_diverged=True)
+        assert sorted(run.diverged) == [0, 1]
+        assert run.positions.shape[:2] == (2, 4)
+        assert run.positions[:, 0].isfinite().all()
+        assert run.positions[:, 1:].isnan().all()
+
+    def test_copies_belong_together(self):
+        with pytest.raises(ValueError, match="2 copies cannot be dropped"):
+            rollout(cloth_system(), 1, copies=2, drop_diverged=True)
 
 
 def test_interpolation_between_steps():
