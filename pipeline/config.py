@@ -224,7 +224,7 @@ class EvaluateConfig(Section):
     rivals: list[Rival] = list(RIVALS)
     """Methods beside the fits and the networks; searches may simulate as often as a fit from one start."""
     identifiability: list[str] = ["*"]
-    """Patterns of <scenario>/<episode> of which it is measured what they tell: 70 simulations each."""
+    """Patterns of <scenario>/<episode> of which it is measured what they tell: 90 simulations each."""
     landscapes: list[str] = []
     """Patterns of <scenario>/<episode> whose loss landscape is simulated."""
     landscape_size: Annotated[int, Field(ge=2)] = 7

@@ -11,8 +11,8 @@ few per cent, not a derivative: after contact the loss is rough, and its exact s
 
 H gives directions and how fast the loss should rise along each. How far one can really go before the loss tells is
 measured: a batch of simulations along each eigenvector, both ways, out to the bounds. The interval ends where the rise
-comes to one standard deviation of what new sampled points change for the last time, and not before a third of where it
-comes to two. The check then simulates the ends, and three times as far, with points that were not used before.
+is still within two standard deviations of what new sampled points change, while it is more from three times as far on.
+The check then simulates the ends, and three times as far, with points that were not used before.
 """
 
 from __future__ import annotations
@@ -38,11 +38,15 @@ IDENTIFIED_WITHIN = 1.5
 """A parameter or ratio counts as identified if the interval ends within this factor of the fitted value."""
 _STEP = 0.05
 """Of the central differences, in logarithms."""
-_SHORTEST = 0.005
+_SHORTEST = 0.0005
 """First step of the scan along a direction, in logarithms."""
-_LENGTHS = 12
+_MORE = 4
+"""How many times the draws of points that a loss is averaged over elsewhere."""
 _FARTHER = 3.0
 """How many intervals away the loss must be clearly higher."""
+_HARDLY, _CLEARLY = 0.7, 1.4
+"""Rises in units of the noise that a scan takes for hidden and for told, so that the check agrees with points not seen
+before. Between lengths of a quadratic loss that are so there is a factor of two: more than a step of the scan."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,8 @@ def identify(
         objective: of the fit, on one episode.
         space: the fitted parameters.
         values: the fitted ones.
-        draws: of sampled points that the scan averages over; the noise takes four times as many.
+        draws: of sampled points that a loss is averaged over elsewhere, whose noise is the measure. What is measured
+            here is averaged over four times as many: one draw costs little beside a simulation.
         seed: of the first draw.
 
     Returns (all plain numbers):
@@ -102,9 +107,8 @@ def identify(
     eigenvalues, columns = np.linalg.eigh(matrix)
     order = np.argsort(eigenvalues)[::-1]
     eigenvalues, directions = np.maximum(eigenvalues[order], 0.0), _signed(columns[:, order].T)
-    limit = 0.5 * noise  # one standard deviation
-    predicted = np.sqrt(limit / np.maximum(eigenvalues, 1e-300))
-    interval, open_ends, lowest = _scan(probe, centre, directions, limit)
+    predicted = np.sqrt(_HARDLY * noise / np.maximum(eigenvalues, 1e-300))
+    interval, open_ends, lowest = _scan(probe, centre, directions, noise)
     widths = interval.max(axis=1)
     half_widths = np.sqrt(((directions * widths[:, None]) ** 2).sum(axis=0))
     names = list(space.names)
@@ -214,7 +218,7 @@ class _Probe:
 
     def noise(self, centre: NDArray[np.float64]) -> float:
         """Two standard deviations of the mean loss over `draws` draws."""
-        losses = self.losses(centre[None], draws=4 * self.draws)[:, 0]
+        losses = self.losses(centre[None], draws=_MORE * self.draws)[:, 0]
         return float(2.0 * losses.std(ddof=1) / math.sqrt(self.draws))
 
 
@@ -249,42 +253,54 @@ def _reach(centre: NDArray[np.float64], direction: NDArray[np.float64], coordina
 
 
 def _scan(
-    probe: _Probe, centre: NDArray[np.float64], directions: NDArray[np.float64], limit: float
+    probe: _Probe, centre: NDArray[np.float64], directions: NDArray[np.float64], noise: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], dict[str, float] | None]:
     """[k, 2] intervals against and along each direction, whether each ends at a bound, and the lowest loss if it is lower
     than the centre's by more than the noise."""
     coordinates = Coordinates(probe.space)
-    rays = np.stack([-directions, directions], axis=1)  # [k, 2, k]
-    reach = np.array([[_reach(centre, ray, coordinates) for ray in pair] for pair in rays])
-    steps = np.geomspace(_SHORTEST, np.maximum(reach, _SHORTEST), _LENGTHS, axis=-1)  # [k, 2, lengths]
-    steps = np.minimum(steps, reach[..., None])
-    places = centre + steps[..., None] * rays[:, :, None]
-    losses = probe.losses(np.concatenate([centre[None], places.reshape(-1, len(centre))])).mean(axis=0)
-    rise = (losses[1:] - losses[0]).reshape(steps.shape)
-    # the outermost place that the loss hardly tells from the centre; beyond a third of the first place after which all are
-    # clearly told, since that is what the interval promises
-    hardly, clearly = _outermost(rise <= limit), _outermost(rise <= 2 * limit) + 1
-    near = np.where(hardly >= 0, _at(steps, hardly), 0.0)
-    interval = np.where(clearly < _LENGTHS, np.maximum(near, _at(steps, clearly) / _FARTHER), near)
+    rays = np.stack([-directions, directions], axis=1).reshape(-1, len(centre))  # [2 k, k]
+    steps = [_lengths(_reach(centre, ray, coordinates)) for ray in rays]
+    places = np.concatenate(
+        [centre[None], *(centre + length[:, None] * ray for length, ray in zip(steps, rays, strict=True))]
+    )
+    losses = probe.losses(places, draws=_MORE * probe.draws).mean(axis=0)
+    rises = np.split(losses[1:] - losses[0], np.cumsum([len(length) for length in steps])[:-1])
+    ends = [_end(length, rise / noise) for length, rise in zip(steps, rises, strict=True)]
+    interval = np.array([length[end] if len(length) else 0.0 for length, end in zip(steps, ends, strict=True)])
+    open_ = np.array([end == len(length) - 1 for length, end in zip(steps, ends, strict=True)])
     lowest = int(losses.argmin())
     lower = None
-    if losses[lowest] < losses[0] - 2 * limit:
-        place = np.concatenate([centre[None], places.reshape(-1, len(centre))])[lowest]
-        found = coordinates.values(place[None])[0]
+    if losses[lowest] < losses[0] - noise:
+        found = coordinates.values(places[lowest][None])[0]
         lower = {"loss": float(losses[lowest]), "loss_fitted": float(losses[0])}
         lower |= dict(zip(probe.space.names, found.tolist(), strict=True))
-    return interval, hardly == _LENGTHS - 1, lower
+    return interval.reshape(-1, 2), open_.reshape(-1, 2), lower
 
 
-def _outermost(hidden: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """[..., n] -> [...] index of the last place that is hidden; -1: none is."""
-    last: NDArray[np.int64] = hidden.shape[-1] - 1 - hidden[..., ::-1].argmax(-1)
-    return np.where(hidden.any(-1), last, -1)
+def _lengths(reach: float) -> NDArray[np.float64]:
+    """Distances to try: from the shortest on, in steps whose square is the factor of the check, and at the bound."""
+    count = max(0, math.ceil(math.log(max(reach, 1e-300) / _SHORTEST) / math.log(_FARTHER**0.5)))
+    inner = _SHORTEST * _FARTHER ** (0.5 * np.arange(count))
+    return np.append(inner[inner < 0.999 * reach], reach) if reach > 0 else np.empty(0)
 
 
-def _at(steps: NDArray[np.float64], index: NDArray[np.int64]) -> NDArray[np.float64]:
-    """[..., n] at [...] of them, brought into the range."""
-    return np.take_along_axis(steps, np.clip(index, 0, steps.shape[-1] - 1)[..., None], -1)[..., 0]
+def _end(lengths: NDArray[np.float64], rise: NDArray[np.float64]) -> int:
+    """Index of the length at which an interval ends.
+
+    The longest of which hold, with something to spare for points not yet seen, what the interval promises: there the loss
+    tells hardly, and three times as far, and anywhere beyond that, it does. Where the loss is too rough for any: the last
+    that it hardly tells, or else the first.
+
+    Args:
+        rise: of the loss at each length, in units of the noise.
+    """
+    if not len(lengths):
+        return -1
+    hardly = rise <= _HARDLY
+    told_beyond = np.array([(rise[lengths >= 0.999 * _FARTHER * length] > _CLEARLY).all() for length in lengths])
+    kept = np.flatnonzero(hardly & told_beyond)
+    kept = kept if len(kept) else np.flatnonzero(hardly)
+    return int(kept[-1]) if len(kept) else 0
 
 
 def _check(
@@ -301,7 +317,9 @@ def _check(
     places = centre + np.stack([ends, _FARTHER * ends], axis=-1)[..., None] * directions[:, None, None]  # [k, 2, 2, k]
     inside: NDArray[np.bool_] = np.all((places >= low - 1e-9) & (places <= high + 1e-9), axis=-1)
     # beyond the bounds nothing is asked of the loss, and a simulation may take minutes to resolve its contacts
-    losses = probe.losses(np.concatenate([centre[None], places[inside]]), first=10_000).mean(axis=0)
+    losses = probe.losses(np.concatenate([centre[None], places[inside]]), first=10_000, draws=_MORE * probe.draws).mean(
+        axis=0
+    )
     rise = np.full(inside.shape, np.nan)
     rise[inside] = losses[1:] - losses[0]
     return [
