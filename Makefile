@@ -59,13 +59,11 @@ SIMULATED := build/simulated
 SIMULATED_PARAMS := pipeline/profiles/simulated.yaml
 simulated: venv
 	diffcloud episodes --params $(SIMULATED_PARAMS) --out $(SIMULATED)/episodes
+	diffcloud fit --params $(SIMULATED_PARAMS) --out $(SIMULATED)/fits $(SIMULATED)/episodes
 	set -e; for scenario in band_stretch vest_hang; do \
-	    diffcloud fit --params $(SIMULATED_PARAMS) --scenario $$scenario --out $(SIMULATED)/fits/$$scenario \
-	        $(SIMULATED)/episodes/$$scenario; \
 	    diffcloud simulate --params $(SIMULATED_PARAMS) --scenario $$scenario --out $(SIMULATED)/sets/$$scenario; \
-	    diffcloud train --params $(SIMULATED_PARAMS) --scenario $$scenario --data $(SIMULATED)/sets/$$scenario \
-	        --out $(SIMULATED)/regressors/$$scenario; \
 	done
+	diffcloud train --params $(SIMULATED_PARAMS) --data $(SIMULATED)/sets --out $(SIMULATED)/regressors
 	diffcloud evaluate --params $(SIMULATED_PARAMS) --fits $(SIMULATED)/fits --episodes $(SIMULATED)/episodes \
 	    --regressors $(SIMULATED)/regressors --simulated $(SIMULATED)/sets --out $(SIMULATED)/reports \
 	    --markdown docs/results/simulated-experiment.md

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,8 +30,13 @@ _CODE = ("mesh", "io", "sim", "scene", "clouds", "fit")
 
 
 def fit(
-    episodes: Annotated[list[Path], typer.Argument(help="Episode files, or folders of them.")],
-    out: Annotated[Path, typer.Option(help="Folder; one JSON and one NPZ per episode.")],
+    episodes: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Episode files, or folders of them; without a scenario, a folder with <scenario>/<episode>.npz."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder; one JSON and one NPZ per episode, without a scenario in <scenario>/.")],
     scenario: ScenarioName = None,
     scene: SceneFile = None,
     params: ParamsFile = None,
@@ -61,8 +66,9 @@ def fit(
     json: JsonFlag = False,
 ) -> None:
     """Fit episodes. Ctrl-C writes the best so far and stops; the same command keeps what is finished and goes on."""
+    config = load_config(params)
     settings = updated(
-        load_config(params).fit,
+        config.fit,
         parameters=None if parameters is None else [name.strip() for name in parameters.split(",")],
         fixed=assignments(fix, "--fix") or None,
         bounds=_bounds(bound) or None,
@@ -81,15 +87,20 @@ def fit(
         joint=joint,
         workers=workers,
     )
-    chosen = choose_scenario(scenario, scene)
-    files = episode_files(episodes)
+    every = scenario is None and scene is None and _by_scenario(episodes, config.scenarios)
+    if every:
+        folders = {name: (choose_scenario(name), episode_files([episodes[0] / name])) for name in config.scenarios}
+    else:
+        folders = {"": (choose_scenario(scenario, scene), episode_files(episodes))}
+    jobs: list[FitJob] = []
     # everything is read before anything is fitted: a damaged last file must not cost the first ones' time
-    recorded = {path.stem: read_episode(path) for path in files}
-    groups = {"joint": recorded} if settings.joint else {name: {name: episode} for name, episode in recorded.items()}
-    jobs = [
-        FitJob(chosen, name, members, settings, out, _first_start(init, chosen, list(members.values())))
-        for name, members in groups.items()
-    ]
+    for folder, (chosen, files) in folders.items():
+        recorded = {path.stem: read_episode(path) for path in files}
+        groups = {"joint": recorded} if settings.joint else {name: {name: episode} for name, episode in recorded.items()}
+        jobs += [
+            FitJob(chosen, name, members, settings, out / folder, _first_start(init, chosen, list(members.values())))
+            for name, members in groups.items()
+        ]
     for job in jobs:
         job.objective()
     space = jobs[0].space
@@ -97,7 +108,11 @@ def fit(
     results: dict[str, Any] = {}
     failures: list[str] = []
 
-    def add(name: str, summary: Mapping[str, Any]) -> None:
+    def key(job: FitJob) -> str:
+        return job.label if every else job.name
+
+    def add(job: FitJob, summary: Mapping[str, Any]) -> None:
+        name = key(job)
         results[name] = {key: summary[key] for key in _SHOWN}
         table.add_row(name, *_row(summary, space))
         for failure in summary["failures"]:
@@ -107,13 +122,13 @@ def fit(
         for job, summary, error in run_all("fit", jobs, settings.workers, patient=True):
             if error is None:
                 errors.print(f"{job.label}: loss {summary['loss_start']:.3e} -> {summary['loss']:.3e}")
-                add(job.name, summary)
+                add(job, summary)
             else:
-                failures.append(f"{job.name}: {error}")
+                failures.append(f"{key(job)}: {error}")
     except KeyboardInterrupt:
         for job in jobs:
-            if job.name not in results and (best := job.known()) is not None:
-                add(job.name, best)
+            if key(job) not in results and (best := job.known()) is not None:
+                add(job, best)
         show(table, json)
         errors.print(f"Interrupted: {out} has the best so far of each. The same command keeps finished fits and goes on.")
         raise typer.Exit(_INTERRUPTED) from None
@@ -121,6 +136,29 @@ def fit(
     finish({"out": str(out), "fits": results}, json)
     if failures:
         raise DiffCloudError("\n".join(failures))
+    if every:
+        for folder in folders:
+            _leave_only(out / folder, {job.name for job in jobs if job.folder == out / folder})
+
+
+def _by_scenario(episodes: list[Path], scenarios: list[str]) -> bool:
+    """Whether there is one folder, and in it one for each scenario."""
+    return len(episodes) == 1 and all((episodes[0] / name).is_dir() for name in scenarios)
+
+
+def _leave_only(folder: Path, names: Collection[str]) -> None:
+    """Remove fits of episodes that are no longer there, and nothing else."""
+    for path in folder.glob("*.json"):
+        if path.stem not in names and _readable(path) is not None:
+            path.unlink()
+            path.with_suffix(".npz").unlink(missing_ok=True)
+
+
+def _readable(path: Path) -> dict[str, Any] | None:
+    try:
+        return read_fit(path)
+    except ConfigError:  # none, or a damaged one
+        return None
 
 
 @dataclass(frozen=True)
@@ -165,12 +203,8 @@ class FitJob:
 
     def known(self) -> dict[str, Any] | None:
         """The summary that this job, or an earlier one of the same inputs and code, has left; maybe interrupted."""
-        path = self.folder / f"{self.name}.json"
-        try:
-            summary = read_fit(path)
-        except ConfigError:  # none, or a damaged one: fitted again
-            return None
-        return summary if summary.get("fingerprint") == self._fingerprint() else None
+        summary = _readable(self.folder / f"{self.name}.json")
+        return summary if summary is not None and summary.get("fingerprint") == self._fingerprint() else None
 
     def run(self, tell: Tell) -> dict[str, Any]:
         """Fit, write, and return the summary.

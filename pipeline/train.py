@@ -33,9 +33,14 @@ _CODE = ("mesh", "io", "clouds", "regressors")
 
 
 def train(
-    scenario: Annotated[str, typer.Option(help="Name of the scenario that was simulated.")],
-    data: Annotated[Path, typer.Option(help="Folder written by `diffcloud simulate`.")],
-    out: Annotated[Path, typer.Option(help="Folder; <model>.safetensors, and a folder <model> of curves and errors.")],
+    data: Annotated[Path, typer.Option(help="Folder written by `diffcloud simulate`; without a scenario, of <scenario>/.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Folder; <model>.safetensors, and <model>/ of curves and errors, without a scenario in <scenario>/."
+        ),
+    ],
+    scenario: Annotated[str | None, typer.Option(help="That was simulated. Default: all of train.scenarios.")] = None,
     model: Annotated[list[str] | None, typer.Option(help=f"{', '.join(MODEL_NAMES)}; repeatable. Default: all.")] = None,
     params: ParamsFile = None,
     profile: Annotated[str | None, typer.Option(help=", ".join(PROFILE_NAMES))] = None,
@@ -80,14 +85,18 @@ def train(
         workers=workers,
     )
     settings = {name: profile_settings(config.profile, name, **config.changes()) for name in config.models}
-    train_set, test_set = SimulatedSet.read(data, "train"), SimulatedSet.read(data, "test")
-    if train_set.scenario != scenario:
-        raise ConfigError(f"{data} holds draws of {train_set.scenario}, not of {scenario}.")
-    jobs = [TrainJob(name, train_set, test_set, settings[name], config, out) for name in config.models]
+    every = scenario is None
+    jobs: list[TrainJob] = []
+    for name in config.scenarios if scenario is None else [scenario]:
+        source, folder = (data / name, out / name) if every else (data, out)
+        train_set, test_set = SimulatedSet.read(source, "train"), SimulatedSet.read(source, "test")
+        if train_set.scenario != name:
+            raise ConfigError(f"{source} holds draws of {train_set.scenario}, not of {name}.")
+        jobs += [TrainJob(kind, train_set, test_set, settings[kind], config, folder) for kind in config.models]
     for job in jobs:
-        errors.print(f"Training {job.model} for {scenario}: {_described(job.settings, train_set)} ...")
+        errors.print(f"Training {job.label}: {_described(job.settings, job.train)} ...")
     table = Table(
-        "model",
+        "network",
         "parameter",
         "held-out draws",
         "median relative error",
@@ -102,8 +111,9 @@ def train(
     try:
         for job, told, error in run_all("train", jobs, config.workers):
             if error is None:
-                results[job.model] = told
-                _add_rows(table, job.model, told)
+                name = job.label if every else job.model
+                results[name] = told
+                _add_rows(table, name, told)
                 if told["resumed_from"]:
                     errors.print(f"{job.label}: went on after epoch {told['resumed_from']} of an interrupted run.")
             else:
@@ -206,7 +216,7 @@ def _described(settings: TrainingSettings, simulated: SimulatedSet) -> str:
     return f"{draws} draws, {settings.epochs} epochs, {settings.points} points a frame"
 
 
-def _add_rows(table: Table, model: str, told: Mapping[str, Any]) -> None:
+def _add_rows(table: Table, network: str, told: Mapping[str, Any]) -> None:
     for name, row in told["held_out"]["parameters"].items():
         keys = (
             "median_relative_error",
@@ -216,5 +226,5 @@ def _add_rows(table: Table, model: str, told: Mapping[str, Any]) -> None:
         )
         cells = (f"{100 * row[key]:.1f} %" for key in keys)
         table.add_row(
-            model, name, str(told["held_out"]["draws"]), *cells, str(told["best_epoch"]), f"{told['seconds']:.0f}"
+            network, name, str(told["held_out"]["draws"]), *cells, str(told["best_epoch"]), f"{told['seconds']:.0f}"
         )

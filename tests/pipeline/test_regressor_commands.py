@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -125,7 +126,7 @@ def test_an_interrupted_training_goes_on(work):
     (work / CHECKPOINT).unlink()
     process = subprocess.Popen([*DIFFCLOUD, *TRAIN, *options], cwd=work, env=env, stderr=subprocess.PIPE, text=True)
     metrics = work / "data/regressors/small/mlp/metrics.json"
-    assert "Training mlp for small" in process.stderr.readline()
+    assert "Training small/mlp" in process.stderr.readline()
     while process.poll() is None and not metrics.exists():  # until an epoch is done
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
@@ -148,6 +149,36 @@ def test_several_networks_at_once_are_those_of_one_after_another(work):
     assert [model["history"] for model in together["models"].values()] == [
         model["history"] for model in alone["models"].values()
     ]
+
+
+def test_without_a_scenario_those_of_the_parameters_are_trained(work):
+    sets = {"train": sagging_sheet(24, scenario="other"), "test": sagging_sheet(10, seed=1, scenario="other")}
+    write_simulated(work / "sims" / "other", sets, about={}, replaced="")
+    (work / "sim").rename(work / "sims" / "small")
+    params = yaml.safe_load((work / "params.yaml").read_text())
+    params["train"] |= {"scenarios": ["small", "other"], "models": ["mlp"], "epochs": 1}
+    (work / "params.yaml").write_text(yaml.safe_dump(params))
+    train = ("train", "--params", "params.yaml", "--data", "sims", "--out", "data/regressors", "--json")
+    assert list(result(run(*train))["models"]) == ["small/mlp", "other/mlp"]
+    assert Regressor.read(work / "data/regressors/other/mlp.safetensors").description.scenario == "other"
+
+
+def test_without_a_scenario_those_of_the_parameters_are_fitted(work):
+    options = yaml.safe_load((work / "raw/scenes/small.yaml").read_text())
+    (work / "raw/scenes/other.yaml").write_text(yaml.safe_dump(options))
+    params = yaml.safe_load((work / "params.yaml").read_text()) | {"scenarios": ["small", "other"]}
+    (work / "params.yaml").write_text(yaml.safe_dump(params))
+    fit = ("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
+    assert "Give --scenario" in str(run(*fit, code=1).exception)  # there is no folder of the other one
+    shutil.copytree(work / "data/episodes/small", work / "data/episodes/other")
+    first = result(run(*fit, "--json"))["fits"]
+    assert list(first) == ["small/e1", "small/e2", "other/e1", "other/e2"]
+    assert json.loads((work / "data/fits/other/e2.json").read_text())["loss"] == first["other/e2"]["loss"]
+    (work / "data/fits/other/notes.json").write_text("{}")
+    (work / "data/episodes/other/e1.npz").unlink()
+    again = result(run(*fit, "--json"))["fits"]
+    assert again == {name: told for name, told in first.items() if name != "other/e1"}  # kept, with their seconds
+    assert sorted(path.name for path in (work / "data/fits/other").iterdir()) == ["e2.json", "e2.npz", "notes.json"]
 
 
 def test_a_finished_network_is_kept_until_something_changes(work):
