@@ -287,20 +287,24 @@ def _lengths(reach: float) -> NDArray[np.float64]:
 def _end(lengths: NDArray[np.float64], rise: NDArray[np.float64]) -> int:
     """Index of the length at which an interval ends.
 
-    The longest of which hold, with something to spare for points not yet seen, what the interval promises: there the loss
-    tells hardly, and three times as far, and anywhere beyond that, it does. Where the loss is too rough for any: the last
-    that it hardly tells, or else the first.
+    The longest that keeps, with something to spare for points not yet seen, what an interval promises: there the loss
+    tells hardly, and three times as far, and anywhere beyond that, it does. If there is none, the one that keeps it with
+    most to spare. Where the loss is too rough for any: the longest that it hardly tells, or else the shortest.
 
     Args:
         rise: of the loss at each length, in units of the noise.
     """
     if not len(lengths):
         return -1
-    hardly = rise <= _HARDLY
-    told_beyond = np.array([(rise[lengths >= 0.999 * _FARTHER * length] > _CLEARLY).all() for length in lengths])
-    kept = np.flatnonzero(hardly & told_beyond)
-    kept = kept if len(kept) else np.flatnonzero(hardly)
-    return int(kept[-1]) if len(kept) else 0
+    beyond = np.array([rise[lengths >= 0.999 * _FARTHER * length].min(initial=np.inf) for length in lengths])
+    kept = np.flatnonzero((rise <= _HARDLY) & (beyond > _CLEARLY))
+    if len(kept):
+        return int(kept[-1])
+    spare = np.minimum(1 / np.maximum(rise, 1e-9), beyond)
+    if spare.max() > 1:
+        return int(spare.argmax())
+    hidden = np.flatnonzero(rise <= 1)
+    return int(hidden[-1]) if len(hidden) else 0
 
 
 def _check(

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from diffcloud.evaluation.identifiability import Coordinates, identify
+from diffcloud.evaluation.identifiability import Coordinates, _end, _lengths, identify
 from diffcloud.fit import FitSpace
 from tests.evaluation.bowls import SPACE, KnownResiduals
 
@@ -61,6 +61,32 @@ class TestVerdicts:
         found = told(30.0, 0.001)
         assert found["open"] == [[False, False], [True, True]]
         assert found["interval"][1][1] == pytest.approx(math.sqrt(2) * math.log(10), rel=1e-6)
+
+
+class TestEnd:
+    LENGTHS = 0.01 * 3 ** (0.5 * np.arange(8))
+
+    @pytest.mark.parametrize(
+        ("rise", "end"),
+        [
+            (30.0 * LENGTHS**2 / LENGTHS[4] ** 2 / 30, 3),  # a parabola: a third of it, and three times it, at its sides
+            ([0.0, 0.1, 0.3, 0.2, 0.8, 1.2, 2.0, 3.0], 4),  # flat: none is hardly told while all is clear beyond
+            ([0.1, 9.0, 0.1, 9.0, 9.0, 9.0, 9.0, 9.0], 2),  # a jump nearby does not count
+            ([5.0, 9.0, 5.0, 9.0, 5.0, 9.0, 5.0, 9.0], 0),  # rough
+            ([0.1, 5.0, 0.1, 5.0, 0.1, 5.0, 0.1, 0.9], 6),  # three times as far is beyond the bounds
+            ([np.inf] * 8, 0),
+            ([0.0] * 8, 7),
+        ],
+    )
+    def test_is_the_longest_that_keeps_its_promise(self, rise, end):
+        assert _end(self.LENGTHS, np.array(rise)) == end
+
+    def test_lengths_hold_each_others_threefold(self):
+        lengths = _lengths(1.0)
+        assert (lengths[0], lengths[-1]) == (0.0005, 1.0)
+        np.testing.assert_allclose(lengths[2:-1] / lengths[:-3], 3.0)
+        assert len(_lengths(1e-5)) == 1
+        assert len(_lengths(0.0)) == 0
 
 
 class TestCheck:
