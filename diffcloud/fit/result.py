@@ -110,12 +110,14 @@ def describe_fit(
     start_values = outcome.start | dict(space.fixed)
     with torch.no_grad():
         frame_steps = scenario.scene.frame_steps
-        run = objective.simulate(split(all_values)[0])
-        start = objective.simulate(split(start_values)[0])
+        fitted, offset = split(all_values)
+        runs = [objective.simulate(fitted, episode=index) for index in range(objective.episode_count)]
+        run, start = runs[0], objective.simulate(split(start_values)[0])
         resampled = []
         for seed in range(1, resampled_seeds + 1):
             objective.reseed(settings.seed + 10_000 + seed)
-            resampled.append(float(objective(*split(all_values))[0]))
+            losses = [objective.frame_losses(one, offset, episode=index) for index, one in enumerate(runs)]
+            resampled.append(float(torch.stack([loss.mean() for loss in losses]).mean()))
         objective.reseed(settings.seed)
     unit = scenario.length_unit_m
     summary = {

@@ -216,6 +216,20 @@ class TestRun:
             objective({"stretch": stretch})
         assert caught.value.entries == [23]
 
+    def test_the_loss_with_fresh_points_is_the_objectives_own(self, scenario):
+        episodes = [clouds_of(scenario, stretch=stretch, mass=1.0, shift=(0.0, 0.0, 0.002)) for stretch in (0.7, 1.4)]
+        objective = Objective(scenario, episodes)
+        space = FitSpace.build(["stretch"], offset=True, offset_range=(0.02, 0.1))
+        settings = AdamSettings(iterations=2, seed=3)
+        outcome = fit_adam(objective, space, settings)
+        summary = describe_fit(objective, space, settings, outcome, episodes=["a", "b"], resampled_seeds=2).summary
+        losses = []
+        for seed in (10_004, 10_005):
+            objective.reseed(seed)
+            values = torch.tensor([list(outcome.values.values())], dtype=torch.float64)
+            losses.append(float(objective(*space.split(values))))
+        assert summary["loss_resampled"] == pytest.approx(np.mean(losses), rel=1e-9)
+
     def test_result_files(self, scenario, objective, tmp_path):
         space = FitSpace.build(["stretch"], fixed={"mass": 1.2})
         settings = AdamSettings(iterations=2)
