@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -11,6 +12,8 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from multiprocessing.synchronize import Event
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Protocol, TypeVar
 
 import torch
@@ -64,10 +67,15 @@ def run_all(
             return
         context = multiprocessing.get_context("spawn")  # not forked: a fork of a process with torch's threads may hang
         stop = context.Event()
-        with ProcessPoolExecutor(
-            min(workers, len(jobs)), mp_context=context, initializer=_begin, initargs=(stop, patient)
-        ) as pool:
-            results = [pool.submit(_attempt, job) for job in jobs]
+        with (
+            # jobs travel in files: a pool whose processes have ended waits for ever to send them what does not fit into a
+            # pipe (Python before 3.11.5, gh-94777)
+            TemporaryDirectory(prefix="diffcloud-") as folder,
+            ProcessPoolExecutor(
+                min(workers, len(jobs)), mp_context=context, initializer=_begin, initargs=(stop, patient)
+            ) as pool,
+        ):
+            results = [pool.submit(_attempt_stored, _stored(job, Path(folder) / str(i))) for i, job in enumerate(jobs)]
             try:
                 for index, (job, result) in enumerate(zip(jobs, results, strict=True)):
                     found = result.result()
@@ -98,6 +106,17 @@ def _attempt(job: Job, tell: Tell = lambda done, text: None) -> tuple[Any, str |
         return job.run(tell), None
     except DiffCloudError as error:
         return None, str(error)
+
+
+def _stored(job: Job, path: Path) -> Path:
+    path.write_bytes(pickle.dumps(job))
+    return path
+
+
+def _attempt_stored(path: Path) -> tuple[Any, str | None]:
+    job: Job = pickle.loads(path.read_bytes())  # which this program has just written
+    path.unlink()
+    return _attempt(job)
 
 
 def _tell(update: Callable[[float, str], None], index: int, label: str, done: float, text: str) -> None:

@@ -16,6 +16,7 @@ class Square:
     """Squares a number; 3 is an error, 7 kills the process."""
 
     number: int
+    luggage: bytes = b""
 
     @property
     def label(self) -> str:
@@ -41,6 +42,8 @@ def test_results_come_in_order_and_an_error_stops_no_other(workers):
     ]
 
 
-def test_a_process_that_dies_is_an_error():
+@pytest.mark.parametrize("luggage", [b"", bytes(10_000_000)], ids=["light", "heavy"])
+def test_a_process_that_dies_is_an_error(luggage):
+    """Also where the other jobs are too large to wait in a pipe."""
     with pytest.raises(DiffCloudError, match="A worker process died"):
-        list(run_all("squares", [Square(7), Square(1), Square(2)], 2))
+        list(run_all("squares", [Square(number, luggage) for number in (7, 1, 2, 4, 5, 6)], 2))
