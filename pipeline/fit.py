@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -108,11 +109,11 @@ def fit(
     results: dict[str, Any] = {}
     failures: list[str] = []
 
-    def key(job: FitJob) -> str:
+    def told_as(job: FitJob) -> str:
         return job.label if every else job.name
 
     def add(job: FitJob, summary: Mapping[str, Any]) -> None:
-        name = key(job)
+        name = told_as(job)
         results[name] = {key: summary[key] for key in _SHOWN}
         table.add_row(name, *_row(summary, space))
         for failure in summary["failures"]:
@@ -124,10 +125,10 @@ def fit(
                 errors.print(f"{job.label}: loss {summary['loss_start']:.3e} -> {summary['loss']:.3e}")
                 add(job, summary)
             else:
-                failures.append(f"{key(job)}: {error}")
+                failures.append(f"{told_as(job)}: {error}")
     except KeyboardInterrupt:
         for job in jobs:
-            if key(job) not in results and (best := job.known()) is not None:
+            if told_as(job) not in results and (best := job.known()) is not None:
                 add(job, best)
         show(table, json)
         errors.print(f"Interrupted: {out} has the best so far of each. The same command keeps finished fits and goes on.")
@@ -137,8 +138,8 @@ def fit(
     if failures:
         raise DiffCloudError("\n".join(failures))
     if every:
-        for folder in folders:
-            _leave_only(out / folder, {job.name for job in jobs if job.folder == out / folder})
+        for place in {job.folder for job in jobs}:
+            _leave_only(place, {job.name for job in jobs if job.folder == place})
 
 
 def _by_scenario(episodes: list[Path], scenarios: list[str]) -> bool:
@@ -204,7 +205,7 @@ class FitJob:
     def known(self) -> dict[str, Any] | None:
         """The summary that this job, or an earlier one of the same inputs and code, has left; maybe interrupted."""
         summary = _readable(self.folder / f"{self.name}.json")
-        return summary if summary is not None and summary.get("fingerprint") == self._fingerprint() else None
+        return summary if summary is not None and summary.get("fingerprint") == self._fingerprint else None
 
     def run(self, tell: Tell) -> dict[str, Any]:
         """Fit, write, and return the summary.
@@ -227,12 +228,13 @@ class FitJob:
         settings = replace(self.settings.adam(self.scenario), init=self.init)
         outcome = fit_adam(objective, space, settings, progress=show_progress)
         result = describe_fit(objective, space, settings, outcome, episodes=list(self.episodes))
-        result.summary["fingerprint"] = self._fingerprint()
+        result.summary["fingerprint"] = self._fingerprint
         write_fit(self.folder, self.name, result)
         if outcome.stop_reason == "interrupted":
             raise KeyboardInterrupt
         return result.summary
 
+    @cached_property
     def _fingerprint(self) -> str:
         settings = self.settings.model_dump(exclude={"workers"})
         return fingerprint([self.scenario, self.name, self.episodes, settings, self.init], packages=_CODE)

@@ -15,12 +15,17 @@ import numpy as np
 import pandas as pd
 
 
+def fit_of(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """What was measured of the fit itself; None if it diverges."""
+    return next((row for row in record["methods"] if row["method"] == "diffcloud"), None)
+
+
 def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """One row per episode: scenario, episode, fabric, category, repeat, loss, and a column per fitted parameter, with
     `ratio` of stretch to mass where both are there."""
     rows = []
     for record in records:
-        fit = next((row for row in record["methods"] if row["method"] == "diffcloud"), None)
+        fit = fit_of(record)
         if fit is None:
             continue
         row = {key: record[key] for key in ("scenario", "episode", "fabric", "category", "repeat")}

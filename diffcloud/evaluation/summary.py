@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from diffcloud.evaluation.methods import PHASES
-from diffcloud.evaluation.repeats import consistency, parameter_table, repeatability, transfer
+from diffcloud.evaluation.repeats import consistency, fit_of, parameter_table, repeatability, transfer
 
 LABELS = {
     "diffcloud": "DiffCloud",
@@ -69,7 +69,7 @@ def fit_table(records: Records) -> pd.DataFrame:
     the episodes of a joint fit; fitted and true parameters; the stretch-to-mass ratio, which a motion identifies best."""
     fits: dict[tuple[str, str], list[tuple[Mapping[str, Any], Mapping[str, Any]]]] = {}
     for record in records:
-        fit = _fit_of(record)
+        fit = fit_of(record)
         if fit is not None:
             fits.setdefault((record["scenario"], record["fit"]), []).append((record, fit))
     rows = []
@@ -97,11 +97,6 @@ def fit_table(records: Records) -> pd.DataFrame:
 def _mean_of(rows: Sequence[Mapping[str, Any]], name: str) -> float:
     """Of a metric; not a number if one of the rows lacks it."""
     return float(np.mean([row.get(name, math.nan) for row in rows]))
-
-
-def _fit_of(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """What was measured of the fit itself; None if it diverges."""
-    return next((row for row in record["methods"] if row["method"] == "diffcloud"), None)
 
 
 def method_means(table: pd.DataFrame) -> pd.DataFrame:
@@ -156,7 +151,7 @@ def identifiability_table(records: Records) -> pd.DataFrame:
     rows = []
     for record in records:
         told = record["identifiability"]
-        fit = _fit_of(record)
+        fit = fit_of(record)
         if told is None or fit is None:
             continue
         agrees = [entry["agrees"] for entry in told["check"]]
