@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from diffcloud.errors import UnresolvedContactError
 from diffcloud.sim.contact.frames import Frames, MeetingPairs, along
@@ -38,8 +39,9 @@ _TIME_TIE = 1e-4
 """Impacts in one interval of this length (of the step) count as simultaneous; then the order is that of the list."""
 _TOUCH = 1e-5
 """[m] Added to the boxes; covers the tolerances of the detection."""
-_EXCHANGES = 40
-"""Most exchanges of the active set before the slower, certain solver takes over."""
+_EXCHANGES = 10
+"""Most exchanges of the active set before the slower, certain solver takes over: of 10,000 problems of folded cloths none
+that ended needed more than 7, and 1 % went round in circles."""
 _REGULAR = 500
 """Units of rounding added to the unit diagonal of the dual problem: redundant constraints (a point met twice) then share
 their force."""
@@ -98,6 +100,14 @@ class Constraints:
         names = ("time", "sign", "weights", "normals", "place")
         joined = (torch.cat([getattr(self, name), getattr(new, name)]) for name in names)
         return Constraints(self.pairs.then(new.pairs), *joined)
+
+    def of(self, entries: Tensor) -> Constraints:
+        """Those of some batch entries [E], ascending, which are numbered anew."""
+        entry = torch.searchsorted(entries, self.pairs.entry).clamp(max=len(entries) - 1)
+        kept = (entries[entry] == self.pairs.entry).nonzero().flatten()
+        pairs = replace(self.pairs.where(kept), entry=entry[kept])
+        tensors = (self.time, self.sign, self.weights, self.normals, self.place)
+        return Constraints(pairs, *(tensor[kept] for tensor in tensors))
 
     def frames(self, start: Tensor, places: Tensor) -> Frames:
         """Weights and normals of these impacts, differentiable in the motion [B, N, 3] from start to places."""
@@ -198,15 +208,20 @@ class _Finder:
             if impacts is None:
                 return history
             constraints, fresh = impacts
-            before = None
+            met = torch.unique(constraints.pairs.entry)  # the other entries have found their places
+            active, regular = self.movable.new_zeros(len(places), 0), places.new_zeros(len(places))
             if history:
-                constraints = history[-1].constraints.then(constraints, len(self.start))
-                before = history[-1].active
-            rows = dual_rows(constraints, self.inverse_mass)
-            target = self.settings.thickness - rows.apply(self.candidate)
-            force, regular = solve_dual(rows, target, before)
-            history.append(_Pass(constraints, fresh, force > 0, regular))
-            moved = self.candidate + (1 - self.settings.residue) * rows.move(force)
+                constraints = history[-1].constraints.then(constraints, len(places))
+                active, regular = history[-1].active, history[-1].regular
+            rows = dual_rows(constraints.of(met), self.inverse_mass[met])
+            count = rows.used.shape[1]
+            active = pad(active, (0, int(constraints.place.max()) + 1 - active.shape[1]))
+            target = self.settings.thickness - rows.apply(self.candidate[met])
+            force, used = solve_dual(rows, target, active[met, :count])
+            active[met, :count] = force > 0
+            history.append(_Pass(constraints, fresh, active, regular.index_copy(0, met, used)))
+            moved = places.clone()
+            moved[met] = self.candidate[met] + (1 - self.settings.residue) * rows.move(force)
             changed = (moved != places).any(-1)
             places = moved
             stray = torch.maximum(
@@ -326,7 +341,7 @@ def dual_rows(constraints: Constraints, inverse_mass: Tensor) -> DualRows:
     )
 
 
-def solve_dual(rows: DualRows, target: Tensor, guess: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def solve_dual(rows: DualRows, target: Tensor, guess: Tensor) -> tuple[Tensor, Tensor]:
     """λ >= 0 with W M⁻¹ Wᵀ λ >= target, complementary, by a primal-dual active set method.
 
     The method (Hintermüller, Ito & Kunisch 2002) exchanges all wrong rows at once. It mostly ends after a few exchanges
@@ -334,30 +349,31 @@ def solve_dual(rows: DualRows, target: Tensor, guess: Tensor | None = None) -> t
 
     Args:
         target: [B, R] h - W x̂.
-        guess: bool [B, r] rows that were active before, r <= R.
+        guess: bool [B, R] rows that were active before.
 
     Returns:
         (λ [B, R], regularisation [B] of the unit-diagonal problem).
     """
     matrix, right, scale = rows.scaled(target)
-    active = right > 0
-    if guess is not None:
-        active[:, : guess.shape[1]] |= guess
-    active &= rows.used
+    active = ((right > 0) | guess) & rows.used
     rounding = torch.finfo(right.dtype).eps
     regular = right.new_full((len(right),), _REGULAR * rounding)
     tolerance = 10 * _REGULAR * rounding * right.abs().amax(1, keepdim=True)
-    force, lacking = right, right
-    wrong = torch.ones_like(regular, dtype=torch.bool)
+    force, lacking = torch.empty_like(right), torch.empty_like(right)
+    open_ = torch.arange(len(right), device=right.device)  # entries whose active set is still changing
     for _ in range(_EXCHANGES):
-        force = solve_active(matrix, right, active, regular)
-        lacking = right - (matrix @ force[..., None]).squeeze(-1)
-        following = torch.where(active, force > 0, lacking > tolerance) & rows.used
-        wrong = (following != active).any(1)
-        if not bool(wrong.any()):
+        part, sought, trial = matrix[open_], right[open_], active[open_]
+        found = solve_active(part, sought, trial, regular[open_])
+        missing = sought - (part @ found[..., None]).squeeze(-1)
+        force[open_], lacking[open_] = found, missing
+        following = torch.where(trial, found > 0, missing > tolerance[open_]) & rows.used[open_]
+        changing = (following != trial).any(1)
+        active[open_] = following
+        open_ = open_[changing]
+        if not len(open_):
             break
-        active = following
-    wrong |= (lacking > max(_CONTRADICTION, 1e5 * rounding) * right.abs().amax(1, keepdim=True)).any(1)
+    wrong = (lacking > max(_CONTRADICTION, 1e5 * rounding) * right.abs().amax(1, keepdim=True)).any(1)
+    wrong[open_] = True
     for entry in wrong.nonzero().flatten().tolist():  # rare: the active set cycles, or there is no solution
         exact, contradiction = _least_distance(matrix[entry], right[entry])
         if contradiction:
