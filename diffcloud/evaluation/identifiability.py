@@ -12,7 +12,8 @@ few per cent, not a derivative: after contact the loss is rough, and its exact s
 H gives directions and how fast the loss should rise along each. How far one can really go before the loss tells is
 measured: a batch of simulations along each eigenvector, both ways, out to the bounds. The interval ends where the rise
 is still within two standard deviations of what new sampled points change, while it is more from three times as far on.
-The check then simulates the ends, and three times as far, with points that were not used before.
+The check then simulates the ends, and three times as far, with points that were not used before. Where contact makes the
+loss so rough that no length is like that, no interval is stated.
 """
 
 from __future__ import annotations
@@ -33,13 +34,15 @@ from diffcloud.fit.batches import without_diverged
 from diffcloud.fit.parameters import NUISANCE
 from diffcloud.scene.scenarios import Scenario
 
-Verdict = Literal["identified", "only the ratio", "only a combination", "not identified"]
+Verdict = Literal["identified", "only the ratio", "only a combination", "not identified", "too rough to tell"]
 IDENTIFIED_WITHIN = 1.5
 """A parameter or ratio counts as identified if the interval ends within this factor of the fitted value."""
 _STEP = 0.05
 """Of the central differences, in logarithms."""
 _SHORTEST = 0.0005
 """First step of the scan along a direction, in logarithms."""
+_PER_THREEFOLD = 4
+"""Steps of the scan to three times as far."""
 _MORE = 4
 """How many times the draws of points that a loss is averaged over elsewhere."""
 _FARTHER = 3.0
@@ -47,6 +50,8 @@ _FARTHER = 3.0
 _HARDLY, _CLEARLY = 0.7, 1.4
 """Rises in units of the noise that a scan takes for hidden and for told, so that the check agrees with points not seen
 before. Between lengths of a quadratic loss that are so there is a factor of two: more than a step of the scan."""
+_SPARE = 1.2
+"""The least margin, as a factor on both sides of the noise, of an interval that is stated at all."""
 
 
 @dataclass(frozen=True)
@@ -95,9 +100,11 @@ def identify(
         noise: what new points change: two standard deviations of the mean loss over `draws`;
         matrix [k][k], eigenvalues [k] (descending) and directions [k][k] (rows) in coordinates;
         predicted [k]: half-widths that the eigenvalues predict;
-        interval [k][2]: measured, against and along each direction; open [k][2]: whether it ends at a bound;
-        check: rises at the interval and at three times as far, and whether they agree;
-        half_widths, verdicts: by parameter; ratio_half_width; combination; lower: the lowest loss met, if it is lower;
+        interval [k][2]: measured, against and along each direction, None where the loss is too rough for one;
+        open [k][2]: whether it ends at a bound;
+        check: rises at each end of an interval and at three times as far, and whether they agree;
+        half_widths (None without any interval), verdicts: by parameter; ratio_half_width; combination;
+        lower: the lowest loss met, if it is lower;
         scale: see `_scale`.
     """
     probe = _Probe(objective, space, draws, seed)
@@ -109,7 +116,7 @@ def identify(
     eigenvalues, directions = np.maximum(eigenvalues[order], 0.0), _signed(columns[:, order].T)
     predicted = np.sqrt(_HARDLY * noise / np.maximum(eigenvalues, 1e-300))
     interval, open_ends, lowest = _scan(probe, centre, directions, noise)
-    widths = interval.max(axis=1)
+    widths = np.fmax(interval[:, 0], interval[:, 1])  # a direction that is rough on one side has that of the other
     half_widths = np.sqrt(((directions * widths[:, None]) ** 2).sum(axis=0))
     names = list(space.names)
     told: dict[str, Any] = {
@@ -119,16 +126,16 @@ def identify(
         "eigenvalues": eigenvalues.tolist(),
         "directions": directions.tolist(),
         "predicted": [_finite(value) for value in predicted],
-        "interval": interval.tolist(),
+        "interval": [[_finite(end) for end in ends] for ends in interval],
         "open": open_ends.tolist(),
-        "half_widths": dict(zip(names, half_widths.tolist(), strict=True)),
+        "half_widths": {name: _finite(value) for name, value in zip(names, half_widths, strict=True)},
         "check": _check(probe, centre, directions, interval, noise),
         "lower": lowest,
         "scale": _scale(objective, space, values, probe, noise),
     }
     if {"stretch", "mass"} <= set(names):
         row = directions[:, names.index("stretch")] - directions[:, names.index("mass")]
-        told["ratio_half_width"] = float(np.sqrt(((row * widths) ** 2).sum()))
+        told["ratio_half_width"] = _finite(np.sqrt(((row * widths) ** 2).sum()))
     told["combination"] = _combination(names, directions[0])
     found = verdicts(names, half_widths, directions, widths, told.get("ratio_half_width"))
     told["verdicts"] = dict(zip(names, found, strict=True))
@@ -145,7 +152,7 @@ def verdicts(
     """A verdict per parameter from half-widths in logarithms.
 
     Args:
-        half_widths: [k] of the parameters.
+        half_widths: [k] of the parameters; NaN if the loss is too rough along a direction.
         directions: [k, k] eigenvectors, in rows.
         widths: [k] of the directions.
         ratio: of stretch to mass, if both are fitted.
@@ -155,7 +162,9 @@ def verdicts(
     shared: NDArray[np.bool_] = np.any((np.abs(directions) > 1 / 3) & (widths <= near)[:, None], axis=0)
     found: list[Verdict] = []
     for index, name in enumerate(names):
-        if half_widths[index] <= near:
+        if math.isnan(half_widths[index]):
+            found.append("too rough to tell")
+        elif half_widths[index] <= near:
             found.append("identified")
         elif name in ("stretch", "mass") and ratio is not None and ratio <= near:
             found.append("only the ratio")
@@ -255,8 +264,8 @@ def _reach(centre: NDArray[np.float64], direction: NDArray[np.float64], coordina
 def _scan(
     probe: _Probe, centre: NDArray[np.float64], directions: NDArray[np.float64], noise: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], dict[str, float] | None]:
-    """[k, 2] intervals against and along each direction, whether each ends at a bound, and the lowest loss if it is lower
-    than the centre's by more than the noise."""
+    """[k, 2] intervals against and along each direction (NaN: too rough), whether each ends at a bound, and the lowest loss
+    if it is lower than the centre's by more than the noise."""
     coordinates = Coordinates(probe.space)
     rays = np.stack([-directions, directions], axis=1).reshape(-1, len(centre))  # [2 k, k]
     steps = [_lengths(_reach(centre, ray, coordinates)) for ray in rays]
@@ -266,7 +275,7 @@ def _scan(
     losses = probe.losses(places, draws=_MORE * probe.draws).mean(axis=0)
     rises = np.split(losses[1:] - losses[0], np.cumsum([len(length) for length in steps])[:-1])
     ends = [_end(length, rise / noise) for length, rise in zip(steps, rises, strict=True)]
-    interval = np.array([length[end] if len(length) else 0.0 for length, end in zip(steps, ends, strict=True)])
+    interval = np.array([np.nan if end is None else length[end] for length, end in zip(steps, ends, strict=True)])
     open_ = np.array([end == len(length) - 1 for length, end in zip(steps, ends, strict=True)])
     lowest = int(losses.argmin())
     lower = None
@@ -278,33 +287,29 @@ def _scan(
 
 
 def _lengths(reach: float) -> NDArray[np.float64]:
-    """Distances to try: from the shortest on, in steps whose square is the factor of the check, and at the bound."""
-    count = max(0, math.ceil(math.log(max(reach, 1e-300) / _SHORTEST) / math.log(_FARTHER**0.5)))
-    inner = _SHORTEST * _FARTHER ** (0.5 * np.arange(count))
-    return np.append(inner[inner < 0.999 * reach], reach) if reach > 0 else np.empty(0)
+    """Distances to try: from the shortest on, so that each has its threefold among them, and at the bound (which may be
+    where one stands)."""
+    count = max(0, math.ceil(_PER_THREEFOLD * math.log(max(reach, 1e-300) / _SHORTEST, _FARTHER)))
+    inner = _SHORTEST * _FARTHER ** (np.arange(count) / _PER_THREEFOLD)
+    return np.append(inner[inner < 0.999 * reach], reach)
 
 
-def _end(lengths: NDArray[np.float64], rise: NDArray[np.float64]) -> int:
-    """Index of the length at which an interval ends.
+def _end(lengths: NDArray[np.float64], rise: NDArray[np.float64]) -> int | None:
+    """Index of the length at which an interval ends, None where the loss is too rough for any.
 
     The longest that keeps, with something to spare for points not yet seen, what an interval promises: there the loss
     tells hardly, and three times as far, and anywhere beyond that, it does. If there is none, the one that keeps it with
-    most to spare. Where the loss is too rough for any: the longest that it hardly tells, or else the shortest.
+    most to spare.
 
     Args:
         rise: of the loss at each length, in units of the noise.
     """
-    if not len(lengths):
-        return -1
-    beyond = np.array([rise[lengths >= 0.999 * _FARTHER * length].min(initial=np.inf) for length in lengths])
+    beyond = np.array([rise[lengths > 0.999 * _FARTHER * length].min(initial=np.inf) for length in lengths])
     kept = np.flatnonzero((rise <= _HARDLY) & (beyond > _CLEARLY))
     if len(kept):
         return int(kept[-1])
     spare = np.minimum(1 / np.maximum(rise, 1e-9), beyond)
-    if spare.max() > 1:
-        return int(spare.argmax())
-    hidden = np.flatnonzero(rise <= 1)
-    return int(hidden[-1]) if len(hidden) else 0
+    return int(spare.argmax()) if spare.max() > _SPARE else None
 
 
 def _check(
@@ -314,7 +319,8 @@ def _check(
     interval: NDArray[np.float64],
     noise: float,
 ) -> list[dict[str, Any]]:
-    """Rises at both ends of every interval and three times as far, with points that nothing above has seen."""
+    """Rises at the ends of all intervals that are stated, and three times as far, with points that nothing above has
+    seen."""
     coordinates = Coordinates(probe.space)
     low, high = coordinates.bounds()
     ends = np.stack([-interval[:, 0], interval[:, 1]], axis=1)  # [k, 2], signed
@@ -333,13 +339,9 @@ def _check(
             "rise": _finite(rise[index, side, 0]),
             "rise_farther": _finite(rise[index, side, 1]),
             "farther_within_bounds": bool(inside[index, side, 1]),
-            "agrees": bool(
-                ends[index, side] != 0
-                and rise[index, side, 0] <= noise
-                and (rise[index, side, 1] > noise or not inside[index, side, 1])
-            ),
+            "agrees": bool(rise[index, side, 0] <= noise and (rise[index, side, 1] > noise or not inside[index, side, 1])),
         }
-        for index, side in np.ndindex(*ends.shape)
+        for index, side in np.argwhere(np.abs(ends) > 0)  # nothing to check for a fit on a bound, or without an interval
     ]
 
 

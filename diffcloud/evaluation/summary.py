@@ -161,6 +161,7 @@ def identifiability_table(records: Records) -> pd.DataFrame:
             row |= {"verdict": told["verdicts"][name], "ratio_factor": _factor(told.get("ratio_half_width"))}
             row |= {"combination": told["combination"], "ends_checked": len(agrees), "ends_agree": sum(agrees)}
             row["ends_at_bounds"] = sum(not entry["farther_within_bounds"] for entry in told["check"])
+            row["ends_rough"] = sum(end is None for ends in told["interval"] for end in ends)
             row["lower_loss_near"] = told["lower"] is not None
             row |= {f"scale_{key}": value for key, value in (told["scale"] or {}).items()}
             rows.append(row)
@@ -341,6 +342,12 @@ def _identified(table: pd.DataFrame) -> list[str]:
         f"{int(ends['ends_checked'].sum())} ends agree; for {int(ends['ends_at_bounds'].sum())} of all ends three times as "
         "far lies beyond the bounds."
     )
+    if ends["ends_rough"].any():
+        found.append(
+            f"{int(ends['ends_rough'].sum())} further ends, in {_count(int(ends['ends_rough'].gt(0).sum()))}, have no "
+            "interval: after contact the loss is so rough there that no length hides in the noise and tells from three "
+            "times as far on."
+        )
     if ends["lower_loss_near"].any():
         found.append(
             f"In {int(ends['lower_loss_near'].sum())} of {len(ends)} episodes a scan along these directions met a clearly "

@@ -86,7 +86,7 @@ def _identifiability(ends: tuple[bool, ...]) -> dict[str, Any]:
         "eigenvalues": [1.9, 0.1],
         "directions": [[0.7071, -0.7071], [0.7071, 0.7071]],
         "predicted": [0.05, 1.0],
-        "interval": [[0.05, 0.05], [1.0, 1.0]],
+        "interval": [[0.05, 0.05], [1.0, None]],
         "open": [[False, False], [False, False]],
         "half_widths": {"stretch": 0.7, "mass": 0.7},
         "ratio_half_width": 0.07,

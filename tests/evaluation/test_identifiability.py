@@ -72,9 +72,11 @@ class TestEnd:
             (30.0 * LENGTHS**2 / LENGTHS[4] ** 2 / 30, 3),  # a parabola: a third of it, and three times it, at its sides
             ([0.0, 0.1, 0.3, 0.2, 0.8, 1.2, 2.0, 3.0], 4),  # flat: none is hardly told while all is clear beyond
             ([0.1, 9.0, 0.1, 9.0, 9.0, 9.0, 9.0, 9.0], 2),  # a jump nearby does not count
-            ([5.0, 9.0, 5.0, 9.0, 5.0, 9.0, 5.0, 9.0], 0),  # rough
+            ([5.0, 9.0, 5.0, 9.0, 5.0, 9.0, 5.0, 9.0], None),  # rough: tells at once
+            ([0.8, 0.8, 0.8, 0.8, 0.8, 0.8, 0.8, 0.8], 6),  # the bounds are met before it tells
+            ([0.95, 1.1, 0.9, 1.1, 0.9, 1.1, 0.9, 1.1], None),  # rough: nowhere hidden with something to spare
             ([0.1, 5.0, 0.1, 5.0, 0.1, 5.0, 0.1, 0.9], 6),  # three times as far is beyond the bounds
-            ([np.inf] * 8, 0),
+            ([np.inf] * 8, None),
             ([0.0] * 8, 7),
         ],
     )
@@ -84,9 +86,9 @@ class TestEnd:
     def test_lengths_hold_each_others_threefold(self):
         lengths = _lengths(1.0)
         assert (lengths[0], lengths[-1]) == (0.0005, 1.0)
-        np.testing.assert_allclose(lengths[2:-1] / lengths[:-3], 3.0)
-        assert len(_lengths(1e-5)) == 1
-        assert len(_lengths(0.0)) == 0
+        np.testing.assert_allclose(lengths[4:-1] / lengths[:-5], 3.0)
+        assert _lengths(1e-5).tolist() == [1e-5]
+        assert _lengths(0.0).tolist() == [0.0]
 
 
 class TestCheck:
@@ -94,6 +96,37 @@ class TestCheck:
         check = told(3.0, 0.5)["check"]
         assert len(check) == 4
         assert all(entry["agrees"] for entry in check)
+
+    @pytest.mark.parametrize("both", [False, True])
+    def test_a_rough_loss_has_no_interval(self, both):
+        """Whatever moves the mass moves all points by a tenth, as when another contact is met: to one side or to both."""
+
+        class Jumping(KnownResiduals):
+            def points(self, run, offset=None):
+                lower = -run[:, 1] if not both else run[:, 1].abs()
+                places = super().points(run, offset)
+                places[..., 0] += 0.1 * (lower > 1e-4)[:, None, None]
+                return places
+
+        found = identify(Jumping([[3.0, 0.0], [0.0, 1.0]], OPTIMUM), SPACE, OPTIMUM)
+        (towards, away) = found["interval"][1]
+        assert towards is None
+        assert all(entry["agrees"] for entry in found["check"])
+        if both:
+            assert away is None
+            assert len(found["check"]) == 2
+            assert found["half_widths"]["mass"] is found["ratio_half_width"] is None
+            assert found["verdicts"]["mass"] == "too rough to tell"
+        else:
+            assert len(found["check"]) == 3
+            assert found["half_widths"]["mass"] == pytest.approx(away, rel=0.01)
+
+    def test_a_fit_on_a_bound_ends_there(self):
+        edge = {"stretch": 10.0, "mass": 1.0}
+        found = identify(KnownResiduals([[3.0, 0.0], [0.0, 0.5]], edge), SPACE, edge)
+        assert found["interval"][0][1] == 0.0
+        assert found["open"][0] == [False, True]
+        assert len(found["check"]) == 3
 
     def test_nothing_is_asked_beyond_the_bounds(self, monkeypatch):
         asked = []

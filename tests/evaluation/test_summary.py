@@ -112,6 +112,7 @@ class TestWords:
         assert "DiffCloud has the lowest mean loss over 2 episodes" in said["winners"][0]
         assert any("verdict on stretch: only the ratio in 2 of 2 episodes" in line for line in said["identifiability"])
         assert any("7 of 8 ends agree" in line for line in said["identifiability"])
+        assert any("2 further ends, in 2 episodes, have no interval" in line for line in said["identifiability"])
         assert any("artefact" in line for line in said["identifiability"])
         assert any("stretch a factor of 2" in line for line in said["repeats"])
 
