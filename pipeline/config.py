@@ -150,6 +150,8 @@ class FitConfig(Section):
     starts: Count = 1
     screen: Annotated[int, Field(ge=0)] = 0
     """Candidates simulated once to choose the starts after the first from; 0: these are spread over the box."""
+    patience: Annotated[int, Field(ge=0)] = 10
+    """Iterations without a lower loss after which a further start goes on beside the best place of all; 0: never."""
     smoothing: NonNegative = 0.5
     """Standard deviation, on the sigmoid's axis, of the first start's perturbed copies, whose gradients are averaged; 0:
     the plain gradient, as the paper has it."""
@@ -177,6 +179,7 @@ class FitConfig(Section):
             threshold=scenario.threshold if self.threshold is None else self.threshold,
             starts=self.starts,
             screen=self.screen,
+            patience=self.patience,
             seed=self.seed,
             resample=self.resample,
             smoothing=self.smoothing,

@@ -49,6 +49,9 @@ def fit(
     learning_rate: Annotated[float | None, typer.Option(help="Default: the scenario's.")] = None,
     starts: Annotated[int | None, typer.Option(help="Starts fitted together; the first is --init.")] = None,
     screen: Annotated[int | None, typer.Option(help="Simulate this many candidates and start from the best.")] = None,
+    patience: Annotated[
+        int | None, typer.Option(help="Move a further start beside the best after so many iterations in vain; 0: never.")
+    ] = None,
     init: Annotated[
         str,
         typer.Option(
@@ -78,6 +81,7 @@ def fit(
         learning_rate=learning_rate,
         starts=starts,
         screen=screen,
+        patience=patience,
         smoothing=smoothing,
         threshold=threshold,
         points=points,

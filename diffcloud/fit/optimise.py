@@ -16,6 +16,8 @@ from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 
 StopReason = Literal["iterations", "threshold", "interrupted"]
+_NEAREST, _FARTHEST = 0.01, 0.3
+"""Of starts that are moved beside the best iterate, as parts of its values."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,11 @@ class AdamSettings:
     """Candidates that are simulated once, without gradients; the further starts are the best of them. 0: starts are spread
     over the box unseen. Where the loss is rough or has many valleys, a start near the right one is worth more than
     many iterations from elsewhere, and a simulation without gradient costs less than half."""
+    patience: int = 0
+    """Iterations without a lower loss of its own after which a further start is taken beside the best iterate of all; 0:
+    never. A few per cent from a minimum a rough loss can be ten times as high, and steps of one size pass it by. What is
+    moved searches at scales from 1 to 30 % of the values, with steps to match. The first start is never moved: it stays
+    the paper's descent."""
 
 
 @dataclass(frozen=True)
@@ -113,9 +120,11 @@ def fit_adam(
     began = time.perf_counter()
     device, dtype = objective.system.device, objective.system.dtype
     start_values, logarithmic, evaluations = _starts(objective, space, settings)
-    unbounded = space.unbounded(start_values, logarithmic).requires_grad_(True)
-    optimiser = torch.optim.Adam([unbounded], lr=settings.learning_rate)
+    iterates = [row.clone().requires_grad_(True) for row in space.unbounded(start_values, logarithmic)]
+    optimiser = torch.optim.Adam([{"params": [row]} for row in iterates], lr=settings.learning_rate)
+    stalled = _Stalled.none(settings.starts, dtype, device)
     generator = torch.Generator().manual_seed(settings.seed)
+    moves = torch.Generator().manual_seed(settings.seed)
     alive = torch.ones(settings.starts, dtype=torch.bool, device=device)
     history = FitHistory(space.names)
     failures: list[str] = []
@@ -125,6 +134,8 @@ def fit_adam(
         for iteration in range(settings.iterations + 1):
             if settings.resample and iteration:
                 objective.reseed(settings.seed + iteration)
+            unbounded = torch.stack(iterates)
+            unbounded.retain_grad()
             owner, noise = _trials(settings, unbounded, generator)
             optimiser.zero_grad()
             while True:
@@ -167,6 +178,17 @@ def fit_adam(
                 break
             if iteration < settings.iterations:
                 optimiser.step()
+                stalled = stalled.after(losses)
+                late = alive & (stalled.since >= settings.patience)
+                for start in late.nonzero().flatten().tolist() if settings.patience else []:
+                    if start == 0:
+                        continue
+                    place, scale = _beside(best.values, space, moves)
+                    with torch.no_grad():
+                        iterates[start].copy_(space.unbounded(place[None], logarithmic[start, None])[0])
+                    optimiser.state.pop(iterates[start])
+                    optimiser.param_groups[start]["lr"] = settings.learning_rate * scale
+                    stalled = stalled.without(start)
     except KeyboardInterrupt:
         if not history.losses:
             raise
@@ -193,6 +215,39 @@ class _Best:
     start: int
     values: Tensor
     """[k]"""
+
+
+@dataclass(frozen=True)
+class _Stalled:
+    """How long each start has been without a lower loss."""
+
+    lowest: Tensor
+    """[B]"""
+    since: Tensor
+    """[B] iterations"""
+
+    @staticmethod
+    def none(starts: int, dtype: torch.dtype, device: torch.device) -> _Stalled:
+        return _Stalled(
+            torch.full((starts,), float("inf"), dtype=dtype, device=device),
+            torch.zeros(starts, dtype=torch.long, device=device),
+        )
+
+    def after(self, losses: Tensor) -> _Stalled:
+        """After an iteration with these losses [B]."""
+        return _Stalled(torch.minimum(self.lowest, losses), torch.where(losses < self.lowest, 0, self.since + 1))
+
+    def without(self, start: int) -> _Stalled:
+        """The same with a new count for a start."""
+        index = torch.tensor([start], device=self.since.device)
+        return _Stalled(self.lowest.index_fill(0, index, float("inf")), self.since.index_fill(0, index, 0))
+
+
+def _beside(values: Tensor, space: FitSpace, generator: torch.Generator) -> tuple[Tensor, float]:
+    """A random place [k] beside values [k], and the scale of how far that is, as a part of them."""
+    scale = _FARTHEST * (_NEAREST / _FARTHEST) ** float(torch.rand(1, generator=generator))
+    noise = scale * torch.randn(len(values), generator=generator).to(values)
+    return space.moved(values, noise), scale
 
 
 def _starts(objective: Objective, space: FitSpace, settings: AdamSettings) -> tuple[Tensor, Tensor, int]:

@@ -131,6 +131,13 @@ class FitSpace:
             values[1:, nuisance] = 0.0
         return torch.as_tensor(values), torch.arange(count) > 0
 
+    def moved(self, values: Tensor, parts: Tensor) -> Tensor:
+        """[..., k] values moved by these parts of themselves, or of the range where the lower bound is zero, inside the
+        bounds."""
+        low, high = self._bounds(values)
+        moved = torch.where(low > 0, values * parts.exp(), values + (high - low) * parts)
+        return torch.minimum(torch.maximum(moved, low), high)
+
     def split(self, values: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """[B, k] -> (parameters of the simulator incl. the fixed ones, offset of the target), name -> [B]."""
         columns = dict(zip(self.names, values.unbind(-1), strict=True))

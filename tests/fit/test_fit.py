@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -299,6 +302,51 @@ def test_screened_starts_are_the_best_candidates():
     expected = torch.cat([losses[:1], losses[1:].sort().values[:3]])
     assert torch.allclose(outcome.history.losses[0], expected, rtol=1e-9)
     assert outcome.evaluations == 15 + 4
+
+
+class Rough:
+    """The squared logarithmic distance to a place, in ripples that are a sixth of a unit wide."""
+
+    def __init__(self) -> None:
+        self.system = SimpleNamespace(device=torch.device("cpu"), dtype=torch.float64)
+
+    def __call__(self, parameters, offset=None):
+        away = torch.stack([(parameters["stretch"] / 0.13).log(), (parameters["mass"] / 7.0).log()])
+        return (away.square() + 0.05 * (1 - (40 * away).cos())).sum(0)
+
+
+class TestPatience:
+    SPACE = FitSpace.build(["stretch", "mass"])
+
+    def fits(self, **options):
+        return [
+            fit_adam(Rough(), self.SPACE, AdamSettings(starts=9, iterations=50, seed=seed, patience=patience, **options))
+            for seed in range(4)
+            for patience in (0, 5)
+        ]
+
+    def test_starts_beside_the_best_find_lower_losses_of_a_rough_landscape(self):
+        found = self.fits()
+        without, with_ = found[::2], found[1::2]
+        assert sum(b.loss for b in with_) < 0.5 * sum(a.loss for a in without)
+        assert [a.evaluations for a in without] == [b.evaluations for b in with_]
+
+    @pytest.mark.parametrize("smoothing", [0.0, 0.3])
+    def test_the_first_start_stays_the_papers(self, smoothing):
+        found = self.fits(smoothing=smoothing)
+        for without, with_ in zip(found[::2], found[1::2], strict=True):
+            for key in ("losses", "values"):
+                a, b = (torch.stack(getattr(outcome.history, key)) for outcome in (without, with_))
+                assert torch.equal(a[:, 0], b[:, 0])
+                assert not torch.equal(a, b)
+
+    def test_moved_values_stay_inside_the_bounds(self):
+        space = FitSpace.build(["stretch", "friction_obstacle"])
+        values = torch.tensor([[9.0, 0.01], [0.2, 0.5]], dtype=torch.float64)
+        high = space.variables[1].high
+        expected = torch.tensor([[10.0, 0.0], [0.2 * math.exp(-0.3), 0.5 + 0.1 * high]], dtype=torch.float64)
+        parts = torch.tensor([[0.5, -0.2], [-0.3, 0.1]], dtype=torch.float64)
+        torch.testing.assert_close(space.moved(values, parts), expected)
 
 
 class TestGradientAgreement:
