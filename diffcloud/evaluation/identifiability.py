@@ -41,8 +41,8 @@ _STEP = 0.05
 """Of the central differences, in logarithms."""
 _SHORTEST = 0.0005
 """First step of the scan along a direction, in logarithms."""
-_PER_THREEFOLD = 4
-"""Steps of the scan to three times as far."""
+_STEPS = (2, 4)
+"""Steps of a scan to three times as far, and of a finer one, which has those of the coarse one among its own."""
 _MORE = 4
 """How many times the draws of points that a loss is averaged over elsewhere."""
 _FARTHER = 3.0
@@ -268,29 +268,42 @@ def _scan(
     if it is lower than the centre's by more than the noise."""
     coordinates = Coordinates(probe.space)
     rays = np.stack([-directions, directions], axis=1).reshape(-1, len(centre))  # [2 k, k]
-    steps = [_lengths(_reach(centre, ray, coordinates)) for ray in rays]
-    places = np.concatenate(
-        [centre[None], *(centre + length[:, None] * ray for length, ray in zip(steps, rays, strict=True))]
-    )
-    losses = probe.losses(places, draws=_MORE * probe.draws).mean(axis=0)
-    rises = np.split(losses[1:] - losses[0], np.cumsum([len(length) for length in steps])[:-1])
-    ends = [_end(length, rise / noise) for length, rise in zip(steps, rises, strict=True)]
-    interval = np.array([np.nan if end is None else length[end] for length, end in zip(steps, ends, strict=True)])
-    open_ = np.array([end == len(length) - 1 for length, end in zip(steps, ends, strict=True)])
-    lowest = int(losses.argmin())
+    reach = [_reach(centre, ray, coordinates) for ray in rays]
+    lengths = [np.empty(0) for _ in rays]
+    rises = [np.empty(0) for _ in rays]
+    lowest, place = float("inf"), centre
+    for steps in _STEPS:  # finer ones only where the coarse ones give no interval
+        wanted = [
+            np.setdiff1d(_lengths(far, steps), known) if _longest(known, rise) is None else np.empty(0)
+            for far, known, rise in zip(reach, lengths, rises, strict=True)
+        ]
+        places = np.concatenate(
+            [centre[None], *(centre + length[:, None] * ray for length, ray in zip(wanted, rays, strict=True))]
+        )
+        losses = probe.losses(places, draws=_MORE * probe.draws).mean(axis=0)
+        if losses.min() < lowest:
+            lowest, place = float(losses.min()), places[int(losses.argmin())]
+        found = np.split((losses[1:] - losses[0]) / noise, np.cumsum([len(length) for length in wanted])[:-1])
+        for index, (length, rise) in enumerate(zip(wanted, found, strict=True)):
+            order = np.argsort(both := np.append(lengths[index], length))
+            lengths[index], rises[index] = both[order], np.append(rises[index], rise)[order]
+    ends = [_end(length, rise) for length, rise in zip(lengths, rises, strict=True)]
+    interval = np.array([np.nan if end is None else length[end] for length, end in zip(lengths, ends, strict=True)])
+    open_ = np.array([end == len(length) - 1 for length, end in zip(lengths, ends, strict=True)])
     lower = None
-    if losses[lowest] < losses[0] - noise:
-        found = coordinates.values(places[lowest][None])[0]
-        lower = {"loss": float(losses[lowest]), "loss_fitted": float(losses[0])}
-        lower |= dict(zip(probe.space.names, found.tolist(), strict=True))
+    if lowest < losses[0] - noise:
+        found_values = coordinates.values(place[None])[0]
+        lower = {"loss": lowest, "loss_fitted": float(losses[0])}
+        lower |= dict(zip(probe.space.names, found_values.tolist(), strict=True))
     return interval.reshape(-1, 2), open_.reshape(-1, 2), lower
 
 
-def _lengths(reach: float) -> NDArray[np.float64]:
-    """Distances to try: from the shortest on, so that each has its threefold among them, and at the bound (which may be
-    where one stands)."""
-    count = max(0, math.ceil(_PER_THREEFOLD * math.log(max(reach, 1e-300) / _SHORTEST, _FARTHER)))
-    inner = _SHORTEST * _FARTHER ** (np.arange(count) / _PER_THREEFOLD)
+def _lengths(reach: float, steps: int) -> NDArray[np.float64]:
+    """Distances to try: from the shortest on, each with its threefold among them, and at the bound (which may be where one
+    stands)."""
+    count = max(0, math.ceil(steps * math.log(max(reach, 1e-300) / _SHORTEST, _FARTHER)))
+    threefold, part = np.divmod(np.arange(count), steps)
+    inner = _SHORTEST * _FARTHER ** (part / steps) * _FARTHER ** threefold.astype(float)
     return np.append(inner[inner < 0.999 * reach], reach)
 
 
@@ -302,14 +315,24 @@ def _end(lengths: NDArray[np.float64], rise: NDArray[np.float64]) -> int | None:
     most to spare.
 
     Args:
+        lengths: ascending.
         rise: of the loss at each length, in units of the noise.
     """
-    beyond = np.array([rise[lengths > 0.999 * _FARTHER * length].min(initial=np.inf) for length in lengths])
-    kept = np.flatnonzero((rise <= _HARDLY) & (beyond > _CLEARLY))
-    if len(kept):
-        return int(kept[-1])
-    spare = np.minimum(1 / np.maximum(rise, 1e-9), beyond)
+    longest = _longest(lengths, rise)
+    if longest is not None:
+        return longest
+    spare = np.minimum(1 / np.maximum(rise, 1e-9), _beyond(lengths, rise))
     return int(spare.argmax()) if spare.max() > _SPARE else None
+
+
+def _longest(lengths: NDArray[np.float64], rise: NDArray[np.float64]) -> int | None:
+    kept = np.flatnonzero((rise <= _HARDLY) & (_beyond(lengths, rise) > _CLEARLY))
+    return int(kept[-1]) if len(kept) else None
+
+
+def _beyond(lengths: NDArray[np.float64], rise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The lowest rise three times as far, or farther, than each length; infinite where that lies beyond the bounds."""
+    return np.array([rise[lengths > 0.999 * _FARTHER * length].min(initial=np.inf) for length in lengths])
 
 
 def _check(

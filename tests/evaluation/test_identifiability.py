@@ -84,11 +84,12 @@ class TestEnd:
         assert _end(self.LENGTHS, np.array(rise)) == end
 
     def test_lengths_hold_each_others_threefold(self):
-        lengths = _lengths(1.0)
+        lengths = _lengths(1.0, 4)
         assert (lengths[0], lengths[-1]) == (0.0005, 1.0)
         np.testing.assert_allclose(lengths[4:-1] / lengths[:-5], 3.0)
-        assert _lengths(1e-5).tolist() == [1e-5]
-        assert _lengths(0.0).tolist() == [0.0]
+        assert set(_lengths(1.0, 2)) < set(lengths)
+        assert _lengths(1e-5, 2).tolist() == [1e-5]
+        assert _lengths(0.0, 2).tolist() == [0.0]
 
 
 class TestCheck:
