@@ -121,6 +121,8 @@ class PreprocessConfig(Section):
     """Kept per frame at most."""
     thinning: Thinning = "random"
     seed: int = 0
+    workers: Count = 1
+    """Processes, one episode each; they change nothing but the time."""
 
 
 class SimulateConfig(Section):

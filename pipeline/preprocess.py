@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import typer
 
 from diffcloud.errors import ConfigError, EpisodeError
-from diffcloud.io.calibrations import read_calibration
+from diffcloud.io.calibrations import Calibration, read_calibration
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.images import write_color
 from diffcloud.io.raw_episodes import RawEpisode, read_description, read_raw_episode
@@ -21,7 +22,8 @@ from diffcloud.sensing.masking import RobotMask
 from diffcloud.sensing.pictures import cloud_picture, mask_picture
 from diffcloud.sensing.robot import Robot, gen3
 from pipeline.config import PreprocessConfig, RawConfig, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, episode_files, errors, finish, progress_bar
+from pipeline.console import JsonFlag, ParamsFile, episode_files, errors, finish
+from pipeline.workers import Tell, run_all
 
 
 def preprocess(
@@ -33,39 +35,80 @@ def preprocess(
     urdf: Annotated[Path | None, typer.Option(help="The robot of raw episodes; without it, as params say.")] = None,
     mask: Annotated[bool, typer.Option(help="Take the robot out of raw episodes.")] = True,
     calibration: Annotated[Path | None, typer.Option(help="Calibration file for the cameras of raw episodes.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Episodes at once, each in a process with one thread.")] = None,
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
     """Raw episodes: depth to points, robot and table out, views merged. Then all: crop, remove outliers, thin."""
     config = load_config(params)
-    settings = updated(config.preprocess, raw=updated(config.preprocess.raw, robot=None if urdf is None else str(urdf)))
+    raw = updated(config.preprocess.raw, robot=None if urdf is None else str(urdf))
+    settings = updated(config.preprocess, raw=raw, workers=workers)
     if not mask:
         settings = settings.model_copy(update={"raw": settings.raw.model_copy(update={"robot": None})})
     sources = _sources(recorded, config.scenarios)
     calibrated = None if calibration is None else read_calibration(calibration)
-    robot = _mask(settings.raw) if any(path.is_dir() for _, path in sources) else None
+    if any(path.is_dir() for _, path in sources):
+        _mask(settings.raw)  # a robot that cannot be read must not cost an episode's time
+    jobs = [PreprocessJob(scenario, path, out, settings, calibrated) for scenario, path in sources]
     kept: dict[str, Any] = {}
-    with progress_bar("preprocess", len(sources)) as update:
-        for index, (scenario, path) in enumerate(sources):
-            tell = _teller(update, index, path.name)
-            try:
-                if path.is_dir():
-                    pictures = _Pictures(read_raw_episode(path))
-                    episode = fuse(
-                        pictures.raw, robot, settings.raw.fusion(), calibration=calibrated, tell=tell, watch=pictures
-                    )
-                else:
-                    pictures, episode = None, read_episode(path)
-                episode = _clean(episode, settings)
-            except EpisodeError as error:
-                raise EpisodeError(f"{path}: {error}") from error
-            write_episode(out / scenario / f"{_stem(path)}.npz", episode)
-            if pictures is not None:
-                pictures.write(out / scenario, _stem(path), episode)
-            kept[_stem(path)] = {"recorded": episode.meta["quality"]["recorded"], "kept": episode.meta["quality"]["kept"]}
-            update(index + 1, path.name)
-    errors.print(f"Cleaned {len(sources)} episodes into {out}.")
+    failures: list[str] = []
+    for job, counts, error in run_all("preprocess", jobs, settings.workers):
+        if error is None:
+            kept[job.name] = counts
+        else:
+            failures.append(error)
+    errors.print(f"Cleaned {len(kept)} episodes into {out}.")
     finish({"out": str(out), "points": kept}, json)
+    if failures:
+        raise EpisodeError("\n".join(failures))
+
+
+@dataclass(frozen=True)
+class PreprocessJob:
+    """One episode to fuse, if it is a raw one, and to clean."""
+
+    scenario: str
+    path: Path
+    """Episode file or raw episode."""
+    out: Path
+    settings: PreprocessConfig
+    calibration: Calibration | None
+
+    @property
+    def name(self) -> str:
+        return _stem(self.path)
+
+    @property
+    def label(self) -> str:
+        return self.path.name
+
+    def run(self, tell: Tell) -> dict[str, list[int]]:
+        """Write the clean episode, with pictures of a raw one; points per frame, recorded and kept.
+
+        Raises:
+            EpisodeError: a damaged episode, or one of which nothing is left.
+        """
+        pictures = None
+        try:
+            if self.path.is_dir():
+                pictures = _Pictures(read_raw_episode(self.path))
+                episode = fuse(
+                    pictures.raw,
+                    _mask(self.settings.raw),
+                    self.settings.raw.fusion(),
+                    calibration=self.calibration,
+                    tell=lambda _, text: tell(0.0, text),
+                    watch=pictures,
+                )
+            else:
+                episode = read_episode(self.path)
+            episode = _clean(episode, self.settings)
+        except EpisodeError as error:
+            raise EpisodeError(f"{self.path}: {error}") from error
+        write_episode(self.out / self.scenario / f"{self.name}.npz", episode)
+        if pictures is not None:
+            pictures.write(self.out / self.scenario, self.name, episode)
+        return {key: episode.meta["quality"][key] for key in ("recorded", "kept")}
 
 
 def _sources(recorded: Path, scenarios: list[str]) -> list[tuple[str, Path]]:
@@ -105,15 +148,12 @@ def _stem(path: Path) -> str:
     return path.name if path.is_dir() else path.stem
 
 
+@cache
 def _mask(raw: RawConfig) -> RobotMask | None:
     if raw.robot is None:
         return None
     robot = gen3() if raw.robot == "gen3" else Robot.from_urdf(Path(raw.robot))
     return RobotMask(robot, inflation_m=raw.inflation_m)
-
-
-def _teller(update: Callable[[int, str], None], done: int, name: str) -> Callable[[int, str], None]:
-    return lambda _, text: update(done, f"{name}, {text}")
 
 
 class _Pictures:

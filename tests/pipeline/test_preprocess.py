@@ -44,6 +44,20 @@ def test_raw_episode_to_episode(tmp_path, params):
     assert same == (tmp_path / "episodes" / "lift" / "blue1.npz").read_bytes()
 
 
+def test_workers_change_nothing_and_a_damaged_episode_stops_no_other(tmp_path, params):
+    for name in ("blue1", "blue2", "blue3"):
+        write_cloth_episode(tmp_path / "raw" / "lift" / name, frames=1)
+    (tmp_path / "raw" / "lift" / "blue2" / "robot.csv").unlink()
+    for workers in (1, 2):
+        out = tmp_path / str(workers)
+        done = invoke("preprocess", tmp_path / "raw", "--out", out, "--params", params, "--workers", workers, code=1)
+        assert done.result["points"].keys() == {"blue1", "blue3"}
+        assert "blue2: " in done.errors
+        assert {path.name for path in (out / "lift").glob("*.npz")} == {"blue1.npz", "blue3.npz"}
+    for path in (tmp_path / "1" / "lift").iterdir():
+        assert path.read_bytes() == (tmp_path / "2" / "lift" / path.name).read_bytes()
+
+
 def test_bad_robots_and_places(tmp_path, params):
     raw = write_cloth_episode(tmp_path / "raw" / "blue1", frames=1).folder
     common = (raw, "--out", tmp_path / "episodes", "--params", params)
