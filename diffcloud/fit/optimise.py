@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -122,13 +123,12 @@ def fit_adam(
     start_values, logarithmic, evaluations = _starts(objective, space, settings)
     iterates = [row.clone().requires_grad_(True) for row in space.unbounded(start_values, logarithmic)]
     optimiser = torch.optim.Adam([{"params": [row]} for row in iterates], lr=settings.learning_rate)
-    stalled = _Stalled.none(settings.starts, dtype, device)
+    patience = _Patience(settings)
     generator = torch.Generator().manual_seed(settings.seed)
-    moves = torch.Generator().manual_seed(settings.seed)
     alive = torch.ones(settings.starts, dtype=torch.bool, device=device)
     history = FitHistory(space.names)
     failures: list[str] = []
-    best = _Best(float("inf"), 0, start_values[0])
+    best = _Best(math.inf, 0, start_values[0])
     reason: StopReason = "iterations"
     try:
         for iteration in range(settings.iterations + 1):
@@ -159,7 +159,7 @@ def fit_adam(
                     owner, noise = owner[~lost], noise[~lost]
             found, values = found.detach(), values.detach()
             unperturbed = (noise == 0).all(-1)
-            losses = torch.full((settings.starts,), float("inf"), dtype=dtype, device=device)
+            losses = torch.full((settings.starts,), math.inf, dtype=dtype, device=device)
             losses[owner[unperturbed]] = found[unperturbed]
             centre = torch.full_like(start_values, float("nan"))
             centre[owner[unperturbed]] = values[unperturbed]
@@ -178,17 +178,12 @@ def fit_adam(
                 break
             if iteration < settings.iterations:
                 optimiser.step()
-                stalled = stalled.after(losses)
-                late = alive & (stalled.since >= settings.patience)
-                for start in late.nonzero().flatten().tolist() if settings.patience else []:
-                    if start == 0:
-                        continue
-                    place, scale = _beside(best.values, space, moves)
+                for start in patience.spent_by(losses, alive):
+                    place, scale = patience.place_beside(best.values, space)
                     with torch.no_grad():
                         iterates[start].copy_(space.unbounded(place[None], logarithmic[start, None])[0])
-                    optimiser.state.pop(iterates[start])
+                    optimiser.state.pop(iterates[start])  # the old place's moments
                     optimiser.param_groups[start]["lr"] = settings.learning_rate * scale
-                    stalled = stalled.without(start)
     except KeyboardInterrupt:
         if not history.losses:
             raise
@@ -217,37 +212,32 @@ class _Best:
     """[k]"""
 
 
-@dataclass(frozen=True)
-class _Stalled:
-    """How long each start has been without a lower loss."""
+class _Patience:
+    """Which starts go on beside the best iterate, and where."""
 
-    lowest: Tensor
-    """[B]"""
-    since: Tensor
-    """[B] iterations"""
+    def __init__(self, settings: AdamSettings) -> None:
+        self._iterations = settings.patience
+        self._lowest = [math.inf] * settings.starts
+        self._in_vain = [0] * settings.starts
+        self._generator = torch.Generator().manual_seed(settings.seed)  # its own: the first start's noise stays the same
 
-    @staticmethod
-    def none(starts: int, dtype: torch.dtype, device: torch.device) -> _Stalled:
-        return _Stalled(
-            torch.full((starts,), float("inf"), dtype=dtype, device=device),
-            torch.zeros(starts, dtype=torch.long, device=device),
-        )
+    def spent_by(self, losses: Tensor, alive: Tensor) -> list[int]:
+        """After an iteration with these losses [B]: starts to move, whose count begins anew."""
+        moved = []
+        for start, (loss, lives) in enumerate(zip(losses.tolist(), alive.tolist(), strict=True)):
+            lower = loss < self._lowest[start]
+            self._lowest[start] = min(loss, self._lowest[start])
+            self._in_vain[start] = 0 if lower else self._in_vain[start] + 1
+            if start > 0 and lives and 0 < self._iterations <= self._in_vain[start]:
+                self._lowest[start], self._in_vain[start] = math.inf, 0
+                moved.append(start)
+        return moved
 
-    def after(self, losses: Tensor) -> _Stalled:
-        """After an iteration with these losses [B]."""
-        return _Stalled(torch.minimum(self.lowest, losses), torch.where(losses < self.lowest, 0, self.since + 1))
-
-    def without(self, start: int) -> _Stalled:
-        """The same with a new count for a start."""
-        index = torch.tensor([start], device=self.since.device)
-        return _Stalled(self.lowest.index_fill(0, index, float("inf")), self.since.index_fill(0, index, 0))
-
-
-def _beside(values: Tensor, space: FitSpace, generator: torch.Generator) -> tuple[Tensor, float]:
-    """A random place [k] beside values [k], and the scale of how far that is, as a part of them."""
-    scale = _FARTHEST * (_NEAREST / _FARTHEST) ** float(torch.rand(1, generator=generator))
-    noise = scale * torch.randn(len(values), generator=generator).to(values)
-    return space.moved(values, noise), scale
+    def place_beside(self, values: Tensor, space: FitSpace) -> tuple[Tensor, float]:
+        """A random place [k] beside values [k], and the scale of how far that is, as a part of them."""
+        scale = _FARTHEST * (_NEAREST / _FARTHEST) ** float(torch.rand(1, generator=self._generator))
+        noise = scale * torch.randn(len(values), generator=self._generator).to(values)
+        return space.moved(values, noise), scale
 
 
 def _starts(objective: Objective, space: FitSpace, settings: AdamSettings) -> tuple[Tensor, Tensor, int]:
