@@ -277,6 +277,8 @@ def _scan(
             np.setdiff1d(_lengths(far, steps), known) if _longest(known, rise) is None else np.empty(0)
             for far, known, rise in zip(reach, lengths, rises, strict=True)
         ]
+        if not any(map(len, wanted)):
+            break
         places = np.concatenate(
             [centre[None], *(centre + length[:, None] * ray for length, ray in zip(wanted, rays, strict=True))]
         )
