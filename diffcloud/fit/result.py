@@ -17,7 +17,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.optimise import AdamSettings, FitOutcome
 from diffcloud.fit.parameters import NUISANCE, FitSpace
-from diffcloud.io.files import atomic_path, read_json, write_json
+from diffcloud.io.files import read_json, together, write_json, write_npz
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS
@@ -170,11 +170,11 @@ def describe_fit(
 
 
 def write_fit(folder: Path, name: str, result: FitResult) -> Path:
-    """Write `<name>.npz` (trajectory) and then `<name>.json`; returns the latter."""
-    folder = Path(folder)
-    with atomic_path(folder / f"{name}.npz") as temporary:
-        np.savez_compressed(
-            temporary,
+    """Write `<name>.npz` (trajectory) and `<name>.json` together; returns the latter."""
+    path = Path(folder) / f"{name}.json"
+    with together():
+        write_npz(
+            path.with_suffix(".npz"),
             nodes=result.positions,
             start_nodes=result.start_positions,
             faces=result.faces,
@@ -182,8 +182,7 @@ def write_fit(folder: Path, name: str, result: FitResult) -> Path:
             obstacle_nodes=result.bodies.nodes,
             obstacle_faces=result.bodies.faces,
         )
-    path = folder / f"{name}.json"
-    write_json(path, result.summary)
+        write_json(path, result.summary)
     return path
 
 

@@ -13,7 +13,7 @@ import pytest
 from diffcloud.errors import DiffCloudError, EpisodeError
 from diffcloud.io.clouds import import_open3d, read_cloud, write_ply
 from diffcloud.io.episodes import Episode, read_episode, write_episode
-from diffcloud.io.files import atomic_path, read_json, write_json, write_text
+from diffcloud.io.files import atomic, read_json, write_json, write_text
 from diffcloud.io.pickles import load_npy
 
 
@@ -22,8 +22,8 @@ def names(folder):
 
 
 def write_half(target, error):
-    with atomic_path(target) as temporary:
-        temporary.write_text("half of the n")
+    with atomic(target) as stream:
+        stream.write(b"half of the n")
         raise error
 
 
