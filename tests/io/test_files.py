@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import pickle
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -67,6 +68,20 @@ class _Evil:
         return (os.system, ("touch /tmp/diffcloud-was-here",))
 
 
+def pickled(value, protocol=4):
+    array = np.empty((), dtype=object)
+    array[()] = value
+    return pickle.dumps(array, protocol=protocol)
+
+
+def write_pickled(path, value=None, *, data=None):
+    """A dictionary as `np.save` writes it, or other bytes in its place."""
+    with path.open("wb") as stream:
+        header = np.lib.format.header_data_from_array_1_0(np.array(None, dtype=object))
+        np.lib.format.write_array_header_1_0(stream, header)
+        stream.write(pickled(value) if data is None else data)
+
+
 class TestPickles:
     def test_plain_containers_and_arrays_are_read(self, tmp_path):
         value = {"0": np.array([1.0, 2.0]), "list": [1, "a", (2.5, None)], "scalar": np.float32(3)}
@@ -79,13 +94,11 @@ class TestPickles:
     @pytest.mark.parametrize("payload", [_Evil(), {"a": [_Evil()]}, pytest, print, np.load])
     def test_code_is_refused_and_not_run(self, tmp_path, payload):
         marker = "/tmp/diffcloud-was-here"
-        header = np.array(None, dtype=object)
-        with (tmp_path / "evil.npy").open("wb") as stream:
-            np.lib.format.write_array_header_1_0(stream, np.lib.format.header_data_from_array_1_0(header))
-            try:
-                stream.write(pickle.dumps(payload))
-            except TypeError:
-                stream.write(b"cos\nsystem\n(S'touch " + marker.encode() + b"'\ntR.")
+        try:
+            data = pickle.dumps(payload)
+        except TypeError:
+            data = b"cos\nsystem\n(S'touch " + marker.encode() + b"'\ntR."
+        write_pickled(tmp_path / "evil.npy", data=data)
         with pytest.raises(EpisodeError, match=r"evil\.npy.*only plain containers|damaged pickle"):
             load_npy(tmp_path / "evil.npy")
         assert not os.path.exists(marker)
@@ -95,6 +108,79 @@ class TestPickles:
         (tmp_path / "d.npy").write_bytes(data)
         with pytest.raises(EpisodeError, match=r"d\.npy"):
             load_npy(tmp_path / "d.npy")
+
+    def test_a_forged_array_of_pointers_is_refused(self, tmp_path):
+        """Object pointers made of bytes: a reader that made the array would follow them wherever they lead."""
+
+        class Forged:
+            def __reduce__(self):
+                return np.ndarray, ((2,), np.dtype(object), b"\x41" * 16)
+
+        for data in (pickle.dumps(Forged()), pickled({"lift_navy": Forged()})):
+            write_pickled(tmp_path / "f.npy", data=data)
+            with pytest.raises(EpisodeError, match=r"f\.npy (refers to numpy's ndarray|is no pickle of numpy)"):
+                load_npy(tmp_path / "f.npy")
+        # an array of one object, whose list of elements is replaced by a pointer
+        data = pickled(None).replace(b"]\x94Na", b"C\x08" + b"\x41" * 8)
+        write_pickled(tmp_path / "f.npy", data=data)
+        with pytest.raises(EpisodeError, match="forged pointers"):
+            load_npy(tmp_path / "f.npy")
+
+    @pytest.mark.parametrize(
+        ("payload", "message"),
+        [
+            (b"]" * 1_000_000 + b"a" * 999_999 + b".", "no pickle of numpy"),
+            (b"]" * 5_000_000, "pickle of 5000000 bytes"),
+            (b"\x80\x04" + b"(" * 10 + b"t.", "no pickle of numpy"),
+            (b"X\xff\xff\xff\x7fabc", "damaged pickle"),
+            (b"\x8d\xff\xff\xff\xff\xff\xff\xff\x7fabc", "damaged pickle"),
+            (b"I5\n.", "pickle instruction INT"),
+            (b"t.", "damaged pickle"),
+        ],
+    )
+    def test_bombs_and_nonsense(self, tmp_path, payload, message):
+        write_pickled(tmp_path / "b.npy", data=payload)
+        with pytest.raises(EpisodeError, match=message):
+            load_npy(tmp_path / "b.npy")
+
+    def test_deep_and_shared_nesting_is_refused_without_unfolding_it(self, tmp_path):
+        deep: list[object] = []
+        for _ in range(100):
+            deep = [deep]
+        shared: list[object] = [1]
+        for _ in range(12):
+            shared = [shared] * 1000
+        for value, message in ((deep, "more than 16 deep"), (shared, "one container twice")):
+            write_pickled(tmp_path / "n.npy", {"a": value})
+            with pytest.raises(EpisodeError, match=message):
+                load_npy(tmp_path / "n.npy")
+
+    def test_every_flipped_byte_gives_a_value_or_a_clear_error(self, tmp_path):
+        write_pickled(tmp_path / "f.npy", {"lift_navy": np.float32([1, 2]), "lift_tan": [1, 2.5, "x", None]})
+        data = bytearray((tmp_path / "f.npy").read_bytes())
+        rng = np.random.default_rng(0)
+        for place in range(len(data)):
+            flipped = data.copy()
+            flipped[place] ^= int(rng.integers(1, 256))
+            (tmp_path / "f.npy").write_bytes(flipped)
+            with suppress(EpisodeError):
+                load_npy(tmp_path / "f.npy")
+
+    def test_a_header_that_claims_more_than_there_is(self, tmp_path):
+        header = {"descr": "<f8", "fortran_order": False, "shape": (10**8, 300)}
+        with (tmp_path / "h.npy").open("wb") as stream:
+            np.lib.format.write_array_header_1_0(stream, header)
+            stream.write(b"abc")
+        with pytest.raises(EpisodeError, match="take 240000000000 bytes, it has 3"):
+            load_npy(tmp_path / "h.npy")
+
+    def test_older_files_of_numpy_are_read(self, tmp_path):
+        for protocol in (2, 3, 4):
+            data = pickled({"a": np.float32([1.5, 2]), "b": np.float64(3)}, protocol)
+            write_pickled(tmp_path / "o.npy", data=data)
+            found = load_npy(tmp_path / "o.npy")
+            assert found["a"].tolist() == [1.5, 2]
+            assert found["b"] == 3
 
     def test_truncated_pickle(self, tmp_path):
         np.save(tmp_path / "t.npy", np.array({"a": np.zeros(50)}, dtype=object), allow_pickle=True)
