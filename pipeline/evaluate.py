@@ -21,6 +21,7 @@ from diffcloud.fit import Objective, read_fit
 from diffcloud.fit.parameters import NUISANCE
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import claimed, files_in, together, write_json, write_text
+from diffcloud.sim.properties import check_values
 from pipeline.comparison import Comparison, compare, comparison_jobs, write_tables
 from pipeline.config import Config, load_config
 from pipeline.console import JsonFlag, ParamsFile, assignments, errors, finish, output, show
@@ -48,6 +49,8 @@ def loss(
     chosen = choose_scenario(scenario, scene)
     objective = Objective(chosen, [read_episode(episode)], points=points, frames=frame, seed=seed)
     values = assignments(set_, "--set")
+    check_values({name: value for name, value in values.items() if name not in NUISANCE}, "--set")
+    chosen.check_parameters(values)
     tensors = {name: torch.tensor([value], dtype=objective.system.dtype) for name, value in values.items()}
     nuisance = {name: tensors.pop(name) for name in list(tensors) if name in NUISANCE}
     with torch.no_grad():

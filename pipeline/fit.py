@@ -106,10 +106,9 @@ def fit(
     for folder, (chosen, files) in folders.items():
         recorded = {path.stem: read_episode(path) for path in files}
         groups = {_JOINT: recorded} if settings.joint else {name: {name: episode} for name, episode in recorded.items()}
-        jobs += [
-            FitJob(chosen, name, members, settings, out / folder, _first_start(init, chosen, list(members.values())))
-            for name, members in groups.items()
-        ]
+        for name, members in groups.items():
+            job = FitJob(chosen, name, members, settings, out / folder)
+            jobs.append(replace(job, init=_first_start(init, job)))
     for job in jobs:
         job.objective()
     space = jobs[0].space
@@ -215,6 +214,7 @@ class FitJob:
             ConfigError: bounds or fixed values that do not fit the parameters.
         """
         settings, scenario = self.settings, self.scenario
+        scenario.check_parameters([*settings.parameters, *settings.fixed])
         return FitSpace.build(
             settings.parameters,
             bounds={**scenario.bounds, **settings.bounds},
@@ -271,17 +271,23 @@ class FitJob:
         return fingerprint([self.scenario, self.name, self.episodes, settings, self.init], packages=_CODE)
 
 
-def _first_start(init: str, scenario: Scenario, episodes: list[Episode]) -> dict[str, float]:
-    """Values of the first start by name; episodes of a joint fit give the mean of their predictions."""
+def _first_start(init: str, job: FitJob) -> dict[str, float]:
+    """Values of the first start by name; episodes of a joint fit give the mean of their predictions.
+
+    Raises:
+        ConfigError: a value of what is not fitted, or outside of its bounds.
+    """
     if init == "middle":
         return {}
     if "=" in init:
-        return assignments(init.split(","), "--init")
+        stated = assignments(init.split(","), "--init")
+        job.space.check_start(stated)
+        return stated
     # imported here: the fits of the pipeline start elsewhere, and must not be stale when a regressor changes
     from pipeline.predict import predicted_start
 
-    found = [predicted_start(init, scenario.name, episode) for episode in episodes]
-    return {name: sum(values[name] for values in found) / len(found) for name in found[0]}
+    found = [predicted_start(init, job.scenario.name, episode) for episode in job.episodes.values()]
+    return job.space.nearest({name: sum(values[name] for values in found) / len(found) for name in found[0]})
 
 
 def _row(summary: Mapping[str, Any], space: FitSpace) -> list[str]:

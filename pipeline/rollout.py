@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import torch
 import typer
 
@@ -17,6 +16,7 @@ from diffcloud.io.clouds import write_ply
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import together, write_npz
 from diffcloud.io.obj import write_cloth
+from diffcloud.sim.properties import check_values
 from diffcloud.sim.simulate import rollout as simulate
 from pipeline.console import JsonFlag, assignments, errors, finish, progress_bar, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, limits
@@ -44,8 +44,8 @@ def rollout(
         fitted = read_fit(fit)["parameters"]
         values |= {name: float(entry["value"]) for name, entry in fitted.items() if name not in NUISANCE}
     values |= assignments(set_, "--set")
-    if any(not np.isfinite(value) for value in values.values()):
-        raise ConfigError(f"Parameters must be finite numbers, got {values}.")
+    check_values(values, "--set")
+    chosen.check_parameters(values)
     frames = frames or chosen.frames
     steps = frames * chosen.scene.frame_steps
     system, _ = chosen.scene.build()

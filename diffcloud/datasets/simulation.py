@@ -7,8 +7,10 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,7 +20,7 @@ from diffcloud.clouds.augmentation import Augmentation, CloudMaker, run_keys
 from diffcloud.datasets.chunks import Chunk, Replaced, SimulatedChunk, chunks_of, simulate_chunk
 from diffcloud.datasets.draws import ParameterDraws
 from diffcloud.datasets.work import WorkFolder
-from diffcloud.errors import ConfigError, DatasetError
+from diffcloud.errors import ConfigError, DatasetError, DiffCloudError
 from diffcloud.io.files import atomic, write_json
 from diffcloud.io.simulated import SimulatedSet, Split, write_simulated
 from diffcloud.scene.scenarios import Scenario
@@ -132,41 +134,62 @@ def _simulated(
         for chunk in chunks:
             yield chunk, simulate_chunk(plan.scenario, plan.draws, chunk)
         return
-    import dask  # takes a second
-    from distributed import Client, KilledWorker, LocalCluster, as_completed
+    from distributed import Client, as_completed
 
-    if scheduler is not None:
-        cluster = None
-        try:
-            client = Client(scheduler, timeout=_ANSWER_S)
-        except (OSError, ValueError) as error:
-            raise ConfigError(
-                f"No Dask scheduler answers at {scheduler}: {error}. Start one with `dask scheduler`."
-            ) from error
-    else:
-        with dask.config.set(_WORKER_MEMORY):
-            cluster = LocalCluster(
-                n_workers=min(workers, len(chunks)),
-                threads_per_worker=1,
-                dashboard_address=":0",  # any port: two sets at once do not quarrel
-                silence_logs=logging.ERROR,
-            )
-        client = Client(cluster)
-        client.run(_ignore_ctrl_c)
-    try:
+    with ExitStack() as stack:
+        if scheduler is not None:
+            try:
+                client = stack.enter_context(Client(scheduler, timeout=_ANSWER_S))
+            except (OSError, ValueError) as error:
+                raise ConfigError(
+                    f"No Dask scheduler answers at {scheduler}: {error}. Start one with `dask scheduler`."
+                ) from error
+        else:
+            client = stack.enter_context(_local_client(min(workers, len(chunks))))
         futures = {client.submit(simulate_chunk, plan.scenario, plan.draws, chunk, pure=False): chunk for chunk in chunks}
-        for future, result in as_completed(futures, with_results=True):
+        done = as_completed(futures, with_results=True)
+        while True:
+            # workers that are gone make Dask raise errors of many kinds; those of a chunk are the project's own
+            try:
+                future, result = next(done)
+            except StopIteration:
+                return
+            except DiffCloudError:
+                raise
+            except Exception as error:
+                raise _workers_lost(error) from error
             yield futures[future], result
             future.release()
-    except KilledWorker as error:
-        raise DatasetError(
-            f"Worker processes ended without a word, perhaps for want of memory ({error}). Finished runs are kept; try "
-            "fewer --workers."
-        ) from error
-    finally:
-        client.close()
-        if cluster is not None:
-            cluster.close()
+
+
+@contextmanager
+def _local_client(workers: int) -> Iterator[Any]:
+    """A Dask client of processes on this machine."""
+    import dask  # takes a second
+    from distributed import Client, LocalCluster
+
+    with ExitStack() as stack:
+        try:
+            with dask.config.set(_WORKER_MEMORY):
+                cluster = LocalCluster(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    dashboard_address=":0",  # any port: two sets at once do not quarrel
+                    silence_logs=logging.CRITICAL,
+                )
+            stack.enter_context(cluster)
+            client = stack.enter_context(Client(cluster))
+            client.run(_ignore_ctrl_c)
+        except Exception as error:  # a worker that dies while it starts
+            raise _workers_lost(error) from error
+        yield client
+
+
+def _workers_lost(error: Exception) -> DatasetError:
+    return DatasetError(
+        f"Worker processes ended without a word ({type(error).__name__}: {error}), as those do that get no more memory or "
+        "are killed. Finished runs are kept; run the command again, perhaps with fewer --workers."
+    )
 
 
 def _ignore_ctrl_c() -> None:

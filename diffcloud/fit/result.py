@@ -45,26 +45,17 @@ class FitResult:
 
 def physical_values(scenario: Scenario, values: Mapping[str, float]) -> dict[str, dict[str, Any]]:
     """Each parameter with what it means: multiplier, physical value and unit (SI if the scene is)."""
-    material, around = scenario.scene.material, scenario.scene.surrounding
-    density = (scenario.scene.mass_material or material).density
-    basis = {
-        "stretch": material.resting_stretching_stiffness,
-        "bending": material.resting_bending_stiffness,
-        "mass": density,
-        "density": density,
-        "drag": around.air_density,
-    }
     described: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
         if name in NUISANCE:
             described[name] = {"value": value, "unit": NUISANCE[name], "physical": value, "physical_unit": NUISANCE[name]}
             continue
         parameter = PARAMETERS[name]
-        multiplier = parameter.kind == "multiplier"
+        basis = parameter.basis
         described[name] = {
             "value": value,
-            "unit": "x basis" if multiplier else parameter.unit,
-            "physical": value * basis[name] if multiplier else value,
+            "unit": parameter.unit if basis is None else "x basis",
+            "physical": value if basis is None else value * scenario.scene.basis(basis),
             "physical_unit": parameter.unit,
             "meaning": parameter.meaning,
         }

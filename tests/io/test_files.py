@@ -6,7 +6,10 @@ import errno
 import json
 import os
 import pickle
+import subprocess
+import sys
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +17,21 @@ import pytest
 from diffcloud.errors import DiffCloudError, EpisodeError
 from diffcloud.io.clouds import import_open3d, read_cloud, write_ply
 from diffcloud.io.episodes import Episode, read_episode, write_episode
-from diffcloud.io.files import atomic, read_json, write_json, write_text
+from diffcloud.io.files import (
+    TEMPORARY,
+    atomic,
+    claimed,
+    files_in,
+    read_json,
+    staged,
+    together,
+    write_json,
+    write_text,
+)
+from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
 from diffcloud.io.pickles import load_npy
+
+ROOT = Path(__file__).parents[2]
 
 
 def names(folder):
@@ -52,6 +68,82 @@ class TestAtomicWrites:
             write_episode(tmp_path / "e.npz", episode())
         assert names(tmp_path) == []
 
+    def test_outputs_of_a_group_appear_together_or_not_at_all(self, tmp_path):
+        def write(text, error=None):
+            with together():
+                write_text(tmp_path / "deep" / "a.txt", text)
+                write_json(tmp_path / "record.json", text)
+                assert not (tmp_path / "deep" / "a.txt").exists() or text == "new"
+                if error is not None:
+                    raise error
+
+        with pytest.raises(KeyboardInterrupt):
+            write("old", KeyboardInterrupt())
+        assert names(tmp_path) == []  # not even the folder
+        write("old")
+        with pytest.raises(DiffCloudError):
+            write("new", DiffCloudError("no"))
+        assert (tmp_path / "deep" / "a.txt").read_text() == "old"
+        assert read_json(tmp_path / "record.json") == "old"
+        write("new")
+        assert (tmp_path / "deep" / "a.txt").read_text() == "new"
+        assert names(tmp_path) == ["deep", "record.json"]
+
+    def test_the_record_is_the_first_to_go_and_the_last_to_come(self, tmp_path, monkeypatch):
+        """So a kill between two renames leaves no record of files that are not all there."""
+        moved = []
+        replace = os.replace
+
+        def watched(source, target):
+            moved.append((target.name, (tmp_path / "record.json").exists()))
+            replace(source, target)
+
+        monkeypatch.setattr(os, "replace", watched)
+        for text in ("old", "new"):
+            with together():
+                for name in ("a.txt", "b.txt", "record.json"):
+                    write_text(tmp_path / name, text)
+        assert moved == 2 * [("a.txt", False), ("b.txt", False), ("record.json", False)]
+
+    def test_what_a_kill_leaves_is_no_data_and_goes_with_the_next_write(self, tmp_path):
+        code = (
+            "import os, sys; from diffcloud.io.files import atomic\n"
+            "with atomic(sys.argv[1]) as stream: stream.write(b'half'); stream.flush(); os.kill(os.getpid(), 9)"
+        )
+        subprocess.run([sys.executable, "-c", code, tmp_path / "e.npz"], cwd=ROOT, check=False)
+        (left,) = tmp_path.iterdir()
+        assert left.suffix == TEMPORARY
+        assert files_in(tmp_path) == files_in(tmp_path, ".npz") == []
+        write_text(tmp_path / "e.npz", "whole")
+        assert names(tmp_path) == ["e.npz"]
+
+    def test_two_processes_do_not_write_one_file_at_once(self, tmp_path):
+        code = (
+            "import sys; from diffcloud.io.files import atomic\n"
+            "with atomic(sys.argv[1]) as stream: stream.write(b'first'); print('writing', flush=True); sys.stdin.read()"
+        )
+        command = [sys.executable, "-c", code, tmp_path / "e.npz"]
+        with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as first:
+            assert first.stdout.readline() == b"writing\n"
+            with pytest.raises(DiffCloudError, match=r"Another process is writing .*e\.npz"):
+                write_text(tmp_path / "e.npz", "second")
+            first.communicate()
+        assert (tmp_path / "e.npz").read_text() == "first"
+
+    def test_a_staged_folder_appears_whole(self, tmp_path):
+        def interrupted():
+            with staged(tmp_path / "e") as folder:
+                write_text(folder / "a.txt", "half")
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            interrupted()
+        assert names(tmp_path) == []
+        with staged(tmp_path / "e") as folder:
+            write_text(folder / "a.txt", "whole")
+            assert not (tmp_path / "e").exists()
+        assert names(tmp_path / "e") == ["a.txt"]
+
     def test_nan_is_not_written_to_json(self, tmp_path):
         with pytest.raises(ValueError, match="JSON"):
             write_json(tmp_path / "a.json", {"x": float("nan")})
@@ -61,6 +153,79 @@ class TestAtomicWrites:
         (tmp_path / "a.json").write_text("{")
         with pytest.raises(DiffCloudError, match=r"a\.json is not readable JSON"):
             read_json(tmp_path / "a.json")
+
+
+class TestClaims:
+    HOLD = (
+        "import sys; from diffcloud.io.files import claimed\n"
+        "with claimed(sys.argv[1]): print('held', flush=True); sys.stdin.read()"
+    )
+
+    def holder(self, out):
+        process = subprocess.Popen(
+            [sys.executable, "-c", self.HOLD, out], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        assert process.stdout.readline() == b"held\n"
+        return process
+
+    def test_the_process_that_holds_an_output_is_named(self, tmp_path):
+        with self.holder(tmp_path / "out") as process:
+            with pytest.raises(DiffCloudError, match=f"is being written by process {process.pid} on .*-c"):
+                self.claim(tmp_path / "out")
+            with pytest.raises(DiffCloudError, match=f"process {process.pid}"):  # by another name of the same place
+                self.claim(tmp_path / "x" / ".." / "out")
+            process.communicate()
+        self.claim(tmp_path / "out")
+        assert names(tmp_path) == []
+
+    def test_a_kill_frees_it(self, tmp_path):
+        with self.holder(tmp_path / "out") as process:
+            process.kill()
+            process.communicate()
+        assert len(names(tmp_path)) == 1
+        self.claim(tmp_path / "out")
+        assert names(tmp_path) == []
+
+    @staticmethod
+    def claim(out):
+        with claimed(out):
+            pass
+
+    def test_a_place_that_cannot_be_written(self, tmp_path):
+        (tmp_path / "file").write_text("")
+        with pytest.raises(DiffCloudError, match="Cannot write"):
+            self.claim(tmp_path / "file" / "out")
+
+
+class TestManifests:
+    def test_only_what_is_listed_is_removed(self, tmp_path):
+        for name in ("a/b/c.json", "a/mine.txt", "d.npz"):
+            write_text(tmp_path / name, "")
+        assert remove_files(tmp_path, ["a/b/c.json", "d.npz", "gone.json"]) == ["a/b/c.json", "d.npz"]
+        assert sorted(path.as_posix() for path in tmp_path.rglob("*")) == [f"{tmp_path}/a", f"{tmp_path}/a/mine.txt"]
+
+    @pytest.mark.parametrize("name", ["../a.txt", "/etc/hostname", "x/../../a.txt"])
+    def test_nothing_outside_is_removed(self, tmp_path, name):
+        write_text(tmp_path / "a.txt", "")
+        with pytest.raises(DiffCloudError, match="lies outside"):
+            remove_files(tmp_path / "folder", [name])
+        assert (tmp_path / "a.txt").exists()
+
+    def test_damaged_ones_are_named(self, tmp_path):
+        assert read_manifest(tmp_path) == set()
+        write_manifest(tmp_path, ["b", "a"])
+        assert read_manifest(tmp_path) == {"a", "b"}
+        write_text(tmp_path / "manifest.json", '{"files": [1]}')
+        with pytest.raises(DiffCloudError, match="must list `files`"):
+            read_manifest(tmp_path)
+
+
+def test_hidden_files_are_no_data(tmp_path):
+    for name in ("b.npz", "a.NPZ", "._a.npz", ".hidden", "c.json"):
+        write_text(tmp_path / name, "")
+    (tmp_path / "folder.npz").mkdir()
+    assert [path.name for path in files_in(tmp_path, ".npz")] == ["a.NPZ", "b.npz"]
+    assert files_in(tmp_path / "none") == []
 
 
 class _Evil:
