@@ -17,12 +17,13 @@ from diffcloud.io.episodes import write_episode
 from diffcloud.io.imports import cloud_folder, release_episodes
 from diffcloud.io.recordings import Recording, read_joint_log, write_recording
 from diffcloud.io.ros_recordings import ros_recording
-from pipeline.console import JsonFlag, errors, finish, warn
+from pipeline.console import JsonFlag, errors, finish, warn, writes
 
 app = typer.Typer(no_args_is_help=True, help="Turn recordings of others into episodes.")
 
 
 @app.command()
+@writes()
 def release(
     folder: Annotated[Path, typer.Argument(help="Holds lift_real_pcls/, fold_real_pcls/, band_sim_pcls/, hang_sim_pcls/.")],
     out: Annotated[Path, typer.Option(help="Folder; episodes go to OUT/release_<lift|fold|band|hang>/.")],
@@ -39,6 +40,7 @@ def release(
 
 
 @app.command()
+@writes(".npz")
 def clouds(
     folder: Annotated[Path, typer.Argument(help="Numbered clouds (npy, ply, xyz, pcd), one a frame, in metres.")],
     out: Annotated[Path, typer.Option(help="Episode file (.npz).")],
