@@ -17,7 +17,7 @@ from diffcloud.io.depth_folders import depth_folders
 from diffcloud.io.episodes import write_episode
 from diffcloud.io.imports import cloud_folder, release_episodes
 from diffcloud.io.recordings import Recording, read_joint_log, write_recording
-from diffcloud.io.ros_joints import GRIPPER_JOINT
+from diffcloud.io.ros_joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
 from diffcloud.io.ros_recordings import ros_recording
 from pipeline.console import JsonFlag, errors, finish, warn
 
@@ -79,7 +79,9 @@ def recording(
     gripper_joint: Annotated[
         str, typer.Option(help="ROS: in joint_states; none for an arm without gripper.")
     ] = GRIPPER_JOINT,
-    gripper_closed: Annotated[float, typer.Option(help="ROS: its angle when closed, rad.")] = 0.8,
+    gripper_closed: Annotated[
+        float | None, typer.Option(help=f"ROS: its angle when closed, rad; {GRIPPER_CLOSED_RAD} if not given.")
+    ] = None,
     scenario: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
     fabric: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
     json: JsonFlag = False,

@@ -14,8 +14,10 @@ from diffcloud.errors import EpisodeError
 from diffcloud.io.raw_episodes import RobotLog
 from diffcloud.io.ros_transforms import TransformTree
 
-GRIPPER_JOINT = "finger_joint"
+GRIPPER_JOINT, GRIPPER_CLOSED_RAD = "finger_joint", 0.8
 """Of a Robotiq 2F-85, in its maker's description."""
+_LATEST_S = 0.5
+"""As with images: a message that is older than one before it by more is of another clock."""
 
 
 def joint_log(
@@ -27,7 +29,7 @@ def joint_log(
     tool_frame: str,
     joint_names: Sequence[str] | None,
     gripper_joint: str | None,
-    gripper_closed_rad: float,
+    gripper_closed_rad: float | None,
 ) -> tuple[RobotLog, tuple[str, ...]]:
     """(rows in order of time, warnings about what stays unknown).
 
@@ -36,9 +38,11 @@ def joint_log(
         messages: (time [s], sensor_msgs/JointState), one or more.
         joint_names: of the arm, in order; None takes joint_1, joint_2, ...
         gripper_joint: None for an arm without one.
+        gripper_closed_rad: None for that of a Robotiq 2F-85.
 
     Raises:
-        EpisodeError: a joint of the arm, or the gripper's, is not in joint_states; lists those that are.
+        EpisodeError: a joint of the arm, or the gripper's, is not in joint_states (lists those that are), or the clock was
+            set back.
     """
     seen = {name for _, message in messages for name in message.name}
     if joint_names is None:
@@ -49,7 +53,7 @@ def joint_log(
             f"{where}: joint_states has {', '.join(sorted(seen))}; {missing or 'joint_1, ...'} not among them. Name the "
             "arm's joints in order with --joint."
         )
-    rows, angles = _series(messages, joint_names)
+    rows, angles = _series(where, messages, joint_names)
     if not len(rows):
         raise EpisodeError(f"{where}: no message of joint_states has the angles of all of {', '.join(joint_names)}.")
     warnings: list[str] = []
@@ -57,8 +61,14 @@ def joint_log(
     others = sorted(seen - set(joint_names))
     if gripper_joint is not None and gripper_joint in seen:
         # often sent by another driver than the arm's joints, in messages of its own
-        times, values = _series(messages, [gripper_joint])
-        gripper = np.interp(rows, times, values[:, 0]) / gripper_closed_rad if len(times) else gripper
+        times, values = _series(where, messages, [gripper_joint])
+        closed = GRIPPER_CLOSED_RAD if gripper_closed_rad is None else gripper_closed_rad
+        gripper = np.interp(rows, times, values[:, 0]) / closed if len(times) else gripper
+        if gripper_closed_rad is None and gripper_joint != GRIPPER_JOINT:
+            warnings.append(
+                f"The gripper is taken to be closed where {gripper_joint} is {closed:g} rad, as a Robotiq 2F-85 is; say "
+                "where it is with --gripper-closed."
+            )
     elif gripper_joint is not None and (others or gripper_joint != GRIPPER_JOINT):
         raise EpisodeError(
             f"{where}: joint_states has no {gripper_joint!r}, so how far the gripper is open is not known; besides the "
@@ -81,10 +91,21 @@ def joint_log(
     return RobotLog(rows, angles, gripper, position, quaternion, np.full((len(rows), 6), np.nan)), tuple(warnings)
 
 
-def _series(messages: Sequence[tuple[float, Any]], names: Sequence[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _series(
+    where: str, messages: Sequence[tuple[float, Any]], names: Sequence[str]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Times [N], each once and in order, and positions [N, J] from the messages that have all of `names`."""
     held = [(t, dict(zip(message.name, message.position, strict=False))) for t, message in messages]
-    rows = sorted(((t, [at[name] for name in names]) for t, at in held if set(names) <= at.keys()), key=lambda row: row[0])
+    rows = [(t, [at[name] for name in names]) for t, at in held if set(names) <= at.keys()]
     times = np.array([t for t, _ in rows])
-    keep = np.concatenate([[True], np.diff(times) > 0]) if len(times) else np.zeros(0, bool)
-    return times[keep], np.array([values for _, values in rows], dtype=np.float64).reshape(-1, len(names))[keep]
+    values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, len(names))
+    behind = np.maximum.accumulate(times) - times
+    if (behind > _LATEST_S).any():
+        first = int(np.flatnonzero(behind > _LATEST_S)[0])
+        raise EpisodeError(
+            f"{where}: message {first + 1} of joint_states with {names[0]} is stamped {behind[first]:.2f} s before one "
+            "that came earlier. The clock was set back while recording, or two drivers use different clocks: cut the "
+            "recording there."
+        )
+    times, first_of_each = np.unique(times, return_index=True)
+    return times, values[first_of_each]

@@ -47,7 +47,7 @@ def ros_recording(
     tool_frame: str = "tool_frame",
     joint_names: list[str] | None = None,
     gripper_joint: str | None = GRIPPER_JOINT,
-    gripper_closed_rad: float = 0.8,
+    gripper_closed_rad: float | None = None,
 ) -> Recording:
     """A recording of ROS; images are read lazily.
 
@@ -55,7 +55,8 @@ def ros_recording(
         paths: one file or rosbag2 folder, or all parts of a split recording.
         world_frame, tool_frame: tf frames; poses that tf does not have stay open, with a warning.
         joint_names: of the arm, in order; None takes joint_1, joint_2, ... of joint_states.
-        gripper_joint, gripper_closed_rad: its angle, from 0 (open) to this (closed), becomes 0..1. None: no gripper.
+        gripper_joint: its angle becomes 0 (open, at 0) to 1 (closed). None: the arm has no gripper.
+        gripper_closed_rad: that angle when closed; None takes that of a Robotiq 2F-85.
 
     Raises:
         EpisodeError: unreadable, one part of a split recording, without depth and camera_info, stamps that run backwards,

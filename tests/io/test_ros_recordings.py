@@ -258,8 +258,15 @@ class TestGripper:
         assert "no 'finger_joint'" in bad.errors
         assert "besides the arm's joints there are robotiq_85_left_knuckle_joint" in bad.errors
         assert "--gripper-joint" in bad.errors
-        imported(tmp_path, path, options=("--gripper-joint", "robotiq_85_left_knuckle_joint"))
+        done = imported(tmp_path, path, options=("--gripper-joint", "robotiq_85_left_knuckle_joint"))
         np.testing.assert_allclose(self.gripper(tmp_path), 0.5)
+        assert "taken to be closed where robotiq_85_left_knuckle_joint is 0.8 rad" in done.result["warnings"][0]
+
+    def test_where_it_is_closed_may_be_given(self, tmp_path):
+        path = bag(tmp_path, "rosbag2", joints={"claw": 0.03})
+        done = imported(tmp_path, path, options=("--gripper-joint", "claw", "--gripper-closed", 0.04))
+        np.testing.assert_allclose(self.gripper(tmp_path), 0.75)
+        assert done.result["warnings"] == []
 
     def test_a_name_that_was_given_must_be_there(self, tmp_path):
         bad = imported(tmp_path, bag(tmp_path, "rosbag2", joints={}), options=("--gripper-joint", "claw"), code=1)
@@ -296,6 +303,15 @@ class TestOrder:
         bad = imported(tmp_path, bag(tmp_path, "rosbag2", stamps_s=lambda number: stamps[number]), code=1)
         assert "/overhead/aligned_depth_to_color/image_raw: message 4 is stamped 9.90 s before" in bad.errors
         assert not (tmp_path / "e").exists()
+
+    def test_joints_of_a_clock_that_was_set_back_are_refused(self, tmp_path):
+        class SetBack(Bag):
+            def _header(self, t, frame):
+                return super()._header(t - 3 if frame == "" and t > 1_700_000_000.3 else t, frame)
+
+        SetBack(tmp_path / "bag", "rosbag2", Habits()).write()
+        bad = imported(tmp_path, tmp_path / "bag", code=1)
+        assert "message 9 of joint_states with joint_1 is stamped 2.95 s before" in bad.errors
 
     def test_of_two_images_with_one_stamp_the_first_is_taken(self, tmp_path):
         stamps = [0.0, 0.1, 0.1, 0.3, 0.4]
