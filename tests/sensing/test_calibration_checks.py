@@ -154,8 +154,9 @@ class TestSuspects:
             table[["tool_x", "tool_y", "tool_z"]] *= 1000
 
         edit_log(episode, change)
-        bad = calibrated(tmp_path, "--force", code=1)
-        assert "they look like millimetres: divide by 1000" in bad.errors
+        for options in ((), ("--force",)):
+            bad = calibrated(tmp_path, *options, code=1)
+            assert "they look like millimetres: divide by 1000" in bad.errors
         assert not (tmp_path / "c.json").exists()
 
     def test_scale_of_the_arm(self, episode, tmp_path):
