@@ -268,7 +268,7 @@ def _camera_remarks(name: str, camera: CameraEvidence, off: float, *, board_too:
         else:
             yield (
                 "objection" if abs(off) > _WRONG else "warning",
-                f"{measures}. Suspected are its depth scale and {' and '.join(others)}: these poses do not tell them "
+                f"{measures}. Suspected are {', '.join(others)} and its depth scale: these poses do not tell them "
                 "apart. Record more, with the board 20 cm nearer and farther.",
             )
 

@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from diffcloud.errors import CalibrationError
 from diffcloud.io.calibrations import read_calibration
 from diffcloud.io.images import write_depth
+from diffcloud.sensing.board_chain import Estimate
 from diffcloud.sensing.calibration import calibrate_hand_eye
+from diffcloud.sensing.calibration_checks import CameraEvidence, judge_hand_eye
 from diffcloud.sensing.cameras import inverse, project, transform
 from diffcloud.sensing.charuco import CameraViews, View
 from tests.pipeline.invoke import invoke
@@ -302,7 +304,7 @@ class TestWithAnArmThatIsOff:
         found = calibrate_hand_eye(views_of(poses, rng, depth={"side": 1.04}), poses, BOARD)
         (message,) = found.objections
         assert "Camera side measures depth +4.0 % off the board's geometry" in message
-        assert "Suspected are its depth scale and its focal length" in message
+        assert "Suspected are its focal length and its depth scale" in message
         assert "square size" not in message
 
     def test_depth_of_all_cameras_that_the_arm_contradicts(self, rng):
@@ -318,6 +320,23 @@ class TestWithAnArmThatIsOff:
         poses[:, :3, 3] *= 1000
         with pytest.raises(CalibrationError, match="millimetres"):
             calibrate_hand_eye(views, poses, BOARD)
+
+
+class TestWithAnArmThatDoesNotTell:
+    """Poses so alike that the arm says neither how large the board is nor how long the focal lengths are."""
+
+    def judged(self, **depth):
+        rough = Estimate(1.0, 0.05)
+        evidence = {name: CameraEvidence(15, 15, 0.1, 1.0, 0.1, 1.0, 615.0, rough, ratio) for name, ratio in depth.items()}
+        return judge_hand_eye(evidence, rough, square_m=0.04)[1]
+
+    def test_depth_of_all_cameras_alike_is_the_board(self):
+        (message,) = self.judged(overhead=0.905, side=0.898)
+        assert "as if its squares were 36.1 mm and not 40.0 mm. How the arm moved the board does not tell" in message
+
+    def test_depth_of_the_only_camera_leaves_three_suspects(self):
+        (message,) = self.judged(side=0.9)
+        assert "Suspected are its focal length, the board's square size and its depth scale" in message
 
 
 class TestCheckerboard:
