@@ -1,115 +1,43 @@
 """Calibrating fixed cameras with a ChArUco board on the gripper.
 
-Chain, for corner X of the board, gripper pose i and camera c:
-
-    pixel = project_c( inverse(T_world_camera_c) · T_world_gripper_i · T_gripper_board · X )
-
-A hand-eye solution of each camera alone starts a joint least-squares refinement of all cameras and the one board, on
-reprojection errors, with a robust loss. Every fifth pose is held out first: what the refined chain says there, in pixels
-and in millimetres, is the number to believe. Then all poses are used.
-
-The covariance is the sandwich estimator clustered by pose: errors of the robot's own kinematics move all corners of a pose
-together, so counting corners as independent would be far too sure.
+A hand-eye solution of each camera alone starts a joint least-squares fit of all cameras and the one board
+(`board_chain`). The error that is stated is held out: poses are left out in turn, the rest is fitted from its own start,
+and what that fit says of the poses left out, in pixels and in millimetres, is the number to believe. Then all poses are
+used. `calibration_checks` says whether the result may be used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from diffcloud.errors import CalibrationError
-from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import RawCamera, RobotLog
-from diffcloud.sensing.cameras import inverse, project, rays, transform
+from diffcloud.sensing.board_chain import Chain, Estimate, fit_chain, in_camera
+from diffcloud.sensing.calibration_checks import (
+    ADVISED_POSES,
+    FEWEST_POSES,
+    HELD_OUT_POSES,
+    CameraEvidence,
+    check_orientations,
+    check_reach,
+    judge_hand_eye,
+)
+from diffcloud.sensing.cameras import inverse, project, transform
+from diffcloud.sensing.charuco import FEWEST_CORNERS, CameraViews, CharucoBoard, View, board_in_camera, depth_at
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
-FEWEST_CORNERS = 6
-FEWEST_POSES = 5
-ADVISED_POSES = 15
-_HELD_OUT_EVERY = 5
-_ROBUST_PX = 1.0
+_FOLDS = 5
 _SMALLEST_TURN_DEG = 10.0
 _NEW_POSE_M, _NEW_POSE_RAD = 0.01, np.deg2rad(2.0)
 _STILL_M, _STILL_RAD = 0.001, np.deg2rad(0.2)
 _STILL_WINDOW_S = 0.1
-
-
-@dataclass(frozen=True)
-class CharucoBoard:
-    """A printed board; measure its squares with a calliper."""
-
-    columns: int = 5
-    """Squares."""
-    rows: int = 7
-    square_m: float = 0.03
-    marker_m: float = 0.022
-    dictionary: str = "DICT_5X5_100"
-
-    def __post_init__(self) -> None:
-        if min(self.columns, self.rows) < 3 or not 0 < self.marker_m < self.square_m < 1:
-            raise CalibrationError(
-                f"A board needs 3 x 3 squares or more and 0 < marker < square < 1 m, got {self.columns} x {self.rows}, "
-                f"square {self.square_m:g} m, marker {self.marker_m:g} m."
-            )
-
-    def opencv(self) -> Any:
-        """The board of cv2.aruco.
-
-        Raises:
-            CalibrationError: an unknown dictionary.
-        """
-        import cv2
-
-        number = getattr(cv2.aruco, self.dictionary, None)
-        if number is None or not self.dictionary.startswith("DICT_"):
-            raise CalibrationError(
-                f"Unknown dictionary {self.dictionary!r}; such as DICT_4X4_50, DICT_5X5_100, DICT_6X6_250."
-            )
-        dictionary = cv2.aruco.getPredefinedDictionary(number)
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, dictionary)
-
-    def corners(self) -> Floats:
-        """[K, 3] inner corners in the board's frame: x right, y down, z into the board [m]."""
-        return np.asarray(self.opencv().getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
-
-    def detect(self, color: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Floats]:
-        """(corner numbers [N], pixels [N, 2]) in an image [H, W, 3]; empty where the board is not seen."""
-        import cv2
-
-        detector = cv2.aruco.CharucoDetector(self.opencv())
-        pixels, numbers, _, _ = detector.detectBoard(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
-        if numbers is None or len(numbers) < FEWEST_CORNERS:
-            return np.zeros(0, np.int64), np.zeros((0, 2))
-        return np.asarray(numbers, np.int64).reshape(-1), np.asarray(pixels, np.float64).reshape(-1, 2)
-
-
-@dataclass(frozen=True)
-class View:
-    """What one camera saw of the board at one gripper pose."""
-
-    pose: int
-    numbers: NDArray[np.int64]
-    """[N] corners."""
-    pixels: Floats
-    """[N, 2]."""
-    depth_m: Floats | None = None
-    """[N] measured at the corners; NaN where there is none."""
-    frame: int = -1
-    """Index of the image, for pictures."""
-
-
-@dataclass(frozen=True)
-class CameraViews:
-    """All views of one camera."""
-
-    intrinsics: Intrinsics
-    views: tuple[View, ...]
 
 
 @dataclass(frozen=True)
@@ -121,8 +49,14 @@ class HandEyeResult:
     covariance: Mapping[str, Floats]
     """[6, 6] by camera: translation [m], rotation [rad], on the world's side."""
     residuals: Mapping[str, Mapping[str, float]]
-    """By camera: rms_px and rms_mm on held-out poses, rms_fit_px, poses, depth_scale where depth was there."""
-    warnings: tuple[str, ...] = field(default=())
+    """By camera: rms_px and rms_mm on held-out poses and how many those are (held_out_poses; without any, neither rms is
+    there), rms_fit_px and rms_fit_mm of the fit itself, poses, focal_scale (its focal length by the arm over the entered
+    one), and depth_scale (measured depth over that of the board as entered) where depth was there."""
+    board_size: Estimate
+    """The board's size by the arm over the entered one."""
+    warnings: tuple[str, ...] = ()
+    objections: tuple[str, ...] = ()
+    """Why this calibration is not to be used; empty for a good one."""
 
 
 def find_views(
@@ -132,23 +66,45 @@ def find_views(
 
     Returns:
         Views by camera, and the gripper poses [P, 4, 4] that they number.
+
+    Raises:
+        CalibrationError: a joint log without tool poses or in other units, or a camera without colour images.
     """
+    check_reach(robot.tool_position_m)
+    lengths = np.linalg.norm(robot.tool_quaternion, axis=1)
+    if not np.isfinite(robot.tool_position_m).all(axis=1).any() or not np.isfinite(lengths).any():
+        raise CalibrationError(
+            "robot.csv has no poses of the tool (tool_x..z and tool_qw..qz): where the board was is not known. Record "
+            "them, or import with the tool's frame in tf (--tool-frame)."
+        )
+    off = float(np.nanmax(np.abs(lengths - 1)))
+    if off > 0.01:
+        raise CalibrationError(
+            f"A tool quaternion in robot.csv has a length of {1 + off:.3g} instead of 1: tool_qw..qz are a unit quaternion "
+            "(w, x, y, z), not angles in degrees or radians. Convert them."
+        )
     found: dict[str, CameraViews] = {}
     poses: list[Floats] = []
     for name, camera in cameras.items():
         views: list[View] = []
+        colorless = 0
         for index, t in enumerate(camera.times):  # images come one after the other; corners are vectorised
             pose = still_pose(robot, float(t))
-            if pose is None or (views and not _is_new(pose, poses[-1])):
+            if pose is None or (views and _same_pose(pose, poses[-1][None])[0]):
                 continue
             color = camera.color(index)
             if color is None:
+                colorless += 1
                 continue
             numbers, pixels = board.detect(color)
             if len(numbers):
-                depth = _depth_at(camera.depth(index), pixels) * camera.info.depth_scale_m
+                depth = depth_at(camera.depth(index), pixels) * camera.info.depth_scale_m
                 views.append(View(len(poses), numbers, pixels, depth, index))
                 poses.append(pose)
+        if colorless and not views:
+            raise CalibrationError(
+                f"Camera {name} has no colour images, in which the board would be found. Record colour, aligned to depth."
+            )
         found[name] = CameraViews(camera.info.intrinsics, tuple(views))
     return found, np.array(poses).reshape(-1, 4, 4)
 
@@ -177,146 +133,79 @@ def calibrate_hand_eye(cameras: Mapping[str, CameraViews], T_world_gripper: Floa
         T_world_gripper: [P, 4, 4] gripper poses, which the views number.
 
     Raises:
-        CalibrationError: too few poses, or the gripper did not turn about two axes; says what to record.
+        CalibrationError: too few poses, the gripper did not turn about two axes, or its poses are in other units; says what
+            to record.
     """
+    check_reach(T_world_gripper[:, :3, 3])
+    groups = _pose_groups(T_world_gripper)
     for name, camera in cameras.items():
-        _check_poses(name, camera, T_world_gripper)
+        _check_poses(name, camera, T_world_gripper, groups)
     corners = board.corners()
-    warnings = tuple(
-        f"Camera {name} saw the board at {len(camera.views)} poses; {ADVISED_POSES} or more are advised."
-        for name, camera in cameras.items()
-        if len(camera.views) < ADVISED_POSES
+    check_orientations(cameras, T_world_gripper, corners)
+    final = _fitted(cameras, T_world_gripper, groups, corners)
+    sized = fit_chain(cameras, T_world_gripper, groups, corners, final.cameras, final.board, sizes=True)
+    held_out = _held_out(cameras, T_world_gripper, groups, corners)
+    evidence = {}
+    for name, camera in cameras.items():
+        fit_px, fit_mm = _errors(camera, T_world_gripper, corners, final.cameras[name], final.board)
+        pixel, millimetre, count = held_out[name]
+        evidence[name] = CameraEvidence(
+            poses=_count(camera, groups),
+            held_out_poses=count,
+            rms_px=_rms(pixel) if count else None,
+            rms_mm=_rms(millimetre) if count else None,
+            rms_fit_px=_rms(fit_px),
+            rms_fit_mm=_rms(fit_mm),
+            focal_px=camera.intrinsics.fx,
+            focal=sized.focal_length[name],
+            depth_ratio=_depth_ratio(camera, corners),
+        )
+    assert sized.board_size is not None  # it was fitted
+    warnings, objections = judge_hand_eye(evidence, sized.board_size, square_m=board.square_m)
+    residuals = {name: camera.residuals() for name, camera in evidence.items()}
+    return HandEyeResult(
+        final.cameras, final.board, final.covariance, residuals, sized.board_size, tuple(warnings), tuple(objections)
     )
+
+
+def _fitted(cameras: Mapping[str, CameraViews], T_world_gripper: Floats, groups: Integers, corners: Floats) -> Chain:
+    """From the hand-eye solution of the same views alone."""
     start = {name: _hand_eye(camera, T_world_gripper, corners) for name, camera in cameras.items()}
     first = next(iter(cameras))
-    board_start = _board_on_gripper(cameras[first], T_world_gripper, corners, start[first])
-
-    seen = sorted({view.pose for camera in cameras.values() for view in camera.views})
-    held_out = set(seen[_HELD_OUT_EVERY // 2 :: _HELD_OUT_EVERY]) if len(seen) >= 2 * FEWEST_POSES else set()
-    training = {name: _without(camera, held_out) for name, camera in cameras.items()}
-    trained = _refine(training, T_world_gripper, corners, start, board_start)
-    final = _refine(cameras, T_world_gripper, corners, trained.cameras, trained.board)
-
-    residuals = {}
-    for name, camera in cameras.items():
-        test = _only(camera, held_out) if held_out else camera
-        chain = trained if held_out else final
-        pixel, millimetre = _errors(test, T_world_gripper, corners, chain.cameras[name], chain.board)
-        fit, _ = _errors(camera, T_world_gripper, corners, final.cameras[name], final.board)
-        residuals[name] = {
-            "rms_px": _rms(pixel),
-            "rms_mm": _rms(millimetre),
-            "rms_fit_px": _rms(fit),
-            "poses": float(len(camera.views)),
-            "held_out_poses": float(len(test.views) if held_out else 0),
-        }
-        ratio = _depth_ratio(camera, T_world_gripper, corners, final.cameras[name], final.board)
-        if ratio is not None:
-            residuals[name]["depth_scale"] = ratio
-            if abs(ratio - 1) > 0.01:
-                warnings += (
-                    f"Camera {name} measures depth {100 * (ratio - 1):+.1f} % off the board's geometry: run the camera's "
-                    "own depth calibration, or check square_m and depth_scale_m.",
-                )
-    return HandEyeResult(final.cameras, final.board, final.covariance, residuals, warnings)
+    board = _board_on_gripper(cameras[first], T_world_gripper, corners, start[first])
+    return fit_chain(cameras, T_world_gripper, groups, corners, start, board)
 
 
-@dataclass(frozen=True)
-class _Refined:
-    cameras: dict[str, Floats]
-    board: Floats
-    covariance: dict[str, Floats]
+def _held_out(
+    cameras: Mapping[str, CameraViews], T_world_gripper: Floats, groups: Integers, corners: Floats
+) -> dict[str, tuple[Floats, Floats, int]]:
+    """By camera, errors [N] in pixels and millimetres at poses that the fit had not seen, and how many poses.
 
-
-def _refine(
-    cameras: Mapping[str, CameraViews],
-    T_world_gripper: Floats,
-    corners: Floats,
-    start: Mapping[str, Floats],
-    board: Floats,
-) -> _Refined:
-    names = list(cameras)
-    placed = {name: start[name] for name in names}
-    observed = {name: _stacked(camera) for name, camera in cameras.items()}
-
-    def chain(step: Floats) -> Floats:
-        moved_board = _moved(board, step[-6:])
-        errors = []
-        for index, name in enumerate(names):
-            poses, numbers, pixels = observed[name]
-            camera = _moved(placed[name], step[6 * index : 6 * index + 6])
-            local = _in_camera(camera, T_world_gripper[poses], moved_board, corners[numbers])
-            errors.append((project(local, cameras[name].intrinsics) - pixels).ravel())
-        return np.concatenate(errors)
-
-    zero = np.zeros(6 * (len(names) + 1))
-    from scipy.optimize import least_squares  # slow to import
-
-    found = least_squares(
-        chain, zero, jac=lambda step: _jacobian(chain, step), loss="soft_l1", f_scale=_ROBUST_PX, x_scale="jac"
-    )
-    if not np.isfinite(found.x).all():
-        raise CalibrationError("The refinement did not converge; check that gripper poses and images belong together.")
-    placed = {name: _moved(placed[name], found.x[6 * index : 6 * index + 6]) for index, name in enumerate(names)}
-    board = _moved(board, found.x[-6:])
-    clusters = np.concatenate([np.repeat(observed[name][0], 2) for name in names])
-    covariance = _clustered_covariance(chain(zero), _jacobian(chain, zero), clusters)
-    blocks = {name: covariance[6 * index : 6 * index + 6, 6 * index : 6 * index + 6] for index, name in enumerate(names)}
-    return _Refined(placed, board, blocks)
-
-
-def _clustered_covariance(residual: Floats, jacobian: Floats, clusters: NDArray[np.int64]) -> Floats:
-    """Sandwich estimator of robust least squares (soft L1), with scores summed over each cluster."""
-    weight = 1 / np.sqrt(1 + (residual / _ROBUST_PX) ** 2)  # derivative of the loss
-    information = jacobian.T @ (weight[:, None] * jacobian)
-    _, index = np.unique(clusters, return_inverse=True)
-    count, width = int(index.max()) + 1, jacobian.shape[1]
-    scores = np.zeros((count, width))
-    np.add.at(scores, index, jacobian * (weight * residual)[:, None])
-    bread = np.linalg.pinv(information)
-    # few clusters: the usual correction of the number of clusters and of parameters
-    small = count / max(count - 1, 1) * len(residual) / max(len(residual) - width, 1)
-    return small * bread @ (scores.T @ scores) @ bread
-
-
-def _moved(matrix: Floats, step: Floats) -> Floats:
-    """A pose after a step [6] (translation, rotation vector) on the left of each: (t + dt, exp(dr) R)."""
-    result = matrix.copy()
-    result[:3, 3] += step[:3]
-    result[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ matrix[:3, :3]
-    return result
-
-
-def _jacobian(function: Callable[[Floats], Floats], at: Floats, width: float = 1e-6) -> Floats:
-    """Central differences: a handful of parameters and a cheap chain do not repay formulas."""
-    columns = [(function(at + step) - function(at - step)) / (2 * width) for step in width * np.eye(len(at))]
-    return np.column_stack(columns)
-
-
-def _stacked(camera: CameraViews) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
-    poses = np.concatenate([np.full(len(view.numbers), view.pose) for view in camera.views])
-    numbers = np.concatenate([view.numbers for view in camera.views])
-    return poses, numbers, np.concatenate([view.pixels for view in camera.views])
-
-
-def _in_camera(T_world_camera: Floats, grippers: Floats, T_gripper_board: Floats, points: Floats) -> Floats:
-    """Board points [N, 3], each at its gripper pose [N, 4, 4], in the camera's frame."""
-    chain = inverse(T_world_camera) @ grippers @ T_gripper_board
-    return np.einsum("nij,nj->ni", chain[:, :3, :3], points) + chain[:, :3, 3]
-
-
-def _board_in_camera(view: View, corners: Floats, intrinsics: Intrinsics) -> Floats:
-    """[4, 4] of one view alone (perspective-n-point)."""
-    import cv2
-
-    # distortion is taken out first, in the camera's own convention
-    plane = np.ascontiguousarray(rays(view.pixels, intrinsics)[:, :2])
-    done, turn, shift = cv2.solvePnP(corners[view.numbers], plane, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_ITERATIVE)
-    if not done:
-        raise CalibrationError("A board could not be placed from its corners.")
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = Rotation.from_rotvec(turn.ravel()).as_matrix(), shift.ravel()
-    return matrix
+    A pose is held out for all cameras at once, with every other visit to it. Folds are dealt so that each camera loses its
+    poses evenly. Too few poses for folds are left out one by one.
+    """
+    seen = {name: {int(groups[view.pose]) for view in camera.views} for name, camera in cameras.items()}
+    order = sorted(set().union(*seen.values()), key=lambda group: ([group in held for held in seen.values()], group))
+    count = _FOLDS if len(order) >= HELD_OUT_POSES else len(order)
+    found: dict[str, list[tuple[Floats, Floats]]] = {name: [] for name in cameras}
+    poses = dict.fromkeys(cameras, 0)
+    for fold in range(count):
+        left_out = set(order[fold::count])
+        views = {int(pose) for pose in np.flatnonzero(np.isin(groups, list(left_out)))}
+        try:
+            chain = _fitted(
+                {name: camera.without(views) for name, camera in cameras.items()}, T_world_gripper, groups, corners
+            )
+        except CalibrationError:
+            continue  # these poses stay without a figure, and the count says so
+        for name, camera in cameras.items():
+            test = camera.only(views)
+            if test.views:
+                found[name].append(_errors(test, T_world_gripper, corners, chain.cameras[name], chain.board))
+                poses[name] += _count(test, groups)
+    empty = [(np.zeros(0), np.zeros(0))]
+    joined = {name: [np.concatenate(part) for part in zip(*(found[name] or empty), strict=True)] for name in cameras}
+    return {name: (joined[name][0], joined[name][1], poses[name]) for name in cameras}
 
 
 def _hand_eye(camera: CameraViews, T_world_gripper: Floats, corners: Floats) -> Floats:
@@ -327,7 +216,9 @@ def _hand_eye(camera: CameraViews, T_world_gripper: Floats, corners: Floats) -> 
     """
     import cv2
 
-    boards = np.stack([_board_in_camera(view, corners, camera.intrinsics) for view in camera.views])
+    if len(camera.views) < 3:
+        raise CalibrationError(f"A hand-eye solution needs three poses, got {len(camera.views)}.")
+    boards = np.stack([board_in_camera(view, corners, camera.intrinsics) for view in camera.views])
     inverted = inverse(T_world_gripper[[view.pose for view in camera.views]])
     rotation, translation = cv2.calibrateHandEye(
         R_gripper2base=list(inverted[:, :3, :3]),
@@ -338,7 +229,8 @@ def _hand_eye(camera: CameraViews, T_world_gripper: Floats, corners: Floats) -> 
     )
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, np.asarray(translation).ravel()
-    if not np.isfinite(matrix).all():
+    # where the poses contradict each other it may also come out as a mirror image
+    if not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) < 0.5:
         raise CalibrationError("The hand-eye start failed: turn the gripper about two axes by 20 degrees and more.")
     return matrix
 
@@ -347,7 +239,7 @@ def _board_on_gripper(camera: CameraViews, T_world_gripper: Floats, corners: Flo
     """[4, 4] mean over the views."""
     chains = np.stack(
         [
-            inverse(T_world_gripper[view.pose]) @ T_world_camera @ _board_in_camera(view, corners, camera.intrinsics)
+            inverse(T_world_gripper[view.pose]) @ T_world_camera @ board_in_camera(view, corners, camera.intrinsics)
             for view in camera.views
         ]
     )
@@ -362,48 +254,32 @@ def _errors(
 ) -> tuple[Floats, Floats]:
     """Reprojection [N] in pixels, and in millimetres the distance [N] between corners where the camera alone puts them
     (from the view's own board pose) and where the robot does."""
-    if not camera.views:
-        return np.zeros(0), np.zeros(0)
-    poses, numbers, pixels = _stacked(camera)
-    local = _in_camera(T_world_camera, T_world_gripper[poses], T_gripper_board, corners[numbers])
+    poses, numbers, pixels = camera.stacked
+    local = in_camera(T_world_camera, T_world_gripper, T_gripper_board, poses, corners[numbers])
     off = np.linalg.norm(project(local, camera.intrinsics) - pixels, axis=1)
     own = np.concatenate(
-        [transform(_board_in_camera(view, corners, camera.intrinsics), corners[view.numbers]) for view in camera.views]
+        [transform(board_in_camera(view, corners, camera.intrinsics), corners[view.numbers]) for view in camera.views]
     )
     return off, 1000 * np.linalg.norm(own - local, axis=1)
 
 
-def _depth_ratio(
-    camera: CameraViews, T_world_gripper: Floats, corners: Floats, T_world_camera: Floats, T_gripper_board: Floats
-) -> float | None:
-    """Measured depth over the depth the chain predicts, median; None without depth."""
-    if any(view.depth_m is None for view in camera.views):
-        return None
-    poses, numbers, _ = _stacked(camera)
-    measured = np.concatenate([view.depth_m for view in camera.views if view.depth_m is not None])
-    predicted = _in_camera(T_world_camera, T_world_gripper[poses], T_gripper_board, corners[numbers])[:, 2]
-    known = np.isfinite(measured) & (measured > 0)
-    return float(np.median(measured[known] / predicted[known])) if known.sum() >= FEWEST_CORNERS else None
+def _depth_ratio(camera: CameraViews, corners: Floats) -> float | None:
+    """Measured depth over that of the board as entered, by each view alone, median; None without depth."""
+    ratios = []
+    for view in camera.views:
+        if view.depth_m is not None:
+            expected = transform(board_in_camera(view, corners, camera.intrinsics), corners[view.numbers])[:, 2]
+            known = np.isfinite(view.depth_m) & (view.depth_m > 0)
+            ratios.append(view.depth_m[known] / expected[known])
+    joined = np.concatenate(ratios) if ratios else np.zeros(0)
+    return float(np.median(joined)) if len(joined) >= FEWEST_CORNERS else None
 
 
-def _depth_at(depth: NDArray[np.uint16], pixels: Floats) -> Floats:
-    """Median of the valid depths in 3 x 3 pixels around each corner, NaN where there is none."""
-    column, row = np.rint(pixels).astype(int).T
-    offset = np.arange(-1, 2)
-    rows = (row[:, None, None] + offset[:, None]).clip(0, depth.shape[0] - 1)
-    columns = (column[:, None, None] + offset).clip(0, depth.shape[1] - 1)
-    around = depth[rows, columns].reshape(len(pixels), -1).astype(np.float64)
-    around[around == 0] = np.nan
-    result = np.full(len(pixels), np.nan)
-    some = np.isfinite(around).any(axis=1)
-    result[some] = np.nanmedian(around[some], axis=1)
-    return result
-
-
-def _check_poses(name: str, camera: CameraViews, T_world_gripper: Floats) -> None:
-    if len(camera.views) < FEWEST_POSES:
+def _check_poses(name: str, camera: CameraViews, T_world_gripper: Floats, groups: Integers) -> None:
+    count = _count(camera, groups)
+    if count < FEWEST_POSES:
         raise CalibrationError(
-            f"Camera {name} saw the board at {len(camera.views)} still poses; at least {FEWEST_POSES} are needed and "
+            f"Camera {name} saw the board at {count} still poses; at least {FEWEST_POSES} are needed and "
             f"{ADVISED_POSES} advised. Hold the gripper still for half a second at each pose, the whole board in view, "
             "and check squares, marker size and dictionary."
         )
@@ -419,18 +295,25 @@ def _check_poses(name: str, camera: CameraViews, T_world_gripper: Floats) -> Non
         )
 
 
-def _is_new(pose: Floats, last: Floats) -> bool:
-    between = inverse(last) @ pose
-    far = np.linalg.norm(between[:3, 3]) > _NEW_POSE_M
-    return bool(far or Rotation.from_matrix(between[:3, :3]).magnitude() > _NEW_POSE_RAD)
+def _pose_groups(T_world_gripper: Floats) -> Integers:
+    """[P] number of the first pose that each is the same as. A second visit, or another camera's image of the same halt,
+    is no pose of its own: held out beside it, it would be known already."""
+    groups = np.full(len(T_world_gripper), -1)
+    for index, pose in enumerate(T_world_gripper):
+        if groups[index] < 0:
+            groups[(groups < 0) & _same_pose(pose, T_world_gripper)] = index
+    return groups
 
 
-def _without(camera: CameraViews, poses: set[int]) -> CameraViews:
-    return CameraViews(camera.intrinsics, tuple(view for view in camera.views if view.pose not in poses))
+def _same_pose(pose: Floats, others: Floats) -> NDArray[np.bool_]:
+    """[N] whether each of `others` [N, 4, 4] is as good as `pose`."""
+    between = inverse(pose) @ others
+    turned = Rotation.from_matrix(between[:, :3, :3]).magnitude()
+    return (np.linalg.norm(between[:, :3, 3], axis=1) <= _NEW_POSE_M) & (turned <= _NEW_POSE_RAD)
 
 
-def _only(camera: CameraViews, poses: set[int]) -> CameraViews:
-    return CameraViews(camera.intrinsics, tuple(view for view in camera.views if view.pose in poses))
+def _count(camera: CameraViews, groups: Integers) -> int:
+    return len({int(groups[view.pose]) for view in camera.views})
 
 
 def _rms(values: Floats) -> float:
