@@ -17,11 +17,11 @@ from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.images import write_color
 from diffcloud.io.pickles import load_npy
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
-from diffcloud.sensing.calibration import calibrate_hand_eye, find_views
-from diffcloud.sensing.calibration_checks import CheckerboardEvidence, judge_checkerboard
-from diffcloud.sensing.charuco import CharucoBoard
+from diffcloud.sensing.calibration.charuco import CharucoBoard
+from diffcloud.sensing.calibration.checkerboard import checkerboard_evidence, register_checkerboard
+from diffcloud.sensing.calibration.checks import CheckerboardEvidence, judge_checkerboard
+from diffcloud.sensing.calibration.hand_eye import calibrate_hand_eye, find_views
 from diffcloud.sensing.pictures import reprojection_picture
-from diffcloud.sensing.registration import checkerboard_evidence, register_checkerboard
 from pipeline.console import JsonFlag, errors, finish, show, warn
 
 _SHOWN = {

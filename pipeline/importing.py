@@ -17,8 +17,8 @@ from diffcloud.io.depth_folders import depth_folders
 from diffcloud.io.episodes import write_episode
 from diffcloud.io.imports import cloud_folder, release_episodes
 from diffcloud.io.recordings import Recording, read_joint_log, write_recording
-from diffcloud.io.ros_joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
-from diffcloud.io.ros_recordings import ros_recording
+from diffcloud.io.ros.joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
+from diffcloud.io.ros.recording import ros_recording
 from pipeline.console import JsonFlag, errors, finish, warn, writes
 
 app = typer.Typer(no_args_is_help=True, help="Turn recordings of others into episodes.")

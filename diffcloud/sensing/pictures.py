@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from diffcloud.io.episodes import Episode
 from diffcloud.io.raw_episodes import RawCamera
-from diffcloud.sensing.calibration import HandEyeResult
+from diffcloud.sensing.calibration.charuco import CameraViews, CharucoBoard
+from diffcloud.sensing.calibration.hand_eye import HandEyeResult
 from diffcloud.sensing.cameras import inverse, project, transform
-from diffcloud.sensing.charuco import CameraViews, CharucoBoard
 from diffcloud.sensing.fusion import Seen
 
 _SHOWN = 3

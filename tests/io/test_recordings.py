@@ -12,7 +12,7 @@ import pytest
 from diffcloud.errors import EpisodeError, HardwareError
 from diffcloud.io.raw_episodes import CameraInfo, read_raw_episode
 from diffcloud.io.recordings import RecordedFrame, Recording, write_recording
-from diffcloud.sensing.validation import validate_raw_episode
+from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.io.ros_bag import FRAMES, START, TOOL, bag
 from tests.pipeline.invoke import invoke
 from tests.sensing.table_scene import HOME_RAD, INTRINSICS, poses, table_depth, write_table_episode

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from diffcloud.io.camera_models import Intrinsics
+from diffcloud.sensing.calibration.charuco import CharucoBoard
 from diffcloud.sensing.cameras import inverse
-from diffcloud.sensing.charuco import CharucoBoard
 
 BOARD = CharucoBoard(5, 7, 0.04, 0.03)
 INTRINSICS = {

@@ -13,10 +13,10 @@ from diffcloud.io.calibrations import read_calibration
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.images import read_color
 from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter, RobotSample
-from diffcloud.sensing.calibration import calibrate_hand_eye, still_pose
+from diffcloud.sensing.calibration.charuco import CameraViews, View
+from diffcloud.sensing.calibration.checkerboard import onto_plane, register_checkerboard, rigid_motion
+from diffcloud.sensing.calibration.hand_eye import calibrate_hand_eye, still_pose
 from diffcloud.sensing.cameras import depth_points, inverse, project, rays, transform
-from diffcloud.sensing.charuco import CameraViews, View
-from diffcloud.sensing.registration import onto_plane, register_checkerboard, rigid_motion
 from tests.pipeline.invoke import invoke
 from tests.sensing.charuco_scene import BOARD, CAMERAS, GRIPPER_BOARD, INTRINSICS, board_depth, gripper_poses, render
 

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from diffcloud.errors import CalibrationError
 from diffcloud.io.calibrations import read_calibration
 from diffcloud.io.images import write_depth
-from diffcloud.sensing.board_chain import Estimate
-from diffcloud.sensing.calibration import calibrate_hand_eye
-from diffcloud.sensing.calibration_checks import CameraEvidence, judge_hand_eye
+from diffcloud.sensing.calibration.chain import Estimate
+from diffcloud.sensing.calibration.charuco import CameraViews, View
+from diffcloud.sensing.calibration.checks import CameraEvidence, judge_hand_eye
+from diffcloud.sensing.calibration.hand_eye import calibrate_hand_eye
 from diffcloud.sensing.cameras import inverse, project, transform
-from diffcloud.sensing.charuco import CameraViews, View
 from tests.pipeline.invoke import invoke
 from tests.sensing.charuco_scene import BOARD, CAMERAS, GRIPPER_BOARD, INTRINSICS, gripper_poses
 from tests.sensing.test_calibration import write_board_episode

@@ -10,7 +10,7 @@ import pytest
 from diffcloud.io.calibrations import Calibration, CameraCalibration, write_calibration
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.images import write_depth
-from diffcloud.sensing.validation import validate_raw_episode
+from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.pipeline.invoke import invoke
 from tests.sensing.table_scene import INTRINSICS, SERIALS, poses, write_table_episode
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.raw_episodes import RobotLog
-from diffcloud.io.ros_transforms import TransformTree
+from diffcloud.io.ros.transforms import TransformTree
 
 GRIPPER_JOINT, GRIPPER_CLOSED_RAD = "finger_joint", 0.8
 """Of a Robotiq 2F-85, in its maker's description."""

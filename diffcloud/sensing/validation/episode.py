@@ -22,8 +22,8 @@ from diffcloud.io.raw_episodes import (
     read_robot_log,
     read_timestamps,
 )
-from diffcloud.sensing.calibration_findings import calibration_findings, exchanged_cameras
-from diffcloud.sensing.findings import Finding, RecordedCamera
+from diffcloud.sensing.validation.calibration import calibration_findings, exchanged_cameras
+from diffcloud.sensing.validation.findings import Finding, RecordedCamera
 
 _GAP = 2.5
 """A gap is this many times the median interval."""

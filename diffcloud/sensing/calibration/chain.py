@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import CalibrationError
+from diffcloud.sensing.calibration.charuco import CameraViews
 from diffcloud.sensing.cameras import inverse, project
-from diffcloud.sensing.charuco import CameraViews
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

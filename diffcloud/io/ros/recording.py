@@ -22,9 +22,9 @@ from diffcloud.errors import EpisodeError
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import CameraInfo
 from diffcloud.io.recordings import RecordedFrame, Recording
-from diffcloud.io.ros_files import opened, refuse_lone_parts
-from diffcloud.io.ros_joints import GRIPPER_JOINT, joint_log
-from diffcloud.io.ros_messages import (
+from diffcloud.io.ros.files import opened, refuse_lone_parts
+from diffcloud.io.ros.joints import GRIPPER_JOINT, joint_log
+from diffcloud.io.ros.messages import (
     DEPTH_UNITS_M,
     DepthEncoding,
     camera_intrinsics,
@@ -33,9 +33,9 @@ from diffcloud.io.ros_messages import (
     depth_image,
     stamp_s,
 )
-from diffcloud.io.ros_pairing import Pairing, pair
-from diffcloud.io.ros_topics import CAMERA_INFO, CameraTopics, aligned_by_name, depth_cameras, info_topic, same_camera
-from diffcloud.io.ros_transforms import TransformTree
+from diffcloud.io.ros.pairing import Pairing, pair
+from diffcloud.io.ros.topics import CAMERA_INFO, CameraTopics, aligned_by_name, depth_cameras, info_topic, same_camera
+from diffcloud.io.ros.transforms import TransformTree
 
 _JOINTS = "sensor_msgs/msg/JointState"
 _TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")

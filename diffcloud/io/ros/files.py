@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from diffcloud.errors import EpisodeError
-from diffcloud.io.ros_topics import is_depth
+from diffcloud.io.ros.topics import is_depth
 
 _METADATA = "metadata.yaml"
 _NUMBERED = re.compile(r"(.*)_(\d+)")

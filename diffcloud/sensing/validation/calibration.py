@@ -14,7 +14,7 @@ from diffcloud.errors import CalibrationError, EpisodeError
 from diffcloud.io.calibrations import Calibration, read_calibration
 from diffcloud.io.images import read_depth
 from diffcloud.sensing.cameras import depth_points, transform
-from diffcloud.sensing.findings import Finding, RecordedCamera
+from diffcloud.sensing.validation.findings import Finding, RecordedCamera
 
 _SWAP_POINTS = 3000
 _SWAP_M = 0.02

@@ -1,9 +1,9 @@
 """Calibrating fixed cameras with a ChArUco board on the gripper.
 
 A hand-eye solution of each camera alone starts a joint least-squares fit of all cameras and the one board
-(`board_chain`). The error that is stated is held out: poses are left out in turn, the rest is fitted from its own start,
+(`chain`). The error that is stated is held out: poses are left out in turn, the rest is fitted from its own start,
 and what that fit says of the poses left out, in pixels and in millimetres, is the number to believe. Then all poses are
-used. `calibration_checks` says whether the result may be used.
+used. `checks` says whether the result may be used.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from diffcloud.errors import CalibrationError
 from diffcloud.io.raw_episodes import RawCamera, RobotLog
-from diffcloud.sensing.board_chain import Chain, Estimate, fit_chain, in_camera
-from diffcloud.sensing.calibration_checks import (
+from diffcloud.sensing.calibration.chain import Chain, Estimate, fit_chain, in_camera
+from diffcloud.sensing.calibration.charuco import FEWEST_CORNERS, CameraViews, CharucoBoard, View, board_in_camera, depth_at
+from diffcloud.sensing.calibration.checks import (
     ADVISED_POSES,
     FEWEST_POSES,
     HELD_OUT_POSES,
@@ -28,7 +29,6 @@ from diffcloud.sensing.calibration_checks import (
     judge_hand_eye,
 )
 from diffcloud.sensing.cameras import inverse, project, transform
-from diffcloud.sensing.charuco import FEWEST_CORNERS, CameraViews, CharucoBoard, View, board_in_camera, depth_at
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

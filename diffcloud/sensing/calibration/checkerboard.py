@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import CalibrationError
-from diffcloud.sensing.calibration_checks import CheckerboardEvidence
+from diffcloud.sensing.calibration.checks import CheckerboardEvidence
 from diffcloud.sensing.cameras import transform
 
 Floats = NDArray[np.float64]

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import CalibrationError
-from diffcloud.sensing.board_chain import Estimate
-from diffcloud.sensing.charuco import CameraViews, board_in_camera
+from diffcloud.sensing.calibration.chain import Estimate
+from diffcloud.sensing.calibration.charuco import CameraViews, board_in_camera
 
 Floats = NDArray[np.float64]
 Remark = tuple[Literal["warning", "objection"], str]
