@@ -15,7 +15,7 @@ import numpy as np
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.camera_models import Intrinsics, read_transform
-from diffcloud.io.files import read_json
+from diffcloud.io.files import files_in, read_json
 from diffcloud.io.images import decode_color, read_depth
 from diffcloud.io.raw_episodes import CameraInfo, first_backwards, read_timestamps
 from diffcloud.io.recordings import RecordedFrame, Recording
@@ -112,9 +112,9 @@ def _numbered(folder: Path, formats: tuple[str, ...]) -> dict[int, Path]:
     if not folder.is_dir():
         raise EpisodeError(f"No such folder of images: {folder}.")
     found: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
+    for path in files_in(folder, *formats):
         match = re.search(r"(\d+)$", path.stem)
-        if path.suffix.lower() in formats and match:
+        if match:
             found[int(match.group(1))] = path
     if not found:
         raise EpisodeError(f"{folder} holds no numbered images such as 000000.png.")

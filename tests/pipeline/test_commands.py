@@ -282,6 +282,8 @@ class TestBadInput:
             (("--scenario", "small.yaml", "--set", "weight=3"), "Unknown parameter 'weight'"),
             (("--scenario", "small.yaml", "--set", "mass=heavy"), "takes NAME=NUMBER"),
             (("--scenario", "small.yaml", "--set", "mass=nan"), "finite"),
+            (("--scenario", "small.yaml", "--set", "stretch=-1e9"), "--set stretch is a multiplier: above 0, got -1e+09"),
+            (("--scenario", "small.yaml", "--set", "body_mass=2"), "body_mass has no effect in small"),
             (("--scene", "none.json"), "No such file"),
         ):
             done = run("rollout", *arguments, "--out", "r.npz", cwd=work, code=1)
@@ -289,9 +291,10 @@ class TestBadInput:
             assert not (work / "r.npz").exists()
 
     def test_a_diverged_rollout_names_step_and_parameters(self, work):
-        done = run("rollout", "--scenario", "small.yaml", "--set", "stretch=-1e9", "--out", "r.npz", cwd=work, code=1)
+        explodes = ("--set", "drag=6.9", "--set", "mass=0.1", "--frames", 2)  # all inside the bounds
+        done = run("rollout", "--scenario", "vest_hang", *explodes, "--out", "r.npz", cwd=work, code=1)
         assert "diverged at step" in done.errors
-        assert "stretch=-1e+09" in done.errors
+        assert "drag=6.9, mass=0.1" in done.errors
         assert not (work / "r.npz").exists()
 
     def test_a_disk_that_cannot_be_written(self, work):
