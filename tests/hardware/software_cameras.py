@@ -114,14 +114,16 @@ class Cameras:
         """Push pairs in the background; the second camera falls silent after `dies_after`."""
 
         def run() -> None:
-            start = time.time()
+            start = time.monotonic()
             while not self._ending.is_set() and (count is None or self.pushed < count):
                 number = self.pushed + 1
+                # what the driver's clock says at that moment, which is the time of day
+                stamp = start + number * self._interval - time.monotonic() + time.time()
                 for index, camera in enumerate(self.cameras):
                     if index == 0 or dies_after is None or number <= dies_after:
-                        camera.push_numbered(number, 1000 * (start + number * self._interval))
+                        camera.push_numbered(number, 1000 * stamp)
                 self.pushed = number
-                wait = start + number * self._interval - time.time()
+                wait = start + number * self._interval - time.monotonic()
                 self._ending.wait(max(wait, 0.001))
 
         self._thread = threading.Thread(target=run, daemon=True)

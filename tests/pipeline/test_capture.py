@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from diffcloud.hardware import installed
-from diffcloud.hardware.kinova import KinovaArm
 from diffcloud.io.calibrations import Calibration, CameraCalibration, write_calibration
 from diffcloud.io.raw_episodes import read_raw_episode
 from pipeline import capture
-from tests.hardware.kortex.client import MINIMAL
+from tests.hardware.kortex.opening import in_process
 from tests.hardware.kortex.server import HOME_M, FakeArm
 from tests.hardware.simulated import SMALL, TestCard
 from tests.pipeline.invoke import invoke
@@ -25,11 +24,7 @@ class Card(TestCard):
 @pytest.fixture
 def server(monkeypatch):
     with FakeArm(start=HOME_M) as arm:
-        monkeypatch.setattr(
-            capture,
-            "open_arm",
-            lambda address: KinovaArm(address, kortex=MINIMAL, tcp_port=arm.tcp_port, udp_port=arm.udp_port),
-        )
+        monkeypatch.setattr(capture, "open_arm", lambda address: in_process(arm, address=address))
         monkeypatch.setattr(capture, "make_camera", lambda name, serial, **options: Card(name, fps=60))
         yield arm
 
@@ -51,7 +46,7 @@ def test_a_capture_is_written_and_valid(tmp_path, server, path):
         "capture", "--out", tmp_path / "e", "--trajectory", path, "--arm", "127.0.0.1", *BOTH, "--yes",
         "--calibration", tmp_path / "c.json", "--scenario", "lift", "--rate", 20, "--fps", 60,
     )  # fmt: skip
-    assert server.stopped_after_last_twist()
+    assert server.stopped_after_last_motion()
     assert server.sessions_open == 0
     assert done.result["largest_error_m"] < 0.02
     episode = read_raw_episode(tmp_path / "e")
@@ -65,7 +60,7 @@ def test_a_dry_run_prints_the_plan_and_opens_nothing(tmp_path, server, path):
     done = invoke("capture", "--out", tmp_path / "e", "--trajectory", path, "--arm", "a", *BOTH, "--dry-run")
     assert done.result["plan"]["keyframes"] == 6
     assert "Dry run: nothing was opened" in done.errors
-    assert "0.04 of 0.5 m/s" in done.errors
+    assert "0.04 of 0.1 m/s" in done.errors
     assert server.calls == []
     assert not (tmp_path / "e").exists()
 
