@@ -154,7 +154,7 @@ class TestAdapter:
 
     def test_an_arm_that_somebody_else_drives_is_not_taken_over(self, arm, server):
         server.manual_until = np.inf
-        with pytest.raises(HardwareError, match="under manual control: .* It is not taken from them"):
+        with pytest.raises(HardwareError, match=r"under manual control: .* It is not taken from them"):
             arm.prepare()
         assert "SetServoingMode" not in server.names()
 

@@ -87,7 +87,7 @@ def test_the_start_is_approached_slowly_then_recorded(tmp_path):
 def test_the_gripper_waits_for_the_end_of_the_way(tmp_path):
     arm = PointArm()
     base = short_path()
-    path = ToolTrajectory(base.times, base.positions + [0.01, 0, 0], np.array([0.0, 0, 1, 1, 1]))
+    path = ToolTrajectory(base.times, np.add(base.positions, [0.01, 0, 0]), np.array([0.0, 0, 1, 1, 1]))
     run(tmp_path / "e", arm, path=path, settings=replace(QUICK, go_home=True))
     events = [event for event, _ in itertools.groupby(arm.events)]
     home, approach, rest = ["prepare", "turn", "stop"], ["prepare", "twist", "stop"], ["gripper 0", "prepare"]
