@@ -36,6 +36,8 @@ _ELBOW_M = 0.76
 """Height of a Gen3's elbow when its upper arm points up [m]."""
 _NOISE = 2e-3
 """m and rad: so much a motion that comes back into the limits may go outwards in between."""
+_TABLE = 8
+"""Place of the table among the criteria of `ArmChecker.excess`: the third face of the links' space."""
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,7 @@ class ArmChecker:
         """A straight minimum-jerk path in joint space, on which no point of the arm is faster than `speed_m_s`.
 
         It may begin outside the limits (a parked arm is folded beyond its joints' margins, and outside the box), but then
-        only comes back into them.
+        only comes back into them; the table is no such limit.
 
         Raises:
             LimitError: it would leave the limits, or leave them farther.
@@ -264,7 +266,10 @@ class ArmChecker:
         link = max(reach, key=lambda name: reach[name])
         value = sign * reach[link]
         if face == 2:
-            return f"{link} is {1000 * (value - self.arm_limits.table_m):.0f} mm above the table (z = {value:.3f} m)"
+            return (
+                f"{link} reaches down to z = {value:.3f} m; the table is at {self.arm_limits.table_m:.3f} m, and a planned "
+                f"path keeps {1000 * self.arm_limits.clearance_m:.0f} mm above it"
+            )
         bound = self._space[0 if face < 3 else 1, axis]
         return f"{link} reaches {'xyz'[axis]} = {value:.3f} m; the arm's space ends at {bound:.3f} m"
 
@@ -277,8 +282,9 @@ class ArmChecker:
     ) -> None:
         excess = self.excess(joints, gripper, positions, slack=0.0)
         allowed = np.zeros_like(excess)
-        if returning:  # beyond a limit by no more than the path was before
+        if returning:  # beyond a limit by no more than the path was before; in the table no part of it may be
             allowed = np.maximum(np.minimum.accumulate(excess, axis=0), 0.0) + _NOISE
+            allowed[:, _TABLE] = np.minimum(allowed[:, _TABLE], self.arm_limits.clearance_m)
         bad = np.flatnonzero((excess > allowed + 1e-9).any(axis=1))
         if len(bad):
             first = int(bad[0])
@@ -336,6 +342,7 @@ class ArmWatch:
         self._allowed = np.zeros(len(start.joints_rad) + 12)
         if returning:
             self._allowed = np.maximum(self._excess(start), 0.0)
+            self._allowed[_TABLE] = 0.0
 
     def check(self, t: float, reading: ArmReading) -> None:
         """Raises:

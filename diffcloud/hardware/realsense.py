@@ -168,7 +168,7 @@ class RealSenseCamera:
                 pipeline.stop()
 
     def _timed(self, frame: CameraFrame, depth: Any, arrival_s: float) -> CameraFrame:
-        """Stamps are in the computer's time of day, or, of some drivers, in the camera's own, which the first frame ties."""
+        """Stamps are in the computer's time of day or, of some drivers, in the camera's own, which the first frame ties."""
         if self._times is None:
             self._times = FrameTimes(
                 f"{self.name} ({self.serial})", 1 / self._fps, longest_s=_QUEUED_PAIRS / self._fps + _LONGEST_WAY_S

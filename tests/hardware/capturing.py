@@ -22,7 +22,7 @@ SPEED_M_S = 0.1
 
 
 def sideways() -> ToolTrajectory:
-    return ToolTrajectory(np.array([0.0, 3.5]), np.stack([HOME_M, HOME_M + [0.0, 3.5 * SPEED_M_S, 0.0]]))
+    return ToolTrajectory(np.array([0.0, 3.5]), np.stack([HOME_M, np.add(HOME_M, [0.0, 3.5 * SPEED_M_S, 0.0])]))
 
 
 def main() -> None:
@@ -31,7 +31,12 @@ def main() -> None:
     print(arm.pid, flush=True)
     try:
         capture(
-            Path(folder), [TestCard(fps=30)], arm=arm, trajectory=sideways(), settings=CaptureSettings(durable=False), tell=print
+            Path(folder),
+            [TestCard(fps=30)],
+            arm=arm,
+            trajectory=sideways(),
+            settings=CaptureSettings(durable=False),
+            tell=print,
         )
     finally:
         arm.close()
