@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -95,6 +97,27 @@ def test_bad_options(tmp_path, server, path, arguments, message, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert message in invoke("capture", "--out", "e", *arguments, code=1).errors
     assert not (tmp_path / "e").exists()
+    assert "SendTwistCommand" not in server.names()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--table", 0.41), "the table is at 0.410"),
+        (("--box", "0.4,-0.3,0.1,0.6,0.3,0.9", "--arm-margin", 0.01), "finger_pad reaches x = 0.637 m; the arm's space ends"),
+        (("--preload", 5), "At rest the tool feels 6.0 N"),
+        (("--urdf", "longer.urdf"), "The arm reports its tool 50 mm"),
+    ],
+)
+def test_limits_of_the_whole_arm(tmp_path, server, path, arguments, message, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    server.wrench[2] = 6.0
+    own = (files("diffcloud.sensing") / "gen3_robotiq_2f_85.urdf").read_text()
+    Path("longer.urdf").write_text(
+        own.replace('<origin xyz="0 0 0.12" rpy="0 0 0"/>', '<origin xyz="0 0 0.17" rpy="0 0 0"/>')
+    )
+    command = ("capture", "--out", "e", "--trajectory", path, "--arm", "127.0.0.1", *BOTH, "--yes")
+    assert message in invoke(*command, *arguments, code=1).errors
     assert "SendTwistCommand" not in server.names()
 
 
