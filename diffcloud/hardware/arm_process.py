@@ -275,7 +275,7 @@ class _Service:
         self._moving = False
         """A velocity came since the last confirmed Stop."""
         self._unconfirmed = False
-        self._shouted = -_SHOUT_EVERY_S
+        self._tried = self._shouted = 0.0
 
     def run(self) -> None:
         """Until the capture closes the socket, or dies."""
@@ -298,8 +298,9 @@ class _Service:
                     break
                 heard = time.monotonic()
                 self._receive(data)
-            elif self._unconfirmed:
-                self._try_stop(1)
+            if self._unconfirmed:
+                if time.monotonic() - self._tried >= _REPEAT_S:
+                    self._try_stop(1)
             elif self._moving and time.monotonic() - heard >= self._watchdog_s:
                 self._halt(f"nothing came from the capture for {self._watchdog_s:g} s: it hangs, or was suspended")
         self._requests.put(None)
@@ -338,6 +339,7 @@ class _Service:
                 failure = self._stop_confirmed(attempts)
             else:
                 failure = HardwareError("a velocity command hangs on its way to the arm")
+        self._tried = time.monotonic()
         if failure is None:
             self._moving = self._unconfirmed = False
             return None
