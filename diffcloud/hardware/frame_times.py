@@ -29,7 +29,7 @@ class FrameTimes:
         self._name, self._period, self._longest = name, period_s, longest_s
         self._offset: float | None = None
         self._last: tuple[int, float] | None = None
-        self.settings = 0
+        self.set_count = 0
         """How often the clock of the stamps was found to have been set."""
 
     def tie(self, offset_s: float) -> None:
@@ -59,7 +59,7 @@ class FrameTimes:
         if set_back or t > arrival_s + _AHEAD_S:
             t = expected
             self._offset = t - stamp_s
-            self.settings += 1
+            self.set_count += 1
         if arrival_s - t > self._longest:
             raise HardwareError(
                 f"Camera {self._name}: its frames are stamped {arrival_s - t:.1f} s before they arrive; its clock, or this "

@@ -257,8 +257,8 @@ class KinovaArm:
     def emergency_stop(self) -> None:
         """Kinova's ApplyEmergencyStop; the arm is in fault afterwards.
 
-        `arm_process` calls it where Stop is refused or not answered. It is no substitute for the button, which also works
-        without a link.
+        `arm_process` calls it, as the last resort, where Stop is refused or not answered: to an arm that answers but will
+        not stop there is nothing else to say. It is no substitute for the button, which also works without a link.
         """
         self._call("ApplyEmergencyStop", self._base.ApplyEmergencyStop)
 

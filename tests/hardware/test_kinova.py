@@ -20,7 +20,7 @@ from tests.hardware.kortex import messages
 from tests.hardware.kortex.client import MINIMAL
 from tests.hardware.kortex.messages import Frame, parsed
 from tests.hardware.kortex.opening import connect, in_process
-from tests.hardware.kortex.server import EMERGENCY, HOME_DEG, HOME_M, FakeArm
+from tests.hardware.kortex.server import EMERGENCY, HOME_DEG, HOME_M, LAG_S, FakeArm
 from tests.hardware.simulated import TestCard
 
 TEN_HZ = CaptureSettings(rate_hz=10.0, hold_s=0.3, durable=False)
@@ -208,15 +208,21 @@ def test_a_trajectory_of_25_steps_at_10_hz(tmp_path, guarded, arm, server):
     ],
 )
 def test_trouble_in_the_middle_of_a_run(tmp_path, server, event, message):
+    places = []
+
+    def happen():
+        places.append(server.position)
+        getattr(server, event)()
+
     arm = in_process(server)
-    server.at_twist[8] = getattr(server, event)
-    start = time.monotonic()
+    server.at_twist[8] = happen
     try:
         with pytest.raises(HardwareError, match=message):
             record(tmp_path / "e", arm)
     finally:
         arm.close()
-    assert time.monotonic() - start < 6
+    fastest, timeout, busy = 0.12, 0.5, 0.5
+    assert np.linalg.norm(server.rest() - places[0]) < fastest * (timeout + busy + LAG_S)
     if event != "cut":  # with no link there is nothing to send it over; the arm's own timeout stops it
         assert server.stopped_after_last_motion()
     episode = read_raw_episode(tmp_path / "e")

@@ -104,7 +104,10 @@ def test_bad_options(tmp_path, server, path, arguments, message, monkeypatch):
     ("arguments", "message"),
     [
         (("--table", 0.41), "the table is at 0.410"),
-        (("--box", "0.4,-0.3,0.1,0.6,0.3,0.9", "--arm-margin", 0.01), "finger_pad reaches x = 0.637 m; the arm's space ends"),
+        (
+            ("--box", "0.4,-0.3,0.1,0.6,0.3,0.9", "--arm-margin", 0.01),
+            "finger_pad reaches x = 0.637 m; the arm's space ends",
+        ),
         (("--preload", 5), "At rest the tool feels 6.0 N"),
         (("--urdf", "longer.urdf"), "The arm reports its tool 50 mm"),
     ],
