@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 
 
 class DiffCloudError(Exception):
@@ -79,5 +80,8 @@ class UnresolvedContactError(DivergedError):
 
 
 def unknown_name(kind: str, name: object, allowed: Iterable[object]) -> str:
-    """The message for a name that is not in a closed set."""
-    return f"Unknown {kind} {name!r}. Allowed: {', '.join(sorted(map(str, allowed)))}."
+    """The message for a name that is not in a closed set; with the one that was probably meant."""
+    names = sorted(map(str, allowed))
+    near = get_close_matches(str(name), names, n=1)
+    meant = f" Did you mean {near[0]!r}?" if near else ""
+    return f"Unknown {kind} {name!r}.{meant} Allowed: {', '.join(names)}."

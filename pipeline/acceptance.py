@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,7 +17,7 @@ from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
-from diffcloud.io.files import atomic_path, write_text
+from diffcloud.io.files import files_in, write_bytes, write_text
 from diffcloud.io.imports import release_episodes
 from diffcloud.scene.scenarios import PAPER_THRESHOLD, load_scenario
 from diffcloud.sim.simulate import rollout
@@ -30,7 +31,7 @@ from pipeline.bench import (
     run_benchmarks,
 )
 from pipeline.config import FitConfig
-from pipeline.console import errors, output, progress_bar, warn
+from pipeline.console import errors, output, progress_bar, warn, writes
 from pipeline.scenario_options import choose_scenario
 
 SCENES = {
@@ -44,6 +45,7 @@ _NOISE = 0.02
 """Two losses closer than this part of each other count as equal: the sampling noise."""
 
 
+@writes()
 def acceptance(
     release: Annotated[Path, typer.Option(help="Folder with lift_real_pcls/ and conf/.")],
     reference: Annotated[Path | None, typer.Option(help="Folder with recorded reference trajectories (*.npz).")] = None,
@@ -62,8 +64,7 @@ def acceptance(
     timings = run_benchmarks({name: _scene(release, name) for name in SCENES}, repeats=3, device="cpu")
     costs = contact_benchmarks(repeats=2)
     write_text(out / "speed.md", _speed(timings, costs))
-    with atomic_path(out / CONTACT_FIGURE) as temporary:
-        temporary.write_bytes(contact_figure(costs))
+    write_bytes(out / CONTACT_FIGURE, contact_figure(costs))
     if not skip_fits:
         write_text(out / "simulated_fits.md", _simulated_fits(release))
         write_text(out / "real_fits.md", _real_fits(release, starts))
@@ -240,7 +241,7 @@ def _simulated_fits(release: Path) -> str:
 
 def _trajectories(release: Path, reference: Path) -> str:
     rows = []
-    for path in sorted(reference.glob("*_s*_m*.npz")):
+    for path in (path for path in files_in(reference, ".npz") if fnmatch(path.name, "*_s*_m*.npz")):
         name = "release_" + path.name.split("_")[0]
         scenario = load_scenario(name, _scene(release, name))  # its limits are said in the table's caption
         system, _ = scenario.scene.build()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,10 +17,33 @@ from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.images import write_color
 from diffcloud.io.pickles import load_npy
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
-from diffcloud.sensing.calibration import CharucoBoard, calibrate_hand_eye, find_views
+from diffcloud.sensing.calibration.charuco import CharucoBoard
+from diffcloud.sensing.calibration.checkerboard import checkerboard_evidence, register_checkerboard
+from diffcloud.sensing.calibration.checks import CheckerboardEvidence, judge_checkerboard
+from diffcloud.sensing.calibration.hand_eye import calibrate_hand_eye, find_views
 from diffcloud.sensing.pictures import reprojection_picture
-from diffcloud.sensing.registration import register_checkerboard
 from pipeline.console import JsonFlag, errors, finish, show, warn
+
+_SHOWN = {
+    "charuco": {
+        "rms_mm": "held out [mm]",
+        "rms_px": "held out [px]",
+        "held_out_poses": "poses",
+        "rms_fit_mm": "fit [mm]",
+        "position_deviation_mm": "± [mm]",
+        "angle_deviation_deg": "± [°]",
+        "depth_scale": "depth",
+        "focal_scale": "focal length",
+    },
+    "checkerboard": {
+        "held_out_mm": "held out [mm]",
+        "rms_mm": "fit [mm]",
+        "largest_mm": "largest [mm]",
+        "held_out_corners": "corners",
+        "depth_scale": "size",
+    },
+}
+"""Heading of each figure that is printed; depth, focal length and size are over what was entered."""
 
 
 def calibrate(
@@ -39,37 +63,68 @@ def calibrate(
     picture: Annotated[Path | None, typer.Option(help="PNG of detected and reprojected corners.")] = None,
     serial: Annotated[list[str] | None, typer.Option(help="checkerboard: NAME=SERIAL; the name if not given.")] = None,
     size: Annotated[str, typer.Option(help="checkerboard: size of the images.")] = "640x480",
+    force: Annotated[
+        bool, typer.Option("--force", help="Write it whatever speaks against it; the file will say so.")
+    ] = False,
     json: JsonFlag = False,
 ) -> None:
     """Calibrate all cameras of a set-up into one file."""
     if method == "checkerboard":
-        calibration, summary = _checkerboard(source, serial or [], _pair(size, "--size"))
+        found = _checkerboard(source, serial or [], _pair(size, "--size"))
     else:
         if len(source) != 1:
             raise CalibrationError(f"--method charuco takes one raw episode, got {len(source)} sources.")
         columns, rows = _pair(squares, "--squares")
         board = CharucoBoard(columns, rows, square_mm / 1000, marker_mm / 1000, dictionary)
-        calibration, summary = _charuco(read_raw_episode(source[0]), board, picture)
-    write_calibration(out, calibration)
-    columns_shown = sorted({key for entry in summary.values() for key in entry if not isinstance(entry[key], list)})
-    table = Table("camera", "position [m]", *columns_shown)
+        found = _charuco(read_raw_episode(source[0]), board, picture)
+    summary, objections = found.summary, list(found.calibration.objections)
+    columns_shown = _SHOWN[method]
+    table = Table("camera", *map(escape, ("position [m]", *columns_shown.values())))
     for name, entry in summary.items():
         position = " ".join(f"{value:.4f}" for value in np.array(entry["T_world_camera"])[:3, 3])
         table.add_row(name, position, *(f"{entry[key]:.4g}" if key in entry else "" for key in columns_shown))
     show(table, json)
+    for message in found.warnings:
+        warn(escape(message))
+    if objections and not force:
+        raise CalibrationError(
+            "The calibration is not written. " + " ".join(objections) + " To write it all the same: --force."
+        )
+    for message in objections:
+        warn(escape(message))
+    write_calibration(out, found.calibration)
     errors.print(f"Wrote {escape(str(out))}.")
-    finish({"out": str(out), "method": method, "cameras": summary}, json)
+    finish(
+        {
+            "out": str(out),
+            "method": method,
+            "cameras": summary,
+            "warnings": found.warnings,
+            "forced": bool(objections),
+            "objections": objections,
+            **found.more,
+        },
+        json,
+    )
 
 
-def _charuco(
-    episode: RawEpisode, board: CharucoBoard, picture: Path | None
-) -> tuple[Calibration, dict[str, dict[str, Any]]]:
+@dataclass(frozen=True)
+class _Found:
+    """A calibration and what is said about it."""
+
+    calibration: Calibration
+    summary: dict[str, dict[str, Any]]
+    """By camera: figures and T_world_camera."""
+    warnings: list[str]
+    more: dict[str, Any] = field(default_factory=dict)
+    """Figures of the whole."""
+
+
+def _charuco(episode: RawEpisode, board: CharucoBoard, picture: Path | None) -> _Found:
     if episode.robot is None:
         raise CalibrationError(f"{episode.folder} has no robot.csv: the board's place comes from the gripper's pose.")
     views, poses = find_views(episode.cameras, episode.robot, board)
     found = calibrate_hand_eye(views, poses, board)
-    for message in found.warnings:
-        warn(message)
     if picture is not None:
         shown = reprojection_picture(episode.cameras, views, poses, board, found)
         write_color(picture, shown)
@@ -94,15 +149,16 @@ def _charuco(
         "dictionary": board.dictionary,
         "T_gripper_board": found.T_gripper_board.tolist(),
     }
-    return Calibration(cameras, "charuco", described), summary
+    by_arm = {"square_by_arm_m": board.square_m * found.board_size.value}
+    calibration = Calibration(cameras, "charuco", {**described, **by_arm}, objections=found.objections)
+    return _Found(calibration, summary, list(found.warnings), by_arm)
 
 
-def _checkerboard(
-    folders: list[Path], serials: list[str], size: tuple[int, int]
-) -> tuple[Calibration, dict[str, dict[str, Any]]]:
+def _checkerboard(folders: list[Path], serials: list[str], size: tuple[int, int]) -> _Found:
     known = dict(item.partition("=")[::2] for item in serials)
     cameras: dict[str, CameraCalibration] = {}
     summary: dict[str, dict[str, Any]] = {}
+    evidence: dict[str, CheckerboardEvidence] = {}
     for folder in folders:
         name = folder.name.removeprefix("calib_")
         if name in summary:
@@ -114,6 +170,7 @@ def _checkerboard(
             fx, fy, cx, cy = np.asarray(load_npy(folder / "intrinsics.npy"), np.float64).ravel()
             intrinsics = Intrinsics(*size, float(fx), float(fy), float(cx), float(cy))
             found = register_checkerboard(*points)
+            evidence[name] = checkerboard_evidence(found, *points)
         except (EpisodeError, CalibrationError) as error:
             raise CalibrationError(f"{folder}: {error}") from error
         except (TypeError, ValueError) as error:
@@ -121,17 +178,18 @@ def _checkerboard(
         residuals = {
             "rms_mm": 1000 * found.rms_m,
             "largest_mm": 1000 * float(found.residual_m.max()),
-            "depth_scale": 1 / found.scale,
+            "depth_scale": evidence[name].size_ratio,
+            "held_out_corners": float(evidence[name].held_out_corners),
         }
-        if abs(found.scale - 1) > 0.01:
-            warn(
-                f"Camera {name} sees the board {100 * (1 / found.scale - 1):+.1f} % too large: a depth scale error, which "
-                "a rigid motion cannot absorb."
-            )
+        held_out_mm = evidence[name].held_out_mm
+        if held_out_mm is not None:
+            residuals["held_out_mm"] = held_out_mm
         label = known.get(name, name)
         cameras[label] = CameraCalibration(label, intrinsics, found.T_world_camera, None, name, residuals)
         summary[name] = {**residuals, "T_world_camera": found.T_world_camera.tolist()}
-    return Calibration(cameras, "checkerboard", {"corners": len(points[0])}), summary
+    warnings, objections = judge_checkerboard(evidence)
+    board = {"corners": len(points[0])}
+    return _Found(Calibration(cameras, "checkerboard", board, objections=tuple(objections)), summary, warnings)
 
 
 def _pair(text: str, option: str) -> tuple[int, int]:

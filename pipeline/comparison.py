@@ -17,7 +17,7 @@ from diffcloud.evaluation.repeats import other_repeats
 from diffcloud.evaluation.summary import PREDICTORS
 from diffcloud.fit import read_fit
 from diffcloud.io.episodes import Episode, read_episode
-from diffcloud.io.files import read_json, write_json, write_text
+from diffcloud.io.files import files_in, read_json, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.regressors import Regressor, predict_episode
 from diffcloud.scene.scenarios import Scenario
@@ -131,7 +131,7 @@ def comparison_jobs(
     Raises:
         ConfigError, EpisodeError: a damaged fit or episode.
     """
-    summaries = {path: read_fit(path) for path in sorted((fits / group).glob("*.json"))}
+    summaries = {path: read_fit(path) for path in files_in(fits / group, ".json")}
     fitted = [(path.stem, name, summary) for path, summary in summaries.items() for name in summary["episodes"]]
     recorded = {name: read_episode(episodes / group / f"{name}.npz") for _, name, _ in fitted}
     values = {

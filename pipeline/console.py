@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar, cast
 
 import typer
 from rich.console import Console
@@ -15,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from diffcloud.errors import ConfigError
+from diffcloud.io.files import claimed, files_in
 
 _PLAIN_WIDTH = 140
 """Columns where the output is a file or a log: tables keep their headings."""
@@ -27,6 +30,8 @@ def _console(*, stderr: bool) -> Console:
 
 errors = _console(stderr=True)
 output = _console(stderr=False)
+
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 JsonFlag = Annotated[bool, typer.Option("--json", help="End standard output with one JSON object.")]
 ParamsFile = Annotated[
@@ -69,6 +74,48 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[float, str], None
         yield update
 
 
+def writes(suffix: str | None = None) -> Callable[[Command], Command]:
+    """Of a command with an option `--out`: no other process writes there while it runs.
+
+    Args:
+        suffix: of the file that it takes; None for a folder.
+    """
+
+    def decorate(command: Command) -> Command:
+        signature = inspect.signature(command)
+
+        @wraps(command)
+        def held(*args: Any, **options: Any) -> Any:
+            given = signature.bind(*args, **options)
+            given.apply_defaults()
+            out = given.arguments["out"]
+            if out is None:
+                return command(*args, **options)
+            if suffix is not None:
+                given.arguments["out"] = out = with_suffix(out, suffix)
+            with claimed(out):
+                return command(*given.args, **given.kwargs)
+
+        return cast(Command, held)
+
+    return decorate
+
+
+def with_suffix(path: Path, suffix: str, option: str = "--out") -> Path:
+    """The path of an output file with its suffix, which is added, and said, where it is missing.
+
+    Raises:
+        ConfigError: another suffix, or a folder.
+    """
+    if path.suffix == suffix and not path.is_dir():
+        return path
+    if path.suffix or path.is_dir():
+        kind = "is a folder" if path.is_dir() else f"ends in {path.suffix}"
+        raise ConfigError(f"{option} takes a {suffix} file, and {path} {kind}. Try {path.with_suffix(suffix).name}.")
+    warn(f"{option} takes a {suffix} file: writing to {path}{suffix}.")
+    return path.with_name(path.name + suffix)
+
+
 def assignments(items: list[str] | None, option: str) -> dict[str, float]:
     """["stretch=0.5", ...] -> {"stretch": 0.5}."""
     values: dict[str, float] = {}
@@ -90,7 +137,7 @@ def episode_files(paths: list[Path]) -> list[Path]:
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
-            inside = sorted(path.glob("*.npz"))
+            inside = files_in(path, ".npz")
             if not inside:
                 raise ConfigError(f"{path} holds no episodes (*.npz).")
             files += inside

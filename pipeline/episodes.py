@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 
 from diffcloud.errors import ConfigError
 from diffcloud.io.episodes import read_episode, write_episode
-from diffcloud.io.raw_episodes import read_description, read_raw_episode
+from diffcloud.io.files import files_in, folders_in, staged
+from diffcloud.io.manifests import remove_files
+from diffcloud.io.raw_episodes import raw_episode_files, read_description, read_raw_episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing import sample_surface
 from diffcloud.sensing.depth_camera import DepthNoise, published_cameras
@@ -22,12 +25,13 @@ from diffcloud.sensing.recorder import ClothMotion, record
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import rollout
 from pipeline.config import EpisodesConfig, load_config
-from pipeline.console import JsonFlag, ParamsFile, errors, finish, progress_bar
+from pipeline.console import JsonFlag, ParamsFile, errors, finish, progress_bar, writes
 from pipeline.scenario_options import choose_scenario
 
 _HIDDEN = ("stretch", "mass")
 
 
+@writes()
 def episodes(
     out: Annotated[Path, typer.Option(help="Folder; episodes go to OUT/<scenario>/<episode>, raw or .npz.")],
     params: ParamsFile = None,
@@ -82,22 +86,37 @@ def _synthetic(
             episode = sample_surface(nodes[repeat], faces, times, obstacle, points=scenario.points, seed=seed, meta=meta)
             write_episode(out / f"{name}.npz", episode)
         else:
-            _clear(out / name)
+            _replaceable(out / name, "synthetic")  # refused before it is recorded
             height = float(obstacles[0].nodes[:, 2].max()) if obstacles else float(nodes[:, 0, :, 2].min())
             motion = ClothMotion(nodes[repeat], faces, times, scenario.grasped, height)
             cameras = published_cameras(*config.image_size, noise=DepthNoise(subpixel_px=config.subpixel_px))
-            record(out / name, motion, cameras, settings=config.recorder(), seed=seed, meta=meta, tell=tell)
+            with staged(out / name) as folder:
+                record(folder, motion, cameras, settings=config.recorder(), seed=seed, meta=meta, tell=tell)
+                _clear(out / name, "synthetic")
         names.append(name)
     return names
 
 
-def _clear(folder: Path) -> None:
-    """Remove a synthetic recording that an earlier run left; never anything else."""
+def _replaceable(folder: Path, source: str) -> list[str]:
+    """Files of the recording of this source that an earlier run left.
+
+    Raises:
+        ConfigError: something else is there.
+    """
     if not folder.exists():
-        return
-    if not (folder / "episode.json").is_file() or read_description(folder).get("source") != "synthetic":
-        raise ConfigError(f"{folder} exists and is no synthetic recording; choose another --out, or move it away.")
-    shutil.rmtree(folder)
+        return []
+    own, others = raw_episode_files(folder)
+    if "episode.json" not in own or read_description(folder).get("source") != source:
+        raise ConfigError(f"{folder} exists and is no {source} recording; choose another --out, or move it away.")
+    if others:
+        raise ConfigError(f"{folder} holds other files ({', '.join(others[:5])}) that would be lost; move them away.")
+    return own
+
+
+def _clear(folder: Path, source: str) -> None:
+    remove_files(folder, _replaceable(folder, source))
+    with suppress(OSError):  # not there, or a hidden file of the system's is
+        folder.rmdir()
 
 
 def _hidden(scenario: Scenario, config: EpisodesConfig, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
@@ -113,7 +132,7 @@ def _hidden(scenario: Scenario, config: EpisodesConfig, rng: np.random.Generator
 
 def _own(folder: Path, out: Path) -> list[str]:
     """Check a person's episodes, raw or not, and copy them."""
-    files, raw = sorted(folder.glob("*.npz")), sorted(path.parent for path in folder.glob("*/episode.json"))
+    files, raw = files_in(folder, ".npz"), [path for path in folders_in(folder) if (path / "episode.json").is_file()]
     if not files and not raw:
         raise ConfigError(
             f"{folder} holds no episodes (*.npz, or raw episodes). Make them with `diffcloud import` or `diffcloud "
@@ -123,5 +142,9 @@ def _own(folder: Path, out: Path) -> list[str]:
         write_episode(out / path.name, read_episode(path))
     for path in raw:
         read_raw_episode(path)
-        shutil.copytree(path, out / path.name, dirs_exist_ok=True)
+        with staged(out / path.name) as copy:
+            for name in raw_episode_files(path)[0]:
+                (copy / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path / name, copy / name)
+            _clear(out / path.name, str(read_description(path).get("source")))
     return [path.stem for path in files] + [path.name for path in raw]

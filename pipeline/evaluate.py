@@ -20,7 +20,8 @@ from diffcloud.evaluation.summary import metrics as summary_metrics
 from diffcloud.fit import Objective, read_fit
 from diffcloud.fit.parameters import NUISANCE
 from diffcloud.io.episodes import read_episode
-from diffcloud.io.files import write_json, write_text
+from diffcloud.io.files import claimed, files_in, together, write_json, write_text
+from diffcloud.sim.properties import check_values
 from pipeline.comparison import Comparison, compare, comparison_jobs, write_tables
 from pipeline.config import Config, load_config
 from pipeline.console import JsonFlag, ParamsFile, assignments, errors, finish, output, show
@@ -48,6 +49,8 @@ def loss(
     chosen = choose_scenario(scenario, scene)
     objective = Objective(chosen, [read_episode(episode)], points=points, frames=frame, seed=seed)
     values = assignments(set_, "--set")
+    check_values({name: value for name, value in values.items() if name not in NUISANCE}, "--set")
+    chosen.check_parameters(values)
     tensors = {name: torch.tensor([value], dtype=objective.system.dtype) for name, value in values.items()}
     nuisance = {name: tensors.pop(name) for name in list(tensors) if name in NUISANCE}
     with torch.no_grad():
@@ -78,7 +81,7 @@ def evaluate(
     if context.invoked_subcommand is not None:
         return
     config = load_config(params)
-    if not any((fits / name).glob("*.json") for name in config.scenarios if (fits / name).is_dir()):
+    if not any(files_in(fits / name, ".json") for name in config.scenarios):
         raise ConfigError(f"{fits} holds no fits of {', '.join(config.scenarios)}; run `diffcloud fit` first.")
     jobs = [
         job
@@ -94,8 +97,9 @@ def evaluate(
             kept=out / "episodes",
         )
     ]
-    comparison = compare(jobs, config.evaluate.workers)
-    metrics = write_evaluation(config, comparison, fits=fits, out=out, markdown=markdown, as_json=json)
+    with claimed(out):
+        comparison = compare(jobs, config.evaluate.workers)
+        metrics = write_evaluation(config, comparison, fits=fits, out=out, markdown=markdown, as_json=json)
     finish({"metrics": metrics, "missing": comparison.missing}, json)
     stop_if_missing(comparison, allow_missing)
 
@@ -121,22 +125,21 @@ def write_evaluation(
     predictions = _predictions(comparison.records)
     told = tables(comparison.records, comparison.seconds, references)
     metrics = _metrics(told["fits"], predictions) | {"comparison": summary_metrics(told)}
-    write_tables(
-        out / "tables",
-        {
-            "losses": pd.DataFrame(curves),
-            "predictions": pd.DataFrame(predictions, columns=_columns(predictions)),
-            **told,
-        },
-    )
+    frames = {
+        "losses": pd.DataFrame(curves),
+        "predictions": pd.DataFrame(predictions, columns=_columns(predictions)),
+        **told,
+    }
     known = [[*key, loss] for key, loss in (references or {}).items()]
     whole = {"records": comparison.records, "failures": comparison.failures, "references": known}
-    write_json(out / "tables" / "comparison.json", whole)
-    write_json(out / "metrics.json", metrics)
     by_episode = {"/".join(key): value for key, value in comparison.seconds.items()}
-    write_json(out / "timings.json", {"fit_seconds": seconds, "methods": by_episode})
-    if markdown is not None:
-        write_text(markdown, comparison_page(told, comparison.missing))
+    with together():
+        write_tables(out / "tables", frames)
+        write_json(out / "tables" / "comparison.json", whole)
+        write_json(out / "timings.json", {"fit_seconds": seconds, "methods": by_episode})
+        if markdown is not None:
+            write_text(markdown, comparison_page(told, comparison.missing))
+        write_json(out / "metrics.json", metrics)
     for table in printed(told):
         show(table, as_json)
     for sentence in (line for lines in sentences(told).values() for line in lines):
@@ -176,7 +179,7 @@ def _curves(config: Config, fits: Path) -> tuple[list[dict[str, Any]], dict[str,
     curves: list[dict[str, Any]] = []
     seconds: dict[str, float] = {}
     for name in config.scenarios:
-        for path in sorted((fits / name).glob("*.json")):
+        for path in files_in(fits / name, ".json"):
             summary = read_fit(path)
             curves += [
                 {"scenario": name, "episode": path.stem, "iteration": i, "loss": min(filter(None, row))}

@@ -16,7 +16,7 @@ from diffcloud.scene.scenarios import Scenario
 from pipeline.acceptance import SCENES
 from pipeline.comparison import compare, comparison_jobs
 from pipeline.config import Config, load_config, updated
-from pipeline.console import JsonFlag, errors, finish
+from pipeline.console import JsonFlag, errors, finish, writes
 from pipeline.evaluate import AllowMissing, MarkdownFile, stop_if_missing, write_evaluation
 from pipeline.fit import FitJob
 from pipeline.report import report
@@ -26,6 +26,7 @@ from pipeline.workers import run_all
 _PROFILE = Path(__file__).parent / "profiles" / "release.yaml"
 
 
+@writes()
 def release(
     folder: Annotated[Path, typer.Argument(help="The published data: holds lift_real_pcls/, conf/ and so on.")],
     params: Annotated[Path, typer.Option("--params", help="Profile; a file of parameters.")] = _PROFILE,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,18 +18,22 @@ from diffcloud.fit.optimise import Progress
 from diffcloud.fit.result import describe_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.fingerprints import fingerprint
+from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
 from diffcloud.scene.scenarios import Scenario
 from pipeline.config import FitConfig, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, assignments, episode_files, errors, finish, show
+from pipeline.console import JsonFlag, ParamsFile, assignments, episode_files, errors, finish, show, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 from pipeline.workers import Tell, check_interrupt, run_all
 
 _INTERRUPTED = 130
+_JOINT = "joint"
+"""Name of the fit of one parameter set to all episodes."""
 _SHOWN = ("loss", "loss_start", "loss_resampled", "iterations", "seconds", "stop_reason", "parameters")
 _CODE = ("mesh", "io", "sim", "scene", "clouds", "fit")
 """Packages whose source decides the numbers of a fit."""
 
 
+@writes()
 def fit(
     episodes: Annotated[
         list[Path],
@@ -101,11 +105,10 @@ def fit(
     # everything is read before anything is fitted: a damaged last file must not cost the first ones' time
     for folder, (chosen, files) in folders.items():
         recorded = {path.stem: read_episode(path) for path in files}
-        groups = {"joint": recorded} if settings.joint else {name: {name: episode} for name, episode in recorded.items()}
-        jobs += [
-            FitJob(chosen, name, members, settings, out / folder, _first_start(init, chosen, list(members.values())))
-            for name, members in groups.items()
-        ]
+        groups = {_JOINT: recorded} if settings.joint else {name: {name: episode} for name, episode in recorded.items()}
+        for name, members in groups.items():
+            job = FitJob(chosen, name, members, settings, out / folder)
+            jobs.append(replace(job, init=_first_start(init, job)))
     for job in jobs:
         job.objective()
     space = jobs[0].space
@@ -123,6 +126,8 @@ def fit(
         for failure in summary["failures"]:
             errors.print(f"[yellow]{name}:[/] {escape(failure)}", soft_wrap=True)
 
+    if every:  # stated before, so that what an interrupted call leaves is known too
+        write_manifest(out, read_manifest(out) | {path.relative_to(out).as_posix() for job in jobs for path in job.files})
     try:
         for job, summary, error in run_all("fit", jobs, settings.workers, patient=True):
             if error is None:
@@ -142,8 +147,7 @@ def fit(
     if failures:
         raise DiffCloudError("\n".join(failures))
     if every:
-        for place in {job.folder for job in jobs}:
-            _leave_only(place, {job.name for job in jobs if job.folder == place})
+        _remove_stale(out, jobs)
 
 
 def _by_scenario(episodes: list[Path], scenarios: list[str]) -> bool:
@@ -151,12 +155,28 @@ def _by_scenario(episodes: list[Path], scenarios: list[str]) -> bool:
     return len(episodes) == 1 and all((episodes[0] / name).is_dir() for name in scenarios)
 
 
-def _leave_only(folder: Path, names: Collection[str]) -> None:
-    """Remove fits of episodes that are no longer there, and nothing else."""
-    for path in folder.glob("*.json"):
-        if path.stem not in names and _readable(path) is not None:
-            path.unlink()
-            path.with_suffix(".npz").unlink(missing_ok=True)
+def _remove_stale(out: Path, jobs: Sequence[FitJob]) -> None:
+    """Remove fits that an earlier call left there and that this one's inputs no longer give: of episodes that are gone, or
+    with other settings. Finished single fits stay beside a joint one, and the reverse."""
+    kept = {name for job in jobs for name in job.files}
+    others = [
+        replace(job, name=name, episodes={name: episode})
+        for job in jobs
+        for name, episode in (job.episodes.items() if job.name == _JOINT else ())
+    ]
+    folders = {job.folder: [each for each in jobs if each.folder == job.folder] for job in jobs}
+    others += [
+        replace(members[0], name=_JOINT, episodes={job.name: job.episodes[job.name] for job in members})
+        for members in folders.values()
+        if members[0].name != _JOINT
+    ]
+    kept |= {name for job in others if job.known() is not None for name in job.files}
+    inside = {path.relative_to(out).as_posix() for path in kept}
+    removed = remove_files(out, sorted(read_manifest(out) - inside))
+    write_manifest(out, inside)
+    if removed:
+        told = "Removed fits whose episode is gone or whose settings have changed"
+        errors.print(f"{told}: {', '.join(removed)}.", markup=False, soft_wrap=True)
 
 
 def _readable(path: Path) -> dict[str, Any] | None:
@@ -183,12 +203,18 @@ class FitJob:
         return f"{self.scenario.name}/{self.name}"
 
     @property
+    def files(self) -> tuple[Path, Path]:
+        """What `run` writes."""
+        return self.folder / f"{self.name}.json", self.folder / f"{self.name}.npz"
+
+    @property
     def space(self) -> FitSpace:
         """
         Raises:
             ConfigError: bounds or fixed values that do not fit the parameters.
         """
         settings, scenario = self.settings, self.scenario
+        scenario.check_parameters([*settings.parameters, *settings.fixed])
         return FitSpace.build(
             settings.parameters,
             bounds={**scenario.bounds, **settings.bounds},
@@ -208,8 +234,9 @@ class FitJob:
 
     def known(self) -> dict[str, Any] | None:
         """The summary that this job, or an earlier one of the same inputs and code, has left; maybe interrupted."""
-        summary = _readable(self.folder / f"{self.name}.json")
-        return summary if summary is not None and summary.get("fingerprint") == self._fingerprint else None
+        summary = _readable(self.files[0])
+        same = summary is not None and summary.get("fingerprint") == self._fingerprint and self.files[1].is_file()
+        return summary if same else None
 
     def run(self, tell: Tell) -> dict[str, Any]:
         """Fit, write, and return the summary.
@@ -240,21 +267,27 @@ class FitJob:
 
     @cached_property
     def _fingerprint(self) -> str:
-        settings = self.settings.model_dump(exclude={"workers"})
+        settings = self.settings.model_dump(exclude={"workers", "joint"})  # which the name and the episodes tell
         return fingerprint([self.scenario, self.name, self.episodes, settings, self.init], packages=_CODE)
 
 
-def _first_start(init: str, scenario: Scenario, episodes: list[Episode]) -> dict[str, float]:
-    """Values of the first start by name; episodes of a joint fit give the mean of their predictions."""
+def _first_start(init: str, job: FitJob) -> dict[str, float]:
+    """Values of the first start by name; episodes of a joint fit give the mean of their predictions.
+
+    Raises:
+        ConfigError: a value of what is not fitted, or outside of its bounds.
+    """
     if init == "middle":
         return {}
     if "=" in init:
-        return assignments(init.split(","), "--init")
+        stated = assignments(init.split(","), "--init")
+        job.space.check_start(stated)
+        return stated
     # imported here: the fits of the pipeline start elsewhere, and must not be stale when a regressor changes
     from pipeline.predict import predicted_start
 
-    found = [predicted_start(init, scenario.name, episode) for episode in episodes]
-    return {name: sum(values[name] for values in found) / len(found) for name in found[0]}
+    found = [predicted_start(init, job.scenario.name, episode) for episode in job.episodes.values()]
+    return job.space.nearest({name: sum(values[name] for values in found) / len(found) for name in found[0]})
 
 
 def _row(summary: Mapping[str, Any], space: FitSpace) -> list[str]:

@@ -15,12 +15,13 @@ from rich.table import Table
 from diffcloud.errors import ConfigError
 from diffcloud.fit.agreement import NAMES, Agreement, gradient_agreement, random_parameters
 from diffcloud.io.files import write_text
-from pipeline.console import JsonFlag, finish, progress_bar, show
+from pipeline.console import JsonFlag, finish, progress_bar, show, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 
 _COLUMNS = [f"{kind}{name}" for kind in ("", "gradient_", "difference_") for name in NAMES]
 
 
+@writes(".csv")
 def gradients(
     scenario: ScenarioName = None,
     scene: SceneFile = None,

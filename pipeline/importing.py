@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
 from diffcloud.errors import ConfigError
 from diffcloud.hardware.realsense import play_recordings
@@ -16,13 +17,15 @@ from diffcloud.io.depth_folders import depth_folders
 from diffcloud.io.episodes import write_episode
 from diffcloud.io.imports import cloud_folder, release_episodes
 from diffcloud.io.recordings import Recording, read_joint_log, write_recording
-from diffcloud.io.ros_recordings import ros_recording
-from pipeline.console import JsonFlag, errors, finish, warn
+from diffcloud.io.ros.joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
+from diffcloud.io.ros.recording import ros_recording
+from pipeline.console import JsonFlag, errors, finish, warn, writes
 
 app = typer.Typer(no_args_is_help=True, help="Turn recordings of others into episodes.")
 
 
 @app.command()
+@writes()
 def release(
     folder: Annotated[Path, typer.Argument(help="Holds lift_real_pcls/, fold_real_pcls/, band_sim_pcls/, hang_sim_pcls/.")],
     out: Annotated[Path, typer.Option(help="Folder; episodes go to OUT/release_<lift|fold|band|hang>/.")],
@@ -39,6 +42,7 @@ def release(
 
 
 @app.command()
+@writes(".npz")
 def clouds(
     folder: Annotated[Path, typer.Argument(help="Numbered clouds (npy, ply, xyz, pcd), one a frame, in metres.")],
     out: Annotated[Path, typer.Option(help="Episode file (.npz).")],
@@ -61,8 +65,8 @@ def recording(
     source: Annotated[
         list[Path],
         typer.Argument(
-            help="A ROS recording (.bag, .mcap, .db3, rosbag2 folder); or, one per camera and as NAME=PATH, recordings of "
-            "the RealSense SDK (.db3, .bag) or folders with depth/*.png and camera.json."
+            help="A ROS recording (.bag, .mcap, .db3, rosbag2 folder), or all parts of a split one; or, one per camera and "
+            "as NAME=PATH, recordings of the RealSense SDK (.db3, .bag) or folders with depth/*.png and camera.json."
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder of the raw episode; must not exist.")],
@@ -74,8 +78,12 @@ def recording(
     joint: Annotated[
         list[str] | None, typer.Option(help="ROS: the arm's joints in order; joint_1, ... if not given.")
     ] = None,
-    gripper_joint: Annotated[str, typer.Option(help="ROS: in joint_states.")] = "finger_joint",
-    gripper_closed: Annotated[float, typer.Option(help="ROS: its angle when closed, rad.")] = 0.8,
+    gripper_joint: Annotated[
+        str, typer.Option(help="ROS: in joint_states; none for an arm without gripper.")
+    ] = GRIPPER_JOINT,
+    gripper_closed: Annotated[
+        float | None, typer.Option(help=f"ROS: its angle when closed, rad; {GRIPPER_CLOSED_RAD} if not given.")
+    ] = None,
     scenario: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
     fabric: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
     json: JsonFlag = False,
@@ -83,16 +91,16 @@ def recording(
     """Import depth recordings of others as a raw episode. Check it with `diffcloud episode validate`."""
     named = _named(source)
     kinds = {_kind(path) for path in named.values()}
-    if len(kinds) > 1 or (kinds == {"ros"} and len(named) > 1):
+    if len(kinds) > 1:
         raise ConfigError("Give one ROS recording, or one RealSense recording or folder per camera, not a mixture.")
     with ExitStack() as stack:
         if kinds == {"ros"}:
             found = ros_recording(
-                source[0],
+                *named.values(),
                 world_frame=world_frame,
                 tool_frame=tool_frame,
                 joint_names=joint or None,
-                gripper_joint=gripper_joint,
+                gripper_joint=None if gripper_joint == "none" else gripper_joint,
                 gripper_closed_rad=gripper_closed,
             )
         elif kinds == {"realsense"}:
@@ -101,13 +109,17 @@ def recording(
             found = depth_folders(named, rate_hz=rate_hz)
         if joint_log is not None:
             found = _with_log(found, joint_log, log_offset)
+        warnings = list(found.warnings)
         if found.robot is None:
-            warn("No joint log: the robot cannot be masked later. Give --joint-log if there is one.")
+            warnings.append("No joint log: the robot cannot be masked later. Give --joint-log if there is one.")
+        for message in warnings:
+            warn(escape(message))
         meta = {key: value for key, value in (("scenario", scenario), ("fabric", fabric)) if value is not None}
         frames = write_recording(out, found, rate_hz=rate_hz, meta=meta)
     errors.print(f"Wrote {frames} frames to {out}.", markup=False)
     rows = 0 if found.robot is None else len(found.robot.times)
-    finish({"out": str(out), "frames": frames, "robot_rows": rows, "source": found.source}, json)
+    result = {"out": str(out), "frames": frames, "robot_rows": rows, "source": found.source, "warnings": warnings}
+    finish(result, json)
 
 
 def _named(sources: list[Path]) -> dict[str, Path]:

@@ -14,6 +14,7 @@ import typer
 from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.io.calibrations import Calibration, read_calibration
 from diffcloud.io.episodes import Episode, read_episode, write_episode
+from diffcloud.io.files import files_in, folders_in, together
 from diffcloud.io.images import write_color
 from diffcloud.io.raw_episodes import RawEpisode, read_description, read_raw_episode
 from diffcloud.sensing import clean_frame
@@ -22,10 +23,11 @@ from diffcloud.sensing.masking import RobotMask
 from diffcloud.sensing.pictures import cloud_picture, mask_picture
 from diffcloud.sensing.robot import Robot, gen3
 from pipeline.config import PreprocessConfig, RawConfig, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, episode_files, errors, finish
+from pipeline.console import JsonFlag, ParamsFile, episode_files, errors, finish, writes
 from pipeline.workers import Tell, run_all
 
 
+@writes()
 def preprocess(
     recorded: Annotated[
         Path,
@@ -105,9 +107,10 @@ class PreprocessJob:
             episode = _clean(episode, self.settings)
         except EpisodeError as error:
             raise EpisodeError(f"{self.path}: {error}") from error
-        write_episode(self.out / self.scenario / f"{self.name}.npz", episode)
-        if pictures is not None:
-            pictures.write(self.out / self.scenario, self.name, episode)
+        with together():
+            if pictures is not None:
+                pictures.write(self.out / self.scenario, self.name, episode)
+            write_episode(self.out / self.scenario / f"{self.name}.npz", episode)
         return {key: episode.meta["quality"][key] for key in ("recorded", "kept")}
 
 
@@ -120,7 +123,7 @@ def _sources(recorded: Path, scenarios: list[str]) -> list[tuple[str, Path]]:
     for name in scenarios:
         folder = recorded / name
         paths = _raw_in(folder)
-        if not paths or any(folder.glob("*.npz")):
+        if not paths or files_in(folder, ".npz"):
             paths += episode_files([folder])
         names = [_stem(path) for path in paths]
         doubled = sorted({stem for stem in names if names.count(stem) > 1})
@@ -131,7 +134,7 @@ def _sources(recorded: Path, scenarios: list[str]) -> list[tuple[str, Path]]:
 
 
 def _raw_in(folder: Path) -> list[Path]:
-    return sorted(path.parent for path in folder.glob("*/episode.json"))
+    return [path for path in folders_in(folder) if (path / "episode.json").is_file()]
 
 
 def _scenario(raw: Path) -> str:

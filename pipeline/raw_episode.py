@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from diffcloud.sensing.validation import validate_raw_episode
+from diffcloud.sensing.validation.episode import validate_raw_episode
 from pipeline.console import JsonFlag, errors, finish, output
 
 app = typer.Typer(no_args_is_help=True, help="Raw episodes: what cameras and arm recorded.")

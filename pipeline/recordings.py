@@ -14,19 +14,20 @@ import typer
 from diffcloud.errors import ConfigError
 from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
 from diffcloud.io.episodes import Episode, read_episode
-from diffcloud.io.files import write_text
+from diffcloud.io.files import folders_in, write_text
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.evaluation import CloudFigures, evaluate_clouds, visible_clouds
 from diffcloud.sensing.recorder import Truth, read_truth
 from pipeline.config import FitConfig, load_config
-from pipeline.console import JsonFlag, ParamsFile, finish, output, progress_bar
+from pipeline.console import JsonFlag, ParamsFile, finish, output, progress_bar, writes
 from pipeline.scenario_options import choose_scenario
 
 _RATIOS = np.geomspace(0.15, 6.5, 9)
 """Of stretch to mass: a fit starts from the best of them."""
 
 
+@writes(".md")
 def recordings(
     recorded: Annotated[Path, typer.Option(help="Folder with raw <scenario>/<episode>/ of `diffcloud episodes`.")],
     episodes: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.npz of `diffcloud preprocess`.")],
@@ -38,10 +39,10 @@ def recordings(
     """Measure masks, clouds and fits of synthetic raw recordings against what was recorded; writes Markdown tables."""
     config = load_config(params)
     found = [
-        (name, path.parent)
+        (name, path)
         for name in config.scenarios
-        for path in sorted((recorded / name).glob("*/episode.json"))
-        if (path.parent / "truth").is_dir()
+        for path in folders_in(recorded / name)
+        if (path / "episode.json").is_file() and (path / "truth").is_dir()
     ]
     if not found:
         raise ConfigError(f"{recorded} holds no synthetic raw episodes of {', '.join(config.scenarios)}.")

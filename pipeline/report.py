@@ -18,7 +18,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.evaluation.summary import tables as comparison_tables
 from diffcloud.fit import read_fit
 from diffcloud.io.episodes import read_episode
-from diffcloud.io.files import atomic_path, read_json, write_text
+from diffcloud.io.files import read_json, together, write_bytes, write_text
 from diffcloud.mesh import SurfaceMesh
 from diffcloud.report import (
     ComparisonEntry,
@@ -29,9 +29,10 @@ from diffcloud.report import (
     overlay_figure,
 )
 from pipeline.config import load_config
-from pipeline.console import JsonFlag, ParamsFile, errors, finish
+from pipeline.console import JsonFlag, ParamsFile, errors, finish, writes
 
 
+@writes(".html")
 def report(
     out: Annotated[Path, typer.Option(help="HTML file.")] = Path("reports/index.html"),
     fits: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.json and .npz.")] = Path("data/fits"),
@@ -88,10 +89,6 @@ def report(
         "machine": f"{platform.machine()}, {os.cpu_count()} processors",
     }
     comparison = _comparison(tables, entries)
-    for figure in comparison.figures:
-        write_text(out.parent / "figures" / f"{figure.name}.svg", figure.svg)
-        with atomic_path(out.parent / "figures" / f"{figure.name}.png") as temporary:
-            temporary.write_bytes(figure.png)
     page = build_page(
         entries,
         title=config.report.title,
@@ -101,7 +98,11 @@ def report(
         trainings=trainings,
         comparison=comparison,
     )
-    write_text(out, page)
+    with together():
+        for figure in comparison.figures:
+            write_text(out.parent / "figures" / f"{figure.name}.svg", figure.svg)
+            write_bytes(out.parent / "figures" / f"{figure.name}.png", figure.png)
+        write_text(out, page)
     errors.print(f"Wrote {out} ({len(page) / 1e6:.1f} MB).")
     finish({"out": str(out), "episodes": len(entries), "bytes": len(page.encode())}, json)
 

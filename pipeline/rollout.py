@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import torch
 import typer
 
@@ -15,13 +14,15 @@ from diffcloud.fit.parameters import NUISANCE
 from diffcloud.fit.result import read_fit
 from diffcloud.io.clouds import write_ply
 from diffcloud.io.episodes import read_episode
-from diffcloud.io.files import atomic_path
+from diffcloud.io.files import together, write_npz
 from diffcloud.io.obj import write_cloth
+from diffcloud.sim.properties import check_values
 from diffcloud.sim.simulate import rollout as simulate
-from pipeline.console import JsonFlag, assignments, errors, finish, progress_bar
+from pipeline.console import JsonFlag, assignments, errors, finish, progress_bar, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, limits
 
 
+@writes(".npz")
 def rollout(
     out: Annotated[
         Path, typer.Option(help="NPZ: nodes [T+1, V, 3], faces [F, 3], times [T+1], obstacle_nodes, obstacle_faces.")
@@ -43,8 +44,8 @@ def rollout(
         fitted = read_fit(fit)["parameters"]
         values |= {name: float(entry["value"]) for name, entry in fitted.items() if name not in NUISANCE}
     values |= assignments(set_, "--set")
-    if any(not np.isfinite(value) for value in values.values()):
-        raise ConfigError(f"Parameters must be finite numbers, got {values}.")
+    check_values(values, "--set")
+    chosen.check_parameters(values)
     frames = frames or chosen.frames
     steps = frames * chosen.scene.frame_steps
     system, _ = chosen.scene.build()
@@ -65,23 +66,21 @@ def rollout(
             raise DivergedError(error.step, error.entries, error.reason, shown) from error
     nodes = run.positions[0, :: chosen.scene.frame_steps].numpy()
     times = run.times[:: chosen.scene.frame_steps].numpy()
-    with atomic_path(out) as temporary, temporary.open("wb") as stream:
-        bodies = chosen.scene.bodies
-        np.savez_compressed(
-            stream,
+    bodies = chosen.scene.bodies
+    with together():
+        for index, frame in enumerate(nodes):
+            if obj is not None:
+                write_cloth(obj / f"{index:03d}.obj", system.mesh, frame)
+            if ply is not None:
+                write_ply(ply / f"{index:03d}.ply", frame, system.mesh.faces)
+        write_npz(
+            out,
             nodes=nodes,
             faces=system.mesh.faces,
             times=times,
             obstacle_nodes=bodies.nodes,
             obstacle_faces=bodies.faces,
         )
-    for folder, suffix in ((obj, "obj"), (ply, "ply")):
-        for index, frame in enumerate(nodes if folder is not None else []):
-            path = Path(str(folder)) / f"{index:03d}.{suffix}"
-            if suffix == "obj":
-                write_cloth(path, system.mesh, frame)
-            else:
-                write_ply(path, frame, system.mesh.faces)
     errors.print(f"Wrote {len(nodes)} frames of {nodes.shape[1]} nodes to {out}.")
     finish(
         {

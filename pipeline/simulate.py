@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Annotated
 
@@ -10,14 +9,14 @@ import typer
 from rich.table import Table
 
 from diffcloud.datasets import ParameterBox, ParameterDraws, SimulationPlan, simulate_set
-from diffcloud.io.files import write_json
 from pipeline.config import load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, errors, finish, progress_bar, show, warn
+from pipeline.console import JsonFlag, ParamsFile, errors, finish, progress_bar, show, warn, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 
 _INTERRUPTED = 130
 
 
+@writes()
 def simulate(
     out: Annotated[Path, typer.Option(help="Folder of the set; an interrupted call is taken up again from OUT.partial.")],
     scenario: ScenarioName = None,
@@ -54,7 +53,6 @@ def simulate(
         ParameterDraws(box, settings.draws, chosen.name, settings.seed),
         {"train": settings.train, "test": settings.test},
     )
-    begin = time.perf_counter()
     with progress_bar(f"simulating {chosen.name}", settings.train + settings.test) as update:
         try:
             outcome = simulate_set(
@@ -70,9 +68,6 @@ def simulate(
             raise typer.Exit(_INTERRUPTED) from None
     if outcome.discarded:
         warn(f"{out}.partial belonged to other settings or other code; it was started again.")
-    seconds = time.perf_counter() - begin
-    # beside the set, not in it: the same draws have the same bytes, whatever they took
-    write_json(out.with_name(f"{out.name}.timings.json"), {"seconds": seconds, "resumed": outcome.resumed})
     megabytes = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6
     replaced = {split: len(entries) for split, entries in outcome.replaced.items()}
     for split, count in replaced.items():
@@ -86,7 +81,7 @@ def simulate(
         settings.draws,
         ", ".join(box.names),
         str(outcome.resumed),
-        f"{seconds:.1f}",
+        f"{outcome.seconds:.1f}",
         f"{megabytes:.1f}",
     )
     show(table, json)
@@ -100,7 +95,7 @@ def simulate(
             "parameters": list(box.names),
             "resumed": outcome.resumed,
             "replaced": replaced,
-            "seconds": seconds,
+            "seconds": outcome.seconds,
             "megabytes": megabytes,
         },
         json,

@@ -12,7 +12,7 @@ import typer
 from rich.table import Table
 
 from diffcloud.errors import CheckpointError, ConfigError, DatasetError, DiffCloudError
-from diffcloud.io.files import read_json, write_json
+from diffcloud.io.files import read_json
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.regressors import (
     MODEL_NAMES,
@@ -23,8 +23,9 @@ from diffcloud.regressors import (
     TrainingSettings,
     profile_settings,
 )
+from diffcloud.regressors.checkpoints import timings_path
 from pipeline.config import TrainConfig, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, errors, finish, show
+from pipeline.console import JsonFlag, ParamsFile, errors, finish, show, writes
 from pipeline.workers import Tell, run_all
 
 _INTERRUPTED = 130
@@ -32,6 +33,7 @@ _CODE = ("mesh", "io", "clouds", "regressors")
 """Packages whose source decides a training."""
 
 
+@writes()
 def train(
     data: Annotated[Path, typer.Option(help="Folder written by `diffcloud simulate`; without a scenario, of <scenario>/.")],
     out: Annotated[
@@ -161,7 +163,6 @@ class TrainJob:
             losses = f"train {progress.train_loss:.4f}  validation {progress.validation_loss:.4f}  best {progress.best:.4f}"
             tell(progress.epoch / self.settings.epochs, f"{progress.epoch}/{self.settings.epochs}  {losses}")
 
-        self._timings.unlink(missing_ok=True)
         result = train_regressor(
             cast(ModelName, self.model),
             self.train,
@@ -170,17 +171,15 @@ class TrainJob:
             self._checkpoint,
             device=self.config.device,
             workers=self.config.loaders,
+            mark=self._fingerprint,
             progress=show_progress,
         )
-        # apart from the other files, which have the same bytes for the same seed
-        told = {"seconds": result.seconds, "resumed": result.resumed_from, "fingerprint": self._fingerprint}
-        write_json(self._timings, told)
-        return self._told(result.summary, told)
+        return self._told(result.summary, {"seconds": result.seconds, "resumed": result.resumed_from})
 
     def _known(self) -> dict[str, Any] | None:
         """What an earlier run of the same settings, data and code has left."""
         try:
-            told = read_json(self._timings, error=DatasetError)
+            told = read_json(timings_path(self._checkpoint), error=DatasetError)
             if not isinstance(told, dict) or told.get("fingerprint") != self._fingerprint:
                 return None
             Regressor.read(self._checkpoint)
@@ -201,10 +200,6 @@ class TrainJob:
     @property
     def _checkpoint(self) -> Path:
         return self.folder / f"{self.model}.safetensors"
-
-    @property
-    def _timings(self) -> Path:
-        return self.folder / f"{self.model}.timings.json"
 
     @cached_property
     def _fingerprint(self) -> str:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,7 +20,8 @@ from diffcloud.clouds.augmentation import Augmentation, CloudMaker, run_keys
 from diffcloud.datasets.chunks import Chunk, Replaced, SimulatedChunk, chunks_of, simulate_chunk
 from diffcloud.datasets.draws import ParameterDraws
 from diffcloud.datasets.work import WorkFolder
-from diffcloud.errors import ConfigError, DatasetError
+from diffcloud.errors import ConfigError, DatasetError, DiffCloudError
+from diffcloud.io.files import atomic, write_json
 from diffcloud.io.simulated import SimulatedSet, Split, write_simulated
 from diffcloud.scene.scenarios import Scenario
 
@@ -59,6 +63,8 @@ class SimulationOutcome:
     replaced: dict[Split, list[Replaced]]
     discarded: bool
     """Whether the chunks of another plan lay there and were thrown away."""
+    seconds: float
+    """Of this call."""
 
 
 def simulate_set(
@@ -70,7 +76,7 @@ def simulate_set(
     clouds: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> SimulationOutcome:
-    """Simulate a set into a folder, which takes its name when it is whole.
+    """Simulate a set into a folder, where it appears when it is whole, and its wall time into `<out>.timings.json`.
 
     Finished chunks are kept in `<out>.partial` and used by the next call with the same plan.
 
@@ -85,8 +91,9 @@ def simulate_set(
         DatasetError: a run diverges with every draw, or workers die.
         DiffCloudError: the folder cannot be written.
     """
-    work = WorkFolder(out, [plan.scenario, plan.draws, dict(plan.counts)])
+    began = time.perf_counter()
     chunks = [chunk for split, count in plan.counts.items() for chunk in chunks_of(plan.draws, split, count)]
+    work = WorkFolder(out, [plan.scenario, plan.draws, dict(plan.counts)], chunks)
     missing = [chunk for chunk in chunks if work.read(chunk) is None]
     finished = resumed = sum(len(chunk.parameters) for chunk in chunks) - sum(len(c.parameters) for c in missing)
     if progress is not None:
@@ -102,11 +109,19 @@ def simulate_set(
     results: dict[Split, list[SimulatedChunk]] = {split: [] for split, count in plan.counts.items() if count}
     for chunk in chunks:
         kept = work.read(chunk)
-        assert kept is not None
+        if kept is None:
+            raise DatasetError(f"{work.path} lost the runs {chunk.name}; was it cleared? Run the command again.")
         results[chunk.split].append(kept)
-    work.publish(lambda folder: _write(folder, plan, results, clouds))
     replaced = {split: [entry for part in parts for entry in part.replaced] for split, parts in results.items()}
-    return SimulationOutcome(resumed, replaced, work.discarded)
+    outcome = SimulationOutcome(resumed, replaced, work.discarded, time.perf_counter() - began)
+
+    def write(folder: Path) -> list[str]:
+        # beside the set, not in it: the same draws have the same bytes, whatever they took
+        write_json(folder.with_name(f"{folder.name}.timings.json"), {"seconds": outcome.seconds, "resumed": resumed})
+        return _write(folder, plan, results, clouds)
+
+    work.publish(write)
+    return outcome
 
 
 def _simulated(
@@ -119,41 +134,62 @@ def _simulated(
         for chunk in chunks:
             yield chunk, simulate_chunk(plan.scenario, plan.draws, chunk)
         return
-    import dask  # takes a second
-    from distributed import Client, KilledWorker, LocalCluster, as_completed
+    from distributed import Client, as_completed
 
-    if scheduler is not None:
-        cluster = None
-        try:
-            client = Client(scheduler, timeout=_ANSWER_S)
-        except (OSError, ValueError) as error:
-            raise ConfigError(
-                f"No Dask scheduler answers at {scheduler}: {error}. Start one with `dask scheduler`."
-            ) from error
-    else:
-        with dask.config.set(_WORKER_MEMORY):
-            cluster = LocalCluster(
-                n_workers=min(workers, len(chunks)),
-                threads_per_worker=1,
-                dashboard_address=":0",  # any port: two sets at once do not quarrel
-                silence_logs=logging.ERROR,
-            )
-        client = Client(cluster)
-        client.run(_ignore_ctrl_c)
-    try:
+    with ExitStack() as stack:
+        if scheduler is not None:
+            try:
+                client = stack.enter_context(Client(scheduler, timeout=_ANSWER_S))
+            except (OSError, ValueError) as error:
+                raise ConfigError(
+                    f"No Dask scheduler answers at {scheduler}: {error}. Start one with `dask scheduler`."
+                ) from error
+        else:
+            client = stack.enter_context(_local_client(min(workers, len(chunks))))
         futures = {client.submit(simulate_chunk, plan.scenario, plan.draws, chunk, pure=False): chunk for chunk in chunks}
-        for future, result in as_completed(futures, with_results=True):
+        done = as_completed(futures, with_results=True)
+        while True:
+            # workers that are gone make Dask raise errors of many kinds; those of a chunk are the project's own
+            try:
+                future, result = next(done)
+            except StopIteration:
+                return
+            except DiffCloudError:
+                raise
+            except Exception as error:
+                raise _workers_lost(error) from error
             yield futures[future], result
             future.release()
-    except KilledWorker as error:
-        raise DatasetError(
-            f"Worker processes ended without a word, perhaps for want of memory ({error}). Finished runs are kept; try "
-            "fewer --workers."
-        ) from error
-    finally:
-        client.close()
-        if cluster is not None:
-            cluster.close()
+
+
+@contextmanager
+def _local_client(workers: int) -> Iterator[Any]:
+    """A Dask client of processes on this machine."""
+    import dask  # takes a second
+    from distributed import Client, LocalCluster
+
+    with ExitStack() as stack:
+        try:
+            with dask.config.set(_WORKER_MEMORY):
+                cluster = LocalCluster(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    dashboard_address=":0",  # any port: two sets at once do not quarrel
+                    silence_logs=logging.CRITICAL,
+                )
+            stack.enter_context(cluster)
+            client = stack.enter_context(Client(cluster))
+            client.run(_ignore_ctrl_c)
+        except Exception as error:  # a worker that dies while it starts
+            raise _workers_lost(error) from error
+        yield client
+
+
+def _workers_lost(error: Exception) -> DatasetError:
+    return DatasetError(
+        f"Worker processes ended without a word ({type(error).__name__}: {error}), as those do that get no more memory or "
+        "are killed. Finished runs are kept; run the command again, perhaps with fewer --workers."
+    )
 
 
 def _ignore_ctrl_c() -> None:
@@ -163,18 +199,22 @@ def _ignore_ctrl_c() -> None:
 
 def _write(
     folder: Path, plan: SimulationPlan, results: Mapping[Split, Sequence[SimulatedChunk]], clouds: int | None
-) -> None:
+) -> list[str]:
     sets = {split: _joined(plan, parts) for split, parts in results.items()}
     about = {
         "draws": plan.draws.kind,
         "seed": plan.draws.seed,
         "integrator": plan.scenario.scene.integrator,
         "replaced": sum(len(part.replaced) for parts in results.values() for part in parts),
+        "clouds": clouds or 0,
     }
-    write_simulated(folder, sets, about=about, replaced=_replaced_table(plan, results))
-    if clouds is not None:
-        for split, simulated in sets.items():
-            export_clouds(folder / "clouds" / split, simulated, points=clouds, seed=plan.draws.seed)
+    names = []
+    for split, simulated in sets.items():
+        if clouds is None:
+            break
+        written = export_clouds(folder / "clouds" / split, simulated, points=clouds, seed=plan.draws.seed)
+        names += [f"clouds/{split}/{name}" for name in written]
+    return names + write_simulated(folder, sets, about=about, replaced=_replaced_table(plan, results))
 
 
 def _joined(plan: SimulationPlan, parts: Sequence[SimulatedChunk]) -> SimulatedSet:
@@ -209,14 +249,18 @@ def _replaced_table(plan: SimulationPlan, results: Mapping[Split, Sequence[Simul
     return pd.DataFrame(rows, columns=columns).to_csv(index=False, lineterminator="\n")
 
 
-def export_clouds(folder: Path, simulated: SimulatedSet, *, points: int, seed: int) -> None:
-    """Write the clouds of every run and frame as `<run>/<frame>.npy` float32 [points, 3], the layout of the published data.
+def export_clouds(folder: Path, simulated: SimulatedSet, *, points: int, seed: int) -> list[str]:
+    """Write the clouds of every run and frame as `<run>/<frame>.npy` float32 [points, 3], the layout of the published data;
+    return their names.
 
     They are the first epoch's of a training with the same seed, number of points and the default augmentation.
     """
     maker = CloudMaker.build(simulated, Augmentation(), points=points)
+    names = []
     for run, nodes in enumerate(simulated.nodes):  # one run's clouds are megabytes
         clouds = maker.clouds(torch.as_tensor(nodes[None]), run_keys(seed, 0, torch.tensor([run])))[0].numpy()
-        (folder / str(run)).mkdir(parents=True)
         for frame, cloud in enumerate(clouds):
-            np.save(folder / str(run) / f"{frame:03d}.npy", cloud, allow_pickle=False)
+            names.append(f"{run}/{frame:03d}.npy")
+            with atomic(folder / names[-1]) as stream:
+                np.save(stream, cloud, allow_pickle=False)
+    return names

@@ -1,15 +1,15 @@
 """Chunks kept on disk while a set is simulated, so that an interrupted run goes on where it stopped.
 
 The work folder lies beside the output. It belongs to one plan: a fingerprint of everything that decides the numbers,
-including this package's source, says whether its chunks may be used.
+including this package's source, says whether its chunks may be used. It lists its files, and only these are ever removed.
 """
 
 from __future__ import annotations
 
 import json
-import shutil
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -18,50 +18,49 @@ import numpy as np
 
 from diffcloud.datasets.chunks import Chunk, Replaced, SimulatedChunk
 from diffcloud.errors import ConfigError, DatasetError
-from diffcloud.io.files import atomic_path, read_json, write_json
+from diffcloud.io.files import files_in, read_json, together, write_json, write_npz
 from diffcloud.io.fingerprints import fingerprint
+from diffcloud.io.manifests import remove_files
+from diffcloud.io.simulated import simulated_files
 
 _CODE = ("mesh", "sim", "scene", "datasets")
 """Packages whose source decides the numbers."""
+_PLAN = "plan.json"
 
 
 class WorkFolder:
     """The chunks of one plan that are finished."""
 
-    def __init__(self, out: Path, plan: Any) -> None:
+    def __init__(self, out: Path, plan: Any, chunks: Sequence[Chunk]) -> None:
         """
         Args:
             out: the set's folder; the work folder is its sibling `<name>.partial`.
             plan: what decides the numbers: dataclasses, mappings, sequences, arrays, numbers, strings.
+            chunks: all of the plan.
 
         Raises:
-            ConfigError: the output exists and is no simulated set.
+            ConfigError: the output or the work folder exists and is something else.
             DiffCloudError: the folder cannot be written.
         """
-        out = Path(out).absolute()
-        if out.exists() and not (out.is_dir() and ((out / "set.json").is_file() or not any(out.iterdir()))):
-            raise ConfigError(
-                f"{out} holds something else than a simulated set; give another --out, or remove it yourself."
-            )
-        self.out, self.path = out, out.with_name(f"{out.name}.partial")
-        self.discarded = False
-        mark = {"fingerprint": fingerprint(plan, packages=_CODE)}
-        if self.path.exists() and self._mark() != mark:
-            self.discarded = True
-            shutil.rmtree(self.path)
-        write_json(self.path / "plan.json", mark)
+        self.out = Path(out).absolute()
+        self.path = self.out.with_name(f"{self.out.name}.partial")
+        mark = fingerprint(plan, packages=_CODE)
+        former = self._plan()
+        if former is None:  # else the output was looked at by the call that made the work folder
+            self._refuse_others()
+        self.discarded = former is not None and former["fingerprint"] != mark
+        if former is not None and self.discarded:
+            remove_files(self.path, former["files"])
+        replaced = simulated_files(self.out) or (former["replaces"] if former is not None else [])
+        self._files = [*(self._file(chunk).name for chunk in chunks), _PLAN]
+        self._replaces: list[str] = replaced
+        write_json(self.path / _PLAN, {"fingerprint": mark, "files": self._files, "replaces": replaced})
 
     def write(self, chunk: Chunk, result: SimulatedChunk) -> None:
         """Keep a finished chunk."""
-        replaced = json.dumps([asdict(entry) for entry in result.replaced])
-        with atomic_path(self._file(chunk)) as temporary:
-            np.savez(
-                temporary,
-                allow_pickle=False,
-                parameters=result.parameters,
-                nodes=result.nodes,
-                replaced=np.array(replaced),
-            )
+        replaced = np.array(json.dumps([asdict(entry) for entry in result.replaced]))
+        arrays = {"parameters": result.parameters, "nodes": result.nodes, "replaced": replaced}
+        write_npz(self._file(chunk), compressed=False, **arrays)
 
     def read(self, chunk: Chunk) -> SimulatedChunk | None:
         """A finished chunk, None if it is missing or damaged."""
@@ -76,26 +75,37 @@ class WorkFolder:
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
             return None
 
-    def publish(self, write: Callable[[Path], None]) -> None:
-        """Let `write` fill a folder, put that in the place of the output, and remove this work folder.
+    def publish(self, write: Callable[[Path], list[str]]) -> None:
+        """Let `write` write the set and name its files; remove what is left of a former one, and this work folder.
 
-        A kill at any moment leaves the former output, or none, and the chunks.
+        A kill at any moment leaves the former set, or none, and the chunks.
         """
-        whole, former = self.path / "whole", self.path / "former"
-        for rest in (whole, former):
-            shutil.rmtree(rest, ignore_errors=True)
-        whole.mkdir()
-        write(whole)
-        if self.out.exists():
-            self.out.rename(former)
-        whole.rename(self.out)
-        shutil.rmtree(self.path)
+        with together():
+            written = write(self.out)
+        remove_files(self.out, set(self._replaces) - set(written))
+        remove_files(self.path, self._files)
+        with suppress(OSError):  # somebody else has put something there
+            self.path.rmdir()
+
+    def _refuse_others(self) -> None:
+        if self.out.exists() and not (self.out.is_dir() and ((self.out / "set.json").is_file() or not files_in(self.out))):
+            raise ConfigError(
+                f"{self.out} holds something else than a simulated set; give another --out, or remove it yourself."
+            )
+        if self.path.exists() and not (self.path.is_dir() and not files_in(self.path)):
+            raise ConfigError(
+                f"{self.path}, where finished runs would be kept, holds something else; give another --out, or move it."
+            )
 
     def _file(self, chunk: Chunk) -> Path:
         return self.path / f"{chunk.name}.npz"
 
-    def _mark(self) -> Any:
+    def _plan(self) -> dict[str, Any] | None:
+        """What the call that made the work folder has stated; None if there is none, or it is of something else."""
         try:
-            return read_json(self.path / "plan.json", error=DatasetError)
+            told = read_json(self.path / _PLAN, error=DatasetError)
         except DatasetError:
             return None
+        named = isinstance(told, dict) and isinstance(told.get("fingerprint"), str)
+        lists = named and all(isinstance(told.get(key), list) for key in ("files", "replaces"))
+        return told if lists else None

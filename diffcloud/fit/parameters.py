@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from diffcloud.errors import ConfigError, unknown_name
-from diffcloud.sim.properties import PARAMETERS
+from diffcloud.sim.properties import PARAMETERS, check_values
 
 NUISANCE = {
     "offset_x": "m",
@@ -72,9 +72,13 @@ class FitSpace:
             ConfigError: an unknown, repeated or doubly given parameter, or bounds out of order.
         """
         fixed, bounds = dict(fixed or {}), dict(bounds or {})
-        for name in (*names, *fixed, *bounds):
+        for name in (*names, *bounds):
             if name not in PARAMETERS:
                 raise ConfigError(unknown_name("parameter", name, PARAMETERS))
+        check_values(fixed, "The fixed value of")
+        for name, pair in bounds.items():
+            for value in pair:
+                PARAMETERS[name].check(value, f"A bound of {name}, {list(pair)},")
         if len(set(names)) < len(names):
             raise ConfigError(f"A parameter is listed twice: {', '.join(names)}.")
         both = sorted(set(names) & set(fixed))
@@ -89,6 +93,30 @@ class FitSpace:
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(variable.name for variable in self.variables)
+
+    def check_start(self, first: Mapping[str, float]) -> None:
+        """
+        Args:
+            first: values of a first start.
+
+        Raises:
+            ConfigError: one of what is not fitted, or outside of its bounds; names the nearest that is allowed.
+        """
+        bounds = {variable.name: (variable.low, variable.high) for variable in self.variables}
+        for name, value in first.items():
+            if name not in bounds:
+                raise ConfigError(f"--init: {unknown_name('fitted parameter', name, bounds)}")
+            low, high = bounds[name]
+            if not low <= value <= high:
+                nearest = high if value > high else low
+                raise ConfigError(
+                    f"--init {name}={value:g} is outside of its bounds [{low:g}, {high:g}]; the nearest allowed value is "
+                    f"{nearest:g}. Or widen them with --bound."
+                )
+
+    def nearest(self, first: Mapping[str, float]) -> dict[str, float]:
+        """Of values that a prediction gave, those that are fitted, within their bounds."""
+        return {v.name: min(max(first[v.name], v.low), v.high) for v in self.variables if v.name in first}
 
     def values(self, unbounded: Tensor, logarithmic: Tensor) -> Tensor:
         """[B, k] unbounded variables -> [B, k] values; `logarithmic` bool [B] picks the scale of each start."""
@@ -118,7 +146,7 @@ class FitSpace:
         middle = 0.5 * (low + high)
         for index, name in enumerate(self.names):
             if first and name in first:
-                middle[index] = np.clip(first[name], low[index], high[index])
+                middle[index] = first[name]
         values = np.repeat(middle[None], count, axis=0)
         if count > 1:
             from scipy.stats import qmc  # takes as long to import as all of scipy else

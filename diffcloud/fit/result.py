@@ -17,7 +17,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.optimise import AdamSettings, FitOutcome
 from diffcloud.fit.parameters import NUISANCE, FitSpace
-from diffcloud.io.files import atomic_path, read_json, write_json
+from diffcloud.io.files import read_json, together, write_json, write_npz
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS
@@ -45,26 +45,17 @@ class FitResult:
 
 def physical_values(scenario: Scenario, values: Mapping[str, float]) -> dict[str, dict[str, Any]]:
     """Each parameter with what it means: multiplier, physical value and unit (SI if the scene is)."""
-    material, around = scenario.scene.material, scenario.scene.surrounding
-    density = (scenario.scene.mass_material or material).density
-    basis = {
-        "stretch": material.resting_stretching_stiffness,
-        "bending": material.resting_bending_stiffness,
-        "mass": density,
-        "density": density,
-        "drag": around.air_density,
-    }
     described: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
         if name in NUISANCE:
             described[name] = {"value": value, "unit": NUISANCE[name], "physical": value, "physical_unit": NUISANCE[name]}
             continue
         parameter = PARAMETERS[name]
-        multiplier = parameter.kind == "multiplier"
+        basis = parameter.basis
         described[name] = {
             "value": value,
-            "unit": "x basis" if multiplier else parameter.unit,
-            "physical": value * basis[name] if multiplier else value,
+            "unit": parameter.unit if basis is None else "x basis",
+            "physical": value if basis is None else value * scenario.scene.basis(basis),
             "physical_unit": parameter.unit,
             "meaning": parameter.meaning,
         }
@@ -170,11 +161,11 @@ def describe_fit(
 
 
 def write_fit(folder: Path, name: str, result: FitResult) -> Path:
-    """Write `<name>.npz` (trajectory) and then `<name>.json`; returns the latter."""
-    folder = Path(folder)
-    with atomic_path(folder / f"{name}.npz") as temporary:
-        np.savez_compressed(
-            temporary,
+    """Write `<name>.npz` (trajectory) and `<name>.json` together; returns the latter."""
+    path = Path(folder) / f"{name}.json"
+    with together():
+        write_npz(
+            path.with_suffix(".npz"),
             nodes=result.positions,
             start_nodes=result.start_positions,
             faces=result.faces,
@@ -182,8 +173,7 @@ def write_fit(folder: Path, name: str, result: FitResult) -> Path:
             obstacle_nodes=result.bodies.nodes,
             obstacle_faces=result.bodies.faces,
         )
-    path = folder / f"{name}.json"
-    write_json(path, result.summary)
+        write_json(path, result.summary)
     return path
 
 

@@ -36,7 +36,8 @@ class CameraCalibration:
     name: str = ""
     """What the person calls it: overhead, side."""
     residuals: Mapping[str, float] = field(default_factory=dict)
-    """rms_px and rms_mm on held-out poses, and what else the method measures."""
+    """What the method measures. charuco: rms_px and rms_mm on held-out poses, rms_fit_px, rms_fit_mm. checkerboard: rms_mm
+    of the fit, held_out_mm on corners left out."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,8 @@ class Calibration:
     board: Mapping[str, Any] = field(default_factory=dict)
     date: str = ""
     """ISO 8601."""
+    objections: tuple[str, ...] = ()
+    """Why it should not be used; it was written all the same, by force."""
 
     def camera(self, serial: str, *, name: str = "") -> CameraCalibration:
         """The calibration of one camera.
@@ -87,6 +90,8 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
             "date": date,
             "units": {"length": "m", "angle": "rad"},
             "board": dict(calibration.board),
+            "forced": bool(calibration.objections),
+            "objections": list(calibration.objections),
             "cameras": cameras,
         },
     )
@@ -103,7 +108,8 @@ def read_calibration(path: Path) -> Calibration:
         raise CalibrationError(f"{path} is not a calibration of schema_version {_VERSION}.")
     try:
         cameras = {str(serial): _camera(str(serial), entry, path) for serial, entry in data["cameras"].items()}
-        return Calibration(cameras, str(data["method"]), data.get("board", {}), str(data.get("date", "")))
+        objections = tuple(str(text) for text in data.get("objections", ()))
+        return Calibration(cameras, str(data["method"]), data.get("board", {}), str(data.get("date", "")), objections)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CalibrationError(f"{path}: a field is missing or wrong: {error!r}.") from error
 

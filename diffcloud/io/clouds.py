@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
+from diffcloud.io.files import atomic
 from diffcloud.io.libusb import load_libusb
 from diffcloud.io.pickles import load_npy
 
@@ -47,10 +48,8 @@ def write_ply(path: Path, vertices: NDArray[Any], faces: NDArray[Any] | None = N
     """Write a cloud [N, 3] or a mesh as binary PLY, atomically."""
     import trimesh
 
-    from diffcloud.io.files import atomic_path
-
     shape = trimesh.PointCloud(vertices) if faces is None else trimesh.Trimesh(vertices, faces, process=False)
-    with atomic_path(Path(path)) as temporary, temporary.open("wb") as stream:
+    with atomic(path) as stream:
         shape.export(stream, file_type="ply")
 
 

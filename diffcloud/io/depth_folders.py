@@ -17,7 +17,7 @@ from diffcloud.errors import EpisodeError
 from diffcloud.io.camera_models import Intrinsics, read_transform
 from diffcloud.io.files import read_json
 from diffcloud.io.images import decode_color, read_depth
-from diffcloud.io.raw_episodes import CameraInfo, read_timestamps
+from diffcloud.io.raw_episodes import CameraInfo, first_backwards, read_timestamps
 from diffcloud.io.recordings import RecordedFrame, Recording
 
 _JSON_NAMES = ("camera.json", "intrinsics.json", "camera_intrinsic.json", "intrinsic.json")
@@ -31,21 +31,23 @@ def depth_folders(folders: Mapping[str, Path], *, rate_hz: float | None = None) 
         rate_hz: of frames without timestamps.csv.
 
     Raises:
-        EpisodeError: no images, no camera JSON, gaps in the numbers, JPEG depth, or no times.
+        EpisodeError: no images, no camera JSON, gaps in the numbers, JPEG depth, no times, or times that run backwards.
     """
     cameras = {name: _camera(Path(folder), name) for name, folder in folders.items()}
     images = {name: _numbered(Path(folder) / "depth", (".png", ".jpg", ".jpeg")) for name, folder in folders.items()}
     times = {name: _times(Path(folder), sorted(images[name]), rate_hz) for name, folder in folders.items()}
     order = sorted((times[name][number], name, number) for name in folders for number in images[name])
 
+    colors = {name: _colors(Path(folder)) for name, folder in folders.items()}
+
     def frames() -> Iterator[RecordedFrame]:
-        colors = {name: _colors(Path(folder)) for name, folder in folders.items()}
         for t, name, number in order:
             path = colors[name].get(number)
             color = None if path is None else decode_color(path.read_bytes(), str(path))
             yield RecordedFrame(name, t, read_depth(images[name][number]), color)
 
-    return Recording(cameras, frames(), f"depth images {', '.join(Path(folder).name for folder in folders.values())}")
+    source = f"depth images {', '.join(Path(folder).name for folder in folders.values())}"
+    return Recording(cameras, frames(), source, warnings=tuple(_lost_colors(images, colors)))
 
 
 def _camera(folder: Path, name: str) -> CameraInfo:
@@ -78,6 +80,14 @@ def _times(folder: Path, numbers: list[int], rate_hz: float | None) -> dict[int,
         missing = [number for number in numbers if number not in known]
         if missing:
             raise EpisodeError(f"{folder / 'timestamps.csv'} lacks frames {missing[:5]}.")
+        bad = first_backwards(np.array([known[number] for number in numbers]))
+        if bad is not None:
+            frame, before = numbers[bad], numbers[bad - 1]
+            raise EpisodeError(
+                f"{folder / 'timestamps.csv'}: the time runs backwards: frame {frame} is of {known[frame]:.6f} s, frame "
+                f"{before} of {known[before]:.6f} s. The clock was set while recording, or rows were mixed up: put the "
+                "times right, or cut the recording there."
+            )
         return known
     if rate_hz is None:
         raise EpisodeError(f"{folder} has no timestamps.csv; give the frame rate with --rate-hz.")
@@ -86,6 +96,16 @@ def _times(folder: Path, numbers: list[int], rate_hz: float | None) -> dict[int,
 
 def _colors(folder: Path) -> dict[int, Path]:
     return _numbered(folder / "color", (".png", ".jpg", ".jpeg")) if (folder / "color").is_dir() else {}
+
+
+def _lost_colors(images: Mapping[str, dict[int, Path]], colors: Mapping[str, dict[int, Path]]) -> Iterator[str]:
+    for name, numbers in images.items():
+        lost = sorted(set(numbers) - set(colors[name]))
+        if colors[name] and lost:
+            yield (
+                f"Camera {name}: {len(lost)} of {len(numbers)} frames have no colour image of their number, such as frame "
+                f"{lost[0]}."
+            )
 
 
 def _numbered(folder: Path, formats: tuple[str, ...]) -> dict[int, Path]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
-from diffcloud.io.files import atomic_path
+from diffcloud.io.files import write_npz
 
 _OPTIONAL = {"gripper", "camera", "pixel", "sigma"}
 _REQUIRED = {"points", "offsets", "times", "meta"}
@@ -122,8 +122,7 @@ def write_episode(path: Path, episode: Episode) -> None:
     arrays: dict[str, Any] = {"points": episode.points, "offsets": episode.offsets, "times": episode.times}
     arrays |= {name: getattr(episode, name) for name in sorted(_OPTIONAL) if getattr(episode, name) is not None}
     arrays["meta"] = np.array(json.dumps(dict(episode.meta), sort_keys=True, allow_nan=False))
-    with atomic_path(Path(path)) as temporary:
-        np.savez_compressed(temporary, allow_pickle=False, **arrays)
+    write_npz(path, **arrays)
 
 
 def read_episode(path: Path) -> Episode:

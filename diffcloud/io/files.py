@@ -1,56 +1,173 @@
-"""Atomic writes and checked reads, shared by every file format of the project."""
+"""The one way to disk and back: outputs that belong together appear together, by one process at a time, and only data are
+read as data.
+
+An output is written under a temporary name beside it and renamed when all outputs of its group are whole. A crash, a full
+disk or Ctrl-C leaves the former files, or none, never half of one. What a kill leaves behind has a suffix that no reader
+takes for data, and is removed by the next write of the same file. Locks are the system's (`flock`): they end with the
+process that holds them, however that ends.
+"""
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
-import tempfile
+import shlex
+import shutil
+import socket
+import sys
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
+
+import numpy as np
 
 from diffcloud.errors import DiffCloudError
 
+TEMPORARY, LOCK = ".diffcloud-tmp", ".diffcloud-lock"
+"""Suffixes of a file that is being written, and of the lock file beside an output that a command holds."""
+_NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EINVAL}
+"""What a file system without locks answers; nothing is locked there."""
+
+
+class _Outputs:
+    """Files that take their names together."""
+
+    def __init__(self) -> None:
+        self._pending: dict[Path, tuple[Path, int]] = {}
+        """Output -> its temporary file and that file's inode."""
+        self._folders: list[Path] = []
+        """Made for the outputs, outermost first."""
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[BinaryIO]:
+        """A stream to the temporary file of `path`."""
+        self._folders += _make_folders(path.parent)
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        temporary = path.with_name(f".{path.name}{TEMPORARY}")
+        with _opened_alone(path, temporary) as stream:
+            self._pending.pop(path, None)
+            self._pending[path] = temporary, os.fstat(stream.fileno()).st_ino
+            yield stream
+
+    def publish(self) -> None:
+        """Give all files their names."""
+        for path, (temporary, inode) in self._pending.items():
+            if _inode(temporary) != inode:
+                raise DiffCloudError(f"Another process wrote {path} at the same time; run the command again.")
+        if len(self._pending) > 1:
+            next(reversed(self._pending)).unlink(missing_ok=True)
+        for path, (temporary, _) in self._pending.items():
+            os.replace(temporary, path)
+        self._pending.clear()
+
+    def discard(self) -> None:
+        """Remove what has not been published."""
+        for temporary, inode in self._pending.values():
+            with suppress(OSError):
+                if _inode(temporary) == inode:
+                    temporary.unlink()
+        self._pending.clear()
+        _remove_empty(self._folders)
+
+
+_group: ContextVar[_Outputs | None] = ContextVar("_group", default=None)
+"""Of the innermost `together`."""
+
 
 @contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its name only if the block ends without an error.
+def together() -> Iterator[None]:
+    """What is written in this block is all there after it, or, if it ends with an error, all as it was before.
 
-    An interrupted or failed write (a full disk, Ctrl-C) leaves the former file, or none, never half of one.
+    The file written last is the record: while it is there, the others are whole. So it is the first to go where the group
+    replaces a former one, and the last to come. A block inside another belongs to the outer one.
 
     Raises:
-        DiffCloudError: the system refused the write; the message names the file.
+        DiffCloudError: the system refused to put the files in place; the message names one.
+    """
+    if _group.get() is not None:
+        yield
+        return
+    outputs = _Outputs()
+    token = _group.set(outputs)
+    try:
+        yield
+        try:
+            outputs.publish()
+        except OSError as error:
+            raise _refused(Path(error.filename2 or error.filename or "the outputs"), error) from error
+    finally:
+        _group.reset(token)
+        outputs.discard()
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[BinaryIO]:
+    """A stream that becomes `path` when the block, and a `together` around it, ends without an error.
+
+    A library that wants a path may write to the stream's `name`.
+
+    Raises:
+        DiffCloudError: the system refused the write, or another process is writing the same file; names the file.
     """
     path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
-        os.close(handle)
-    except OSError as error:
-        raise DiffCloudError(f"Cannot write {path}: {error.strerror or error}.") from error
-    temporary = Path(name)
+    with together():
+        outputs = _group.get()
+        assert outputs is not None
+        try:
+            with outputs.open(path) as stream:
+                yield stream
+        except OSError as error:
+            raise _refused(path, error) from error
+
+
+@contextmanager
+def staged(folder: Path) -> Iterator[Path]:
+    """A temporary folder, not yet there, that becomes `folder`, which must not exist, if the block ends without an error.
+
+    What a kill leaves of it is removed by the next call for the same folder.
+
+    Raises:
+        DiffCloudError: the system refused to put it in place.
+    """
+    folder = Path(folder)
+    temporary = folder.with_name(f".{folder.name}{TEMPORARY}")
+    shutil.rmtree(temporary, ignore_errors=True)
     try:
         yield temporary
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
-        os.replace(temporary, path)
+        temporary.rename(folder)
     except OSError as error:
-        raise DiffCloudError(f"Cannot write {path}: {error.strerror or error}. Nothing was changed.") from error
+        raise _refused(folder, error) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file atomically."""
+    with atomic(path) as stream:
+        stream.write(data)
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically (UTF-8)."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_bytes(path, text.encode("utf-8"))
 
 
 def write_json(path: Path, value: Any) -> None:
     """Write JSON atomically; NaN and infinity are refused, since no other reader takes them."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def write_npz(path: Path, *, compressed: bool = True, **arrays: Any) -> None:
+    """Write an NPZ file atomically, without pickles; the same arrays give the same bytes."""
+    save = np.savez_compressed if compressed else np.savez
+    with atomic(path) as stream:
+        save(stream, allow_pickle=False, **arrays)
 
 
 def read_json(path: Path, *, error: type[DiffCloudError] = DiffCloudError) -> Any:
@@ -63,5 +180,146 @@ def read_json(path: Path, *, error: type[DiffCloudError] = DiffCloudError) -> An
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError as missing:
         raise error(f"No such file: {path}.") from missing
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as damage:
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as damage:
         raise error(f"{path} is not readable JSON: {damage}.") from damage
+
+
+def files_in(folder: Path, *suffixes: str) -> list[Path]:
+    """Data files of a folder by name, with one of these suffixes (lower case; none given: any).
+
+    Hidden files are never data: editors, operating systems and interrupted writes leave such behind (`._a.npz`).
+    """
+    if not Path(folder).is_dir():
+        return []
+    return sorted(
+        path
+        for path in Path(folder).iterdir()
+        if not path.name.startswith(".") and (not suffixes or path.suffix.lower() in suffixes) and path.is_file()
+    )
+
+
+def folders_in(folder: Path) -> list[Path]:
+    """Folders of a folder by name, without hidden ones."""
+    if not Path(folder).is_dir():
+        return []
+    return sorted(path for path in Path(folder).iterdir() if not path.name.startswith(".") and path.is_dir())
+
+
+@contextmanager
+def claimed(output: Path) -> Iterator[None]:
+    """Hold an output, file or folder, against other processes; by a lock file beside it that is there only meanwhile.
+
+    Raises:
+        DiffCloudError: another process holds it (names that process), or the place cannot be written.
+    """
+    output = Path(os.path.realpath(output))
+    lock = output.with_name(f".{output.name}{LOCK}")
+    folders: list[Path] = []
+    try:
+        folders = _make_folders(lock.parent)
+        descriptor = _hold(lock, output)
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, json.dumps(_this_process()).encode())
+    except OSError as error:
+        _remove_empty(folders)
+        raise DiffCloudError(f"Cannot write {output}: {error.strerror or error}. Nothing was changed.") from error
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+        os.close(descriptor)
+        _remove_empty(folders)
+
+
+def _hold(lock: Path, output: Path) -> int:
+    """A descriptor of the lock file, locked until it is closed."""
+    while True:
+        descriptor = os.open(lock, os.O_CREAT | os.O_RDWR, 0o666)
+        if not _try_lock(descriptor):
+            holder = _holder(descriptor)
+            os.close(descriptor)
+            raise DiffCloudError(f"{output} is being written by {holder}. Wait for it, stop it, or choose another output.")
+        # the former holder removes the file before it lets go: a lock on a removed file holds nobody off
+        if os.fstat(descriptor).st_ino == _inode(lock):
+            return descriptor
+        os.close(descriptor)
+
+
+def _this_process() -> dict[str, object]:
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    since = time.strftime("%Y-%m-%d %H:%M:%S")
+    return {"process": os.getpid(), "host": socket.gethostname(), "command": command, "since": since}
+
+
+def _holder(descriptor: int) -> str:
+    try:
+        told = json.loads(os.pread(descriptor, 65536, 0))
+        return f"process {told['process']} on {told['host']} since {told['since']} ({told['command']})"
+    except (OSError, ValueError, KeyError, TypeError):  # it is only just about to tell
+        return "another process"
+
+
+def _try_lock(descriptor: int) -> bool:
+    """Lock an open file until it is closed; False if another process holds it."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+    return True
+
+
+@contextmanager
+def _opened_alone(path: Path, temporary: Path) -> Iterator[BinaryIO]:
+    """The temporary file, new and locked; one that an ended process left is removed.
+
+    Raises:
+        DiffCloudError: another process holds it.
+    """
+    while True:
+        try:
+            stream = temporary.open("xb")
+            break
+        except FileExistsError:
+            with suppress(FileNotFoundError), temporary.open("rb") as left:
+                if not _try_lock(left.fileno()):
+                    raise DiffCloudError(
+                        f"Another process is writing {path}; wait for it, or choose another output."
+                    ) from None
+                temporary.unlink()
+    with stream:
+        _try_lock(stream.fileno())
+        yield stream
+
+
+def _refused(path: Path, error: OSError) -> DiffCloudError:
+    return DiffCloudError(
+        f"Cannot write {path}: {error.strerror or error}. Nothing was changed; free the disk, or choose another place, and "
+        "run the command again."
+    )
+
+
+def _inode(path: Path) -> int | None:
+    try:
+        return path.stat().st_ino
+    except FileNotFoundError:
+        return None
+
+
+def _make_folders(folder: Path) -> list[Path]:
+    """Make a folder and what it lies in; those that were missing, outermost first."""
+    missing = []
+    while not folder.exists():
+        missing.append(folder)
+        folder = folder.parent
+    for one in reversed(missing):
+        one.mkdir(exist_ok=True)
+    return missing[::-1]
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    for folder in reversed(folders):
+        with suppress(OSError):  # it has something in it by now
+            folder.rmdir()

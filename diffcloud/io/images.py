@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
-from diffcloud.io.files import atomic_path
+from diffcloud.io.files import atomic
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
@@ -161,7 +161,7 @@ def _write(path: Path, image: NDArray[Any], durable: bool) -> None:
     done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, _SPEED])
     if not done:
         raise EpisodeError(f"{path}: the image could not be encoded as PNG.")
-    with atomic_path(Path(path)) as temporary, temporary.open("wb") as stream:
+    with atomic(path) as stream:
         stream.write(data.tobytes())
         if durable:
             stream.flush()

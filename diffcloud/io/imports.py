@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from diffcloud.errors import EpisodeError
 from diffcloud.io.clouds import FORMATS, read_cloud
 from diffcloud.io.episodes import Episode
+from diffcloud.io.files import files_in, folders_in
 from diffcloud.io.pickles import load_npy
 
 RELEASE_FRAME_TIME = 0.04
@@ -55,7 +56,7 @@ def release_episodes(folder: Path) -> Iterator[tuple[str, str, Episode]]:
     for scenario, source in found.items():
         predictions = {model: _table(source / f"preds_{model}.npy") for model in _MODELS}
         truth = _table(source / "gt.npy")
-        for episode in sorted(path for path in source.iterdir() if path.is_dir()):
+        for episode in folders_in(source):
             meta: dict[str, Any] = {"scenario": f"release_{scenario}", "source": "published data"}
             meta |= _fabric(episode.name, scenario)
             meta["predictions"] = {
@@ -120,9 +121,9 @@ def _numbered(folder: Path, formats: tuple[str, ...]) -> list[Path]:
     if not folder.is_dir():
         raise EpisodeError(f"No such folder of clouds: {folder}.")
     numbers: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
+    for path in files_in(folder, *formats):
         match = re.search(r"(\d+)$", path.stem)
-        if path.suffix.lower() not in formats or match is None:
+        if match is None:
             continue
         number = int(match.group(1))
         if number in numbers:

@@ -18,6 +18,7 @@ import datetime
 import errno
 import io
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,11 @@ from diffcloud.io.images import read_color, read_depth, write_color, write_depth
 
 SCHEMA_VERSION = 1
 UNITS = {"length": "m", "angle": "rad", "time": "s", "force": "N", "torque": "N·m"}
+_FILES = re.compile(
+    r"episode\.json|robot\.csv|cameras/[^/]+/(camera\.json|timestamps\.csv|(depth|color)/\d+\.png)"
+    r"|truth/(cameras\.json|cloth\.npz|[^/]+/\d+\.png)"
+)
+"""Relative paths of a raw episode's files, with the truth of a synthetic one."""
 _TOOL = ("tool_x", "tool_y", "tool_z", "tool_qw", "tool_qx", "tool_qy", "tool_qz")
 _WRENCH = ("wrench_fx", "wrench_fy", "wrench_fz", "wrench_tx", "wrench_ty", "wrench_tz")
 
@@ -294,6 +300,15 @@ def first_backwards(times: NDArray[np.float64]) -> int | None:
     """Index of the first time that does not come after the one before it."""
     bad = np.flatnonzero(~(np.diff(times) > 0))
     return int(bad[0]) + 1 if len(bad) else None
+
+
+def raw_episode_files(folder: Path) -> tuple[list[str], list[str]]:
+    """Relative paths of the files of a raw episode, and of others that lie in its folder; hidden ones are neither."""
+    paths = (path for path in Path(folder).rglob("*") if path.is_file())
+    names = [path.relative_to(folder) for path in paths]
+    seen = sorted(name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts))
+    own = [name for name in seen if _FILES.fullmatch(name)]
+    return own, sorted(set(seen) - set(own))
 
 
 class RawEpisodeWriter:

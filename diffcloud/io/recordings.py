@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
-from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter, RobotLog, RobotSample, read_robot_log
+from diffcloud.io.raw_episodes import (
+    CameraInfo,
+    RawEpisodeWriter,
+    RobotLog,
+    RobotSample,
+    first_backwards,
+    read_robot_log,
+)
 
 _EPOCH_S = 1e8
 """Times beyond three years are seconds since 1970."""
@@ -40,6 +48,8 @@ class Recording:
     source: str
     robot: RobotLog | None = None
     """On the frames' clock."""
+    warnings: tuple[str, ...] = ()
+    """What was left out, guessed or put right, for the person who imports."""
 
 
 def write_recording(
@@ -54,7 +64,7 @@ def write_recording(
         Frames by camera.
 
     Raises:
-        EpisodeError: no frame at all.
+        EpisodeError: no frame at all, or one that does not come after the camera's frame before it.
     """
     frames = iter(recording.frames)
     first = next(frames, None)
@@ -73,17 +83,23 @@ def write_recording(
         durable=False,
         meta=meta,
     )
-    times: list[float] = []
+    latest: dict[str, float] = {}
     with writer:
         for sample in [] if robot is None else _samples(robot, start):
             writer.add_robot(sample)
-        writer.add_frame(first.camera, 0.0, first.depth, first.color)
-        for frame in frames:
-            if frame.camera == first.camera:
-                times.append(frame.time_s - start)
+        for frame in chain([first], frames):
+            before = latest.get(frame.camera)
+            if before is not None and frame.time_s <= before:
+                raise EpisodeError(
+                    f"{recording.source}: frame {writer.frame_counts[frame.camera]} of camera {frame.camera} is of "
+                    f"{frame.time_s:.6f} s, the one before it of {before:.6f} s. The clock was set back while recording, "
+                    "or frames were mixed up: cut the recording there."
+                )
+            latest[frame.camera] = frame.time_s
             writer.add_frame(frame.camera, frame.time_s - start, frame.depth, frame.color)
-        if not rate_hz and times:
-            writer.state_rate(round(len(times) / times[-1], 3))
+        counted = writer.frame_counts[first.camera] - 1
+        if not rate_hz and counted:
+            writer.state_rate(round(counted / (latest[first.camera] - start), 3))
     return writer.frame_counts
 
 
@@ -96,11 +112,17 @@ def read_joint_log(path: Path, *, offset_s: float = 0.0, recording_start_s: floa
             since 1970 is on the recording's clock already.
 
     Raises:
-        EpisodeError: missing, damaged, or on another clock than the recording.
+        EpisodeError: missing, damaged, with times that run backwards, or on another clock than the recording.
     """
     log = read_robot_log(path)
     if not len(log.times):
         raise EpisodeError(f"{path} is an empty joint log.")
+    bad = first_backwards(log.times)
+    if bad is not None:
+        raise EpisodeError(
+            f"{path}: row {bad + 1}: the time runs backwards ({log.times[bad]:.6f} s after {log.times[bad - 1]:.6f} s); "
+            "the clock was set while recording, or rows were mixed up. Sort or cut the log."
+        )
     own_clock = log.times[0] < _EPOCH_S <= recording_start_s
     times = log.times + offset_s + (recording_start_s if own_clock else 0.0)
     if recording_start_s > times[-1] or (log.times[0] >= _EPOCH_S > recording_start_s):

@@ -2,12 +2,14 @@
 
 A folder holds, for each split (`train`, `test`), `<split>.csv` (one row per run: the parameters) and `<split>_nodes.npy`
 (float32 [N, T+1, V, 3]), and for both `set.json` (scenario, parameters and bounds, frames, how it was drawn), `surface.npz`
-(faces, times, the obstacle that is seen) and `replaced.csv` (draws whose simulation diverged, and why). No pickles. All in
-the frame and length unit of the scenario's scene. Clouds are sampled when they are needed (`clouds.augmentation`).
+(faces, times, the obstacle that is seen) and `replaced.csv` (draws whose simulation diverged, and why); on demand also
+`clouds/<split>/<run>/<frame>.npy`. No pickles. All in the frame and length unit of the scenario's scene. Otherwise clouds
+are sampled when they are needed (`clouds.augmentation`).
 """
 
 from __future__ import annotations
 
+import re
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,7 +21,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from diffcloud.errors import DatasetError, unknown_name
-from diffcloud.io.files import atomic_path, read_json, write_json, write_text
+from diffcloud.io.files import atomic, read_json, write_json, write_npz, write_text
 from diffcloud.mesh.topology import SurfaceMesh
 
 Split = Literal["train", "test"]
@@ -124,8 +126,10 @@ class SimulatedSet:
             raise DatasetError(f"{folder}, {split}: {error}") from error
 
 
-def write_simulated(folder: Path, sets: Mapping[Split, SimulatedSet], *, about: Mapping[str, Any], replaced: str) -> None:
-    """Write all files of a set into a folder; the same set gives the same bytes.
+def write_simulated(
+    folder: Path, sets: Mapping[Split, SimulatedSet], *, about: Mapping[str, Any], replaced: str
+) -> list[str]:
+    """Write all files of a set into a folder, and return their names; the same set gives the same bytes.
 
     Args:
         sets: the splits that have runs; they share everything but parameters and nodes.
@@ -139,13 +143,12 @@ def write_simulated(folder: Path, sets: Mapping[Split, SimulatedSet], *, about: 
         arrays["loss_faces"] = first.loss_faces
     if first.obstacle is not None:
         arrays |= {"obstacle_nodes": first.obstacle.nodes, "obstacle_faces": first.obstacle.faces}
-    with atomic_path(folder / "surface.npz") as temporary:
-        np.savez(temporary, allow_pickle=False, **arrays)
+    write_npz(folder / "surface.npz", compressed=False, **arrays)
     for split, simulated in sets.items():
         table = pd.DataFrame(simulated.parameters, columns=list(simulated.names)).rename_axis("run")
         write_text(folder / f"{split}.csv", table.to_csv(lineterminator="\n"))
-        with atomic_path(folder / f"{split}_nodes.npy") as temporary:
-            np.save(temporary, simulated.nodes, allow_pickle=False)
+        with atomic(folder / f"{split}_nodes.npy") as stream:
+            np.save(stream, simulated.nodes, allow_pickle=False)
     write_text(folder / "replaced.csv", replaced)
     parameters = [
         {"name": name, "low": low, "high": high}
@@ -163,6 +166,23 @@ def write_simulated(folder: Path, sets: Mapping[Split, SimulatedSet], *, about: 
         **about,
     }
     write_json(folder / "set.json", summary)
+    tables = (f"{split}{end}" for split in sets for end in (".csv", "_nodes.npy"))
+    return ["surface.npz", "replaced.csv", *tables, "set.json"]
+
+
+def simulated_files(folder: Path) -> list[str]:
+    """Files of the set that a folder holds: what a new set may take the place of. None of any other folder."""
+    folder = Path(folder)
+    try:
+        about = _about(folder / "set.json")
+    except DatasetError:
+        return []
+    splits = [split for split in SPLITS if about[split]]
+    names = ["set.json", "surface.npz", "replaced.csv", *(f"{s}{end}" for s in splits for end in (".csv", "_nodes.npy"))]
+    if about.get("clouds"):
+        found = (path.relative_to(folder).as_posix() for path in (folder / "clouds").glob("*/*/*.npy"))
+        names += [name for name in found if re.fullmatch(rf"clouds/({'|'.join(splits)})/\d+/\d+\.npy", name)]
+    return names
 
 
 def _about(path: Path) -> dict[str, Any]:

@@ -136,6 +136,24 @@ class ClothMesh:
             angle=np.arctan2(along[..., 1], along[..., 0]),
         )
 
+    @cached_property
+    def size(self) -> float:
+        """How far apart nodes can be on the cloth: the longest of the shortest ways along edges, in material space [m].
+
+        Found by going to the farthest node of the first one, and from there to its farthest: on a cloth without long arms
+        that is the longest way.
+        """
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import dijkstra  # slow to import
+
+        sides = self.face_verts[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        pairs, first = np.unique(np.sort(self.vert_node[sides], axis=1), axis=0, return_index=True)
+        lengths = np.linalg.norm(self.verts[sides[first, 0]] - self.verts[sides[first, 1]], axis=1)
+        graph = coo_array((lengths, pairs.T), shape=(len(self.nodes),) * 2).tocsr()
+        ways = dijkstra(graph, directed=False, indices=0)
+        ways = dijkstra(graph, directed=False, indices=int(np.where(np.isfinite(ways), ways, -1).argmax()))
+        return float(ways[np.isfinite(ways)].max())
+
     def _material_edge(self, face: IntArray, edge: IntArray) -> FloatArray:
         """[H, 2] u(n1) - u(n0) in the material space of the given face of each edge."""
         corners, verts = self.faces[face], self.face_verts[face]

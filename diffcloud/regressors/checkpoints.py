@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from diffcloud.clouds.background import Background
 from diffcloud.errors import CheckpointError
-from diffcloud.io.files import atomic_path
+from diffcloud.io.files import write_bytes
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.regressors.grouping import Order
 from diffcloud.regressors.networks import ModelName, build_network
@@ -211,8 +211,7 @@ class Regressor:
     def write(self, path: Path) -> None:
         """Write atomically; the same regressor gives the same bytes."""
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in self.network.state_dict().items()}
-        with atomic_path(path) as temporary:
-            save_file(tensors, temporary, metadata={_KEY: self.description.model_dump_json()})
+        write_bytes(path, save(tensors, metadata={_KEY: self.description.model_dump_json()}))
 
     @staticmethod
     def read(path: Path) -> Regressor:
@@ -246,6 +245,11 @@ class Regressor:
         # copies, since kernels take other paths, with other last bits, where memory is not aligned as torch aligns it
         network.load_state_dict({name: tensor.clone() for name, tensor in tensors.items()}, assign=True)
         return Regressor(described, network.eval())
+
+
+def timings_path(checkpoint: Path) -> Path:
+    """The file beside a checkpoint that tells the seconds of its training."""
+    return checkpoint.with_suffix(".timings.json")
 
 
 def _check_tensors(path: Path, network: nn.Module, tensors: dict[str, Tensor]) -> None:

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import lightning.pytorch as lightning
@@ -31,7 +32,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 import diffcloud
 from diffcloud.errors import ConfigError, TrainingError
-from diffcloud.io.files import atomic_path, write_json
+from diffcloud.io.files import together, write_bytes, write_json
 from diffcloud.regressors.checkpoints import (
     BackgroundBody,
     Description,
@@ -39,6 +40,7 @@ from diffcloud.regressors.checkpoints import (
     Regressor,
     laplace_reach,
     split_outputs,
+    timings_path,
 )
 from diffcloud.regressors.dataset import Augmentation, CloudDataset, SimulatedSet
 from diffcloud.regressors.networks import ModelName, frames_seen
@@ -86,19 +88,23 @@ def train_regressor(
     *,
     device: Device = "auto",
     workers: int = 0,
+    mark: str = "",
     progress: Callable[[TrainingProgress], None] | None = None,
 ) -> TrainingResult:
     """Train, keep the best weights, measure them on held-out draws, and write all that.
 
-    Writes `out` (the checkpoint) and a folder of the same name without suffix: `training.json`, and DVCLive's metrics. The
-    state after the last whole epoch lies in a hidden file beside `out` until the end; the same call takes it up.
+    Writes together: `out` (the checkpoint), a folder of the same name without suffix (`training.json`, beside DVCLive's
+    metrics, which come epoch by epoch), and `<name>.timings.json`, apart since the other files have the same bytes for the
+    same seed. The state after the last whole epoch lies in a hidden file beside `out` until the end; the same call takes
+    it up.
 
     Args:
         workers: processes that sample clouds; 0 for none. They change nothing but the time.
+        mark: fingerprint of what is trained, kept with the timings.
 
     Raises:
         ConfigError: sets that do not belong together or are too small.
-        TrainingError: a loss that is no number any more.
+        TrainingError: a loss that is no number any more, or metrics that the system refuses to write.
         KeyboardInterrupt: interrupted; the same call goes on from the last whole epoch.
     """
     began = time.perf_counter()
@@ -129,7 +135,13 @@ def train_regressor(
     state = _resume_path(out, told, train, test)
     live = out.with_suffix("")
     recorder = _Recorder(live, progress)
-    resumed_from = _fit(module, clouds, recorder, settings, state, device=device, workers=workers)
+    try:
+        resumed_from = _fit(module, clouds, recorder, settings, state, device=device, workers=workers)
+    except OSError as error:
+        raise TrainingError(
+            f"Cannot write the metrics of {live}: {error.strerror or error}. Free the disk and run the command again; it "
+            "goes on from the last saved epoch."
+        ) from error
     assert recorder.weights is not None
     module.network.load_state_dict(recorder.weights)
     network = module.network.cpu()
@@ -142,11 +154,14 @@ def train_regressor(
         "history": recorder.history,
         "held_out": _held_out(regressor, clouds),
     }
-    write_json(live / "training.json", summary)
-    regressor.write(out)
+    seconds = time.perf_counter() - began
+    with together():
+        write_json(live / "training.json", summary)
+        regressor.write(out)
+        write_json(timings_path(out), {"seconds": seconds, "resumed": resumed_from, "fingerprint": mark})
     for left in out.parent.glob(f".{out.stem}.*.resume"):
         left.unlink(missing_ok=True)
-    return TrainingResult(regressor, summary, time.perf_counter() - began, resumed_from)
+    return TrainingResult(regressor, summary, seconds, resumed_from)
 
 
 def _check_sets(train: SimulatedSet, test: SimulatedSet, settings: TrainingSettings) -> None:
@@ -367,8 +382,10 @@ class _Saver(lightning.Callback):
             self.save(trainer)
 
     def save(self, trainer: lightning.Trainer) -> None:
-        with atomic_path(self.path) as temporary:
-            trainer.save_checkpoint(temporary)
+        # Lightning writes files only, and in its own way
+        with TemporaryDirectory(prefix="diffcloud-") as folder:
+            trainer.save_checkpoint(Path(folder) / "state")
+            write_bytes(self.path, (Path(folder) / "state").read_bytes())
         self.last = time.monotonic()
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import html
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import pandas as pd
+from markupsafe import Markup
 
 from diffcloud.evaluation.summary import Tables, label, overview, sentences
 from diffcloud.report.figures import INK, Figure
+from diffcloud.report.tables import UNKNOWN, Cell, Table, table
 
 _OVERVIEW = {
     "scenario": "scenario",
@@ -78,6 +79,22 @@ _CONSISTENCY = {
     "value_second": "value",
     "factor": "factor",
 }
+_EPISODES = {
+    "episode": "episode",
+    "scenario": "scenario",
+    "method": "method",
+    "category": "category",
+    "rms_mm": "mm",
+    "rms_other_frames_mm": "other frames mm",
+    "loss": "loss",
+    "reference_loss": "reference simulator",
+    "two_sided": "two-sided",
+    "success": "success",
+    "value_stretch": "stretch",
+    "value_mass": "mass",
+    "simulations": "simulations",
+    "status": "status",
+}
 
 
 @dataclass(frozen=True)
@@ -92,85 +109,102 @@ class ComparisonEntry:
     command: str = "diffcloud evaluate"
 
 
-def comparison_summary(entry: ComparisonEntry) -> str:
-    """Which method wins, by how much, and what is identified: for the top of the page."""
-    table = overview(entry.told)
-    names = [str(name) for name in table]
+@dataclass(frozen=True)
+class Overview:
+    """The comparison in the page's summary: which method wins, by how much, and what is identified."""
+
+    table: Table
+    gaps: int
+    """Things that are missing."""
+    apart: float | None
+    """Largest factor between recordings or motions of one fabric: a verdict looks at one recording, and this belongs beside
+    it. None where there is no verdict, or nothing to hold it against."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of the page: sentences, and a table."""
+
+    name: str
+    title: str
+    caption: str
+    findings: Sequence[str]
+    table: Table
+    source: str
+    """The CSV with the same numbers."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure to stand inside the page."""
+
+    name: str
+    title: str
+    svg: Markup
+    caption: str
+    source: str
+
+
+def comparison_overview(entry: ComparisonEntry) -> Overview:
+    """For the top of the page."""
+    rows = overview(entry.told)
+    names = [str(name) for name in rows]
     verdicts = {name: f"verdict on {name.removeprefix('verdict_')}" for name in names if name.startswith("verdict_")}
-    gaps = comparison_failures(entry)
-    note = (
-        f"<p><b>Incomplete:</b> {len(gaps)} {'thing is' if len(gaps) == 1 else 'things are'} missing; "
-        '<a href="#failures">what failed</a>.</p>'
-        if gaps
-        else ""
-    )
-    return (
-        f'{note}<div class="scroll">{_table(table, {**_OVERVIEW, **verdicts, **_OVERVIEW_END})}</div>'
-        '<p class="caption">Mean distance from the simulated to the recorded cloth [mm]. '
-        '<a href="#comparison">All methods</a> · <a href="#identifiability">what “identified” means</a> · '
-        f'<a href="#repeats">what repeats say</a>.</p>{_caution(entry.told)}'
-    )
-
-
-def _caution(told: Tables) -> str:
-    """A verdict looks at one recording; what others of the same fabric gave belongs beside it."""
-    if told["identifiability"].empty or told["repeatability"].empty:
-        return ""
-    apart = [told[name]["factor"].max() for name in ("repeatability", "consistency") if len(told[name])]
-    return (
-        "<p>Verdicts are about one recording each. Another recording or motion of the same fabric gave a value up to "
-        f'<b>{max(apart):.3g} times</b> as large: see <a href="#repeats">repeats</a> before you take a number for a '
-        "property of the fabric.</p>"
-    )
-
-
-def comparison_section(entry: ComparisonEntry) -> str:
-    """Figures and tables as HTML sections."""
     told = entry.told
-    said = {topic: "".join(f"<li>{html.escape(line)}</li>" for line in lines) for topic, lines in sentences(told).items()}
-    figures = "".join(_figure(figure, entry.command) for figure in entry.figures)
-    parts = [
-        _section(
+    apart = [told[name]["factor"].max() for name in ("repeatability", "consistency") if len(told[name])]
+    compared = bool(apart) and not told["identifiability"].empty and not told["repeatability"].empty
+    drawn = _table(rows, {**_OVERVIEW, **verdicts, **_OVERVIEW_END})
+    return Overview(drawn, len(comparison_failures(entry)), float(max(apart)) if compared else None)
+
+
+def comparison_sections(entry: ComparisonEntry) -> list[Section]:
+    """Sections with their tables; those without rows are left out."""
+    told, said = entry.told, sentences(entry.told)
+    shown = told["methods"][told["methods"]["status"] != "not asked for"]
+    sections = [
+        Section(
             "comparison",
             "Methods on equal terms",
             "The same simulator, frames, sampled points and bounds for all; searches may simulate as often as a fit from "
             "one start. Distances are root mean squares from the simulated cloth to the recorded cloud.",
+            [*said["winners"], *said["success"]],
             _table(told["means"], _MEANS),
             "means",
-            said["winners"] + said["success"],
         ),
-        f'<section id="figures"><h2>Figures</h2>{figures}</section>' if figures else "",
-        _section(
+        Section(
             "identifiability",
             "What is identified",
             "A parameter counts as identified if the loss tells it within a factor of 1.5. “Scale moves” and “artefact” "
             "are changes of the loss, in units of the resampling noise, when stretch and mass are doubled or halved "
             "together, and when bending, air and all masses go along: then only soft handles and contact stiffness are "
             "left to tell.",
+            said["identifiability"],
             _table(told["identifiability"], _IDENTIFIED),
             "identifiability",
-            said["identifiability"],
         ),
-        _section(
+        Section(
             "repeats",
             "Repeats of one fabric",
             "Parameters of the cloth come out again when it is recorded again.",
+            [*said["repeats"], *said["credibility"]],
             _table(told["repeatability"], _REPEATS),
             "repeatability",
-            said["repeats"] + said["credibility"],
         ),
-        _section(
+        Section(
             "transfer",
             "Transfer between repeats",
             "Gain is 1 where another recording's parameters are as good as the own fit, 0 where they are no better than "
             "the middle of the range.",
+            [],
             _table(told["transfer"], _TRANSFER),
             "transfer",
         ),
-        _section("consistency", "One fabric in two motions", "", _table(told["consistency"], _CONSISTENCY), "consistency"),
-        _section("episodes", "Every episode and method", "", _episodes(told["methods"]), "methods"),
+        Section(
+            "consistency", "One fabric in two motions", "", [], _table(told["consistency"], _CONSISTENCY), "consistency"
+        ),
+        Section("episodes", "Every episode and method", "", [], _table(shown, _EPISODES), "methods"),
     ]
-    return "".join(parts)
+    return [section for section in sections if section.table.rows]
 
 
 def comparison_failures(entry: ComparisonEntry) -> list[str]:
@@ -184,18 +218,12 @@ def comparison_failures(entry: ComparisonEntry) -> list[str]:
     return [*entry.failures, *gaps]
 
 
-def _section(name: str, title: str, caption: str, table: str, source: str, said: str = "") -> str:
-    if not table:
-        return ""
-    note = f'<p class="caption">{caption}</p>' if caption else ""
-    findings = f'<ul class="findings">{said}</ul>' if said else ""
-    return (
-        f'<section id="{name}"><h2>{title}</h2>{note}{findings}<div class="scroll">{table}</div>'
-        f'<p class="caption">Source: <code>tables/{source}.csv</code>, by <code>diffcloud evaluate</code>.</p></section>'
-    )
+def comparison_pictures(entry: ComparisonEntry) -> list[Picture]:
+    """Figures as SVG that may stand inside the page."""
+    return [Picture(figure.name, figure.title, _inside(figure), figure.caption, figure.source) for figure in entry.figures]
 
 
-def _figure(figure: Figure, command: str) -> str:
+def _inside(figure: Figure) -> Markup:
     # identifiers inside are made unique: several figures share one page
     svg = figure.svg[figure.svg.index("<svg") :]
     svg = re.sub(r'(id="|url\(#|href="#)', rf"\g<1>{figure.name}-", svg).replace(INK, "currentColor")
@@ -203,51 +231,24 @@ def _figure(figure: Figure, command: str) -> str:
     svg = svg.replace("<svg", f'<svg style="max-width: {_PIXELS_PER_INCH * figure.width:.0f}px"', 1)
     # names of the standard, fetched by nobody; inside HTML they are not needed
     svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.S))
-    return (
-        f'<figure id="figure-{html.escape(figure.name)}"><h3>{html.escape(figure.title)}</h3>{svg}'
-        f'<figcaption class="caption">{html.escape(figure.caption)} Source: <code>{html.escape(figure.source)}</code>; '
-        f"made by <code>{html.escape(command)}</code> and <code>diffcloud report</code>.</figcaption></figure>"
-    )
+    return Markup(svg)  # matplotlib has escaped its texts
 
 
-def _episodes(table: pd.DataFrame) -> str:
-    columns = {
-        "episode": "episode",
-        "scenario": "scenario",
-        "method": "method",
-        "category": "category",
-        "rms_mm": "mm",
-        "rms_other_frames_mm": "other frames mm",
-        "loss": "loss",
-        "reference_loss": "reference simulator",
-        "two_sided": "two-sided",
-        "success": "success",
-        "value_stretch": "stretch",
-        "value_mass": "mass",
-        "simulations": "simulations",
-        "status": "status",
-    }
-    return _table(table[table["status"] != "not asked for"], columns)
+def _table(frame: pd.DataFrame, columns: Mapping[str, str]) -> Table:
+    """Without rows where the frame has none."""
+    kept = [name for name in columns if name in frame and frame[name].notna().any()]
+    rows = frame[kept].to_dict("records") if kept else []
+    return table((columns[name] for name in kept), ((_cell(name, row[name]) for name in kept) for row in rows))
 
 
-def _table(table: pd.DataFrame, columns: Mapping[str, str]) -> str:
-    """Empty without rows."""
-    kept = [name for name in columns if name in table and table[name].notna().any()]
-    if table.empty:
-        return ""
-    heads = "".join(f"<th>{html.escape(columns[name])}</th>" for name in kept)
-    rows = "".join(f"<tr>{''.join(_cell(name, row[name]) for name in kept)}</tr>" for row in table[kept].to_dict("records"))
-    return f'<table class="sorts"><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>'
-
-
-def _cell(name: str, value: Any) -> str:
+def _cell(name: str, value: Any) -> Cell:
     if value is None or (isinstance(value, float) and value != value):
-        return "<td>–</td>"
+        return UNKNOWN
     if name == "method":
-        return f"<td>{html.escape(label(str(value)))}</td>"
+        return Cell(label(str(value)))
     if isinstance(value, bool):
-        return f"<td>{'yes' if value else 'no'}</td>"
+        return Cell("yes" if value else "no")
     if isinstance(value, int | float):
         shares = {"success_rate": f"{100 * value:.0f} %", "below_predictor": f"{-100 * value:+.0f} %"}
-        return f'<td data-value="{value}">{shares.get(name, f"{value:.4g}")}</td>'
-    return f"<td>{html.escape(str(value))}</td>"
+        return Cell(shares.get(name, f"{value:.4g}"), sort=value)
+    return Cell(str(value))

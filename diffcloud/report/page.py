@@ -1,23 +1,32 @@
-"""Build the report page. All data and scripts are inside it: no request leaves the page."""
+"""Build the report page. All data and scripts are inside it: no request leaves the page.
+
+Texts are escaped by the templates, whatever an episode is called; data for the scripts are JSON that cannot end or confuse
+the script element it stands in.
+"""
 
 from __future__ import annotations
 
-import html
-import json
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from importlib.resources import files
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from diffcloud.io.episodes import Episode
 from diffcloud.mesh.topology import SurfaceMesh
-from diffcloud.report.comparison import ComparisonEntry, comparison_failures, comparison_section, comparison_summary
-from diffcloud.report.recordings import recording_section
-from diffcloud.report.regressors import TrainingEntry, regressor_section, training_data
+from diffcloud.report.comparison import (
+    ComparisonEntry,
+    comparison_failures,
+    comparison_overview,
+    comparison_pictures,
+    comparison_sections,
+)
+from diffcloud.report.recordings import recordings_pictures, recordings_table
+from diffcloud.report.regressors import TrainingEntry, errors_table, predictions_table, training_data
+from diffcloud.report.tables import Cell, Table, number, table
 
 _DECIMALS = 4
 
@@ -68,28 +77,47 @@ def build_page(
     from plotly.offline import get_plotlyjs
 
     rng = np.random.default_rng(seed)
-    data = [_entry_data(entry, overlay_points, rng) for entry in entries]
-    names = _parameter_names(entries)
-    lines = (f"<tr><td>{html.escape(key)}</td><td>{html.escape(value)}</td></tr>" for key, value in environment.items())
-    parts = {
-        "title": html.escape(title),
-        "summary": _summary(entries) + (comparison_summary(comparison) if comparison else ""),
-        "comparison": comparison_section(comparison) if comparison else "",
-        "parameter_heads": "".join(f"<th>{html.escape(name)}</th>" for name in names),
-        "rows": "".join(_table_row(index, entry, names) for index, entry in enumerate(entries)),
-        "regressors": regressor_section(
-            predictions, {(entry.scenario, entry.name): entry.row["rms_mm"] for entry in entries}, trainings
-        ),
-        "trainings": _script_json(training_data(trainings)),
-        "failures": _failures(entries, comparison_failures(comparison) if comparison else []),
-        "recordings": recording_section(entries),
-        "environment": "".join(lines),
-        "data": _script_json(data),
-        "plotly": get_plotlyjs(),
-    }
-    template = files("diffcloud.report").joinpath("template.html").read_text(encoding="utf-8")
-    # one pass, so that what is put in is never searched for further places
-    return re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place.group(1)], template)
+    fitted_mm = {(entry.scenario, entry.name): entry.row["rms_mm"] for entry in entries}
+    missing = comparison_failures(comparison) if comparison else []
+    engine = Environment(
+        loader=PackageLoader("diffcloud.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    engine.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
+    return engine.get_template("page.html").render(
+        title=title,
+        summary=_summary(entries),
+        overview=comparison_overview(comparison) if comparison else None,
+        sections=comparison_sections(comparison) if comparison else [],
+        pictures=comparison_pictures(comparison) if comparison else [],
+        command=comparison.command if comparison else "",
+        fits=_fits_table(entries),
+        predictions=predictions_table(predictions, fitted_mm),
+        errors=errors_table(trainings),
+        failures=[*missing, *(f"{entry.name}: {text}" for entry in entries for text in entry.fit["failures"])],
+        recordings=recordings_table(entries),
+        photographs=recordings_pictures(entries),
+        environment=environment,
+        episodes=[_entry_data(entry, overlay_points, rng) for entry in entries],
+        trainings=training_data(trainings),
+        plotly=Markup(get_plotlyjs()),
+    )
+
+
+@dataclass(frozen=True)
+class _Summary:
+    """The first sentences of the page, in numbers."""
+
+    episodes: int
+    start_mm: float
+    final_mm: float
+    known: int
+    """Episodes whose hidden ratio of stretch to mass is known."""
+    ratio_error: float
+    """Median factor by which the fits miss it, less one."""
 
 
 def _entry_data(entry: EpisodeEntry, overlay_points: int, rng: np.random.Generator) -> dict[str, Any]:
@@ -135,68 +163,50 @@ def _parameter_names(entries: Sequence[EpisodeEntry]) -> list[str]:
     return list(names)
 
 
-def _summary(entries: Sequence[EpisodeEntry]) -> str:
-    start = np.array([entry.row["rms_start_mm"] for entry in entries])
-    final = np.array([entry.row["rms_mm"] for entry in entries])
-    text = (
-        f"<p><b>{len(entries)} episodes</b> were fitted. The mean distance between the simulated cloth and the recorded "
-        f"cloud at the loss frame fell from <b>{start.mean():.1f} mm</b> to <b>{final.mean():.1f} mm</b> (RMS, fresh "
-        f"points).</p>"
-    )
+def _summary(entries: Sequence[EpisodeEntry]) -> _Summary:
     errors = [
         abs(np.log(entry.row["fitted_ratio"] / entry.row["true_ratio"])) for entry in entries if "true_ratio" in entry.row
     ]
-    if errors:
-        text += (
-            f"<p>The hidden stretch-to-mass ratio is known for {len(errors)} of them; the fits miss it by "
-            f"<b>{100 * (np.exp(np.median(errors)) - 1):.0f} %</b> (median). A motion under gravity identifies this ratio: "
-            "stretch and mass alone are tied together, and only bending, air and soft contacts tell them apart weakly. "
-            "Weigh the cloth and use <code>--fix mass=…</code> to settle the scale.</p>"
-        )
-    return text
+    return _Summary(
+        len(entries),
+        float(np.mean([entry.row["rms_start_mm"] for entry in entries])),
+        float(np.mean([entry.row["rms_mm"] for entry in entries])),
+        len(errors),
+        float(np.exp(np.median(errors)) - 1) if errors else 0.0,
+    )
 
 
-def _table_row(index: int, entry: EpisodeEntry, names: Sequence[str]) -> str:
+def _fits_table(entries: Sequence[EpisodeEntry]) -> Table:
+    names: dict[str, None] = {}
+    for entry in entries:
+        names |= dict.fromkeys(entry.fit["parameters"])
+    heads = ("episode", "scenario", "fabric", "start mm", "fitted mm", "other frames mm", *names)
+    heads = (*heads, "stretch / mass", "iterations", "seconds")
+    return table(heads, (_fit_row(index, entry, list(names)) for index, entry in enumerate(entries)))
+
+
+def _fit_row(index: int, entry: EpisodeEntry, names: Sequence[str]) -> list[Cell]:
     row, fit = entry.row, entry.fit
-    cells = [
-        f'<td><a href="#overlay" data-episode="{index}">{html.escape(entry.name)}</a></td>',
-        f"<td>{html.escape(entry.scenario)}</td>",
-        f"<td>{html.escape(str(entry.episode.meta.get('fabric', '')))}</td>",
-        _number(row["rms_start_mm"], 1),
-        _number(row["rms_mm"], 1, strong=True),
-        _number(row["rms_other_frames_mm"], 1),
+    true_ratio = row.get("true_ratio")
+    return [
+        Cell(entry.name, episode=index),
+        Cell(entry.scenario),
+        Cell(str(entry.episode.meta.get("fabric", ""))),
+        number(row["rms_start_mm"], 1),
+        replace(number(row["rms_mm"], 1), strong=True),
+        number(row["rms_other_frames_mm"], 1),
+        *(_parameter_cell(fit["parameters"].get(name), row.get(f"true_{name}")) for name in names),
+        number(row.get("fitted_ratio"), 2, note="" if true_ratio is None else f"true {true_ratio:.2f}"),
+        number(fit["iterations"], 0),
+        number(fit["seconds"], 1),
     ]
-    for name in names:
-        value = fit["parameters"].get(name)
-        if value is None:
-            cells.append("<td></td>")
-            continue
-        true = row.get(f"true_{name}")
-        notes = [f"{value['physical']:.3g} {html.escape(value['physical_unit'])}"]
-        notes += [f"true {true:.2f}"] if true is not None else []
-        notes += ["at its bound"] if value.get("at_bound") else []
-        notes += ["given"] if value.get("fixed") else []
-        cells.append(f'<td data-value="{value["value"]}">{value["value"]:.2f}<small>{" · ".join(notes)}</small></td>')
-    ratio, true_ratio = row.get("fitted_ratio"), row.get("true_ratio")
-    note = f"<small>true {true_ratio:.2f}</small>" if true_ratio is not None else ""
-    cells.append("<td></td>" if ratio is None else f'<td data-value="{ratio}">{ratio:.2f}{note}</td>')
-    cells.append(_number(fit["iterations"], 0))
-    cells.append(_number(fit["seconds"], 1))
-    return f"<tr>{''.join(cells)}</tr>"
 
 
-def _number(value: float, digits: int, *, strong: bool = False) -> str:
-    text = "–" if value != value else f"{value:.{digits}f}"
-    return f'<td data-value="{value}">{f"<b>{text}</b>" if strong else text}</td>'
-
-
-def _failures(entries: Sequence[EpisodeEntry], missing: Sequence[str]) -> str:
-    lines = [*missing, *(f"{entry.name}: {text}" for entry in entries for text in entry.fit["failures"])]
-    if not lines:
-        return "<p>No start of any fit diverged, and no method is missing.</p>"
-    return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>"
-
-
-def _script_json(value: Any) -> str:
-    """JSON that cannot end the script element it stands in."""
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
+def _parameter_cell(fitted: Mapping[str, Any] | None, true: float | None) -> Cell:
+    if fitted is None:
+        return Cell("")
+    notes = [f"{fitted['physical']:.3g} {fitted['physical_unit']}"]
+    notes += [f"true {true:.2f}"] if true is not None else []
+    notes += ["at its bound"] if fitted.get("at_bound") else []
+    notes += ["given"] if fitted.get("fixed") else []
+    return number(fitted["value"], 2, note=" · ".join(notes))

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import base64
-import html
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from diffcloud.io.episodes import Episode
+from diffcloud.report.tables import UNKNOWN, Cell, Table, number, table
+
+_HEADS = ("Episode", "Points per view", "Masked", "Overlap mm", "Cameras moved mm", "Arm thicker mm", "Log late ms")
 
 
 class RecordedEntry(Protocol):
@@ -25,60 +28,53 @@ class RecordedEntry(Protocol):
     def pictures(self) -> Mapping[str, bytes]: ...
 
 
-def recording_section(entries: Sequence[RecordedEntry]) -> str:
-    """HTML; empty where no episode comes from a raw recording."""
-    recorded = [entry for entry in entries if "points_per_view" in entry.episode.meta.get("quality", {})]
-    if not recorded:
-        return ""
-    heads = "".join(
-        f"<th>{text}</th>"
-        for text in (
-            "Episode",
-            "Points per view",
-            "Masked",
-            "Overlap mm",
-            "Cameras moved mm",
-            "Arm thicker mm",
-            "Log late ms",
-        )
-    )
-    rows = "".join(_row(entry) for entry in recorded)
-    pictures = "".join(
-        f"<figure><figcaption>{html.escape(entry.name)}: {html.escape(caption)}</figcaption>"
-        f'<img alt="{html.escape(entry.name)}: {html.escape(caption)}" loading="lazy" '
-        f'src="data:image/png;base64,{base64.b64encode(data).decode()}"></figure>'
-        for entry in recorded
+@dataclass(frozen=True)
+class Photograph:
+    """A PNG to stand inside the page."""
+
+    caption: str
+    base64: str
+
+
+def recordings_table(entries: Sequence[RecordedEntry]) -> Table:
+    """A row for each episode that comes from a raw recording."""
+    return table(_HEADS, (_row(entry) for entry in entries if _is_recorded(entry)))
+
+
+def recordings_pictures(entries: Sequence[RecordedEntry]) -> list[Photograph]:
+    """What preprocessing drew of them."""
+    return [
+        Photograph(f"{entry.name}: {caption}", base64.b64encode(data).decode())
+        for entry in entries
+        if _is_recorded(entry)
         for caption, data in entry.pictures.items()
-    )
-    return (
-        '<section id="recordings"><h2>Raw recordings</h2><p>From depth images to clouds: least, median and greatest number '
-        "of points of each camera over the frames, the part of its measurements that was masked (robot, its shadow, flying "
-        "pixels), the median distance between the views where they overlap, and what the refinement found.</p>"
-        f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'
-        f'<div class="pictures">{pictures}</div></section>'
-    )
+    ]
 
 
-def _row(entry: RecordedEntry) -> str:
+def _is_recorded(entry: RecordedEntry) -> bool:
+    return "points_per_view" in entry.episode.meta.get("quality", {})
+
+
+def _row(entry: RecordedEntry) -> list[Cell]:
     quality = entry.episode.meta["quality"]
     refined = quality.get("refinement", {})
     overlap = [value for value in quality["overlap_m"] if value is not None]
-    cells = [
-        entry.name,
-        "; ".join(f"{name} {_range(values)}" for name, values in quality["points_per_view"].items()),
-        "; ".join(f"{name} {_mean(values, 100):.0f} %" for name, values in quality["masked_fraction"].items()),
-        f"{_mean(overlap, 1e3):.1f}" if overlap else "–",
-        "; ".join(f"{name} {1e3 * shift:.1f}" for name, shift in list(refined.get("shift_m", {}).items())[1:]) or "–",
-        f"{1e3 * refined['skin_m']:.1f}" if refined else "–",
-        f"{1e3 * refined['lag_s']:.0f}" if refined else "–",
+    moved = "; ".join(f"{name} {1e3 * shift:.1f}" for name, shift in list(refined.get("shift_m", {}).items())[1:])
+    return [
+        Cell(entry.name),
+        Cell("; ".join(f"{name} {_range(values)}" for name, values in quality["points_per_view"].items())),
+        Cell("; ".join(f"{name} {100 * _mean(values):.0f} %" for name, values in quality["masked_fraction"].items())),
+        number(_mean(overlap), 1, factor=1e3),
+        Cell(moved) if moved else UNKNOWN,
+        number(refined.get("skin_m"), 1, factor=1e3),
+        number(refined.get("lag_s"), 0, factor=1e3),
     ]
-    return "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + "</tr>"
 
 
 def _range(values: Sequence[int]) -> str:
     return f"{min(values)} / {int(np.median(values))} / {max(values)}"
 
 
-def _mean(values: Sequence[Any], factor: float) -> float:
+def _mean(values: Sequence[Any]) -> float:
     known = [value for value in values if value is not None]
-    return factor * float(np.mean(known)) if known else float("nan")
+    return float(np.mean(known)) if known else float("nan")

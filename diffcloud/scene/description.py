@@ -12,6 +12,7 @@ from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.sim.build import Integrator, Surrounding, build_system
 from diffcloud.sim.energies import Handles
 from diffcloud.sim.materials import Material
+from diffcloud.sim.properties import Basis
 from diffcloud.sim.simulate import init
 from diffcloud.sim.state import State, System
 
@@ -59,6 +60,21 @@ class Scene:
                 [np.zeros((0, 3), np.int64), *(body.faces + n for body, n in zip(bodies, first[:-1], strict=True))]
             ),
         )
+
+    def basis(self, name: Basis) -> float:
+        """What multipliers act on, in the scene's units: stiffness at rest in stretching [N/m] or in bending [N·m], density
+        of the cloth [kg/m²] or of the air [kg/m³], mass of all rigid bodies [kg]."""
+        match name:
+            case "stretching":
+                return self.material.resting_stretching_stiffness
+            case "bending":
+                return self.material.resting_bending_stiffness
+            case "density":
+                return (self.mass_material or self.material).density
+            case "air_density":
+                return self.surrounding.air_density
+            case "body_mass":
+                return float(self.build()[0].properties.body_mass.sum()) if self.surrounding.bodies else 0.0
 
     def implicit(self) -> Scene:
         """The same scene with the implicit integrator, whose contact is its own."""

@@ -95,9 +95,9 @@ class ExtensionBlock(Checked):
 
     hard_handles: bool = False
     integrator: Integrator = "linearised"
+    """"implicit": converged steps with smooth contact."""
     shaped: bool = False
     """Whether hinges are at rest as the mesh stands, not flat."""
-    """"implicit": converged steps with smooth contact."""
     contact: Literal["meshes", "published", "planes"] = "meshes"
     """Of the linearised integrator: with all meshes and the cloth itself; the same with ARCSim's quirks, which the
     published experiments need; or with planes only."""

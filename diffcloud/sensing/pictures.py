@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from diffcloud.io.episodes import Episode
 from diffcloud.io.raw_episodes import RawCamera
-from diffcloud.sensing.calibration import CameraViews, CharucoBoard, HandEyeResult
+from diffcloud.sensing.calibration.charuco import CameraViews, CharucoBoard
+from diffcloud.sensing.calibration.hand_eye import HandEyeResult
 from diffcloud.sensing.cameras import inverse, project, transform
 from diffcloud.sensing.fusion import Seen
 

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from diffcloud.errors import EpisodeError
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.clouds import import_open3d
-from diffcloud.io.files import atomic_path, read_json, write_json
+from diffcloud.io.files import read_json, write_json, write_npz
 from diffcloud.io.images import read_depth, write_depth
 from diffcloud.io.raw_episodes import RawEpisodeWriter, RobotSample, ScenePlacement
 from diffcloud.mesh.topology import SurfaceMesh
@@ -197,8 +197,8 @@ def record(
                 write_depth(folder / "truth" / camera.name / f"{index:06d}.png", labels)
             tell(index + 1, f"frame {index}")
     write_json(folder / "truth" / "cameras.json", {camera.name: camera.view.T_world_camera.tolist() for camera in cameras})
-    with atomic_path(folder / "truth" / "cloth.npz") as temporary:
-        np.savez(temporary, allow_pickle=False, nodes=nodes, faces=motion.faces, times=motion.times)
+    cloth = {"nodes": nodes, "faces": motion.faces, "times": motion.times}
+    write_npz(folder / "truth" / "cloth.npz", compressed=False, **cloth)
 
 
 class _Scene:

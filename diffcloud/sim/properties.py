@@ -6,6 +6,7 @@ as the mass multiplier. This module is the only place that maps one to the other
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Literal
@@ -52,7 +53,8 @@ class Properties:
         return Properties(*(tensor.repeat(count, *[1] * (tensor.dim() - 1)) for tensor in self.tensors()))
 
 
-Kind = Literal["multiplier", "absolute"]
+Basis = Literal["stretching", "bending", "density", "air_density", "body_mass"]
+"""What of the basis material, the air and the bodies a multiplier acts on."""
 
 
 @dataclass(frozen=True)
@@ -60,28 +62,69 @@ class Parameter:
     """What a named parameter is and how a person reads it."""
 
     name: str
-    kind: Kind
-    unit: str
-    """Of the physical value: what the multiplier times its basis is measured in."""
-    bounds: tuple[float, float]
     meaning: str
+    unit: str
+    """Of the physical value: of the number itself, or of what the multiplier times its basis is."""
+    bounds: tuple[float, float]
+    """Of a fit, unless others are given."""
+    basis: Basis | None = None
+    """What it multiplies; None: it is the physical value itself."""
+
+    def check(self, value: float, what: str) -> None:
+        """
+        Args:
+            what: names the value in the message, such as "--set stretch".
+
+        Raises:
+            ConfigError: not a number that this parameter can have.
+        """
+        if not math.isfinite(value):
+            raise ConfigError(f"{what} must be a finite number, got {value:g}. The default range is {list(self.bounds)}.")
+        if self.basis is not None and value <= 0:
+            raise ConfigError(
+                f"{what} is a multiplier: above 0, got {value:g}; the lowest usual value is {self.bounds[0]:g}."
+            )
+        if value < 0:
+            raise ConfigError(f"{what} must not be negative, got {value:g}; the nearest allowed value is 0.")
 
 
+_MULTIPLIED = (0.1, 10.0)
 PARAMETERS: dict[str, Parameter] = {
     parameter.name: parameter
     for parameter in (
-        Parameter("stretch", "multiplier", "N/m", (0.1, 10.0), "times the stretching table"),
-        Parameter("mass", "multiplier", "kg/m²", (0.1, 10.0), "times the node masses (of a named node set)"),
-        Parameter("density", "multiplier", "kg/m²", (0.1, 10.0), "times all node masses"),
-        Parameter("bending", "multiplier", "N·m", (0.1, 10.0), "times the bending table"),
-        Parameter("drag", "multiplier", "kg/m³", (0.1, 10.0), "times the air density and the tangential drag"),
-        Parameter("damping", "absolute", "s", (0.0, 0.1), "stiffness-proportional damping"),
-        Parameter("body_mass", "multiplier", "kg", (0.1, 10.0), "times the mass of all rigid bodies"),
-        Parameter("friction_obstacle", "absolute", "-", (0.0, 1.5), "Coulomb friction between cloth and obstacles"),
-        Parameter("friction_cloth", "absolute", "-", (0.0, 1.5), "Coulomb friction between cloths"),
+        Parameter("stretch", "multiplier on the stretching table", "N/m", _MULTIPLIED, "stretching"),
+        Parameter(
+            "mass",
+            "multiplier on node masses (of a node set, where the scenario names one)",
+            "kg/m²",
+            _MULTIPLIED,
+            "density",
+        ),
+        Parameter("density", "multiplier on all node masses", "kg/m²", _MULTIPLIED, "density"),
+        Parameter("bending", "multiplier on the bending table", "N·m", _MULTIPLIED, "bending"),
+        Parameter("drag", "multiplier on the air density and the tangential drag", "kg/m³", _MULTIPLIED, "air_density"),
+        Parameter("damping", "stiffness-proportional damping", "s", (0.0, 0.1)),
+        Parameter("friction_obstacle", "Coulomb coefficient between cloth and obstacles", "–", (0.0, 1.5)),
+        Parameter("friction_cloth", "Coulomb coefficient of the cloth with itself", "–", (0.0, 1.5)),
+        Parameter("body_mass", "multiplier on the masses of all rigid bodies", "kg", _MULTIPLIED, "body_mass"),
     )
 }
-"""Every fit parameter by name. The paper fits stretch and mass in [0.1, 10]."""
+"""Every parameter by name: the one table that bounds, units, checks, records and docs/concepts.md are made from. The paper
+fits stretch and mass in [0.1, 10]."""
+
+
+def check_values(values: Mapping[str, float], option: str) -> None:
+    """
+    Args:
+        option: what the values were given by, for messages.
+
+    Raises:
+        ConfigError: an unknown parameter, or a value that it cannot have.
+    """
+    for name, value in values.items():
+        if name not in PARAMETERS:
+            raise ConfigError(f"{option}: {unknown_name('parameter', name, PARAMETERS)}")
+        PARAMETERS[name].check(value, f"{option} {name}")
 
 
 def scaled_properties(

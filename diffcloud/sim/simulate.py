@@ -11,10 +11,12 @@ from torch import Tensor
 
 from diffcloud.errors import DivergedError
 from diffcloud.sim.adjoint import implicit_solve
+from diffcloud.sim.energies.base import geometry
 from diffcloud.sim.energies.handles import HandleSchedule, follow_track
 from diffcloud.sim.implicit import ImplicitStart, ImplicitStep, StuckError
 from diffcloud.sim.linear_solve import NotPositiveDefiniteError, SingularMatrixError
 from diffcloud.sim.linearised import Held, LinearisedStep, StepStart
+from diffcloud.sim.plausibility import Motion, implausible
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.rigid import BodyState
 from diffcloud.sim.state import ImplicitSetup, State, System
@@ -224,6 +226,7 @@ def rollout(
         state = replace(state, anchors=state.positions[:, system.handles.nodes])
     if state.bodies is None and system.implicit is not None:
         state = replace(state, bodies=init(system, len(state.positions)).bodies)
+    given, first, anchors = (properties, schedule), state, state.anchors.detach()
     kept = torch.arange(len(state.positions), device=system.device)
     positions, poses, entries = [state.positions], [state.bodies], [kept]
     diverged: dict[int, DivergedError] = {}
@@ -239,6 +242,7 @@ def rollout(
             kept = kept[rest]
             properties, schedule, state = _only(rest, properties, schedule, state)
             continue
+        anchors = anchors.index_copy(0, kept, state.anchors.detach())
         positions.append(state.positions)
         poses.append(state.bodies)
         entries.append(kept)
@@ -249,7 +253,74 @@ def rollout(
     if poses[0] is not None and poses[0].centre.shape[1]:
         columns = zip(*(pose.tensors() for pose in poses if pose is not None), strict=True)
         bodies = BodyState(*(_over_time(column, entries, steps) for column in columns))
-    return Rollout(_over_time(positions, entries, steps), all_times, bodies, diverged)
+    joined = _over_time(positions, entries, steps)
+    for entry, fault in _implausible(system, given, (first, anchors), joined, bodies, copies).items():
+        if entry in diverged:
+            continue
+        if not drop_diverged:
+            raise fault
+        diverged[entry] = fault
+        later = torch.arange(steps + 1, device=joined.device)[:, None, None] >= fault.step
+        joined = joined.index_copy(0, torch.tensor([entry]), torch.where(later, torch.nan, joined[entry])[None])
+    return Rollout(joined, all_times, bodies, diverged)
+
+
+def _implausible(
+    system: System,
+    given: tuple[Properties, HandleSchedule],
+    begin: tuple[State, Tensor],
+    positions: Tensor,
+    bodies: BodyState | None,
+    copies: int,
+) -> dict[int, DivergedError]:
+    """Batch entries whose motion cannot be one.
+
+    Args:
+        given: of the whole batch.
+        begin: the state that it began with, and the handles' anchors [B, H, 3] at its end.
+        positions: [B, S + 1, V, 3].
+    """
+    (properties, schedule), (first, anchors) = given, begin
+    batch, nodes = len(positions) // copies, positions.detach()
+    linear = schedule.linear
+    others = np.zeros((nodes.shape[1], 0, 3))
+    if system.implicit is not None:
+        times = np.arange(nodes.shape[1], dtype=np.float64) * system.time_step
+        scenery = system.implicit.scenery
+        moving = [number for place, _ in scenery.moving for number in range(*place.indices(len(scenery.fixed)))]
+        others = scenery.at(times, dtype=torch.float64, device=torch.device("cpu")).numpy()[:, moving]
+    found: dict[int, DivergedError] = {}
+    for entry in range(batch):
+        known = nodes[entry].isfinite().all(-1).all(-1).nonzero().flatten()
+        last = int(known[-1])  # a dropped entry is not known to the end
+        translation = schedule.translation[min(entry, len(schedule.translation) - 1), :last].detach()
+        targets = translation + (linear[:last] @ anchors[entry, ..., None]).squeeze(-1)
+        own = others[: last + 1]
+        if bodies is not None:
+            own = np.concatenate([own, bodies.centre[entry, : last + 1].detach().numpy()], axis=1)
+        motion = Motion(
+            positions=nodes[entry, : last + 1].cpu().numpy(),
+            time_step=system.time_step,
+            mass=properties.node_mass[entry].detach().cpu().numpy(),
+            size=system.mesh.size,
+            places=torch.cat([nodes[entry, :1, system.handles.nodes], targets]).cpu().numpy(),
+            held=schedule.active[:last],
+            gravity=float(system.gravity.norm()),
+            wind=float(system.air.wind.norm()),
+            velocities=first.velocities[entry].detach().cpu().numpy(),
+            others=own,
+        )
+
+        def stored(step: int, entry: int = entry) -> float:
+            one = Properties(*(tensor[entry : entry + 1] for tensor in properties.tensors()))
+            shape = geometry(system.stretching.elements, nodes[entry : entry + 1, step])
+            with torch.no_grad():
+                return float(sum(energy.at(shape, one).energy() for energy in (system.stretching, system.bending)))
+
+        fault = implausible(motion, stored) if last else None
+        if fault is not None:
+            found[entry] = DivergedError(fault[0], [entry], fault[1])
+    return found
 
 
 def _only(

@@ -66,8 +66,8 @@ def board(folder: Path) -> None:
     for name, pose in poses().items():
         place = folder / "PATH" / f"calib_{name}"
         place.mkdir(parents=True)
-        robot = rng.uniform((0.5, -0.2, 0.0), (0.7, 0.2, 0.3), (40, 3))
-        seen = (np.c_[robot, np.ones(40)] @ inverse(pose).T)[:, :3]
+        robot = np.array([[0.54 + 0.055 * column, 0.11 - 0.055 * row, 0.055] for row in range(5) for column in range(5)])
+        seen = (np.c_[robot, np.ones(25)] @ inverse(pose).T)[:, :3]
         np.save(place / "robot_chessboard.npy", robot)
         np.save(place / "cam_chessboard.npy", seen)
         np.save(place / "intrinsics.npy", np.array([615.0, 615.0, 320.0, 240.0]))

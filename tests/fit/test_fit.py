@@ -77,15 +77,39 @@ class TestSpace:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"names": ["strech"]}, "Unknown parameter 'strech'. Allowed: .*stretch"),
+            ({"names": ["strech"]}, "Unknown parameter 'strech'. Did you mean 'stretch'?. Allowed: .*stretch"),
             ({"names": ["stretch", "stretch"]}, "twice"),
             ({"names": ["stretch"], "bounds": {"stretch": (2.0, 1.0)}}, r"in order \(low < high\), got \[2.0, 1.0\]"),
             ({"names": ["mass"], "fixed": {"mass": 1.0}}, "Nothing is left"),
+            (
+                {"names": ["stretch"], "bounds": {"stretch": (-1.0, 1.0)}},
+                r"A bound of stretch, \[-1.0, 1.0\], is a multiplier",
+            ),
+            ({"names": ["stretch"], "bounds": {"mas": (0.5, 1.0)}}, "Unknown parameter 'mas'. Did you mean 'mass'"),
+            ({"names": ["stretch"], "fixed": {"mass": 0.0}}, "The fixed value of mass is a multiplier: above 0, got 0"),
         ],
     )
     def test_bad_spaces(self, options, message):
         with pytest.raises(ConfigError, match=message):
             FitSpace.build(**options)
+
+    @pytest.mark.parametrize(
+        ("first", "message"),
+        [
+            ({"strech": 0.3}, "--init: Unknown fitted parameter 'strech'. Did you mean 'stretch'"),
+            ({"mass": 0.0}, r"--init mass=0 is outside of its bounds \[0.1, 10\]; the nearest allowed value is 0.1"),
+            ({"mass": 1e9}, r"--init mass=1e\+09 is outside of its bounds \[0.1, 10\]; the nearest allowed value is 10"),
+            ({"mass": float("nan")}, "--init mass=nan is outside"),
+            ({"bending": 1.0}, "--init: Unknown fitted parameter 'bending'"),
+        ],
+    )
+    def test_starts_that_are_typed_wrongly(self, first, message):
+        with pytest.raises(ConfigError, match=message):
+            FitSpace.build(["stretch", "mass"]).check_start(first)
+
+    def test_predicted_starts_are_brought_inside(self):
+        space = FitSpace.build(["stretch", "mass"])
+        assert space.nearest({"stretch": 12.0, "mass": 0.01, "bending": 1.0}) == {"stretch": 10.0, "mass": 0.1}
 
 
 class TestRecovery:

@@ -11,7 +11,7 @@ from diffcloud.errors import HardwareError
 from diffcloud.hardware import CaptureSettings, capture
 from diffcloud.hardware.realsense import RealSenseCamera, connected_cameras, import_realsense, play_recording
 from diffcloud.io.raw_episodes import read_raw_episode
-from diffcloud.sensing.validation import validate_raw_episode
+from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.hardware.simulated import PointArm, short_path
 from tests.hardware.software_cameras import CX, CY, DEPTH_SCALE, FPS, FX, FY, HEIGHT, WIDTH, Cameras, numbered_depth
 

@@ -20,7 +20,7 @@ from diffcloud.errors import DiffCloudError, EpisodeError, HardwareError, LimitE
 from diffcloud.hardware import CaptureSettings, Limits, capture, session
 from diffcloud.hardware.trajectory import ToolTrajectory
 from diffcloud.io.raw_episodes import RawEpisodeWriter, read_raw_episode
-from diffcloud.sensing.validation import validate_raw_episode
+from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.hardware.simulated import START, PointArm, TestCard, short_path
 
 BESIDE = np.add(START, [0.02, 0, 0])

@@ -6,6 +6,10 @@ import errno
 import json
 import os
 import pickle
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +17,21 @@ import pytest
 from diffcloud.errors import DiffCloudError, EpisodeError
 from diffcloud.io.clouds import import_open3d, read_cloud, write_ply
 from diffcloud.io.episodes import Episode, read_episode, write_episode
-from diffcloud.io.files import atomic_path, read_json, write_json, write_text
+from diffcloud.io.files import (
+    TEMPORARY,
+    atomic,
+    claimed,
+    files_in,
+    read_json,
+    staged,
+    together,
+    write_json,
+    write_text,
+)
+from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
 from diffcloud.io.pickles import load_npy
+
+ROOT = Path(__file__).parents[2]
 
 
 def names(folder):
@@ -22,8 +39,8 @@ def names(folder):
 
 
 def write_half(target, error):
-    with atomic_path(target) as temporary:
-        temporary.write_text("half of the n")
+    with atomic(target) as stream:
+        stream.write(b"half of the n")
         raise error
 
 
@@ -51,6 +68,82 @@ class TestAtomicWrites:
             write_episode(tmp_path / "e.npz", episode())
         assert names(tmp_path) == []
 
+    def test_outputs_of_a_group_appear_together_or_not_at_all(self, tmp_path):
+        def write(text, error=None):
+            with together():
+                write_text(tmp_path / "deep" / "a.txt", text)
+                write_json(tmp_path / "record.json", text)
+                assert not (tmp_path / "deep" / "a.txt").exists() or text == "new"
+                if error is not None:
+                    raise error
+
+        with pytest.raises(KeyboardInterrupt):
+            write("old", KeyboardInterrupt())
+        assert names(tmp_path) == []  # not even the folder
+        write("old")
+        with pytest.raises(DiffCloudError):
+            write("new", DiffCloudError("no"))
+        assert (tmp_path / "deep" / "a.txt").read_text() == "old"
+        assert read_json(tmp_path / "record.json") == "old"
+        write("new")
+        assert (tmp_path / "deep" / "a.txt").read_text() == "new"
+        assert names(tmp_path) == ["deep", "record.json"]
+
+    def test_the_record_is_the_first_to_go_and_the_last_to_come(self, tmp_path, monkeypatch):
+        """So a kill between two renames leaves no record of files that are not all there."""
+        moved = []
+        replace = os.replace
+
+        def watched(source, target):
+            moved.append((target.name, (tmp_path / "record.json").exists()))
+            replace(source, target)
+
+        monkeypatch.setattr(os, "replace", watched)
+        for text in ("old", "new"):
+            with together():
+                for name in ("a.txt", "b.txt", "record.json"):
+                    write_text(tmp_path / name, text)
+        assert moved == 2 * [("a.txt", False), ("b.txt", False), ("record.json", False)]
+
+    def test_what_a_kill_leaves_is_no_data_and_goes_with_the_next_write(self, tmp_path):
+        code = (
+            "import os, sys; from diffcloud.io.files import atomic\n"
+            "with atomic(sys.argv[1]) as stream: stream.write(b'half'); stream.flush(); os.kill(os.getpid(), 9)"
+        )
+        subprocess.run([sys.executable, "-c", code, tmp_path / "e.npz"], cwd=ROOT, check=False)
+        (left,) = tmp_path.iterdir()
+        assert left.suffix == TEMPORARY
+        assert files_in(tmp_path) == files_in(tmp_path, ".npz") == []
+        write_text(tmp_path / "e.npz", "whole")
+        assert names(tmp_path) == ["e.npz"]
+
+    def test_two_processes_do_not_write_one_file_at_once(self, tmp_path):
+        code = (
+            "import sys; from diffcloud.io.files import atomic\n"
+            "with atomic(sys.argv[1]) as stream: stream.write(b'first'); print('writing', flush=True); sys.stdin.read()"
+        )
+        command = [sys.executable, "-c", code, tmp_path / "e.npz"]
+        with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as first:
+            assert first.stdout.readline() == b"writing\n"
+            with pytest.raises(DiffCloudError, match=r"Another process is writing .*e\.npz"):
+                write_text(tmp_path / "e.npz", "second")
+            first.communicate()
+        assert (tmp_path / "e.npz").read_text() == "first"
+
+    def test_a_staged_folder_appears_whole(self, tmp_path):
+        def interrupted():
+            with staged(tmp_path / "e") as folder:
+                write_text(folder / "a.txt", "half")
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            interrupted()
+        assert names(tmp_path) == []
+        with staged(tmp_path / "e") as folder:
+            write_text(folder / "a.txt", "whole")
+            assert not (tmp_path / "e").exists()
+        assert names(tmp_path / "e") == ["a.txt"]
+
     def test_nan_is_not_written_to_json(self, tmp_path):
         with pytest.raises(ValueError, match="JSON"):
             write_json(tmp_path / "a.json", {"x": float("nan")})
@@ -62,9 +155,96 @@ class TestAtomicWrites:
             read_json(tmp_path / "a.json")
 
 
+class TestClaims:
+    HOLD = (
+        "import sys; from diffcloud.io.files import claimed\n"
+        "with claimed(sys.argv[1]): print('held', flush=True); sys.stdin.read()"
+    )
+
+    def holder(self, out):
+        process = subprocess.Popen(
+            [sys.executable, "-c", self.HOLD, out], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        assert process.stdout.readline() == b"held\n"
+        return process
+
+    def test_the_process_that_holds_an_output_is_named(self, tmp_path):
+        with self.holder(tmp_path / "out") as process:
+            with pytest.raises(DiffCloudError, match=f"is being written by process {process.pid} on .*-c"):
+                self.claim(tmp_path / "out")
+            with pytest.raises(DiffCloudError, match=f"process {process.pid}"):  # by another name of the same place
+                self.claim(tmp_path / "x" / ".." / "out")
+            process.communicate()
+        self.claim(tmp_path / "out")
+        assert names(tmp_path) == []
+
+    def test_a_kill_frees_it(self, tmp_path):
+        with self.holder(tmp_path / "out") as process:
+            process.kill()
+            process.communicate()
+        assert len(names(tmp_path)) == 1
+        self.claim(tmp_path / "out")
+        assert names(tmp_path) == []
+
+    @staticmethod
+    def claim(out):
+        with claimed(out):
+            pass
+
+    def test_a_place_that_cannot_be_written(self, tmp_path):
+        (tmp_path / "file").write_text("")
+        with pytest.raises(DiffCloudError, match="Cannot write"):
+            self.claim(tmp_path / "file" / "out")
+
+
+class TestManifests:
+    def test_only_what_is_listed_is_removed(self, tmp_path):
+        for name in ("a/b/c.json", "a/mine.txt", "d.npz"):
+            write_text(tmp_path / name, "")
+        assert remove_files(tmp_path, ["a/b/c.json", "d.npz", "gone.json"]) == ["a/b/c.json", "d.npz"]
+        assert sorted(path.as_posix() for path in tmp_path.rglob("*")) == [f"{tmp_path}/a", f"{tmp_path}/a/mine.txt"]
+
+    @pytest.mark.parametrize("name", ["../a.txt", "/etc/hostname", "x/../../a.txt"])
+    def test_nothing_outside_is_removed(self, tmp_path, name):
+        write_text(tmp_path / "a.txt", "")
+        with pytest.raises(DiffCloudError, match="lies outside"):
+            remove_files(tmp_path / "folder", [name])
+        assert (tmp_path / "a.txt").exists()
+
+    def test_damaged_ones_are_named(self, tmp_path):
+        assert read_manifest(tmp_path) == set()
+        write_manifest(tmp_path, ["b", "a"])
+        assert read_manifest(tmp_path) == {"a", "b"}
+        write_text(tmp_path / "manifest.json", '{"files": [1]}')
+        with pytest.raises(DiffCloudError, match="must list `files`"):
+            read_manifest(tmp_path)
+
+
+def test_hidden_files_are_no_data(tmp_path):
+    for name in ("b.npz", "a.NPZ", "._a.npz", ".hidden", "c.json"):
+        write_text(tmp_path / name, "")
+    (tmp_path / "folder.npz").mkdir()
+    assert [path.name for path in files_in(tmp_path, ".npz")] == ["a.NPZ", "b.npz"]
+    assert files_in(tmp_path / "none") == []
+
+
 class _Evil:
     def __reduce__(self):
         return (os.system, ("touch /tmp/diffcloud-was-here",))
+
+
+def pickled(value, protocol=4):
+    array = np.empty((), dtype=object)
+    array[()] = value
+    return pickle.dumps(array, protocol=protocol)
+
+
+def write_pickled(path, value=None, *, data=None):
+    """A dictionary as `np.save` writes it, or other bytes in its place."""
+    with path.open("wb") as stream:
+        header = np.lib.format.header_data_from_array_1_0(np.array(None, dtype=object))
+        np.lib.format.write_array_header_1_0(stream, header)
+        stream.write(pickled(value) if data is None else data)
 
 
 class TestPickles:
@@ -79,13 +259,11 @@ class TestPickles:
     @pytest.mark.parametrize("payload", [_Evil(), {"a": [_Evil()]}, pytest, print, np.load])
     def test_code_is_refused_and_not_run(self, tmp_path, payload):
         marker = "/tmp/diffcloud-was-here"
-        header = np.array(None, dtype=object)
-        with (tmp_path / "evil.npy").open("wb") as stream:
-            np.lib.format.write_array_header_1_0(stream, np.lib.format.header_data_from_array_1_0(header))
-            try:
-                stream.write(pickle.dumps(payload))
-            except TypeError:
-                stream.write(b"cos\nsystem\n(S'touch " + marker.encode() + b"'\ntR.")
+        try:
+            data = pickle.dumps(payload)
+        except TypeError:
+            data = b"cos\nsystem\n(S'touch " + marker.encode() + b"'\ntR."
+        write_pickled(tmp_path / "evil.npy", data=data)
         with pytest.raises(EpisodeError, match=r"evil\.npy.*only plain containers|damaged pickle"):
             load_npy(tmp_path / "evil.npy")
         assert not os.path.exists(marker)
@@ -95,6 +273,79 @@ class TestPickles:
         (tmp_path / "d.npy").write_bytes(data)
         with pytest.raises(EpisodeError, match=r"d\.npy"):
             load_npy(tmp_path / "d.npy")
+
+    def test_a_forged_array_of_pointers_is_refused(self, tmp_path):
+        """Object pointers made of bytes: a reader that made the array would follow them wherever they lead."""
+
+        class Forged:
+            def __reduce__(self):
+                return np.ndarray, ((2,), np.dtype(object), b"\x41" * 16)
+
+        for data in (pickle.dumps(Forged()), pickled({"lift_navy": Forged()})):
+            write_pickled(tmp_path / "f.npy", data=data)
+            with pytest.raises(EpisodeError, match=r"f\.npy (refers to numpy's ndarray|is no pickle of numpy)"):
+                load_npy(tmp_path / "f.npy")
+        # an array of one object, whose list of elements is replaced by a pointer
+        data = pickled(None).replace(b"]\x94Na", b"C\x08" + b"\x41" * 8)
+        write_pickled(tmp_path / "f.npy", data=data)
+        with pytest.raises(EpisodeError, match="forged pointers"):
+            load_npy(tmp_path / "f.npy")
+
+    @pytest.mark.parametrize(
+        ("payload", "message"),
+        [
+            (b"]" * 1_000_000 + b"a" * 999_999 + b".", "no pickle of numpy"),
+            (b"]" * 5_000_000, "pickle of 5000000 bytes"),
+            (b"\x80\x04" + b"(" * 10 + b"t.", "no pickle of numpy"),
+            (b"X\xff\xff\xff\x7fabc", "damaged pickle"),
+            (b"\x8d\xff\xff\xff\xff\xff\xff\xff\x7fabc", "damaged pickle"),
+            (b"I5\n.", "pickle instruction INT"),
+            (b"t.", "damaged pickle"),
+        ],
+    )
+    def test_bombs_and_nonsense(self, tmp_path, payload, message):
+        write_pickled(tmp_path / "b.npy", data=payload)
+        with pytest.raises(EpisodeError, match=message):
+            load_npy(tmp_path / "b.npy")
+
+    def test_deep_and_shared_nesting_is_refused_without_unfolding_it(self, tmp_path):
+        deep: list[object] = []
+        for _ in range(100):
+            deep = [deep]
+        shared: list[object] = [1]
+        for _ in range(12):
+            shared = [shared] * 1000
+        for value, message in ((deep, "more than 16 deep"), (shared, "one container twice")):
+            write_pickled(tmp_path / "n.npy", {"a": value})
+            with pytest.raises(EpisodeError, match=message):
+                load_npy(tmp_path / "n.npy")
+
+    def test_every_flipped_byte_gives_a_value_or_a_clear_error(self, tmp_path):
+        write_pickled(tmp_path / "f.npy", {"lift_navy": np.float32([1, 2]), "lift_tan": [1, 2.5, "x", None]})
+        data = bytearray((tmp_path / "f.npy").read_bytes())
+        rng = np.random.default_rng(0)
+        for place in range(len(data)):
+            flipped = data.copy()
+            flipped[place] ^= int(rng.integers(1, 256))
+            (tmp_path / "f.npy").write_bytes(flipped)
+            with suppress(EpisodeError):
+                load_npy(tmp_path / "f.npy")
+
+    def test_a_header_that_claims_more_than_there_is(self, tmp_path):
+        header = {"descr": "<f8", "fortran_order": False, "shape": (10**8, 300)}
+        with (tmp_path / "h.npy").open("wb") as stream:
+            np.lib.format.write_array_header_1_0(stream, header)
+            stream.write(b"abc")
+        with pytest.raises(EpisodeError, match="take 240000000000 bytes, it has 3"):
+            load_npy(tmp_path / "h.npy")
+
+    def test_older_files_of_numpy_are_read(self, tmp_path):
+        for protocol in (2, 3, 4):
+            data = pickled({"a": np.float32([1.5, 2]), "b": np.float64(3)}, protocol)
+            write_pickled(tmp_path / "o.npy", data=data)
+            found = load_npy(tmp_path / "o.npy")
+            assert found["a"].tolist() == [1.5, 2]
+            assert found["b"] == 3
 
     def test_truncated_pickle(self, tmp_path):
         np.save(tmp_path / "t.npy", np.array({"a": np.zeros(50)}, dtype=object), allow_pickle=True)

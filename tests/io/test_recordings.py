@@ -8,121 +8,14 @@ import time
 
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from scipy.spatial.transform import Rotation
 
-from diffcloud.io.raw_episodes import read_raw_episode
-from diffcloud.sensing.cameras import inverse
-from diffcloud.sensing.validation import validate_raw_episode
+from diffcloud.errors import EpisodeError, HardwareError
+from diffcloud.io.raw_episodes import CameraInfo, read_raw_episode
+from diffcloud.io.recordings import RecordedFrame, Recording, write_recording
+from diffcloud.sensing.validation.episode import validate_raw_episode
+from tests.io.ros_bag import FRAMES, START, TOOL, bag
 from tests.pipeline.invoke import invoke
 from tests.sensing.table_scene import HOME_RAD, INTRINSICS, poses, table_depth, write_table_episode
-
-START = 1_700_000_000.0
-FRAMES = 5
-TOOL = np.array([0.5767, 0.0013, 0.4337])
-
-
-class Bag:
-    """Writes the table scene as ROS messages, of either generation."""
-
-    def __init__(self, path, kind, *, encoding="16UC1", joints=True):
-        self._ros1 = kind == "rosbag1"
-        self._store = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_HUMBLE)
-        if self._ros1:  # the store lacks it, bags bring it along
-            definition = "geometry_msgs/TransformStamped[] transforms"
-            self._store.register(get_types_from_msg(definition, "tf2_msgs/msg/TFMessage"))
-        self._encoding, self._joints = encoding, joints
-        if self._ros1:
-            self._writer = Writer1(path)
-        else:
-            plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-            self._writer = Writer2(path, version=9, storage_plugin=plugin)
-        self._connections = {}
-
-    def write(self):
-        with self._writer:
-            for step in range(2 * FRAMES + 4):
-                t = START + step / 20 - 0.05
-                self._tf(t)
-                if self._joints:
-                    names = [f"joint_{index + 1}" for index in range(7)]
-                    names, values = ["finger_joint", *names[::-1]], [0.4, *HOME_RAD[::-1]]
-                    self._send("/joint_states", t, "sensor_msgs/msg/JointState", name=names,
-                               position=np.array(values), velocity=np.zeros(0), effort=np.zeros(0))  # fmt: skip
-                if step % 2 == 1 and step // 2 < FRAMES:
-                    for name, pose in poses().items():
-                        self._camera(name, pose, t, step // 2)
-
-    def _camera(self, name, pose, t, number):
-        frame = f"{name}_optical"
-        matrix = INTRINSICS.matrix.ravel()
-        upper = {"D": np.zeros(5), "K": matrix, "R": np.eye(3).ravel(), "P": np.zeros(12)}
-        lens = upper if self._ros1 else {key.lower(): value for key, value in upper.items()}
-        region = self._type("sensor_msgs/msg/RegionOfInterest")(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-        prefix = f"/{name}/aligned_depth_to_color"
-        size = {"height": INTRINSICS.height, "width": INTRINSICS.width}
-        rest = {**size, **lens, "distortion_model": "plumb_bob", "binning_x": 0, "binning_y": 0, "roi": region}
-        self._send(f"{prefix}/camera_info", t, "sensor_msgs/msg/CameraInfo", frame=frame, **rest)
-        depth = table_depth(pose)
-        depth[0, 0] = 1000 + number
-        data = depth if self._encoding == "16UC1" else np.where(depth > 0, depth / 1000, np.nan).astype(np.float32)
-        color = np.full((*depth.shape, 3), [10, 20, 30 + number], np.uint8)
-        self._image(f"/{name}/color/image_raw", t - 0.002, frame, color, "bgr8")
-        self._image(f"{prefix}/image_raw", t, frame, data, self._encoding)
-        self._image(f"/{name}/depth/image_rect_raw", t, frame, data, self._encoding)  # not aligned: to be left alone
-
-    def _image(self, topic, t, frame, pixels, encoding):
-        size = {"height": pixels.shape[0], "width": pixels.shape[1], "step": pixels[0].nbytes, "is_bigendian": 0}
-        data = np.frombuffer(pixels.tobytes(), np.uint8)
-        self._send(topic, t, "sensor_msgs/msg/Image", frame=frame, encoding=encoding, data=data, **size)
-
-    def _tf(self, t):
-        places = {f"{name}_link": pose @ inverse(self.optical) for name, pose in poses().items()}
-        edges = [("base_link", child, place) for child, place in places.items()]
-        edges += [(f"{name}_link", f"{name}_optical", self.optical) for name in poses()]
-        tool = np.eye(4)
-        tool[:3, 3] = np.add(TOOL, [0, 0, 0.1 * (t - START)])
-        edges.append(("base_link", "tool_frame", tool))
-        moves = []
-        for parent, child, place in edges:
-            x, y, z, w = Rotation.from_matrix(place[:3, :3]).as_quat()
-            turn = self._type("geometry_msgs/msg/Quaternion")(x=x, y=y, z=z, w=w)
-            shift = self._type("geometry_msgs/msg/Vector3")(*place[:3, 3])
-            move = self._type("geometry_msgs/msg/Transform")(translation=shift, rotation=turn)
-            kind = self._type("geometry_msgs/msg/TransformStamped")
-            moves.append(kind(header=self._header(t, parent), child_frame_id=child, transform=move))
-        self._send("/tf", t, "tf2_msgs/msg/TFMessage", header=False, transforms=moves)
-
-    optical = np.array([[0, 0, 1, 0.01], [-1, 0, 0, 0.02], [0, -1, 0, 0], [0, 0, 0, 1.0]])
-
-    def _type(self, name):
-        return self._store.types[name]
-
-    def _header(self, t, frame):
-        stamp = self._type("builtin_interfaces/msg/Time")(sec=int(t), nanosec=round(t % 1 * 1e9))
-        sequence = {"seq": 0} if self._ros1 else {}
-        return self._type("std_msgs/msg/Header")(stamp=stamp, frame_id=frame, **sequence)
-
-    def _send(self, topic, t, kind, *, frame="", header=True, **fields):
-        if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
-        if header:
-            fields["header"] = self._header(t, frame)
-        message = self._type(kind)(**fields)
-        raw = self._store.serialize_ros1(message, kind) if self._ros1 else self._store.serialize_cdr(message, kind)
-        self._writer.write(self._connections[topic], round(t * 1e9), raw)
-
-
-def bag(tmp_path, kind, **options):
-    path = tmp_path / ("bag.bag" if kind == "rosbag1" else "bag")
-    Bag(path, kind, **options).write()
-    if kind == "mcap":  # a lone file, as MCAP is mostly handed around
-        shutil.move(path / "bag.mcap", tmp_path / "lone.mcap")
-        return tmp_path / "lone.mcap"
-    return path
 
 
 @pytest.mark.parametrize("kind", ["rosbag1", "rosbag2", "mcap"])
@@ -219,12 +112,50 @@ def test_folders_that_are_damaged(tmp_path):
     assert "different clocks" in bad.errors
 
 
+def test_times_of_a_folder_that_run_backwards_are_refused_with_the_frame(tmp_path):
+    folders, _ = as_folders(tmp_path)
+    (folders[0] / "timestamps.csv").write_text("frame,t_s\n0,0.0\n1,0.2\n2,0.1\n3,0.3\n")
+    bad = invoke("import", "recording", folders[0], "--out", tmp_path / "e", code=1)
+    assert "frame 2 is of 0.100000 s, frame 1 of 0.200000 s" in bad.errors
+    assert not (tmp_path / "e").exists()
+
+
+def test_a_joint_log_that_runs_backwards_is_refused_with_the_row(tmp_path):
+    folders, log = as_folders(tmp_path)
+    rows = log.read_text().splitlines()
+    log.write_text("\n".join([*rows[:4], rows[5], rows[4], *rows[6:]]) + "\n")
+    bad = invoke("import", "recording", folders[0], "--out", tmp_path / "e", "--joint-log", log, code=1)
+    assert "row 5: the time runs backwards (0.100000 s after 0.150000 s)" in bad.errors
+    assert not (tmp_path / "e").exists()
+
+
+def test_colour_that_a_folder_lacks_is_counted(tmp_path):
+    folders, log = as_folders(tmp_path)
+    for number in (2, 3):  # the colour recording stopped early
+        (folders[0] / "color" / f"{number:06d}.png").unlink()
+    done = invoke("import", "recording", folders[0], "--out", tmp_path / "e", "--joint-log", log)
+    (message,) = done.result["warnings"]
+    assert "Camera overhead: 2 of 4 frames have no colour image of their number, such as frame 2" in message
+
+
+@pytest.mark.parametrize("second_s", [1.0, 0.9])
+def test_frames_of_any_source_come_one_after_the_other(tmp_path, second_s):
+    info = CameraInfo("side", "1", INTRINSICS, 0.001)
+    depth = table_depth(poses()["side"])
+    frames = [RecordedFrame("side", t, depth) for t in (1.0, second_s)]
+    with pytest.raises(EpisodeError, match="frame 1 of camera side is of"):
+        write_recording(tmp_path / "e", Recording({"side": info}, frames, "test"))
+
+
 def test_realsense_recordings_of_two_cameras_with_a_joint_log(tmp_path):
-    pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed (pip install diffcloud[hardware])")
     from diffcloud.hardware.realsense import RealSenseCamera, import_realsense
     from tests.hardware.software_cameras import FPS, HEIGHT, WIDTH, Cameras, numbered_depth
 
-    cameras = Cameras(import_realsense())
+    try:
+        rs = import_realsense()  # a plain import would miss libusb where the system has none
+    except HardwareError as error:
+        pytest.skip(f"pyrealsense2 is not installed (pip install diffcloud[hardware]): {error}")
+    cameras = Cameras(rs)
     opened = [
         RealSenseCamera(
             name, serial, context=cameras.context, width=WIDTH, height=HEIGHT, fps=FPS, record_to=tmp_path / f"{name}.db3"

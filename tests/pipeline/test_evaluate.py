@@ -152,6 +152,15 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on PATH: the page is not opened in a browser")
 def test_the_page_runs_in_a_browser_without_errors_and_asks_nobody(work):
+    nasty = "<!--<script>"  # an unescaped one would swallow the scripts
+    for path in [*work.rglob("tan2.*")]:
+        path.rename(path.with_name(path.name.replace("tan2", nasty)))
+    for path in [
+        *(work / "reports" / "tables").iterdir(),
+        *(work / "data" / "fits").rglob("*.json"),
+        work / "reports/timings.json",
+    ]:
+        path.write_text(path.read_text().replace("tan2", nasty))
     invoke("report", "--params", "params.yaml")
     page = work / "reports" / "index.html"
     assert page.stat().st_size < 25e6

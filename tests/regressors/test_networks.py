@@ -115,5 +115,5 @@ def test_one_batch_can_be_learned_by_heart(model, generator):
 
 
 def test_an_unknown_model_is_named():
-    with pytest.raises(ConfigError, match=r"Unknown model 'pointnet'. Allowed: meteornet, mlp, pointnet2"):
+    with pytest.raises(ConfigError, match=r"'pointnet'. Did you mean 'pointnet2'.* Allowed: meteornet, mlp, pointnet2"):
         frames_seen("pointnet")

@@ -196,7 +196,7 @@ class TestScenarios:
     def test_names(self):
         assert SCENARIO_NAMES[:4] == ("lift", "fold", "band_stretch", "vest_hang")
         assert SCENARIO_NAMES[4:] == ("release_lift", "release_fold", "release_hang", "release_band")
-        with pytest.raises(ConfigError, match=r"Unknown scenario 'lfit'. Allowed: .*lift"):
+        with pytest.raises(ConfigError, match=r"Unknown scenario 'lfit'. Did you mean 'lift'.. Allowed: .*lift"):
             load_scenario("lfit")
         with pytest.raises(ConfigError, match="needs --scene"):
             load_scenario("release_lift")

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from diffcloud.io.camera_models import Intrinsics
-from diffcloud.sensing.calibration import CharucoBoard
+from diffcloud.sensing.calibration.charuco import CharucoBoard
 from diffcloud.sensing.cameras import inverse
 
 BOARD = CharucoBoard(5, 7, 0.04, 0.03)

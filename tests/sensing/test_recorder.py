@@ -18,7 +18,7 @@ from diffcloud.sensing.fusion import FusionSettings, fuse
 from diffcloud.sensing.masking import RobotMask, joints_at
 from diffcloud.sensing.recorder import CLOTH, ROBOT, TABLE, read_truth
 from diffcloud.sensing.robot import GEN3_HOME_RAD, Robot, gen3
-from diffcloud.sensing.validation import validate_raw_episode
+from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.sensing.recorded_scene import FRAMES, motion, write_recorded_episode
 
 SETTINGS = FusionSettings(flying_m=0.03)

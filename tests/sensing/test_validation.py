@@ -10,7 +10,7 @@ import pytest
 from diffcloud.io.calibrations import Calibration, CameraCalibration, write_calibration
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.images import write_depth
-from diffcloud.sensing.validation import validate_raw_episode
+from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.pipeline.invoke import invoke
 from tests.sensing.table_scene import INTRINSICS, SERIALS, poses, write_table_episode
 
@@ -145,14 +145,21 @@ def test_swapped_poses_are_seen_in_the_depth(episode):
     assert codes(episode) == {"swapped_cameras"}
 
 
-def calibration(path, serials, intrinsics=INTRINSICS):
+def calibration(path, serials, intrinsics=INTRINSICS, objections=()):
     cameras = {serial: CameraCalibration(serial, intrinsics, poses()[name], name=name) for name, serial in serials.items()}
-    write_calibration(path, Calibration(cameras, "charuco"))
+    write_calibration(path, Calibration(cameras, "charuco", objections=objections))
     return path
 
 
 def test_the_right_calibration_is_silent(episode, tmp_path):
     assert codes(episode, calibration=calibration(tmp_path / "c.json", SERIALS)) == set()
+
+
+def test_a_calibration_that_was_forced_is_a_warning_with_its_reason(episode, tmp_path):
+    path = calibration(tmp_path / "lab.json", SERIALS, objections=("Camera side has 5 poses.",))
+    findings = validate_raw_episode(episode, calibration=path)
+    assert {(finding.severity, finding.code) for finding in findings} == {("warning", "forced_calibration")}
+    assert "Camera side has 5 poses." in findings[0].message
 
 
 def test_swapped_serials(episode, tmp_path):

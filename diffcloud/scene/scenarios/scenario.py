@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from diffcloud.errors import ConfigError
 from diffcloud.scene.description import Scene
 from diffcloud.sim.properties import Properties, scaled_properties
 from diffcloud.sim.state import System
@@ -55,6 +56,14 @@ class Scenario:
     def grasped(self) -> list[int]:
         """Nodes that a moving handle holds."""
         return [handle.node for handle in self.scene.handles.handles if handle.motion is not None]
+
+    def check_parameters(self, names: Iterable[str]) -> None:
+        """
+        Raises:
+            ConfigError: a parameter that nothing in the scene depends on.
+        """
+        if "body_mass" in names and not self.scene.surrounding.bodies:
+            raise ConfigError(f"body_mass has no effect in {self.name}, whose scene has no rigid bodies; leave it out.")
 
     def properties(self, system: System, values: Mapping[str, Tensor]) -> Properties:
         """Physical quantities of parameter sets, name -> [B], with the scenario's node sets applied.

@@ -6,19 +6,15 @@ Each check looks at one thing and yields findings; none stops the others, so tha
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from diffcloud.errors import CalibrationError, EpisodeError
-from diffcloud.io.calibrations import Calibration, read_calibration
+from diffcloud.errors import EpisodeError
 from diffcloud.io.images import png_size, read_color, read_depth
 from diffcloud.io.raw_episodes import (
-    CameraInfo,
     RobotLog,
     first_backwards,
     read_camera_info,
@@ -26,7 +22,8 @@ from diffcloud.io.raw_episodes import (
     read_robot_log,
     read_timestamps,
 )
-from diffcloud.sensing.cameras import depth_points, transform
+from diffcloud.sensing.validation.calibration import calibration_findings, exchanged_cameras
+from diffcloud.sensing.validation.findings import Finding, RecordedCamera
 
 _GAP = 2.5
 """A gap is this many times the median interval."""
@@ -36,30 +33,6 @@ _LONGEST_REACH_M = 3.0
 """No arm of this kind reaches farther."""
 _SPARSE = 0.02
 """Fewer valid pixels than this are a warning."""
-_SWAP_POINTS = 3000
-_SWAP_M = 0.02
-"""Views that disagree by more than this, and agree when exchanged, are exchanged."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that is wrong, or doubtful."""
-
-    severity: Literal["fault", "warning"]
-    """A fault makes what follows wrong; a warning is worth a look."""
-    code: str
-    """A word to filter by, such as clock_gap."""
-    place: str
-    message: str
-
-
-@dataclass(frozen=True)
-class _Camera:
-    name: str
-    folder: Path
-    info: CameraInfo | None
-    frames: NDArray[np.int64]
-    times: NDArray[np.float64]
 
 
 def validate_raw_episode(folder: Path, *, calibration: Path | None = None) -> list[Finding]:
@@ -93,8 +66,8 @@ def validate_raw_episode(folder: Path, *, calibration: Path | None = None) -> li
         if camera is not None:
             cameras.append(camera)
     for camera in cameras:
-        findings += [*_clock(camera, description), *_images(camera), *_calibrated(camera, folder, calibration)]
-    findings += _exchanged(cameras, folder, calibration)
+        findings += [*_clock(camera, description), *_images(camera), *calibration_findings(camera, folder, calibration)]
+    findings += exchanged_cameras(cameras, folder, calibration)
     if description.get("robot") is not None:
         try:
             log = read_robot_log(folder / "robot.csv")
@@ -105,7 +78,7 @@ def validate_raw_episode(folder: Path, *, calibration: Path | None = None) -> li
     return sorted(findings, key=lambda finding: finding.severity != "fault")
 
 
-def _open_camera(folder: Path, name: str) -> tuple[_Camera | None, list[Finding]]:
+def _open_camera(folder: Path, name: str) -> tuple[RecordedCamera | None, list[Finding]]:
     findings = []
     info = None
     try:
@@ -119,10 +92,10 @@ def _open_camera(folder: Path, name: str) -> tuple[_Camera | None, list[Finding]
     if not len(frames):
         message = "No frame was finished: the camera delivered nothing, or stopped at once."
         return None, [*findings, Finding("fault", "no_frames", f"cameras/{name}", message)]
-    return _Camera(name, folder, info, frames, times), findings
+    return RecordedCamera(name, folder, info, frames, times), findings
 
 
-def _clock(camera: _Camera, description: dict[str, Any]) -> Iterator[Finding]:
+def _clock(camera: RecordedCamera, description: dict[str, Any]) -> Iterator[Finding]:
     place = f"cameras/{camera.name}/timestamps.csv"
     times = camera.times
     bad = first_backwards(times)
@@ -170,7 +143,7 @@ def _clock(camera: _Camera, description: dict[str, Any]) -> Iterator[Finding]:
         )
 
 
-def _images(camera: _Camera) -> Iterator[Finding]:
+def _images(camera: RecordedCamera) -> Iterator[Finding]:
     place = f"cameras/{camera.name}"
     if list((camera.folder / "depth").glob("*.[jJ][pP]*[gG]")):
         yield Finding(
@@ -245,7 +218,7 @@ def _image_code(path: Path, message: str) -> str:
     return "image"
 
 
-def _colour(camera: _Camera) -> Iterator[Finding]:
+def _colour(camera: RecordedCamera) -> Iterator[Finding]:
     folder = camera.folder / "color"
     place = f"cameras/{camera.name}/color"
     if not folder.is_dir():
@@ -263,103 +236,6 @@ def _colour(camera: _Camera) -> Iterator[Finding]:
             message = f"{size[0]} x {size[1]} pixels; depth and colour of an episode are aligned and of one size."
             yield Finding("fault", "image_size", f"{place}/{path.name}", message)
             return
-
-
-def _calibration_of(camera: _Camera, folder: Path, calibration: Path | None) -> Calibration | None:
-    if calibration is not None:
-        return read_calibration(calibration)
-    if camera.info is None or camera.info.calibration is None:
-        return None
-    return read_calibration(folder / camera.info.calibration)
-
-
-def _calibrated(camera: _Camera, folder: Path, calibration: Path | None) -> Iterator[Finding]:
-    place = f"cameras/{camera.name}/camera.json"
-    if camera.info is None:
-        return
-    try:
-        held = _calibration_of(camera, folder, calibration)
-        if held is None:
-            if camera.info.T_world_camera is None:
-                message = "Not calibrated: neither T_world_camera nor a calibration file. Run diffcloud calibrate."
-                yield Finding("warning", "uncalibrated", place, message)
-            return
-        entry = held.camera(camera.info.serial, name=camera.name)
-    except CalibrationError as error:
-        yield Finding("fault", "other_calibration", place, str(error))
-        return
-    if not entry.intrinsics.same_camera(camera.info.intrinsics):
-        yield Finding(
-            "fault",
-            "other_calibration",
-            place,
-            f"The calibration of serial {camera.info.serial} has other intrinsics ({_brief(entry)} against "
-            f"{_brief(camera.info)}): it was made at another resolution or with another camera.",
-        )
-    if entry.name and entry.name != camera.name and any(other.name == camera.name for other in held.cameras.values()):
-        yield Finding(
-            "fault",
-            "swapped_cameras",
-            place,
-            f"Serial {camera.info.serial} is {entry.name!r} in the calibration, but {camera.name!r} here: the cameras were "
-            "swapped when the capture was started. Exchange the folder names, or calibrate again if they were moved.",
-        )
-
-
-def _brief(camera: Any) -> str:
-    held = camera.intrinsics
-    return f"{held.width} x {held.height}, f {held.fx:.1f}, c ({held.cx:.1f}, {held.cy:.1f})"
-
-
-def _pose(camera: _Camera, folder: Path, calibration: Path | None) -> NDArray[np.float64] | None:
-    if camera.info is None:
-        return None
-    try:
-        held = _calibration_of(camera, folder, calibration)
-        if held is not None:
-            return held.camera(camera.info.serial).T_world_camera
-    except CalibrationError:
-        return None
-    return camera.info.T_world_camera
-
-
-def _exchanged(cameras: list[_Camera], folder: Path, calibration: Path | None) -> Iterator[Finding]:
-    """Two views of one scene must agree; where they do so only with each other's pose, the poses are exchanged."""
-    for index, first in enumerate(cameras):
-        for second in cameras[index + 1 :]:
-            poses = [_pose(camera, folder, calibration) for camera in (first, second)]
-            clouds = [_first_points(camera) for camera in (first, second)]
-            if poses[0] is None or poses[1] is None or clouds[0] is None or clouds[1] is None:
-                continue
-            stated = _disagreement(transform(poses[0], clouds[0]), transform(poses[1], clouds[1]))
-            exchanged = _disagreement(transform(poses[1], clouds[0]), transform(poses[0], clouds[1]))
-            if stated > _SWAP_M and exchanged < 0.5 * stated:
-                yield Finding(
-                    "fault",
-                    "swapped_cameras",
-                    f"cameras/{first.name}, cameras/{second.name}",
-                    f"The two views disagree by {1000 * stated:.0f} mm, and by {1000 * exchanged:.0f} mm when each takes "
-                    "the other's pose: the cameras or their calibrations are swapped.",
-                )
-
-
-def _first_points(camera: _Camera) -> NDArray[np.float64] | None:
-    if camera.info is None:
-        return None
-    try:
-        depth = read_depth(camera.folder / "depth" / f"{camera.frames[0]:06d}.png")
-        step = max(1, int(np.sqrt(depth.size / _SWAP_POINTS)))
-        points, _ = depth_points(depth, camera.info.intrinsics, camera.info.depth_scale_m, step=step)
-    except (EpisodeError, IndexError):
-        return None
-    return points if len(points) > 50 else None
-
-
-def _disagreement(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Lower quartile of the distances both ways: half of each view may see what the other does not."""
-    there, _ = cKDTree(second).query(first)
-    back, _ = cKDTree(first).query(second)
-    return float(max(np.quantile(there, 0.25), np.quantile(back, 0.25)))
 
 
 def _robot(log: RobotLog) -> Iterator[Finding]:
@@ -407,7 +283,7 @@ def _robot(log: RobotLog) -> Iterator[Finding]:
             yield Finding("warning", "clock_gap", place, message)
 
 
-def _coverage(log: RobotLog, cameras: list[_Camera]) -> Iterator[Finding]:
+def _coverage(log: RobotLog, cameras: list[RecordedCamera]) -> Iterator[Finding]:
     if not len(log.times):
         return
     usual = float(np.median(np.diff(log.times))) if len(log.times) > 1 else 0.0

@@ -13,9 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import CalibrationError
+from diffcloud.sensing.calibration.checks import CheckerboardEvidence
 from diffcloud.sensing.cameras import transform
 
 Floats = NDArray[np.float64]
+
+_STRIPS = 5
+_FEWEST_HELD_OUT = 9
+"""Three corners each way."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +67,53 @@ def register_checkerboard(camera_points: Floats, robot_points: Floats) -> Regist
     return Registration(matrix, residual, float(spread[0] / spread[1]))
 
 
+def checkerboard_evidence(found: Registration, camera_points: Floats, robot_points: Floats) -> CheckerboardEvidence:
+    """What speaks for and against a registration, from the points it was made of."""
+    held_out = held_out_errors(camera_points, robot_points)
+    apart = np.linalg.norm(robot_points[:, None] - robot_points, axis=-1) + np.diag(np.full(len(robot_points), np.inf))
+    return CheckerboardEvidence(
+        corners=len(camera_points),
+        held_out_corners=0 if held_out is None else len(camera_points),
+        held_out_mm=None if held_out is None else 1000 * float(np.sqrt((held_out**2).mean())),
+        size_ratio=1 / found.scale,
+        pitch_m=float(np.median(apart.min(axis=1))),
+    )
+
+
+def held_out_errors(camera_points: Floats, robot_points: Floats) -> Floats | None:
+    """How far corners that were left out lie from where the others put them: [M] distances [m].
+
+    They are left out in strips across the board, along both of its axes.
+
+    A corner left out is moved as the published method moves all: at the depth of the plane through the others. Strips,
+    because corners of one depth image are wrong together: a neighbour would vouch for the one left out. What all corners
+    share, such as the board's place under the robot, no corner left out can show.
+
+    Args:
+        camera_points, robot_points: as for `register_checkerboard`.
+
+    Returns:
+        None for fewer than 9 corners.
+    """
+    if len(camera_points) < _FEWEST_HELD_OUT:
+        return None
+    centred = robot_points - robot_points.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
+    everything = np.arange(len(camera_points))
+    errors = []
+    for axis in axes:
+        for strip in np.array_split(np.argsort(centred @ axis, kind="stable"), _STRIPS):
+            rest = np.setdiff1d(everything, strip)
+            coefficients = _plane(camera_points[rest])
+            matrix = rigid_motion(_at_depth(camera_points[rest], coefficients), robot_points[rest])
+            placed = transform(matrix, _at_depth(camera_points[strip], coefficients))
+            errors.append(np.linalg.norm(placed - robot_points[strip], axis=1))
+    return np.concatenate(errors)
+
+
 def onto_plane(points: Floats) -> Floats:
     """Points [N, 3] with z replaced by their least-squares plane z = a x + b y + c."""
-    design = np.column_stack([points[:, :2], np.ones(len(points))])
-    coefficients, _, rank, _ = np.linalg.lstsq(design, points[:, 2], rcond=None)
-    if rank < 3:
-        raise CalibrationError("The corners lie on a line in the image; a plane needs a grid.")
-    return np.column_stack([points[:, :2], design @ coefficients])
+    return _at_depth(points, _plane(points))
 
 
 def rigid_motion(source: Floats, target: Floats) -> Floats:
@@ -82,3 +127,16 @@ def rigid_motion(source: Floats, target: Floats) -> Floats:
     matrix[:3, :3] = vt.T @ handed @ u.T
     matrix[:3, 3] = centres[1] - matrix[:3, :3] @ centres[0]
     return matrix
+
+
+def _plane(points: Floats) -> Floats:
+    """(a, b, c) of z = a x + b y + c."""
+    design = np.column_stack([points[:, :2], np.ones(len(points))])
+    coefficients, _, rank, _ = np.linalg.lstsq(design, points[:, 2], rcond=None)
+    if rank < 3:
+        raise CalibrationError("The corners lie on a line in the image; a plane needs a grid.")
+    return np.asarray(coefficients)
+
+
+def _at_depth(points: Floats, coefficients: Floats) -> Floats:
+    return np.column_stack([points[:, :2], np.column_stack([points[:, :2], np.ones(len(points))]) @ coefficients])

@@ -1,0 +1,150 @@
+"""Opening ROS recordings: one file, the parts of a split one, or a rosbag2 folder.
+
+Recorders split long recordings into files `name_0`, `name_1`, ... One of them is a recording that starts or ends in the
+middle, and often one without the transforms, which are sent once. rosbag2 lists the parts in metadata.yaml. rosbag1 only
+numbers them, as people number their takes: there the parts are those whose times adjoin.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any
+
+import yaml
+
+from diffcloud.errors import EpisodeError
+from diffcloud.io.ros.topics import is_depth
+
+_METADATA = "metadata.yaml"
+_NUMBERED = re.compile(r"(.*)_(\d+)")
+_DATE = re.compile(r"_?\d{4}-\d{2}-\d{2}-\d{2}-\d{2}-\d{2}")
+"""rosbag1 writes into each part's name when that part was begun."""
+_ADJOINING_S = 5.0
+"""Parts follow each other at once, but may begin with a slow topic; between two takes somebody lays the cloth out again."""
+
+
+@contextmanager
+def opened(paths: Sequence[Path]) -> Iterator[Any]:
+    """A reader (`rosbags.highlevel.AnyReader`) of all files together, messages in order of their arrival.
+
+    Raises:
+        EpisodeError: missing, or not a readable recording.
+    """
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    # bags of rosbag2 before 2023 carry no message definitions; those of Humble serve
+    try:
+        reader = AnyReader([Path(path) for path in paths], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader.open()
+    except FileNotFoundError as error:
+        raise EpisodeError(f"No such recording: {error}.") from error
+    except Exception as error:  # damaged files fail in many ways inside
+        shown = ", ".join(map(str, paths))
+        raise EpisodeError(f"{shown} is not a readable ROS recording ({type(error).__name__}: {error}).") from error
+    try:
+        yield reader
+    finally:
+        with suppress(Exception):
+            reader.close()
+
+
+def refuse_lone_parts(paths: Sequence[Path]) -> tuple[str, ...]:
+    """Refuse some parts of a split recording without the others.
+
+    Returns:
+        Warnings: files that may be parts, and cannot be read.
+
+    Raises:
+        EpisodeError: names the folder, or the files, to give instead.
+    """
+    warnings: list[str] = []
+    given = {Path(path).resolve() for path in paths}
+    for path in map(Path, paths):
+        if path.is_dir():
+            continue
+        listed = _listed_beside(path)
+        if path.name in listed:
+            if {(path.parent / name).resolve() for name in listed} - given:
+                raise EpisodeError(
+                    f"{path} is one of the {len(listed)} parts of a split recording ({', '.join(listed)}): give the folder "
+                    f"{path.parent} to import all of it."
+                )
+            continue
+        parts, doubtful = _adjoining(path)
+        if {part.resolve() for part in parts} - given:
+            raise EpisodeError(
+                f"{path} is one of the {len(parts)} parts of a split recording, whose times adjoin: give all of them, "
+                f"{' '.join(map(str, parts))}. To import one alone, move it to a folder of its own."
+            )
+        warnings += [
+            f"{other} cannot be read; if it is a part of the same recording as {path.name}, that part is missing."
+            for other in doubtful
+        ]
+    return tuple(dict.fromkeys(warnings))
+
+
+def _listed_beside(path: Path) -> list[str]:
+    """Names of the files of the rosbag2 recording in whose folder a file lies; empty without metadata.yaml."""
+    try:
+        data = yaml.safe_load((path.parent / _METADATA).read_text(encoding="utf-8"))
+        return [PurePath(name).name for name in data["rosbag2_bagfile_information"]["relative_file_paths"]]
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError):
+        return []  # a folder's own damage is reported when the folder is opened
+
+
+def _adjoining(path: Path) -> tuple[list[Path], list[Path]]:
+    """(parts of one recording in their order, `path` among them; unreadable files whose names would fit)."""
+    match = _NUMBERED.fullmatch(path.stem)
+    if match is None:
+        return [path], []
+    number = int(match.group(2))
+    # numbered alike but for the date
+    beside = {
+        int(found.group(2)): other
+        for other in sorted(path.parent.iterdir())
+        if other.suffix == path.suffix
+        and other.is_file()
+        and (found := _NUMBERED.fullmatch(other.stem)) is not None
+        and _DATE.sub("", found.group(1)) == _DATE.sub("", match.group(1))
+    }
+    parts, doubtful = [path], []
+    for step in (-1, 1):
+        last, next_number = _extent(path), number + step
+        while last is not None and next_number in beside:
+            following = _extent(beside[next_number])
+            if following is None:
+                doubtful.append(beside[next_number])
+            elif last.adjoins(following):
+                parts.insert(0 if step < 0 else len(parts), beside[next_number])
+            if following is None or not last.adjoins(following):
+                break
+            last, next_number = following, next_number + step
+    return parts, doubtful
+
+
+@dataclass(frozen=True)
+class _Extent:
+    """What a file covers."""
+
+    start_s: float
+    end_s: float
+    depths: frozenset[str]
+
+    def adjoins(self, other: _Extent) -> bool:
+        near = self.start_s <= other.end_s + _ADJOINING_S and other.start_s <= self.end_s + _ADJOINING_S
+        return near and bool(self.depths & other.depths)  # cameras recorded side by side are no parts
+
+
+def _extent(path: Path) -> _Extent | None:
+    """None for a file that cannot be read."""
+    try:
+        with opened([path]) as reader:
+            depths = frozenset(held.topic for held in reader.connections if is_depth(held.topic, held.msgtype))
+            return _Extent(1e-9 * reader.start_time, 1e-9 * reader.end_time, depths)
+    except EpisodeError:
+        return None

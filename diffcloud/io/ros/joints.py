@@ -1,0 +1,111 @@
+"""The joint log of a ROS recording: joint_states, and the tool's pose from tf."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from diffcloud.errors import EpisodeError
+from diffcloud.io.raw_episodes import RobotLog
+from diffcloud.io.ros.transforms import TransformTree
+
+GRIPPER_JOINT, GRIPPER_CLOSED_RAD = "finger_joint", 0.8
+"""Of a Robotiq 2F-85, in its maker's description."""
+_LATEST_S = 0.5
+"""As with images: a message that is older than one before it by more is of another clock."""
+
+
+def joint_log(
+    where: str,
+    messages: Sequence[tuple[float, Any]],
+    tree: TransformTree,
+    *,
+    world_frame: str,
+    tool_frame: str,
+    joint_names: Sequence[str] | None,
+    gripper_joint: str | None,
+    gripper_closed_rad: float | None,
+) -> tuple[RobotLog, tuple[str, ...]]:
+    """(rows in order of time, warnings about what stays unknown).
+
+    Args:
+        where: the recording, for messages.
+        messages: (time [s], sensor_msgs/JointState), one or more.
+        joint_names: of the arm, in order; None takes joint_1, joint_2, ...
+        gripper_joint: None for an arm without one.
+        gripper_closed_rad: None for that of a Robotiq 2F-85.
+
+    Raises:
+        EpisodeError: a joint of the arm, or the gripper's, is not in joint_states (lists those that are), or the clock was
+            set back.
+    """
+    seen = {name for _, message in messages for name in message.name}
+    if joint_names is None:
+        joint_names = sorted((name for name in seen if re.fullmatch(r"joint_\d+", name)), key=lambda name: int(name[6:]))
+    missing = sorted(set(joint_names) - seen)
+    if not joint_names or missing:
+        raise EpisodeError(
+            f"{where}: joint_states has {', '.join(sorted(seen))}; {missing or 'joint_1, ...'} not among them. Name the "
+            "arm's joints in order with --joint."
+        )
+    rows, angles = _series(where, messages, joint_names)
+    if not len(rows):
+        raise EpisodeError(f"{where}: no message of joint_states has the angles of all of {', '.join(joint_names)}.")
+    warnings: list[str] = []
+    gripper = np.full(len(rows), np.nan)
+    others = sorted(seen - set(joint_names))
+    if gripper_joint is not None and gripper_joint in seen:
+        # often sent by another driver than the arm's joints, in messages of its own
+        times, values = _series(where, messages, [gripper_joint])
+        closed = GRIPPER_CLOSED_RAD if gripper_closed_rad is None else gripper_closed_rad
+        gripper = np.interp(rows, times, values[:, 0]) / closed if len(times) else gripper
+        if gripper_closed_rad is None and gripper_joint != GRIPPER_JOINT:
+            warnings.append(
+                f"The gripper is taken to be closed where {gripper_joint} is {closed:g} rad, as a Robotiq 2F-85 is; say "
+                "where it is with --gripper-closed."
+            )
+    elif gripper_joint is not None and (others or gripper_joint != GRIPPER_JOINT):
+        raise EpisodeError(
+            f"{where}: joint_states has no {gripper_joint!r}, so how far the gripper is open is not known; besides the "
+            f"arm's joints there are {', '.join(others) or 'none'}. Name the gripper's joint with --gripper-joint (and its "
+            "angle when closed with --gripper-closed), or give --gripper-joint none."
+        )
+    elif gripper_joint is not None:
+        warnings.append(
+            "joint_states has only the arm's joints: how far the gripper is open stays unknown, and it is masked as open. "
+            "If the arm has none, --gripper-joint none says so."
+        )
+    position, quaternion = np.full((len(rows), 3), np.nan), np.full((len(rows), 4), np.nan)
+    try:
+        poses = tree.lookup(world_frame, tool_frame, rows)
+    except EpisodeError as error:
+        warnings.append(f"The tool's pose stays unknown: {error}. Name its frames with --tool-frame and --world-frame.")
+    else:
+        position = poses[:, :3, 3]
+        quaternion = np.roll(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), 1, axis=1)
+    return RobotLog(rows, angles, gripper, position, quaternion, np.full((len(rows), 6), np.nan)), tuple(warnings)
+
+
+def _series(
+    where: str, messages: Sequence[tuple[float, Any]], names: Sequence[str]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times [N], each once and in order, and positions [N, J] from the messages that have all of `names`."""
+    held = [(t, dict(zip(message.name, message.position, strict=False))) for t, message in messages]
+    rows = [(t, [at[name] for name in names]) for t, at in held if set(names) <= at.keys()]
+    times = np.array([t for t, _ in rows])
+    values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, len(names))
+    behind = np.maximum.accumulate(times) - times
+    if (behind > _LATEST_S).any():
+        first = int(np.flatnonzero(behind > _LATEST_S)[0])
+        raise EpisodeError(
+            f"{where}: message {first + 1} of joint_states with {names[0]} is stamped {behind[first]:.2f} s before one "
+            "that came earlier. The clock was set back while recording, or two drivers use different clocks: cut the "
+            "recording there."
+        )
+    times, first_of_each = np.unique(times, return_index=True)
+    return times, values[first_of_each]

@@ -1,0 +1,158 @@
+"""What ROS messages hold, of either generation: stamps, depth and colour images, intrinsics.
+
+Depth comes as 16-bit integers in millimetres (16UC1), as 32-bit floats in metres (32FC1), or as a PNG of either in a
+CompressedImage. A PNG has no floats: compressed_depth_image_transport stores inverse depth in 16 bits instead, and how to
+get back in 12 bytes before the PNG (a format number and two floats a, b): depth = a / (value - b), 0 is no measurement.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import EpisodeError
+from diffcloud.io.camera_models import Intrinsics
+from diffcloud.io.images import decode_color, decode_depth
+
+DepthEncoding = Literal["16UC1", "32FC1"]
+DEPTH_UNITS_M: dict[DepthEncoding, float] = {"16UC1": 0.001, "32FC1": 0.00025}
+"""Of the raw episode's 16-bit images. Floats are stored in quarters of a millimetre, up to 16 m."""
+_COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
+_COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
+
+
+def stamp_s(message: Any, arrival_ns: int) -> float:
+    """Time of a message: its own stamp, or its arrival where it has none [s]."""
+    stamp = message.header.stamp
+    seconds = float(stamp.sec + 1e-9 * stamp.nanosec)
+    return seconds if seconds > 0 else 1e-9 * arrival_ns
+
+
+def depth_encoding(message: Any, topic: str) -> DepthEncoding:
+    """What the numbers of an Image or CompressedImage of depth mean.
+
+    Raises:
+        EpisodeError: an encoding or compression that is not read; names it.
+    """
+    if hasattr(message, "encoding"):
+        if message.encoding == "32FC1":
+            return "32FC1"
+        if message.encoding in ("16UC1", "mono16"):
+            return "16UC1"
+        raise EpisodeError(f"{topic} has the encoding {message.encoding!r}; depth is 16UC1, 32FC1 or compressedDepth.")
+    stated, _, compression = (part.strip() for part in message.format.partition(";"))
+    if not _is_compressed_depth(message):
+        # plain images: 16-bit PNG is millimetres, and the decoder refuses all else; floats cannot be in one
+        if stated == "32FC1":
+            raise EpisodeError(f"{topic} has the format {message.format!r}, which loses floats; record compressedDepth.")
+        return "16UC1"
+    codec = compression.removeprefix("compressedDepth").strip()
+    if codec not in ("", "png"):
+        raise EpisodeError(
+            f"{topic} is compressed by {codec!r} (format {message.format!r}); of compressedDepth PNG is read. Record with "
+            "the publisher's parameter format:=png, or republish the topic as raw images."
+        )
+    if stated == "32FC1":
+        return "32FC1"
+    if stated in ("16UC1", "mono16"):
+        return "16UC1"
+    raise EpisodeError(
+        f"{topic} has the format {message.format!r}; compressedDepth must state its encoding first, as in "
+        "'16UC1; compressedDepth png' or '32FC1; compressedDepth png'."
+    )
+
+
+def depth_image(message: Any, topic: str, encoding: DepthEncoding) -> NDArray[np.uint16]:
+    """Depth [H, W] in the unit of its encoding (`DEPTH_UNITS_M`); 0 is no measurement, or beyond 16 bits.
+
+    Args:
+        encoding: of the topic's first message, which fixes the unit for all.
+
+    Raises:
+        EpisodeError: damaged, or of another encoding.
+    """
+    own = depth_encoding(message, topic)
+    if own != encoding:
+        raise EpisodeError(f"{topic} changes its encoding from {encoding} to {own} within the recording; import the parts.")
+    if hasattr(message, "encoding"):
+        values = _pixels(message, np.dtype(np.uint16 if own == "16UC1" else np.float32))[..., 0]
+        return values.astype(np.uint16) if own == "16UC1" else _in_units(values, DEPTH_UNITS_M[own])
+    data = bytes(message.data)
+    if not _is_compressed_depth(message):
+        return decode_depth(data, topic)
+    size = _COMPRESSED_DEPTH_HEADER.size
+    if len(data) <= size:
+        raise EpisodeError(f"A compressedDepth image of {topic} has {len(data)} bytes; the recording is damaged.")
+    values = decode_depth(data[size:], topic)
+    if own == "16UC1":
+        return values
+    _, a, b = _COMPRESSED_DEPTH_HEADER.unpack(data[:size])
+    if not (np.isfinite([a, b]).all() and a > 0):
+        raise EpisodeError(f"A 32FC1 compressedDepth image of {topic} has the quantisation {a:g}, {b:g}: it is damaged.")
+    inverse = np.where(values > 0, values.astype(np.float64) - b, np.nan)
+    with np.errstate(divide="ignore"):
+        return _in_units(a / inverse, DEPTH_UNITS_M[own])
+
+
+def color_image(message: Any, topic: str) -> NDArray[np.uint8]:
+    """Colour [H, W, 3] red, green, blue.
+
+    Raises:
+        EpisodeError: damaged, or of an encoding that is not read.
+    """
+    if not hasattr(message, "encoding"):
+        return decode_color(bytes(message.data), topic)
+    if message.encoding not in _COLOR_CHANNELS:
+        raise EpisodeError(f"{topic} has the encoding {message.encoding!r}; colour is {', '.join(_COLOR_CHANNELS)}.")
+    return np.ascontiguousarray(_pixels(message, np.dtype(np.uint8))[..., _COLOR_CHANNELS[message.encoding]])
+
+
+def camera_intrinsics(message: Any, name: str) -> Intrinsics:
+    """Of a CameraInfo message.
+
+    Raises:
+        EpisodeError: a lens model that is not read, or numbers that no camera has.
+    """
+    # ROS 1 writes D and K, ROS 2 d and k
+    matrix = np.asarray(message.k if hasattr(message, "k") else message.K, dtype=np.float64).reshape(3, 3)
+    lens = [float(value) for value in (message.d if hasattr(message, "d") else message.D)]
+    distorted = any(lens)
+    if message.distortion_model not in ("", "plumb_bob") and distorted:
+        raise EpisodeError(f"Camera {name} has the distortion model {message.distortion_model!r}; plumb_bob is read.")
+    return Intrinsics(
+        message.width,
+        message.height,
+        float(matrix[0, 0]),
+        float(matrix[1, 1]),
+        float(matrix[0, 2]),
+        float(matrix[1, 2]),
+        "brown_conrady" if distorted else "none",
+        tuple((lens + [0.0] * 5)[:5]) if distorted else (),
+    )
+
+
+def _is_compressed_depth(message: Any) -> bool:
+    return "compressedDepth" in message.format
+
+
+def _in_units(metres: NDArray[Any], unit_m: float) -> NDArray[np.uint16]:
+    """Rounded to whole units; what is not finite, not in front of the camera or beyond 16 bits is no measurement."""
+    known = np.isfinite(metres) & (metres > 0) & (metres < 65535.5 * unit_m)
+    return np.where(known, np.rint(np.where(known, metres, 0) / unit_m), 0).astype(np.uint16)
+
+
+def _pixels(message: Any, kind: np.dtype[Any]) -> NDArray[Any]:
+    """[H, W, C] of an Image message; rows may be padded, bytes may be swapped."""
+    kind = kind.newbyteorder(">" if message.is_bigendian else "<")
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    if len(data) != message.height * message.step or message.step < message.width * kind.itemsize:
+        raise EpisodeError(
+            f"An image of {message.width} x {message.height} has {len(data)} bytes; the recording is damaged."
+        )
+    rows = data.reshape(message.height, message.step)
+    channels = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}.get(message.encoding, 1)
+    used = np.ascontiguousarray(rows[:, : message.width * channels * kind.itemsize])
+    return used.view(kind).reshape(message.height, message.width, channels)

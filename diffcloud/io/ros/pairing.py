@@ -1,0 +1,105 @@
+"""Which image of a ROS camera comes when, and which colour image belongs to which depth image.
+
+All stamps are known before the first image is written: messages that arrived out of order are sorted, a clock that was
+set back is refused, and each depth image gets the colour image nearest to it in time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import EpisodeError
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_LATEST_S = 0.5
+"""Networks deliver a message so much later than a younger one; more than that is another clock."""
+_PAIR_S = (0.02, 0.05)
+"""Least and greatest tolerance between colour and depth: the cloth's edge may have moved by centimetres after more."""
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """The frames of one camera in order of time."""
+
+    times: Floats
+    """[T] of depth [s]."""
+    depths: Integers
+    """[T] number of the depth message, in order of arrival."""
+    colors: Integers
+    """[T] number of the colour message; -1 for none."""
+    warnings: tuple[str, ...]
+
+
+def pair(camera: str, depth_topic: str, depth_s: Sequence[float], color_s: Sequence[float] | None) -> Pairing:
+    """Sort depth images and give each its colour image.
+
+    The tolerance is half a frame interval of the slower stream (no colour image can be asked to be nearer), within
+    20 and 50 ms.
+
+    Args:
+        depth_s: stamps in order of arrival [s].
+        color_s: of the colour images that are aligned to depth; None without any.
+
+    Raises:
+        EpisodeError: a stamp lies more than half a second before an earlier message's; names topic and message.
+    """
+    warnings: list[str] = []
+    stamps = np.array(depth_s)
+    depths, late = _sorted(depth_topic, stamps)
+    if late:
+        warnings.append(f"Camera {camera}: {late} of {len(stamps)} depth images arrived out of order; they were sorted.")
+    if len(depths) < len(stamps):
+        warnings.append(
+            f"Camera {camera}: {len(stamps) - len(depths)} of {len(stamps)} depth images have the stamp of another; only "
+            "the first of each was taken."
+        )
+    times = stamps[depths]
+    colors = np.full(len(depths), -1)
+    if color_s is not None and not len(color_s):
+        warnings.append(f"Camera {camera}: its colour topic has no message, so no frame has colour.")
+    elif color_s is not None:
+        tolerance = _tolerance_s(times, np.sort(np.array(color_s)))
+        order = np.argsort(color_s, kind="stable")
+        clock = np.array(color_s)[order]
+        after = np.searchsorted(clock, times).clip(0, len(clock) - 1)
+        before = (after - 1).clip(0)
+        nearest = np.where(np.abs(clock[before] - times) < np.abs(clock[after] - times), before, after)
+        off = np.abs(clock[nearest] - times)
+        colors = np.where(off <= tolerance, order[nearest], -1)
+        lost = colors < 0
+        if lost.any():
+            warnings.append(
+                f"Camera {camera}: {int(lost.sum())} of {len(times)} frames have no colour. The nearest colour image is "
+                f"{1000 * np.median(off[lost]):.0f} ms away (median), and {1000 * tolerance:.0f} ms are allowed (half a "
+                f"frame interval, between {1000 * _PAIR_S[0]:.0f} and {1000 * _PAIR_S[1]:.0f}): the streams were not "
+                "synchronised, or images were lost."
+            )
+    return Pairing(times, depths, colors, tuple(warnings))
+
+
+def _sorted(topic: str, stamps: Floats) -> tuple[Integers, int]:
+    """(messages in order of their stamps, each stamp once; how many arrived after a younger one)."""
+    youngest = np.maximum.accumulate(stamps)
+    behind = youngest - stamps
+    worst = int(behind.argmax())
+    if behind[worst] > _LATEST_S:
+        first = int(np.flatnonzero(behind > _LATEST_S)[0])
+        raise EpisodeError(
+            f"{topic}: message {first + 1} is stamped {behind[first]:.2f} s before one that came earlier "
+            f"({stamps[first]:.6f} s after {youngest[first]:.6f} s). The clock was set back while recording, or a "
+            "recording was played into this one: cut the recording there, and import the pieces."
+        )
+    order = np.argsort(stamps, kind="stable")
+    once = np.concatenate([[True], np.diff(stamps[order]) > 0])
+    return order[once], int((behind > 0).sum())
+
+
+def _tolerance_s(depth: Floats, color: Floats) -> float:
+    intervals = [float(np.median(np.diff(times))) for times in (depth, color) if len(times) > 1]
+    return float(np.clip(0.5 * max(intervals, default=0.0), *_PAIR_S))

@@ -1,0 +1,283 @@
+"""Recordings of ROS, without ROS: rosbag1 files, rosbag2 folders and files, MCAP.
+
+A recording is read twice. The first pass takes everything but the pixels: which topics there are, stamps, intrinsics, tf
+and joints. So whatever is wrong with them is said before anything is written. The second pass takes the images.
+
+Colour goes into a raw episode only where it shares depth's pixels. Unaligned colour could be looked up through the
+cameras' extrinsics, but where the colour camera sees something else in front, or depth has a hole, the wrong colour would
+come: it is left out, with a warning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import EpisodeError
+from diffcloud.io.camera_models import Intrinsics
+from diffcloud.io.raw_episodes import CameraInfo
+from diffcloud.io.recordings import RecordedFrame, Recording
+from diffcloud.io.ros.files import opened, refuse_lone_parts
+from diffcloud.io.ros.joints import GRIPPER_JOINT, joint_log
+from diffcloud.io.ros.messages import (
+    DEPTH_UNITS_M,
+    DepthEncoding,
+    camera_intrinsics,
+    color_image,
+    depth_encoding,
+    depth_image,
+    stamp_s,
+)
+from diffcloud.io.ros.pairing import Pairing, pair
+from diffcloud.io.ros.topics import CAMERA_INFO, CameraTopics, aligned_by_name, depth_cameras, info_topic, same_camera
+from diffcloud.io.ros.transforms import TransformTree
+
+_JOINTS = "sensor_msgs/msg/JointState"
+_TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+
+def ros_recording(
+    *paths: Path,
+    world_frame: str = "base_link",
+    tool_frame: str = "tool_frame",
+    joint_names: list[str] | None = None,
+    gripper_joint: str | None = GRIPPER_JOINT,
+    gripper_closed_rad: float | None = None,
+) -> Recording:
+    """A recording of ROS; images are read lazily.
+
+    Args:
+        paths: one file or rosbag2 folder, or all parts of a split recording.
+        world_frame, tool_frame: tf frames; poses that tf does not have stay open, with a warning.
+        joint_names: of the arm, in order; None takes joint_1, joint_2, ... of joint_states.
+        gripper_joint: its angle becomes 0 (open, at 0) to 1 (closed). None: the arm has no gripper.
+        gripper_closed_rad: that angle when closed; None takes that of a Robotiq 2F-85.
+
+    Raises:
+        EpisodeError: unreadable, one part of a split recording, without depth and camera_info, stamps that run backwards,
+            or without the named joints; lists what there is.
+    """
+    split = refuse_lone_parts(paths)
+    shown = ", ".join(path.name for path in map(Path, paths))
+    scan = _scan(paths, shown)
+    tree = TransformTree(scan.transforms)
+    cameras: dict[str, CameraInfo] = {}
+    sources: dict[str, _Source] = {}
+    warnings = [*split]
+    for name, topics in scan.cameras.items():
+        info, depth = scan.infos.get(topics.info), scan.images.get(topics.depth)
+        if info is None or depth is None:
+            raise EpisodeError(f"{shown}: camera {name} has no message on {topics.info} or {topics.depth}.")
+        color, why_not = _aligned_color(scan, topics)
+        warnings += why_not
+        pairing = pair(name, topics.depth, depth.stamps, None if color is None else scan.images[color].stamps)
+        warnings += pairing.warnings
+        assert depth.encoding is not None  # of every depth topic
+        sources[name] = _Source(topics.depth, color, depth.encoding, pairing)
+        place = None
+        try:
+            place = tree.fixed(world_frame, info.header.frame_id or depth.frame)
+        except EpisodeError as error:
+            warnings.append(
+                f"Camera {name}: its place stays open, as {error}. Name the robot's base with --world-frame, or calibrate."
+            )
+        intrinsics = camera_intrinsics(info, name)
+        cameras[name] = CameraInfo(name, f"ros{topics.depth}", intrinsics, DEPTH_UNITS_M[depth.encoding], place)
+    robot = None
+    if scan.joints:
+        robot, unknown = joint_log(
+            shown,
+            scan.joints,
+            tree,
+            world_frame=world_frame,
+            tool_frame=tool_frame,
+            joint_names=joint_names,
+            gripper_joint=gripper_joint,
+            gripper_closed_rad=gripper_closed_rad,
+        )
+        warnings += unknown
+    return Recording(cameras, _frames(paths, sources), f"ros recording {shown}", robot, tuple(warnings))
+
+
+@dataclass
+class _Images:
+    """What the first pass keeps of a topic with images."""
+
+    frame: str
+    """tf frame of the first message."""
+    size: tuple[int, int] | None
+    """(width, height) of the first colour image; of depth camera_info says it."""
+    encoding: DepthEncoding | None
+    """Of the first depth image; None for colour."""
+    stamps: list[float] = field(default_factory=list)
+    """In order of arrival [s]."""
+
+
+@dataclass
+class _Scan:
+    """Everything but the pixels."""
+
+    topics: Mapping[str, str]
+    cameras: Mapping[str, CameraTopics]
+    infos: dict[str, Any] = field(default_factory=dict)
+    images: dict[str, _Images] = field(default_factory=dict)
+    joints: list[tuple[float, Any]] = field(default_factory=list)
+    transforms: list[tuple[float, Any]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Where the images of a camera come from."""
+
+    depth: str
+    color: str | None
+    encoding: DepthEncoding
+    pairing: Pairing
+
+
+def _scan(paths: Sequence[Path], shown: str) -> _Scan:
+    with opened(paths) as reader:
+        topics = {held.topic: held.msgtype for held in reader.connections}
+        scan = _Scan(topics, depth_cameras(topics, shown))
+        depths = {camera.depth for camera in scan.cameras.values()}
+        images = depths | {topic for camera in scan.cameras.values() for topic in camera.colors}
+        wanted = [
+            held for held in reader.connections if held.topic in images or held.msgtype in (CAMERA_INFO, _JOINTS, *_TF)
+        ]
+        for connection, arrival, raw in reader.messages(wanted):
+            topic, kind = connection.topic, connection.msgtype
+            message = reader.deserialize(raw, kind)
+            if kind in _TF:
+                scan.transforms += [(stamp_s(item, arrival), item) for item in message.transforms]
+            elif kind == _JOINTS:
+                scan.joints.append((stamp_s(message, arrival), message))
+            elif kind == CAMERA_INFO:
+                scan.infos.setdefault(topic, message)
+            else:
+                if topic not in scan.images:
+                    scan.images[topic] = _first_image(message, topic, is_depth=topic in depths)
+                scan.images[topic].stamps.append(stamp_s(message, arrival))
+    return scan
+
+
+def _first_image(message: Any, topic: str, *, is_depth: bool) -> _Images:
+    if is_depth:
+        return _Images(message.header.frame_id, None, depth_encoding(message, topic))
+    height, width = color_image(message, topic).shape[:2]
+    return _Images(message.header.frame_id, (width, height), None)
+
+
+def _aligned_color(scan: _Scan, camera: CameraTopics) -> tuple[str | None, list[str]]:
+    """(the camera's colour topic whose pixels are those of depth, warnings if there is colour but none such)."""
+    why_not = {}
+    for topic in camera.colors:
+        if topic not in scan.images:
+            continue  # announced, but never sent
+        reason = _unaligned(scan, camera, topic)
+        if reason is None:
+            return topic, []
+        why_not[topic] = reason
+    if not why_not:
+        return None, []
+    return None, [
+        f"Camera {camera.name}: colour is left out, as it is not aligned to {camera.depth}: "
+        + "; ".join(f"{topic} {reason}" for topic, reason in why_not.items())
+        + ". Record depth aligned to colour (with realsense2_camera align_depth.enable:=true), or play the recording "
+        "through depth_image_proc's register node."
+    ]
+
+
+def _unaligned(scan: _Scan, camera: CameraTopics, color: str) -> str | None:
+    """Why the pixels of a colour image are not those of depth; None if they are."""
+    images, depth_info = scan.images[color], scan.infos[camera.info]
+    size = (depth_info.width, depth_info.height)
+    if images.size != size:
+        assert images.size is not None  # of every colour topic
+        return f"has {images.size[0]} x {images.size[1]} pixels, depth {size[0]} x {size[1]}"
+    if aligned_by_name(camera.depth) and same_camera(camera.depth, color):
+        return None
+    frames = [scan.images[topic].frame.strip("/") for topic in (color, camera.depth)]
+    if frames[0] != frames[1]:
+        return f"is seen from the tf frame {frames[0]!r}, depth from {frames[1]!r}"
+    held = scan.infos.get(info_topic(color, scan.topics) or "")
+    if held is None:
+        return "has no camera_info that would show that it shares depth's intrinsics"
+    depth = camera_intrinsics(depth_info, camera.name)
+    try:
+        own = camera_intrinsics(held, color)
+    except EpisodeError as error:
+        return f"has intrinsics that cannot be compared ({error})"
+    return None if _equal(own, depth) else f"has {_brief(own)}, depth {_brief(depth)}"
+
+
+def _brief(held: Intrinsics) -> str:
+    return f"f {held.fx:.1f}, c ({held.cx:.1f}, {held.cy:.1f})"
+
+
+def _equal(first: Intrinsics, second: Intrinsics) -> bool:
+    """Whether both say the same; the last digits may be rounded."""
+    one, other = (
+        [held.width, held.height, held.fx, held.fy, held.cx, held.cy, *(held.coefficients or (0.0,) * 5)]
+        for held in (first, second)
+    )
+    return bool(np.allclose(one, other, rtol=1e-4, atol=1e-4))
+
+
+def _frames(paths: Sequence[Path], sources: Mapping[str, _Source]) -> Iterator[RecordedFrame]:
+    """Frames of each camera in order of time, each with its colour image."""
+    cameras = {name: _Assembly(name, source) for name, source in sources.items()}
+    by_topic: dict[str, _Assembly] = {}
+    for name, source in sources.items():
+        by_topic |= {topic: cameras[name] for topic in (source.depth, source.color) if topic is not None}
+    with opened(paths) as reader:
+        for connection, _, raw in reader.messages([held for held in reader.connections if held.topic in by_topic]):
+            camera = by_topic[connection.topic]
+            camera.take(connection.topic, reader.deserialize(raw, connection.msgtype))
+            yield from camera.finished()
+
+
+class _Assembly:
+    """Puts one camera's frames together; holds images only until their frame is whole and its turn has come."""
+
+    def __init__(self, name: str, source: _Source) -> None:
+        self._name, self._source = name, source
+        self._rank = {int(number): rank for rank, number in enumerate(source.pairing.depths)}
+        self._uses = {
+            int(number): int(count)
+            for number, count in zip(*np.unique(source.pairing.colors, return_counts=True), strict=True)
+        }
+        self._seen = {"depth": 0, "color": 0}
+        self._depths: dict[int, NDArray[np.uint16]] = {}
+        self._colors: dict[int, NDArray[np.uint8]] = {}
+        self._next = 0
+
+    def take(self, topic: str, message: Any) -> None:
+        """The next message of either topic."""
+        kind = "depth" if topic == self._source.depth else "color"
+        number = self._seen[kind]
+        self._seen[kind] += 1
+        if kind == "depth" and number in self._rank:
+            self._depths[self._rank[number]] = depth_image(message, topic, self._source.encoding)
+        elif kind == "color" and number in self._uses:
+            self._colors[number] = color_image(message, topic)
+
+    def finished(self) -> Iterator[RecordedFrame]:
+        """Frames whose images have come and whose predecessors are gone."""
+        pairing = self._source.pairing
+        while self._next in self._depths:
+            number = int(pairing.colors[self._next])
+            if number >= 0 and number not in self._colors:
+                return
+            color = None
+            if number >= 0:
+                color = self._colors[number]
+                self._uses[number] -= 1
+                if not self._uses[number]:
+                    del self._colors[number]
+            yield RecordedFrame(self._name, float(pairing.times[self._next]), self._depths.pop(self._next), color)
+            self._next += 1

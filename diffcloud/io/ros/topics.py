@@ -1,0 +1,173 @@
+"""Which topics of a ROS recording belong to which depth camera.
+
+Topics name camera and content by habit only: `/overhead/aligned_depth_to_color/image_raw`, `/lab/side/depth/image_raw`,
+`/side_depth/image`. What is left of a topic without the words for its content is its camera.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from diffcloud.errors import EpisodeError
+
+IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+
+_CONTENT = {
+    *("image", "images", "raw", "rect", "rectified", "compressed", "compresseddepth"),
+    *("depth", "color", "colour", "rgb", "aligned", "to", "registered", "hw", "sw", "float"),
+}
+"""Words of topics that say what is in them, not whose it is."""
+_HOLDERS = {"camera", "cameras", "cam", "cams"}
+"""Folders that say only that cameras are in them, or that this is one."""
+
+Key = tuple[str, ...]
+"""The parts of a topic that name its camera."""
+
+
+@dataclass(frozen=True)
+class CameraTopics:
+    """Topics of one depth camera."""
+
+    name: str
+    depth: str
+    info: str
+    """camera_info of depth."""
+    colors: tuple[str, ...]
+    """Colour images of the same camera, likeliest first; whether they are aligned to depth is another question."""
+
+
+def is_depth(topic: str, kind: str) -> bool:
+    """Whether a topic holds depth images."""
+    return kind in (IMAGE, COMPRESSED_IMAGE) and _content(topic) == "depth"
+
+
+def aligned_by_name(depth_topic: str) -> bool:
+    """Whether the topic itself says that its depth is aligned to the colour image."""
+    topic = depth_topic.lower()
+    other = re.search(r"depth_to_([a-z]+)", topic)
+    if other is not None:  # not to an infrared imager
+        return other.group(1) in ("color", "colour", "rgb")
+    return "align" in topic or "registered" in topic
+
+
+def same_camera(first: str, second: str) -> bool:
+    """Whether two topics name the same camera, as far as they name one."""
+    return _without_holders(_key(first)) == _without_holders(_key(second))
+
+
+def info_topic(image_topic: str, topics: Mapping[str, str]) -> str | None:
+    """The nearest camera_info beside an image topic or above it."""
+    folder = image_topic
+    while "/" in folder:
+        folder = folder.rsplit("/", 1)[0]
+        if topics.get(f"{folder}/camera_info") == CAMERA_INFO:
+            return f"{folder}/camera_info"
+    return None
+
+
+def depth_cameras(topics: Mapping[str, str], where: str) -> dict[str, CameraTopics]:
+    """All depth cameras of a recording, by name; of several depth topics of one camera, the one aligned to colour.
+
+    Args:
+        topics: message type by topic.
+        where: the recording, for messages.
+
+    Raises:
+        EpisodeError: no depth topic, no camera_info beside one, or one camera_info beside the depth of two cameras.
+    """
+    depths: dict[Key, str] = {}
+    for _, topic in sorted((_preference(topic, kind), topic) for topic, kind in topics.items() if is_depth(topic, kind)):
+        depths.setdefault(_key(topic), topic)
+    if not depths:
+        raise EpisodeError(f"{where} has no depth image topic; its topics are {', '.join(sorted(topics)) or 'none'}.")
+    infos: dict[str, str] = {}
+    for topic in depths.values():
+        info = info_topic(topic, topics)
+        if info is None:
+            raise EpisodeError(f"{where} has no camera_info beside {topic}; record it, the intrinsics are in it.")
+        if info in infos:
+            raise EpisodeError(
+                f"{where} has one camera_info, {info}, for two cameras ({infos[info]} and {topic}): whose intrinsics it "
+                "states cannot be told. Record a camera_info beside the depth of each camera."
+            )
+        infos[info] = topic
+    colors = _colors(topics, list(depths))
+    names = _names(list(depths))
+    found = {
+        name: CameraTopics(name, depths[key], info, colors[key])
+        for key, name, info in zip(depths, names, infos, strict=True)
+    }
+    return dict(sorted(found.items()))
+
+
+def _preference(topic: str, kind: str) -> tuple[bool, bool, bool]:
+    """Sorts aligned before not aligned, images as they are before compressed ones."""
+    return not aligned_by_name(topic), kind != IMAGE, "compressedDepth" not in topic
+
+
+def _content(topic: str) -> str | None:
+    """depth, color, or neither: the last part of a topic that says so, as a depth camera has colour images too."""
+    for part in reversed(topic.lower().split("/")):
+        if "depth" in part:
+            return "depth"
+        if re.search("colou?r|rgb", part):
+            return "color"
+    return None
+
+
+def _key(topic: str) -> Key:
+    """The topic's parts without the words for its content; empty where nothing else is left."""
+    kept = []
+    for part in topic.strip("/").split("/"):
+        # aligned to an infrared imager is no camera of that name
+        words = re.sub(r"depth_to_[a-z0-9]+", "depth", part, flags=re.IGNORECASE).split("_")
+        rest = "_".join(word for word in words if word.lower() not in _CONTENT)
+        if rest:
+            kept.append(rest)
+    return tuple(kept)
+
+
+def _without_holders(key: Key) -> Key:
+    return tuple(part for part in key if part.lower() not in _HOLDERS)
+
+
+def _names(keys: list[Key]) -> list[str]:
+    """A plain name for each camera: as few parts of its topic as tell the cameras apart."""
+    named = [_without_holders(key) or key for key in keys]
+    if len(set(named)) < len(named):
+        named = keys
+    if len(named) == 1:
+        return [named[0][-1] if named[0] else "depth"]
+    first = next((index for index, parts in enumerate(zip(*named, strict=False)) if len(set(parts)) > 1), None)
+    if first is not None and len({parts[first] for parts in named}) == len(named):
+        return [parts[first] for parts in named]
+    return ["_".join(parts) or "depth" for parts in named]
+
+
+def _colors(topics: Mapping[str, str], cameras: list[Key]) -> dict[Key, tuple[str, ...]]:
+    """Colour topics of each camera: those whose topics share more with it than with any other camera."""
+    found: dict[Key, list[tuple[int, str]]] = {camera: [] for camera in cameras}
+    for topic, kind in topics.items():
+        if kind not in (IMAGE, COMPRESSED_IMAGE) or _content(topic) != "color":
+            continue
+        shared = {camera: _shared(_key(topic), camera) for camera in cameras}
+        nearest = [camera for camera, count in shared.items() if count == max(shared.values())]
+        if len(nearest) == 1 and (shared[nearest[0]] > 0 or not _key(topic) or not nearest[0]):
+            found[nearest[0]].append((len(_key(topic)), topic))
+    return {
+        camera: tuple(topic for _, topic in sorted(held, key=lambda entry: (entry[0], topics[entry[1]] != IMAGE, entry[1])))
+        for camera, held in found.items()
+    }
+
+
+def _shared(first: Key, second: Key) -> int:
+    """How many leading parts two keys have in common."""
+    count = 0
+    for one, other in zip(first, second, strict=False):
+        if one != other:
+            break
+        count += 1
+    return count

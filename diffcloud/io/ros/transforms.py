@@ -1,0 +1,128 @@
+"""tf: where frames stand in each other over time.
+
+Each frame has one parent, so frames form a tree (or several). A camera and the robot's base may both hang from a third
+frame such as `world`: the way from one to the other goes up to the nearest frame above both, and down again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from diffcloud.errors import EpisodeError
+
+Floats = NDArray[np.float64]
+
+_MOVED_M, _MOVED_RAD = 0.002, np.deg2rad(0.2)
+"""A camera that moves by more does not stand."""
+_LOOKED_AT = 1000
+"""Times at most."""
+
+
+@dataclass(frozen=True)
+class _Edge:
+    """A frame in its parent."""
+
+    parent: str
+    stamps: Floats
+    """[N] in order [s]."""
+    matrices: Floats
+    """[N, 4, 4]."""
+
+    def at(self, times: Floats) -> Floats:
+        """[T, 4, 4] at the nearest stamps."""
+        after = np.searchsorted(self.stamps, times).clip(0, len(self.stamps) - 1)
+        before = (after - 1).clip(0)
+        nearest = np.where(np.abs(self.stamps[before] - times) < np.abs(self.stamps[after] - times), before, after)
+        return self.matrices[nearest]
+
+
+class TransformTree:
+    """All transforms of a recording.
+
+    Args:
+        transforms: (time [s], geometry_msgs/TransformStamped).
+    """
+
+    def __init__(self, transforms: list[tuple[float, Any]]) -> None:
+        grouped: dict[str, list[tuple[float, Any]]] = {}
+        for t, item in transforms:
+            grouped.setdefault(_plain(item.child_frame_id), []).append((t, item))
+        self._edges: dict[str, _Edge] = {}
+        self._doubtful: dict[str, list[str]] = {}
+        for child, entries in grouped.items():
+            parents = sorted({_plain(item.header.frame_id) for _, item in entries})
+            if len(parents) > 1:
+                self._doubtful[child] = parents
+                continue
+            entries.sort(key=lambda entry: entry[0])
+            moves = [item.transform for _, item in entries]
+            matrices = np.tile(np.eye(4), (len(moves), 1, 1))
+            turns = [[move.rotation.x, move.rotation.y, move.rotation.z, move.rotation.w] for move in moves]
+            matrices[:, :3, :3] = Rotation.from_quat(np.array(turns)).as_matrix()
+            matrices[:, :3, 3] = [[move.translation.x, move.translation.y, move.translation.z] for move in moves]
+            self._edges[child] = _Edge(parents[0], np.array([t for t, _ in entries]), matrices)
+
+    def lookup(self, target: str, source: str, times: Floats) -> Floats:
+        """[T, 4, 4] that maps points of `source` to `target` at times [T], each edge at its nearest stamp.
+
+        Raises:
+            EpisodeError: tf does not connect them, or puts a frame on the way into two others.
+        """
+        up, down = self._way(target, source)
+        return np.linalg.inv(self._chain(down, times)) @ self._chain(up, times)
+
+    def fixed(self, target: str, source: str) -> Floats:
+        """[4, 4] that maps points of `source` to `target` for good.
+
+        Raises:
+            EpisodeError: as `lookup`, or `source` moves in `target`.
+        """
+        stamps = [self._edges[frame].stamps for way in self._way(target, source) for frame in way]
+        times = np.unique(np.concatenate([np.zeros(1), *stamps]))
+        poses = self.lookup(target, source, times[:: 1 + len(times) // _LOOKED_AT])
+        turns = Rotation.from_matrix(poses[:, :3, :3]) * Rotation.from_matrix(poses[0, :3, :3]).inv()
+        moved, turned = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max(), turns.magnitude().max()
+        if moved > _MOVED_M or turned > _MOVED_RAD:
+            raise EpisodeError(
+                f"in tf {_plain(source)!r} moves in {_plain(target)!r}, by {1000 * moved:.0f} mm and "
+                f"{np.rad2deg(turned):.1f} degrees"
+            )
+        return np.asarray(poses[0])
+
+    def _way(self, target: str, source: str) -> tuple[list[str], list[str]]:
+        """Frames from `source`, and from `target`, up to below the nearest frame above both."""
+        up, down = self._above(source), self._above(target)
+        common = next((frame for frame in up if frame in down), None)
+        if common is None:
+            for frame in (up[-1], down[-1]):
+                if frame in self._doubtful:
+                    parents = " and ".join(map(repr, self._doubtful[frame]))
+                    raise EpisodeError(f"tf puts {frame!r} into both {parents}, and which of them holds cannot be told")
+            frames = sorted({*self._edges, *(edge.parent for edge in self._edges.values())})
+            known = f"its frames are {', '.join(frames)}" if frames else "the recording has none"
+            raise EpisodeError(f"tf does not connect {_plain(source)!r} with {_plain(target)!r}; {known}")
+        return up[: up.index(common)], down[: down.index(common)]
+
+    def _above(self, frame: str) -> list[str]:
+        """The frame, its parent, and so on up to the root."""
+        found = [_plain(frame)]
+        while found[-1] in self._edges and self._edges[found[-1]].parent not in found:
+            found.append(self._edges[found[-1]].parent)
+        return found
+
+    def _chain(self, frames: list[str], times: Floats) -> Floats:
+        """[T, 4, 4] that maps points of frames[0] to the parent of the last; each is the child of the next."""
+        result = np.tile(np.eye(4), (len(times), 1, 1))
+        for frame in frames:
+            result = self._edges[frame].at(times) @ result
+        return result
+
+
+def _plain(frame: str) -> str:
+    """ROS 1 allows a leading slash."""
+    return frame.strip("/")

@@ -1,0 +1,43 @@
+"""Tables as the templates draw them: plain text, with numbers to sort by."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell."""
+
+    text: str
+    sort: float | None = None
+    """What the column sorts by, if that is not the text."""
+    note: str = ""
+    """Below, smaller."""
+    strong: bool = False
+    episode: int | None = None
+    """Links to the overlay of this episode."""
+
+
+UNKNOWN = Cell("–")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Headings, and rows of as many cells."""
+
+    heads: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+
+def table(heads: Iterable[str], rows: Iterable[Iterable[Cell]]) -> Table:
+    """A table of any iterables."""
+    return Table(tuple(heads), tuple(tuple(row) for row in rows))
+
+
+def number(value: float | None, digits: int, *, factor: float = 1.0, unit: str = "", note: str = "") -> Cell:
+    """A number times `factor`, with a unit; a dash where there is none."""
+    if value is None or value != value:
+        return UNKNOWN
+    return Cell(f"{factor * value:.{digits}f}{unit}", sort=value, note=note)

@@ -1,0 +1,309 @@
+"""Whether a calibration may be used, and what is suspected where it may not.
+
+Lengths come from three sources: the arm (how far the board moved), the board (its squares, as entered, seen through the
+focal length), and depth. A source that is wrong disagrees with the others, each in a way of its own:
+
+    wrong          size of the board by the arm   focal length by the arm   depth over the board's
+    square size    off                            right                     off by as much, in all cameras
+    arm's scale    off                            right                     right
+    focal length   right                          off, in this camera       off by as much, in this camera
+    depth scale    right                          right                     off, in this camera
+
+An *objection* is a reason not to use the calibration; a *warning* is about something that leaves the cameras' places right.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from diffcloud.errors import CalibrationError
+from diffcloud.sensing.calibration.chain import Estimate
+from diffcloud.sensing.calibration.charuco import CameraViews, board_in_camera
+
+Floats = NDArray[np.float64]
+Remark = tuple[Literal["warning", "objection"], str]
+
+FEWEST_POSES = 5
+"""Fewer cannot be solved for."""
+HELD_OUT_POSES = 10
+"""Fewer give no held-out error to rely on. Simulated with an arm that is off by 1 mm and 0.2 degrees at each pose, nine in
+ten cameras that were calibrated at five poses stood 6 to 28 mm out of place, at held-out errors of 2 to 5 mm."""
+ADVISED_POSES = 15
+LARGEST_ERROR_MM = 10.0
+"""Held out."""
+_LONGEST_REACH_M = 3.0
+"""No arm of this kind reaches farther."""
+_LARGEST_TURN_DEG = 5.0
+"""Between how arm and board turn, median over pairs of poses; right ones differ by tenths."""
+_HINT, _WRONG = 0.01, 0.02
+"""Two per cent at a metre are 20 mm of depth, and a board that is wrong by as much moves a camera by 13 mm."""
+_SURE = 4.0
+"""Standard deviations; ten poses estimate those themselves only roughly."""
+_SMALLEST_DEVIATION = 0.003
+"""Of a focal length; that depth follows it exactly holds only for a board that faces the camera."""
+_CHECKERBOARD_WRONG = 0.05
+"""Of the board's size. One placement does not tell board from camera; 20 cm before or behind the board, where cloth is
+recorded, this is the 10 mm that are allowed elsewhere."""
+
+
+@dataclass(frozen=True)
+class CameraEvidence:
+    """What is known of one camera's calibration."""
+
+    poses: int
+    held_out_poses: int
+    rms_px: float | None
+    """On held-out poses; None without any."""
+    rms_mm: float | None
+    rms_fit_px: float
+    """On the poses that were fitted."""
+    rms_fit_mm: float
+    focal_px: float
+    """As entered."""
+    focal: Estimate
+    """By the arm, over the entered one."""
+    depth_ratio: float | None
+    """Measured depth over that of the board as entered; None without depth."""
+
+    def residuals(self) -> dict[str, float]:
+        """For the calibration file."""
+        optional = {"rms_px": self.rms_px, "rms_mm": self.rms_mm, "depth_scale": self.depth_ratio}
+        return {
+            **{key: value for key, value in optional.items() if value is not None},
+            "rms_fit_px": self.rms_fit_px,
+            "rms_fit_mm": self.rms_fit_mm,
+            "poses": float(self.poses),
+            "held_out_poses": float(self.held_out_poses),
+            "focal_scale": self.focal.value,
+        }
+
+
+@dataclass(frozen=True)
+class CheckerboardEvidence:
+    """What is known of a registration by a checkerboard."""
+
+    corners: int
+    held_out_corners: int
+    held_out_mm: float | None
+    """None where there are too few corners to hold any out."""
+    size_ratio: float
+    """Size of the board that the camera saw over the one that the robot knows."""
+    pitch_m: float
+    """Distance of neighbouring corners that the robot knows."""
+
+
+def check_reach(positions: Floats) -> None:
+    """Refuse tool positions [N, 3] that no arm reaches.
+
+    Raises:
+        CalibrationError: more than three metres from the base, as millimetres are.
+    """
+    known = positions[np.isfinite(positions).all(axis=1)]
+    farthest = float(np.linalg.norm(known, axis=1).max()) if len(known) else 0.0
+    if farthest > _LONGEST_REACH_M:
+        unit = "they look like millimetres: divide by 1000" if farthest > 50 else "check their unit and their frame"
+        raise CalibrationError(
+            f"The gripper's positions lie up to {farthest:.0f} m from the robot's base, farther than an arm reaches. They "
+            f"are metres in the base frame; {unit}."
+        )
+
+
+def check_orientations(cameras: Mapping[str, CameraViews], T_world_gripper: Floats, corners: Floats) -> None:
+    """Refuse tool orientations that do not turn as the board does.
+
+    From one pose to another both turn by the same angle, and about axes that one rotation, that of the board on the
+    gripper, takes from one to the other, wherever the camera stands.
+
+    Raises:
+        CalibrationError: names the order of the quaternion if that explains it, or else what may.
+    """
+    for name, camera in cameras.items():
+        boards = np.stack([board_in_camera(view, corners, camera.intrinsics)[:3, :3] for view in camera.views])
+        arm = Rotation.from_matrix(T_world_gripper[[view.pose for view in camera.views], :3, :3])
+        off = _turn_mismatch_deg(Rotation.from_matrix(boards), arm)
+        if off > _LARGEST_TURN_DEG:
+            # the inverse; and what was stored as (x, y, z, w) but read as (w, x, y, z) differs from it by fixed rotations
+            inverted = _turn_mismatch_deg(Rotation.from_matrix(boards), arm.inv())
+            reason = (
+                "Their inverses would fit, or the same numbers as x, y, z, w: robot.csv takes the tool in the base frame, "
+                "and tool_qw first."
+                if inverted <= _LARGEST_TURN_DEG
+                else "Check that tool_qw..qz are (w, x, y, z), that no angles in degrees were taken for radians on the "
+                "way, that they belong to these images, and that squares and dictionary are those of the board."
+            )
+            raise CalibrationError(
+                f"The gripper's orientations do not turn as the board does in the images of camera {name}: from pose to "
+                f"pose the turns differ by {off:.0f} degrees (median). {reason}"
+            )
+
+
+def judge_hand_eye(
+    cameras: Mapping[str, CameraEvidence], board_size: Estimate, *, square_m: float
+) -> tuple[list[str], list[str]]:
+    """(warnings, objections) about a calibration with a board on the gripper.
+
+    Args:
+        board_size: by the arm, over the entered one.
+        square_m: as entered.
+    """
+    remarks = [*_size_remarks(cameras, board_size, square_m)]
+    for name, camera in cameras.items():
+        if camera.held_out_poses < HELD_OUT_POSES:
+            remarks.append(
+                (
+                    "objection",
+                    f"Camera {name} has {camera.held_out_poses} poses that could be held out; a held-out error from fewer "
+                    f"than {HELD_OUT_POSES} is not to be relied on. Record {ADVISED_POSES} or more.",
+                )
+            )
+        if camera.poses < ADVISED_POSES:
+            remarks.append(
+                ("warning", f"Camera {name} saw the board at {camera.poses} poses; {ADVISED_POSES} or more are advised.")
+            )
+    remarks += _too_far_off({name: camera.rms_mm for name, camera in cameras.items()}, "poses")
+    return _parted(remarks)
+
+
+def judge_checkerboard(cameras: Mapping[str, CheckerboardEvidence]) -> tuple[list[str], list[str]]:
+    """(warnings, objections) about registrations by a checkerboard that the robot knows."""
+    remarks: list[Remark] = []
+    for name, camera in cameras.items():
+        if camera.held_out_mm is None:
+            remarks.append(
+                (
+                    "objection",
+                    f"Camera {name} has {camera.corners} corners, too few to hold any out: its error is not known. Record "
+                    "a board of 3 x 3 corners or more.",
+                )
+            )
+    remarks += _too_far_off({name: camera.held_out_mm for name, camera in cameras.items()}, "corners")
+    off = {name: float(np.log(camera.size_ratio)) for name, camera in cameras.items()}
+    common = _common(list(off.values()))
+    for name, camera in cameras.items():
+        if abs(off[name]) <= _HINT:
+            continue
+        seen = 1000 * camera.pitch_m * camera.size_ratio
+        if common is None or len(cameras) == 1:
+            suspects = "its depth scale, its focal length" + (" and the board's squares" if len(cameras) == 1 else "")
+        else:
+            suspects = (
+                f"the board's squares, as all cameras see them alike: {seen:.1f} mm where the robot's corners are "
+                f"{1000 * camera.pitch_m:.1f} mm apart; then a depth scale that is wrong in all of them"
+            )
+        remarks.append(
+            (
+                "objection" if abs(off[name]) > _CHECKERBOARD_WRONG else "warning",
+                f"Camera {name} sees the board {abs(100 * (camera.size_ratio - 1)):.1f} % too "
+                f"{'large' if off[name] > 0 else 'small'}, which a rigid motion cannot absorb. Suspected are {suspects}.",
+            )
+        )
+    return _parted(remarks)
+
+
+def _size_remarks(cameras: Mapping[str, CameraEvidence], board: Estimate, square_m: float) -> Iterator[Remark]:
+    """What arm, board and depth say of each other's lengths (the table above)."""
+    size, size_deviation = float(np.log(board.value)), board.deviation / board.value
+    depth = {name: float(np.log(held.depth_ratio)) for name, held in cameras.items() if held.depth_ratio is not None}
+    common = _common(list(depth.values()))
+    entered, by_arm = 1000 * square_m, 1000 * square_m * board.value
+    explained = 0.0
+    """Of the depth ratios, by the board."""
+    if abs(size) > max(_HINT, _SURE * size_deviation):
+        with_arm = [abs(ratio - size) < abs(ratio) for ratio in depth.values()]
+        said = f"by how the arm moves the board its squares are {by_arm:.1f} mm, entered are {entered:.1f} mm"
+        if not with_arm:
+            suspect = f"the board's square size, or the scale of the arm's positions: {said}"
+        elif np.mean(with_arm) > 0.5:
+            suspect = f"the board's square size: {said}, and depth agrees with the arm"
+            explained = size if common is None else common  # by depth more exactly
+        else:
+            suspect = f"the scale of the arm's positions: {said}, and depth agrees with what was entered"
+        yield "objection" if abs(size) > _WRONG else "warning", f"Suspected is {suspect}."
+    elif common is not None and len(depth) > 1 and abs(common - size) < _SURE * size_deviation:
+        explained = common
+        yield (
+            "objection" if abs(common) > _WRONG else "warning",
+            f"Suspected is the board's square size: all cameras measure depth {_percent(common)} off the board's geometry, "
+            f"as if its squares were {entered * np.exp(common):.1f} mm and not {entered:.1f} mm. How the arm moved the "
+            "board does not tell; measure the squares again.",
+        )
+    for name, held in cameras.items():
+        off = depth[name] - explained if name in depth else 0.0
+        # of two cameras the other would have seen a wrong board too
+        board_too = len(depth) == 1 and not explained and abs(off - size) < _SURE * size_deviation
+        yield from _camera_remarks(name, held, off, board_too=board_too)
+
+
+def _camera_remarks(name: str, camera: CameraEvidence, off: float, *, board_too: bool) -> Iterator[Remark]:
+    """About one camera whose depth is `off` (logarithm of the ratio) the board's, beyond what the board explains."""
+    focal = float(np.log(camera.focal.value))
+    deviation = max(camera.focal.deviation / camera.focal.value, _SMALLEST_DEVIATION)
+    measures = f"Camera {name} measures depth {_percent(off)} off the board's geometry"
+    if abs(focal) > max(_WRONG, _SURE * deviation):
+        yield (
+            "objection",
+            f"Suspected is the focal length of camera {name}: by how the arm moves the board it is "
+            f"{camera.focal_px * camera.focal.value:.0f} px, entered are {camera.focal_px:.0f} px"
+            + (f" ({measures}, too)" if abs(off) > _HINT else "")
+            + ". Are the intrinsics of this camera, at this resolution?",
+        )
+    elif abs(off) > _HINT:
+        others = ["its focal length"] if abs(focal - off) < _SURE * deviation else []
+        if board_too:
+            others.append("the board's square size")
+        if not others:
+            yield (
+                "warning",
+                f"{measures}. Suspected is its depth scale, since board and focal length agree with the arm: run the "
+                "camera's own depth calibration, or check depth_scale_m. The camera's place does not depend on it; its "
+                "clouds do.",
+            )
+        else:
+            yield (
+                "objection" if abs(off) > _WRONG else "warning",
+                f"{measures}. Suspected are {', '.join(others)} and its depth scale: these poses do not tell them "
+                "apart. Record more, with the board 20 cm nearer and farther.",
+            )
+
+
+def _common(values: list[float]) -> float | None:
+    """The value in which all agree, if it is not nothing."""
+    if not values or max(values) - min(values) > _HINT or min(map(abs, values)) <= _HINT:
+        return None
+    return float(np.median(values))
+
+
+def _turn_mismatch_deg(board: Rotation, arm: Rotation) -> float:
+    """Median over all pairs of poses of what is left between how both turn, after the best rotation of the axes."""
+    one, other = np.triu_indices(len(board), 1)
+    seen, told = ((turns[one].inv() * turns[other]).as_rotvec() for turns in (board, arm))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # turns about one axis leave the rotation about it open: any will do
+        held, _ = Rotation.align_vectors(seen, told)
+    return float(np.rad2deg(np.median(np.linalg.norm(seen - held.apply(told), axis=1))))
+
+
+def _too_far_off(held_out_mm: Mapping[str, float | None], of: str) -> Iterator[Remark]:
+    far = {name: error for name, error in held_out_mm.items() if error is not None and error > LARGEST_ERROR_MM}
+    if far:
+        errors = ", ".join(f"{error:.1f} mm (camera {name})" for name, error in far.items())
+        yield (
+            "objection",
+            f"The error on held-out {of} is {errors}; at most {LARGEST_ERROR_MM:.0f} mm are allowed. Look for a bent "
+            "board, a wrong size, or places of the robot that do not belong to the images.",
+        )
+
+
+def _percent(log_ratio: float) -> str:
+    return f"{100 * (np.exp(log_ratio) - 1):+.1f} %"
+
+
+def _parted(remarks: list[Remark]) -> tuple[list[str], list[str]]:
+    return [text for kind, text in remarks if kind == "warning"], [text for kind, text in remarks if kind == "objection"]

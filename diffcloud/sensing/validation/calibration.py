@@ -1,0 +1,131 @@
+"""Whether the cameras of a raw episode are those of their calibration, and stand where it says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from diffcloud.errors import CalibrationError, EpisodeError
+from diffcloud.io.calibrations import Calibration, read_calibration
+from diffcloud.io.images import read_depth
+from diffcloud.sensing.cameras import depth_points, transform
+from diffcloud.sensing.validation.findings import Finding, RecordedCamera
+
+_SWAP_POINTS = 3000
+_SWAP_M = 0.02
+"""Views that disagree by more than this, and agree when exchanged, are exchanged."""
+
+
+def _calibration_of(camera: RecordedCamera, folder: Path, calibration: Path | None) -> Calibration | None:
+    if calibration is not None:
+        return read_calibration(calibration)
+    if camera.info is None or camera.info.calibration is None:
+        return None
+    return read_calibration(folder / camera.info.calibration)
+
+
+def calibration_findings(camera: RecordedCamera, folder: Path, calibration: Path | None) -> Iterator[Finding]:
+    """About one camera.
+
+    Args:
+        folder: of the episode, where camera.json's own calibration file is looked for.
+        calibration: a calibration file that is used instead.
+    """
+    place = f"cameras/{camera.name}/camera.json"
+    if camera.info is None:
+        return
+    try:
+        held = _calibration_of(camera, folder, calibration)
+        if held is None:
+            if camera.info.T_world_camera is None:
+                message = "Not calibrated: neither T_world_camera nor a calibration file. Run diffcloud calibrate."
+                yield Finding("warning", "uncalibrated", place, message)
+            return
+        entry = held.camera(camera.info.serial, name=camera.name)
+    except CalibrationError as error:
+        yield Finding("fault", "other_calibration", place, str(error))
+        return
+    if not entry.intrinsics.same_camera(camera.info.intrinsics):
+        yield Finding(
+            "fault",
+            "other_calibration",
+            place,
+            f"The calibration of serial {camera.info.serial} has other intrinsics ({_brief(entry)} against "
+            f"{_brief(camera.info)}): it was made at another resolution or with another camera.",
+        )
+    if held.objections:
+        yield Finding(
+            "warning",
+            "forced_calibration",
+            place,
+            f"The calibration was written by force, although: {' '.join(held.objections)}",
+        )
+    if entry.name and entry.name != camera.name and any(other.name == camera.name for other in held.cameras.values()):
+        yield Finding(
+            "fault",
+            "swapped_cameras",
+            place,
+            f"Serial {camera.info.serial} is {entry.name!r} in the calibration, but {camera.name!r} here: the cameras were "
+            "swapped when the capture was started. Exchange the folder names, or calibrate again if they were moved.",
+        )
+
+
+def _brief(camera: Any) -> str:
+    held = camera.intrinsics
+    return f"{held.width} x {held.height}, f {held.fx:.1f}, c ({held.cx:.1f}, {held.cy:.1f})"
+
+
+def _pose(camera: RecordedCamera, folder: Path, calibration: Path | None) -> NDArray[np.float64] | None:
+    if camera.info is None:
+        return None
+    try:
+        held = _calibration_of(camera, folder, calibration)
+        if held is not None:
+            return held.camera(camera.info.serial).T_world_camera
+    except CalibrationError:
+        return None
+    return camera.info.T_world_camera
+
+
+def exchanged_cameras(cameras: list[RecordedCamera], folder: Path, calibration: Path | None) -> Iterator[Finding]:
+    """Two views of one scene must agree; where they do so only with each other's pose, the poses are exchanged."""
+    for index, first in enumerate(cameras):
+        for second in cameras[index + 1 :]:
+            poses = [_pose(camera, folder, calibration) for camera in (first, second)]
+            clouds = [_first_points(camera) for camera in (first, second)]
+            if poses[0] is None or poses[1] is None or clouds[0] is None or clouds[1] is None:
+                continue
+            stated = _disagreement(transform(poses[0], clouds[0]), transform(poses[1], clouds[1]))
+            exchanged = _disagreement(transform(poses[1], clouds[0]), transform(poses[0], clouds[1]))
+            if stated > _SWAP_M and exchanged < 0.5 * stated:
+                yield Finding(
+                    "fault",
+                    "swapped_cameras",
+                    f"cameras/{first.name}, cameras/{second.name}",
+                    f"The two views disagree by {1000 * stated:.0f} mm, and by {1000 * exchanged:.0f} mm when each takes "
+                    "the other's pose: the cameras or their calibrations are swapped.",
+                )
+
+
+def _first_points(camera: RecordedCamera) -> NDArray[np.float64] | None:
+    if camera.info is None:
+        return None
+    try:
+        depth = read_depth(camera.folder / "depth" / f"{camera.frames[0]:06d}.png")
+        step = max(1, int(np.sqrt(depth.size / _SWAP_POINTS)))
+        points, _ = depth_points(depth, camera.info.intrinsics, camera.info.depth_scale_m, step=step)
+    except (EpisodeError, IndexError):
+        return None
+    return points if len(points) > 50 else None
+
+
+def _disagreement(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Lower quartile of the distances both ways: half of each view may see what the other does not."""
+    there, _ = cKDTree(second).query(first)
+    back, _ = cKDTree(first).query(second)
+    return float(max(np.quantile(there, 0.25), np.quantile(back, 0.25)))

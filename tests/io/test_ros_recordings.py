@@ -1,0 +1,321 @@
+"""ROS recordings with the habits of other laboratories: imported right, or refused or warned about by name."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+from diffcloud.io.raw_episodes import read_raw_episode
+from tests.io.ros_bag import FRAMES, Bag, Habits, bag
+from tests.pipeline.invoke import invoke
+from tests.sensing.table_scene import INTRINSICS, poses, table_depth
+
+KINDS = pytest.mark.parametrize("kind", ["rosbag1", "rosbag2"])
+
+
+def imported(tmp_path, *sources, options=(), code=0):
+    return invoke("import", "recording", *sources, "--out", tmp_path / "e", *options, code=code)
+
+
+def depth_m(tmp_path, name, index):
+    camera = read_raw_episode(tmp_path / "e").cameras[name]
+    return camera.depth(index) * camera.info.depth_scale_m
+
+
+def has_color(tmp_path, name):
+    camera = read_raw_episode(tmp_path / "e").cameras[name]
+    return [camera.color(index) is not None for index in range(len(camera.frames))]
+
+
+class TestCompressedDepth:
+    @KINDS
+    def test_floats_are_stored_as_inverse_depth(self, tmp_path, kind):
+        path = bag(tmp_path, kind, encoding="32FC1; compressedDepth png", unaligned=False)
+        imported(tmp_path, path)
+        for name, pose in poses().items():
+            found, true = depth_m(tmp_path, name, 2), table_depth(pose) / 1000
+            # one step of the quantisation, and half a step of the episode's unit
+            np.testing.assert_allclose(found.ravel()[1:], true.ravel()[1:], atol=true.max() ** 2 / 10100 + 1.3e-4)
+
+    def test_beyond_the_range_is_no_measurement(self, tmp_path, monkeypatch):
+        far = table_depth(poses()["side"])
+        far[:40] = 12_000  # the transport's range ends at ten metres
+        monkeypatch.setattr("tests.io.ros_bag.table_depth", lambda pose: far.copy())
+        imported(tmp_path, bag(tmp_path, "rosbag2", encoding="32FC1; compressedDepth png", unaligned=False))
+        found = depth_m(tmp_path, "side", 1)
+        assert (found[1:40] == 0).all()
+        np.testing.assert_allclose(found[40:], far[40:] / 1000, atol=2e-3)
+
+    @pytest.mark.parametrize("stated", ["16UC1; compressedDepth png", "16UC1; compressedDepth"])
+    def test_integers_are_millimetres(self, tmp_path, stated):
+        imported(tmp_path, bag(tmp_path, "rosbag2", encoding=stated, unaligned=False))
+        expected = table_depth(poses()["side"])
+        expected[0, 0] = 1002
+        np.testing.assert_allclose(depth_m(tmp_path, "side", 2), expected / 1000)
+
+    @pytest.mark.parametrize(
+        ("stated", "message"),
+        [
+            ("32FC1; compressedDepth rvl", "compressed by 'rvl'"),
+            ("16UC1; compressedDepth rvl", "compressed by 'rvl'"),
+            ("; compressedDepth", "must state its encoding"),
+            ("32FC1; png compressed", "loses floats"),
+        ],
+    )
+    def test_what_is_not_read_is_refused_by_name(self, tmp_path, stated, message):
+        path = bag(tmp_path, "rosbag2", encoding=stated, unaligned=False)
+        assert message in imported(tmp_path, path, code=1).errors
+        assert not (tmp_path / "e").exists()
+
+
+class TestNames:
+    @pytest.mark.parametrize(
+        ("folder", "depth"),
+        [
+            ("/cameras/{name}", "aligned_depth_to_color/image_raw"),
+            ("/lab/left/{name}", "aligned_depth_to_color/image_raw"),
+            ("/{name}/camera", "aligned_depth_to_color/image_raw"),
+            ("/lab/{name}/camera", "depth_registered/image"),
+        ],
+    )
+    def test_cameras_that_share_a_namespace_stay_apart(self, tmp_path, folder, depth):
+        done = imported(tmp_path, bag(tmp_path, "rosbag2", folder=folder, depth=depth))
+        assert done.result["frames"] == {"overhead": FRAMES, "side": FRAMES}
+        assert done.result["warnings"] == []
+        for name, pose in poses().items():
+            np.testing.assert_allclose(depth_m(tmp_path, name, 1).ravel()[1:], table_depth(pose).ravel()[1:] / 1000)
+            camera = read_raw_episode(tmp_path / "e").cameras[name]
+            np.testing.assert_allclose(camera.info.T_world_camera, pose, atol=1e-9)
+            assert has_color(tmp_path, name) == [True] * FRAMES
+
+    def test_cameras_that_are_named_beside_the_word_depth(self, tmp_path):
+        """/lab/overhead_depth/image and /lab/side_depth/image."""
+        done = imported(tmp_path, bag(tmp_path, "rosbag2", folder="/lab/{name}_depth", depth="image", unaligned=False))
+        assert done.result["frames"] == {"overhead": FRAMES, "side": FRAMES}
+
+    def test_intrinsics_that_two_cameras_would_share_are_refused(self, tmp_path):
+        class OneInfo(Bag):
+            def _info(self, topic, *rest):
+                super()._info("/lab/camera_info", *rest)
+
+        habits = Habits(folder="/lab/{name}", depth="depth/image", unaligned=False)
+        OneInfo(tmp_path / "bag", "rosbag2", habits).write()
+        bad = imported(tmp_path, tmp_path / "bag", code=1)
+        assert "one camera_info, /lab/camera_info, for two cameras" in bad.errors
+
+
+UNALIGNED = {"depth": "depth/image_rect_raw", "unaligned": False}
+
+
+class TestColor:
+    @pytest.mark.parametrize(
+        ("habits", "reason"),
+        [
+            ({"depth_frame": "{name}_depth_optical"}, "is seen from the tf frame 'side_optical', depth from"),
+            ({"color_info": 1.6 * INTRINSICS.fx}, "has f 246.4, c (79.5, 59.5), depth f 154.0"),
+            ({}, "has no camera_info"),
+        ],
+    )
+    def test_unaligned_colour_is_left_out(self, tmp_path, habits, reason):
+        done = imported(tmp_path, bag(tmp_path, "rosbag2", **UNALIGNED, **habits))
+        assert has_color(tmp_path, "side") == [False] * FRAMES
+        (message,) = [text for text in done.result["warnings"] if "Camera side: colour is left out" in text]
+        assert reason in message
+        assert "align_depth.enable:=true" in message
+        assert message in done.errors
+
+    def test_one_optical_frame_and_equal_intrinsics_are_aligned(self, tmp_path):
+        done = imported(tmp_path, bag(tmp_path, "rosbag1", **UNALIGNED, color_info=INTRINSICS.fx))
+        assert has_color(tmp_path, "side") == [True] * FRAMES
+        assert done.result["warnings"] == []
+
+    def test_the_tolerance_follows_the_frame_rate(self, tmp_path):
+        """At 10 Hz colour may come 30 ms after depth: no nearer image exists. The 20 ms of before dropped it."""
+        done = imported(tmp_path, bag(tmp_path, "rosbag2", color_late_s=lambda number: 0.03))
+        assert has_color(tmp_path, "side") == [True] * FRAMES
+        assert done.result["warnings"] == []
+
+    def test_lost_colour_is_counted(self, tmp_path):
+        late = bag(tmp_path, "rosbag2", color_late_s=lambda number: 0.001 if number < 3 else 5.0)
+        done = imported(tmp_path, late)
+        assert has_color(tmp_path, "side") == [True] * 3 + [False] * 2
+        (message,) = [text for text in done.result["warnings"] if text.startswith("Camera side")]
+        assert "2 of 5 frames have no colour" in message
+        assert "149 ms away (median), and 50 ms are allowed" in message
+
+    def test_a_frame_gets_the_nearest_image_even_if_it_arrives_frames_later(self, tmp_path):
+        """The image of 0.0 s arrives with the depth of 0.2 s."""
+        stamps = {0: 0.101, 1: 0.201, 2: 0.001, 3: 0.301, 4: 0.401}
+        imported(tmp_path, bag(tmp_path, "rosbag2", color_late_s=lambda number: stamps[number] - number / 10))
+        camera = read_raw_episode(tmp_path / "e").cameras["side"]
+        assert [int(camera.color(index)[0, 0, 0]) for index in range(FRAMES)] == [32, 30, 31, 33, 34]
+
+
+class TestSplitRecordings:
+    HALVES = (range(7), range(7, 2 * FRAMES + 4))
+
+    def numbered(self, tmp_path, kind, names, halves=HALVES):
+        """Files of one folder without metadata.yaml."""
+        for name, steps in zip(names, halves, strict=True):
+            if kind == "rosbag1":
+                Bag(tmp_path / f"{name}.bag", kind, Habits(), steps).write()
+            else:
+                Bag(tmp_path / "made", kind, Habits(), steps).write()
+                (source,) = [path for path in (tmp_path / "made").iterdir() if path.name != "metadata.yaml"]
+                shutil.move(source, tmp_path / f"{name}{source.suffix}")
+                shutil.rmtree(tmp_path / "made")
+        return sorted(path for path in tmp_path.iterdir() if path.suffix in (".bag", ".db3", ".mcap"))
+
+    @pytest.mark.parametrize(
+        ("kind", "names"),
+        [
+            ("rosbag1", ("lift_0", "lift_1")),
+            ("rosbag1", ("lab_2024-03-01-10-00-00_0", "lab_2024-03-01-10-05-00_1")),
+            ("rosbag2", ("lift_0", "lift_1")),
+            ("mcap", ("lift_0", "lift_1")),
+        ],
+    )
+    def test_one_part_is_refused_and_all_are_one_recording(self, tmp_path, kind, names):
+        parts = self.numbered(tmp_path, kind, names)
+        for part in parts:
+            bad = imported(tmp_path, part, code=1)
+            assert "one of the 2 parts of a split recording" in bad.errors
+            assert all(other.name in bad.errors for other in parts)
+        done = imported(tmp_path, *parts)
+        assert done.result["frames"] == {"overhead": FRAMES, "side": FRAMES}
+
+    def test_takes_that_are_numbered_are_no_parts(self, tmp_path):
+        """Two recordings half a minute apart."""
+        takes = self.numbered(tmp_path, "rosbag1", ("lift_0", "lift_1"), (range(7), range(601, 608)))
+        assert imported(tmp_path, takes[0]).result["frames"] == {"overhead": 3, "side": 3}
+
+    def test_a_part_that_metadata_lists(self, tmp_path):
+        parts = self.numbered(tmp_path, "rosbag2", ("run_0", "run_1"))
+        Bag(tmp_path / "run", "rosbag2", Habits()).write()
+        (whole,) = (tmp_path / "run").glob("*.db3")
+        whole.unlink()
+        for part in parts:
+            shutil.move(part, tmp_path / "run" / part.name)
+        listed = (tmp_path / "run" / "metadata.yaml").read_text()
+        listed = listed.replace(f"- {whole.name}", "- run_0.db3\n  - run_1.db3")
+        (tmp_path / "run" / "metadata.yaml").write_text(listed)
+        bad = imported(tmp_path, tmp_path / "run" / "run_1.db3", code=1)
+        assert f"give the folder {tmp_path / 'run'} to import all of it" in bad.errors
+        assert imported(tmp_path, tmp_path / "run").result["frames"] == {"overhead": FRAMES, "side": FRAMES}
+
+    def test_a_part_that_cannot_be_read_is_named(self, tmp_path):
+        parts = self.numbered(tmp_path, "rosbag2", ("lift_0", "lift_1"))
+        parts[1].write_bytes(b"SQLite format 3\x00 torn")
+        done = imported(tmp_path, parts[0])
+        assert any("lift_1.db3 cannot be read" in message for message in done.result["warnings"])
+
+
+class TestTransforms:
+    @KINDS
+    def test_cameras_beside_the_base_in_a_common_frame(self, tmp_path, kind):
+        done = imported(tmp_path, bag(tmp_path, kind, root="world"))
+        episode = read_raw_episode(tmp_path / "e")
+        for name, pose in poses().items():
+            np.testing.assert_allclose(episode.cameras[name].info.T_world_camera, pose, atol=1e-9)
+        assert done.result["warnings"] == []
+
+    def test_what_tf_does_not_connect_is_said(self, tmp_path):
+        options = ("--world-frame", "map", "--tool-frame", "flange")
+        done = imported(tmp_path, bag(tmp_path, "rosbag2"), options=options)
+        texts = " ".join(done.result["warnings"])
+        assert "Camera side: its place stays open, as tf does not connect 'side_optical' with 'map'" in texts
+        assert "its frames are base_link, overhead_link" in texts
+        assert "The tool's pose stays unknown: tf does not connect 'flange' with 'map'" in texts
+
+    def test_a_camera_that_moves_has_no_place(self, tmp_path):
+        """It is mounted on the tool, which rises by 10 cm a second."""
+        done = imported(tmp_path, bag(tmp_path, "rosbag2", mount="tool_frame"))
+        assert read_raw_episode(tmp_path / "e").cameras["side"].info.T_world_camera is None
+        assert any("'side_optical' moves in 'base_link', by 65 mm" in text for text in done.result["warnings"])
+
+    def test_a_frame_with_two_parents_is_not_believed(self, tmp_path):
+        class Twice(Bag):
+            def _header(self, t, frame):
+                return super()._header(t, "elsewhere" if frame == "base_link" and t > self.later else frame)
+
+            later = 1_700_000_000.3
+
+        Twice(tmp_path / "bag", "rosbag2", Habits()).write()
+        done = imported(tmp_path, tmp_path / "bag")
+        assert read_raw_episode(tmp_path / "e").cameras["side"].info.T_world_camera is None
+        assert any("puts 'side_link' into both 'base_link' and 'elsewhere'" in text for text in done.result["warnings"])
+
+
+class TestGripper:
+    def gripper(self, tmp_path):
+        return read_raw_episode(tmp_path / "e").robot.gripper
+
+    def test_another_name_is_refused_with_those_there_are(self, tmp_path):
+        path = bag(tmp_path, "rosbag2", joints={"robotiq_85_left_knuckle_joint": 0.4})
+        bad = imported(tmp_path, path, code=1)
+        assert "no 'finger_joint'" in bad.errors
+        assert "besides the arm's joints there are robotiq_85_left_knuckle_joint" in bad.errors
+        assert "--gripper-joint" in bad.errors
+        done = imported(tmp_path, path, options=("--gripper-joint", "robotiq_85_left_knuckle_joint"))
+        np.testing.assert_allclose(self.gripper(tmp_path), 0.5)
+        assert "taken to be closed where robotiq_85_left_knuckle_joint is 0.8 rad" in done.result["warnings"][0]
+
+    def test_where_it_is_closed_may_be_given(self, tmp_path):
+        path = bag(tmp_path, "rosbag2", joints={"claw": 0.03})
+        done = imported(tmp_path, path, options=("--gripper-joint", "claw", "--gripper-closed", 0.04))
+        np.testing.assert_allclose(self.gripper(tmp_path), 0.75)
+        assert done.result["warnings"] == []
+
+    def test_a_name_that_was_given_must_be_there(self, tmp_path):
+        bad = imported(tmp_path, bag(tmp_path, "rosbag2", joints={}), options=("--gripper-joint", "claw"), code=1)
+        assert "no 'claw'" in bad.errors
+
+    def test_an_arm_without_gripper(self, tmp_path):
+        path = bag(tmp_path, "rosbag2", joints={})
+        assert any("only the arm's joints" in text for text in imported(tmp_path, path).result["warnings"])
+        shutil.rmtree(tmp_path / "e")
+        assert imported(tmp_path, path, options=("--gripper-joint", "none")).result["warnings"] == []
+        assert np.isnan(self.gripper(tmp_path)).all()
+
+    @KINDS
+    def test_messages_of_its_own_are_met(self, tmp_path, kind):
+        """Its driver sends joint_states beside those of the arm's, a hundredth of a second later."""
+        imported(tmp_path, bag(tmp_path, kind, joints={}, own_joints={"finger_joint": 0.4}))
+        assert len(self.gripper(tmp_path)) == 2 * FRAMES + 4
+        np.testing.assert_allclose(self.gripper(tmp_path), 0.5)
+
+
+class TestOrder:
+    @KINDS
+    def test_images_that_arrive_out_of_order_are_sorted(self, tmp_path, kind):
+        stamps = [0.0, 0.2, 0.1, 0.3, 0.4]
+        done = imported(tmp_path, bag(tmp_path, kind, stamps_s=lambda number: stamps[number]))
+        camera = read_raw_episode(tmp_path / "e").cameras["side"]
+        np.testing.assert_allclose(camera.times, np.arange(FRAMES) / 10, atol=1e-6)
+        assert [int(camera.depth(index)[0, 0]) for index in range(FRAMES)] == [1000, 1002, 1001, 1003, 1004]
+        assert [int(camera.color(index)[0, 0, 0]) for index in range(FRAMES)] == [30, 32, 31, 33, 34]
+        assert any("Camera side: 1 of 5 depth images arrived out of order" in text for text in done.result["warnings"])
+
+    def test_a_clock_that_was_set_back_is_refused_with_the_place(self, tmp_path):
+        stamps = [10.0, 10.1, 10.2, 0.3, 0.4]
+        bad = imported(tmp_path, bag(tmp_path, "rosbag2", stamps_s=lambda number: stamps[number]), code=1)
+        assert "/overhead/aligned_depth_to_color/image_raw: message 4 is stamped 9.90 s before" in bad.errors
+        assert not (tmp_path / "e").exists()
+
+    def test_joints_of_a_clock_that_was_set_back_are_refused(self, tmp_path):
+        class SetBack(Bag):
+            def _header(self, t, frame):
+                return super()._header(t - 3 if frame == "" and t > 1_700_000_000.3 else t, frame)
+
+        SetBack(tmp_path / "bag", "rosbag2", Habits()).write()
+        bad = imported(tmp_path, tmp_path / "bag", code=1)
+        assert "message 9 of joint_states with joint_1 is stamped 2.95 s before" in bad.errors
+
+    def test_of_two_images_with_one_stamp_the_first_is_taken(self, tmp_path):
+        stamps = [0.0, 0.1, 0.1, 0.3, 0.4]
+        done = imported(tmp_path, bag(tmp_path, "rosbag2", stamps_s=lambda number: stamps[number]))
+        camera = read_raw_episode(tmp_path / "e").cameras["side"]
+        assert [int(camera.depth(index)[0, 0]) for index in range(4)] == [1000, 1001, 1003, 1004]
+        assert any("1 of 5 depth images have the stamp of another" in text for text in done.result["warnings"])

@@ -1,0 +1,108 @@
+"""Motions that no cloth can have are told from those that one can."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from diffcloud.errors import DivergedError
+from diffcloud.mesh import grid_cloth
+from diffcloud.scene.scenarios import load_scenario
+from diffcloud.sim.plausibility import Motion, implausible
+from diffcloud.sim.simulate import rollout
+
+STEP, STEPS = 0.02, 50
+T = STEP * np.arange(STEPS + 1)
+
+
+def motion(displacement, **changes):
+    """A square cloth of 0.2 m whose nodes are all displaced by [S + 1, 3]; its first node is held where it is."""
+    mesh = grid_cloth(4, 4, 0.2, 0.2)
+    positions = mesh.nodes + np.asarray(displacement)[:, None]
+    made = Motion(
+        positions=positions,
+        time_step=STEP,
+        mass=np.full(16, 0.01),
+        size=mesh.size,
+        places=np.tile(positions[0, :1], (STEPS + 1, 1, 1)),
+        held=np.ones((STEPS, 1), dtype=bool),
+        gravity=9.81,
+        wind=0.0,
+        velocities=np.zeros((16, 3)),
+        others=np.zeros((STEPS + 1, 0, 3)),
+    )
+    return replace(made, **changes)
+
+
+def along(z):
+    return np.stack([0 * z, 0 * z, z], axis=1)
+
+
+def nothing_stored(_):
+    return 0.0
+
+
+def free(**changes):
+    return {"held": np.zeros((STEPS, 1), dtype=bool), **changes}
+
+
+def test_a_cloth_at_rest_is_plausible():
+    assert implausible(motion(along(0 * T)), nothing_stored) is None
+
+
+def test_a_node_three_sizes_away_from_every_handle_is_not():
+    mesh = grid_cloth(4, 4, 0.2, 0.2)
+    step, reason = implausible(motion(along(-1.2 * T)), nothing_stored)
+    farthest = np.linalg.norm(mesh.nodes - mesh.nodes[0], axis=1).max()
+    expected = np.flatnonzero(np.hypot(1.2 * T, farthest) > 3 * mesh.size)[0]
+    assert step == expected
+    assert "from everything that held the cloth" in reason
+    near = motion(along(-1.2 * T), places=motion(along(-1.2 * T)).positions[:, :1])  # the handle goes along
+    assert implausible(near, nothing_stored) is None
+
+
+def test_free_fall_is_plausible_and_twice_its_distance_is_not():
+    assert implausible(motion(along(-0.5 * 9.81 * T**2), **free()), nothing_stored) is None
+    far = motion(along(-1.1 * 9.81 * T**2 - 3 * 0.4), **free())
+    assert implausible(far, nothing_stored) is not None
+
+
+def test_a_cloth_that_was_let_go_may_fall():
+    """Held for half the time, then in free fall."""
+    held = (np.arange(1, STEPS + 1) <= STEPS // 2)[:, None]
+    late = np.clip(T - T[STEPS // 2], 0, None)
+    assert implausible(motion(along(-0.5 * 9.81 * late**2), held=held), nothing_stored) is None
+
+
+def test_kinetic_energy_from_nowhere_is_told():
+    """Near the handle, but much too quick for gravity to have done it: unless elastic energy was stored before."""
+    shaking = motion(along(0.2 * np.sin(40 * T)))
+    step, reason = implausible(shaking, nothing_stored)
+    assert step == 1
+    assert "kinetic energy" in reason
+    assert implausible(shaking, lambda step: 2.0) is None
+
+
+def test_a_quick_handle_explains_a_quick_cloth():
+    shaken = along(0.2 * np.sin(40 * T))
+    made = motion(shaken)
+    assert implausible(replace(made, places=made.positions[:, :1]), nothing_stored) is None
+
+
+def test_an_explosion_inside_the_bounds_is_a_named_error():
+    scenario = load_scenario("vest_hang")
+    system, _ = scenario.scene.build()
+    values = {"drag": [1.0, 6.9], "mass": [1.0, 0.1]}
+    tensors = {name: torch.tensor(pair, dtype=torch.float64) for name, pair in values.items()}
+    properties = scenario.properties(system, tensors)
+    with pytest.raises(DivergedError, match=r"batch entries \[1\]: .*(kinetic energy|from everything that held)"):
+        rollout(system, 8, properties=properties)
+    kept = rollout(system, 8, properties=properties, drop_diverged=True)
+    assert list(kept.diverged) == [1]
+    step = kept.diverged[1].step
+    assert bool(kept.positions[0].isfinite().all())
+    assert bool(kept.positions[1, :step].isfinite().all())
+    assert bool(kept.positions[1, step:].isnan().all())
