@@ -30,6 +30,10 @@ class LimitError(HardwareError):
     """A motion that would leave, or has left, what the person allowed: box, speed, acceleration, wrench."""
 
 
+class UnconfirmedStopError(HardwareError):
+    """The arm has not confirmed Stop: it may still be moving."""
+
+
 class CalibrationError(DiffCloudError):
     """A calibration that cannot be made from the data, or does not belong to the camera."""
 

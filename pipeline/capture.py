@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,17 +13,27 @@ import typer
 from rich.markup import escape
 
 from diffcloud.errors import ConfigError
-from diffcloud.hardware import CaptureSettings, Limits, ToolTrajectory, capture, check_trajectory, read_trajectory
+from diffcloud.hardware import (
+    ArmLimits,
+    ArmProcess,
+    CaptureSettings,
+    Limits,
+    ToolTrajectory,
+    capture,
+    check_trajectory,
+    read_trajectory,
+)
 from diffcloud.hardware.kinova import KinovaArm
 from diffcloud.hardware.realsense import RealSenseCamera
 from diffcloud.io.calibrations import read_calibration
+from diffcloud.sensing.robot import Robot
 from pipeline.console import JsonFlag, errors, finish, warn
 
 
-def open_arm(address: str) -> KinovaArm:
+def open_arm(address: str) -> ArmProcess:
     """The arm at an address; user and password come from DIFFCLOUD_ARM_USER and DIFFCLOUD_ARM_PASSWORD."""
     user, password = (os.environ.get(f"DIFFCLOUD_ARM_{name}", "admin") for name in ("USER", "PASSWORD"))
-    return KinovaArm(address, username=user, password=password)
+    return ArmProcess(partial(KinovaArm, address, username=user, password=password))
 
 
 def make_camera(name: str, serial: str, **options: Any) -> RealSenseCamera:
@@ -47,6 +58,16 @@ def record(
     acceleration: Annotated[float, typer.Option(help="Limit, m/s².")] = Limits.acceleration_m_s2,
     force: Annotated[float, typer.Option(help="Limit, N.")] = Limits.force_N,
     torque: Annotated[float, typer.Option(help="Limit, N·m.")] = Limits.torque_Nm,
+    preload: Annotated[float, typer.Option(help="Limit of what the tool feels at rest, N.")] = Limits.preload_N,
+    table: Annotated[float, typer.Option(help="Height of the table in the base frame, m; no link goes below.")] = (
+        ArmLimits.table_m
+    ),
+    arm_margin: Annotated[
+        float, typer.Option(help="How far links may reach beyond the workspace box and the base, m.")
+    ] = ArmLimits.margin_m,
+    urdf: Annotated[
+        Path | None, typer.Option(help="Description of the arm with its tool; without it, a Gen3 with a 2F-85.")
+    ] = None,
     stretch_time: Annotated[float, typer.Option(help="2: half as fast.")] = 1.0,
     home: Annotated[bool, typer.Option(help="Move to the arm's home position first.")] = False,
     clear_faults: Annotated[bool, typer.Option(help="Clear the arm's faults first.")] = False,
@@ -59,10 +80,14 @@ def record(
 ) -> None:
     """Drive the arm along a trajectory, record cameras and arm, write while it runs.
 
-    The arm is stopped whatever ends the capture: the end, a limit, a fault, a lost camera, Ctrl-C. What was recorded so
-    far stays.
+    The arm is stopped whatever ends the capture: the end, a limit, a fault, a lost camera, Ctrl-C or Ctrl-Z, even if this
+    process is killed. What was recorded so far stays.
     """
-    limits = _limits(box, speed, acceleration, force, torque)
+    limits = _limits(
+        box, speed_m_s=speed, acceleration_m_s2=acceleration, force_N=force, torque_Nm=torque, preload_N=preload
+    )
+    arm_limits = ArmLimits(table_m=table, margin_m=arm_margin)
+    robot = None if urdf is None else Robot.from_urdf(urdf)
     path = None if trajectory is None else read_trajectory(trajectory, rate_hz=rate_hz, stretch_time=stretch_time)
     serials = _serials(camera)
     width, height = _size(size)
@@ -95,6 +120,8 @@ def record(
             arm=opened,
             trajectory=path,
             limits=limits,
+            arm_limits=arm_limits,
+            robot=robot,
             settings=settings,
             seconds=seconds,
             meta={key: value for key, value in (("scenario", scenario), ("fabric", fabric)) if value is not None}
@@ -121,8 +148,8 @@ def record(
     finish(result | {"largest_error_m": report.largest_error_m, "dropped": dropped}, json)
 
 
-def _limits(box: str | None, speed: float, acceleration: float, force: float, torque: float) -> Limits:
-    limits = Limits(speed_m_s=speed, acceleration_m_s2=acceleration, force_N=force, torque_Nm=torque)
+def _limits(box: str | None, **values: float) -> Limits:
+    limits = Limits(**values)  # type: ignore[arg-type]  # the box, the only field that is no number, comes below
     if box is None:
         return limits
     try:

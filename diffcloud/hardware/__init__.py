@@ -1,9 +1,15 @@
 """Cameras and arm. Their own packages are imported when a device is opened, and never needed for anything else."""
 
-from diffcloud.hardware.session import ArmReading, CameraFrame, CaptureReport, CaptureSettings, capture
+from diffcloud.hardware.arm_limits import ArmLimits
+from diffcloud.hardware.arm_process import ArmProcess
+from diffcloud.hardware.devices import ArmReading, CameraFrame
+from diffcloud.hardware.session import CaptureReport, capture
+from diffcloud.hardware.settings import CaptureSettings
 from diffcloud.hardware.trajectory import Limits, ToolTrajectory, VelocityController, check_trajectory, read_trajectory
 
 __all__ = [
+    "ArmLimits",
+    "ArmProcess",
     "ArmReading",
     "CameraFrame",
     "CaptureReport",

@@ -1,8 +1,13 @@
 """A Kinova Gen3 through Kinova's own `kortex_api`.
 
-Commands go over TCP, measurements over UDP (`RefreshFeedback`: joints, tool pose, wrench, faults in one datagram). A twist
-keeps the arm moving until the next command, so every exit sends Stop; should the link itself be lost, the arm stops by the
-connection timeout that is set here when the session is opened.
+Commands go over TCP, measurements over UDP (`RefreshFeedback`: joints, tool pose, wrench, faults in one datagram). A
+velocity keeps the arm moving until the next command, so every exit sends Stop; should the link itself be lost, the arm
+stops by the connection timeout that is set here when the session is opened: Kinova documents it as the inactivity after
+which the robot stops any movement that the session initiated. `kortex_api` keeps a session alive by a message every 150 ms,
+from a thread of its own: that timeout sees a lost link and a dead process, not one that hangs. Hence `arm_process`.
+
+The way home is driven here, joint by joint, not by the arm's action named Home, of which only the joint angles are read:
+the action has a speed of its own, and would not be held against the limits.
 
 The arm speaks degrees; everything that leaves this module is in radians. Joint angles are continued across the arm's wrap
 at 360 degrees, so that they can be interpolated.
@@ -14,7 +19,7 @@ import collections
 import collections.abc
 import importlib
 import os
-import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -24,16 +29,18 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import HardwareError
-from diffcloud.hardware.session import ArmReading
+from diffcloud.hardware.devices import ArmReading
 
 TCP_PORT, UDP_PORT = 10000, 10001
 JOINT_COUNT = 7
 
 _SESSION_TIMEOUT_MS = 10_000
-_CONNECTION_TIMEOUT_MS = 1000
-"""The arm stops by itself when the link has been silent for this long."""
+_CONNECTION_TIMEOUT_MS = 500
+"""The arm stops by itself when the link has been silent for this long: three keep-alives."""
 _CALL_TIMEOUT_MS = 400
-"""Of one call; below the session's watchdog, so that a lost link is reported as one."""
+"""Of one call; below the watchdog of the arm's process, so that a lost link is reported as one."""
+_TRANSIENT_S = 3.0
+"""After a session has closed, and after a Stop, the arm may report manual control for a moment."""
 _FAULTS = {
     0x10: "joint fault",
     0x400: "pose out of reach",
@@ -141,19 +148,30 @@ class KinovaArm:
         return {"model": "Kinova Gen3", "gripper": "Robotiq 2F-85", "address": self.address, "joints": JOINT_COUNT}
 
     def prepare(self) -> None:
-        """Refuse an arm in fault, and take control of it.
+        """Take control of an arm that is ready.
 
         Raises:
-            HardwareError: in fault, or in another mode than ready; says how to clear it.
+            HardwareError: in fault, driven by somebody else (gamepad, web page, by hand), or otherwise not ready; says how
+                to get it ready.
         """
-        state = self._call("GetArmState", self._base.GetArmState).active_state
         names = self._kortex.Common_pb2
+        end = time.monotonic() + _TRANSIENT_S
+        while True:
+            state = self._call("GetArmState", self._base.GetArmState).active_state
+            if state != names.ARMSTATE_SERVOING_MANUALLY_CONTROLLED or time.monotonic() > end:
+                break
+            time.sleep(0.05)
         if state == names.ARMSTATE_IN_FAULT:
             raise HardwareError(
                 f"The arm at {self.address} is in fault ({self._faults(self._feedback())}). Release the emergency stop, "
                 "look why, then clear it: diffcloud capture --clear-faults, or the arm's web page."
             )
-        if state not in (names.ARMSTATE_SERVOING_READY, names.ARMSTATE_SERVOING_MANUALLY_CONTROLLED):
+        if state == names.ARMSTATE_SERVOING_MANUALLY_CONTROLLED:
+            raise HardwareError(
+                f"The arm at {self.address} is under manual control: somebody drives it by gamepad, web page or hand. It "
+                "is not taken from them; let go of it (and leave admittance mode), then try again."
+            )
+        if state != names.ARMSTATE_SERVOING_READY:
             raise HardwareError(f"The arm at {self.address} is not ready (state {state}); wait, or switch it on again.")
         mode = self._kortex.Base_pb2.ServoingModeInformation()
         mode.servoing_mode = self._kortex.Base_pb2.SINGLE_LEVEL_SERVOING
@@ -163,45 +181,25 @@ class KinovaArm:
         """Clear faults; the emergency stop must be released first."""
         self._call("ClearFaults", self._base.ClearFaults)
 
-    def home(self, timeout_s: float) -> None:
-        """Run the arm's own action named Home, and wait for its end.
+    def home_joints(self) -> NDArray[np.float64]:
+        """[7] joint angles of the arm's action named Home [rad].
 
         Raises:
-            HardwareError: no such action, aborted, or not done in time; the arm is stopped.
+            HardwareError: there is no such action, or it is not for this arm.
         """
-        base, messages = self._base, self._kortex.Base_pb2
-        wanted = messages.RequestedActionType()
-        wanted.action_type = messages.REACH_JOINT_ANGLES
-        actions = self._call("ReadAllActions", base.ReadAllActions, wanted).action_list
-        handles = [action.handle for action in actions if action.name == "Home"]
-        if not handles:
-            raise HardwareError(f"The arm at {self.address} has no action named Home; make one on its web page.")
-        events: list[int] = []
-        done = threading.Event()
-
-        def heard(notification: Any) -> None:
-            if notification.action_event in (messages.ACTION_END, messages.ACTION_ABORT):
-                events.append(notification.action_event)
-                done.set()
-
-        topic = self._kortex.Common_pb2.NotificationOptions()
-        # the stub of a topic has no option of this name in every version, so its own timeout holds
-        subscription = self._call("ActionTopic", lambda options: base.OnNotificationActionTopic(heard, topic))
-        arrived = False
-        try:
-            self._call("ExecuteActionFromReference", base.ExecuteActionFromReference, handles[0])
-            arrived = done.wait(timeout_s)
-        finally:
-            if not arrived:
-                self.stop()
-            self._call("Unsubscribe", base.Unsubscribe, subscription)
-        if not arrived:
-            raise HardwareError(f"The arm at {self.address} did not reach home within {timeout_s:g} s; it was stopped.")
-        if events[0] == messages.ACTION_ABORT:
-            raise HardwareError(
-                f"The arm at {self.address} aborted the motion home ({self._faults(self._feedback())}): something is in "
-                "the way, or the emergency stop was pressed."
-            )
+        wanted = self._kortex.Base_pb2.RequestedActionType()
+        wanted.action_type = self._kortex.Base_pb2.REACH_JOINT_ANGLES
+        actions = self._call("ReadAllActions", self._base.ReadAllActions, wanted).action_list
+        for action in actions:
+            if action.name == "Home":
+                angles = action.reach_joint_angles.joint_angles.joint_angles
+                degrees = [angle.value for angle in sorted(angles, key=lambda angle: angle.joint_identifier)]
+                if len(degrees) != JOINT_COUNT or not np.isfinite(degrees).all():
+                    raise HardwareError(
+                        f"The action Home of the arm at {self.address} holds {degrees}, not 7 joint angles."
+                    )
+                return np.deg2rad(degrees)
+        raise HardwareError(f"The arm at {self.address} has no action named Home; make one on its web page.")
 
     def read(self) -> ArmReading:
         """Measure joints, tool, wrench and gripper.
@@ -227,11 +225,21 @@ class KinovaArm:
 
     def send_velocity(self, linear_m_s: NDArray[np.float64]) -> None:
         """Move the tool with this velocity [3] in the base frame, without turning, until the next command."""
+        self._refuse_nan(linear_m_s)
         command = self._kortex.Base_pb2.TwistCommand()
         command.reference_frame = self._kortex.Common_pb2.CARTESIAN_REFERENCE_FRAME_BASE
         command.duration = 0
         command.twist.linear_x, command.twist.linear_y, command.twist.linear_z = map(float, linear_m_s)
         self._call("SendTwistCommand", self._base.SendTwistCommand, command)
+
+    def send_joint_velocity(self, rad_s: NDArray[np.float64]) -> None:
+        """Move the joints with these velocities [7] until the next command."""
+        self._refuse_nan(rad_s)
+        command = self._kortex.Base_pb2.JointSpeeds()
+        for index, value in enumerate(np.rad2deg(rad_s)):
+            joint = command.joint_speeds.add()
+            joint.joint_identifier, joint.value = index, float(value)
+        self._call("SendJointSpeedsCommand", self._base.SendJointSpeedsCommand, command)
 
     def set_gripper(self, position: float) -> None:
         """Drive the gripper to 0 (open) .. 1 (closed); does not wait."""
@@ -247,7 +255,11 @@ class KinovaArm:
         self._call("Stop", self._base.Stop)
 
     def emergency_stop(self) -> None:
-        """Stop by the brakes; the arm is in fault afterwards."""
+        """Kinova's ApplyEmergencyStop; the arm is in fault afterwards.
+
+        `arm_process` calls it, as the last resort, where Stop is refused or not answered: to an arm that answers but will
+        not stop there is nothing else to say. It is no substitute for the button, which also works without a link.
+        """
         self._call("ApplyEmergencyStop", self._base.ApplyEmergencyStop)
 
     def close(self) -> None:
@@ -282,6 +294,10 @@ class KinovaArm:
                 "computer is in the arm's network (ping it), and user name and password."
             ) from error
         return router
+
+    def _refuse_nan(self, velocity: NDArray[np.float64]) -> None:
+        if not np.isfinite(velocity).all():
+            raise HardwareError(f"A velocity for the arm at {self.address} is not finite: {velocity}.")
 
     def _options(self) -> Any:
         options = self._kortex.RouterClientSendOptions()

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from diffcloud.errors import HardwareError
-from diffcloud.hardware.session import CameraFrame
+from diffcloud.hardware.devices import CameraFrame
+from diffcloud.hardware.frame_times import FrameTimes
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.libusb import load_libusb
 from diffcloud.io.raw_episodes import CameraInfo
@@ -26,6 +27,8 @@ from diffcloud.io.recordings import RecordedFrame, Recording
 
 _QUEUED_PAIRS = 64
 """The SDK keeps so many for us; a pipeline without a queue of its own keeps one, and drops the rest when we are late."""
+_LONGEST_WAY_S = 3.0
+"""From the camera to that queue."""
 _PLAYBACK_WAIT_MS = 100
 _PLAYBACK_PATIENCE = 50
 """Waits without a frame, while the file is not at its end."""
@@ -92,7 +95,7 @@ class RealSenseCamera:
         self._queue: Any = None
         self._align: Any = None
         self._last_number: int | None = None
-        self._clock_offset_s: float | None = None
+        self._times: FrameTimes | None = None
         self.dropped = 0
         """Frames that the camera numbered and nobody received."""
 
@@ -125,13 +128,14 @@ class RealSenseCamera:
             profile = self._pipeline.start(config, self._queue)
             self._align = rs.align(rs.stream.color)
             info = _camera_info(rs, self.name, self.serial, profile)
+        self._last_number, self._times = None, None
         try:
             for _ in range(self._warm_up):
                 self.read(5.0)
         except HardwareError:
             self.close()
             raise
-        self._last_number, self.dropped, self._clock_offset_s = None, 0, None
+        self._last_number, self.dropped = None, 0
         return info
 
     def read(self, timeout_s: float) -> CameraFrame:
@@ -148,9 +152,9 @@ class RealSenseCamera:
                 come, frame = self._queue.try_wait_for_frame(max(1, int(1000 * left)))
                 frames = frame.as_frameset() if come and frame.is_frameset() else None
                 if frames and frames.get_depth_frame() and frames.get_color_frame():
-                    depth = frames.get_depth_frame()
+                    arrival, depth = time.monotonic(), frames.get_depth_frame()
                     if self._is_new(depth.get_frame_number()):
-                        return self._on_host_clock(_frame(self._align.process(frames)), depth)
+                        return self._timed(_frame(self._align.process(frames)), depth, arrival)
         raise HardwareError(
             f"Camera {self.name} ({self.serial}) delivered no frame for {timeout_s:g} s: unplugged, or its USB link is "
             "overloaded. Use a port (better a controller) of its own for each camera."
@@ -163,12 +167,16 @@ class RealSenseCamera:
             with _explained(f"Camera {self.name} ({self.serial}) could not be closed"):
                 pipeline.stop()
 
-    def _on_host_clock(self, frame: CameraFrame, depth: Any) -> CameraFrame:
-        """Some drivers count in the camera's own time; its first frame then ties it to the host's."""
-        if self._clock_offset_s is None:
-            own = depth.get_frame_timestamp_domain() == import_realsense().timestamp_domain.hardware_clock
-            self._clock_offset_s = time.time() - frame.time_s if own else 0.0
-        return CameraFrame(frame.time_s + self._clock_offset_s, frame.depth, frame.color)
+    def _timed(self, frame: CameraFrame, depth: Any, arrival_s: float) -> CameraFrame:
+        """Stamps are in the computer's time of day or, of some drivers, in the camera's own, which the first frame ties."""
+        if self._times is None:
+            self._times = FrameTimes(
+                f"{self.name} ({self.serial})", 1 / self._fps, longest_s=_QUEUED_PAIRS / self._fps + _LONGEST_WAY_S
+            )
+            if depth.get_frame_timestamp_domain() != import_realsense().timestamp_domain.hardware_clock:
+                self._times.tie(time.monotonic() - time.time())
+        t = self._times.monotonic(depth.get_frame_number(), frame.time_s, arrival_s)
+        return CameraFrame(t, frame.depth, frame.color)
 
     def _is_new(self, number: int) -> bool:
         """The syncer may pair one depth image with two colour images; only the first counts."""

@@ -26,15 +26,19 @@ _APPROACH_RATE_HZ = 20.0
 
 @dataclass(frozen=True)
 class Limits:
-    """What a motion may do. Defaults are the reference's workspace, and speeds its trajectories keep."""
+    """What the tool may do. The default box is the reference's workspace; its trajectories are faster than the default
+    speed, which is one that a person can react to."""
 
     box_low_m: tuple[float, float, float] = (0.40, -0.36, 0.055)
     box_high_m: tuple[float, float, float] = (0.95, 0.36, 0.95)
-    speed_m_s: float = 0.5
+    speed_m_s: float = 0.1
     acceleration_m_s2: float = 2.5
     force_N: float = 30.0
     """Of the external wrench at the tool, beyond what it was at rest."""
     torque_Nm: float = 10.0
+    preload_N: float = 15.0
+    """Of the external wrench at rest: more is no offset of the estimate, but something that the tool presses on."""
+    preload_Nm: float = 5.0
     tracking_error_m: float = 0.08
     """Farther from the trajectory than this, something holds the arm."""
     box_slack_m: float = 0.01
@@ -43,7 +47,8 @@ class Limits:
     def __post_init__(self) -> None:
         if not (np.array(self.box_low_m) < self.box_high_m).all():
             raise LimitError(f"The box needs low < high on each axis, got {self.box_low_m} and {self.box_high_m}.")
-        for name in ("speed_m_s", "acceleration_m_s2", "force_N", "torque_Nm", "tracking_error_m"):
+        names = ("speed_m_s", "acceleration_m_s2", "force_N", "torque_Nm", "preload_N", "preload_Nm", "tracking_error_m")
+        for name in names:
             if not getattr(self, name) > 0:
                 raise LimitError(f"The limit {name} must be positive, got {getattr(self, name)}.")
 

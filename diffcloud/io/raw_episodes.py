@@ -386,19 +386,23 @@ class RawEpisodeWriter:
         """Write one frame of one camera; it counts once this returns."""
         self._cameras[camera].add(t_s, depth, color)
 
-    def add_robot(self, sample: RobotSample) -> None:
-        """Write one row of robot.csv."""
+    def add_robot(self, *samples: RobotSample) -> None:
+        """Write rows of robot.csv; all of them together are waited for once."""
         if self._robot is None:
             raise EpisodeError("This episode was opened without a robot.")
-        if len(sample.joints_rad) != self._joint_count:
-            raise EpisodeError(f"A robot row has {len(sample.joints_rad)} joints, the log {self._joint_count}.")
-        unknown = np.full(3, np.nan)
-        position = unknown if sample.tool_position_m is None else sample.tool_position_m
-        quaternion = np.full(4, np.nan) if sample.tool_quaternion is None else sample.tool_quaternion
-        wrench = np.full(6, np.nan) if sample.wrench is None else sample.wrench
-        gripper = np.nan if sample.gripper is None else sample.gripper
-        self._robot.append([sample.t_s, *sample.joints_rad, gripper, *position, *quaternion, *wrench])
-        self.robot_rows += 1
+        rows = []
+        for sample in samples:
+            if len(sample.joints_rad) != self._joint_count:
+                raise EpisodeError(f"A robot row has {len(sample.joints_rad)} joints, the log {self._joint_count}.")
+            unknown = np.full(3, np.nan)
+            position = unknown if sample.tool_position_m is None else sample.tool_position_m
+            quaternion = np.full(4, np.nan) if sample.tool_quaternion is None else sample.tool_quaternion
+            wrench = np.full(6, np.nan) if sample.wrench is None else sample.wrench
+            gripper = np.nan if sample.gripper is None else sample.gripper
+            rows.append([sample.t_s, *sample.joints_rad, gripper, *position, *quaternion, *wrench])
+        if rows:
+            self._robot.append(*rows)
+            self.robot_rows += len(rows)
 
     def state_rate(self, rate_hz: float) -> None:
         """The rate of the frames, where it is known only at the end."""
@@ -472,8 +476,8 @@ class _Rows:
             raise DiffCloudError(f"Cannot write {path}: {error.strerror}.") from error
         self._write(",".join(columns))
 
-    def append(self, values: Sequence[float]) -> None:
-        self._write(",".join("" if np.isnan(value) else f"{value:.9g}" for value in values))
+    def append(self, *rows: Sequence[float]) -> None:
+        self._write("\n".join(",".join("" if np.isnan(value) else f"{value:.9g}" for value in row) for row in rows))
 
     def close(self) -> None:
         self._stream.close()

@@ -76,7 +76,7 @@ def board(folder: Path) -> None:
 def lab(folder: Path) -> None:
     """A trajectory, a calibration, raw episodes, and recordings of other tools."""
     params(folder)
-    (folder / "lift.csv").write_text("t_s,x,y,z\n0,0.5,0,0.2\n2,0.5,0,0.3\n")
+    (folder / "lift.csv").write_text("t_s,x,y,z\n0,0.6,0,0.2\n2,0.6,0,0.3\n")
     ros = {name: f"ros/{name}/aligned_depth_to_color/image_raw" for name in SERIALS}
     table = {serial: (name, poses()[name]) for names in (SERIALS, ros) for name, serial in names.items()}
     cloth = {f"00{index}": (name, view.T_world_camera) for index, (name, view) in enumerate(views().items())}

@@ -9,6 +9,8 @@ import numpy as np
 
 WIDTH, HEIGHT, FPS = 424, 240, 60
 FX, FY, CX, CY = 256.0, 256.0, 212.0, 120.0
+_LEAD_S = 0.25
+"""Before the first frame: a capture may feed cameras when it says that it records, and then starts its clock."""
 DEPTH_SCALE = 1 / 64
 """Short binary fractions: with them the SDK's alignment, which computes in float32 and rounds down, has no rounding error,
 so that depth can be compared bit by bit. With others it moves one pixel in ten by one. The scale also has six decimals,
@@ -114,15 +116,16 @@ class Cameras:
         """Push pairs in the background; the second camera falls silent after `dies_after`."""
 
         def run() -> None:
-            start = time.time()
+            start = time.monotonic() + _LEAD_S
             while not self._ending.is_set() and (count is None or self.pushed < count):
                 number = self.pushed + 1
+                self._ending.wait(max(start + number * self._interval - time.monotonic(), 0.001))
+                # what the driver's clock says at that moment, which is the time of day
+                stamp = start + number * self._interval - time.monotonic() + time.time()
                 for index, camera in enumerate(self.cameras):
                     if index == 0 or dies_after is None or number <= dies_after:
-                        camera.push_numbered(number, 1000 * (start + number * self._interval))
+                        camera.push_numbered(number, 1000 * stamp)
                 self.pushed = number
-                wait = start + number * self._interval - time.time()
-                self._ending.wait(max(wait, 0.001))
 
         self._thread = threading.Thread(target=run, daemon=True)
         self._thread.start()

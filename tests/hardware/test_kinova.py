@@ -13,23 +13,17 @@ import pytest
 
 from diffcloud.errors import HardwareError, LimitError
 from diffcloud.hardware import CaptureSettings, Limits, ToolTrajectory, capture
-from diffcloud.hardware.kinova import KinovaArm, Kortex, load_kortex
+from diffcloud.hardware.kinova import Kortex, load_kortex
 from diffcloud.io.raw_episodes import read_raw_episode
+from diffcloud.sensing.robot import GEN3_HOME_RAD
 from tests.hardware.kortex import messages
 from tests.hardware.kortex.client import MINIMAL
 from tests.hardware.kortex.messages import Frame, parsed
-from tests.hardware.kortex.server import EMERGENCY, HOME_DEG, HOME_M, FakeArm
+from tests.hardware.kortex.opening import connect, in_process
+from tests.hardware.kortex.server import EMERGENCY, HOME_DEG, HOME_M, LAG_S, FakeArm
 from tests.hardware.simulated import TestCard
 
 TEN_HZ = CaptureSettings(rate_hz=10.0, hold_s=0.3, durable=False)
-
-
-@pytest.fixture(scope="module")
-def kortex():
-    try:
-        return load_kortex()
-    except HardwareError:
-        return MINIMAL
 
 
 @pytest.fixture
@@ -39,14 +33,22 @@ def server():
 
 
 @pytest.fixture
-def arm(server, kortex):
-    opened = connect(server, kortex)
+def arm(server):
+    """The adapter itself, in this process."""
+    opened = here(server)
     yield opened
     opened.close()
 
 
-def connect(server, kortex, **options):
-    return KinovaArm("127.0.0.1", kortex=kortex, tcp_port=server.tcp_port, udp_port=server.udp_port, **options)
+@pytest.fixture
+def guarded(server):
+    opened = in_process(server)
+    yield opened
+    opened.close()
+
+
+def here(server, **options):
+    return connect(server.tcp_port, server.udp_port, **options)
 
 
 def lift(keyframes=25, height=0.15):
@@ -81,20 +83,20 @@ class TestWire:
 
 
 class TestAdapter:
-    def test_sessions_open_and_close(self, server, kortex):
-        arm = connect(server, kortex)
+    def test_sessions_open_and_close(self, server):
+        arm = here(server)
         assert server.sessions_open == 2  # commands and measurements
-        assert server.connection_timeouts_ms == [1000, 1000]  # the arm stops by itself when the link is silent
+        assert server.connection_timeouts_ms == [500, 500]  # the arm stops by itself when the link is silent
         arm.close()
         arm.close()
         assert server.sessions_open == 0
 
-    def test_a_wrong_password_and_a_wrong_address(self, server, kortex):
+    def test_a_wrong_password_and_a_wrong_address(self, server):
         with pytest.raises(HardwareError, match=r"No arm answers at 127\.0\.0\.1:\d+ .*user name and password"):
-            connect(server, kortex, password="wrong")
+            here(server, password="wrong")
         server.cut()
         with pytest.raises(HardwareError, match="Check power, cable"):
-            connect(server, kortex)
+            here(server)
 
     def test_readings_are_radians_and_metres(self, arm, server):
         reading = arm.read()
@@ -108,10 +110,13 @@ class TestAdapter:
         assert reading.gripper == 0.0
 
     def test_joints_do_not_jump_where_the_arm_wraps(self, arm, server):
+        """The first joint turns from 0 to below 359 degrees as the arm reports it."""
         first = arm.read().joints_rad
-        server.position = HOME_M - [0.0, 0.0, 0.02]  # joints turn back by 1.2 degrees, the first past zero
-        second = arm.read().joints_rad
-        np.testing.assert_allclose(second - first, np.deg2rad(-1.2), atol=1e-5)
+        for y in (0.01, 0.02, 0.03):
+            server.position = [HOME_M[0], y, HOME_M[2]]
+            reading = arm.read()
+        assert np.rad2deg(server.joints_rad[0]) < -1
+        np.testing.assert_allclose(reading.joints_rad - first, server.joints_rad - GEN3_HOME_RAD, atol=1e-5)
 
     def test_a_twist_moves_until_stop(self, arm, server):
         arm.prepare()
@@ -123,16 +128,41 @@ class TestAdapter:
         time.sleep(0.15)
         assert arm.read().tool_position_m[2] - HOME_M[2] == pytest.approx(risen, abs=0.005)
 
-    def test_home_waits_for_the_end(self, arm, server):
-        server.position = np.add(HOME_M, [0.0, 0.1, 0.0])
-        arm.home(2.0)
-        np.testing.assert_allclose(arm.read().tool_position_m, HOME_M, atol=1e-6)
-        assert server.names()[-4:] == ["ReadAllActions", "ActionTopic", "ExecuteActionFromReference", "Unsubscribe"]
+    def test_joint_velocities_move_until_stop(self, arm, server):
+        arm.prepare()
+        before = server.joints_rad
+        arm.send_joint_velocity(np.array([0.0, 0, 0, 0, 0, 0, 0.3]))
+        time.sleep(0.2)
+        arm.stop()
+        server.rest()
+        turned = server.joints_rad - before
+        assert 0.03 < turned[6] < 0.18
+        np.testing.assert_allclose(turned[:6], 0, atol=1e-9)
+        np.testing.assert_allclose(arm.read().tool_position_m, HOME_M, atol=1e-3)  # the last joint turns about the tool
 
-    def test_home_that_is_aborted(self, arm, server):
-        server.abort_home = True
-        with pytest.raises(HardwareError, match="aborted the motion home"):
-            arm.home(2.0)
+    def test_velocities_that_are_no_numbers_are_not_sent(self, arm, server):
+        arm.prepare()
+        with pytest.raises(HardwareError, match="not finite"):
+            arm.send_velocity(np.array([0.0, np.nan, 0.0]))
+        with pytest.raises(HardwareError, match="not finite"):
+            arm.send_joint_velocity(np.full(7, np.inf))
+        assert not {"SendTwistCommand", "SendJointSpeedsCommand"} & set(server.names())
+
+    def test_home_is_known_without_going_there(self, arm, server):
+        np.testing.assert_allclose(np.rad2deg(arm.home_joints()), HOME_DEG, atol=1e-4)
+        assert server.names()[-1] == "ReadAllActions"
+
+    def test_an_arm_that_somebody_else_drives_is_not_taken_over(self, arm, server):
+        server.manual_until = np.inf
+        with pytest.raises(HardwareError, match=r"under manual control: .* It is not taken from them"):
+            arm.prepare()
+        assert "SetServoingMode" not in server.names()
+
+    def test_manual_control_of_a_moment_is_waited_for(self, arm, server):
+        """The arm reports it after a session has closed."""
+        server.manual_until = time.monotonic() + 0.3
+        arm.prepare()
+        assert server.names()[-1] == "SetServoingMode"
 
     def test_the_gripper(self, arm, server):
         arm.set_gripper(0.8)
@@ -152,15 +182,15 @@ class TestAdapter:
             arm.read()
 
 
-def record(folder, arm, **options):
-    return capture(folder, [TestCard(fps=30)], arm=arm, trajectory=lift(), settings=TEN_HZ, **options)
+def record(folder, arm, *, limits=Limits(speed_m_s=0.2), **options):
+    return capture(folder, [TestCard(fps=30)], arm=arm, trajectory=lift(), limits=limits, settings=TEN_HZ, **options)
 
 
-def test_a_trajectory_of_25_steps_at_10_hz(tmp_path, arm, server):
-    report = record(tmp_path / "e", arm)
+def test_a_trajectory_of_25_steps_at_10_hz(tmp_path, guarded, arm, server):
+    report = record(tmp_path / "e", guarded)
     assert len(server.twist_times) >= 25
     assert np.median(np.diff(server.twist_times)) == pytest.approx(0.1, abs=0.02)
-    assert server.stopped_after_last_twist()
+    assert server.stopped_after_last_motion()
     assert report.largest_error_m < 0.03
     np.testing.assert_allclose(arm.read().tool_position_m, lift().positions[-1], atol=3e-3)
     log = read_raw_episode(tmp_path / "e").robot
@@ -177,18 +207,24 @@ def test_a_trajectory_of_25_steps_at_10_hz(tmp_path, arm, server):
         ("cut", "did not carry out"),
     ],
 )
-def test_trouble_in_the_middle_of_a_run(tmp_path, server, kortex, event, message):
-    arm = connect(server, kortex)
-    server.at_twist[8] = getattr(server, event)
-    start = time.monotonic()
+def test_trouble_in_the_middle_of_a_run(tmp_path, server, event, message):
+    places = []
+
+    def happen():
+        places.append(server.position)
+        getattr(server, event)()
+
+    arm = in_process(server)
+    server.at_twist[8] = happen
     try:
         with pytest.raises(HardwareError, match=message):
             record(tmp_path / "e", arm)
     finally:
         arm.close()
-    assert time.monotonic() - start < 6
+    fastest, timeout, busy = 0.12, 0.5, 0.5
+    assert np.linalg.norm(server.rest() - places[0]) < fastest * (timeout + busy + LAG_S)
     if event != "cut":  # with no link there is nothing to send it over; the arm's own timeout stops it
-        assert server.stopped_after_last_twist()
+        assert server.stopped_after_last_motion()
     episode = read_raw_episode(tmp_path / "e")
     assert episode.description["status"] == "stopped"
     assert len(episode.robot.times) > 20
@@ -199,13 +235,13 @@ def test_trouble_in_the_middle_of_a_run(tmp_path, server, kortex, event, message
     ("limits", "message"),
     [
         (Limits(box_high_m=(0.95, 0.36, 0.5)), "outside the workspace box"),
-        (Limits(speed_m_s=0.05), "the limit is 0.05 m/s"),
+        (Limits(), "the limit is 0.1 m/s"),
     ],
 )
-def test_what_leaves_the_box_or_is_too_fast_is_refused_before_the_arm_moves(tmp_path, arm, server, limits, message):
+def test_what_leaves_the_box_or_is_too_fast_is_refused_before_the_arm_moves(tmp_path, guarded, server, limits, message):
     before = server.names()
     with pytest.raises(LimitError, match=message):
-        record(tmp_path / "e", arm, limits=limits)
+        record(tmp_path / "e", guarded, limits=limits)
     assert server.names() == before
     np.testing.assert_array_equal(server.position, HOME_M)
 
@@ -217,9 +253,9 @@ def test_without_kortex_api_the_error_says_where_it_is(monkeypatch):
         load_kortex()
 
 
-def test_no_thread_is_left(server, kortex):
+def test_no_thread_is_left(server):
     before = threading.active_count()
-    connect(server, kortex).close()
+    here(server).close()
     deadline = time.monotonic() + 3
     while threading.active_count() > before and time.monotonic() < deadline:
         time.sleep(0.05)

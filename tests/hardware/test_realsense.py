@@ -109,6 +109,26 @@ def test_the_usual_scale_comes_back_exactly(tmp_path, make_cameras):
         assert len(list(frames)) >= 1
 
 
+@pytest.mark.parametrize("change_s", [-3600.0, 3600.0])
+def test_a_clock_that_is_set_while_recording_loses_no_frame(tmp_path, make_cameras, monkeypatch, change_s):
+    """Stamps are the computer's time of day; after a third of the frames somebody sets it."""
+    cameras = make_cameras()
+    right = time.time
+    monkeypatch.setattr(time, "time", lambda: right() + (change_s if cameras.pushed >= 40 else 0.0))
+
+    def feed_once_recording(text):
+        if text == "recording":
+            cameras.feed(count=120)
+
+    settings = CaptureSettings(rate_hz=60.0, camera_timeout_s=1.5, durable=False)
+    with pytest.raises(HardwareError, match="delivered no frame"):  # once all have come
+        capture(tmp_path / "e", opened(cameras), seconds=60, tell=feed_once_recording, settings=settings)
+    for camera in read_raw_episode(tmp_path / "e").cameras.values():
+        numbers = [int(camera.depth(index)[0, 0]) for index in range(len(camera.frames))]
+        assert numbers == list(range(1, 121))
+        np.testing.assert_allclose(np.diff(camera.times), 1 / FPS, atol=5e-3)
+
+
 def test_depth_is_aligned_to_a_colour_camera_beside_it(make_cameras):
     """Colour 15 mm to the side: a wall's left edge moves by f b / z pixels."""
     cameras = make_cameras(baseline_m=0.015)
@@ -130,7 +150,7 @@ def test_depth_is_aligned_to_a_colour_camera_beside_it(make_cameras):
 
 def test_a_camera_that_stops_mid_run_ends_the_capture_and_stops_the_arm(tmp_path, make_cameras):
     cameras = make_cameras()
-    cameras.feed(dies_after=40)
+    cameras.feed(dies_after=200)  # seconds after the arm has begun
     arm = PointArm()
     settings = CaptureSettings(rate_hz=10.0, hold_s=5.0, camera_timeout_s=0.7, durable=False)
     with pytest.raises(HardwareError, match=r"Camera side \(222222222222\) delivered no frame for 0.7 s: unplugged"):
@@ -142,7 +162,7 @@ def test_a_camera_that_stops_mid_run_ends_the_capture_and_stops_the_arm(tmp_path
     assert episode.description["status"] == "stopped"
     side = episode.cameras["side"]
     numbers = [int(side.depth(index)[0, 0]) for index in range(len(side.frames))]
-    assert numbers[-1] == 40  # all frames so far
+    assert numbers[-1] == 200  # all frames so far
     faults = {finding.code for finding in validate_raw_episode(tmp_path / "e") if finding.severity == "fault"}
     assert "truncated_image" not in faults
 

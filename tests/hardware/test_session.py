@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import signal
 import subprocess
@@ -15,16 +16,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from diffcloud.errors import DiffCloudError, EpisodeError, HardwareError, LimitError
+from diffcloud.errors import DiffCloudError, EpisodeError, HardwareError, LimitError, UnconfirmedStopError
 from diffcloud.hardware import CaptureSettings, Limits, capture, session
 from diffcloud.hardware.trajectory import ToolTrajectory
-from diffcloud.io.raw_episodes import read_raw_episode
+from diffcloud.io.raw_episodes import RawEpisodeWriter, read_raw_episode
 from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.hardware.simulated import START, PointArm, TestCard, short_path
 
 BESIDE = np.add(START, [0.02, 0, 0])
-QUICK = CaptureSettings(rate_hz=50.0, hold_s=0.05, durable=False, watchdog_s=5.0)
-"""Patient: a busy machine may hold the loop up."""
+QUICK = CaptureSettings(rate_hz=50.0, hold_s=0.05, durable=False)
 
 
 def run(folder, arm, *, cameras=None, path=None, limits=None, settings=QUICK):
@@ -46,7 +46,7 @@ def test_a_capture_to_its_end(tmp_path):
         numbers = [int(camera.depth(index)[0, 0]) for index in range(len(camera.frames))]
         assert np.diff(numbers).tolist() == [1] * (len(numbers) - 1)  # none lost
     log = episode.robot
-    assert np.interp(0.2, log.times, log.tool_position_m[:, 2]) == pytest.approx(START[2] + 0.02, abs=0.01)
+    assert np.interp(0.4, log.times, log.tool_position_m[:, 2]) == pytest.approx(START[2] + 0.02, abs=0.01)
     assert log.tool_position_m[-1, 2] == pytest.approx(START[2] + 0.02, abs=0.002)
     codes = {finding.code for finding in validate_raw_episode(tmp_path / "e")}
     assert not codes & {"short_robot_log", "clock_backwards", "missing_frames"}
@@ -84,20 +84,21 @@ def test_the_start_is_approached_slowly_then_recorded(tmp_path):
     np.testing.assert_allclose(log.tool_position_m[0], BESIDE, atol=2e-3)
 
 
-def test_home_and_gripper(tmp_path):
+def test_the_gripper_waits_for_the_end_of_the_way(tmp_path):
     arm = PointArm()
     base = short_path()
-    path = ToolTrajectory(base.times, base.positions, np.array([0.0, 0, 1, 1, 1]))
-    run(tmp_path / "e", arm, path=path, settings=CaptureSettings(rate_hz=50, hold_s=0.05, go_home=True, durable=False))
-    assert arm.events[:3] == ["prepare", "home", "gripper 0"]
-    assert arm.events.count("gripper 1") == 1
+    path = ToolTrajectory(base.times, np.add(base.positions, [0.01, 0, 0]), np.array([0.0, 0, 1, 1, 1]))
+    run(tmp_path / "e", arm, path=path, settings=replace(QUICK, go_home=True))
+    events = [event for event, _ in itertools.groupby(arm.events)]
+    home, approach, rest = ["prepare", "turn", "stop"], ["prepare", "twist", "stop"], ["gripper 0", "prepare"]
+    assert events == [*home, *approach, *rest, "gripper 0", "twist", "gripper 1", "twist", "stop"]
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"path": short_path(distance=0.9)}, "outside the workspace box"),
-        ({"path": short_path(distance=0.2)}, "moves at 1.000 m/s"),
+        ({"path": short_path(distance=0.2)}, "moves at 0.500 m/s; the limit is 0.1"),
     ],
 )
 def test_refused_before_anything_opens_or_moves(tmp_path, changes, message):
@@ -187,18 +188,24 @@ def test_every_exit_stops_the_arm_and_keeps_the_data(tmp_path, trouble, kind, me
         run(tmp_path / "e", arm)
     assert arm.stopped
     assert "twist" in arm.events
+    assert ("halt" in arm.events) == (kind is KeyboardInterrupt)  # the signal's handler itself sends Stop
     assert signal.getsignal(signal.SIGTERM) == before
     episode = read_raw_episode(tmp_path / "e")
     assert episode.description["status"] == "stopped"
     assert len(episode.robot.times) >= 7
     assert len(episode.cameras["side"].frames) >= 1
-    assert not [thread for thread in threading.enumerate() if thread.name.startswith(("side", "watchdog"))]
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith(("side", "robot_write"))]
 
 
 def test_an_arm_that_is_held_is_noticed_by_its_distance(tmp_path):
     arm = PointArm({3: hold})
     with pytest.raises(LimitError, match="mm from the trajectory"):
-        run(tmp_path / "e", arm, path=short_path(0.05, 0.2), limits=Limits(tracking_error_m=0.02, acceleration_m_s2=9))
+        run(
+            tmp_path / "e",
+            arm,
+            path=short_path(0.05, 0.2),
+            limits=Limits(tracking_error_m=0.02, speed_m_s=0.3, acceleration_m_s2=9),
+        )
     assert arm.stopped
 
 
@@ -233,36 +240,82 @@ def test_a_full_disk_stops_the_arm(tmp_path, monkeypatch):
     assert "No space left" in episode.description["stop_reason"]
 
 
-def test_a_loop_that_hangs_is_stopped_by_the_watchdog(tmp_path):
-    stops = []
+def test_the_control_loop_writes_to_no_disk(tmp_path, monkeypatch):
+    """While the arm moves, its thread neither appends a row nor waits for the disk."""
+    arm, loop, seen = PointArm(), threading.current_thread(), []
 
-    def hang(arm):
-        start = time.monotonic()
-        while time.monotonic() - start < 2 and "stop" not in arm.events:
-            time.sleep(0.01)
-        stops.append(time.monotonic() - start)
+    def spied(call):
+        def spy(*arguments):
+            if not arm.stopped:
+                seen.append(threading.current_thread())
+            return call(*arguments)
 
-    arm = PointArm({9: hang})
-    with pytest.raises(HardwareError, match="watchdog stopped the arm"):
-        run(tmp_path / "e", arm, settings=replace(QUICK, watchdog_s=0.3))
-    assert 0.2 < stops[0] < 1.0
+        return spy
+
+    monkeypatch.setattr(RawEpisodeWriter, "add_robot", spied(RawEpisodeWriter.add_robot))
+    monkeypatch.setattr(os, "fsync", spied(os.fsync))
+    monkeypatch.setattr(os, "replace", spied(os.replace))
+    report = run(tmp_path / "e", arm, settings=replace(QUICK, durable=True))
+    assert seen  # others have written
+    assert loop not in seen
+    assert report.robot_rows == len(read_raw_episode(tmp_path / "e").robot.times) > 15
+
+
+def test_a_disk_that_refuses_the_arms_log_stops_the_arm(tmp_path, monkeypatch):
+    def refuse(self, *samples):
+        raise DiffCloudError("Cannot write robot.csv: No space left on device.")
+
+    monkeypatch.setattr(RawEpisodeWriter, "add_robot", refuse)
+    arm = PointArm()
+    with pytest.raises(DiffCloudError, match=r"robot\.csv: No space left"):
+        run(tmp_path / "e", arm, path=short_path(0.02, 2.0))
     assert arm.stopped
+    assert arm.events.count("twist") < 50  # not only at the end
 
 
-def test_a_stop_that_fails_is_tried_again(tmp_path):
+@pytest.mark.parametrize("trouble", [{}, {9: fail}])
+def test_a_stop_that_is_not_confirmed_is_told(tmp_path, trouble):
     class Deaf(PointArm):
-        failures = 2
-
         def stop(self):
-            if self.failures:
-                self.failures -= 1
-                raise HardwareError("no answer")
             super().stop()
+            raise UnconfirmedStopError("THE ARM MAY STILL BE MOVING")
 
-    arm = Deaf({9: fail})
-    with pytest.raises(HardwareError, match="went into fault"):
-        run(tmp_path / "e", arm)
-    assert arm.stopped
+    told = []
+    with pytest.raises(HardwareError) as raised:
+        capture(tmp_path / "e", [TestCard()], arm=Deaf(trouble), trajectory=short_path(), settings=QUICK, tell=told.append)
+    assert "THE ARM MAY STILL BE MOVING" in told
+    assert isinstance(raised.value, UnconfirmedStopError) == (not trouble)
+
+
+def test_an_arm_that_nobody_watches_is_refused(tmp_path):
+    class Bare:
+        joint_count = 7
+
+    with pytest.raises(HardwareError, match=r"ArmProcess.*got Bare"):
+        capture(tmp_path / "e", [TestCard()], arm=Bare(), trajectory=short_path())
+
+
+def test_a_camera_whose_clock_runs_backwards_ends_the_capture(tmp_path):
+    """Not one with a part of the frames that calls itself complete."""
+
+    class Jumping(TestCard):
+        def read(self, timeout_s):
+            frame = super().read(timeout_s)
+            return replace(frame, time_s=frame.time_s - (5.0 if self.delivered > 10 else 0.0))
+
+    with pytest.raises(HardwareError, match=r"Camera side: its clock ran backwards by 4\.9"):
+        capture(tmp_path / "e", [Jumping()], seconds=5, settings=QUICK)
+    episode = read_raw_episode(tmp_path / "e")
+    assert (episode.description["status"], len(episode.cameras["side"].frames)) == ("stopped", 10)
+
+
+def test_setting_the_time_of_day_changes_nothing(tmp_path, monkeypatch):
+    right, start = time.time, time.monotonic()
+    monkeypatch.setattr(time, "time", lambda: right() - (3600.0 if time.monotonic() > start + 0.3 else 0.0))
+    camera = TestCard(fps=100)
+    report = capture(tmp_path / "e", [camera], seconds=1.0, settings=QUICK)
+    assert report.frames["side"] >= camera.delivered - 2  # the first may be older than the start, the last come too late
+    assert np.diff(read_raw_episode(tmp_path / "e").cameras["side"].times).min() > 0
 
 
 def test_a_closed_terminal_stops_the_arm(tmp_path):

@@ -10,6 +10,7 @@ from diffcloud.hardware import Limits, ToolTrajectory, VelocityController, check
 from diffcloud.hardware.trajectory import approach
 
 CORNER = np.array([0.5, 0.0, 0.3])
+FAST = Limits(speed_m_s=0.5)
 
 
 def line(distance=0.2, seconds=2.0, keyframes=21, start=CORNER):
@@ -49,7 +50,7 @@ def test_keyframes_are_passed_on_time_and_velocities_are_the_slopes():
 
 def test_the_arm_follows_within_a_centimetre_and_ends_on_the_last_keyframe():
     path = line()
-    positions, commands = follow(path, Limits())
+    positions, commands = follow(path, FAST)
     wanted = np.array([path.position(tick / 10) for tick in range(len(positions))])
     assert np.linalg.norm(positions - wanted, axis=1).max() < 0.012
     np.testing.assert_allclose(positions[-1], path.positions[-1], atol=1e-3)
@@ -84,8 +85,8 @@ def test_a_gain_that_overshoots_for_ever_is_refused():
         (line(start=np.array([0.9, 0.0, 0.3])), {}, r"Keyframe \d+ .*outside the workspace box .*--box"),
         (line(start=np.array([0.5, 0.0, 0.05])), {}, "Keyframe 0 .* 21 keyframes do"),
         (ToolTrajectory(line().times, 1000 * line().positions), {}, "millimetres"),
-        (line(), {"speed_m_s": 0.1}, r"moves at 0\.18\d m/s; the limit is 0\.1 m/s\. .*--stretch-time 1\.9"),
-        (line(), {"acceleration_m_s2": 0.2}, r"accelerates with 0\.2\d m/s²; the limit is 0\.2"),
+        (line(), {}, r"moves at 0\.18\d m/s; the limit is 0\.1 m/s\. .*--stretch-time 1\.9"),
+        (line(), {"speed_m_s": 0.5, "acceleration_m_s2": 0.2}, r"accelerates with 0\.2\d m/s²; the limit is 0\.2"),
     ],
 )
 def test_what_breaks_a_limit_is_refused_by_name(path, limits, message):
@@ -96,7 +97,7 @@ def test_what_breaks_a_limit_is_refused_by_name(path, limits, message):
 def test_what_a_refusal_suggests_is_enough():
     path = line()
     slower = ToolTrajectory(path.times * 1.97, path.positions)
-    check_trajectory(slower, Limits(speed_m_s=0.1))
+    check_trajectory(slower, Limits())
 
 
 def test_approach_is_straight_smooth_and_slow():
@@ -143,9 +144,12 @@ def test_limits_must_make_sense():
         Limits(speed_m_s=0)
 
 
-def test_published_trajectories_keep_the_default_limits(release):
+def test_published_trajectories_keep_the_limits_at_their_own_speed(release):
     folder = release.parent / "trajs"
     if not folder.is_dir():
         pytest.skip("the published trajectories (trajs/) are not beside DIFFCLOUD_RELEASE")
     for name in ("lift", "fold", "stretch"):
-        check_trajectory(read_trajectory(folder / f"{name}_traj.npy"), Limits())
+        path = read_trajectory(folder / f"{name}_traj.npy")
+        check_trajectory(path, FAST)
+        with pytest.raises(LimitError, match="--stretch-time"):
+            check_trajectory(path, Limits())

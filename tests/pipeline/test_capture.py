@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
+from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from diffcloud.hardware import installed
-from diffcloud.hardware.kinova import KinovaArm
 from diffcloud.io.calibrations import Calibration, CameraCalibration, write_calibration
 from diffcloud.io.raw_episodes import read_raw_episode
 from pipeline import capture
-from tests.hardware.kortex.client import MINIMAL
+from tests.hardware.kortex.opening import in_process
 from tests.hardware.kortex.server import HOME_M, FakeArm
 from tests.hardware.simulated import SMALL, TestCard
 from tests.pipeline.invoke import invoke
@@ -25,11 +26,7 @@ class Card(TestCard):
 @pytest.fixture
 def server(monkeypatch):
     with FakeArm(start=HOME_M) as arm:
-        monkeypatch.setattr(
-            capture,
-            "open_arm",
-            lambda address: KinovaArm(address, kortex=MINIMAL, tcp_port=arm.tcp_port, udp_port=arm.udp_port),
-        )
+        monkeypatch.setattr(capture, "open_arm", lambda address: in_process(arm, address=address))
         monkeypatch.setattr(capture, "make_camera", lambda name, serial, **options: Card(name, fps=60))
         yield arm
 
@@ -51,7 +48,7 @@ def test_a_capture_is_written_and_valid(tmp_path, server, path):
         "capture", "--out", tmp_path / "e", "--trajectory", path, "--arm", "127.0.0.1", *BOTH, "--yes",
         "--calibration", tmp_path / "c.json", "--scenario", "lift", "--rate", 20, "--fps", 60,
     )  # fmt: skip
-    assert server.stopped_after_last_twist()
+    assert server.stopped_after_last_motion()
     assert server.sessions_open == 0
     assert done.result["largest_error_m"] < 0.02
     episode = read_raw_episode(tmp_path / "e")
@@ -65,7 +62,7 @@ def test_a_dry_run_prints_the_plan_and_opens_nothing(tmp_path, server, path):
     done = invoke("capture", "--out", tmp_path / "e", "--trajectory", path, "--arm", "a", *BOTH, "--dry-run")
     assert done.result["plan"]["keyframes"] == 6
     assert "Dry run: nothing was opened" in done.errors
-    assert "0.04 of 0.5 m/s" in done.errors
+    assert "0.04 of 0.1 m/s" in done.errors
     assert server.calls == []
     assert not (tmp_path / "e").exists()
 
@@ -100,6 +97,30 @@ def test_bad_options(tmp_path, server, path, arguments, message, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert message in invoke("capture", "--out", "e", *arguments, code=1).errors
     assert not (tmp_path / "e").exists()
+    assert "SendTwistCommand" not in server.names()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--table", 0.41), "the table is at 0.410"),
+        (
+            ("--box", "0.4,-0.3,0.1,0.6,0.3,0.9", "--arm-margin", 0.01),
+            "finger_pad reaches x = 0.637 m; the arm's space ends",
+        ),
+        (("--preload", 5), "At rest the tool feels 6.0 N"),
+        (("--urdf", "longer.urdf"), "The arm reports its tool 50 mm"),
+    ],
+)
+def test_limits_of_the_whole_arm(tmp_path, server, path, arguments, message, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    server.wrench[2] = 6.0
+    own = (files("diffcloud.sensing") / "gen3_robotiq_2f_85.urdf").read_text()
+    Path("longer.urdf").write_text(
+        own.replace('<origin xyz="0 0 0.12" rpy="0 0 0"/>', '<origin xyz="0 0 0.17" rpy="0 0 0"/>')
+    )
+    command = ("capture", "--out", "e", "--trajectory", path, "--arm", "127.0.0.1", *BOTH, "--yes")
+    assert message in invoke(*command, *arguments, code=1).errors
     assert "SendTwistCommand" not in server.names()
 
 

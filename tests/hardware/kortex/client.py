@@ -89,7 +89,6 @@ class RouterClient:
     def __init__(self, transport: Any, error_callback: Any) -> None:
         self._transport, self._callback = transport, error_callback
         self.session = 0
-        self.topics: dict[int, Any] = {}
         self._waiting: dict[int, Future[Frame]] = {}
         self._number, self._lock = 0, threading.Lock()
         self._reader: threading.Thread | None = None
@@ -116,11 +115,7 @@ class RouterClient:
     def _read(self) -> None:
         while (data := self._transport.receive()) is not None:
             frame = Frame.decode(data)
-            if frame.kind == 5:
-                callback = self.topics.get(frame.uid)
-                if callback is not None:
-                    callback(parsed(messages.ActionNotification, frame.payload))
-            elif (answer := self._waiting.pop(frame.number, None)) is not None:
+            if (answer := self._waiting.pop(frame.number, None)) is not None:
                 answer.set_result(frame)
         for answer in self._waiting.values():
             answer.set_exception(ConnectionError("the link was closed"))
@@ -159,15 +154,10 @@ class BaseClient:
     def __init__(self, router: RouterClient) -> None:
         self._router = router
 
-    def OnNotificationActionTopic(self, callback: Any, notificationoptions: Any, deviceId: int = 0) -> Any:
-        self._router.topics[UIDS["ActionTopic"]] = callback
-        return parsed(messages.NotificationHandle, self._router.call("ActionTopic", notificationoptions))
-
     GetArmState = _stub("GetArmState", messages.ArmStateInformation)
     SetServoingMode = _stub("SetServoingMode", Empty)
     ReadAllActions = _stub("ReadAllActions", messages.ActionList)
-    ExecuteActionFromReference = _stub("ExecuteActionFromReference", Empty)
-    Unsubscribe = _stub("Unsubscribe", Empty)
+    SendJointSpeedsCommand = _stub("SendJointSpeedsCommand", Empty)
     SendTwistCommand = _stub("SendTwistCommand", Empty)
     Stop = _stub("Stop", Empty)
     ApplyEmergencyStop = _stub("ApplyEmergencyStop", Empty)

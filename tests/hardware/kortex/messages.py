@@ -205,14 +205,14 @@ CreateSessionInfo = _message(
     password=(3, "string"),
     connection_inactivity_timeout=(4, "uint"),
 )
-NotificationOptions = _message("NotificationOptions", type=(1, "uint"))
-NotificationHandle = _message("NotificationHandle", identifier=(1, "uint"))
 ServoingModeInformation = _message("ServoingModeInformation", servoing_mode=(1, "uint"))
 RequestedActionType = _message("RequestedActionType", action_type=(1, "uint"))
 ActionHandle = _message("ActionHandle", identifier=(1, "uint"), action_type=(2, "uint"))
-Action = _message("Action", handle=(1, ActionHandle), name=(2, "string"))
+JointAngle = _message("JointAngle", joint_identifier=(1, "uint"), value=(2, "float"))
+JointAngles = _message("JointAngles", joint_angles=(1, [JointAngle]))
+ConstrainedJointAngles = _message("ConstrainedJointAngles", joint_angles=(1, JointAngles))
+Action = _message("Action", handle=(1, ActionHandle), name=(2, "string"), reach_joint_angles=(10, ConstrainedJointAngles))
 ActionList = _message("ActionList", action_list=(1, [Action]))
-ActionNotification = _message("ActionNotification", action_event=(1, "uint"), handle=(2, ActionHandle))
 Pose = _message("Pose", **{name: (index + 1, "float") for index, name in enumerate(_POSE)})
 Twist = _message(
     "Twist",
@@ -220,8 +220,8 @@ Twist = _message(
        for block, kind in enumerate(("linear", "angular")) for index, axis in enumerate("xyz")},
 )  # fmt: skip
 TwistCommand = _message("TwistCommand", reference_frame=(1, "uint"), twist=(2, Twist), duration=(3, "uint"))
-JointAngle = _message("JointAngle", joint_identifier=(1, "uint"), value=(2, "float"))
-JointAngles = _message("JointAngles", joint_angles=(1, [JointAngle]))
+JointSpeed = _message("JointSpeed", joint_identifier=(1, "uint"), value=(2, "float"), duration=(3, "uint"))
+JointSpeeds = _message("JointSpeeds", joint_speeds=(1, [JointSpeed]), duration=(2, "uint"))
 Finger = _message("Finger", finger_identifier=(1, "uint"), value=(2, "float"))
 Gripper = _message("Gripper", finger=(1, [Finger]))
 GripperCommand = _message("GripperCommand", mode=(1, "uint"), gripper=(2, Gripper), duration=(3, "uint"))
@@ -244,13 +244,11 @@ UIDS = {
     "CloseSession": 0x10002,
     "KeepAlive": 0x10003,
     "ReadAllActions": 0x2002C,
-    "ExecuteActionFromReference": 0x2002F,
-    "Unsubscribe": 0x20061,
-    "ActionTopic": 0x2006A,
     "Stop": 0x20070,
     "GetMeasuredCartesianPose": 0x20073,
     "SendTwistCommand": 0x20079,
     "GetMeasuredJointAngles": 0x2007E,
+    "SendJointSpeedsCommand": 0x20084,
     "SendGripperCommand": 0x20088,
     "GetMeasuredGripperMovement": 0x20089,
     "ApplyEmergencyStop": 0x20091,
@@ -264,8 +262,6 @@ NAMES = {uid: name for name, uid in UIDS.items()}
 CONSTANTS = {
     "SINGLE_LEVEL_SERVOING": 2,
     "REACH_JOINT_ANGLES": 7,
-    "ACTION_END": 1,
-    "ACTION_ABORT": 2,
     "GRIPPER_POSITION": 3,
     "CARTESIAN_REFERENCE_FRAME_BASE": 3,
     "ARMSTATE_IN_FAULT": 4,

@@ -1,0 +1,414 @@
+"""The arm in a process of its own, which stops it when the capture hangs, is suspended, or dies.
+
+A velocity keeps the arm moving until the next command, so somebody has to be there to send Stop. The capture cannot always
+be: it may be suspended (Ctrl-Z, SIGSTOP), killed, or stuck in a driver. So the connection belongs to a child process that
+does nothing else. It is in a session of its own, where a terminal's signals do not reach it, and treats every signal that
+can be caught as an order to stop the arm. It sends Stop by itself
+
+- when nothing has been heard from the capture for `watchdog_s` while the arm moves,
+- when the socket to the capture ends, because that process has,
+- when the capture asks for it: `stop` waits for the arm's confirmation, `halt` does not wait and may be called from a
+  signal handler.
+
+A Stop that the arm does not confirm is repeated, then followed by the arm's emergency stop, shouted about, and repeated
+again. From any Stop on, velocities are refused until the next `prepare`; a velocity that was on its way when Stop was sent
+is followed by another Stop. So the last thing an arm hears after a Stop is never a velocity.
+
+If the child itself is killed or suspended, or the cable is cut, nobody can send anything, and the arm's own connection
+timeout stops it (`kinova`). A child whose capture is gone and whose Stops are not confirmed ends after a few seconds for
+the same reason: while it lives, it keeps the connection alive.
+
+The socket keeps message boundaries (SOCK_SEQPACKET), so a call that a signal interrupts leaves no half message behind. The
+child is started as a plain process, not through multiprocessing, which would import the caller's `__main__` (a script
+without a guard would start itself again) and would wait at exit for a child that ignores its SIGTERM.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import queue
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from types import FrameType
+from typing import Any
+
+from diffcloud.errors import DiffCloudError, HardwareError, UnconfirmedStopError
+from diffcloud.hardware.devices import Arm, ArmReading, Floats
+from diffcloud.hardware.interruption import catchable_signals
+
+WATCHDOG_S = 0.5
+"""A control loop at 50 Hz misses 25 readings before it counts as hung."""
+
+_STOP_ATTEMPTS = 2
+_REPEAT_S = 0.2
+"""Between attempts at a Stop that the arm has not confirmed."""
+_GIVE_UP_S = 3.0
+"""So long a child whose capture is gone tries to stop the arm."""
+_IN_FLIGHT_S = 0.5
+"""A command that overlaps with a Stop is waited for this long, so that another Stop can follow it."""
+_LARGEST_MESSAGE = 1 << 16
+_OPEN_TIMEOUT_S = 60.0
+_CALL_TIMEOUT_S = 2.0
+_TIMEOUTS_S = {"prepare": 10.0, "stop": 2.5}
+"""Of calls that may take longer: `prepare` waits for a transient state, `stop` tries more than once."""
+_CLOSE_TIMEOUT_S = 6.0
+_DISCONNECT_TIMEOUT_S = 2.0
+_SHOUT_EVERY_S = 1.0
+_HALT = pickle.dumps((0, "halt", ()))
+MAY_BE_MOVING = "THE ARM MAY STILL BE MOVING: PRESS THE EMERGENCY STOP."
+
+
+class ArmProcess:
+    """A connected arm in a child process; keeps the protocol `devices.GuardedArm`.
+
+    Args:
+        open_arm: connects to the arm. It is pickled and called in the child, so it is a function of a module (or a
+            `functools.partial` of one), not of a script.
+        watchdog_s: while the arm moves, the capture may be silent this long.
+
+    Raises:
+        HardwareError: `open_arm` failed, or the child could not be started.
+    """
+
+    def __init__(self, open_arm: Callable[[], Arm], *, watchdog_s: float = WATCHDOG_S) -> None:
+        self._lock = threading.Lock()
+        self._number = 0
+        self._socket, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        code = (
+            f"import sys; sys.path[:] = {sys.path!r}; from diffcloud.hardware.arm_process import serve; "
+            f"serve({there.fileno()})"
+        )
+        try:
+            with there:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-c", code],
+                    pass_fds=[there.fileno()],
+                    start_new_session=True,
+                    stdin=subprocess.DEVNULL,
+                    stdout=2,  # what a library prints must not get into the capture's output
+                )
+        except OSError as error:
+            self._socket.close()
+            raise HardwareError(f"The process that is to hold the arm could not be started: {error}.") from error
+        try:
+            # the factory, which may hold a password, goes over the socket and not into the list of processes
+            self._socket.settimeout(_OPEN_TIMEOUT_S)
+            self._socket.send(pickle.dumps((open_arm, watchdog_s)))
+            self._description, self.joint_count = self._answer(0, "open", _OPEN_TIMEOUT_S)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        """Of the child."""
+        return self._process.pid
+
+    def describe(self) -> dict[str, Any]:
+        """Model and address."""
+        return dict(self._description)
+
+    def clear_faults(self) -> None:
+        """See `Arm`."""
+        self._call("clear_faults")
+
+    def prepare(self) -> None:
+        """See `Arm`; from here on velocities are accepted."""
+        self._call("prepare")
+
+    def home_joints(self) -> Floats:
+        """See `Arm`."""
+        joints: Floats = self._call("home_joints")
+        return joints
+
+    def read(self) -> ArmReading:
+        """See `Arm`."""
+        reading: ArmReading = self._call("read")
+        return reading
+
+    def send_velocity(self, linear_m_s: Floats) -> None:
+        """See `Arm`.
+
+        Raises:
+            HardwareError: also after a Stop, until `prepare`: says what sent that Stop.
+        """
+        self._call("send_velocity", linear_m_s)
+
+    def send_joint_velocity(self, rad_s: Floats) -> None:
+        """See `Arm`; refused as `send_velocity` is."""
+        self._call("send_joint_velocity", rad_s)
+
+    def set_gripper(self, position: float) -> None:
+        """See `Arm`."""
+        self._call("set_gripper", position)
+
+    def stop(self) -> None:
+        """Stop all motion; velocities are refused until `prepare`.
+
+        Raises:
+            UnconfirmedStopError: the arm confirmed neither Stop nor emergency stop. The child goes on trying.
+        """
+        try:
+            self._call("stop")
+        except UnconfirmedStopError:
+            raise
+        except HardwareError as error:
+            raise UnconfirmedStopError(f"{MAY_BE_MOVING} Stop could not be sent: {error}") from error
+
+    def emergency_stop(self) -> None:
+        """See `Arm`."""
+        self._call("emergency_stop")
+
+    def halt(self) -> None:
+        """Have Stop sent without waiting: one message, whole or not at all, so a signal handler may do it anywhere."""
+        with suppress(OSError):  # the child is gone or its queue is full; `stop`, which follows, says so
+            os.write(self._socket.fileno(), _HALT)  # not through the socket object, which a call may be using
+
+    def close(self) -> None:
+        """Disconnect and end the child, which stops the arm first if it moves; harmless twice."""
+        self._socket.close()
+        try:
+            self._process.wait(_CLOSE_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()  # it hangs in the driver; the arm's own timeout stops what moves
+            self._process.wait()
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        with self._lock:
+            self._number += 1
+            try:
+                self._socket.send(pickle.dumps((self._number, name, arguments)))
+            except OSError as error:
+                raise HardwareError(f"The process that holds the arm is gone ({error}).") from error
+            return self._answer(self._number, name, _TIMEOUTS_S.get(name, _CALL_TIMEOUT_S))
+
+    def _answer(self, wanted: int, name: str, timeout_s: float) -> Any:
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._socket.settimeout(max(1e-3, deadline - time.monotonic()))
+            try:
+                data = self._socket.recv(_LARGEST_MESSAGE)
+            except TimeoutError as error:
+                raise HardwareError(
+                    f"The process that holds the arm did not answer to {name} within {timeout_s:g} s: it hangs or was "
+                    "suspended."
+                ) from error
+            except OSError as error:
+                raise HardwareError(f"The link to the process that holds the arm is broken ({error}).") from error
+            if not data:
+                raise HardwareError(f"The process that holds the arm ended during {name}: it was killed, or it crashed.")
+            number, value, error_raised = pickle.loads(data)
+            if number != wanted:  # the answer to a call that a signal interrupted
+                continue
+            if error_raised is not None:
+                raise error_raised
+            return value
+
+
+def serve(handle: int) -> None:
+    """The child's main function: open the arm, carry out requests, watch.
+
+    Args:
+        handle: of the socket to the capture, inherited.
+    """
+    waker, woken = socket.socketpair()
+    waker.setblocking(False)
+    for number in catchable_signals():
+        signal.signal(number, _wake)
+    signal.set_wakeup_fd(waker.fileno(), warn_on_full_buffer=False)
+    with socket.socket(fileno=handle) as link, waker, woken:
+        try:
+            open_arm, watchdog_s = pickle.loads(link.recv(_LARGEST_MESSAGE))
+            arm = open_arm()
+        except Exception as error:
+            _send(link, 0, None, _sendable(error))
+            return
+        try:
+            _send(link, 0, (arm.describe(), arm.joint_count), None)
+            _Service(link, woken, arm, watchdog_s).run()
+        finally:
+            # a driver that hangs here, or its threads, must not keep the connection alive
+            closing = threading.Thread(target=arm.close, daemon=True)
+            closing.start()
+            closing.join(_DISCONNECT_TIMEOUT_S)
+            os._exit(0)
+
+
+def _wake(number: int, _: FrameType | None) -> None:
+    """The wakeup socket tells; this only keeps the signal from ending or suspending the process."""
+
+
+@dataclass(frozen=True)
+class _Request:
+    number: int
+    name: str
+    arguments: tuple[Any, ...]
+    stops: int
+    """So many Stops had been ordered when it came."""
+
+
+class _Service:
+    """Receives and watches in the main thread, which calls nothing but Stop; a second thread carries out the calls.
+
+    So a call that hangs, or the arm's slow answer, never delays a Stop.
+    """
+
+    def __init__(self, link: socket.socket, woken: socket.socket, arm: Arm, watchdog_s: float) -> None:
+        self._link, self._woken, self._arm, self._watchdog_s = link, woken, arm, watchdog_s
+        self._requests: queue.SimpleQueue[_Request | None] = queue.SimpleQueue()
+        self._commanding = threading.Lock()
+        """Held while a velocity is on its way to the arm."""
+        self._stops = 0
+        """Stops that were ordered so far. Velocities are accepted while `_prepared` is the same number: there is no
+        order of events in which a prepare releases what a later Stop has locked."""
+        self._prepared = -1
+        self._reason = "it has not been prepared yet"
+        self._moving = False
+        """A velocity came since the last confirmed Stop."""
+        self._unconfirmed = False
+        self._tried = self._shouted = 0.0
+
+    def run(self) -> None:
+        """Until the capture closes the socket, or dies."""
+        worker = threading.Thread(target=self._work, name="arm calls", daemon=True)
+        worker.start()
+        heard = time.monotonic()
+        while True:
+            patience = None
+            if self._unconfirmed:
+                patience = _REPEAT_S
+            elif self._moving:
+                patience = max(0.0, heard + self._watchdog_s - time.monotonic())
+            ready, _, _ = select.select([self._link, self._woken], [], [], patience)
+            if self._woken in ready:
+                self._woken.recv(4096)
+                self._halt("a signal came to the process that holds it")
+            if self._link in ready:
+                data = _received(self._link)
+                if not data:
+                    break
+                heard = time.monotonic()
+                self._receive(data)
+            if self._unconfirmed:
+                if time.monotonic() - self._tried >= _REPEAT_S:
+                    self._try_stop(1)
+            elif self._moving and time.monotonic() - heard >= self._watchdog_s:
+                self._halt(f"nothing came from the capture for {self._watchdog_s:g} s: it hangs, or was suspended")
+        self._requests.put(None)
+        if self._moving:
+            self._halt("the capture has ended")
+            end = time.monotonic() + _GIVE_UP_S
+            while self._unconfirmed and time.monotonic() < end:
+                time.sleep(_REPEAT_S)
+                self._try_stop(1)
+
+    def _receive(self, data: bytes) -> None:
+        number, name, arguments = pickle.loads(data)
+        if name == "halt":
+            self._halt("the capture was interrupted")
+        elif name == "stop":
+            _send(self._link, number, None, self._halt("the capture sent Stop"))
+        else:
+            if name in ("send_velocity", "send_joint_velocity"):
+                self._moving = True  # from here on silence counts, whatever becomes of the command
+            self._requests.put(_Request(number, name, arguments, self._stops))
+
+    def _halt(self, reason: str) -> UnconfirmedStopError | None:
+        self._stops += 1  # first: from here on no velocity goes out
+        self._reason = reason
+        return self._try_stop(_STOP_ATTEMPTS)
+
+    def _try_stop(self, attempts: int) -> UnconfirmedStopError | None:
+        """Stop, then the emergency stop; None when the arm has confirmed one of them."""
+        self._unconfirmed = True
+        in_flight = self._commanding.locked()
+        failure = self._stop_confirmed(attempts)
+        if in_flight:
+            # it passed the check before this Stop was ordered, and may have followed it on the wire
+            if self._commanding.acquire(timeout=_IN_FLIGHT_S):
+                self._commanding.release()
+                failure = self._stop_confirmed(attempts)
+            else:
+                failure = HardwareError("a velocity command hangs on its way to the arm")
+        self._tried = time.monotonic()
+        if failure is None:
+            self._moving = self._unconfirmed = False
+            return None
+        text = f"{MAY_BE_MOVING} It did not confirm Stop ({failure})"
+        if time.monotonic() - self._shouted >= _SHOUT_EVERY_S:
+            self._shouted = time.monotonic()
+            _shout(f"{text}; Stop is repeated.")
+        return UnconfirmedStopError(f"{text}; Stop was repeated, and goes on being repeated while this process lives.")
+
+    def _stop_confirmed(self, attempts: int) -> Exception | None:
+        failure: Exception | None = None
+        for _ in range(attempts):
+            try:
+                self._arm.stop()
+                return None
+            except Exception as error:  # whatever the driver raises, the next attempt must come
+                failure = error
+        try:
+            # The last resort: an arm that refuses Stop may still take this, and is then in fault. On a lost link it
+            # fails like Stop did, and costs one call.
+            self._arm.emergency_stop()
+            _shout(f"The arm did not confirm Stop ({failure}); its emergency stop was applied, and it is in fault.")
+            return None
+        except Exception:
+            return failure
+
+    def _work(self) -> None:
+        while (request := self._requests.get()) is not None:
+            try:
+                value, error = self._carry_out(request), None
+            except Exception as failure:  # the capture gets every failure, and this thread goes on
+                value, error = None, _sendable(failure)
+            _send(self._link, request.number, value, error)
+
+    def _carry_out(self, request: _Request) -> Any:
+        call = getattr(self._arm, request.name)
+        if request.name in ("send_velocity", "send_joint_velocity"):
+            with self._commanding:
+                if self._prepared != self._stops:
+                    raise HardwareError(
+                        f"The arm was stopped and takes no velocities until it is prepared again: {self._reason}."
+                    )
+                return call(*request.arguments)
+        value = call(*request.arguments)
+        if request.name == "prepare":
+            self._prepared = request.stops
+        return value
+
+
+def _sendable(error: Exception) -> DiffCloudError:
+    """Errors of a driver's own kind need not be known, or picklable, on the other side."""
+    if type(error) in (HardwareError, UnconfirmedStopError):
+        return error  # type: ignore[return-value]  # one of these two
+    return HardwareError(str(error) if isinstance(error, DiffCloudError) else f"{type(error).__name__}: {error}")
+
+
+def _received(link: socket.socket) -> bytes:
+    """One message; nothing once the other side is gone."""
+    try:
+        return link.recv(_LARGEST_MESSAGE)
+    except OSError:
+        return b""
+
+
+def _send(link: socket.socket, number: int, value: Any, error: DiffCloudError | None) -> None:
+    with suppress(OSError):  # the capture is gone; the main thread sees it too, and stops the arm
+        link.send(pickle.dumps((number, value, error)))
+
+
+def _shout(text: str) -> None:
+    with suppress(OSError):  # the terminal may be gone
+        os.write(2, f"{text}\n".encode())

@@ -1,0 +1,71 @@
+"""What the tool feels: the external wrench against its value at rest."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import LimitError
+from diffcloud.hardware.devices import Arm, ArmReading
+from diffcloud.hardware.trajectory import Limits
+
+Floats = NDArray[np.float64]
+
+_READINGS = 20
+_INTERVAL_S = 0.02
+
+
+class Contact:
+    """The wrench of an arm at rest, and checks of later ones against it.
+
+    The arm estimates the wrench from its joint torques, which leaves an offset that depends on the pose: so each motion
+    takes its own zero, the mean over some readings. A large one is no offset: the tool is already pressing on something,
+    and a motion could add the whole limit to it.
+
+    Args:
+        zero: [6] force [N] and torque [N·m].
+
+    Raises:
+        LimitError: not finite, or beyond the preload limits.
+    """
+
+    def __init__(self, zero: Floats, limits: Limits) -> None:
+        force, torque = _sizes(zero)
+        if not (force <= limits.preload_N and torque <= limits.preload_Nm):
+            raise LimitError(
+                f"At rest the tool feels {force:.1f} N and {torque:.1f} N·m; up to {limits.preload_N:g} N and "
+                f"{limits.preload_Nm:g} N·m are taken for the estimate's offset. Free the tool, check the payload that is "
+                "configured on the arm (web page: Configurations, Tool), or raise --preload."
+            )
+        self._zero, self._limits = zero, limits
+
+    def check(self, when: str, wrench: Floats) -> None:
+        """Raises:
+        LimitError: the change is beyond the limits, or not a number.
+        """
+        limits = self._limits
+        force, torque = _sizes(wrench - self._zero)
+        if not (force <= limits.force_N and torque <= limits.torque_Nm):  # also true of NaN
+            raise LimitError(
+                f"{when} the tool felt {force:.1f} N and {torque:.1f} N·m; limits are {limits.force_N:g} N and "
+                f"{limits.torque_Nm:g} N·m. Something is in the way, or the cloth is caught."
+            )
+
+
+def at_rest(arm: Arm, limits: Limits) -> tuple[ArmReading, Contact]:
+    """The last of some readings of an arm that does not move, and the zero of its wrench from all of them.
+
+    Raises:
+        LimitError: see `Contact`.
+    """
+    readings = []
+    for _ in range(_READINGS):
+        readings.append(arm.read())
+        time.sleep(_INTERVAL_S)
+    return readings[-1], Contact(np.mean([reading.wrench for reading in readings], axis=0), limits)
+
+
+def _sizes(wrench: Floats) -> tuple[float, float]:
+    return float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
