@@ -22,7 +22,7 @@ from diffcloud.sensing.calibration.checkerboard import checkerboard_evidence, re
 from diffcloud.sensing.calibration.checks import CheckerboardEvidence, judge_checkerboard
 from diffcloud.sensing.calibration.hand_eye import calibrate_hand_eye, find_views
 from diffcloud.sensing.pictures import reprojection_picture
-from pipeline.console import JsonFlag, errors, finish, show, warn
+from pipeline.console import JsonFlag, errors, finish, show, warn, writes
 
 _SHOWN = {
     "charuco": {
@@ -46,6 +46,7 @@ _SHOWN = {
 """Heading of each figure that is printed; depth, focal length and size are over what was entered."""
 
 
+@writes(".json")
 def calibrate(
     source: Annotated[
         list[Path],
