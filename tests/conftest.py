@@ -18,9 +18,12 @@ from diffcloud.scene.scenarios import Scenario, built_in, grid_scenario
 if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(1)  # as the commands do: beside another busy process spinning threads cost tenfold
 
-# a shell without job control starts background jobs deaf to Ctrl-C, and processes inherit that; tests press it
+# a shell without job control starts background jobs deaf to Ctrl-C, and nohup deafens them to a closed terminal; processes
+# inherit that, and tests send both
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture
