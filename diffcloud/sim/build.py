@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from diffcloud.errors import SceneError
-from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
-from diffcloud.sim.contact import ContactSettings, HalfSpaces, MeshContact, ReferenceContact
+from diffcloud.mesh.topology import ClothMesh
+from diffcloud.sim.contact import HalfSpaces, MeshContact
 from diffcloud.sim.contact.barrier import Barrier
 from diffcloud.sim.contact.smooth import PlaneContacts, SmoothContact
 from diffcloud.sim.contact.surface import ContactSurface
@@ -21,38 +21,12 @@ from diffcloud.sim.energies import Air, Bending, Handles, Stretching
 from diffcloud.sim.linear_solve import GeneralPattern, pattern
 from diffcloud.sim.materials import Material
 from diffcloud.sim.properties import Properties
-from diffcloud.sim.rigid import Bodies, RigidBody
-from diffcloud.sim.scenery import MovingObstacle, Scenery
+from diffcloud.sim.rigid import Bodies
+from diffcloud.sim.scenery import Scenery
 from diffcloud.sim.state import Apart, ImplicitSetup, System
+from diffcloud.sim.surrounding import Surrounding
 
 Integrator = Literal["implicit", "linearised"]
-
-
-@dataclass(frozen=True)
-class Surrounding:
-    """Everything around the cloth."""
-
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
-    """[m/s²]"""
-    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Velocity of the air [m/s]."""
-    air_density: float = 1.0
-    """[kg/m³]; ARCSim's default, real air has 1.2."""
-    air_drag: float = 0.0
-    """Tangential drag [kg/(m²·s)]."""
-    friction_cloth: float = 0.6
-    friction_obstacle: float = 0.3
-    contact: ContactSettings = field(default_factory=ContactSettings)
-    proximity: bool = True
-    """Whether planes repel and rub (off: only projection)."""
-    self_contact: bool = True
-    """Whether the cloth meets itself (implicit integrator); without, layers pass through each other in quicker steps."""
-    obstacles: tuple[SurfaceMesh, ...] = ()
-    """Static ones."""
-    moving: tuple[MovingObstacle, ...] = ()
-    bodies: tuple[RigidBody, ...] = ()
-    reference_contact: ReferenceContact | None = None
-    """Contact with all meshes and of the cloth with itself by proximity and impact zones; None: with planes only."""
 
 
 def build_system(

@@ -1,130 +1,138 @@
-"""Which axis-aligned boxes overlap, for a batch, without testing all pairs.
+"""Which pairs of primitives can touch: those whose axis-aligned boxes overlap, found by sweeping along one axis.
 
-Few boxes are compared outright. Many go through a uniform grid: each box is entered into the cells it covers, and only
-boxes that share a cell are compared; the few boxes much larger than the rest (a table's faces) are compared with all.
+Both kinds of pair are four points with signed weights that sum to zero, and the vector between the closest places is
+Σ w_k x_k: a point and a face have (1, -b0, -b1, -b2), two edges (a0, a1, -b0, -b1).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+import numpy as np
 
-import torch
-from torch import Tensor
-
-_ALL_PAIRS = 500_000
-"""Up to this many pairs per batch entry, comparing all is quicker than a grid on a CPU (measured on folded cloths: by a
-half there, and by up to eight times below a tenth of it, where boxes overlap much)."""
-_MOST_CELLS = 64
-"""A box that covers more grid cells is compared with all others."""
+from diffcloud.sim.compiled.data import Floats, Ints
+from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.pool import with_room
+from diffcloud.sim.compiled.sorting import ascending
+from diffcloud.sim.contact.surface import Surface
 
 
-@dataclass(frozen=True)
-class Boxes:
-    """Axis-aligned boxes."""
+@kernel
+def candidates(surface: Surface, places: Floats, others: Floats, margin: float, among_fixed: int) -> tuple[Ints, Ints]:
+    """Pairs whose boxes come within `margin` of each other [m]: (point-face [C, 2], edge-edge [C, 2]) in no order.
 
-    low: Tensor
-    """[B, N, 3] [m]"""
-    high: Tensor
-    """[B, N, 3] [m]"""
+    Pairs that share a point, that lie on one obstacle, or of which neither can move are left out.
 
-    @staticmethod
-    def around(corners: tuple[Tensor, ...], margin: float) -> Boxes:
-        """Boxes that hold all `corners`, each [B, N, n, 3], and `margin` more on every side."""
-        low = torch.stack([c.amin(2) for c in corners]).amin(0) - margin
-        high = torch.stack([c.amax(2) for c in corners]).amax(0) + margin
-        return Boxes(low, high)
+    Args:
+        places, others: [N, 3] positions of all points; a box holds a primitive at both (start and end of a motion).
+        among_fixed: keep the pairs of which neither can move.
 
-
-class Eligible(Protocol):
-    """Of which pairs of two lists an overlap matters, whatever their places."""
-
-    def __call__(self, a: Tensor, b: Tensor) -> Tensor:
-        """bool of pairs by their indices in both lists, which are broadcast."""
-
-    @property
-    def table(self) -> Tensor:
-        """bool [N, M] of all pairs: kept, since it is asked for in every step."""
+    Returns:
+        Indices into the surface's points and faces, and into its edges (twice).
+    """
+    points = _boxes(places, others, surface.points.reshape(-1, 1), 0.5 * margin)
+    faces = _boxes(places, others, surface.faces, 0.5 * margin)
+    edges = _boxes(places, others, surface.edges, 0.5 * margin)
+    return (
+        _overlapping(surface, points, faces, 0, among_fixed),
+        _overlapping(surface, edges, edges, 1, among_fixed),
+    )
 
 
-def overlapping(first: Boxes, second: Boxes, eligible: Eligible) -> tuple[Tensor, Tensor, Tensor]:
-    """(entry [P], index in `first` [P], index in `second` [P]) of the boxes that overlap, in lexicographic order."""
-    if first.low.shape[1] * second.low.shape[1] <= _ALL_PAIRS:
-        return _all_pairs(first, second, eligible.table)
-    entry, a, b = _grid_pairs(first, second)
-    kept = eligible(a, b).nonzero().flatten()
-    return entry[kept], a[kept], b[kept]
+@kernel
+def _boxes(places: Floats, others: Floats, primitives: Ints, margin: float) -> Floats:
+    """[M, 6] the lowest, then the highest coordinates."""
+    found = np.empty((len(primitives), 6))
+    for m in range(len(primitives)):
+        for axis in range(3):
+            low, high = np.inf, -np.inf
+            for k in range(primitives.shape[1]):
+                first, second = places[primitives[m, k], axis], others[primitives[m, k], axis]
+                low, high = min(low, first, second), max(high, first, second)
+            found[m, axis], found[m, 3 + axis] = low - margin, high + margin
+    return found
 
 
-def _all_pairs(first: Boxes, second: Boxes, eligible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    # axis by axis in memory, which the comparisons need to be vectorised
-    low_a, high_a, low_b, high_b = (t.movedim(-1, 0).contiguous() for t in (first.low, first.high, second.low, second.high))
-    together = low_a[0, :, :, None] <= high_b[0, :, None]
-    together &= low_b[0, :, None] <= high_a[0, :, :, None]
-    for axis in (1, 2):
-        together &= low_a[axis, :, :, None] <= high_b[axis, :, None]
-        together &= low_b[axis, :, None] <= high_a[axis, :, :, None]
-    together &= eligible
-    entry, a, b = together.nonzero(as_tuple=True)
-    return entry, a, b
+@kernel
+def _overlapping(surface: Surface, first: Floats, second: Floats, edges: int, among_fixed: int) -> Ints:
+    """[C, 2] of two lists of boxes: one of each pair begins within the other, along the axis on which they spread most."""
+    axis = _widest(second)
+    order_a, order_b = ascending(first[:, axis]), ascending(second[:, axis])
+    a, b = first[order_a], second[order_b]
+    found = np.empty((4 * len(first) + 64, 2), np.int64)
+    count = begin = 0
+    for i in range(len(a)):
+        while begin < len(b) and b[begin, axis] < a[i, axis]:
+            begin += 1
+        for j in range(begin, len(b)):
+            if b[j, axis] > a[i, 3 + axis]:
+                break
+            if _meet(a, i, b, j) and _eligible(surface, order_a[i], order_b[j], edges, among_fixed):
+                found = with_room(found, count, 1)
+                found[count, 0], found[count, 1] = order_a[i], order_b[j]
+                count += 1
+    begin = 0
+    for j in range(len(b)):
+        while begin < len(a) and a[begin, axis] <= b[j, axis]:
+            begin += 1
+        for i in range(begin, len(a)):
+            if a[i, axis] > b[j, 3 + axis]:
+                break
+            if _meet(a, i, b, j) and _eligible(surface, order_a[i], order_b[j], edges, among_fixed):
+                found = with_room(found, count, 1)
+                found[count, 0], found[count, 1] = order_a[i], order_b[j]
+                count += 1
+    return found[:count]
 
 
-def _grid_pairs(first: Boxes, second: Boxes) -> tuple[Tensor, Tensor, Tensor]:
-    batch, count_a, count_b = len(first.low), first.low.shape[1], second.low.shape[1]
-    low_a, high_a = first.low.flatten(0, 1), first.high.flatten(0, 1)
-    low_b, high_b = second.low.flatten(0, 1), second.high.flatten(0, 1)
-    extent = torch.cat([high_a - low_a, high_b - low_b])
-    cell = float(extent.amax(-1).median().clamp(min=1e-12)) * 1.5
-    origin = torch.minimum(low_a.amin(0), low_b.amin(0))
-
-    def cells(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-        start = ((low - origin) / cell).floor().long()
-        return start, ((high - origin) / cell).floor().long() - start + 1
-
-    start_a, size_a = cells(low_a, high_a)
-    start_b, size_b = cells(low_b, high_b)
-    extent_of_grid = torch.maximum((start_a + size_a).amax(0), (start_b + size_b).amax(0))
-    entry_a = torch.arange(batch, device=low_a.device).repeat_interleave(count_a)
-    entry_b = torch.arange(batch, device=low_a.device).repeat_interleave(count_b)
-    large_a, large_b = size_a.prod(-1) > _MOST_CELLS, size_b.prod(-1) > _MOST_CELLS
-
-    key_a, box_a = _enter(start_a, size_a, entry_a, (~large_a).nonzero().flatten(), extent_of_grid)
-    key_b, box_b = _enter(start_b, size_b, entry_b, (~large_b).nonzero().flatten(), extent_of_grid)
-    key_b, order = key_b.sort()
-    box_b = box_b[order]
-    lowest, highest = torch.searchsorted(key_b, key_a), torch.searchsorted(key_b, key_a, right=True)
-    pair_a, pair_b = _join(box_a, lowest, highest - lowest, box_b)
-    lists = [(pair_a, pair_b)]
-    # a large box meets every box of its batch entry
-    for large, per_entry, swap in ((large_a, count_b, False), (large_b, count_a, True)):
-        which = large.nonzero().flatten()
-        if len(which):
-            entry = which // (count_b if swap else count_a)
-            others = entry[:, None] * per_entry + torch.arange(per_entry, device=which.device)
-            own = which[:, None].expand_as(others)
-            lists.append((others.flatten(), own.flatten()) if swap else (own.flatten(), others.flatten()))
-    pair_a, pair_b = (torch.cat(parts) for parts in zip(*lists, strict=True))
-    meet = ((low_a[pair_a] <= high_b[pair_b]) & (low_b[pair_b] <= high_a[pair_a])).all(-1)
-    unique = torch.unique(pair_a[meet] * (batch * count_b) + pair_b[meet])
-    pair_a, pair_b = unique // (batch * count_b), unique % (batch * count_b)
-    return entry_a[pair_a], pair_a % count_a, pair_b % count_b
+@kernel
+def _widest(boxes: Floats) -> int:
+    """The axis along which boxes [M, 6] spread most."""
+    best, axis = -1.0, 0
+    for k in range(3):
+        low, high = np.inf, -np.inf
+        for m in range(len(boxes)):
+            low, high = min(low, boxes[m, k]), max(high, boxes[m, k])
+        if high - low > best:
+            best, axis = high - low, k
+    return axis
 
 
-def _enter(start: Tensor, size: Tensor, entry: Tensor, which: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
-    """(cell key, box) of every cell that the boxes `which` cover."""
-    start, size = start[which], size[which]
-    count = size.prod(-1)
-    box = torch.arange(len(which), device=which.device).repeat_interleave(count)
-    place = torch.arange(len(box), device=which.device) - (count.cumsum(0) - count)[box]
-    size_y, size_z = size[box, 1], size[box, 2]
-    x = start[box, 0] + place // (size_y * size_z)
-    y = start[box, 1] + place // size_z % size_y
-    z = start[box, 2] + place % size_z
-    return ((entry[which][box] * grid[0] + x) * grid[1] + y) * grid[2] + z, which[box]
+@kernel
+def _meet(a: Floats, i: int, b: Floats, j: int) -> bool:
+    return (
+        a[i, 0] <= b[j, 3]
+        and b[j, 0] <= a[i, 3]
+        and a[i, 1] <= b[j, 4]
+        and b[j, 1] <= a[i, 4]
+        and a[i, 2] <= b[j, 5]
+        and b[j, 2] <= a[i, 5]
+    )
 
 
-def _join(left: Tensor, lowest: Tensor, count: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-    """Pair left[i] with right[lowest[i] : lowest[i] + count[i]]."""
-    index = torch.arange(len(left), device=left.device).repeat_interleave(count)
-    place = torch.arange(len(index), device=left.device) - (count.cumsum(0) - count)[index]
-    return left[index], right[lowest[index] + place]
+@kernel
+def _eligible(surface: Surface, a: int, b: int, edges: int, among_fixed: int) -> bool:
+    """Whether contact can bring two primitives together; of two edges, in one order only."""
+    second = surface.edges[b, 0] if edges else surface.faces[b, 0]
+    first = surface.edges[a, 0] if edges else surface.points[a]
+    owner_a, owner_b = surface.owner[first], surface.owner[second]
+    if owner_a == owner_b and (owner_a > 0 or not surface.touches_itself):
+        return False
+    moves_a, moves_b = surface.movable[owner_a] or among_fixed > 0, surface.movable[owner_b] or among_fixed > 0
+    if edges:
+        if not moves_a or (moves_b and a >= b):
+            return False
+        for k in range(2):
+            for l in range(2):
+                if surface.edges[a, k] == surface.edges[b, l]:
+                    return False
+        return True
+    if not moves_a and not moves_b:
+        return False
+    return surface.faces[b, 0] != first and surface.faces[b, 1] != first and surface.faces[b, 2] != first
+
+
+@kernel
+def corners_of(surface: Surface, edges: int, a: int, b: int) -> tuple[int, int, int, int]:
+    """The four points of a pair."""
+    if edges:
+        return surface.edges[a, 0], surface.edges[a, 1], surface.edges[b, 0], surface.edges[b, 1]
+    return surface.points[a], surface.faces[b, 0], surface.faces[b, 1], surface.faces[b, 2]

@@ -10,199 +10,117 @@ them before it meets a face, a point or another edge.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh, directed_edges
+from diffcloud.sim.compiled.data import Floats, Ints
 
 _FLAT = 1e-6
 """Sine of the dihedral angle below which an obstacle's edge counts as flat."""
 
 
-@dataclass(frozen=True)
-class _Eligible:
-    """Pairs of two lists of primitives that contact can bring together; see `broad_phase.Eligible`.
-
-    Pairs that share a point, that lie on one obstacle, or of which neither can move are left out.
-    """
-
-    first: Tensor
-    """[N, n] points."""
-    second: Tensor
-    """[M, m] points."""
-    owners: tuple[Tensor, Tensor]
-    """[N], [M]"""
-    moves: tuple[Tensor, Tensor]
-    """bool [N], [M]"""
-    touches_itself: bool
-    ranks: tuple[Tensor, Tensor] | None = None
-    """[N], [M] numbers in one list: of two primitives that are in both lists, the first has the lower one."""
-
-    def __call__(self, a: Tensor, b: Tensor) -> Tensor:
-        """bool of pairs by their indices in both lists, which are broadcast."""
-        owner_a, owner_b = self.owners[0][a], self.owners[1][b]
-        moves_a, moves_b = self.moves[0][a], self.moves[1][b]
-        own = (owner_a == 0) & self.touches_itself
-        apart = (self.first[a][..., :, None] != self.second[b][..., None, :]).all(-1).all(-1)
-        eligible = ((owner_a != owner_b) | own) & (moves_a | moves_b) & apart
-        if self.ranks is not None:
-            eligible &= (self.ranks[0][a] < self.ranks[1][b]) | ~moves_b
-        return eligible
-
-    @cached_property
-    def table(self) -> Tensor:
-        """bool [N, M] of all pairs."""
-        device = self.first.device
-        return self(torch.arange(len(self.first), device=device)[:, None], torch.arange(len(self.second), device=device))
-
-
-@dataclass(frozen=True)
-class Partners:
-    """What contact can bring together."""
-
-    point_face: _Eligible
-    """Of all points and all faces."""
-    first_edges: Tensor
-    """[N] the edges that can move."""
-    edge_edge: _Eligible
-    """Of these and all edges, each pair once."""
-
-
-@dataclass(frozen=True)
-class ContactSurface:
+class Surface(NamedTuple):
     """Points, edges and faces that can touch."""
 
     cloth_points: int
     """V"""
     point_count: int
     """N = V + points of all obstacles."""
-    points: Tensor
+    points: Ints
     """[P] points that take part in point-face pairs."""
-    edges: Tensor
+    edges: Ints
     """[E, 2] points."""
-    edge_faces: Tensor
+    edge_faces: Ints
     """[E, 2] the face on each side of an edge (`ClothMesh.edges`), -1 where none."""
-    faces: Tensor
+    faces: Ints
     """[F, 3] points."""
-    owner: Tensor
+    owner: Ints
     """[N] of each point."""
-    point_area: Tensor
+    point_area: Floats
     """[P] a third of the area of the faces around [m²]; the cloth's in material space, as everywhere."""
-    edge_area: Tensor
+    edge_area: Floats
     """[E] [m²]"""
-    face_area: Tensor
+    face_area: Floats
     """[F] [m²]"""
-    typical_face_area: Tensor
+    typical_face_area: Floats
     """[owners] mean over the faces of each [m²]."""
-    edge_share: Tensor
+    edge_share: Floats
     """[F, 3] what each face takes off for its edges 01, 12, 20: a half where two faces meet (see `barrier`)."""
-    corner_share: Tensor
+    corner_share: Floats
     """[F, 3] what each face adds for its corners: one over the faces around an inner point."""
-    movable: Tensor
-    """bool [owners]: the cloth, and bodies that contact can move."""
+    movable: NDArray[np.bool_]
+    """[owners]: the cloth, and bodies that contact can move."""
     touches_itself: bool
     """Whether the cloth's own parts are paired with each other."""
 
-    @staticmethod
-    def build(
-        cloth: ClothMesh,
-        obstacles: Sequence[SurfaceMesh],
-        *,
-        movable: Sequence[bool] | None = None,
-        all_edges: bool = False,
-        touches_itself: bool = True,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str = "cpu",
-    ) -> ContactSurface:
-        """Join a cloth and its obstacles.
 
-        Args:
-            movable: of each obstacle; default none.
-            touches_itself: whether the cloth's own parts are paired with each other.
-            all_edges: keep the flat and concave edges and points of obstacles, as ARCSim does.
-        """
-        movable = [False] * len(obstacles) if movable is None else list(movable)
-        points = [np.arange(len(cloth.nodes))]
-        edges, faces = [cloth.edges[0]], [cloth.faces]
-        edge_area = [_spread(cloth.edges[1], cloth.face_area)]
-        edge_faces: list[NDArray[np.int64]] = [cloth.edges[1]]
-        face_area, point_area = [cloth.face_area], [cloth.node_area]
-        owner = [np.zeros(len(cloth.nodes), dtype=np.int64)]
-        shares = [_shares(cloth.faces, len(cloth.nodes))]
-        count, face_count = len(cloth.nodes), len(cloth.faces)
-        for index, mesh in enumerate(obstacles):
-            corner = mesh.nodes[mesh.faces]
-            area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-            kept, sides = directed_edges(mesh.faces) if all_edges else _sharp_edges(mesh)
-            used = np.unique(kept)
-            per_point = np.bincount(mesh.faces.ravel(), np.repeat(area / 3, 3), len(mesh.nodes)).astype(np.float64)
-            points.append(used + count)
-            point_area.append(per_point[used])
-            edges.append(kept + count)
-            edge_faces.append(np.where(sides < 0, -1, sides + face_count))
-            edge_area.append(_spread(sides, area))
-            faces.append(mesh.faces + count)
-            face_area.append(area)
-            shares.append(_shares(mesh.faces, len(mesh.nodes)))
-            owner.append(np.full(len(mesh.nodes), index + 1, dtype=np.int64))
-            count, face_count = count + len(mesh.nodes), face_count + len(mesh.faces)
+def contact_surface(
+    cloth: ClothMesh,
+    obstacles: Sequence[SurfaceMesh],
+    *,
+    movable: Sequence[bool] | None = None,
+    all_edges: bool = False,
+    touches_itself: bool = True,
+) -> Surface:
+    """Join a cloth and its obstacles.
 
-        def index_tensor(parts: list[NDArray[np.int64]]) -> Tensor:
-            return torch.as_tensor(np.concatenate(parts), dtype=torch.long, device=device)
+    Args:
+        movable: of each obstacle; default none.
+        touches_itself: whether the cloth's own parts are paired with each other.
+        all_edges: keep the flat and concave edges and points of obstacles, as ARCSim does.
+    """
+    movable = [False] * len(obstacles) if movable is None else list(movable)
+    points = [np.arange(len(cloth.nodes))]
+    edges, faces = [cloth.edges[0]], [cloth.faces]
+    edge_area = [_spread(cloth.edges[1], cloth.face_area)]
+    edge_faces: list[NDArray[np.int64]] = [cloth.edges[1]]
+    face_area, point_area = [cloth.face_area], [cloth.node_area]
+    owner = [np.zeros(len(cloth.nodes), dtype=np.int64)]
+    shares = [_shares(cloth.faces, len(cloth.nodes))]
+    count, face_count = len(cloth.nodes), len(cloth.faces)
+    for index, mesh in enumerate(obstacles):
+        corner = mesh.nodes[mesh.faces]
+        area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+        kept, sides = directed_edges(mesh.faces) if all_edges else _sharp_edges(mesh)
+        used = np.unique(kept)
+        per_point = np.bincount(mesh.faces.ravel(), np.repeat(area / 3, 3), len(mesh.nodes)).astype(np.float64)
+        points.append(used + count)
+        point_area.append(per_point[used])
+        edges.append(kept + count)
+        edge_faces.append(np.where(sides < 0, -1, sides + face_count))
+        edge_area.append(_spread(sides, area))
+        faces.append(mesh.faces + count)
+        face_area.append(area)
+        shares.append(_shares(mesh.faces, len(mesh.nodes)))
+        owner.append(np.full(len(mesh.nodes), index + 1, dtype=np.int64))
+        count, face_count = count + len(mesh.nodes), face_count + len(mesh.faces)
 
-        def area_tensor(parts: list[NDArray[np.float64]]) -> Tensor:
-            return torch.as_tensor(np.concatenate(parts), dtype=dtype, device=device)
+    def whole(parts: list[NDArray[np.int64]]) -> Ints:
+        return np.ascontiguousarray(np.concatenate(parts), dtype=np.int64)
 
-        return ContactSurface(
-            cloth_points=len(cloth.nodes),
-            point_count=count,
-            points=index_tensor(points),
-            edges=index_tensor(edges),
-            edge_faces=index_tensor(edge_faces),
-            faces=index_tensor(faces),
-            owner=index_tensor(owner),
-            point_area=area_tensor(point_area),
-            edge_area=area_tensor(edge_area),
-            face_area=area_tensor(face_area),
-            typical_face_area=torch.tensor([area.mean() for area in face_area], dtype=dtype, device=device),
-            edge_share=area_tensor([edge for edge, _ in shares]),
-            corner_share=area_tensor([corner for _, corner in shares]),
-            movable=torch.tensor([True, *movable], device=device),
-            touches_itself=touches_itself,
-        )
+    def real(parts: list[NDArray[np.float64]]) -> Floats:
+        return np.ascontiguousarray(np.concatenate(parts), dtype=np.float64)
 
-    @cached_property
-    def partners(self) -> Partners:
-        """What contact can bring together."""
-        return self._partners(self.movable)
-
-    @cached_property
-    def all_partners(self) -> Partners:
-        """The same if everything could move: with the pairs of two obstacles."""
-        return self._partners(torch.ones_like(self.movable))
-
-    def _partners(self, movable: Tensor) -> Partners:
-        owners = [self.owner[corners] for corners in (self.points, self.faces[:, 0], self.edges[:, 0])]
-        point, face, edge = ((owner, movable[owner]) for owner in owners)
-        first = edge[1].nonzero().flatten()
-        ranks = torch.arange(len(self.edges), device=first.device)
-        return Partners(
-            _Eligible(self.points[:, None], self.faces, (point[0], face[0]), (point[1], face[1]), self.touches_itself),
-            first,
-            _Eligible(
-                self.edges[first],
-                self.edges,
-                (edge[0][first], edge[0]),
-                (edge[1][first], edge[1]),
-                self.touches_itself,
-                (first, ranks),
-            ),
-        )
+    return Surface(
+        cloth_points=len(cloth.nodes),
+        point_count=count,
+        points=whole(points),
+        edges=whole(edges),
+        edge_faces=whole(edge_faces),
+        faces=whole(faces),
+        owner=whole(owner),
+        point_area=real(point_area),
+        edge_area=real(edge_area),
+        face_area=real(face_area),
+        typical_face_area=np.array([area.mean() for area in face_area]),
+        edge_share=real([edge for edge, _ in shares]),
+        corner_share=real([corner for _, corner in shares]),
+        movable=np.array([True, *movable]),
+        touches_itself=touches_itself,
+    )
 
 
 def _spread(edge_faces: NDArray[np.int64], face_area: NDArray[np.float64]) -> NDArray[np.float64]:

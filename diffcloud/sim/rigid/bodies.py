@@ -20,26 +20,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloud.errors import SceneError
-from diffcloud.mesh.topology import SurfaceMesh
+from diffcloud.sim.rigid.body import RigidBody
 from diffcloud.sim.rigid.rotation import rotation
-
-Vector = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class RigidBody:
-    """A movable obstacle."""
-
-    mesh: SurfaceMesh
-    """Closed, oriented outwards, in world coordinates at the start [m]."""
-    density: float = 1000.0
-    """[kg/m³]; without effect if `mass` is given."""
-    mass: float | None = None
-    """[kg]"""
-    velocity: Vector = (0.0, 0.0, 0.0)
-    """[m/s]"""
-    angular_velocity: Vector = (0.0, 0.0, 0.0)
-    """[rad/s]"""
 
 
 @dataclass(frozen=True)

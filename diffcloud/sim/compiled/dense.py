@@ -1,0 +1,61 @@
+"""Dense linear systems inside kernels: LU with partial pivoting."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffcloud.sim.compiled.data import Floats, Ints
+from diffcloud.sim.compiled.kernel import kernel
+
+
+@kernel
+def lu(matrix: Floats, pivots: Ints) -> bool:
+    """Factorise a matrix [n, n] in place; pivots [n] takes the row that each one was exchanged with. False: singular."""
+    count = len(matrix)
+    for k in range(count):
+        best = k
+        for i in range(k + 1, count):
+            if abs(matrix[i, k]) > abs(matrix[best, k]):
+                best = i
+        pivots[k] = best
+        if not abs(matrix[best, k]) > 0:
+            return False
+        if best != k:
+            for j in range(count):
+                matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
+        for i in range(k + 1, count):
+            factor = matrix[i, k] / matrix[k, k]
+            matrix[i, k] = factor
+            if factor != 0:
+                for j in range(k + 1, count):
+                    matrix[i, j] -= factor * matrix[k, j]
+    return True
+
+
+@kernel
+def lu_solve(matrix: Floats, pivots: Ints, right: Floats) -> None:
+    """Solve with a factorised matrix; `right` [n] takes the solution."""
+    count = len(matrix)
+    for k in range(count):
+        right[k], right[pivots[k]] = right[pivots[k]], right[k]
+        for i in range(k + 1, count):
+            right[i] -= matrix[i, k] * right[k]
+    for k in range(count - 1, -1, -1):
+        for j in range(k + 1, count):
+            right[k] -= matrix[k, j] * right[j]
+        right[k] /= matrix[k, k]
+
+
+@kernel
+def lu_solve_transposed(matrix: Floats, pivots: Ints, right: Floats) -> None:
+    """The same with the transposed matrix."""
+    count = len(matrix)
+    for k in range(count):
+        for j in range(k):
+            right[k] -= matrix[j, k] * right[j]
+        right[k] /= matrix[k, k]
+    for k in range(count - 1, -1, -1):
+        for i in range(k + 1, count):
+            right[k] -= matrix[i, k] * right[i]
+    for k in range(count - 1, -1, -1):
+        right[k], right[pivots[k]] = right[pivots[k]], right[k]

@@ -1,0 +1,53 @@
+"""Functions of a few numbers, written once as a formula like the terms: value, reverse and tangent are generated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from diffcloud.sim.compiled.source import Code
+from diffcloud.sim.compiled.trace import Graph, Scalar, directional, gradient
+
+
+@dataclass(frozen=True, eq=False)
+class Function:
+    """outputs = formula(inputs, constants), all flat lists of numbers.
+
+    Generated: `<name>_value(inputs, constants, outputs)`, `<name>_reverse(inputs, constants, adjoint, gradients)` adds the
+    gradients of adjoint · outputs, `<name>_tangent(inputs, constants, rates, output_rates)` gives the rates [K, outputs] along
+    the directions [K, inputs].
+    """
+
+    name: str
+    inputs: int
+    constants: int
+    formula: Callable[[Sequence[Scalar], Sequence[Scalar]], Sequence[Scalar]]
+
+    def sources(self) -> list[str]:
+        """The three functions' code."""
+        graph = Graph()
+        inputs = [graph.input(f"inputs[{k}]") for k in range(self.inputs)]
+        outputs = list(self.formula(inputs, [graph.input(f"constants[{k}]") for k in range(self.constants)]))
+        weighted = graph.constant(0.0)
+        for k, output in enumerate(outputs):
+            weighted = weighted + graph.input(f"adjoint[{k}]") * output
+        slopes = gradient(weighted, inputs)
+        changes = directional(outputs, inputs, [graph.input(f"rates[k, {k}]") for k in range(self.inputs)])
+        return [
+            self._source("value", "outputs", [f"outputs[{k}] = " for k in range(len(outputs))], outputs),
+            self._source("reverse", "adjoint, gradients", [f"gradients[{k}] += " for k in range(self.inputs)], slopes),
+            self._source(
+                "tangent", "rates, output_rates", [f"output_rates[k, {k}] = " for k in range(len(outputs))], changes, True
+            ),
+        ]
+
+    def _source(
+        self, kind: str, more: str, stores: Sequence[str], values: Sequence[Scalar], loop: bool = False
+    ) -> str:
+        code = Code()
+        code.compute(values)
+        lines = code.lines + [store + code.name(value) for store, value in zip(stores, values, strict=True)]
+        if loop:
+            lines = ["for k in range(len(rates)):", *(f"    {line}" for line in lines)]
+        head = f"@kernel\ndef {self.name}_{kind}(inputs, constants, {more}):"
+        return "\n".join([head, *(f"    {line}" for line in lines)])

@@ -1,0 +1,19 @@
+"""Lists that grow inside kernels: an array with room, and how much of it is used."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffcloud.sim.compiled.kernel import kernel
+
+
+@kernel
+def with_room(pool, used: int, more: int):  # type: ignore[no-untyped-def]
+    """The pool [capacity, width], or a longer copy where `more` rows do not fit after the `used` ones."""
+    if used + more <= len(pool):
+        return pool
+    longer = np.empty((max(2 * len(pool), used + more), pool.shape[1]), pool.dtype)
+    for row in range(used):
+        for column in range(pool.shape[1]):
+            longer[row, column] = pool[row, column]
+    return longer

@@ -1,0 +1,71 @@
+"""Straight-line Python code of formulas."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from diffcloud.sim.compiled.trace import Scalar, ordered
+
+_INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "lt": "<", "le": "<=", "eq": "==", "and": "&"}
+_CALL = {
+    "sqrt": "sqrt",
+    "log": "log",
+    "sin": "sin",
+    "cos": "cos",
+    "abs": "abs",
+    "floor": "floor",
+    "atan2": "atan2",
+    "min": "min",
+}
+
+
+class Code:
+    """Lines of code in which each node is computed once."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self._known: dict[int, str] = {}
+
+    def compute(self, outputs: Iterable[Scalar]) -> None:
+        """Assign everything that the outputs need and that is not known yet."""
+        for node in ordered(outputs):
+            if node.number in self._known:
+                continue
+            if node.value is not None:
+                text = repr(node.value)
+                self._known[node.number] = text if node.value >= 0 else f"({text})"
+                continue
+            name = f"t{node.number}"
+            self.lines.append(f"{name} = {self._expression(node)}")
+            self._known[node.number] = name
+
+    def name(self, node: Scalar) -> str:
+        """Of a node that has been computed: a variable or a number."""
+        return self._known[node.number]
+
+    def names(self, nodes: Sequence[Scalar]) -> str:
+        """Separated by commas."""
+        return ", ".join(self.name(node) for node in nodes)
+
+    def _expression(self, node: Scalar) -> str:
+        names = [self._known[operand.number] for operand in node.operands]
+        operation = node.operation
+        if operation in _INFIX:
+            return f"{names[0]} {_INFIX[operation]} {names[1]}"
+        if operation in _CALL:
+            return f"{_CALL[operation]}({', '.join(names)})"
+        match operation:
+            case "input":
+                return str(node.payload)
+            case "held":
+                return names[0]
+            case "neg":
+                return f"-{names[0]}"
+            case "where":
+                return f"{names[1]} if {names[0]} else {names[2]}"
+            case "sign":
+                return f"(1.0 if {names[0]} > 0 else 0.0) - (1.0 if {names[0]} < 0 else 0.0)"
+            case "pick":
+                before, after = node.payload  # type: ignore[misc]  # of `terms.term.Element`
+                return f"{before}int({names[0]}){after}"
+        raise ValueError(f"No code for {operation}.")

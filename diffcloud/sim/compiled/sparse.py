@@ -1,0 +1,358 @@
+"""Sparse direct solvers for the matrices of a step: 3 x 3 blocks, one for each pair of nodes that share an element.
+
+Nodes are numbered anew by their *place* in an order that keeps the factors small (minimum degree, as SuperLU finds it). The
+lower half is stored column by column; an element finds its blocks by *slots* that are worked out once. Contact between parts
+of the cloth that share no element adds blocks in single steps, and the pattern of the factor is then found again, which costs
+about as much as the factor.
+
+Cholesky for the linearised step. For the exact Jacobian of the implicit step, which is not symmetric but has a symmetric
+pattern, LU by blocks: the upper half is stored transposed, in the pattern of the lower. It does not exchange rows beyond the
+blocks; `solve_general` looks at what is left over and turns to a dense factor where that has gone wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse.linalg import splu
+
+from diffcloud.sim.compiled.data import Floats, Ints
+from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.sorting import sort_part
+
+
+class Pattern(NamedTuple):
+    """Where a symmetric pattern of blocks has entries, and its factor."""
+
+    place: Ints
+    """[V] of each node in the order of elimination."""
+    starts: Ints
+    """[V + 1] of each column of the lower half in `rows`."""
+    rows: Ints
+    """[A] places, ascending within a column, the diagonal first."""
+    factor_starts: Ints
+    """[V + 1]"""
+    factor_rows: Ints
+    """[L]"""
+
+
+def pattern(node_count: int, groups: Sequence[Ints]) -> Pattern:
+    """The pattern of elements, each group [E, n] of nodes."""
+    first = np.concatenate([np.arange(node_count), *(np.repeat(nodes, nodes.shape[1], axis=1).ravel() for nodes in groups)])
+    second = np.concatenate([np.arange(node_count), *(np.tile(nodes, nodes.shape[1]).ravel() for nodes in groups)])
+    place = _fill_reducing(node_count, first, second)
+    row, column = np.maximum(place[first], place[second]), np.minimum(place[first], place[second])
+    key = np.unique(column * node_count + row)
+    starts = np.searchsorted(key // node_count, np.arange(node_count + 1)).astype(np.int64)
+    rows = key % node_count
+    factor_starts, factor_rows = factor_pattern(starts, rows)
+    return Pattern(place, starts, rows, factor_starts, factor_rows)
+
+
+def slots(of: Pattern, nodes: Ints) -> Ints:
+    """[E, pairs] where the blocks of each pair (a, b >= a) of an element's nodes lie; s, or ~s where it is transposed."""
+    count = len(of.place)
+    column_of = np.repeat(np.arange(count), np.diff(of.starts))
+    key = column_of * count + of.rows
+    first, second = np.triu_indices(nodes.shape[1])
+    row, column = of.place[nodes[:, first]], of.place[nodes[:, second]]
+    found = np.searchsorted(key, np.minimum(row, column) * count + np.maximum(row, column))
+    return np.where(row >= column, found, ~found).astype(np.int64)
+
+
+def _fill_reducing(node_count: int, first: Ints, second: Ints) -> Ints:
+    """[V] places by minimum degree."""
+    graph = csc_matrix(coo_matrix((np.ones(len(first)), (first, second)), shape=(node_count, node_count)))
+    graph.data[:] = 1.0
+    graph += csc_matrix((np.full(node_count, 2.0 * node_count), (np.arange(node_count),) * 2), shape=graph.shape)
+    found = splu(graph, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return found.perm_c.astype(np.int64)
+
+
+@kernel
+def factor_pattern(starts: Ints, rows: Ints) -> tuple[Ints, Ints]:
+    """Starts and rows of the factor: a column takes over the rows of those that it is the first row of."""
+    count = len(starts) - 1
+    first_child = np.full(count, -1, np.int64)
+    next_child = np.full(count, -1, np.int64)
+    seen = np.full(count, -1, np.int64)
+    found = np.empty(4 * len(rows) + count, np.int64)
+    found_starts = np.zeros(count + 1, np.int64)
+    used = 0
+    for j in range(count):
+        begin = used
+        if used + count > len(found):
+            longer = np.empty(2 * len(found) + count, np.int64)
+            for p in range(used):
+                longer[p] = found[p]
+            found = longer
+        seen[j] = j
+        found[used] = j
+        used += 1
+        for p in range(starts[j], starts[j + 1]):
+            i = rows[p]
+            if seen[i] != j:
+                seen[i] = j
+                found[used] = i
+                used += 1
+        child = first_child[j]
+        while child >= 0:
+            for p in range(found_starts[child] + 1, found_starts[child + 1]):
+                i = found[p]
+                if seen[i] != j:
+                    seen[i] = j
+                    found[used] = i
+                    used += 1
+            child = next_child[child]
+        sort_part(found, begin, used)
+        found_starts[j + 1] = used
+        if used > begin + 1:
+            parent = found[begin + 1]
+            next_child[j] = first_child[parent]
+            first_child[parent] = j
+    return found_starts, found[:used]
+
+
+@kernel
+def add_assemble(slots: Ints, blocks: Floats, matrix: Floats) -> None:
+    """Add the symmetric blocks [E, pairs, 9] of elements to a matrix, each to the half that is stored."""
+    for e in range(len(slots)):
+        for p in range(slots.shape[1]):
+            slot, block = slots[e, p], blocks[e, p]
+            if slot >= 0:
+                _add(matrix[slot], block)
+            else:
+                _add_transposed(matrix[~slot], block)
+
+
+@kernel
+def add_jacobian(slots: Ints, blocks: Floats, lower: Floats, upper: Floats) -> None:
+    """The same for blocks [E, n², 9] without symmetry: the upper half is stored transposed, apart."""
+    count = blocks.shape[1]
+    corners = int(sqrt(count))
+    for e in range(len(slots)):
+        p = 0
+        for a in range(corners):
+            for b in range(a, corners):
+                slot, block, mirrored = slots[e, p], blocks[e, a * corners + b], blocks[e, b * corners + a]
+                p += 1
+                if slot >= 0:
+                    _add(lower[slot], block)
+                    if b > a:
+                        _add_transposed(upper[slot], mirrored)
+                else:
+                    _add_transposed(upper[~slot], block)
+                    _add(lower[~slot], mirrored)
+
+
+@kernel
+def _add(target, block):  # type: ignore[no-untyped-def]
+    for k in range(9):
+        target[k] += block[k]
+
+
+@kernel
+def _add_transposed(target, block):  # type: ignore[no-untyped-def]
+    for row in range(3):
+        for column in range(3):
+            target[3 * row + column] += block[3 * column + row]
+
+
+@kernel
+def find_slot(of: Pattern, first: int, second: int) -> int:
+    """Where the block (first, second) of two nodes lies, as `slots` says; where the pattern has none, or one of them is no node,
+    the spare place after the last."""
+    spare = len(of.rows)
+    if first >= len(of.place) or second >= len(of.place):
+        return spare
+    row, column = max(of.place[first], of.place[second]), min(of.place[first], of.place[second])
+    low, high = of.starts[column], of.starts[column + 1]
+    while low < high:
+        middle = (low + high) // 2
+        if of.rows[middle] < row:
+            low = middle + 1
+        else:
+            high = middle
+    if low == of.starts[column + 1] or of.rows[low] != row:
+        return spare
+    return low if of.place[first] >= of.place[second] else ~low
+
+
+@kernel
+def hold(of: Pattern, holder: Ints, mass: Floats, matrix: Floats) -> None:
+    """Let nodes [V] that a handle prescribes (holder >= 0) couple with nothing; their diagonal is their mass."""
+    free = np.ones(len(of.place), np.bool_)
+    any_held = False
+    for i in range(len(of.place)):
+        if holder[i] >= 0:
+            free[of.place[i]], any_held = False, True
+    if not any_held:
+        return
+    for j in range(len(of.place)):
+        for p in range(of.starts[j], of.starts[j + 1]):
+            if not (free[j] and free[of.rows[p]]):
+                matrix[p] = 0.0
+    for i in range(len(of.place)):
+        if holder[i] >= 0:
+            block = matrix[of.starts[of.place[i]]]
+            block[0] = block[4] = block[8] = mass[i]
+
+
+@kernel
+def widened(of: Pattern, first: Ints, second: Ints) -> tuple[Pattern, Ints]:
+    """A pattern with more pairs of nodes, and where the blocks of the old one lie in it."""
+    count = len(of.place)
+    last, following = np.full(count, -1, np.int64), np.empty(len(first), np.int64)  # the pairs of each column
+    for e in range(len(first)):
+        column = min(of.place[first[e]], of.place[second[e]])
+        following[e], last[column] = last[column], e
+    starts, rows = np.zeros(count + 1, np.int64), np.empty(len(of.rows) + len(first), np.int64)
+    moved = np.empty(len(of.rows), np.int64)
+    used = 0
+    for j in range(count):
+        begin = used
+        for p in range(of.starts[j], of.starts[j + 1]):
+            rows[used] = of.rows[p]
+            used += 1
+        e = last[j]
+        while e >= 0:
+            row = max(of.place[first[e]], of.place[second[e]])
+            known = False
+            for p in range(begin, used):
+                known = known or rows[p] == row
+            if not known:
+                rows[used] = row
+                used += 1
+            e = following[e]
+        sort_part(rows, begin, used)
+        starts[j + 1] = used
+        p = begin
+        for old in range(of.starts[j], of.starts[j + 1]):
+            while rows[p] != of.rows[old]:
+                p += 1
+            moved[old] = p
+    rows = rows[:used]
+    factor_starts, factor_rows = factor_pattern(starts, rows)
+    return Pattern(of.place, starts, rows, factor_starts, factor_rows), moved
+
+
+@kernel
+def cholesky(of: Pattern, matrix: Floats, factor: Floats) -> bool:
+    """Factor [L, 9] of a matrix [A, 9]; its diagonal blocks hold the inverse of their diagonals. False: not positive definite.
+
+    Column after column: each takes off what the finished columns that reach it contribute (left-looking).
+    """
+    count = len(of.place)
+    starts, rows = of.factor_starts, of.factor_rows
+    work = np.zeros((count, 9))
+    reached = np.empty(count, np.int64)  # of each finished column, its first entry not yet used
+    waiting = np.full(count, -1, np.int64)  # of each row, a finished column that reaches it next
+    following = np.empty(count, np.int64)
+    for j in range(count):
+        for p in range(of.starts[j], of.starts[j + 1]):
+            work[of.rows[p]] = matrix[p]
+        k = waiting[j]
+        while k >= 0:
+            after = following[k]
+            _take_off(work, factor, factor, rows, reached[k], starts[k + 1])
+            _await_next(k, reached, waiting, following, rows, starts)
+            k = after
+        begin = starts[j]
+        block = work[j]
+        if not block[0] > 0:
+            return False
+        i0 = 1 / sqrt(block[0])
+        l10, l20 = block[3] * i0, block[6] * i0
+        pivot = block[4] - l10 * l10
+        if not pivot > 0:
+            return False
+        i1 = 1 / sqrt(pivot)
+        l21 = (block[7] - l20 * l10) * i1
+        pivot = block[8] - l20 * l20 - l21 * l21
+        if not pivot > 0:
+            return False
+        i2 = 1 / sqrt(pivot)
+        diagonal = factor[begin]
+        diagonal[0], diagonal[3], diagonal[4] = i0, l10, i1
+        diagonal[6], diagonal[7], diagonal[8] = l20, l21, i2
+        block[:] = 0.0
+        for p in range(begin + 1, starts[j + 1]):
+            block, found = work[rows[p]], factor[p]
+            for r in range(0, 9, 3):
+                a = block[r] * i0
+                b = (block[r + 1] - a * l10) * i1
+                found[r], found[r + 1] = a, b
+                found[r + 2] = (block[r + 2] - a * l20 - b * l21) * i2
+            block[:] = 0.0
+        reached[j] = begin
+        _await_next(j, reached, waiting, following, rows, starts)
+    return True
+
+
+@kernel
+def _await_next(column, reached, waiting, following, rows, starts):  # type: ignore[no-untyped-def]
+    """Let a finished column wait for its next row."""
+    reached[column] += 1
+    if reached[column] < starts[column + 1]:
+        row = rows[reached[column]]
+        following[column] = waiting[row]
+        waiting[row] = column
+
+
+@kernel
+def _take_off(work, left, right, rows, begin, end):  # type: ignore[no-untyped-def]
+    """work[i] -= left[i, k] right[j, k]ᵀ for the rows i of column k from j = rows[begin] on."""
+    t = right[begin]
+    t0, t1, t2, t3, t4, t5, t6, t7, t8 = t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7], t[8]
+    for p in range(begin, end):
+        w, f = work[rows[p]], left[p]
+        a, b, c = f[0], f[1], f[2]
+        w[0] -= a * t0 + b * t1 + c * t2
+        w[1] -= a * t3 + b * t4 + c * t5
+        w[2] -= a * t6 + b * t7 + c * t8
+        a, b, c = f[3], f[4], f[5]
+        w[3] -= a * t0 + b * t1 + c * t2
+        w[4] -= a * t3 + b * t4 + c * t5
+        w[5] -= a * t6 + b * t7 + c * t8
+        a, b, c = f[6], f[7], f[8]
+        w[6] -= a * t0 + b * t1 + c * t2
+        w[7] -= a * t3 + b * t4 + c * t5
+        w[8] -= a * t6 + b * t7 + c * t8
+
+
+@kernel
+def solve(of: Pattern, factor: Floats, right: Floats, solution: Floats) -> None:
+    """solution [V, 3] = A⁻¹ right, by a Cholesky factor."""
+    count = len(of.place)
+    starts, rows = of.factor_starts, of.factor_rows
+    work = np.empty((count, 3))
+    for node in range(count):
+        work[of.place[node]] = right[node]
+    for j in range(count):
+        d = factor[starts[j]]
+        a = work[j, 0] * d[0]
+        b = (work[j, 1] - d[3] * a) * d[4]
+        c = (work[j, 2] - d[6] * a - d[7] * b) * d[8]
+        work[j, 0], work[j, 1], work[j, 2] = a, b, c
+        for p in range(starts[j] + 1, starts[j + 1]):
+            f, w = factor[p], work[rows[p]]
+            w[0] -= f[0] * a + f[1] * b + f[2] * c
+            w[1] -= f[3] * a + f[4] * b + f[5] * c
+            w[2] -= f[6] * a + f[7] * b + f[8] * c
+    for j in range(count - 1, -1, -1):
+        a, b, c = work[j, 0], work[j, 1], work[j, 2]
+        for p in range(starts[j] + 1, starts[j + 1]):
+            f, w = factor[p], work[rows[p]]
+            a -= f[0] * w[0] + f[3] * w[1] + f[6] * w[2]
+            b -= f[1] * w[0] + f[4] * w[1] + f[7] * w[2]
+            c -= f[2] * w[0] + f[5] * w[1] + f[8] * w[2]
+        d = factor[starts[j]]
+        c *= d[8]
+        b = (b - d[7] * c) * d[4]
+        work[j, 0], work[j, 1], work[j, 2] = (a - d[3] * b - d[6] * c) * d[0], b, c
+    for node in range(count):
+        solution[node] = work[of.place[node]]

@@ -1,0 +1,425 @@
+"""Expressions of numbers that differentiate themselves: a force is written once, as a formula, and everything that a step
+needs of it (its value, its stiffness, its derivatives in both modes) is generated from that.
+
+A formula is an ordinary Python function of `Scalar` and `Vector`. Calling it builds a graph; equal expressions are one node.
+`gradient` walks the graph backwards (reverse accumulation), which gives another graph. `compiled.source` writes graphs as
+straight-line Python code, which numba compiles.
+
+Conditions are values (`where`), not branches: both sides are computed. Where a function has a corner its derivative is the
+one that torch takes, since the twins in tests/ are written in torch: that of the side which holds for `maximum` with a
+constant (the argument's own at equality), half of both for `minimum` of two arguments, zero for `absolute` at zero, and zero
+for everything that picks a place in a table.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import overload
+
+_COMMUTE = {"add", "mul", "eq", "and", "or"}
+
+
+@dataclass(eq=False)
+class Graph:
+    """All nodes of some formulas."""
+
+    nodes: list[Scalar] = field(default_factory=list)
+    _known: dict[tuple[object, ...], Scalar] = field(default_factory=dict)
+
+    def node(self, operation: str, *operands: Scalar, payload: object = None) -> Scalar:
+        """The node of an operation; the same one for the same operation."""
+        numbers = [operand.number for operand in operands]
+        if operation in _COMMUTE:
+            numbers.sort()
+        key = (operation, *numbers, payload)
+        found = self._known.get(key)
+        if found is None:
+            found = Scalar(self, len(self.nodes), operation, operands, payload)
+            self.nodes.append(found)
+            self._known[key] = found
+        return found
+
+    def constant(self, value: float) -> Scalar:
+        return self.node("constant", payload=float(value))
+
+    def input(self, name: str) -> Scalar:
+        """A number that the code is given: a variable's name, or an array with its indices."""
+        return self.node("input", payload=name)
+
+    def vector(self, *names: str) -> Vector:
+        return Vector(*(self.input(name) for name in names))
+
+
+@dataclass(eq=False, frozen=True, repr=False)
+class Scalar:
+    """One number of a formula. Operators build the graph; comparisons give conditions for `where`."""
+
+    graph: Graph
+    number: int
+    operation: str
+    operands: tuple[Scalar, ...]
+    payload: object = None
+
+    @property
+    def value(self) -> float | None:
+        """Of a constant."""
+        return self.payload if self.operation == "constant" else None  # type: ignore[return-value]
+
+    def of(self, other: Scalar | float) -> Scalar:
+        """A number as a node of this graph."""
+        return other if isinstance(other, Scalar) else self.graph.constant(other)
+
+    def __add__(self, other: Scalar | float) -> Scalar:
+        return _add(self, self.of(other))
+
+    def __radd__(self, other: float) -> Scalar:
+        return _add(self.of(other), self)
+
+    def __sub__(self, other: Scalar | float) -> Scalar:
+        return _sub(self, self.of(other))
+
+    def __rsub__(self, other: float) -> Scalar:
+        return _sub(self.of(other), self)
+
+    @overload
+    def __mul__(self, other: Scalar | float) -> Scalar: ...
+    @overload
+    def __mul__(self, other: Vector) -> Vector: ...
+    def __mul__(self, other: Scalar | float | Vector) -> Scalar | Vector:
+        return other * self if isinstance(other, Vector) else _mul(self, self.of(other))
+
+    def __rmul__(self, other: float) -> Scalar:
+        return _mul(self.of(other), self)
+
+    def __truediv__(self, other: Scalar | float) -> Scalar:
+        return _div(self, self.of(other))
+
+    def __rtruediv__(self, other: float) -> Scalar:
+        return _div(self.of(other), self)
+
+    def __neg__(self) -> Scalar:
+        return _neg(self)
+
+    def __lt__(self, other: Scalar | float) -> Scalar:
+        return self.graph.node("lt", self, self.of(other))
+
+    def __le__(self, other: Scalar | float) -> Scalar:
+        return self.graph.node("le", self, self.of(other))
+
+    def __gt__(self, other: Scalar | float) -> Scalar:
+        return self.of(other) < self
+
+    def __ge__(self, other: Scalar | float) -> Scalar:
+        return self.of(other) <= self
+
+    def equals(self, other: Scalar | float) -> Scalar:
+        """A condition; `==` compares nodes."""
+        return self.graph.node("eq", self, self.of(other))
+
+    def __and__(self, other: Scalar) -> Scalar:
+        return self.graph.node("and", self, other)
+
+    def __repr__(self) -> str:
+        return f"<{self.operation} {self.number}>"
+
+
+@dataclass(frozen=True)
+class Vector:
+    """Three numbers."""
+
+    x: Scalar
+    y: Scalar
+    z: Scalar
+
+    def __iter__(self) -> Iterable[Scalar]:  # type: ignore[misc]  # unpacking is all it is for
+        return iter((self.x, self.y, self.z))
+
+    def __getitem__(self, axis: int) -> Scalar:
+        return (self.x, self.y, self.z)[axis]
+
+    def __add__(self, other: Vector) -> Vector:
+        return Vector(self.x + other.x, self.y + other.y, self.z + other.z)
+
+    def __sub__(self, other: Vector) -> Vector:
+        return Vector(self.x - other.x, self.y - other.y, self.z - other.z)
+
+    def __mul__(self, factor: Scalar | float) -> Vector:
+        return Vector(self.x * factor, self.y * factor, self.z * factor)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, divisor: Scalar | float) -> Vector:
+        return self * (1.0 / divisor)
+
+    def __neg__(self) -> Vector:
+        return Vector(-self.x, -self.y, -self.z)
+
+
+def dot(a: Vector, b: Vector) -> Scalar:
+    """a · b"""
+    return a.x * b.x + a.y * b.y + a.z * b.z
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """a × b"""
+    return Vector(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
+
+
+def total(parts: Iterable[Vector]) -> Vector:
+    """The sum of one or more vectors."""
+    first, *rest = parts
+    for part in rest:
+        first = first + part
+    return first
+
+
+def squareroot(a: Scalar) -> Scalar:
+    return _unary("sqrt", a)
+
+
+def logarithm(a: Scalar) -> Scalar:
+    return _unary("log", a)
+
+
+def floor(a: Scalar) -> Scalar:
+    """Without derivative."""
+    return _unary("floor", a)
+
+
+def absolute(a: Scalar) -> Scalar:
+    return _unary("abs", a)
+
+
+def arctangent(sine: Scalar, cosine: Scalar) -> Scalar:
+    """atan2"""
+    return sine.graph.node("atan2", sine, cosine)
+
+
+def sine(a: Scalar) -> Scalar:
+    return _unary("sin", a)
+
+
+def cosine(a: Scalar) -> Scalar:
+    return _unary("cos", a)
+
+
+def where(condition: Scalar, then: Scalar | float, otherwise: Scalar | float) -> Scalar:
+    """`then` where the condition holds, else `otherwise`."""
+    a, b = condition.of(then), condition.of(otherwise)
+    return a if a is b else condition.graph.node("where", condition, a, b)
+
+
+def maximum(a: Scalar, low: Scalar | float) -> Scalar:
+    """At least `low`."""
+    return where(a >= low, a, low)
+
+
+def clamped(a: Scalar, low: float, high: float) -> Scalar:
+    """Between both."""
+    return where(a < low, low, where(a > high, high, a))
+
+
+def minimum(a: Scalar, b: Scalar) -> Scalar:
+    """The smaller one."""
+    return a.graph.node("min", a, b)
+
+
+def larger(a: Scalar, b: Scalar) -> Scalar:
+    """The larger one."""
+    return -minimum(-a, -b)
+
+
+def norm(a: Vector, tiny: float = 1e-30) -> Scalar:
+    """|a|, with the derivative zero instead of infinite at the origin."""
+    return squareroot(maximum(dot(a, a), tiny))
+
+
+def held(a: Scalar) -> Scalar:
+    """The same number, as a constant for derivatives."""
+    return a.graph.node("held", a)
+
+
+def gradient(output: Scalar, inputs: Sequence[Scalar]) -> list[Scalar]:
+    """d output / d input for each input, by reverse accumulation."""
+    zero = output.graph.constant(0.0)
+    if output.value is not None:
+        return [zero] * len(inputs)
+    wanted = _depending(output, inputs)
+    slopes: dict[int, Scalar] = {output.number: output.graph.constant(1.0)}
+    for node in reversed(ordered([output])):
+        slope = slopes.get(node.number)
+        if slope is None or node.number not in wanted:
+            continue
+        for operand, part in _partials(node, slope):
+            if operand.number in wanted:
+                slopes[operand.number] = slopes[operand.number] + part if operand.number in slopes else part
+    return [slopes.get(one.number, zero) for one in inputs]
+
+
+def directional(outputs: Sequence[Scalar], inputs: Sequence[Scalar], rates: Sequence[Scalar]) -> list[Scalar]:
+    """How the outputs change when each input changes at its rate, by forward accumulation."""
+    zero = outputs[0].graph.constant(0.0)
+    one = outputs[0].graph.constant(1.0)
+    known = {source.number: rate for source, rate in zip(inputs, rates, strict=True)}
+    for node in ordered(outputs):
+        if node.number in known:
+            continue
+        for operand, part in _partials(node, one):
+            rate = known.get(operand.number, zero)
+            if rate.value != 0:
+                change = part * rate
+                known[node.number] = known[node.number] + change if node.number in known else change
+    return [known.get(output.number, zero) for output in outputs]
+
+
+def _partials(node: Scalar, slope: Scalar) -> list[tuple[Scalar, Scalar]]:
+    """(operand, slope times d node / d operand) of each operand that has one."""
+    a = node.operands[0] if node.operands else None
+    match node.operation, node.operands:
+        case "add", (p, q):
+            return [(p, slope), (q, slope)]
+        case "sub", (p, q):
+            return [(p, slope), (q, -slope)]
+        case "mul", (p, q):
+            return [(p, slope * q), (q, slope * p)]
+        case "div", (p, q):
+            part = slope / q
+            return [(p, part), (q, -part * node)]
+        case "neg", (p,):
+            return [(p, -slope)]
+        case "sqrt", (p,):
+            return [(p, slope * 0.5 / node)]
+        case "log", (p,):
+            return [(p, slope / p)]
+        case "sin", (p,):
+            return [(p, slope * cosine(p))]
+        case "cos", (p,):
+            return [(p, -slope * sine(p))]
+        case "abs", (p,):
+            return [(p, slope * _unary("sign", p))]
+        case "atan2", (p, q):
+            part = slope / (p * p + q * q)
+            return [(p, part * q), (q, -part * p)]
+        case "where", (condition, p, q):
+            return [(p, where(condition, slope, 0.0)), (q, where(condition, 0.0, slope))]
+        case "min", (p, q):
+            half = where(p.equals(q), 0.5, 0.0)
+            return [(p, slope * where(p < q, 1.0, half)), (q, slope * where(q < p, 1.0, half))]
+        case (("constant" | "input" | "floor" | "sign" | "pick" | "held" | "lt" | "le" | "eq" | "and"), _):
+            return []
+    raise ValueError(f"No derivative of {node.operation} ({a}).")
+
+
+def _depending(output: Scalar, inputs: Sequence[Scalar]) -> set[int]:
+    """Numbers of the nodes between the inputs and the output that have derivatives by an input."""
+    sources = {one.number for one in inputs}
+    found: set[int] = set()
+    for node in ordered([output]):
+        differentiable = node.operation not in ("floor", "sign", "pick", "held", "lt", "le", "eq", "and")
+        if node.number in sources or (differentiable and any(one.number in found for one in node.operands)):
+            found.add(node.number)
+    return found
+
+
+def ordered(outputs: Iterable[Scalar]) -> list[Scalar]:
+    """All nodes that the outputs need, each after its operands: in the order in which they were made."""
+    seen: dict[int, Scalar] = {}
+    todo = list(outputs)
+    while todo:
+        node = todo.pop()
+        if node.number not in seen:
+            seen[node.number] = node
+            todo += node.operands
+    return [seen[number] for number in sorted(seen)]
+
+
+def uses(outputs: Iterable[Scalar]) -> Mapping[int, int]:
+    """How often the outputs and the nodes that they need use each node."""
+    counts: dict[int, int] = {}
+    outputs = list(outputs)
+    for node in ordered(outputs):
+        for operand in node.operands:
+            counts[operand.number] = counts.get(operand.number, 0) + 1
+    for output in outputs:
+        counts[output.number] = counts.get(output.number, 0) + 1
+    return counts
+
+
+def _add(a: Scalar, b: Scalar) -> Scalar:
+    if a.value is not None and b.value is not None:
+        return a.graph.constant(a.value + b.value)
+    if a.value == 0:
+        return b
+    if b.value == 0:
+        return a
+    if b.operation == "neg":
+        return _sub(a, b.operands[0])
+    if a.operation == "neg":
+        return _sub(b, a.operands[0])
+    return a.graph.node("add", a, b)
+
+
+def _sub(a: Scalar, b: Scalar) -> Scalar:
+    if a is b:
+        return a.graph.constant(0.0)
+    if a.value is not None and b.value is not None:
+        return a.graph.constant(a.value - b.value)
+    if b.value == 0:
+        return a
+    if a.value == 0:
+        return _neg(b)
+    if b.operation == "neg":
+        return _add(a, b.operands[0])
+    return a.graph.node("sub", a, b)
+
+
+def _mul(a: Scalar, b: Scalar) -> Scalar:
+    if a.value is not None:
+        a, b = b, a  # a constant comes second
+    if b.value is not None:
+        if a.value is not None:
+            return a.graph.constant(a.value * b.value)
+        if b.value == 0:
+            return b
+        if b.value == 1:
+            return a
+        if b.value == -1:
+            return _neg(a)
+    if a.operation == "neg":
+        return _neg(_mul(a.operands[0], b))
+    if b.operation == "neg":
+        return _neg(_mul(a, b.operands[0]))
+    # a slope that counts on one side of a condition only
+    if b.operation == "where" and {b.operands[1].value, b.operands[2].value} == {0.0, 1.0}:
+        return where(b.operands[0], _mul(a, b.operands[1]), _mul(a, b.operands[2]))
+    return a.graph.node("mul", a, b)
+
+
+def _div(a: Scalar, b: Scalar) -> Scalar:
+    if a.value == 0:
+        return a
+    if b.value is not None:
+        return _mul(a, a.graph.constant(1 / b.value)) if _is_power_of_two(b.value) else a.graph.node("div", a, b)
+    if a.operation == "neg":
+        return _neg(_div(a.operands[0], b))
+    return a.graph.node("div", a, b)
+
+
+def _neg(a: Scalar) -> Scalar:
+    if a.value is not None:
+        return a.graph.constant(-a.value)
+    if a.operation == "neg":
+        return a.operands[0]
+    if a.operation == "sub":
+        return _sub(a.operands[1], a.operands[0])
+    return a.graph.node("neg", a)
+
+
+def _unary(operation: str, a: Scalar) -> Scalar:
+    return a.graph.node(operation, a)
+
+
+def _is_power_of_two(value: float) -> bool:
+    return value != 0 and math.frexp(value)[0] in (0.5, -0.5)

@@ -1,0 +1,200 @@
+"""An episode of linearised steps: one linear system each, then what is in the way."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters
+from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.pool import with_room
+from diffcloud.sim.compiled.sparse import cholesky, solve
+from diffcloud.sim.linearised.matrix import linear_system, pattern_with
+from diffcloud.sim.linearised.scene import Held, Kept, Scene, aim, held_now, nothing_kept, take_anchors
+from diffcloud.sim.reference.impact_zones import Impacts, resolve
+from diffcloud.sim.reference.nearest import nearest_pairs
+from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE, NOT_POSITIVE_DEFINITE, UNRESOLVED
+
+
+@kernel
+def simulate(
+    scene: Scene,
+    held: Held,
+    parameters: Parameters,
+    track: Floats,
+    anchors: Floats,
+    positions: Floats,
+    velocities: Floats,
+    keep: int,
+    control: Ints,
+) -> tuple[int, int, Kept]:
+    """All steps of one cloth.
+
+    Args:
+        track: [S, G, 3] displacement of the grippers at the end of each step [m].
+        anchors: [H, 3] of the handles; takes those that become active.
+        positions, velocities: [S + 1, V, 3] the first is the start; take the others.
+        keep: rows of factors that may be kept for the derivatives; below zero: nothing is kept.
+        control: [2] finished steps are added to the first; the second one stops the run when it is not zero.
+
+    Returns:
+        (how it ended (`status`), the step in which it did, what the derivatives need)
+    """
+    steps, nodes = len(positions) - 1, positions.shape[1]
+    kept = nothing_kept(steps if keep >= 0 else 0, nodes)
+    points, motion = with_obstacles(scene, positions[0]), still(scene, nodes)
+    force = np.empty((len(points), 3))
+    for step in range(steps):
+        if control[1] != 0:
+            return INTERRUPTED, step, kept
+        take_anchors(held, track, step, positions[step], anchors)
+        aim(held, track, step, anchors, parameters)
+        begin_motion(scene, held, parameters, step, positions[step], velocities[step], motion)
+        if scene.repels:
+            corners, constants = nearest_pairs(scene.surface, scene.repulsion, motion.positions)
+        else:
+            corners, constants = np.empty((0, 5), np.int64), np.empty((0, 4))
+        pattern, moved = pattern_with(scene.pattern, corners)
+        holder = held_now(scene, held, step)
+        force[:] = 0.0
+        matrix = linear_system(
+            scene, parameters, motion, holder, corners, constants, pattern, moved, force
+        )
+        factor = np.empty((len(pattern.factor_rows), 9))
+        if not cholesky(pattern, matrix, factor):
+            return NOT_POSITIVE_DEFINITE, step, kept
+        candidate = positions[step + 1]
+        change = np.empty((nodes, 3))
+        for i in range(nodes):
+            for axis in range(3):
+                force[i, axis] = 0.0 if holder[i] >= 0 else scene.time_step * force[i, axis]
+        solve(pattern, factor, force, change)
+        finite = True
+        for i in range(nodes):
+            for axis in range(3):
+                v = motion.after[i, axis] + change[i, axis]  # prescribed nodes have it already
+                velocities[step + 1, i, axis] = v
+                points[i, axis] = positions[step, i, axis] + scene.time_step * v
+                finite = finite and np.isfinite(points[i, axis])
+        if not finite:
+            return NOT_FINITE, step, kept
+        if keep >= 0:
+            kept = _remember(kept, step, velocities[step + 1], corners, constants, factor, keep)
+        project(scene, points)
+        if scene.collides:
+            mobile = mobility(scene, parameters, holder)
+            resolved, impacts = resolve(
+                scene.surface, scene.projection, motion.positions, points, mobile, kept.impacts
+            )
+            kept = _with_impacts(kept, impacts, step, keep)
+            if not resolved:
+                return UNRESOLVED, step, kept
+        for i in range(nodes):
+            for axis in range(3):
+                x = positions[step, i, axis] + scene.time_step * velocities[step + 1, i, axis]
+                velocities[step + 1, i, axis] += (points[i, axis] - x) / scene.time_step
+                candidate[i, axis] = points[i, axis]
+        control[0] += 1
+    return DONE, steps, kept
+
+
+@kernel
+def with_obstacles(scene: Scene, cloth: Floats) -> Floats:
+    """[N, 3] all points, of the cloth's [V, 3]."""
+    points = np.empty((len(cloth) + len(scene.obstacles), 3))
+    points[: len(cloth)] = cloth
+    points[len(cloth) :] = scene.obstacles
+    return points
+
+
+@kernel
+def still(scene: Scene, nodes: int) -> Motion:
+    """Room for the motion of all points; obstacles rest."""
+    count = nodes + len(scene.obstacles)
+    motion = Motion(np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3)))
+    motion.positions[nodes:] = scene.obstacles
+    return motion
+
+
+@kernel
+def begin_motion(
+    scene: Scene, held: Held, parameters: Parameters, step: int, positions: Floats, velocities: Floats, motion: Motion
+) -> None:
+    """The motion of a step before its linear system: as before, but for what handles prescribe."""
+    dt = scene.time_step
+    for i in range(len(positions)):
+        for axis in range(3):
+            motion.positions[i, axis] = positions[i, axis]
+            motion.before[i, axis] = motion.after[i, axis] = velocities[i, axis]
+    if held.hard:
+        for h in range(len(held.node)):
+            if held.strength[step, h] > 0:
+                i = held.node[h]
+                for axis in range(3):
+                    motion.after[i, axis] = (parameters.target[h, axis] - positions[i, axis]) / dt
+    displace(scene, parameters, len(positions), motion)
+
+
+@kernel
+def displace(scene: Scene, parameters: Parameters, nodes: int, motion: Motion) -> None:
+    """The displacement in which elastic forces are linear: (Δt + β) v."""
+    reach = scene.time_step + parameters.damping[0]
+    for i in range(nodes):
+        for axis in range(3):
+            motion.displacement[i, axis] = reach * motion.after[i, axis]
+
+
+@kernel
+def project(scene: Scene, points: Floats) -> None:
+    """Put nodes that are behind a plane back above it."""
+    for p in range(len(scene.plane_offsets)):
+        normal = scene.plane_normals[p]
+        for i in range(len(points) - len(scene.obstacles)):
+            gap = normal[0] * points[i, 0] + normal[1] * points[i, 1] + normal[2] * points[i, 2] - scene.plane_offsets[p]
+            if gap < 0:
+                for axis in range(3):
+                    points[i, axis] += (scene.projection.thickness - gap) * normal[axis]
+
+
+@kernel
+def mobility(scene: Scene, parameters: Parameters, holder: Ints) -> Floats:
+    """[N] inverse masses of the impact stage: prescribed nodes do not give way."""
+    found = parameters.inverse_mass.copy()
+    for i in range(len(holder)):
+        if holder[i] >= 0:
+            found[i] = 0.0
+    return found
+
+
+@kernel
+def _remember(
+    kept: Kept, step: int, solved: Floats, corners: Ints, constants: Floats, factor: Floats, limit: int
+) -> Kept:
+    """What a step adds to the record, but for its impacts."""
+    kept.solved[step] = solved
+    begins = kept.begins
+    pairs, rows = begins[step, 0], begins[step, 4]
+    more = with_room(kept.corners, pairs, len(corners))
+    numbers = with_room(kept.constants, pairs, len(corners))
+    more[pairs : pairs + len(corners)] = corners
+    numbers[pairs : pairs + len(corners)] = constants
+    begins[step + 1, 0] = pairs + len(corners)
+    factors = kept.factors
+    if rows + len(factor) <= limit:
+        factors = with_room(factors, rows, len(factor))
+        factors[rows : rows + len(factor)] = factor
+        begins[step + 1, 4] = rows + len(factor)
+    else:
+        begins[step + 1, 4] = rows
+    return Kept(kept.solved, begins, more, numbers, kept.impacts, factors)
+
+
+@kernel
+def _with_impacts(kept: Kept, impacts: Impacts, step: int, keep: int) -> Kept:
+    """The record with the impacts of a step; without derivatives its room is used again."""
+    if keep >= 0:
+        for k in range(3):
+            kept.begins[step + 1, 1 + k] = impacts.used[k]
+    else:
+        for k in range(3):
+            impacts.used[k] = 0
+    return Kept(kept.solved, kept.begins, kept.corners, kept.constants, impacts, kept.factors)

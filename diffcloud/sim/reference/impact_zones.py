@@ -1,0 +1,299 @@
+"""Impact zones (Harmon et al. 2008, "Robust treatment of simultaneous collisions"): the candidate positions of a step are
+moved as little as possible, in the metric of the masses, so that nothing has passed through anything.
+
+Passes of detection and projection alternate until a pass finds no impact. An impact j found at time t_j is the linear
+constraint n_j · Σ w_jk x_k >= thickness with the normal and the weights at that time. All constraints found in a step
+stay; those that share points that can move are a zone, and `dual` solves each.
+"""
+
+from __future__ import annotations
+
+from math import floor
+from typing import NamedTuple
+
+import numpy as np
+
+from diffcloud.sim.compiled.data import Floats, Ints
+from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.pool import with_room
+from diffcloud.sim.compiled.sorting import ascending
+from diffcloud.sim.contact.broad_phase import candidates, corners_of
+from diffcloud.sim.contact.surface import Surface
+from diffcloud.sim.reference.dual import applied, gram, solve_dual
+from diffcloud.sim.reference.impact_times import NEVER, first_impact
+
+PASSES = 100
+_REACH = 0.01
+"""[m] Candidate pairs are listed this far around the boxes that their points sweep, and again once a point leaves its box by
+almost half of that."""
+_TIME_TIE = 1e-4
+"""Impacts in one interval of this length (of the step) count as simultaneous; then the order is that of the primitives."""
+_TOUCH = 1e-5
+"""[m] Added to the boxes; covers the tolerances of the detection."""
+
+
+class Projection(NamedTuple):
+    """Choices of the impact stage."""
+
+    thickness: float
+    """τ_p: what the projection leaves between primitives [m]."""
+    smallest: float
+    """[m⁴] Pairs with |a × b|² below never meet (ARCSim: 1e-6)."""
+    residue: float
+    """Part of each correction that is left out. The original's iterative solver leaves more gap the smaller the
+    correction, which decides ties of the next step; 1e-9 reproduces that."""
+
+
+class Impacts(NamedTuple):
+    """What an episode's passes found, for its derivatives. `used` counts the rows of the others."""
+
+    met: Ints
+    """[J, 5] kind and four points of each impact."""
+    places: Floats
+    """[J, 9] its weights, normal against the approach, time, and sign of the normal."""
+    passes: Ints
+    """[P, 2] how many impacts of its step each pass knows, and how many of them are new."""
+    forces: Floats
+    """[., 2] λ and regularisation of every impact that a pass knows, pass after pass."""
+    used: Ints
+    """[3] rows of `met` (and `places`), `passes`, `forces`."""
+
+
+@kernel
+def no_impacts() -> Impacts:
+    """An empty record."""
+    ints, floats = np.empty((16, 5), np.int64), np.empty((16, 9))
+    return Impacts(ints, floats, np.empty((16, 2), np.int64), np.empty((16, 2)), np.zeros(3, np.int64))
+
+
+@kernel
+def resolve(
+    surface: Surface, choices: Projection, start: Floats, places: Floats, inverse_mass: Floats, record: Impacts
+) -> tuple[bool, Impacts]:
+    """Positions after the impacts of a step.
+
+    Args:
+        start: [N, 3] points at the start of the step, free of intersections.
+        places: [N, 3] points at its end before contact; take those after it.
+        inverse_mass: [N] [1/kg]; zero for points that cannot move.
+
+    Returns:
+        (whether 100 passes sufficed, the record with the passes of this step)
+    """
+    pairs = _listed(surface, start, places)
+    if len(pairs) == 0:
+        return True, record
+    candidate, listed_at, before = places.copy(), places.copy(), places.copy()
+    changed = np.ones(len(places), np.bool_)
+    first = record.used[0]
+    for _ in range(PASSES):
+        fresh, record = _impacts(surface, choices, pairs, start, places, changed, inverse_mass, record)
+        if fresh == 0:
+            return True, record
+        record = _project(choices, candidate, places, inverse_mass, record, first, fresh)
+        stray = False
+        for i in range(len(places)):
+            changed[i] = False
+            for axis in range(3):
+                x = places[i, axis]
+                changed[i] = changed[i] or x != before[i, axis]
+                before[i, axis] = x
+                low = min(start[i, axis], listed_at[i, axis])
+                high = max(start[i, axis], listed_at[i, axis])
+                stray = stray or x < low - 0.4 * _REACH or x > high + 0.4 * _REACH
+        if stray:
+            pairs = _listed(surface, start, places)
+            listed_at = places.copy()
+    return False, record
+
+
+@kernel
+def _listed(surface: Surface, start: Floats, places: Floats) -> Ints:
+    """Candidate pairs [C, 7]: kind, points and primitives."""
+    point_face, edge_edge = candidates(surface, start, places, _REACH, 0)
+    found = np.empty((len(point_face) + len(edge_edge), 7), np.int64)
+    for c in range(len(found)):
+        edges = 1 if c >= len(point_face) else 0
+        a, b = (edge_edge[c - len(point_face), 0], edge_edge[c - len(point_face), 1]) if edges else (
+            point_face[c, 0],
+            point_face[c, 1],
+        )
+        found[c, 0] = edges
+        found[c, 1], found[c, 2], found[c, 3], found[c, 4] = corners_of(surface, edges, a, b)
+        found[c, 5], found[c, 6] = a, b
+    return found
+
+
+@kernel
+def _impacts(  # type: ignore[no-untyped-def]
+    surface: Surface, choices: Projection, pairs: Ints, start: Floats, places: Floats, changed, inverse_mass: Floats,
+    record: Impacts,
+) -> tuple[int, Impacts]:
+    """The impacts of this pass that are kept: in the order of time, each that shares no movable point with one before."""
+    hits, times, found = np.empty((16, 1), np.int64), np.empty((16, 2)), np.empty((16, 7))
+    count = 0
+    x, y, place = np.empty((4, 3)), np.empty((4, 3)), np.empty(7)
+    for c in range(len(pairs)):
+        if not (changed[pairs[c, 1]] or changed[pairs[c, 2]] or changed[pairs[c, 3]] or changed[pairs[c, 4]]):
+            continue
+        if not _boxes_meet(pairs, c, start, places):
+            continue
+        for k in range(4):
+            for axis in range(3):
+                x[k, axis], y[k, axis] = start[pairs[c, 1 + k], axis], places[pairs[c, 1 + k], axis]
+        time = first_impact(pairs[c, 0], x, y, choices.smallest, place)
+        if time == NEVER:
+            continue
+        hits, times, found = with_room(hits, count, 1), with_room(times, count, 1), with_room(found, count, 1)
+        hits[count, 0] = c
+        times[count, 0], times[count, 1] = floor(time / _TIME_TIE), time
+        for k in range(7):
+            found[count, k] = place[k]
+        count += 1
+    if count == 0:
+        return 0, record
+    faces, edges = float(len(surface.faces)), float(len(surface.edges))
+    number = np.empty(count)  # the place in the list of all pairs
+    for h in range(count):
+        c = hits[h, 0]
+        number[h] = pairs[c, 5] * faces + pairs[c, 6] if pairs[c, 0] == 0 else 1e15 + pairs[c, 5] * edges + pairs[c, 6]
+    order = ascending(number)
+    order = order[ascending(times[:count, 0][order])]
+    taken = np.zeros(len(places), np.bool_)
+    met, stored = with_room(record.met, record.used[0], count), with_room(record.places, record.used[0], count)
+    fresh = 0
+    for h in order:
+        c = hits[h, 0]
+        free, movable = True, False
+        for k in range(4):
+            i = pairs[c, 1 + k]
+            if inverse_mass[i] > 0:
+                movable, free = True, free and not taken[i]
+        if not (free and movable):
+            continue
+        row = record.used[0] + fresh
+        approach = 0.0
+        for k in range(4):
+            i = pairs[c, 1 + k]
+            taken[i] = True
+            met[row, 1 + k] = i
+            for axis in range(3):
+                approach += found[h, k] * found[h, 4 + axis] * (places[i, axis] - start[i, axis])
+        sign = -1.0 if approach > 0 else 1.0
+        met[row, 0] = pairs[c, 0]
+        for k in range(4):
+            stored[row, k] = found[h, k]
+        for axis in range(3):
+            stored[row, 4 + axis] = sign * found[h, 4 + axis]
+        stored[row, 7], stored[row, 8] = times[h, 1], sign
+        fresh += 1
+    record.used[0] += fresh
+    return fresh, Impacts(met, stored, record.passes, record.forces, record.used)
+
+
+@kernel
+def _project(
+    choices: Projection, candidate: Floats, places: Floats, inverse_mass: Floats, record: Impacts, first: int, fresh: int
+) -> Impacts:
+    """Solve the zones that have new impacts and move their points; note the pass."""
+    count = record.used[0] - first
+    met, rows = record.met[first : first + count], record.places[first : first + count]
+    passes = with_room(record.passes, record.used[1], 1)
+    forces = with_room(record.forces, record.used[2], count)
+    begin, known = record.used[2], 0
+    if count > fresh:  # what the pass before knew
+        known = passes[record.used[1] - 1, 0]
+        for j in range(known):
+            forces[begin + j, 0], forces[begin + j, 1] = forces[begin - known + j, 0], forces[begin - known + j, 1]
+    for j in range(known, count):
+        forces[begin + j, 0] = forces[begin + j, 1] = 0.0
+    zone = zones(met, inverse_mass)
+    for j in range(count - fresh, count):
+        if zone[j] < 0:
+            continue
+        label, members = zone[j], np.empty(count, np.int64)
+        size = 0
+        for other in range(count):
+            if zone[other] == label:
+                members[size] = other
+                size += 1
+        chosen = members[:size]
+        points, own = met[chosen][:, 1:5].copy(), rows[chosen]
+        matrix, target = gram(points, own, inverse_mass), applied(points, own, candidate)
+        force = np.empty(size)
+        for m in range(size):
+            target[m] = choices.thickness - target[m]
+            force[m] = forces[begin + chosen[m], 0]
+        regular = solve_dual(matrix, target, force)
+        for m in range(size):
+            zone[chosen[m]] = -1  # done
+            forces[begin + chosen[m], 0], forces[begin + chosen[m], 1] = force[m], regular
+        move(points, own, force, 1 - choices.residue, inverse_mass, candidate, places)
+    passes[record.used[1], 0], passes[record.used[1], 1] = count, fresh
+    record.used[1] += 1
+    record.used[2] += count
+    return Impacts(record.met, record.places, passes, forces, record.used)
+
+
+@kernel
+def zones(met: Ints, inverse_mass: Floats) -> Ints:
+    """[J] a number for each group of impacts that are joined by points that can move."""
+    parent = np.arange(len(inverse_mass))
+    for j in range(len(met)):
+        root = -1
+        for k in range(1, 5):
+            i = met[j, k]
+            if inverse_mass[i] > 0:
+                while parent[i] != i:
+                    parent[i] = parent[parent[i]]
+                    i = parent[i]
+                if root < 0:
+                    root = i
+                else:
+                    parent[max(i, root)] = min(i, root)
+                    root = min(i, root)
+    found = np.full(len(met), -1, np.int64)
+    for j in range(len(met)):
+        for k in range(1, 5):
+            i = met[j, k]
+            if inverse_mass[i] > 0:
+                while parent[i] != i:
+                    i = parent[i]
+                found[j] = i
+    return found
+
+
+@kernel
+def move(  # type: ignore[no-untyped-def]
+    points: Ints, rows: Floats, force: Floats, part: float, inverse_mass: Floats, candidate: Floats, places: Floats
+) -> None:
+    """places = candidate + part · M⁻¹ Wᵀ λ at the points of rows that can move."""
+    for j in range(len(points)):
+        for k in range(4):
+            i = points[j, k]
+            if inverse_mass[i] > 0:
+                for axis in range(3):
+                    places[i, axis] = candidate[i, axis]
+    for j in range(len(points)):
+        for k in range(4):
+            i = points[j, k]
+            for axis in range(3):
+                places[i, axis] += part * inverse_mass[i] * rows[j, k] * rows[j, 4 + axis] * force[j]
+
+
+@kernel
+def _boxes_meet(pairs: Ints, c: int, start: Floats, places: Floats) -> bool:
+    """Whether the boxes that both primitives sweep touch."""
+    split = 3 if pairs[c, 0] > 0 else 2
+    for axis in range(3):
+        low, high = np.inf, -np.inf
+        for k in range(1, split):
+            first, last = start[pairs[c, k], axis], places[pairs[c, k], axis]
+            low, high = min(low, first, last), max(high, first, last)
+        other_low, other_high = np.inf, -np.inf
+        for k in range(split, 5):
+            first, last = start[pairs[c, k], axis], places[pairs[c, k], axis]
+            other_low, other_high = min(other_low, first, last), max(other_high, first, last)
+        if not (low <= other_high + _TOUCH and other_low <= high + _TOUCH):
+            return False
+    return True

@@ -1,0 +1,60 @@
+"""Repulsion and lagged friction between meshes, as forces of the linearised step (ARCSim).
+
+A pair at distance h, with n turned so that h > 0, violates the thickness τ by c = max(τ - h, 0). Energy K c³/(6 τ) with
+K = k_c times the smaller area; force K c²/(2 τ) along n, stiffness K c/τ, shared over the four points by the weights w.
+Friction is γ = min(μ f_n/|P v|, 1/(Δt Σ w_k²/m_k)) times the sliding velocity P v, P = I - n nᵀ. In γ the force f_n and
+the velocity v = Σ w_k v_k are those of the start of the step; the sliding velocity itself is implicit.
+
+`nearest` says which pairs: each point, edge and face has a slot on each of its two sides that keeps only the nearest pair. A
+pair that holds two slots counts twice in the original (`count_once` off).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+from diffcloud.sim.compiled.trace import Vector, dot, larger, maximum, norm, total, where
+from diffcloud.sim.reference.frames import Kind, frame
+from diffcloud.sim.terms.term import Element, Term
+
+_TINY = 1e-12
+
+
+def force(kind: Kind, pair: Element) -> Sequence[Vector]:
+    """Repulsion to first order in the motion of the step, and friction of the velocity at its end."""
+    weights, normal = frame(kind, pair.positions)
+    normal = pair.constant("sign") * normal
+
+    def along(field: Sequence[Vector]) -> Vector:
+        return total(weight * one for weight, one in zip(weights, field, strict=True))
+
+    thickness = pair.constant("thickness")
+    violation = maximum(thickness - dot(normal, along(pair.positions)), 0.0)
+    stiffness = violation * (pair.constant("stiffness") / thickness)
+    pushing = 0.5 * stiffness * violation
+    before, after = along(pair.before), along(pair.after)
+    mobility = sum((w * w * pair.parameter("inverse_mass", k) for k, w in enumerate(weights)), weights[0].of(0.0))
+    with_obstacle = pair.constant("with_obstacle") > 0.0
+    limit = where(with_obstacle, pair.parameter("friction_obstacle"), pair.parameter("friction_cloth")) * pushing
+    speed = norm(before - dot(normal, before) * normal)
+    gamma = limit / larger(speed, limit * pair.time_step * mobility + _TINY)
+    pressure = pushing - stiffness * dot(normal, pair.ahead * after) + gamma * dot(normal, after)
+    push = pair.constant("count") * (pressure * normal - gamma * after)
+    return [weight * push for weight in weights]
+
+
+def _term(kind: Kind) -> Term:
+    return Term(
+        f"proximity_{kind}",
+        corners=4,
+        force=partial(force, kind),
+        constants={name: () for name in ("sign", "count", "stiffness", "with_obstacle", "thickness")},
+        parameters={"inverse_mass": "corner", "friction_obstacle": "episode", "friction_cloth": "episode"},
+    )
+
+
+PROXIMITY_POINT_FACE = _term("point_face")
+PROXIMITY_EDGE_EDGE = _term("edge_edge")
+"""Constants: what turns the normal towards the first primitive; how often the pair counts; k_c times the area [N/m]; 1 where an
+obstacle takes part; τ [m]."""

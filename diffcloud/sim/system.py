@@ -1,0 +1,64 @@
+"""What is constant in a run (`System`), how it is built, and what changes with each step (`State`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffcloud.errors import SceneError
+from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
+from diffcloud.sim import implicit, linearised
+from diffcloud.sim.handles import Handles
+from diffcloud.sim.materials import Material
+from diffcloud.sim.properties import Properties
+from diffcloud.sim.rigid.bodies import Bodies, BodyState
+from diffcloud.sim.surrounding import Integrator, Surrounding
+from diffcloud.sim.terms.term import Setup
+
+
+@dataclass(frozen=True)
+class System:
+    """Everything constant in a run."""
+
+    setup: Setup
+    time_step: float
+    """[s]"""
+    properties: Properties
+    """Of the basis material, batch 1."""
+    bodies: Bodies
+
+    @property
+    def mesh(self) -> ClothMesh:
+        return self.setup.mesh
+
+    @property
+    def handles(self) -> Handles:
+        return self.setup.handles
+
+    @property
+    def obstacles(self) -> tuple[SurfaceMesh, ...]:
+        """Meshes to draw: static, moving, and rigid bodies."""
+        around = self.setup.surrounding
+        return (*around.obstacles, *(moving.mesh for moving in around.moving), *(body.mesh for body in around.bodies))
+
+    @cached_property
+    def scene(self) -> linearised.Scene | implicit.Scene:
+        """What the kernels of the integrator are given."""
+        build = linearised.build_scene if self.setup.integrator == "linearised" else implicit.build_scene
+        return build(self.setup, self.time_step)
+
+
+@dataclass(frozen=True)
+class State:
+    """A batch of cloths at one time."""
+
+    positions: Tensor
+    """[B, V, 3] [m]"""
+    velocities: Tensor
+    """[B, V, 3] [m/s]"""
+    bodies: BodyState | None = None
+    """Of the rigid bodies; None: where they start."""

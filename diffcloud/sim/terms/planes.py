@@ -1,0 +1,84 @@
+"""Contact of the linearised step with half-spaces n · x >= offset: repulsion and lagged Coulomb friction.
+
+Repulsion (ARCSim, thickness τ): violation c = max(τ + offset - n · x, 0), energy K c³/(6 τ) with K = k_c times the node's
+material area; force K c²/(2 τ) along n, stiffness K c/τ.
+
+Friction (lagged: normal force and sliding direction of the start of the step): γ = min(μ f_n / |v_t|, m / Δt), force
+-γ P v with P = I - n nᵀ, implicit in v. The second branch is sticking: it halves the sliding velocity in each
+step, so a node on an incline of angle α creeps at g sin(α) Δt, which vanishes with the step.
+
+Projection (`project`): a node whose candidate position is behind the plane is put at the projection thickness above it. For a
+single static plane this is the exact solution of the impact-zone problem (nodes do not couple), and inelastic.
+
+Not reproduced from ARCSim: the doubled constraint of the node nearest to each obstacle face, contacts of cloth edges
+with the obstacle's edges, and the plane's finite extent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.mesh.topology import ClothMesh
+from diffcloud.sim.compiled.trace import Vector, dot, larger, maximum, norm
+from diffcloud.sim.surrounding import Surrounding
+from diffcloud.sim.terms.term import Element, Elements, Setup, Term
+
+_TINY = 1e-12
+
+
+def force(node: Element) -> Sequence[Vector]:
+    """Repulsion to first order in the motion of the step, and friction of the velocity at its end."""
+    normal, thickness = node.vector("normal"), node.constant("thickness")
+    violation = maximum(thickness + node.constant("offset") - dot(node.positions[0], normal), 0.0)
+    stiffness = violation * (node.constant("stiffness") / thickness)
+    pushing = 0.5 * stiffness * violation
+    limit = node.parameter("friction_obstacle") * pushing
+    before, after = node.before[0], node.after[0]
+    speed = norm(before - dot(before, normal) * normal)
+    sticking = limit * node.time_step / node.parameter("node_mass") + _TINY
+    gamma = limit / larger(speed, sticking)
+    along = pushing - stiffness * dot(node.ahead * after, normal) + gamma * dot(after, normal)
+    return [along * normal - gamma * after]
+
+
+def build(setup: Setup) -> Elements | None:
+    """Every node with every plane."""
+    if setup.integrator != "linearised" or not setup.surrounding.proximity:
+        return None
+    normals, offsets = half_spaces(setup.mesh, setup.surrounding)
+    nodes = np.tile(np.arange(len(setup.mesh.nodes)), len(normals))
+    contact = setup.surrounding.contact
+    return Elements(
+        nodes[:, None],
+        {
+            "normal": np.repeat(normals, len(setup.mesh.nodes), axis=0),
+            "offset": np.repeat(offsets, len(setup.mesh.nodes)),
+            "stiffness": contact.stiffness * setup.mesh.node_area[nodes],
+            "thickness": np.full(len(nodes), contact.repulsion_thickness),
+        },
+    )
+
+
+PLANES = Term(
+    "planes",
+    corners=1,
+    force=force,
+    build=build,
+    constants={"normal": (3,), "offset": (), "stiffness": (), "thickness": ()},
+    parameters={"node_mass": "corner", "friction_obstacle": "episode"},
+)
+"""Constants: unit normal towards the cloth; offset [m]; k_c times the node's area [N/m]; τ [m]."""
+
+
+def half_spaces(mesh: ClothMesh, surrounding: Surrounding) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Planar obstacles as (normals [P, 3], offsets [P]), on the side where most of the cloth starts; none where contact with
+    meshes covers them."""
+    found = [obstacle.plane() for obstacle in surrounding.obstacles if surrounding.reference_contact is None]
+    planes = [plane for plane in found if plane is not None]
+    normals = np.array([normal for normal, _ in planes]).reshape(-1, 3)
+    offsets = np.array([offset for _, offset in planes]).reshape(-1)
+    side = np.where(np.median(mesh.nodes @ normals.T - offsets, axis=0) < 0, -1.0, 1.0)
+    return normals * side[:, None], offsets * side

@@ -1,0 +1,136 @@
+"""In-plane elasticity with the measured tables of Wang et al. 2011, as ARCSim samples them.
+
+    energy per face = a [k0 E00²/2 + k1 E00 E11 + k2 E11²/2 + k3 E01²],   E = (FᵀF - I)/2,   k = k(E)
+
+with F [3, 2] the deformation gradient and a the material-space area. The coefficients are looked up trilinearly in a
+30³ grid over (E00, E11, |E01|). ARCSim samples with half-pixel centres and border padding (grid_sample with
+align_corners = False); with zero padding the resting stiffness would be halved. They are constants in force and stiffness,
+but their dependence on the strain does enter derivatives with respect to the state.
+
+The stiffness takes the geometric term of tension only and drops the shear's (ARCSim), which keeps it positive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.sim.compiled.trace import Scalar, Vector, absolute, clamped, dot, floor, held, maximum, where
+from diffcloud.sim.materials import TABLE_ENTRY_TO_STRETCHING
+from diffcloud.sim.terms.term import Element, Elements, Setup, Term
+
+_SAMPLES = 30
+_SCALE = 900.0 / 29.0
+"""Grid cells per unit of strain: a range factor 60/29 in grid_sample's coordinates."""
+
+
+def force(face: Element) -> Sequence[Vector]:
+    """-∂W/∂x - H d on the three corners."""
+    xu, xv = _along_material(face, face.positions)
+    du, dv = _along_material(face, face.displacement)
+    e00, e11, e01 = 0.5 * (dot(xu, xu) - 1), 0.5 * (dot(xv, xv) - 1), 0.5 * dot(xu, xv)
+    k0, k1, k2, k3 = (k * face.parameter("stretching") for k in _coefficients(face, e00, e11, e01))
+    # strains after the displacement, to first order
+    p00, p11 = e00 + dot(xu, du), e11 + dot(xv, dv)
+    p01 = e01 + 0.5 * (dot(xu, dv) + dot(xv, du))
+    stress_u, stress_v, shear = k0 * p00 + k1 * p11, k1 * p00 + k2 * p11, k3 * p01
+    stretched_u, stretched_v = maximum(e00, 0.0), maximum(e11, 0.0)
+    tension_u, tension_v = k0 * stretched_u + k1 * stretched_v, k1 * stretched_u + k2 * stretched_v
+    row_u = stress_u * xu + shear * xv + tension_u * du
+    row_v = shear * xu + stress_v * xv + tension_v * dv
+    area = face.constant("area")
+    pulls = [
+        -area * (face.constant("inverse_rest", side, 0) * row_u + face.constant("inverse_rest", side, 1) * row_v)
+        for side in (0, 1)
+    ]
+    return [-(pulls[0] + pulls[1]), *pulls]
+
+
+def build(setup: Setup) -> Elements:
+    """The faces, with their rest shapes and the sampled table."""
+    mesh = setup.mesh
+    return Elements(
+        nodes=mesh.faces,
+        constants={"area": mesh.face_area, "inverse_rest": np.linalg.inv(mesh.material_edges)},
+        tables={"cells": _cell_polynomials(_sampled(setup.material.stretching))},
+    )
+
+
+STRETCHING = Term(
+    "stretching",
+    corners=3,
+    force=force,
+    build=build,
+    constants={"area": (), "inverse_rest": (2, 2)},
+    tables={"cells": 3},
+    parameters={"stretching": "element"},
+)
+"""Constants: area in material space [m²]; inverse of its edge matrix [1/m], row i of edge i, column of direction u or v.
+Tables: [29³, 8, 4] trilinear polynomial (x, y, z, xy, xz, yz, xyz, 1) of (k0, k1, k2, k3) in each cell [N/m]."""
+
+
+def _along_material(face: Element, field: Sequence[Vector]) -> tuple[Vector, Vector]:
+    """Derivatives of a field of the corners along u and v."""
+    first, second = field[1] - field[0], field[2] - field[0]
+    u, v = (
+        face.constant("inverse_rest", 0, axis) * first + face.constant("inverse_rest", 1, axis) * second for axis in (0, 1)
+    )
+    return u, v
+
+
+def _coefficients(face: Element, e00: Scalar, e11: Scalar, e01: Scalar) -> list[Scalar]:
+    """k0, k1, k2, k3 at a strain [N/m]."""
+    places = [clamped((e + 0.25) * _SCALE - 0.5, 0.0, _SAMPLES - 1.0) for e in (e00, e11)]
+    places.append(clamped(absolute(e01) * _SCALE - 0.5, 0.0, _SAMPLES - 1.0))
+    last = _SAMPLES - 2.0
+    corners = [held(where(floor(place) < last, floor(place), last)) for place in places]
+    x, y, z = (place - corner for place, corner in zip(places, corners, strict=True))
+    cell = (corners[0] * (_SAMPLES - 1) + corners[1]) * (_SAMPLES - 1) + corners[2]
+    monomials = [x, y, z, x * y, x * z, y * z, x * y * z]
+    found = []
+    for number in range(4):
+        value = face.look_up("cells", cell, len(monomials), number)
+        for power, monomial in enumerate(monomials):
+            value = value + monomial * face.look_up("cells", cell, power, number)
+        found.append(value)
+    return found
+
+
+def _sampled(stretching: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[6, 4] table -> [4, 30, 30, 30] coefficients over (C00, C11, C01), C = FᵀF (PHYSICS: grid of samples)."""
+    index = np.arange(_SAMPLES)
+    c00, c11, c01 = np.meshgrid(0.5 + index / 15, 0.5 + index / 15, index / 15, indexing="ij")
+    largest = 0.5 * (c00 + c11 + np.sqrt(4 * c01**2 + (c00 - c11) ** 2))
+    direction_u, direction_v = largest - c11, c01.copy()
+    axis_aligned = c01 == 0
+    direction_u[axis_aligned] = (c00 >= c11)[axis_aligned]
+    direction_v[axis_aligned] = (c00 < c11)[axis_aligned]
+    angle = 8 * np.abs(np.arctan2(direction_v, direction_u)) / np.pi
+    strain = 6 * (np.sqrt(largest) - 1)
+    p = np.clip(1.25 * angle - 0.5, 0, 4)
+    q = np.clip(2 * strain - 0.5, 0, 1)
+    low = np.minimum(p.astype(int), 3)
+    fraction = p - low
+    reference = stretching[1:].T  # [4, 5]
+    at_reference = reference[:, low] * (1 - fraction) + reference[:, low + 1] * fraction
+    at_rest = stretching[0][:, None, None, None]
+    return np.maximum(0.0, TABLE_ENTRY_TO_STRETCHING * (at_rest * (1 - q) + at_reference * q))
+
+
+def _cell_polynomials(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[K, n, n, n] -> [(n-1)³, 8, K]: each cell's trilinear polynomial in its local coordinates."""
+    ends = (slice(None, -1), slice(1, None))
+    c = {(x, y, z): table[:, ends[x], ends[y], ends[z]] for x in (0, 1) for y in (0, 1) for z in (0, 1)}
+    polynomial = [
+        c[1, 0, 0] - c[0, 0, 0],
+        c[0, 1, 0] - c[0, 0, 0],
+        c[0, 0, 1] - c[0, 0, 0],
+        c[1, 1, 0] - c[1, 0, 0] - c[0, 1, 0] + c[0, 0, 0],
+        c[1, 0, 1] - c[1, 0, 0] - c[0, 0, 1] + c[0, 0, 0],
+        c[0, 1, 1] - c[0, 1, 0] - c[0, 0, 1] + c[0, 0, 0],
+        c[1, 1, 1] - c[1, 1, 0] - c[1, 0, 1] - c[0, 1, 1] + c[1, 0, 0] + c[0, 1, 0] + c[0, 0, 1] - c[0, 0, 0],
+        c[0, 0, 0],
+    ]
+    return np.stack(polynomial).transpose(2, 3, 4, 0, 1).reshape(-1, 8, len(table))
