@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffcloud.sim.compiled.data import Floats, Ints, Parameters
+from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.sparse import Pattern
 from diffcloud.sim.contact.surface import Surface
@@ -37,28 +37,6 @@ class Scene(NamedTuple):
     projection: Projection
 
 
-class Held(NamedTuple):
-    """Handles over the S steps of a run."""
-
-    node: Ints
-    """[H]"""
-    hard: bool
-    stiffness: float
-    """k_h [N/m]"""
-    strength: Floats
-    """[S, H] in [0, 1]."""
-    linear: Floats
-    """[S, H, 3, 3]"""
-    translation: Floats
-    """[S, H, 3] [m]"""
-    first_step: Ints
-    """[H] the step that takes the anchor."""
-    inverse: Floats
-    """[H, 3, 3] of the linear part in that step."""
-    gripper: Ints
-    """[H] whose track a handle follows; -1: none."""
-
-
 class Kept(NamedTuple):
     """What an episode's derivatives need of each step."""
 
@@ -82,47 +60,3 @@ def nothing_kept(steps: int, nodes: int) -> Kept:
     corners, constants, factors = np.empty((16, 5), np.int64), np.empty((16, 4)), np.empty((16, 9))
     begins = np.zeros((steps + 1, 5), np.int64)
     return Kept(np.empty((steps, nodes, 3)), begins, corners, constants, no_impacts(), factors)
-
-
-@kernel
-def held_now(scene: Scene, held: Held, step: int) -> Ints:
-    """[V] the handle that prescribes each node in a step; -1: none."""
-    found = np.full(len(scene.pattern.place), -1, np.int64)
-    if held.hard:
-        for h in range(len(held.node)):
-            if held.strength[step, h] > 0:
-                found[held.node[h]] = h
-    return found
-
-
-@kernel
-def take_anchors(held: Held, track: Floats, step: int, positions: Floats, anchors: Floats) -> None:
-    """Anchors [H, 3] of the handles that become active in this step: the node's position, back through the motion."""
-    for h in range(len(held.node)):
-        if held.first_step[h] == step:
-            shift = _shift(held, track, step, h)
-            for axis in range(3):
-                anchors[h, axis] = 0.0
-                for k in range(3):
-                    anchors[h, axis] += held.inverse[h, axis, k] * (positions[held.node[h], k] - shift[k])
-
-
-@kernel
-def aim(held: Held, track: Floats, step: int, anchors: Floats, parameters: Parameters) -> None:
-    """Stiffness and targets of the handles at the end of a step."""
-    for h in range(len(held.node)):
-        parameters.hold[h] = 0.0 if held.hard else held.stiffness * held.strength[step, h]
-        shift = _shift(held, track, step, h)
-        for axis in range(3):
-            parameters.target[h, axis] = shift[axis]
-            for k in range(3):
-                parameters.target[h, axis] += held.linear[step, h, axis, k] * anchors[h, k]
-
-
-@kernel
-def _shift(held: Held, track: Floats, step: int, h: int) -> Floats:
-    shift = held.translation[step, h].copy()
-    if held.gripper[h] >= 0:
-        for axis in range(3):
-            shift[axis] += track[step, held.gripper[h], axis]
-    return shift

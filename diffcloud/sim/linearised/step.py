@@ -8,8 +8,9 @@ from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters
 from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.compiled.sparse import cholesky, solve
+from diffcloud.sim.held import Held, aim, first_anchors, holders, take_anchors
 from diffcloud.sim.linearised.matrix import linear_system, pattern_with
-from diffcloud.sim.linearised.scene import Held, Kept, Scene, aim, held_now, nothing_kept, take_anchors
+from diffcloud.sim.linearised.scene import Kept, Scene, nothing_kept
 from diffcloud.sim.reference.impact_zones import Impacts, resolve
 from diffcloud.sim.reference.nearest import nearest_pairs
 from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE, NOT_POSITIVE_DEFINITE, UNRESOLVED
@@ -30,8 +31,8 @@ def simulate(
     """All steps of one cloth.
 
     Args:
-        track: [S, G, 3] displacement of the grippers at the end of each step [m].
-        anchors: [H, 3] of the handles; takes those that become active.
+        track: [S, 3] displacement of the gripper at the end of each step [m]; of any length where no handle follows it.
+        anchors: [H, 3] takes those of the handles.
         positions, velocities: [S + 1, V, 3] the first is the start; take the others.
         keep: rows of factors that may be kept for the derivatives; below zero: nothing is kept.
         control: [2] finished steps are added to the first; the second one stops the run when it is not zero.
@@ -41,6 +42,7 @@ def simulate(
     """
     steps, nodes = len(positions) - 1, positions.shape[1]
     kept = nothing_kept(steps if keep >= 0 else 0, nodes)
+    anchors[:] = first_anchors(held, positions[0])
     points, motion = with_obstacles(scene, positions[0]), still(scene, nodes)
     force = np.empty((len(points), 3))
     for step in range(steps):
@@ -54,7 +56,7 @@ def simulate(
         else:
             corners, constants = np.empty((0, 5), np.int64), np.empty((0, 4))
         pattern, moved = pattern_with(scene.pattern, corners)
-        holder = held_now(scene, held, step)
+        holder = holders(held, step, nodes)
         force[:] = 0.0
         matrix = linear_system(
             scene, parameters, motion, holder, corners, constants, pattern, moved, force
