@@ -180,7 +180,7 @@ def _simulated_clouds(release: Path) -> str:
         # file j is the state after j steps (PHYSICS: experiments)
         steps = min(episode.frame_count - 1, scenario.steps)
         sampler = SurfaceSampler.build(
-            system.stretching.elements.nodes,
+            torch.as_tensor(system.mesh.faces),
             scenario.points,
             generator=torch.Generator().manual_seed(0),
             dtype=system.dtype,

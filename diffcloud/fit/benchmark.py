@@ -10,13 +10,13 @@ import torch
 
 from diffcloud.mesh import grid_cloth, sphere_surface
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim.build import Surrounding, build_system
-from diffcloud.sim.contact import ContactSettings, ReferenceContact
-from diffcloud.sim.energies import Handles
+from diffcloud.sim.build import build_system
+from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import preset
 from diffcloud.sim.properties import scaled_properties
 from diffcloud.sim.simulate import rollout
-from diffcloud.sim.state import System
+from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
+from diffcloud.sim.system import System
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def time_contact(side: int, *, steps: int = 25, repeats: int = 3) -> ContactTimi
     def once(system: System) -> float:
         values = {name: torch.ones(1, dtype=system.dtype, requires_grad=True) for name in ("stretch", "mass")}
         begin = time.perf_counter()
-        properties = scaled_properties(system.properties, values, faces=system.stretching.elements.nodes)
+        properties = scaled_properties(system.properties, values, faces=torch.as_tensor(system.mesh.faces))
         rollout(system, steps, properties=properties).positions[:, -1].square().mean().backward()
         return time.perf_counter() - begin
 

@@ -45,8 +45,6 @@ class Objective:
         frames: Sequence[int] | None = None,
         points: int | None = None,
         seed: int = 0,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str = "cpu",
     ) -> None:
         """
         Args:
@@ -59,7 +57,7 @@ class Objective:
             EpisodeError: a loss frame that an episode lacks, or one after the end of the simulation.
         """
         self.scenario = scenario
-        self.system, _ = scenario.scene.build(dtype=dtype, device=device)
+        self.system, _ = scenario.scene.build()
         self.frames = tuple(scenario.loss_frames if frames is None else frames)
         self.point_count = points or scenario.points
         self.reseed(seed)
@@ -75,11 +73,11 @@ class Objective:
         """Draw the common random numbers anew."""
         subset = self.scenario.loss_faces
         self.sampler = SurfaceSampler.build(
-            self.system.stretching.elements.nodes,
+            torch.as_tensor(self.system.mesh.faces),
             self.point_count,
             generator=torch.Generator().manual_seed(seed),
-            subset=None if subset is None else torch.as_tensor(subset, device=self.system.device),
-            dtype=self.system.dtype,
+            subset=None if subset is None else torch.as_tensor(subset),
+            dtype=torch.float64,
         )
 
     def __call__(self, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor] | None = None) -> Tensor:
@@ -143,7 +141,7 @@ class Objective:
         for frame in self.frames:
             cloud = episode.frame(frame)
             times.append(episode.times[frame])
-            clouds.append(NeighbourIndex(torch.as_tensor(cloud, dtype=system.dtype, device=system.device)))
+            clouds.append(NeighbourIndex(torch.as_tensor(cloud, dtype=torch.float64)))
         end = self.scenario.steps * system.time_step
         if max(times) > end + 0.5 * self.scenario.scene.frame_time:
             raise EpisodeError(
@@ -154,12 +152,11 @@ class Objective:
         if episode.gripper is not None:
             track = torch.as_tensor(
                 track_displacement(episode, self.scenario.steps, system.time_step),
-                dtype=system.dtype,
-                device=system.device,
+                dtype=torch.float64,
             )[None]
         centre = torch.cat([cloud.points for cloud in clouds]).mean(0)
         return _Target(
-            torch.as_tensor(np.array(times), dtype=system.dtype, device=system.device), tuple(clouds), centre, track
+            torch.as_tensor(np.array(times), dtype=torch.float64), tuple(clouds), centre, track
         )
 
 

@@ -6,15 +6,15 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import torch
 
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
-from diffcloud.sim.build import Integrator, Surrounding, build_system
-from diffcloud.sim.energies import Handles
+from diffcloud.sim.build import build_system
+from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import Material
 from diffcloud.sim.properties import Basis
 from diffcloud.sim.simulate import init
-from diffcloud.sim.state import State, System
+from diffcloud.sim.surrounding import Integrator, Surrounding
+from diffcloud.sim.system import State, System
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Scene:
         """The same scene with the implicit integrator, whose contact is its own."""
         return replace(self, integrator="implicit", surrounding=replace(self.surrounding, reference_contact=None))
 
-    def build(self, *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> tuple[System, State]:
+    def build(self) -> tuple[System, State]:
         """(System, State at time zero with batch 1)."""
         system = build_system(
             self.mesh,
@@ -91,7 +91,5 @@ class Scene:
             mass_material=self.mass_material,
             integrator=self.integrator,
             shaped=self.shaped,
-            dtype=dtype,
-            device=device,
         )
         return system, init(system)

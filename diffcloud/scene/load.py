@@ -14,12 +14,10 @@ from diffcloud.io.obj import read_cloth, read_surface
 from diffcloud.mesh.topology import ClothMesh, FloatArray, SurfaceMesh
 from diffcloud.scene.description import Scene
 from diffcloud.scene.schema import KeyframeBlock, SceneFile, TransformBlock, explain
-from diffcloud.sim.build import Surrounding
-from diffcloud.sim.contact import ContactSettings, ReferenceContact
-from diffcloud.sim.energies import Handles
-from diffcloud.sim.energies.handles import Handle
+from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import read_material
 from diffcloud.sim.motion import Keyframe, Motion, axis_angle_quaternion
+from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
 
 _SUPPORTED_SWITCHES = {"remeshing", "proximity", "strainlimiting", "separation", "popfilter", "plasticity"}
 """Of `disable`: those whose stage this simulator has (proximity), or never runs anyway."""
@@ -82,6 +80,7 @@ def load_scene(path: Path, *, reload_materials: bool = False) -> Scene:
             ),
             proximity="proximity" not in scene.disable,
             reference_contact=_contact(scene),
+            lagged_air=_contact(scene) == ReferenceContact.as_published(),
             obstacles=tuple(
                 _transform_surface(read_surface(_inside(root, obstacle.mesh, path)), obstacle.transform)
                 for obstacle in scene.obstacles

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from diffcloud.errors import DiffCloudError
-from diffcloud.sim.build import Integrator
+from diffcloud.sim.surrounding import Integrator
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]

@@ -10,9 +10,9 @@ from diffcloud.errors import SceneError
 from diffcloud.io.files import write_json
 from diffcloud.io.obj import write_cloth, write_surface
 from diffcloud.scene.description import Scene
-from diffcloud.sim.contact import ReferenceContact
 from diffcloud.sim.materials import Material
 from diffcloud.sim.motion import Motion
+from diffcloud.sim.surrounding import ReferenceContact
 
 
 def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:

@@ -7,9 +7,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.sim.motion import Motion
@@ -42,10 +40,10 @@ class Scenery:
             tuple((place, obstacle.motion) for place, obstacle in zip(slices, moving, strict=True)),
         )
 
-    def at(self, times: NDArray[np.float64], *, dtype: torch.dtype, device: torch.device) -> Tensor:
+    def at(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """[T, O, 3] at times [T] [s]."""
         points = np.broadcast_to(self.fixed, (len(times), *self.fixed.shape)).copy()
         for place, motion in self.moving:
             linear, translation = motion.at(times)
             points[:, place] = np.einsum("tij,oj->toi", linear, self.fixed[place]) + translation[:, None]
-        return torch.as_tensor(points, dtype=dtype, device=device)
+        return points

@@ -1,28 +1,22 @@
-"""The simulation: init, step, rollout."""
+"""The simulation: init, rollout, and derivatives of rollouts.
+
+Kernels simulate one cloth at a time; here they are given batches, over threads, as one differentiable operation of torch.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from diffcloud.errors import DivergedError
-from diffcloud.sim.adjoint import implicit_solve
-from diffcloud.sim.energies.base import geometry
-from diffcloud.sim.energies.handles import HandleSchedule, follow_track
-from diffcloud.sim.implicit import ImplicitStart, ImplicitStep, StuckError
-from diffcloud.sim.linear_solve import NotPositiveDefiniteError, SingularMatrixError
-from diffcloud.sim.linearised import Held, LinearisedStep, StepStart
-from diffcloud.sim.plausibility import Motion, implausible
+from diffcloud.sim.episodes import Batch
 from diffcloud.sim.properties import Properties
-from diffcloud.sim.rigid import BodyState
-from diffcloud.sim.state import ImplicitSetup, State, System
-
-_DEEPEST = 5
-"""A step that does not converge is halved up to this many times."""
+from diffcloud.sim.rigid.bodies import BodyState
+from diffcloud.sim.system import State, System
 
 
 @dataclass(frozen=True)
@@ -33,6 +27,8 @@ class Rollout:
     """[B, S + 1, V, 3] after 0, 1, ... S steps [m]."""
     times: Tensor
     """[S + 1] [s]"""
+    velocities: Tensor
+    """[B, S + 1, V, 3] [m/s]"""
     bodies: BodyState | None = None
     """Of rigid bodies, its fields stacked [B, S + 1, N, ...]."""
     diverged: Mapping[int, DivergedError] = field(default_factory=dict)
@@ -56,134 +52,10 @@ def init(system: System, batch: int = 1, *, positions: Tensor | None = None, vel
         positions, velocities: [B or 1, V, 3] instead of the mesh's own positions and rest.
     """
     if positions is None:
-        positions = torch.as_tensor(system.mesh.nodes, dtype=system.dtype, device=system.device)[None]
+        positions = torch.as_tensor(system.mesh.nodes, dtype=torch.float64)[None]
     positions = positions.expand(batch, -1, -1)
     velocities = torch.zeros_like(positions) if velocities is None else velocities.expand(batch, -1, -1)
-    bodies = None
-    if system.implicit is not None:
-        bodies = BodyState(*(t.expand(batch, *t.shape[1:]) for t in system.implicit.bodies.start.tensors()))
-    return State(positions, velocities, anchors=positions[:, system.handles.nodes], bodies=bodies)
-
-
-def step(system: System, properties: Properties, schedule: HandleSchedule, state: State, *, copies: int = 1) -> State:
-    """One time step of every cloth in the batch.
-
-    Args:
-        schedule: handles over the run; its translation is [B or 1, S, H, 3].
-        copies: see `adjoint.implicit_solve`.
-
-    Raises:
-        DivergedError: names the step and the batch entries.
-    """
-    state = _take_anchors(system, schedule, state)
-    if system.implicit is not None:
-        return _implicit_step(system, system.implicit, properties, schedule, state, copies)
-    problem, targets = _problem(system, schedule, state, copies)
-    start = StepStart(state.positions, state.velocities, targets.expand(properties.batch, -1, -1), properties)
-    try:
-        change = implicit_solve(problem, *start.tensors(), copies=copies)
-    except NotPositiveDefiniteError as error:
-        raise DivergedError(state.step + 1, error.entries, str(error)) from error
-    velocities = state.velocities + problem.prescribe(change, start)
-    positions = state.positions + system.time_step * velocities
-    if system.halfspaces is not None:
-        projected = system.halfspaces.project(positions)
-        velocities = velocities + (projected - positions) / system.time_step
-        positions = projected
-    _refuse_divergence(positions, state.step + 1)
-    if system.contact is not None:
-        inverse_mass = 1 / properties.node_mass
-        if problem.held is not None:
-            inverse_mass = torch.where(problem.held.mask[:, 0], 0.0, inverse_mass)
-        resolved = system.contact.resolve(
-            state.positions,
-            positions,
-            inverse_mass,
-            (properties.friction_obstacle, properties.friction_cloth),
-            step=state.step + 1,
-            copies=copies,
-        )
-        velocities = velocities + (resolved - positions) / system.time_step
-        positions = resolved
-    return State(positions, velocities, state.anchors, state.step + 1)
-
-
-def _implicit_step(
-    system: System, setup: ImplicitSetup, properties: Properties, schedule: HandleSchedule, state: State, copies: int
-) -> State:
-    active = torch.as_tensor(schedule.active[state.step], device=system.device)
-    targets = schedule.translation[:, state.step] + (schedule.linear[state.step] @ state.anchors[..., None]).squeeze(-1)
-    nodes = torch.tensor(system.handles.nodes, dtype=torch.long, device=system.device)[active]
-    times = np.array([state.step, state.step + 1]) * system.time_step
-    before, after = setup.scenery.at(times, dtype=system.dtype, device=system.device)
-    problem = ImplicitStep(system, setup, schedule.strength[state.step][active], nodes, (before, after))
-    assert state.bodies is not None
-    start = ImplicitStart(
-        state.positions,
-        state.velocities,
-        targets[:, active].expand(properties.batch, -1, -1),
-        state.bodies,
-        properties,
-    )
-    positions, velocities, bodies = _advance(problem, start, copies, state.step + 1)
-    _refuse_divergence(positions, state.step + 1)
-    return State(positions, velocities, state.anchors, state.step + 1, bodies)
-
-
-def _advance(
-    problem: ImplicitStep, start: ImplicitStart, copies: int, step: int, depth: int = 0
-) -> tuple[Tensor, Tensor, BodyState]:
-    """Positions and velocities of the cloth, and the bodies, after one step; entries that fail take two half steps."""
-    try:
-        return problem.advanced(implicit_solve(problem, *start.tensors(), copies=copies), start)
-    except (StuckError, SingularMatrixError) as error:
-        if depth == _DEEPEST:
-            values = {
-                name: getattr(start.properties, name)[error.entries[0]].mean().item()
-                for name in ("stretching", "node_mass")
-            }
-            advice = (
-                f"{error}; {2**depth} sub-steps did not help (mean stretching multiplier {values['stretching']:.3g}, mean "
-                f"node mass {values['node_mass']:.3g} kg). Try a smaller time step, a thicker or stiffer contact, or "
-                "slower handles"
-            )
-            raise DivergedError(step, error.entries, advice) from error
-        failed = error.entries
-        found = error.found if isinstance(error, StuckError) else None
-    batch = len(start.positions) // copies
-    rest = [entry for entry in range(batch) if entry not in set(failed)]
-    parts = []
-    if rest:
-        chosen = _entries(rest, batch, copies, start.positions.device)
-        known = None if found is None else found[rest]
-        parts.append((chosen, _advance(problem.fresh(known), start.only(chosen), copies, step, depth)))
-    chosen = _entries(failed, batch, copies, start.positions.device)
-    try:
-        parts.append((chosen, _halves(problem, start.only(chosen), copies, step, depth)))
-    except DivergedError as error:
-        raise DivergedError(step, [failed[entry] for entry in error.entries], error.reason) from error
-    order = torch.cat([chosen for chosen, _ in parts]).argsort()
-    positions = torch.cat([part[0] for _, part in parts])[order]
-    velocities = torch.cat([part[1] for _, part in parts])[order]
-    bodies = BodyState(*(torch.cat(columns)[order] for columns in zip(*(p[2].tensors() for _, p in parts), strict=True)))
-    return positions, velocities, bodies
-
-
-def _halves(
-    problem: ImplicitStep, start: ImplicitStart, copies: int, step: int, depth: int
-) -> tuple[Tensor, Tensor, BodyState]:
-    first, second = problem.halves()
-    held = start.positions[:, problem.handle_nodes]
-    middle = replace(start, targets=0.5 * (held + start.targets)) if problem.system.handles.hard else start
-    positions, velocities, bodies = _advance(first, middle, copies, step, depth + 1)
-    start = replace(start, positions=positions, velocities=velocities, bodies=bodies)
-    return _advance(second, start, copies, step, depth + 1)
-
-
-def _entries(entries: list[int], batch: int, copies: int, device: torch.device) -> Tensor:
-    """Rows of batch entries in K copies of a batch."""
-    chosen = torch.tensor(entries, device=device)
-    return (torch.arange(copies, device=device)[:, None] * batch + chosen).flatten()
+    return State(positions, velocities)
 
 
 def rollout(
@@ -193,192 +65,128 @@ def rollout(
     properties: Properties | None = None,
     state: State | None = None,
     track: Tensor | None = None,
-    copies: int = 1,
     drop_diverged: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Rollout:
-    """Simulate `steps` steps.
+    """Simulate `steps` steps, on the CPU in double precision. Differentiable in reverse mode in all tensors that it is given.
 
     Args:
         properties: of a batch of parameter sets; default the basis material, batch 1.
         state: where to begin; default rest.
         track: [B or 1, S, 3] displacement of the gripper since the start at the end of each step [m]; then the moving
             handles follow it instead of the scene's own motion.
-        copies: see `adjoint.implicit_solve`.
-        drop_diverged: go on without batch entries that diverge, and name them in `Rollout.diverged`; not with copies.
-        progress: called with the number of finished steps.
+        drop_diverged: go on without batch entries that diverge, and name them in `Rollout.diverged`.
+        progress: called now and then with the number of finished steps, of the whole batch on average.
 
     Raises:
-        DivergedError: names the step and the batch entries.
+        DivergedError: names the batch entries that diverged, and the first step in which one did.
     """
-    if drop_diverged and copies > 1:
-        raise ValueError(f"Entries of {copies} copies cannot be dropped.")
     properties = system.properties if properties is None else properties
-    times = np.cumsum(np.full(steps, system.time_step))  # repeated addition, as the reference accumulates time
-    if track is not None:
-        system = replace(system, handles=system.handles.following_track())
-    schedule = system.handles.schedule(times, dtype=system.dtype, device=system.device)
-    if track is not None:
-        schedule = follow_track(system.handles, schedule, track)
-    if state is None:
-        state = init(system, properties.batch)
-    elif state.anchors.shape[1] != len(system.handles.nodes):
-        state = replace(state, anchors=state.positions[:, system.handles.nodes])
-    if state.bodies is None and system.implicit is not None:
-        state = replace(state, bodies=init(system, len(state.positions)).bodies)
-    given, first, anchors = (properties, schedule), state, state.anchors.detach()
-    kept = torch.arange(len(state.positions), device=system.device)
-    positions, poses, entries = [state.positions], [state.bodies], [kept]
-    diverged: dict[int, DivergedError] = {}
-    while len(kept) and len(positions) <= steps:
-        try:
-            state = step(system, properties, schedule, state, copies=copies)
-        except DivergedError as error:
-            if not drop_diverged or not error.entries:
-                raise
-            lost = kept[sorted(set(error.entries))].tolist()
-            diverged |= {entry: DivergedError(error.step, [entry], error.reason) for entry in lost}
-            rest = (~torch.isin(kept, torch.tensor(lost, device=kept.device))).nonzero().flatten()
-            kept = kept[rest]
-            properties, schedule, state = _only(rest, properties, schedule, state)
-            continue
-        anchors = anchors.index_copy(0, kept, state.anchors.detach())
-        positions.append(state.positions)
-        poses.append(state.bodies)
-        entries.append(kept)
-        if progress is not None:
-            progress(len(positions) - 1)
-    all_times = torch.as_tensor(np.concatenate([[0.0], times]), dtype=system.dtype, device=system.device)
-    bodies = None
-    if poses[0] is not None and poses[0].centre.shape[1]:
-        columns = zip(*(pose.tensors() for pose in poses if pose is not None), strict=True)
-        bodies = BodyState(*(_over_time(column, entries, steps) for column in columns))
-    joined = _over_time(positions, entries, steps)
-    for entry, fault in _implausible(system, given, (first, anchors), joined, bodies, copies).items():
-        if entry in diverged:
-            continue
-        if not drop_diverged:
-            raise fault
-        diverged[entry] = fault
-        later = torch.arange(steps + 1, device=joined.device)[:, None, None] >= fault.step
-        joined = joined.index_copy(0, torch.tensor([entry]), torch.where(later, torch.nan, joined[entry])[None])
-    return Rollout(joined, all_times, bodies, diverged)
+    state = init(system, properties.batch) if state is None else state
+    count = max(properties.batch, len(state.positions), 0 if track is None else len(track))
+    batch = Batch(system, steps, tracked=track is not None, progress=progress)
+    start = _start(system, state)
+    given = [*start, torch.zeros(1, steps, 3, dtype=torch.float64) if track is None else track, *properties.tensors()]
+    positions, velocities, poses = _Episodes.apply(batch, *(_expanded(tensor, count) for tensor in given))
+    diverged = batch.diverged()
+    if diverged and not drop_diverged:
+        raise _joined(diverged)
+    if diverged:
+        positions, velocities, poses = (_cut(tensor, diverged) for tensor in (positions, velocities, poses))
+    return Rollout(positions, batch.times, velocities, _body_state(poses), diverged)
 
 
-def _implausible(
+def rollout_tangents(
     system: System,
-    given: tuple[Properties, HandleSchedule],
-    begin: tuple[State, Tensor],
-    positions: Tensor,
-    bodies: BodyState | None,
-    copies: int,
-) -> dict[int, DivergedError]:
-    """Batch entries whose motion cannot be one.
+    steps: int,
+    *,
+    properties: Properties,
+    tangents: Properties,
+    state: State | None = None,
+    state_tangents: tuple[Tensor | None, Tensor | None] = (None, None),
+    track: Tensor | None = None,
+    track_tangents: Tensor | None = None,
+) -> tuple[Rollout, Tensor]:
+    """A rollout and its derivative along K directions, carried along with it.
 
     Args:
-        given: of the whole batch.
-        begin: the state that it began with, and the handles' anchors [B, H, 3] at its end.
-        positions: [B, S + 1, V, 3].
+        properties: [B, ...].
+        tangents: [K · B, ...] directions of the properties, directions outermost.
+        state, state_tangents: start, and directions [K · B, V, 3] of its positions and velocities.
+        track, track_tangents: gripper displacement [B or 1, S, 3] and its directions [K · B, S, 3].
+
+    Returns:
+        The rollout of the batch B, and d positions [K, B, S + 1, V, 3].
+
+    Raises:
+        DivergedError: as `rollout`.
     """
-    (properties, schedule), (first, anchors) = given, begin
-    batch, nodes = len(positions) // copies, positions.detach()
-    linear = schedule.linear
-    others = np.zeros((nodes.shape[1], 0, 3))
-    if system.implicit is not None:
-        times = np.arange(nodes.shape[1], dtype=np.float64) * system.time_step
-        scenery = system.implicit.scenery
-        moving = [number for place, _ in scenery.moving for number in range(*place.indices(len(scenery.fixed)))]
-        others = scenery.at(times, dtype=torch.float64, device=torch.device("cpu")).numpy()[:, moving]
-    found: dict[int, DivergedError] = {}
-    for entry in range(batch):
-        known = nodes[entry].isfinite().all(-1).all(-1).nonzero().flatten()
-        last = int(known[-1])  # a dropped entry is not known to the end
-        translation = schedule.translation[min(entry, len(schedule.translation) - 1), :last].detach()
-        targets = translation + (linear[:last] @ anchors[entry, ..., None]).squeeze(-1)
-        own = others[: last + 1]
-        if bodies is not None:
-            own = np.concatenate([own, bodies.centre[entry, : last + 1].detach().numpy()], axis=1)
-        motion = Motion(
-            positions=nodes[entry, : last + 1].cpu().numpy(),
-            time_step=system.time_step,
-            mass=properties.node_mass[entry].detach().cpu().numpy(),
-            size=system.mesh.size,
-            places=torch.cat([nodes[entry, :1, system.handles.nodes], targets]).cpu().numpy(),
-            held=schedule.active[:last],
-            gravity=float(system.gravity.norm()),
-            wind=float(system.air.wind.norm()),
-            velocities=first.velocities[entry].detach().cpu().numpy(),
-            others=own,
-        )
-
-        def stored(step: int, entry: int = entry) -> float:
-            one = Properties(*(tensor[entry : entry + 1] for tensor in properties.tensors()))
-            shape = geometry(system.stretching.elements, nodes[entry : entry + 1, step])
-            with torch.no_grad():
-                return float(sum(energy.at(shape, one).energy() for energy in (system.stretching, system.bending)))
-
-        fault = implausible(motion, stored) if last else None
-        if fault is not None:
-            found[entry] = DivergedError(fault[0], [entry], fault[1])
-    return found
+    count = properties.batch
+    directions = tangents.batch // count
+    state = init(system, count) if state is None else state
+    batch = Batch(system, steps, tracked=track is not None)
+    start = _start(system, state)
+    given = [*start, torch.zeros(1, steps, 3, dtype=torch.float64) if track is None else track, *properties.tensors()]
+    moves: list[Tensor | None] = [*state_tangents, None, track_tangents, *tangents.tensors()]
+    values = [_expanded(tensor.detach(), count) for tensor in given]
+    rates = [
+        torch.zeros(directions, *value.shape, dtype=torch.float64)
+        if move is None
+        else move.detach().double().reshape(directions, *value.shape)
+        for value, move in zip(values, moves, strict=True)
+    ]
+    positions, velocities, poses = batch.simulate(values, keep=True)
+    diverged = batch.diverged()
+    if diverged:
+        raise _joined(diverged)
+    found = batch.tangents(rates)
+    return Rollout(positions, batch.times, velocities, _body_state(poses)), found
 
 
-def _only(
-    rest: Tensor, properties: Properties, schedule: HandleSchedule, state: State
-) -> tuple[Properties, HandleSchedule, State]:
-    """Of the batch entries `rest` alone."""
-    if len(schedule.translation) > 1:
-        schedule = replace(schedule, translation=schedule.translation[rest])
-    bodies = None if state.bodies is None else BodyState(*(tensor[rest] for tensor in state.bodies.tensors()))
-    state = State(state.positions[rest], state.velocities[rest], state.anchors[rest], state.step, bodies)
-    return Properties(*(tensor[rest] for tensor in properties.tensors())), schedule, state
+class _Episodes(torch.autograd.Function):
+    """Episodes of a batch; inputs as `Batch.simulate` takes them."""
+
+    @staticmethod
+    def forward(ctx: Any, batch: Batch, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        ctx.batch = batch
+        return batch.simulate(inputs, keep=any(ctx.needs_input_grad))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        found = ctx.batch.gradients(gradients)
+        return (None, *found)
 
 
-def _over_time(parts: Sequence[Tensor], entries: Sequence[Tensor], steps: int) -> Tensor:
-    """[B, S + 1, ...] of what is known at each time [b, ...] of the batch entries [b], NaN where nothing is."""
-    batch = len(parts[0])
-    if len(parts) == steps + 1 and len(parts[-1]) == batch:
-        return torch.stack(list(parts), dim=1)
-    nothing = torch.full_like(parts[0], torch.nan)
-    whole = [nothing.index_copy(0, kept, part) for kept, part in zip(entries, parts, strict=True)]
-    return torch.stack(whole + [nothing] * (steps + 1 - len(whole)), dim=1)
+def _start(system: System, state: State) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions and velocities [B, V, 3] and poses of the bodies [B or 1, N, 18]."""
+    bodies = system.bodies.start if state.bodies is None else state.bodies
+    return state.positions, state.velocities, torch.cat([part.flatten(2) for part in bodies.tensors()], dim=2)
 
 
-def _take_anchors(system: System, schedule: HandleSchedule, state: State) -> State:
-    """Anchors of the handles that become active in this step: the node's position, back through the motion."""
-    starting = np.flatnonzero(schedule.first_step == state.step)
-    if not len(starting):
-        return state
-    held = state.positions[:, [system.handles.nodes[index] for index in starting]]
-    linear, translation = schedule.linear[state.step, starting], schedule.translation[:, state.step, starting]
-    anchors = torch.linalg.solve(linear, (held - translation)[..., None]).squeeze(-1)
-    index = torch.as_tensor(starting, device=anchors.device)
-    return replace(state, anchors=state.anchors.index_copy(1, index, anchors))
+def _expanded(tensor: Tensor, count: int) -> Tensor:
+    return tensor.double().expand(count, *tensor.shape[1:])
 
 
-def _problem(system: System, schedule: HandleSchedule, state: State, copies: int = 1) -> tuple[LinearisedStep, Tensor]:
-    """The equation of this step, and the targets [B, H, 3] of its active handles."""
-    active = schedule.active[state.step]
-    nodes, held = _held(system, schedule, tuple(np.flatnonzero(active)))
-    targets = schedule.translation[:, state.step] + (schedule.linear[state.step] @ state.anchors[..., None]).squeeze(-1)
-    strength = schedule.strength[state.step]
-    if len(nodes) < len(active):
-        targets, strength = targets[:, active], strength[active]
-    proximity = None
-    if system.contact is not None:
-        proximity = system.contact.near(state.positions[: len(state.positions) // copies])
-    return LinearisedStep(system, strength, nodes, held, proximity), targets
+def _body_state(poses: Tensor) -> BodyState | None:
+    """[B, S + 1, N, 18] -> the bodies' states; None: there are none."""
+    if not poses.shape[2]:
+        return None
+    centre, orientation, velocity, angular_velocity = poses.split([3, 9, 3, 3], dim=-1)
+    return BodyState(centre, orientation.unflatten(-1, (3, 3)), velocity, angular_velocity)
 
 
-def _held(system: System, schedule: HandleSchedule, active: tuple[int, ...]) -> tuple[Tensor, Held | None]:
-    """Nodes of the active handles, and what hard ones prescribe; made once per set of active handles."""
-    if active not in schedule.cache:
-        nodes = torch.tensor([system.handles.nodes[i] for i in active], dtype=torch.long, device=system.device)
-        schedule.cache[active] = nodes, Held.build(system, nodes) if system.handles.hard and active else None
-    return schedule.cache[active]
+def _joined(diverged: Mapping[int, DivergedError]) -> DivergedError:
+    """One error of all entries that diverged."""
+    first = min(diverged.values(), key=lambda error: error.step)
+    if len(diverged) == 1:
+        return first
+    return DivergedError(first.step, sorted(diverged), first.reason)
 
 
-def _refuse_divergence(positions: Tensor, step: int) -> None:
-    if not bool(torch.isfinite(positions.detach().sum())):
-        entries = (~torch.isfinite(positions).all(-1).all(-1)).nonzero().flatten().tolist()
-        raise DivergedError(step, entries, "positions are not finite")
+def _cut(tensor: Tensor, diverged: Mapping[int, DivergedError]) -> Tensor:
+    """[B, S + 1, ...] with NaN from the step on in which an entry diverged."""
+    last = torch.full((len(tensor),), tensor.shape[1], dtype=torch.long)
+    last[list(diverged)] = torch.tensor([error.step for error in diverged.values()])
+    gone = torch.arange(tensor.shape[1]) >= last[:, None]
+    return torch.where(gone.view(*gone.shape, *[1] * (tensor.dim() - 2)), torch.nan, tensor)

@@ -42,10 +42,6 @@ class ReferenceContact:
     """Whether a pair that is nearest for both its primitives repels once, not twice."""
     residue: float = 0.0
     """Part of each impact correction that is left out; decides ties in the next step."""
-    differentiate_normals: bool = True
-    """Whether derivatives include how times, weights and normals of impacts move."""
-    impact_friction: bool = False
-    """Whether impacts rub too; in the original only proximity does."""
 
     @staticmethod
     def as_published() -> ReferenceContact:
@@ -64,9 +60,9 @@ class Surrounding:
     air_density: float = 1.0
     """[kg/m³]; ARCSim's default, real air has 1.2."""
     air_drag: float = 0.0
-    lagged_air: bool = False
-    """Whether the linearised step takes drag from before the step, as ARCSim does; light cloth in dense air then explodes."""
     """Tangential drag [kg/(m²·s)]."""
+    lagged_air: bool = False
+    """Whether drag is that before the linearised step, as in ARCSim, where light cloth in dense air explodes."""
     friction_cloth: float = 0.6
     friction_obstacle: float = 0.3
     contact: ContactSettings = field(default_factory=ContactSettings)

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
-import numpy as np
-import torch
 from torch import Tensor
 
-from diffcloud.errors import SceneError
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
-from diffcloud.sim import implicit, linearised
+from diffcloud.sim import linearised
 from diffcloud.sim.handles import Handles
-from diffcloud.sim.materials import Material
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.rigid.bodies import Bodies, BodyState
-from diffcloud.sim.surrounding import Integrator, Surrounding
 from diffcloud.sim.terms.term import Setup
 
 
@@ -46,10 +42,28 @@ class System:
         return (*around.obstacles, *(moving.mesh for moving in around.moving), *(body.mesh for body in around.bodies))
 
     @cached_property
-    def scene(self) -> linearised.Scene | implicit.Scene:
+    def point_count(self) -> int:
+        """N, all points that kernels know: nodes of the cloth, then points of obstacles and bodies that can touch it."""
+        around = self.setup.surrounding
+        static = [o for o in around.obstacles if o.plane() is None or self.setup.integrator == "linearised"]
+        meshes = [*static, *(moving.mesh for moving in around.moving), *(body.mesh for body in around.bodies)]
+        if self.setup.integrator == "linearised" and around.reference_contact is None:
+            meshes = []
+        return len(self.mesh.nodes) + sum(len(mesh.nodes) for mesh in meshes)
+
+    @property
+    def moving_points(self) -> int:
+        """Of the obstacles that follow a motion."""
+        return sum(len(moving.mesh.nodes) for moving in self.setup.surrounding.moving)
+
+    @cached_property
+    def scene(self) -> Any:
         """What the kernels of the integrator are given."""
-        build = linearised.build_scene if self.setup.integrator == "linearised" else implicit.build_scene
-        return build(self.setup, self.time_step)
+        if self.setup.integrator == "linearised":
+            return linearised.build_scene(self.setup, self.time_step)
+        from diffcloud.sim import implicit
+
+        return implicit.build_scene(self.setup, self.time_step)
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ def clouds_of(scenario, *, points=800, seed=5, gripper=True, shift=(0, 0, 0), ya
     run = rollout(system, scenario.steps, properties=scenario.properties(system, values))
     nodes = run.positions[0, :: scenario.scene.frame_steps]
     generator = torch.Generator().manual_seed(seed)
-    sampler = SurfaceSampler.build(system.stretching.elements.nodes, points, generator=generator)
+    sampler = SurfaceSampler.build(torch.as_tensor(system.mesh.faces), points, generator=generator)
     frames = sampler.sample(nodes).numpy()
     if yaw or any(shift):
         middle = frames[-1].mean(0)

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from diffcloud.sim.energies.base import geometry
 
 from diffcloud.mesh import grid_cloth
 from diffcloud.scene.scenarios import built_in, grid_scenario
 from diffcloud.sim import init, rollout
-from diffcloud.sim.build import Surrounding, build_system
-from diffcloud.sim.energies import Handles
-from diffcloud.sim.energies.base import geometry
-from diffcloud.sim.energies.handles import Handle
+from diffcloud.sim.build import build_system
+from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import isotropic
+from diffcloud.sim.surrounding import Surrounding
 
 DENSITY = 0.2
 

@@ -11,14 +11,13 @@ import trimesh
 
 from diffcloud.mesh.shapes import cylinder_surface, grid_cloth
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
-from diffcloud.sim.build import Surrounding, build_system
-from diffcloud.sim.contact import ContactSettings
-from diffcloud.sim.energies import Handles
-from diffcloud.sim.energies.handles import Handle
+from diffcloud.sim.build import build_system
+from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import isotropic
 from diffcloud.sim.motion import Keyframe, Motion
-from diffcloud.sim.rigid import RigidBody
+from diffcloud.sim.rigid.body import RigidBody
 from diffcloud.sim.simulate import rollout
+from diffcloud.sim.surrounding import ContactSettings, Surrounding
 
 FABRIC = isotropic("test-fabric", density=0.2, stretching=200.0, shear=80.0, bending=1e-5, source="test")
 GROUND = SurfaceMesh(np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))

@@ -11,7 +11,7 @@ from torch.autograd import forward_ad
 
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim import Properties, init, rollout, rollout_tangents
-from diffcloud.sim.state import System
+from diffcloud.sim.system import System
 
 SCALARS = ("stretch", "mass", "density", "bending", "damping", "drag", "friction_obstacle")
 STEPS = tuple(10.0**-k for k in range(2, 9))

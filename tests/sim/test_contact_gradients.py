@@ -11,16 +11,15 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from diffcloud.mesh import ClothMesh, box_surface, grid_cloth, rectangle_surface
-from diffcloud.sim.build import Surrounding, build_system
-from diffcloud.sim.contact import ContactSettings
-from diffcloud.sim.energies import Handles
-from diffcloud.sim.energies.handles import Handle
+from diffcloud.sim.build import build_system
+from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import isotropic
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.properties import scaled_properties
-from diffcloud.sim.rigid import RigidBody
+from diffcloud.sim.rigid.body import RigidBody
 from diffcloud.sim.rigid.rotation import rotation
 from diffcloud.sim.simulate import init, rollout
+from diffcloud.sim.surrounding import ContactSettings, Surrounding
 
 STEPS = 25
 FABRIC = isotropic("test", density=0.3, stretching=60.0, bending=1e-4, shear=30.0)
@@ -77,7 +76,7 @@ def inputs(system) -> dict[str, Tensor]:
 def functional(system, values: dict[str, Tensor], weights: tuple[Tensor, Tensor], copies: int = 1) -> Tensor:
     batch = len(values["stretch"])
     properties = scaled_properties(
-        system.properties, {name: values[name] for name in NAMES}, faces=system.stretching.elements.nodes
+        system.properties, {name: values[name] for name in NAMES}, faces=torch.as_tensor(system.mesh.faces)
     )
     state = init(system, batch)
     bodies = replace(

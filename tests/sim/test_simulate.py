@@ -11,14 +11,13 @@ import torch
 from diffcloud.errors import DivergedError, SceneError
 from diffcloud.mesh import SurfaceMesh, box_surface, grid_cloth
 from diffcloud.sim import Rollout, init, rollout
-from diffcloud.sim.build import Surrounding, build_system
-from diffcloud.sim.contact import ContactSettings
-from diffcloud.sim.energies import Handles
-from diffcloud.sim.energies.handles import Handle
+from diffcloud.sim.build import build_system
+from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import isotropic
 from diffcloud.sim.motion import Keyframe, Motion
-from diffcloud.sim.rigid import RigidBody
+from diffcloud.sim.rigid.body import RigidBody
 from diffcloud.sim.simulate import step
+from diffcloud.sim.surrounding import ContactSettings, Surrounding
 from tests.conftest import small_lift
 
 MATERIAL = isotropic("test", density=0.2, stretching=50.0, bending=1e-5, shear=20.0)

@@ -15,12 +15,10 @@ from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.scene.description import Scene
 from diffcloud.scene.scenarios.scenario import Recorder, Scenario
 from diffcloud.scene.schema import Checked, NonNegative, Positive, Vector
-from diffcloud.sim.build import Integrator, Surrounding
-from diffcloud.sim.contact import ContactSettings, ReferenceContact
-from diffcloud.sim.energies import Handles
-from diffcloud.sim.energies.handles import Handle
+from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import preset, read_material
 from diffcloud.sim.motion import Keyframe, Motion
+from diffcloud.sim.surrounding import ContactSettings, Integrator, ReferenceContact, Surrounding
 
 
 class ScenarioOptions(Checked):

@@ -10,7 +10,7 @@ import numpy as np
 from diffcloud.errors import SceneError
 from diffcloud.scene.load import load_scene
 from diffcloud.scene.scenarios.scenario import Scenario
-from diffcloud.sim.contact import ReferenceContact
+from diffcloud.sim.surrounding import ReferenceContact
 
 PAPER_THRESHOLD = 5e-4
 """Stop below this one-sided Chamfer loss, in squared length units of the release (paper, section IV-F)."""
@@ -66,7 +66,7 @@ def release_scenario(name: str, path: Path) -> Scenario:
     """
     settings = RELEASE[name]
     scene = load_scene(path, reload_materials=True)
-    surrounding = replace(scene.surrounding, reference_contact=ReferenceContact.as_published())
+    surrounding = replace(scene.surrounding, reference_contact=ReferenceContact.as_published(), lagged_air=True)
     scene = replace(scene, integrator="linearised", surrounding=surrounding)
     faces, nodes = settings.loss_faces, settings.mass_nodes
     for what, index, count in (("face", faces, len(scene.mesh.faces)), ("node", nodes, len(scene.mesh.nodes))):

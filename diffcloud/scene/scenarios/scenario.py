@@ -14,7 +14,7 @@ from torch import Tensor
 from diffcloud.errors import ConfigError
 from diffcloud.scene.description import Scene
 from diffcloud.sim.properties import Properties, scaled_properties
-from diffcloud.sim.state import System
+from diffcloud.sim.system import System
 
 Recorder = Literal["depth_cameras", "whole_surface"]
 """How synthetic episodes are made: seen by depth cameras with their noise, or points all over the cloth and the first
@@ -73,6 +73,6 @@ class Scenario:
         """
         sets = {}
         for name in values.keys() & self.node_sets.keys():
-            sets[name] = torch.zeros(len(system.mesh.nodes), dtype=torch.bool, device=system.device)
-            sets[name][torch.as_tensor(self.node_sets[name], device=system.device)] = True
-        return scaled_properties(system.properties, values, faces=system.stretching.elements.nodes, node_sets=sets)
+            sets[name] = torch.zeros(len(system.mesh.nodes), dtype=torch.bool)
+            sets[name][torch.as_tensor(self.node_sets[name])] = True
+        return scaled_properties(system.properties, values, faces=torch.as_tensor(system.mesh.faces), node_sets=sets)

@@ -41,9 +41,7 @@ class Function:
             ),
         ]
 
-    def _source(
-        self, kind: str, more: str, stores: Sequence[str], values: Sequence[Scalar], loop: bool = False
-    ) -> str:
+    def _source(self, kind: str, more: str, stores: Sequence[str], values: Sequence[Scalar], loop: bool = False) -> str:
         code = Code()
         code.compute(values)
         lines = code.lines + [store + code.name(value) for store, value in zip(stores, values, strict=True)]

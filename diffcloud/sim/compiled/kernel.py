@@ -32,8 +32,9 @@ def cache_folder() -> Path:
     """Where compiled and generated code of this version lies."""
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
     for source in sorted(_SIM.rglob("*.py")):
-        digest.update(source.relative_to(_SIM).as_posix().encode())
-        digest.update(source.read_bytes())
+        text = source.read_bytes()
+        if b"@kernel" in text or b"compiled" in text:
+            digest.update(source.relative_to(_SIM).as_posix().encode() + text)
     root = Path(os.environ["DIFFCLOUD_CACHE_DIR"]) if "DIFFCLOUD_CACHE_DIR" in os.environ else user_cache_path("diffcloud")
     return root / "kernels" / digest.hexdigest()[:16]
 

@@ -2,7 +2,7 @@
 
 For each term five functions over its elements: `<name>_force` adds its forces, `<name>_assemble` also gives its part of the
 symmetric step matrix, `<name>_jacobian` its exact derivatives for the implicit step, `<name>_reverse` adds the gradients of
-y · f, `<name>_tangent` how f changes along some directions. Matrices come as 3 x 3 blocks, row by row, for each pair of an
+y · f, `<name>_tangent` how f changes along some directions; `<name>_energy` adds what its elements store. Matrices come as 3 x 3 blocks, row by row, for each pair of an
 element's nodes. The module is written into the cache folder, where it can be read.
 """
 
@@ -39,6 +39,7 @@ _ARGUMENTS = {
     "jacobian": "parameters, motion, timing, displaced, moved, blocks",
     "reverse": "parameters, motion, timing, adjoint, parameter_gradients, motion_gradients",
     "tangent": "parameters, motion, timing, parameter_rates, motion_rates, force_rates",
+    "energy": "parameters, motion, timing, energy",
 }
 
 
@@ -77,6 +78,8 @@ def source_of(terms: Sequence[Term], contacts: Sequence[Term], functions: Sequen
             if "blocks[" in text:
                 stiff[kind].add(term.name)
         parts += [_force(term), *own.values(), _reverse(term), _tangent(term)]
+        if term.energy is not None:
+            parts.append(_energy(term))
     parts.append(f"Terms = namedtuple('Terms', {[term.name for term in terms]!r})")
     parts += [_all(kind, terms, stiff.get(kind, set())) for kind in _ARGUMENTS]
     parts += [source for function in functions for source in function.sources()]
@@ -92,7 +95,7 @@ def _all(kind: str, terms: Sequence[Term], stiff: set[str]) -> str:
         if term.name in stiff:
             count = len(term.pairs) if kind == "assemble" else term.corners**2
             lines.append(f"blocks = np.empty((len(terms.{term.name}.nodes), {count}, 9))")
-        elif kind == "jacobian":
+        elif kind == "jacobian" or (kind == "energy" and term.energy is None):
             continue
         lines.append(f"{term.name}_{kind}(terms.{term.name}, {arguments})")
         if term.name in stiff:
@@ -109,6 +112,15 @@ def _force(term: Term) -> str:
     code = Code()
     code.compute(formula.force)
     return _loop(term, "force", code.lines + _added_forces(formula, code))
+
+
+def _energy(term: Term) -> str:
+    """energy[0] += what the elements store"""
+    assert term.energy is not None
+    stored = term.energy(Element(term, Graph()))
+    code = Code()
+    code.compute([stored])
+    return _loop(term, "energy", [*code.lines, f"energy[0] += {code.name(stored)}"])
 
 
 def _assemble(term: Term) -> str:

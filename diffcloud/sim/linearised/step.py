@@ -6,12 +6,12 @@ import numpy as np
 
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters
 from diffcloud.sim.compiled.kernel import kernel
-from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.compiled.sparse import cholesky, solve
 from diffcloud.sim.held import Held, aim, first_anchors, holders, take_anchors
 from diffcloud.sim.linearised.matrix import linear_system, pattern_with
-from diffcloud.sim.linearised.scene import Kept, Scene, nothing_kept
-from diffcloud.sim.reference.impact_zones import Impacts, resolve
+from diffcloud.sim.linearised.record import Kept, nothing_kept, remember, with_impacts
+from diffcloud.sim.linearised.scene import Scene
+from diffcloud.sim.reference.impact_zones import resolve
 from diffcloud.sim.reference.nearest import nearest_pairs
 from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE, NOT_POSITIVE_DEFINITE, UNRESOLVED
 
@@ -44,7 +44,7 @@ def simulate(
     kept = nothing_kept(steps if keep >= 0 else 0, nodes)
     anchors[:] = first_anchors(held, positions[0])
     points, motion = with_obstacles(scene, positions[0]), still(scene, nodes)
-    force = np.empty((len(points), 3))
+    force, above = np.empty((len(points), 3)), np.empty((len(scene.plane_offsets), nodes), np.bool_)
     for step in range(steps):
         if control[1] != 0:
             return INTERRUPTED, step, kept
@@ -58,9 +58,7 @@ def simulate(
         pattern, moved = pattern_with(scene.pattern, corners)
         holder = holders(held, step, nodes)
         force[:] = 0.0
-        matrix = linear_system(
-            scene, parameters, motion, holder, corners, constants, pattern, moved, force
-        )
+        matrix = linear_system(scene, parameters, motion, holder, corners, constants, pattern, moved, force)
         factor = np.empty((len(pattern.factor_rows), 9))
         if not cholesky(pattern, matrix, factor):
             return NOT_POSITIVE_DEFINITE, step, kept
@@ -80,14 +78,12 @@ def simulate(
         if not finite:
             return NOT_FINITE, step, kept
         if keep >= 0:
-            kept = _remember(kept, step, velocities[step + 1], corners, constants, factor, keep)
-        project(scene, points)
+            kept = remember(kept, step, velocities[step + 1], corners, constants, factor, keep)
+        project(scene, points, above)
         if scene.collides:
             mobile = mobility(scene, parameters, holder)
-            resolved, impacts = resolve(
-                scene.surface, scene.projection, motion.positions, points, mobile, kept.impacts
-            )
-            kept = _with_impacts(kept, impacts, step, keep)
+            resolved, impacts = resolve(scene.surface, scene.projection, motion.positions, points, mobile, kept.impacts)
+            kept = with_impacts(kept, impacts, step, keep)
             if not resolved:
                 return UNRESOLVED, step, kept
         for i in range(nodes):
@@ -146,12 +142,13 @@ def displace(scene: Scene, parameters: Parameters, nodes: int, motion: Motion) -
 
 
 @kernel
-def project(scene: Scene, points: Floats) -> None:
-    """Put nodes that are behind a plane back above it."""
+def project(scene: Scene, points: Floats, above) -> None:  # type: ignore[no-untyped-def]
+    """Put nodes that are behind a plane back above it; `above` bool [P, V] takes which of them were not."""
     for p in range(len(scene.plane_offsets)):
         normal = scene.plane_normals[p]
-        for i in range(len(points) - len(scene.obstacles)):
+        for i in range(above.shape[1]):
             gap = normal[0] * points[i, 0] + normal[1] * points[i, 1] + normal[2] * points[i, 2] - scene.plane_offsets[p]
+            above[p, i] = gap >= 0
             if gap < 0:
                 for axis in range(3):
                     points[i, axis] += (scene.projection.thickness - gap) * normal[axis]
@@ -165,38 +162,3 @@ def mobility(scene: Scene, parameters: Parameters, holder: Ints) -> Floats:
         if holder[i] >= 0:
             found[i] = 0.0
     return found
-
-
-@kernel
-def _remember(
-    kept: Kept, step: int, solved: Floats, corners: Ints, constants: Floats, factor: Floats, limit: int
-) -> Kept:
-    """What a step adds to the record, but for its impacts."""
-    kept.solved[step] = solved
-    begins = kept.begins
-    pairs, rows = begins[step, 0], begins[step, 4]
-    more = with_room(kept.corners, pairs, len(corners))
-    numbers = with_room(kept.constants, pairs, len(corners))
-    more[pairs : pairs + len(corners)] = corners
-    numbers[pairs : pairs + len(corners)] = constants
-    begins[step + 1, 0] = pairs + len(corners)
-    factors = kept.factors
-    if rows + len(factor) <= limit:
-        factors = with_room(factors, rows, len(factor))
-        factors[rows : rows + len(factor)] = factor
-        begins[step + 1, 4] = rows + len(factor)
-    else:
-        begins[step + 1, 4] = rows
-    return Kept(kept.solved, begins, more, numbers, kept.impacts, factors)
-
-
-@kernel
-def _with_impacts(kept: Kept, impacts: Impacts, step: int, keep: int) -> Kept:
-    """The record with the impacts of a step; without derivatives its room is used again."""
-    if keep >= 0:
-        for k in range(3):
-            kept.begins[step + 1, 1 + k] = impacts.used[k]
-    else:
-        for k in range(3):
-            impacts.used[k] = 0
-    return Kept(kept.solved, kept.begins, kept.corners, kept.constants, impacts, kept.factors)

@@ -15,8 +15,6 @@ from collections.abc import Sequence
 from math import sqrt
 from typing import Literal
 
-import numpy as np
-
 from diffcloud.sim.compiled.data import Floats
 from diffcloud.sim.compiled.function import Function
 from diffcloud.sim.compiled.kernel import kernel
@@ -67,14 +65,20 @@ def _meeting(kind: Kind, inputs: Sequence[Scalar], constants: Sequence[Scalar]) 
     slope = where(moves, rate, 1.0)
     change = where(moves, (volume - held(volume)) / held(slope), 0.0)
     moment = time - change
-    return [number for part in _flat(*frame(kind, [p + moment * (q - p) for p, q in zip(start, end, strict=True)])) for number in part]
+    return [
+        number
+        for part in _flat(*frame(kind, [p + moment * (q - p) for p, q in zip(start, end, strict=True)]))
+        for number in part
+    ]
 
 
 def _flat(weights: list[Scalar], normal: Vector) -> tuple[list[Scalar], list[Scalar]]:
     return weights, [normal.x, normal.y, normal.z]
 
 
-POINT_FACE_MEETING = Function("point_face_meeting", 24, 1, lambda inputs, constants: _meeting("point_face", inputs, constants))
+POINT_FACE_MEETING = Function(
+    "point_face_meeting", 24, 1, lambda inputs, constants: _meeting("point_face", inputs, constants)
+)
 EDGE_EDGE_MEETING = Function("edge_edge_meeting", 24, 1, lambda inputs, constants: _meeting("edge_edge", inputs, constants))
 
 
@@ -103,7 +107,10 @@ def covers(edges: int, weights: Floats, tolerance: float) -> bool:
     """Whether the places of weights [4] lie on both primitives."""
     if edges > 0:
         return (
-            weights[0] >= -tolerance and weights[1] >= -tolerance and -weights[2] >= -tolerance and -weights[3] >= -tolerance
+            weights[0] >= -tolerance
+            and weights[1] >= -tolerance
+            and -weights[2] >= -tolerance
+            and -weights[3] >= -tolerance
         )
     return -weights[1] >= -tolerance and -weights[2] >= -tolerance and -weights[3] >= -tolerance
 

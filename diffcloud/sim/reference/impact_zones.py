@@ -114,9 +114,13 @@ def _listed(surface: Surface, start: Floats, places: Floats) -> Ints:
     found = np.empty((len(point_face) + len(edge_edge), 7), np.int64)
     for c in range(len(found)):
         edges = 1 if c >= len(point_face) else 0
-        a, b = (edge_edge[c - len(point_face), 0], edge_edge[c - len(point_face), 1]) if edges else (
-            point_face[c, 0],
-            point_face[c, 1],
+        a, b = (
+            (edge_edge[c - len(point_face), 0], edge_edge[c - len(point_face), 1])
+            if edges
+            else (
+                point_face[c, 0],
+                point_face[c, 1],
+            )
         )
         found[c, 0] = edges
         found[c, 1], found[c, 2], found[c, 3], found[c, 4] = corners_of(surface, edges, a, b)
@@ -126,7 +130,13 @@ def _listed(surface: Surface, start: Floats, places: Floats) -> Ints:
 
 @kernel
 def _impacts(  # type: ignore[no-untyped-def]
-    surface: Surface, choices: Projection, pairs: Ints, start: Floats, places: Floats, changed, inverse_mass: Floats,
+    surface: Surface,
+    choices: Projection,
+    pairs: Ints,
+    start: Floats,
+    places: Floats,
+    changed,
+    inverse_mass: Floats,
     record: Impacts,
 ) -> tuple[int, Impacts]:
     """The impacts of this pass that are kept: in the order of time, each that shares no movable point with one before."""
@@ -211,13 +221,8 @@ def _project(
     for j in range(count - fresh, count):
         if zone[j] < 0:
             continue
-        label, members = zone[j], np.empty(count, np.int64)
-        size = 0
-        for other in range(count):
-            if zone[other] == label:
-                members[size] = other
-                size += 1
-        chosen = members[:size]
+        chosen = take_zone(zone, j)
+        size = len(chosen)
         points, own = met[chosen][:, 1:5].copy(), rows[chosen]
         matrix, target = gram(points, own, inverse_mass), applied(points, own, candidate)
         force = np.empty(size)
@@ -226,13 +231,24 @@ def _project(
             force[m] = forces[begin + chosen[m], 0]
         regular = solve_dual(matrix, target, force)
         for m in range(size):
-            zone[chosen[m]] = -1  # done
             forces[begin + chosen[m], 0], forces[begin + chosen[m], 1] = force[m], regular
         move(points, own, force, 1 - choices.residue, inverse_mass, candidate, places)
     passes[record.used[1], 0], passes[record.used[1], 1] = count, fresh
     record.used[1] += 1
     record.used[2] += count
     return Impacts(record.met, record.places, passes, forces, record.used)
+
+
+@kernel
+def take_zone(zone: Ints, row: int) -> Ints:
+    """The rows of the zone to which a row belongs; it is struck off the list."""
+    label, size = zone[row], 0
+    members = np.empty(len(zone), np.int64)
+    for other in range(len(zone)):
+        if zone[other] == label:
+            members[size], zone[other] = other, -1
+            size += 1
+    return members[:size]
 
 
 @kernel

@@ -15,6 +15,9 @@ from diffcloud.sim.contact.surface import Surface
 from diffcloud.sim.reference.frames import covers, cross3, dot3, frame_at, height
 
 _OUTSIDE = 1e-6
+_PARALLEL = 1e-12
+"""Squared sine of the angle between two edges below which they never repel: they have no common normal, and derivatives without
+bound; what is there to hold apart points and faces do."""
 _TINY = 1e-30
 _TINIEST = 1e-300
 
@@ -117,7 +120,9 @@ def _near(surface: Surface, repulsion: Repulsion, points: Floats, among_fixed: i
             square = frame_at(edges, x, place)
             distance = height(place, x)
             # pairs between one and two thicknesses hold slots in the original, but without force, and never against a nearer one
-            if not (square > 0 and square >= repulsion.smallest and abs(distance) < repulsion.thickness):
+            if not (square > _PARALLEL * _spanned(edges, x) and square >= repulsion.smallest):
+                continue
+            if not abs(distance) < repulsion.thickness:
                 continue
             if not covers(edges, place, _OUTSIDE):
                 continue
@@ -131,12 +136,28 @@ def _near(surface: Surface, repulsion: Repulsion, points: Floats, among_fixed: i
                 pairs[count, 1 + k] = corners[k]
             pairs[count, 5], pairs[count, 6] = a, b
             _set_slots(surface, pairs, count, place, around)
-            area = min(surface.edge_area[a], surface.edge_area[b]) if edges > 0 else min(
-                surface.point_area[a], surface.face_area[b]
+            area = (
+                min(surface.edge_area[a], surface.edge_area[b])
+                if edges > 0
+                else min(surface.point_area[a], surface.face_area[b])
             )
             found[count, 0], found[count, 1], found[count, 2] = abs(distance), (-1.0 if distance < 0 else 1.0), area
             count += 1
     return pairs[:count], found[:count]
+
+
+@kernel
+def _spanned(edges: int, x: Floats) -> float:
+    """|a|² |b|² of a pair's two edge vectors [m⁴], x [4, 3]."""
+    found = 1.0
+    for side in range(2):
+        first = 2 * side if edges > 0 else 1
+        last = first + 1 if edges > 0 else 2 + side
+        square = 0.0
+        for axis in range(3):
+            square += (x[last, axis] - x[first, axis]) ** 2
+        found *= square
+    return found
 
 
 @kernel

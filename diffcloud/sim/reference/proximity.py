@@ -49,7 +49,7 @@ def _term(kind: Kind) -> Term:
         f"proximity_{kind}",
         corners=4,
         force=partial(force, kind),
-        constants={name: () for name in ("sign", "count", "stiffness", "with_obstacle", "thickness")},
+        constants=dict.fromkeys(("sign", "count", "stiffness", "with_obstacle", "thickness"), ()),
         parameters={"inverse_mass": "corner", "friction_obstacle": "episode", "friction_cloth": "episode"},
     )
 

@@ -57,7 +57,9 @@ class Bodies:
     """Batch 1."""
 
     @staticmethod
-    def build(bodies: Sequence[RigidBody], *, dtype: torch.dtype, device: torch.device) -> Bodies:
+    def build(
+        bodies: Sequence[RigidBody], *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"
+    ) -> Bodies:
         """Mass properties of the meshes (trimesh integrates over the volume).
 
         Raises:

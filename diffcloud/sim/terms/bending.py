@@ -46,14 +46,10 @@ _COLUMNS = 5
 
 def force(hinge: Element) -> Sequence[Vector]:
     """-K (θ + ∇θ · d) ∇θ on the nodes of the edge and the two opposite ones."""
-    start, end, first, second = hinge.positions
-    edge, arms = end - start, (first - start, second - start)
-    squared = maximum(dot(edge, edge), _TINY)
-    length = squareroot(squared)
-    along = [dot(arm, edge) / squared for arm in arms]
-    normals = (cross(edge, arms[0]), cross(arms[1], edge))
-    angle = _dihedral(edge, length, *normals) - hinge.constant("rest_angle")
-    angle = angle - held(2 * math.pi * floor(angle / (2 * math.pi) + 0.5))  # the short way round
+    start, _, first, second = hinge.positions
+    edge, length, normals, angle = _bent(hinge)
+    squared = length * length
+    along = [dot(arm, edge) / squared for arm in (first - start, second - start)]
     tilts = []
     for normal in normals:  # unit normal over height, with the height kept above a part of the edge
         area = norm(normal)
@@ -68,6 +64,13 @@ def force(hinge: Element) -> Sequence[Vector]:
         moved = moved + dot(part, shift)
     stiffness = _table_value(hinge, angle) * hinge.constant("stiffness") * hinge.parameter("bending")
     return [(-stiffness * moved) * part for part in gradient]
+
+
+def energy(hinge: Element) -> Scalar:
+    """K θ²/2"""
+    angle = _bent(hinge)[3]
+    stiffness = _table_value(hinge, angle) * hinge.constant("stiffness") * hinge.parameter("bending")
+    return 0.5 * stiffness * angle * angle
 
 
 def build(setup: Setup) -> Elements:
@@ -89,6 +92,7 @@ BENDING = Term(
     "bending",
     corners=4,
     force=force,
+    energy=energy,
     build=build,
     constants={"stiffness": (), "curvature": (), "rest_angle": (), "rows": (2, _COLUMNS)},
     parameters={"bending": "element"},
@@ -104,6 +108,16 @@ def dihedral_angles(mesh: ClothMesh) -> NDArray[np.float64]:
     first, second = np.cross(edge, corner[:, 2] - corner[:, 0]), np.cross(corner[:, 3] - corner[:, 0], edge)
     sine = -(edge * np.cross(first, second)).sum(-1) / np.linalg.norm(edge, axis=-1)
     return np.asarray(np.arctan2(sine, (first * second).sum(-1)))
+
+
+def _bent(hinge: Element) -> tuple[Vector, Scalar, tuple[Vector, Vector], Scalar]:
+    """(edge, its length, normals on both sides, θ)."""
+    start, end, first, second = hinge.positions
+    edge = end - start
+    length = squareroot(maximum(dot(edge, edge), _TINY))
+    normals = (cross(edge, first - start), cross(second - start, edge))
+    angle = _dihedral(edge, length, *normals) - hinge.constant("rest_angle")
+    return edge, length, normals, angle - held(2 * math.pi * floor(angle / (2 * math.pi) + 0.5))  # the short way round
 
 
 def _dihedral(edge: Vector, length: Scalar, first: Vector, second: Vector) -> Scalar:

@@ -48,6 +48,15 @@ def force(face: Element) -> Sequence[Vector]:
     return [-(pulls[0] + pulls[1]), *pulls]
 
 
+def energy(face: Element) -> Scalar:
+    """W"""
+    xu, xv = _along_material(face, face.positions)
+    e00, e11, e01 = 0.5 * (dot(xu, xu) - 1), 0.5 * (dot(xv, xv) - 1), 0.5 * dot(xu, xv)
+    k0, k1, k2, k3 = (k * face.parameter("stretching") for k in _coefficients(face, e00, e11, e01))
+    axial = 0.5 * (k0 * e00 * e00 + k2 * e11 * e11) + k1 * e00 * e11
+    return face.constant("area") * (axial + k3 * e01 * e01)
+
+
 def build(setup: Setup) -> Elements:
     """The faces, with their rest shapes and the sampled table."""
     mesh = setup.mesh
@@ -62,6 +71,7 @@ STRETCHING = Term(
     "stretching",
     corners=3,
     force=force,
+    energy=energy,
     build=build,
     constants={"area": (), "inverse_rest": (2, 2)},
     tables={"cells": 3},

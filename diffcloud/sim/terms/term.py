@@ -71,6 +71,9 @@ class Term:
     resistance: Callable[[Element], Sequence[Vector]] | None = None
     """The force whose derivative by displacement and velocity is the positive semidefinite stiffness, where it is not `force`."""
 
+    energy: Callable[[Element], Scalar] | None = None
+    """[J] that an element stores, where it does; tells explosions from motions."""
+
     @property
     def class_name(self) -> str:
         """Of the named tuple that holds its elements."""

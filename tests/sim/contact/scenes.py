@@ -8,7 +8,7 @@ import numpy as np
 
 from diffcloud.mesh import SurfaceMesh
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim.contact import ReferenceContact
+from diffcloud.sim.surrounding import ReferenceContact
 from tests.conftest import small_lift
 
 

@@ -11,7 +11,7 @@ import torch
 from diffcloud.errors import SceneError
 from diffcloud.mesh import SurfaceMesh
 from diffcloud.sim import rollout
-from diffcloud.sim.contact import ReferenceContact
+from diffcloud.sim.surrounding import ReferenceContact
 from tests.sim.contact.scenes import over_box
 from tests.sim.directional import Episode, directions
 from tests.sim.test_gradients import compare

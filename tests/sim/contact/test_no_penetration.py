@@ -20,13 +20,11 @@ from diffcloud.mesh import (
     sphere_surface,
 )
 from diffcloud.scene import Scenario, Scene, load_scenario
-from diffcloud.sim.build import Surrounding
-from diffcloud.sim.contact import ReferenceContact
-from diffcloud.sim.energies import Handles
-from diffcloud.sim.energies.handles import Handle
+from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import preset
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.simulate import rollout
+from diffcloud.sim.surrounding import ReferenceContact, Surrounding
 from tests.sim.contact.penetration import find_penetrations
 
 STEP = 1 / 60

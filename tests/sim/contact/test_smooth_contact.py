@@ -5,22 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-
-from diffcloud.mesh import SurfaceMesh, box_surface, grid_cloth, rectangle_surface, sphere_surface
-from diffcloud.sim.build import Surrounding, build_system
-from diffcloud.sim.contact import ContactSettings
 from diffcloud.sim.contact.additive_ccd import pair_distance, safe_fraction
 from diffcloud.sim.contact.barrier import Barrier
-from diffcloud.sim.contact.broad_phase import Boxes, _all_pairs, _grid_pairs
 from diffcloud.sim.contact.distance import edge_edge_weights, point_face_weights
+
+from diffcloud.mesh import SurfaceMesh, box_surface, grid_cloth, rectangle_surface, sphere_surface
+from diffcloud.sim.build import build_system
+from diffcloud.sim.contact.broad_phase import Boxes, _all_pairs, _grid_pairs
 from diffcloud.sim.contact.surface import ContactSurface
-from diffcloud.sim.energies import Handles
-from diffcloud.sim.energies.handles import Handle
+from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import isotropic
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.rigid.rotation import from_roll_pitch_yaw, left_jacobian, roll_pitch_yaw, rotation
 from diffcloud.sim.scenery import MovingObstacle
 from diffcloud.sim.simulate import init, rollout
+from diffcloud.sim.surrounding import ContactSettings, Surrounding
 
 FABRIC = isotropic("test", density=0.2, stretching=50.0, shear=20.0, bending=1e-5)
 

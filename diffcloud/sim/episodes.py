@@ -1,0 +1,292 @@
+"""A batch of episodes: arrays for the kernels, one thread each, and what became of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloud.errors import DivergedError, UnresolvedContactError
+from diffcloud.sim import implicit, linearised, status
+from diffcloud.sim.compiled.data import Floats, Motion, Parameters, Timing
+from diffcloud.sim.handles import HandleSchedule
+from diffcloud.sim.held import Held
+from diffcloud.sim.plausibility import Motion as Course
+from diffcloud.sim.plausibility import implausible
+from diffcloud.sim.reference.impact_zones import PASSES
+from diffcloud.sim.scenery import Scenery
+from diffcloud.sim.system import System
+from diffcloud.sim.terms import kernels
+from diffcloud.sim.threads import run_all
+
+FACTOR_MEMORY = 256 * 2**20
+"""[bytes] of factors that a batch keeps for its derivatives; beyond, the steps' factors are made again."""
+_BLOCK = 9 * 8
+
+_PROPERTIES = Parameters._fields[:1] + Parameters._fields[2:10]
+"""Fields that `Properties` has too, in its order."""
+
+
+class Batch:
+    """Episodes of one system. Inputs are arrays with a leading batch axis [B, ...]: positions and velocities [B, V, 3], poses of
+    the bodies [B, N, 18], the gripper's track [B, S, 3], and those of `Properties`."""
+
+    def __init__(self, system: System, steps: int, *, tracked: bool, progress: Callable[[int], None] | None = None) -> None:
+        self.system, self.steps = system, steps
+        times = np.cumsum(np.full(steps, system.time_step))  # repeated addition, as the reference accumulates time
+        self.schedule = system.handles.tracked_schedule(times) if tracked else system.handles.schedule(times)
+        self.held = _held(system, self.schedule)
+        all_times = np.concatenate([[0.0], times])
+        self.times = torch.as_tensor(all_times)
+        self._integrator: Any = implicit if system.setup.integrator == "implicit" else linearised
+        self._scenery = _scenery(system).at(all_times)
+        self._progress = progress
+
+    def simulate(self, inputs: Sequence[Tensor], *, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions and velocities [B, S + 1, V, 3] and poses of the bodies [B, S + 1, N, 18]; `diverged` tells which hold.
+
+        Args:
+            keep: what derivatives need.
+        """
+        self._inputs = [np.ascontiguousarray(tensor.detach().numpy()) for tensor in inputs]
+        positions, velocities, poses, self._track, *properties = self._inputs
+        count = len(positions)
+        self.positions, self.velocities, self.poses = (self._over_time(first) for first in (positions, velocities, poses))
+        self._parameters = [self._read([one[entry] for one in properties]) for entry in range(count)]
+        self._control = np.zeros((count, 2), np.int64)
+        self._anchors = np.zeros((count, len(self.held.node), 3))
+        self._fault = np.zeros((count, 6))
+        self._ends: list[Any] = [None] * count
+        limit = FACTOR_MEMORY // (_BLOCK * count) if keep else -1
+
+        def job(entry: int) -> None:
+            self._ends[entry] = self._integrator.simulate(
+                self.system.scene,
+                self.held,
+                self._parameters[entry],
+                self._track[entry],
+                *self._more(entry),
+                self._anchors[entry],
+                self.positions[entry],
+                self.velocities[entry],
+                *self._bodies(self.poses[entry]),
+                limit,
+                self._control[entry],
+                *([self._fault[entry]] if self._moves_bodies else []),
+            )
+
+        self._run(job, count)
+        return tuple(torch.from_numpy(array) for array in (self.positions, self.velocities, self.poses))  # type: ignore[return-value]
+
+    def gradients(self, outputs: Sequence[Tensor]) -> list[Tensor]:
+        """Gradients by the inputs, from those by what `simulate` gave."""
+        position, velocity, pose = (np.array(tensor.detach().numpy(), dtype=np.float64, order="C") for tensor in outputs)
+        count = len(position)
+        found = [np.zeros_like(array) for array in self._inputs]
+
+        def job(entry: int) -> None:
+            parameters = self._parameters[entry]
+            gradients = Parameters(*(np.zeros_like(array) for array in parameters))
+            self._integrator.reverse(
+                self.system.scene,
+                self.held,
+                parameters,
+                self._track[entry],
+                *self._more(entry),
+                self.positions[entry],
+                self.velocities[entry],
+                *self._bodies(self.poses[entry]),
+                self._ends[entry][2],
+                position[entry],
+                velocity[entry],
+                *self._bodies(pose[entry]),
+                gradients,
+                found[3][entry],
+            )
+            for array, first in zip(found, (position, velocity, pose), strict=False):
+                array[entry] = first[entry, 0]
+            for array, name in zip(found[4:], _PROPERTIES, strict=True):
+                array[entry] = getattr(gradients, name).reshape(array[entry].shape)
+
+        self._run(job, count)
+        return [torch.from_numpy(array) for array in found]
+
+    def tangents(self, rates: Sequence[Tensor]) -> Tensor:
+        """d positions [K, B, S + 1, V, 3] along rates [K, B, ...] of the inputs."""
+        position, velocity, pose, track, *properties = (np.ascontiguousarray(tensor.numpy()) for tensor in rates)
+        directions, count = position.shape[:2]
+        found = np.empty((count, self.steps + 1, *position.shape[:1], *position.shape[2:]))
+
+        def job(entry: int) -> None:
+            parameters = self._parameters[entry]
+            moves = self._read_rates(parameters, [one[:, entry] for one in properties])
+            velocity_rates = np.empty_like(found[entry])
+            found[entry, 0], velocity_rates[0] = position[:, entry], velocity[:, entry]
+            pose_rates = np.empty((self.steps + 1, directions, *pose.shape[2:]))
+            pose_rates[0] = pose[:, entry]
+            self._integrator.tangents(
+                self.system.scene,
+                self.held,
+                parameters,
+                moves,
+                self._track[entry],
+                np.ascontiguousarray(track[:, entry]),
+                *self._more(entry),
+                self.positions[entry],
+                self.velocities[entry],
+                *self._bodies(self.poses[entry]),
+                self._ends[entry][2],
+                found[entry],
+                velocity_rates,
+                *self._bodies(pose_rates),
+            )
+
+        self._run(job, count)
+        return torch.from_numpy(np.moveaxis(found, 2, 0))
+
+    def diverged(self) -> dict[int, DivergedError]:
+        """What is wrong with entries of the last simulation."""
+        found = {}
+        for entry, (end, step, kept) in enumerate(self._ends):
+            fault = self._failed(entry, end, step, kept) if end != status.DONE else None
+            last = self.steps if fault is None else step
+            course = (
+                implausible(self._course(entry, last), lambda at, entry=entry: self._stored(entry, at)) if last else None
+            )
+            if course is not None:
+                fault = DivergedError(course[0], [entry], course[1])
+            if fault is not None:
+                found[entry] = fault
+        return found
+
+    # --- arrays ------------------------------------------------------------------------------------------------------
+
+    @property
+    def _moves_bodies(self) -> bool:
+        return self._integrator is implicit
+
+    def _more(self, entry: int) -> tuple[Any, ...]:
+        """What the implicit step needs in addition."""
+        return (self._scenery,) if self._moves_bodies else ()
+
+    def _bodies(self, array: Floats) -> tuple[Floats, ...]:
+        return (array,) if self._moves_bodies else ()
+
+    def _over_time(self, first: Floats) -> Floats:
+        """[B, S + 1, ...] that begins with [B, ...]; the rest is NaN."""
+        whole = np.full((len(first), self.steps + 1, *first.shape[1:]), np.nan)
+        whole[:, 0] = first
+        return whole
+
+    def _read(self, properties: Sequence[Floats]) -> Parameters:
+        """Of one entry, in the order of `_PROPERTIES`."""
+        node_mass, *rest = (np.atleast_1d(one) for one in properties)
+        handles = len(self.held.node)
+        inverse = np.zeros(self.system.point_count)
+        inverse[: len(node_mass)] = 1 / node_mass
+        return Parameters(node_mass, inverse, *rest, np.zeros(handles), np.zeros((handles, 3)))
+
+    def _read_rates(self, parameters: Parameters, properties: Sequence[Floats]) -> Parameters:
+        """The same with a leading axis K."""
+        node_mass, *rest = (np.ascontiguousarray(one.reshape(len(one), -1)) for one in properties)
+        handles = len(self.held.node)
+        inverse = np.zeros((len(node_mass), self.system.point_count))
+        inverse[:, : node_mass.shape[1]] = -node_mass / parameters.node_mass**2
+        return Parameters(
+            node_mass, inverse, *rest, np.zeros((len(node_mass), handles)), np.zeros((len(node_mass), handles, 3))
+        )
+
+    # --- running -----------------------------------------------------------------------------------------------------
+
+    def _run(self, job: Callable[[int], None], count: int) -> None:
+        def look() -> None:
+            if self._progress is not None:
+                self._progress(int(self._control[:, 0].sum()) // count)
+
+        def stop() -> None:
+            self._control[:, 1] = 1
+
+        run_all([lambda entry=entry: job(entry) for entry in range(count)], look=look, stop=stop)  # type: ignore[misc]
+
+    # --- what became of them -----------------------------------------------------------------------------------------
+
+    def _failed(self, entry: int, end: int, step: int, kept: Any) -> DivergedError:
+        match end:
+            case status.NOT_POSITIVE_DEFINITE:
+                return DivergedError(step + 1, [entry], "the step matrix is not positive definite")
+            case status.UNRESOLVED:
+                kind, *points = kept.impacts.met[kept.impacts.used[0] - 1].tolist()
+                name = "edge-edge" if kind else "point-face"
+                return UnresolvedContactError(step + 1, [entry], f"the {name} pair of points {points}", PASSES)
+            case status.STUCK:
+                return DivergedError(step + 1, [entry], self._stuck(entry))
+        return DivergedError(step + 1, [entry], "positions are not finite")
+
+    def _stuck(self, entry: int) -> str:
+        change, kind, *points = self._fault[entry].tolist()
+        name = ("point-face", "edge-edge", "point-plane")[int(kind)] if kind >= 0 else "no"
+        closest = f"{name} pair of points {[int(point) for point in points if point >= 0]}"
+        parameters = self._parameters[entry]
+        return (
+            f"the implicit step did not converge (relative change {change:.1e}; closest: {closest}); sub-steps did not help "
+            f"(mean stretching multiplier {parameters.stretching.mean():.3g}, mean node mass "
+            f"{parameters.node_mass.mean():.3g} kg). Try a smaller time step, a thicker or stiffer contact, or slower handles"
+        )
+
+    def _course(self, entry: int, last: int) -> Course:
+        """The motion up to a step, for `implausible`."""
+        system, schedule = self.system, self.schedule
+        translation = schedule.translation[:last] + self.held.tracked[:, None] * self._track[entry, :last, None]
+        targets = translation + np.einsum("shij,hj->shi", schedule.linear[:last], self._anchors[entry])
+        moving = self._scenery[: last + 1, len(self._scenery[0]) - system.moving_points :]
+        centres = self.poses[entry, : last + 1, :, :3]
+        return Course(
+            positions=self.positions[entry, : last + 1],
+            time_step=system.time_step,
+            mass=self._parameters[entry].node_mass,
+            size=system.mesh.size,
+            places=np.concatenate([self.positions[entry, :1][:, self.held.node], targets]),
+            held=schedule.active[:last],
+            gravity=float(np.linalg.norm(system.setup.surrounding.gravity)),
+            wind=float(np.linalg.norm(system.setup.surrounding.wind)),
+            velocities=self.velocities[entry, 0],
+            others=np.concatenate([moving, centres], axis=1),
+        )
+
+    def _stored(self, entry: int, step: int) -> float:
+        """Elastic energy [J]."""
+        nodes = self.positions[entry, step]
+        rest, energy = np.zeros_like(nodes), np.zeros(1)
+        motion = Motion(nodes, rest, rest, rest)
+        kernels.energy(self.system.scene.terms, self._parameters[entry], motion, Timing(self.system.time_step, 0.0), energy)
+        return float(energy[0])
+
+
+def _scenery(system: System) -> Scenery:
+    around = system.setup.surrounding
+    static = [obstacle for obstacle in around.obstacles if obstacle.plane() is None]
+    return Scenery.build(static, around.moving)
+
+
+def _held(system: System, schedule: HandleSchedule) -> Held:
+    """The schedule for kernels."""
+    steps, count = schedule.strength.shape
+    inverse: NDArray[np.float64] = np.zeros((count, 3, 3))
+    for h, first in enumerate(schedule.first_step):
+        if first < steps:
+            inverse[h] = np.linalg.inv(schedule.linear[first, h])
+    return Held(
+        node=np.array(system.handles.nodes, dtype=np.int64),
+        hard=system.handles.hard,
+        stiffness=float(system.handles.stiffness),
+        strength=np.ascontiguousarray(schedule.strength),
+        linear=np.ascontiguousarray(schedule.linear),
+        translation=np.ascontiguousarray(schedule.translation),
+        first_step=schedule.first_step.astype(np.int64),
+        inverse=inverse,
+        tracked=schedule.tracked.astype(np.int64),
+    )

@@ -1,0 +1,202 @@
+"""Gradients of an episode of linearised steps, from its end to its start: one solve per step, with the factor of the step.
+
+For a step's equation r(u, p) = 0 and the gradient g by u, the matrix A y = g gives the gradient -yᵀ ∂r/∂p by all that the
+equation reads.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
+from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.sparse import cholesky, solve
+from diffcloud.sim.held import Held, aim, aim_reverse, first_anchors, holders, take_anchors, take_anchors_reverse
+from diffcloud.sim.linearised.matrix import linear_system, pattern_with, repelling
+from diffcloud.sim.linearised.record import Kept
+from diffcloud.sim.linearised.scene import Scene
+from diffcloud.sim.linearised.step import displace, mobility, project, still, with_obstacles
+from diffcloud.sim.reference.impact_derivatives import resolve_reverse
+from diffcloud.sim.terms import kernels
+
+_reverse = kernels.reverse
+_point_face_reverse = kernels.proximity_point_face_reverse
+_edge_edge_reverse = kernels.proximity_edge_edge_reverse
+
+
+@kernel
+def reverse(
+    scene: Scene,
+    held: Held,
+    parameters: Parameters,
+    track: Floats,
+    positions: Floats,
+    velocities: Floats,
+    kept: Kept,
+    position_gradients: Floats,
+    velocity_gradients: Floats,
+    gradients: Parameters,
+    track_gradients: Floats,
+) -> None:
+    """Sweep the steps of an episode backwards.
+
+    Args:
+        positions, velocities: [S + 1, V, 3] as `simulate` found them.
+        position_gradients, velocity_gradients: [S + 1, V, 3] of a loss by each; the first rows take those by the start.
+        gradients: zeros; takes the sums over all steps.
+        track_gradients: [S, 3] zeros; takes those by the gripper's track.
+    """
+    dt = scene.time_step
+    steps, nodes = len(positions) - 1, positions.shape[1]
+    motion, slopes = still(scene, nodes), still(scene, nodes)
+    points = len(motion.positions)
+    anchors = first_anchors(held, positions[0])
+    for step in range(steps):
+        take_anchors(held, track, step, positions[step], anchors)
+    anchor_gradient, start_gradient = np.zeros(anchors.shape), np.zeros((points, 3))
+    places, adjoint = np.zeros((points, 3)), np.zeros((points, 3))
+    right, mass_gradient = np.empty((nodes, 3)), np.zeros(points)
+    for step in range(steps - 1, -1, -1):
+        aim(held, track, step, anchors, parameters)
+        holder = holders(held, step, nodes)
+        restore(scene, parameters, positions[step], velocities[step], kept.solved[step], motion)
+        x, v = position_gradients[step], velocity_gradients[step]
+        after = velocity_gradients[step + 1]  # by the velocities at the end, then by those before contact
+        start_gradient[:] = 0.0
+        for i in range(nodes):
+            for axis in range(3):
+                places[i, axis] = position_gradients[step + 1, i, axis] + after[i, axis] / dt
+        candidate, above = candidates(scene, motion)
+        if scene.collides and kept.begins[step + 1, 2] > kept.begins[step, 2]:
+            mobile = mobility(scene, parameters, holder)
+            mass_gradient[:] = 0.0
+            resolve_reverse(
+                scene.projection,
+                kept.impacts,
+                kept.begins[step],
+                kept.begins[step + 1],
+                motion.positions,
+                candidate,
+                mobile,
+                places,
+                start_gradient,
+                mass_gradient,
+            )
+            for i in range(nodes):
+                if holder[i] < 0:
+                    gradients.inverse_mass[i] += mass_gradient[i]
+        project_reverse(scene, above, places)
+        for i in range(nodes):
+            for axis in range(3):
+                slope = places[i, axis] - after[i, axis] / dt
+                x[i, axis] += slope + start_gradient[i, axis]
+                after[i, axis] += dt * slope
+        corners = kept.corners[kept.begins[step, 0] : kept.begins[step + 1, 0]]
+        constants = kept.constants[kept.begins[step, 0] : kept.begins[step + 1, 0]]
+        pattern, factor = factor_of(scene, parameters, motion, holder, kept, step, corners, constants)
+        for i in range(nodes):
+            for axis in range(3):
+                right[i, axis] = 0.0 if holder[i] >= 0 else after[i, axis]
+        solve(pattern, factor, right, adjoint)
+        for i in range(nodes):
+            for axis in range(3):
+                change = kept.solved[step, i, axis] - velocities[step, i, axis]
+                if holder[i] < 0:
+                    gradients.node_mass[i] -= adjoint[i, axis] * change
+                adjoint[i, axis] = 0.0 if holder[i] >= 0 else dt * adjoint[i, axis]
+        clear(slopes)
+        timing = Timing(dt, dt)
+        gradients.target[:] = 0.0
+        _reverse(scene.terms, parameters, motion, timing, adjoint, gradients, slopes)
+        if len(corners) > 0:
+            point_face, edge_edge = repelling(scene, pattern, corners, constants)
+            _point_face_reverse(point_face, parameters, motion, timing, adjoint, gradients, slopes)
+            _edge_edge_reverse(edge_edge, parameters, motion, timing, adjoint, gradients, slopes)
+        reach = dt + parameters.damping[0]
+        for i in range(nodes):
+            for axis in range(3):
+                gradients.damping[0] += slopes.displacement[i, axis] * motion.after[i, axis]
+                slope = after[i, axis] + slopes.after[i, axis] + reach * slopes.displacement[i, axis]
+                x[i, axis] += slopes.positions[i, axis]
+                v[i, axis] += slopes.before[i, axis]
+                if holder[i] < 0:
+                    v[i, axis] += slope
+                else:  # its velocity is (x* - x₀)/Δt
+                    gradients.target[holder[i], axis] += slope / dt
+                    x[i, axis] -= slope / dt
+        aim_reverse(held, step, gradients.target, anchor_gradient, track_gradients)
+        take_anchors_reverse(held, step, anchor_gradient, x, track_gradients)
+    for h in range(len(held.node)):  # those that no step took
+        for axis in range(3):
+            position_gradients[0, held.node[h], axis] += anchor_gradient[h, axis]
+    for i in range(nodes):
+        gradients.node_mass[i] -= parameters.inverse_mass[i] ** 2 * gradients.inverse_mass[i]
+
+
+@kernel
+def restore(
+    scene: Scene, parameters: Parameters, positions: Floats, velocities: Floats, solved: Floats, motion: Motion
+) -> None:
+    """The motion at a step's solution."""
+    nodes = len(positions)
+    motion.positions[:nodes] = positions
+    motion.before[:nodes] = velocities
+    motion.after[:nodes] = solved
+    displace(scene, parameters, nodes, motion)
+
+
+@kernel
+def candidates(scene: Scene, motion: Motion):  # type: ignore[no-untyped-def]
+    """([N, 3] points before the impacts of a step, [P, V] whether each plane left each node where it was)."""
+    nodes = len(scene.pattern.place)
+    cloth = np.empty((nodes, 3))
+    for i in range(nodes):
+        for axis in range(3):
+            cloth[i, axis] = motion.positions[i, axis] + scene.time_step * motion.after[i, axis]
+    points = with_obstacles(scene, cloth)
+    above = np.ones((len(scene.plane_offsets), nodes), np.bool_)
+    project(scene, points, above)
+    return points, above
+
+
+@kernel
+def project_reverse(scene: Scene, above, places: Floats) -> None:  # type: ignore[no-untyped-def]
+    """What planes stop does not move along their normals."""
+    for p in range(len(above) - 1, -1, -1):
+        normal = scene.plane_normals[p]
+        for i in range(above.shape[1]):
+            if not above[p, i]:
+                along = normal[0] * places[i, 0] + normal[1] * places[i, 1] + normal[2] * places[i, 2]
+                for axis in range(3):
+                    places[i, axis] -= along * normal[axis]
+
+
+@kernel
+def factor_of(  # type: ignore[no-untyped-def]
+    scene: Scene,
+    parameters: Parameters,
+    motion: Motion,
+    holder: Ints,
+    kept: Kept,
+    step: int,
+    corners: Ints,
+    constants: Floats,
+):
+    """(pattern, factor) of a step: as it was kept, or made again."""
+    pattern, moved = pattern_with(scene.pattern, corners)
+    begin, end = kept.begins[step, 4], kept.begins[step + 1, 4]
+    if end > begin:
+        return pattern, kept.factors[begin:end]
+    force = np.zeros((len(motion.positions), 3))
+    matrix = linear_system(scene, parameters, motion, holder, corners, constants, pattern, moved, force)
+    factor = np.empty((len(pattern.factor_rows), 9))
+    cholesky(pattern, matrix, factor)
+    return pattern, factor
+
+
+@kernel
+def clear(motion: Motion) -> None:
+    motion.positions[:] = 0.0
+    motion.before[:] = 0.0
+    motion.after[:] = 0.0
+    motion.displacement[:] = 0.0

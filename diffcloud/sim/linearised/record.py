@@ -1,0 +1,70 @@
+"""What an episode of linearised steps keeps for its derivatives."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from diffcloud.sim.compiled.data import Floats, Ints
+from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.pool import with_room
+from diffcloud.sim.reference.impact_zones import Impacts, no_impacts
+
+
+class Kept(NamedTuple):
+    """What an episode's derivatives need of each step."""
+
+    solved: Floats
+    """[S, V, 3] velocities after the linear system, before contact [m/s]."""
+    begins: Ints
+    """[S + 1, 5] the first row of each step in `corners`, `impacts.met`, `impacts.passes`, `impacts.forces`, `factors`; -1
+    where the factor is to be made again."""
+    corners: Ints
+    """[., 5] kind and points of the pairs that repel."""
+    constants: Floats
+    """[., 4] sign, count, stiffness and whether an obstacle takes part."""
+    impacts: Impacts
+    factors: Floats
+    """[., 9]"""
+
+
+@kernel
+def nothing_kept(steps: int, nodes: int) -> Kept:
+    """An empty record."""
+    corners, constants, factors = np.empty((16, 5), np.int64), np.empty((16, 4)), np.empty((16, 9))
+    begins = np.zeros((steps + 1, 5), np.int64)
+    return Kept(np.empty((steps, nodes, 3)), begins, corners, constants, no_impacts(), factors)
+
+
+@kernel
+def remember(kept: Kept, step: int, solved: Floats, corners: Ints, constants: Floats, factor: Floats, limit: int) -> Kept:
+    """What a step adds to the record, but for its impacts."""
+    kept.solved[step] = solved
+    begins = kept.begins
+    pairs, rows = begins[step, 0], begins[step, 4]
+    more = with_room(kept.corners, pairs, len(corners))
+    numbers = with_room(kept.constants, pairs, len(corners))
+    more[pairs : pairs + len(corners)] = corners
+    numbers[pairs : pairs + len(corners)] = constants
+    begins[step + 1, 0] = pairs + len(corners)
+    factors = kept.factors
+    if rows + len(factor) <= limit:
+        factors = with_room(factors, rows, len(factor))
+        factors[rows : rows + len(factor)] = factor
+        begins[step + 1, 4] = rows + len(factor)
+    else:
+        begins[step + 1, 4] = rows
+    return Kept(kept.solved, begins, more, numbers, kept.impacts, factors)
+
+
+@kernel
+def with_impacts(kept: Kept, impacts: Impacts, step: int, keep: int) -> Kept:
+    """The record with the impacts of a step; without derivatives its room is used again."""
+    if keep >= 0:
+        for k in range(3):
+            kept.begins[step + 1, 1 + k] = impacts.used[k]
+    else:
+        for k in range(3):
+            impacts.used[k] = 0
+    return Kept(kept.solved, kept.begins, kept.corners, kept.constants, impacts, kept.factors)
