@@ -61,7 +61,7 @@ def acceptance(
     else:
         write_text(out / "trajectories.md", _trajectories(release, reference))
     write_text(out / "simulated_clouds.md", _simulated_clouds(release))
-    timings = run_benchmarks({name: _scene(release, name) for name in SCENES}, repeats=3, device="cpu")
+    timings = run_benchmarks({name: _scene(release, name) for name in SCENES}, repeats=3)
     costs = contact_benchmarks(repeats=2)
     write_text(out / "speed.md", _speed(timings, costs))
     write_bytes(out / CONTACT_FIGURE, contact_figure(costs))
@@ -183,12 +183,12 @@ def _simulated_clouds(release: Path) -> str:
             torch.as_tensor(system.mesh.faces),
             scenario.points,
             generator=torch.Generator().manual_seed(0),
-            dtype=system.dtype,
+            dtype=torch.float64,
         )
         with torch.no_grad():
             points = sampler.sample(rollout(system, steps, properties=scenario.properties(system, tensors)).positions)
             clouds = [
-                NeighbourIndex(torch.as_tensor(episode.frame(frame), dtype=system.dtype)) for frame in range(steps + 1)
+                NeighbourIndex(torch.as_tensor(episode.frame(frame), dtype=torch.float64)) for frame in range(steps + 1)
             ]
             losses = [float(one_sided_chamfer(points[:, frame], cloud)) for frame, cloud in enumerate(clouds)]
         loss = losses[scenario.loss_frames[0]]

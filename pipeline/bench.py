@@ -8,13 +8,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 import typer
 from rich.table import Table
 
 from diffcloud.fit.benchmark import time_contact, time_episode
 from diffcloud.scene.scenarios import GridScenario, Scenario, built_in, grid_scenario
-from pipeline.console import JsonFlag, finish, progress_bar, show
+from diffcloud.sim.threads import thread_count, use_threads
+from pipeline.console import JsonFlag, Threads, finish, progress_bar, show
 from pipeline.scenario_options import SceneFile, choose_scenario
 
 _BATCHES = (1, 16, 64)
@@ -28,22 +28,23 @@ def bench(
     scene: SceneFile = None,
     repeats: Annotated[int, typer.Option(min=1, help="The fastest of these counts.")] = 3,
     contact: Annotated[bool, typer.Option(help="What contacts cost instead: finer and finer cloths on a sphere.")] = False,
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
     """Time lift episodes; with --scene the published lift too (25 steps)."""
+    use_threads(threads)
     if contact:
         costs = contact_benchmarks(repeats=repeats)
         show(contact_table(costs), json)
-        finish({"threads": torch.get_num_threads(), "timings": costs}, json)
+        finish({"threads": thread_count(), "timings": costs}, json)
         return
     published = {} if scene is None else {"release_lift": scene}
-    timings = run_benchmarks(published, repeats=repeats, device=device)
+    timings = run_benchmarks(published, repeats=repeats)
     show(benchmark_table(timings), json)
-    finish({"threads": torch.get_num_threads(), "device": device, "timings": timings}, json)
+    finish({"threads": thread_count(), "timings": timings}, json)
 
 
-def run_benchmarks(published: Mapping[str, Path], *, repeats: int, device: str) -> list[dict[str, Any]]:
+def run_benchmarks(published: Mapping[str, Path], *, repeats: int) -> list[dict[str, Any]]:
     """All timings in one run; machines are noisy, so compare within it.
 
     Args:
@@ -61,9 +62,7 @@ def run_benchmarks(published: Mapping[str, Path], *, repeats: int, device: str) 
     with progress_bar("bench", len(jobs)) as update:
         for index, (name, scenario, batch) in enumerate(jobs):
             update(index, f"{name}, batch {batch}")
-            timings.append(
-                {"scenario": name, **asdict(time_episode(scenario, batch=batch, repeats=repeats, device=device))}
-            )
+            timings.append({"scenario": name, **asdict(time_episode(scenario, batch=batch, repeats=repeats))})
     return timings
 
 

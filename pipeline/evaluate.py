@@ -22,9 +22,10 @@ from diffcloud.fit.parameters import NUISANCE
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import claimed, files_in, together, write_json, write_text
 from diffcloud.sim.properties import check_values
+from diffcloud.sim.threads import use_threads
 from pipeline.comparison import Comparison, compare, comparison_jobs, write_tables
 from pipeline.config import Config, load_config
-from pipeline.console import JsonFlag, ParamsFile, assignments, errors, finish, output, show
+from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, errors, finish, output, show
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 
 app = typer.Typer(help="Measure parameters, and compare methods.")
@@ -43,15 +44,17 @@ def loss(
     points: Annotated[int | None, typer.Option(help="Sampled per frame.")] = None,
     frame: Annotated[list[int] | None, typer.Option(help="Loss frame, repeatable.")] = None,
     seed: Annotated[int, typer.Option(help="Of the sampled points; fits use 0.")] = 0,
+    threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
     """One-sided Chamfer loss of one parameter set on one episode, with the metric and points that a fit uses."""
+    use_threads(threads)
     chosen = choose_scenario(scenario, scene)
     objective = Objective(chosen, [read_episode(episode)], points=points, frames=frame, seed=seed)
     values = assignments(set_, "--set")
     check_values({name: value for name, value in values.items() if name not in NUISANCE}, "--set")
     chosen.check_parameters(values)
-    tensors = {name: torch.tensor([value], dtype=objective.system.dtype) for name, value in values.items()}
+    tensors = {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
     nuisance = {name: tensors.pop(name) for name in list(tensors) if name in NUISANCE}
     with torch.no_grad():
         found = float(objective(tensors, nuisance)[0])
@@ -75,9 +78,11 @@ def evaluate(
     markdown: MarkdownFile = None,
     allow_missing: AllowMissing = False,
     params: ParamsFile = None,
+    threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
     """Compare all methods on all episodes: metrics.json, timings.json, and tables. Ctrl-C keeps finished episodes."""
+    use_threads(threads)
     if context.invoked_subcommand is not None:
         return
     config = load_config(params)

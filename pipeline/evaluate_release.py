@@ -13,10 +13,11 @@ from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.files import read_json
 from diffcloud.io.imports import release_episodes
 from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.threads import use_threads
 from pipeline.acceptance import SCENES
 from pipeline.comparison import compare, comparison_jobs
 from pipeline.config import Config, load_config, updated
-from pipeline.console import JsonFlag, errors, finish, writes
+from pipeline.console import JsonFlag, Threads, errors, finish, writes
 from pipeline.evaluate import AllowMissing, MarkdownFile, stop_if_missing, write_evaluation
 from pipeline.fit import FitJob
 from pipeline.report import report
@@ -39,9 +40,11 @@ def release(
     only: Annotated[str, typer.Option(help="Pattern of <scenario>/<episode>, such as 'release_lift/*'.")] = "*",
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; the profile says how many if not given.")] = None,
     allow_missing: AllowMissing = False,
+    threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
     """Import, fit, compare and report every published episode. Ctrl-C keeps what is finished; the same command goes on."""
+    use_threads(threads)
     if not (folder / "conf").is_dir():
         raise ConfigError(f"{folder} has no conf/; give the folder with lift_real_pcls/ and conf/.")
     config = load_config(params)

@@ -20,8 +20,9 @@ from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
 from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.threads import use_threads
 from pipeline.config import FitConfig, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, assignments, episode_files, errors, finish, show, writes
+from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, episode_files, errors, finish, show, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 from pipeline.workers import Tell, check_interrupt, run_all
 
@@ -71,9 +72,11 @@ def fit(
     offset: Annotated[bool | None, typer.Option(help="Fit a rigid offset of the target along.")] = None,
     joint: Annotated[bool | None, typer.Option("--joint", help="One parameter set for all episodes.")] = None,
     workers: Annotated[int | None, typer.Option(help="Fits at once, each in a process with one thread.")] = None,
+    threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
     """Fit episodes. Ctrl-C writes the best so far and stops; the same command keeps what is finished and goes on."""
+    use_threads(threads)
     config = load_config(params)
     settings = updated(
         config.fit,

@@ -15,7 +15,8 @@ from rich.table import Table
 from diffcloud.errors import ConfigError
 from diffcloud.fit.agreement import NAMES, Agreement, gradient_agreement, random_parameters
 from diffcloud.io.files import write_text
-from pipeline.console import JsonFlag, finish, progress_bar, show, writes
+from diffcloud.sim.threads import use_threads
+from pipeline.console import JsonFlag, Threads, finish, progress_bar, show, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 
 _COLUMNS = [f"{kind}{name}" for kind in ("", "gradient_", "difference_") for name in NAMES]
@@ -29,10 +30,12 @@ def gradients(
     pairs: Annotated[int, typer.Option(min=1, help="Random (stretch, mass), uniform over their bounds.")] = 50,
     seed: Annotated[int, typer.Option(min=0, help="Of the pairs.")] = 0,
     out: Annotated[Path | None, typer.Option(help="CSV of all pairs; one that is there is gone on with.")] = None,
+    threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
     """Sign and size of d loss/d parameter against the central difference of ±1 %; the loss is the mean squared node
     distance at the loss frame to the run at (1, 1)."""
+    use_threads(threads)
     chosen = choose_scenario(scenario, scene)
     if implicit:
         chosen = replace(chosen, scene=chosen.scene.implicit())

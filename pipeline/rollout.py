@@ -50,7 +50,7 @@ def rollout(
     steps = frames * chosen.scene.frame_steps
     system, _ = chosen.scene.build()
     properties = chosen.properties(
-        system, {name: torch.tensor([value], dtype=system.dtype) for name, value in values.items()}
+        system, {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
     )
     track = None
     if episode is not None:

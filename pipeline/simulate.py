@@ -9,8 +9,9 @@ import typer
 from rich.table import Table
 
 from diffcloud.datasets import ParameterBox, ParameterDraws, SimulationPlan, simulate_set
+from diffcloud.sim.threads import use_threads
 from pipeline.config import load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, errors, finish, progress_bar, show, warn, writes
+from pipeline.console import JsonFlag, ParamsFile, Threads, errors, finish, progress_bar, show, warn, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 
 _INTERRUPTED = 130
@@ -27,10 +28,10 @@ def simulate(
     draws: Annotated[str | None, typer.Option(help="uniform, sobol, logarithmic, or modes (as published).")] = None,
     parameters: Annotated[str | None, typer.Option(help="Comma-separated, e.g. stretch,mass.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of the draws and of exported clouds.")] = None,
+    threads: Threads = None,
     workers: Annotated[
-        int | None,
-        typer.Option(min=0, help="Local processes; 0: in this one. Default: one a core for more than a few runs, else 0."),
-    ] = None,
+        int, typer.Option(min=0, help="Local processes with one thread each, instead of the threads of this one.")
+    ] = 0,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, e.g. tcp://host:8786.")] = None,
     export_clouds: Annotated[
         bool, typer.Option("--export-clouds", help="Write every cloud too, to OUT/clouds/<split>/<run>/<frame>.npy.")
@@ -38,6 +39,7 @@ def simulate(
     json: JsonFlag = False,
 ) -> None:
     """Simulate runs with drawn parameters. Ctrl-C keeps what is finished; the same call goes on from there."""
+    use_threads(threads)
     settings = updated(
         load_config(params).simulate,
         parameters=None if parameters is None else [name.strip() for name in parameters.split(",")],

@@ -19,6 +19,7 @@ from typing import Any, Protocol, TypeVar
 import torch
 
 from diffcloud.errors import DiffCloudError
+from diffcloud.sim.threads import use_threads
 from pipeline.console import progress_bar
 from pipeline.memory import keep_freed_memory
 
@@ -129,6 +130,7 @@ def _begin(stop: Event, patient: bool) -> None:
     _stop = stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
+    use_threads(1)
     keep_freed_memory()
     if not patient:
         threading.Thread(target=_end_at, args=(stop,), daemon=True).start()

@@ -73,15 +73,6 @@ def simulate_chunk(scenario: Scenario, draws: ParameterDraws, chunk: Chunk) -> S
     Raises:
         DatasetError: a run diverged with 20 draws.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        return _simulate(scenario, draws, chunk)
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _simulate(scenario: Scenario, draws: ParameterDraws, chunk: Chunk) -> SimulatedChunk:
     parameters = chunk.parameters.copy()
     nodes = np.empty((len(parameters), scenario.frames + 1, len(scenario.scene.mesh.nodes), 3), dtype=np.float32)
     missing, replaced = np.arange(len(parameters)), list[Replaced]()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,9 +23,8 @@ from diffcloud.errors import ConfigError, DatasetError, DiffCloudError
 from diffcloud.io.files import atomic, write_json
 from diffcloud.io.simulated import SimulatedSet, Split, write_simulated
 from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.threads import use_threads
 
-_WORTH_PROCESSES = 8
-"""Chunks from which on several processes save more than the seconds it takes to start them."""
 _WORKER_MEMORY = {
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": str(1 << 30),
     "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": str(1 << 25),
@@ -71,7 +69,7 @@ def simulate_set(
     plan: SimulationPlan,
     out: Path,
     *,
-    workers: int | None = None,
+    workers: int = 0,
     scheduler: str | None = None,
     clouds: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -81,7 +79,7 @@ def simulate_set(
     Finished chunks are kept in `<out>.partial` and used by the next call with the same plan.
 
     Args:
-        workers: local processes; 0: in this one. None: one a core where that is worth starting them, else 0.
+        workers: local processes with a thread each; 0: the threads of this one.
         scheduler: address of a Dask scheduler, whose workers have this version of the package; instead of `workers`.
         clouds: points of each exported cloud; None: none are exported.
         progress: called with the number of finished runs.
@@ -98,9 +96,6 @@ def simulate_set(
     finished = resumed = sum(len(chunk.parameters) for chunk in chunks) - sum(len(c.parameters) for c in missing)
     if progress is not None:
         progress(finished)
-    if workers is None:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        workers = cores if cores > 1 and len(missing) >= _WORTH_PROCESSES else 0
     for chunk, result in _simulated(plan, missing, workers, scheduler):
         work.write(chunk, result)
         finished += len(chunk.parameters)
@@ -195,6 +190,7 @@ def _workers_lost(error: Exception) -> DatasetError:
 def _ignore_ctrl_c() -> None:
     """In a worker process: the terminal sends Ctrl-C to it too, but the process that started it tells it to stop."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    use_threads(1)
 
 
 def _write(

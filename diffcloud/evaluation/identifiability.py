@@ -182,7 +182,7 @@ class _Probe:
 
     def losses(self, places: NDArray[np.float64], *, first: int = 0, draws: int | None = None) -> NDArray[np.float64]:
         """[draws, B] at coordinates [B, k]; infinite where the simulation diverges. `first`: draw to begin with."""
-        values = torch.as_tensor(self._coordinates.values(places)).to(self._objective.system.gravity)
+        values = torch.as_tensor(self._coordinates.values(places)).double()
         return self.losses_of(*self.space.split(values), first=first, draws=draws)
 
     def losses_of(
@@ -213,7 +213,7 @@ class _Probe:
 
     def distances(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
         """[B, N] distance of every sampled point to its nearest recorded one, of all frames and draws."""
-        values = torch.as_tensor(self._coordinates.values(places)).to(self._objective.system.gravity)
+        values = torch.as_tensor(self._coordinates.values(places)).double()
         found = []
         with torch.no_grad():
             parameters, offset = self.space.split(values)
@@ -388,7 +388,7 @@ def _scale(
     scaled = (("stretch", "mass"), ("stretch", "mass", "bending"), ("stretch", "bending", "drag", "density", "body_mass"))
     base = dict.fromkeys(scaled[1] + scaled[2], 1.0) | dict(values) | dict(space.fixed)
     sets = [base] + [base | {name: factor * base[name] for name in group} for group in scaled for factor in (0.5, 2.0)]
-    tensors = {name: objective.system.gravity.new_tensor([one[name] for one in sets]) for name in base}
+    tensors = {name: torch.tensor([one[name] for one in sets], dtype=torch.float64) for name in base}
     offset = {name: tensors.pop(name) for name in NUISANCE if name in tensors}
     losses = probe.losses_of(tensors, offset).mean(axis=0)
     change = np.abs(losses[1:] - losses[0]).reshape(3, 2).max(axis=1) / max(noise, 1e-300)

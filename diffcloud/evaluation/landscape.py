@@ -33,7 +33,7 @@ def loss_landscape(
     x, y = np.meshgrid(*axes)
     places = np.tile([values[name] for name in space.names], (size * size, 1))
     places[:, 0], places[:, 1] = x.ravel(), y.ravel()
-    losses = batch_losses(objective, space, torch.as_tensor(places).to(objective.system.gravity)).reshape(size, size)
+    losses = batch_losses(objective, space, torch.as_tensor(places).double()).reshape(size, size)
     columns = [list(history["names"]).index(variable.name) for variable in (first, second)]
     paths = np.array(history["values"], dtype=np.float64)[:, :, columns]  # [N, B, 2]; None is NaN
     return {

@@ -198,7 +198,7 @@ class _Search:
         """Losses of places [b, k] in the unit box, of the first ones if the budget ends within them."""
         places = torch.as_tensor(fractions[: self.left], dtype=torch.float64).clamp(_EDGE, 1 - _EDGE)
         logarithmic = torch.ones(len(places), dtype=torch.bool)
-        values = self._space.values(torch.logit(places), logarithmic).to(self._objective.system.gravity)
+        values = self._space.values(torch.logit(places), logarithmic).double()
         losses = batch_losses(self._objective, self._space, values)
         self._spent += len(places)
         lowest = int(losses.argmin())

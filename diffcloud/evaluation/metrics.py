@@ -82,9 +82,9 @@ class EpisodeMeter:
         return Measured(rows, diverged)
 
     def _distances(self, sets: Sequence[Mapping[str, float]]) -> list[dict[str, Any]]:
-        own, like = self._own, self._own.system.gravity
+        own = self._own
         names = dict.fromkeys(name for values in sets for name in values)
-        tensors = {name: like.new_tensor([values.get(name, 0.0) for values in sets]) for name in names}
+        tensors = {name: torch.tensor([values.get(name, 0.0) for values in sets], dtype=torch.float64) for name in names}
         offset = {name: tensors.pop(name) for name in names if name in NUISANCE}
         run = own.simulate(tensors)
         own.reseed(self._seeds[0])

@@ -14,6 +14,7 @@ from diffcloud.sim.build import build_system
 from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import preset
 from diffcloud.sim.properties import scaled_properties
+from diffcloud.sim.reference.nearest import nearest_pairs
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
 from diffcloud.sim.system import System
@@ -30,16 +31,16 @@ class Timing:
     forward_backward: float
 
 
-def time_episode(scenario: Scenario, *, batch: int, repeats: int = 3, device: str = "cpu") -> Timing:
+def time_episode(scenario: Scenario, *, batch: int, repeats: int = 3) -> Timing:
     """Time rollouts of a scenario with gradients of stretch and mass.
 
     The loss is the mean square of the last positions: the cost of the simulation alone.
     """
-    system, _ = scenario.scene.build(device=device)
+    system, _ = scenario.scene.build()
 
     def once(backward: bool) -> float:
         values = {
-            name: torch.linspace(0.5, 2.0, batch, dtype=system.dtype, device=device).requires_grad_(backward)
+            name: torch.linspace(0.5, 2.0, batch, dtype=torch.float64).requires_grad_(backward)
             for name in ("stretch", "mass")
         }
         begin = time.perf_counter()
@@ -48,7 +49,6 @@ def time_episode(scenario: Scenario, *, batch: int, repeats: int = 3, device: st
             loss = run.positions[:, -1].square().mean()
         if backward:
             loss.backward()
-        float(loss.detach())  # waits for a GPU
         return time.perf_counter() - begin
 
     once(True)
@@ -95,17 +95,18 @@ def time_contact(side: int, *, steps: int = 25, repeats: int = 3) -> ContactTimi
     free = build(Surrounding())
 
     def once(system: System) -> float:
-        values = {name: torch.ones(1, dtype=system.dtype, requires_grad=True) for name in ("stretch", "mass")}
+        values = {name: torch.ones(1, dtype=torch.float64, requires_grad=True) for name in ("stretch", "mass")}
         begin = time.perf_counter()
         properties = scaled_properties(system.properties, values, faces=torch.as_tensor(system.mesh.faces))
         rollout(system, steps, properties=properties).positions[:, -1].square().mean().backward()
         return time.perf_counter() - begin
 
     with torch.no_grad():
-        positions = rollout(touching, steps).positions[0]
-    assert touching.contact is not None
-    near = touching.contact.near(positions)  # all steps as a batch
-    contacts = 0 if near is None else len(near.pairs)
+        positions = rollout(touching, steps).positions[0].numpy()
+    scene = touching.scene
+    contacts = sum(
+        len(nearest_pairs(scene.surface, scene.repulsion, np.concatenate([one, scene.obstacles]))[0]) for one in positions
+    )
     return ContactTiming(
         nodes=len(mesh.nodes),
         steps=steps,

@@ -155,9 +155,7 @@ class Objective:
                 dtype=torch.float64,
             )[None]
         centre = torch.cat([cloud.points for cloud in clouds]).mean(0)
-        return _Target(
-            torch.as_tensor(np.array(times), dtype=torch.float64), tuple(clouds), centre, track
-        )
+        return _Target(torch.as_tensor(np.array(times), dtype=torch.float64), tuple(clouds), centre, track)
 
 
 def track_displacement(episode: Episode, steps: int, time_step: float) -> np.ndarray:

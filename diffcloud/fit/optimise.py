@@ -119,13 +119,12 @@ def fit_adam(
         KeyboardInterrupt: interrupted before the first loss.
     """
     began = time.perf_counter()
-    device, dtype = objective.system.device, objective.system.dtype
     start_values, logarithmic, evaluations = _starts(objective, space, settings)
     iterates = [row.clone().requires_grad_(True) for row in space.unbounded(start_values, logarithmic)]
     optimiser = torch.optim.Adam([{"params": [row]} for row in iterates], lr=settings.learning_rate)
     patience = _Patience(settings)
     generator = torch.Generator().manual_seed(settings.seed)
-    alive = torch.ones(settings.starts, dtype=torch.bool, device=device)
+    alive = torch.ones(settings.starts, dtype=torch.bool)
     history = FitHistory(space.names)
     failures: list[str] = []
     best = _Best(math.inf, 0, start_values[0])
@@ -148,7 +147,7 @@ def fit_adam(
                     (share * found).sum().backward()
                     break
                 except DivergedError as error:
-                    lost = torch.zeros(len(owner), dtype=torch.bool, device=device)
+                    lost = torch.zeros(len(owner), dtype=torch.bool)
                     lost[error.entries] = True
                     for entry in (lost & (noise == 0).all(-1)).nonzero().flatten().tolist():
                         alive[owner[entry]] = False  # the start itself; a lost copy costs only this iteration's share
@@ -159,7 +158,7 @@ def fit_adam(
                     owner, noise = owner[~lost], noise[~lost]
             found, values = found.detach(), values.detach()
             unperturbed = (noise == 0).all(-1)
-            losses = torch.full((settings.starts,), math.inf, dtype=dtype, device=device)
+            losses = torch.full((settings.starts,), math.inf, dtype=torch.float64)
             losses[owner[unperturbed]] = found[unperturbed]
             centre = torch.full_like(start_values, float("nan"))
             centre[owner[unperturbed]] = values[unperturbed]
@@ -242,11 +241,10 @@ class _Patience:
 
 def _starts(objective: Objective, space: FitSpace, settings: AdamSettings) -> tuple[Tensor, Tensor, int]:
     """Initial values [B, k], which scale each uses [B], and how many simulations it took to choose them."""
-    system = objective.system
     screened = settings.starts > 1 and settings.screen >= settings.starts
     count = 1 + settings.screen if screened else settings.starts
     values, logarithmic = space.starts(count, seed=settings.seed, first=settings.init)
-    values, logarithmic = values.to(system.device, system.dtype), logarithmic.to(system.device)
+    values = values.double()
     if not screened:
         return values, logarithmic, 0
     order = batch_losses(objective, space, values[1:]).argsort()[: settings.starts - 1] + 1

@@ -87,8 +87,7 @@ def describe_fit(
             entry["at_bound"] = bool(min(outcome.values[name] - low, high - outcome.values[name]) < 0.01 * (high - low))
 
     def batch(values: Mapping[str, float]) -> dict[str, torch.Tensor]:
-        like = objective.system.gravity
-        return {name: torch.tensor([value], dtype=like.dtype, device=like.device) for name, value in values.items()}
+        return {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
 
     def split(values: Mapping[str, float]) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
         tensors = batch(values)
