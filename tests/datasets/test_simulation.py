@@ -16,6 +16,7 @@ from diffcloud.errors import ConfigError, DatasetError, DivergedError
 from diffcloud.io.simulated import SimulatedSet
 from diffcloud.regressors.dataset import CloudDataset
 from diffcloud.sim.simulate import rollout
+from diffcloud.sim.threads import use_threads
 from tests.conftest import small_lift
 
 BOX = ParameterBox.build(["stretch", "mass"])
@@ -72,17 +73,16 @@ def test_a_chunk_keeps_no_derivatives(monkeypatch):
     assert runs[0].positions.grad_fn is None
 
 
-def test_threads_are_set_for_a_chunk_and_set_back(monkeypatch):
-    before, used = torch.get_num_threads(), []
-    monkeypatch.setattr(chunks, "rollout", lambda *a, **k: used.append(torch.get_num_threads()) or rollout(*a, **k))
-    torch.set_num_threads(2)
+def test_threads_change_no_bytes():
+    found, whole = [], plan()
+    chunk = chunks.chunks_of(whole.draws, "test", 3)[0]
     try:
-        whole = plan()
-        chunks.simulate_chunk(whole.scenario, whole.draws, chunks.chunks_of(whole.draws, "test", 3)[0])
-        assert torch.get_num_threads() == 2
+        for threads in (1, 2, 5):
+            use_threads(threads)
+            found.append(chunks.simulate_chunk(whole.scenario, whole.draws, chunk).nodes.tobytes())
     finally:
-        torch.set_num_threads(before)
-    assert used == [1]
+        use_threads(None)
+    assert len(set(found)) == 1
 
 
 def test_an_interrupted_set_ends_with_the_same_bytes_and_redoes_nothing(whole, tmp_path, monkeypatch):

@@ -77,17 +77,17 @@ def test_every_field_reaches_the_system(folder):
     assert float(system.properties.air_drag) == 0.1
     assert float(system.properties.friction_cloth) == 0.5
     assert float(system.properties.friction_obstacle) == 0.2
-    assert system.air.wind.tolist() == [1, 0, 0]
-    assert system.gravity.tolist() == [0, 0, -30]
+    assert (system.scene.terms.air.wind == [1, 0, 0]).all()
+    assert (system.scene.terms.gravity.gravity == [0, 0, -30]).all()
     assert system.handles.nodes == [0, 2, 8]
     assert system.handles.stiffness == 500
     assert system.handles.handles[2].start == 0.1
     assert system.handles.handles[2].fade == 0.2
-    assert system.halfspaces is None  # planes are met as meshes
-    assert system.contact is not None
+    assert system.scene.collides
+    assert not len(system.scene.plane_offsets)  # planes are met as meshes
     planes, _ = replace(scene, surrounding=replace(scene.surrounding, reference_contact=None)).build()
-    assert planes.halfspaces.offsets.tolist() == pytest.approx([-0.15])
-    assert planes.halfspaces.settings.projection_thickness == pytest.approx(5e-4)
+    assert planes.scene.plane_offsets.tolist() == pytest.approx([-0.15])
+    assert planes.scene.projection.thickness == pytest.approx(5e-4)
     assert float(system.properties.node_mass.sum()) == pytest.approx(0.6 * 0.16)
     linear, translation = system.handles.handles[2].motion.at(np.array([1.0]))
     assert translation.tolist() == [[0, 0, 1]]
@@ -104,7 +104,7 @@ def test_reloading_materials_keeps_multipliers_in_the_masses_only(folder):
 
 
 def assert_same(a, b, path="system"):
-    """Deep equality of dataclasses of tensors and arrays."""
+    """Deep equality of named tuples and dataclasses of tensors and arrays."""
     assert type(a) is type(b), path
     if isinstance(a, torch.Tensor):
         assert torch.equal(a, b), path
@@ -127,7 +127,10 @@ def assert_same(a, b, path="system"):
 def test_a_written_scene_loads_to_the_same_system(folder, tmp_path, source):
     scene = load_scene(write(folder, scene_data())) if source == "file" else load_scenario(source).scene
     again = load_scene(write_scene(scene, tmp_path / "written"))
-    assert_same(again.build()[0], scene.build()[0])
+    (first, _), (second, _) = again.build(), scene.build()
+    assert_same(first.scene, second.scene, "scene")
+    assert_same(first.properties, second.properties, "properties")
+    assert_same(first.handles, second.handles, "handles")
     assert (again.frame_time, again.frame_steps, again.end_time) == (scene.frame_time, scene.frame_steps, scene.end_time)
 
 
