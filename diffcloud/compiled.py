@@ -41,7 +41,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 def kernel_sources(package: Path = _PACKAGE) -> Iterator[Path]:
     """The files whose change compiles again: all of the simulator, which generates kernels, and others that hold some."""
     for source in sorted(package.rglob("*.py")):
-        if source.relative_to(package).parts[0] == "sim" or b"\n@kernel\n" in source.read_bytes():
+        if source.relative_to(package).parts[0] == "sim" or b"\n@kernel\n" in b"\n" + source.read_bytes():
             yield source
 
 

@@ -25,7 +25,7 @@ def _rotated(bits: int, by: int) -> int:
 
 
 def _curve_tables() -> tuple[Ints, Ints]:
-    """For each octant in each of S states: its place along the curve [8 S], and where the next state's octants begin [8 S]."""
+    """[8 S] of each octant in each of S states its place along the curve, and where the next state's octants begin."""
     gray = [i ^ i >> 1 for i in range(8)]
     entry = [0, 0, 0, 3, 3, 6, 6, 5]  # the corner at which the curve enters the w-th octant
     direction = [0, 1, 1, 2, 2, 1, 1, 0]  # the axis along which it crosses it

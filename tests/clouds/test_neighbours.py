@@ -15,8 +15,9 @@ SIZES = [1, 2, 7, 8, 9, 127, 128, 129, 700, 2200]  # around full leaves, groups,
 
 def brute_force(queries, targets):
     """[Q, 3], [P, 3] -> [Q] the lowest number of the nearest."""
-    squares = (queries[:, None] - targets) ** 2
-    return (squares[..., 0] + squares[..., 1] + squares[..., 2]).argmin(1)
+    with np.errstate(over="ignore"):
+        squares = (queries[:, None] - targets) ** 2
+        return (squares[..., 0] + squares[..., 1] + squares[..., 2]).argmin(1)
 
 
 def surface(rng, count):
