@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import llvmlite
 import numba
@@ -97,14 +97,15 @@ def kernel(function: F) -> F:
     """A function that numba compiles: of arrays, numbers and named tuples of them. It releases the interpreter's lock."""
     if UNCOMPILED:
         return function
-    given, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(cache_folder())  # of other people's functions, and of this
+    config: Any = numba.config
+    given, config.CACHE_DIR = config.CACHE_DIR, str(cache_folder())  # of other people's functions, and of this
     try:
-        return numba.njit(cache=True, nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+        return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
     finally:
-        numba.config.CACHE_DIR = given
+        config.CACHE_DIR = given
 
 
-class _Announcement(event.Listener):  # type: ignore[misc]
+class _Announcement(event.Listener):
     """Says once in a process that kernels are being compiled."""
 
     def __init__(self) -> None:

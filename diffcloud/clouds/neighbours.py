@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloud.clouds.curve import Floats, curve_order
-from diffcloud.clouds.tree import Tree, build_tree, find_nearest
 from diffcloud.errors import EpisodeError
+
+if TYPE_CHECKING:
+    from diffcloud.clouds.curve import Floats, Ints
+    from diffcloud.clouds.tree import Tree
 
 
 class NeighbourIndex:
@@ -32,7 +35,14 @@ class NeighbourIndex:
 
     @cached_property
     def _tree(self) -> Tree:
+        from diffcloud.clouds.tree import build_tree  # numba takes a moment to import, and not every command needs it
+
         return build_tree(_as_array(self.points))
+
+    def _find(self, queries: Floats, order: Ints) -> Tensor:
+        from diffcloud.clouds.tree import find_nearest
+
+        return torch.from_numpy(find_nearest(queries, order, self._tree))
 
     def nearest_index(self, queries: Tensor) -> Tensor:
         """[..., 3] -> [...] index of the nearest target point, the lowest of equally near ones.
@@ -40,9 +50,10 @@ class NeighbourIndex:
         Distances are computed in float64. A query that is NaN or infinite has no neighbour and gets index 0: its
         distance is NaN or infinite by itself.
         """
+        from diffcloud.clouds.curve import curve_order
+
         flat = _as_array(queries.reshape(-1, 3))
-        found = find_nearest(flat, curve_order(flat), self._tree)
-        return torch.from_numpy(found).to(queries.device).view(queries.shape[:-1])
+        return self._find(flat, curve_order(flat)).to(queries.device).view(queries.shape[:-1])
 
     def nearest(self, queries: Tensor) -> Tensor:
         """[..., 3] -> [..., 3]: the nearest target point of each query, in the queries' dtype."""
@@ -50,8 +61,8 @@ class NeighbourIndex:
 
     def nearest_to(self, other: NeighbourIndex) -> Tensor:
         """[P', 3] the nearest target point of each point of another cloud, whose own tree has them in order already."""
-        found = find_nearest(_as_array(other.points), other._tree.order, self._tree)
-        return self.points.to(other.points)[torch.from_numpy(found).to(other.points.device)]
+        found = self._find(_as_array(other.points), other._tree.order)
+        return self.points.to(other.points)[found.to(other.points.device)]
 
 
 def compile_neighbours() -> None:
