@@ -35,7 +35,7 @@ def lazy_group(places: dict[str, str]) -> type[TyperGroup]:
 
         def format_help(self, ctx: Any, formatter: Any) -> None:
             """As usual, but with names and first sentences alone for commands."""
-            self.get_command = lambda ctx, cmd_name: _summary(cmd_name, places[cmd_name])  # type: ignore[method-assign, assignment]
+            self.get_command = lambda ctx, cmd_name: _summary(cmd_name, places[cmd_name])  # type: ignore[method-assign]
             try:
                 super().format_help(ctx, formatter)
             finally:
