@@ -5,59 +5,54 @@ from __future__ import annotations
 import os
 import sys
 
-import torch
 import typer
 
 from diffcloud.errors import DiffCloudError
-from pipeline import acceptance, bench, evaluate, fit, importing, raw_episode, report, rollout
-from pipeline.calibrate import calibrate
-from pipeline.capture import record
 from pipeline.console import errors
-from pipeline.doctor import doctor
-from pipeline.episodes import episodes
-from pipeline.evaluate_release import release
-from pipeline.gradients import gradients
+from pipeline.lazy import lazy_group
 from pipeline.memory import keep_freed_memory
-from pipeline.predict import predict
-from pipeline.preprocess import preprocess
-from pipeline.recordings import recordings
-from pipeline.simulate import simulate
-from pipeline.train import train
-from pipeline.visibility import visibility
+
+COMMANDS = {
+    "import": "pipeline.importing:app",
+    "evaluate": "pipeline.evaluate_release:app",
+    "episode": "pipeline.raw_episode:app",
+    "episodes": "pipeline.episodes:episodes",
+    "preprocess": "pipeline.preprocess:preprocess",
+    "simulate": "pipeline.simulate:simulate",
+    "fit": "pipeline.fit:fit",
+    "train": "pipeline.train:train",
+    "predict": "pipeline.predict:predict",
+    "report": "pipeline.report:report",
+    "rollout": "pipeline.rollout:rollout",
+    "visibility": "pipeline.visibility:visibility",
+    "gradients": "pipeline.gradients:gradients",
+    "bench": "pipeline.bench:bench",
+    "capture": "pipeline.capture:record",
+    "calibrate": "pipeline.calibrate:calibrate",
+    "doctor": "pipeline.doctor:doctor",
+    "acceptance": "pipeline.acceptance:acceptance",
+    "recordings": "pipeline.recordings:recordings",
+}
+"""Name -> where it lies; it is imported when it is run."""
 
 app = typer.Typer(
+    cls=lazy_group(COMMANDS),
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Find the simulator parameters of a real cloth from the point clouds of its motion.",
 )
-app.add_typer(importing.app, name="import")
-app.add_typer(evaluate.app, name="evaluate")
-evaluate.app.command("release")(release)
-app.add_typer(raw_episode.app, name="episode")
-app.command()(episodes)
-app.command()(preprocess)
-app.command()(simulate)
-app.command()(fit.fit)
-app.command()(train)
-app.command()(predict)
-app.command()(report.report)
-app.command()(rollout.rollout)
-app.command()(visibility)
-app.command()(gradients)
-app.command()(bench.bench)
-app.command("capture")(record)
-app.command()(calibrate)
-app.command()(doctor)
-app.command()(acceptance.acceptance)
-app.command()(recordings)
+
+
+@app.callback()
+def diffcloud() -> None:
+    """Find the simulator parameters of a real cloth from the point clouds of its motion."""
 
 
 def main() -> None:
     """Run, and turn the project's own errors into a message and exit status 1."""
     # A step is a chain of small operations: a second thread gains nothing (measured), and beside another busy process its
-    # spinning costs tenfold. OMP_NUM_THREADS overrides.
-    if "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(1)
+    # spinning costs tenfold. Said to OpenMP, which reads it when torch is imported, by those commands that need torch.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     keep_freed_memory()
     try:
         app()

@@ -1,17 +1,17 @@
-"""`diffcloud doctor`: what is installed and connected, and what is missing."""
+"""`diffcloud doctor`: what is installed and connected, what is missing, and where compiled code is kept."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
 from diffcloud.hardware.installed import check_installation
-from pipeline.console import JsonFlag, finish, show
+from pipeline.console import JsonFlag, finish, progress_bar, show
 
 _COLORS = {"ok": "green", "missing": "red"}
 
@@ -19,14 +19,40 @@ _COLORS = {"ok": "green", "missing": "red"}
 def doctor(
     arm: Annotated[str | None, typer.Option(help="Address of the arm, to see whether it answers.")] = None,
     folder: Annotated[Path, typer.Option(help="Where episodes would be written.")] = Path("."),
+    compile_: Annotated[
+        bool, typer.Option("--compile", help="Compile the kernels now rather than at first use (up to a minute).")
+    ] = False,
     json: JsonFlag = False,
 ) -> None:
     """Print what a capture needs and whether it is here. Nothing moves. Exit status 0 whatever is missing."""
+    if compile_:
+        _compile()
     checks = check_installation(arm=arm, folder=folder)
     table = Table("", "state", "detail")
     for check in checks:
         color = _COLORS[check.state]
         table.add_row(check.name, f"[{color}]{check.state}[/]", escape(check.detail))
     show(table, json)
+    compiled = _compiled()
+    kept = Table("compiled code", "")
+    kept.add_row("folder", escape(compiled["folder"]))
+    kept.add_row("size", f"{compiled['bytes'] / 1e6:.1f} MB")
+    kept.add_row("built", "yes" if compiled["built"] else "no: at first use, or now by diffcloud doctor --compile")
+    show(kept, json)
     missing = [check.name for check in checks if check.state != "ok"]
-    finish({"checks": [asdict(check) for check in checks], "missing": missing}, json)
+    finish({"checks": [asdict(check) for check in checks], "missing": missing, "compiled": compiled}, json)
+
+
+def _compiled() -> dict[str, Any]:
+    from diffcloud.compiled import cache_folder, cache_size, is_built  # imports numba, which takes a moment
+
+    return {"folder": str(cache_folder()), "bytes": cache_size(), "built": is_built()}
+
+
+def _compile() -> None:
+    from diffcloud.clouds.neighbours import compile_neighbours
+    from diffcloud.sim.compiled.warm import compile_all
+
+    work = [("nearest neighbours", compile_neighbours)]
+    with progress_bar("compiling", len(work)) as update:
+        compile_all(update, work)

@@ -18,7 +18,7 @@ from pipeline.acceptance import SCENES
 from pipeline.comparison import compare, comparison_jobs
 from pipeline.config import Config, load_config, updated
 from pipeline.console import JsonFlag, Threads, errors, finish, writes
-from pipeline.evaluate import AllowMissing, MarkdownFile, stop_if_missing, write_evaluation
+from pipeline.evaluate import AllowMissing, MarkdownFile, app, stop_if_missing, write_evaluation
 from pipeline.fit import FitJob
 from pipeline.report import report
 from pipeline.scenario_options import choose_scenario
@@ -28,6 +28,7 @@ _PROFILE = Path(__file__).parent / "profiles" / "release.yaml"
 
 
 @writes()
+@app.command("release")
 def release(
     folder: Annotated[Path, typer.Argument(help="The published data: holds lift_real_pcls/, conf/ and so on.")],
     params: Annotated[Path, typer.Option("--params", help="Profile; a file of parameters.")] = _PROFILE,

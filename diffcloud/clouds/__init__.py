@@ -3,7 +3,7 @@
 from diffcloud.clouds.augmentation import Augmentation, CloudMaker
 from diffcloud.clouds.background import Background
 from diffcloud.clouds.losses import chamfer, one_sided_chamfer
-from diffcloud.clouds.neighbours import NeighbourIndex, brute_force_neighbours
+from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
 
 __all__ = [
@@ -12,7 +12,6 @@ __all__ = [
     "CloudMaker",
     "NeighbourIndex",
     "SurfaceSampler",
-    "brute_force_neighbours",
     "chamfer",
     "one_sided_chamfer",
 ]

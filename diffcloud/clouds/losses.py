@@ -35,6 +35,6 @@ def chamfer(source: Tensor, targets: Sequence[NeighbourIndex]) -> Tensor:
     for cloud, target in zip(source, targets, strict=True):  # ragged: one target at a time
         back = NeighbourIndex(cloud)
         points = target.points.to(cloud)
-        forth = (cloud - target.nearest(cloud)).square().sum(-1).mean()
-        values.append(forth + (points - back.nearest(points)).square().sum(-1).mean())
+        forth = (cloud - target.nearest_to(back)).square().sum(-1).mean()
+        values.append(forth + (points - back.nearest_to(target).to(points)).square().sum(-1).mean())
     return torch.stack(values)

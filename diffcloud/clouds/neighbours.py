@@ -1,27 +1,23 @@
-"""Nearest neighbours in a fixed target cloud: a KD-tree on the CPU, chunked brute force on a GPU."""
+"""Nearest neighbours in a fixed target cloud."""
 
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from diffcloud.errors import EpisodeError
 
-_CHUNK_BYTES = 256 * 2**20
-
-
-def brute_force_neighbours(queries: Tensor, targets: Tensor) -> Tensor:
-    """[Q, 3], [P, 3] -> [Q] index of the nearest target; memory bounded by chunks."""
-    rows = max(1, _CHUNK_BYTES // (targets.element_size() * 3 * len(targets)))
-    return torch.cat([(chunk[:, None] - targets).square().sum(-1).argmin(1) for chunk in queries.detach().split(rows)])
+if TYPE_CHECKING:
+    from diffcloud.clouds.curve import Floats, Ints
+    from diffcloud.clouds.tree import Tree
 
 
 class NeighbourIndex:
-    """A target cloud that answers nearest-neighbour queries. Its search structure is built once, on first use."""
+    """A target cloud that answers nearest-neighbour queries. Its search tree is built once, on first use."""
 
     def __init__(self, points: Tensor) -> None:
         """
@@ -38,22 +34,42 @@ class NeighbourIndex:
         self.points = points
 
     @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self.points.detach().cpu().numpy())
+    def _tree(self) -> Tree:
+        from diffcloud.clouds.tree import build_tree  # numba takes a moment to import, and not every command needs it
+
+        return build_tree(_as_array(self.points))
+
+    def _find(self, queries: Floats, order: Ints) -> Tensor:
+        from diffcloud.clouds.tree import find_nearest
+
+        return torch.from_numpy(find_nearest(queries, order, self._tree))
 
     def nearest_index(self, queries: Tensor) -> Tensor:
-        """[..., 3] -> [...] index of the nearest target point."""
-        flat = queries.detach().reshape(-1, 3)
-        if flat.device.type == "cpu":
-            # one worker: for a few thousand queries starting threads costs more than it gains
-            workers = 1 if len(flat) < 20_000 else -1
-            _, index = self._tree.query(flat.numpy(), workers=workers)
-            # a query that is NaN or infinite has no neighbour: the loss is then NaN by itself
-            found = torch.as_tensor(np.minimum(index, len(self.points) - 1))
-        else:
-            found = brute_force_neighbours(flat, self.points.to(flat))
-        return found.view(queries.shape[:-1])
+        """[..., 3] -> [...] index of the nearest target point, the lowest of equally near ones.
+
+        Distances are computed in float64. A query that is NaN or infinite has no neighbour and gets index 0: its
+        distance is NaN or infinite by itself.
+        """
+        from diffcloud.clouds.curve import curve_order
+
+        flat = _as_array(queries.reshape(-1, 3))
+        return self._find(flat, curve_order(flat)).to(queries.device).view(queries.shape[:-1])
 
     def nearest(self, queries: Tensor) -> Tensor:
         """[..., 3] -> [..., 3]: the nearest target point of each query, in the queries' dtype."""
         return self.points.to(queries)[self.nearest_index(queries)]
+
+    def nearest_to(self, other: NeighbourIndex) -> Tensor:
+        """[P', 3] the nearest target point of each point of another cloud, whose own tree has them in order already."""
+        found = self._find(_as_array(other.points), other._tree.order)
+        return self.points.to(other.points)[found.to(other.points.device)]
+
+
+def compile_neighbours() -> None:
+    """Compile what queries need."""
+    index = NeighbourIndex(torch.zeros((1, 3), dtype=torch.float64))
+    index.nearest(index.points)
+
+
+def _as_array(points: Tensor) -> Floats:
+    return np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float64)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffcloud.clouds import NeighbourIndex, SurfaceSampler, brute_force_neighbours, chamfer, one_sided_chamfer
+from diffcloud.clouds import NeighbourIndex, SurfaceSampler, chamfer, one_sided_chamfer
 from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.mesh import grid_cloth
 
@@ -84,20 +84,6 @@ class TestSampling:
 
 
 class TestNeighbours:
-    @BOTH_TYPES
-    def test_tree_agrees_with_brute_force(self, rng, dtype):
-        target, queries = (torch.as_tensor(rng.normal(size=(n, 3)), dtype=dtype) for n in (300, 500))
-        index = NeighbourIndex(target)
-        expected = brute_force_neighbours(queries, target)
-        assert torch.equal(index.nearest_index(queries), expected)
-        assert index.nearest(queries).dtype == dtype
-
-    def test_brute_force_in_chunks_is_the_same(self, rng, monkeypatch):
-        target, queries = (torch.as_tensor(rng.normal(size=(n, 3))) for n in (50, 70))
-        whole = brute_force_neighbours(queries, target)
-        monkeypatch.setattr("diffcloud.clouds.neighbours._CHUNK_BYTES", 8 * 3 * 50 * 7)
-        assert torch.equal(brute_force_neighbours(queries, target), whole)
-
     @pytest.mark.parametrize(
         ("points", "message"),
         [(torch.zeros(0, 3), "at least one point"), (torch.zeros(4, 2), "shape"), (torch.full((4, 3), torch.nan), "NaN")],

@@ -1,0 +1,128 @@
+"""Compiled functions and where they are kept.
+
+numba compiles a kernel when it is first called and keeps the machine code in the user's cache folder. The folder's name
+holds a fingerprint of every source that goes into kernels, since numba itself looks at one function's file and not at
+those it calls; so an upgrade compiles again and never mixes versions. Several processes may compile at once: files are
+written whole. Folders of other versions that nobody has used for 30 days are removed when a new one is made.
+
+`DIFFCLOUD_CACHE_DIR` puts the folder elsewhere. `DIFFCLOUD_UNCOMPILED=1` runs all kernels as plain Python, for a
+debugger; a step then takes seconds.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import llvmlite  # type: ignore[import-untyped]
+import numba
+from numba.core import event
+from platformdirs import user_cache_path
+
+UNCOMPILED = os.environ.get("DIFFCLOUD_UNCOMPILED", "") not in ("", "0")
+_PACKAGE = Path(__file__).parent
+_KEPT_DAYS = 30
+_MARK = "complete"
+"""A file in the folder, once everything has been compiled ahead."""
+_log = logging.getLogger(__name__)
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def kernel_sources(package: Path = _PACKAGE) -> Iterator[Path]:
+    """The files whose change compiles again: those that hold kernels, and those that kernels are generated from."""
+    for source in sorted(package.rglob("*.py")):
+        text = b"\n" + source.read_bytes()
+        if b"\n@kernel\n" in text or b"sim.compiled" in text or source.parent == package / "sim" / "compiled":
+            yield source
+
+
+def fingerprint(package: Path = _PACKAGE) -> str:
+    """16 hexadecimal digits of the compiler's versions, this file, and the kernels' sources."""
+    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode() + Path(__file__).read_bytes())
+    for source in kernel_sources(package):
+        digest.update(source.relative_to(package).as_posix().encode())
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@cache
+def cache_folder() -> Path:
+    """Where compiled and generated code of this version lies. It is made here, if it can be."""
+    root = Path(os.environ["DIFFCLOUD_CACHE_DIR"]) if "DIFFCLOUD_CACHE_DIR" in os.environ else user_cache_path("diffcloud")
+    folder = root / "kernels" / fingerprint()
+    with suppress(OSError):  # a cache that cannot be written is numba's to report
+        if not folder.is_dir():
+            folder.mkdir(parents=True)
+            remove_stale(folder)
+        os.utime(folder)  # when it was last used
+    return folder
+
+
+def remove_stale(folder: Path) -> None:
+    """Remove the folders of other versions beside this one that nobody has used for 30 days."""
+    for other in folder.parent.iterdir():
+        if other == folder or not re.fullmatch("[0-9a-f]{16}", other.name):
+            continue
+        with suppress(OSError):  # another process may be removing it too
+            if time.time() - other.stat().st_mtime > _KEPT_DAYS * 86400:
+                shutil.rmtree(other, ignore_errors=True)
+
+
+def cache_size() -> int:
+    """Of all files in the folder [bytes]."""
+    return sum(file.stat().st_size for file in cache_folder().rglob("*") if file.is_file())
+
+
+def is_built() -> bool:
+    """Whether everything has been compiled ahead."""
+    return (cache_folder() / _MARK).is_file()
+
+
+def mark_built() -> None:
+    """Remember that everything has been compiled ahead."""
+    cache_folder().mkdir(parents=True, exist_ok=True)
+    (cache_folder() / _MARK).touch()
+
+
+def kernel(function: F) -> F:
+    """A function that numba compiles: of arrays, numbers and named tuples of them. It releases the interpreter's lock."""
+    if UNCOMPILED:
+        return function
+    config: Any = numba.config
+    given, config.CACHE_DIR = config.CACHE_DIR, str(cache_folder())  # of other people's functions, and of this
+    try:
+        return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    finally:
+        config.CACHE_DIR = given
+
+
+class _Announcement(event.Listener):
+    """Says once in a process that kernels are being compiled."""
+
+    def __init__(self) -> None:
+        self.silent = False
+
+    def on_start(self, compiling: Any) -> None:
+        function = compiling.data["dispatcher"].py_func
+        if not self.silent and function.__module__.startswith("diffcloud"):
+            self.silent = True
+            _log.warning(
+                "Compiling kernels, once for this version and computer (up to a minute); kept in %s.", cache_folder()
+            )
+
+    def on_end(self, compiling: Any) -> None:
+        pass
+
+
+announcement = _Announcement()
+event.register("numba:compile", announcement)

@@ -1,0 +1,93 @@
+"""Commands whose files are imported when they are run: the list of all of them, with its help, imports none."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
+
+
+def lazy_group(places: dict[str, str]) -> type[TyperGroup]:
+    """A group of the commands that lie at places, "module:function" or "module:app" for a group of its own."""
+
+    class LazyGroup(TyperGroup):
+        """Finds a command by its name."""
+
+        def list_commands(self, ctx: Any) -> list[str]:
+            return list(places)
+
+        def get_command(self, ctx: Any, cmd_name: str) -> Any:
+            return _load(cmd_name, places[cmd_name]) if cmd_name in places else None
+
+        @property
+        def commands(self) -> Any:
+            return _Commands(places)
+
+        @commands.setter
+        def commands(self, given: Any) -> None:
+            """Those that were registered as usual: none."""
+
+        def format_help(self, ctx: Any, formatter: Any) -> None:
+            """As usual, but with names and first sentences alone for commands."""
+            self.get_command = lambda ctx, cmd_name: _summary(cmd_name, places[cmd_name])  # type: ignore[method-assign]
+            try:
+                super().format_help(ctx, formatter)
+            finally:
+                del self.get_command
+
+    return LazyGroup
+
+
+class _Commands(Mapping[str, Any]):
+    """Names, and the commands, each imported when it is asked for."""
+
+    def __init__(self, places: dict[str, str]) -> None:
+        self._places = places
+
+    def __getitem__(self, name: str) -> Any:
+        return _load(name, self._places[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+
+def _load(name: str, place: str) -> Any:
+    module, _, attribute = place.partition(":")
+    found: typer.Typer | Callable[..., Any] = getattr(importlib.import_module(module), attribute)
+    if isinstance(found, typer.Typer):
+        command = get_command(found)
+    else:
+        alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+        alone.command(name)(found)
+        command = get_command(alone)
+    command.name = name
+    return command
+
+
+def _summary(name: str, place: str) -> TyperCommand:
+    """The command's name and help, read from its file: the function's docstring, or `help` of a group."""
+    module, _, attribute = place.partition(":")
+    path = Path(__file__).parents[1].joinpath(*module.split(".")).with_suffix(".py")
+    text = ""
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef) and node.name == attribute:
+            text = ast.get_docstring(node) or ""
+        elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id == attribute:
+            options = node.value.keywords if isinstance(node.value, ast.Call) else []
+            text = next((str(ast.literal_eval(option.value)) for option in options if option.arg == "help"), "")
+        elif (
+            isinstance(node, ast.ImportFrom)
+            and node.module
+            and attribute in [alias.asname or alias.name for alias in node.names]
+        ):
+            return _summary(name, f"{node.module}:{attribute}")
+    return TyperCommand(name, help=text)
