@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from diffcloud.sim.energies.base import geometry
 
 from diffcloud.mesh import grid_cloth
 from diffcloud.scene.scenarios import built_in, grid_scenario
@@ -16,6 +15,7 @@ from diffcloud.sim.build import build_system
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import isotropic
 from diffcloud.sim.surrounding import Surrounding
+from tests.sim.twins.forces import Forces
 
 DENSITY = 0.2
 
@@ -32,10 +32,8 @@ def test_uniaxial_patch_pulls_with_stiffness_times_strain():
     stiffness, epsilon = 80.0, 0.03
     mesh = grid_cloth(6, 5, 0.3, 0.2)
     material = isotropic("m", density=DENSITY, stretching=stiffness, bending=1e-5)
-    system = build_system(mesh, material, time_step=0.01, handles=Handles(()), integrator="linearised")
-    positions = torch.as_tensor(mesh.nodes * [1 + epsilon, 1.0, 1.0])[None]
-    at = system.stretching.at(geometry(system.stretching.elements, positions), system.properties)
-    forces = at.forces()[0].numpy().reshape(6, 5, 3)
+    patch = Forces(mesh, material)
+    forces = patch.force("stretching", patch.motion(mesh.nodes * [1 + epsilon, 1.0, 1.0])).reshape(6, 5, 3)
     strain = epsilon + epsilon**2 / 2  # Green
     expected = stiffness * strain * (1 + epsilon) * 0.3
     assert forces[:, 0, 0].sum() == pytest.approx(expected, rel=1e-12)

@@ -1,0 +1,294 @@
+"""Each force: kernels against plain twins, laws of the energies, and the published look-up values of the material tables."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from diffcloud.mesh import SurfaceMesh, grid_cloth
+from diffcloud.sim.compiled.data import Motion, Parameters
+from diffcloud.sim.materials import Material, isotropic
+from diffcloud.sim.surrounding import ContactSettings, Surrounding
+from diffcloud.sim.terms import TERMS
+from diffcloud.sim.terms.stretching import _sampled
+from tests.sim.twins.forces import Forces, twin_force
+from tests.sim.twins.terms import TWINS, coefficients, sampled
+
+# ARCSim's camel-ponte-roma (Wang et al. 2011), whose sampled values are known
+CAMEL = Material(
+    name="camel-ponte-roma",
+    density=0.284,
+    stretching=np.array(
+        [
+            [31.146198, -12.802702, 44.028667, 31.896357],
+            [78.707756, 26.754574, 268.680725, 27.743423],
+            [67.368431, 77.767944, 182.273407, -14.661531],
+            [113.367035, 54.802021, 175.126572, 44.657330],
+            [144.294830, 111.404854, 138.422150, -29.861851],
+            [143.933365, 49.654823, 191.777588, 39.491055],
+        ]
+    ),
+    bending=1e-6
+    * np.array(
+        [
+            [36.348366, 49.585537, 45.744080, 47.413387, 20.726685],
+            [33.013252, 29.744385, 35.103642, 34.041019, 14.439938],
+            [37.157593, 34.107452, 33.229435, 34.685535, 10.439938],
+        ]
+    ),
+)
+CONSTANT = isotropic("constant", density=0.2, stretching=40.0, bending=1e-4, shear=15.0)
+TABLE = SurfaceMesh(np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0.3], [-1, 1, 0.3]]), np.array([[0, 1, 2], [0, 2, 3]]))
+AROUND = {
+    name: Surrounding(
+        obstacles=(TABLE,),
+        wind=(0.3, -0.2, 0.5),
+        air_drag=0.4,
+        lagged_air=name == "lagged",
+        contact=ContactSettings(1e3, 0.15, 0.015),
+    )
+    for name in ("damped", "lagged")
+}
+
+
+@pytest.fixture
+def mesh():
+    return grid_cloth(4, 5, 0.3, 0.4, alternate_diagonals=True)
+
+
+def crumpled(mesh, rng, amount=0.02) -> np.ndarray:
+    return mesh.nodes + amount * rng.normal(size=mesh.nodes.shape)
+
+
+def rotation(rng) -> np.ndarray:
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return q * np.sign(np.linalg.det(q))
+
+
+def states(mesh, rng) -> dict[str, np.ndarray]:
+    """Positions at which formulas are at ease, and others at which they are not."""
+    collapsed, inverted, flat = crumpled(mesh, rng), crumpled(mesh, rng), mesh.nodes.copy()
+    collapsed[3] = collapsed[4]
+    collapsed[7] = collapsed[6]
+    inverted[mesh.faces[5]] = inverted[mesh.faces[5]][[1, 0, 2]]
+    return {
+        "crumpled": crumpled(mesh, rng),
+        "torn": crumpled(mesh, rng, 0.3),
+        "collapsed": collapsed,
+        "inverted": inverted,
+        "flat": flat,
+        "folded": np.column_stack([np.minimum(flat[:, 0], 0.2 - flat[:, 0]), flat[:, 1], 1e-3 * flat[:, 1]]),
+    }
+
+
+@pytest.mark.parametrize("around", AROUND)
+@pytest.mark.parametrize("state", ["crumpled", "torn", "collapsed", "inverted", "flat", "folded"])
+@pytest.mark.parametrize("name", [term.name for term in TERMS])
+def test_kernels_are_as_their_twins_say(name, state, around, mesh, rng):
+    """Forces to 1e-12, derivatives to 1e-9 of the largest; also at nonzero rest angles."""
+    bent = replace(mesh, nodes=crumpled(mesh, rng, 0.01))
+    forces = Forces(bent, CAMEL, AROUND[around], shaped=True, rng=rng)
+    moves = [0.5 * rng.normal(size=mesh.nodes.shape) for _ in range(3)]
+    motion = forces.motion(states(mesh, rng)[state], *moves)
+    extra, twin = sampled(name, _sampled(CAMEL.stretching)), TWINS[name]
+    inputs = {
+        key: torch.as_tensor(value).requires_grad_()
+        for key, value in (*motion._asdict().items(), *forces.parameters._asdict().items())
+    }
+    found, expected = forces.force(name, motion), twin_force(forces, name, twin, inputs, extra)
+    scale = max(np.abs(found).max(), 1e-9)
+    np.testing.assert_allclose(found, expected.detach().numpy(), rtol=0, atol=1e-12 * scale)
+
+    adjoint = rng.normal(size=mesh.nodes.shape)
+    gradients, slopes = forces.reverse(name, motion, adjoint)
+    derived = torch.autograd.grad(
+        (expected * torch.as_tensor(adjoint)).sum(), list(inputs.values()), materialize_grads=True
+    )
+    for key, value in zip(inputs, derived, strict=True):
+        own = getattr(slopes, key) if key in Motion._fields else getattr(gradients, key)
+        scale = max(np.abs(value.numpy()).max(initial=0), 1e-9)
+        np.testing.assert_allclose(own, value.numpy(), rtol=0, atol=1e-9 * scale, err_msg=key)
+
+    rates = Parameters(*(rng.normal(size=(2, *field.shape)) for field in forces.parameters))
+    changes = Motion(*(rng.normal(size=(2, *field.shape)) for field in motion))
+    along = forces.tangent(name, motion, rates, changes)
+    for k in range(2):
+        weighted = sum((getattr(gradients, key) * getattr(rates, key)[k]).sum() for key in Parameters._fields)
+        weighted += sum((getattr(slopes, key) * getattr(changes, key)[k]).sum() for key in Motion._fields)
+        assert (along[k] * adjoint).sum() == pytest.approx(weighted, rel=1e-9, abs=1e-9 * max(1.0, np.abs(along[k]).max()))
+
+
+@pytest.mark.parametrize("name", [term.name for term in TERMS])
+def test_matrices_are_the_derivatives_of_the_forces(name, mesh, rng):
+    """`assemble` by displacement and velocity, `jacobian` by positions too: against reverse mode, row by row."""
+    forces = Forces(mesh, CAMEL, AROUND["damped"], rng=rng)
+    motion = forces.motion(crumpled(mesh, rng), *(0.5 * rng.normal(size=mesh.nodes.shape) for _ in range(3)))
+    displaced, moved = 0.3, 0.7
+    rows = {field: [] for field in Motion._fields}
+    for row in np.eye(3 * len(mesh.nodes)):
+        _, slopes = forces.reverse(name, motion, row.reshape(-1, 3))
+        for field in Motion._fields:
+            rows[field].append(getattr(slopes, field).ravel())
+    by = {field: np.array(found) for field, found in rows.items()}
+    assembled = -displaced * by["displacement"] - moved * by["after"]
+    scale = max(np.abs(assembled).max(), 1e-9)
+    np.testing.assert_allclose(forces.stiffness(name, motion, displaced, moved), assembled, rtol=0, atol=1e-12 * scale)
+    whole = assembled - moved * by["before"] - moved * forces.timing.time_step * by["positions"]
+    scale = max(np.abs(whole).max(), 1e-9)
+    np.testing.assert_allclose(forces.jacobian(name, motion, displaced, moved), whole, rtol=0, atol=1e-12 * scale)
+
+
+KINDS = pytest.mark.parametrize("name", ["stretching", "bending"])
+MATERIALS = pytest.mark.parametrize("material", [CAMEL, CONSTANT], ids=lambda m: m.name)
+
+
+@KINDS
+class TestEnergies:
+    def test_forces_are_minus_the_gradient_where_coefficients_are_constant(self, name, mesh, rng):
+        forces, at = Forces(mesh, CONSTANT, rng=rng), crumpled(mesh, rng)
+        found, step = forces.force(name, forces.motion(at)), 1e-6
+        for node, axis in ((0, 2), (7, 0), (12, 1), (19, 2)):
+            change = np.zeros_like(at)
+            change[node, axis] = step
+            slope = forces.energy(name, forces.motion(at + change)) - forces.energy(name, forces.motion(at - change))
+            assert found[node, axis] == pytest.approx(-slope / (2 * step), rel=1e-6, abs=1e-8)
+
+    def test_stiffness_is_symmetric_and_positive_where_coefficients_are_constant(self, name, mesh, rng):
+        forces = Forces(mesh, CONSTANT, rng=rng)
+        dense = forces.stiffness(name, forces.motion(crumpled(mesh, rng)), 1.0, 0.0)
+        assert np.abs(dense - dense.T).max() <= 1e-12 * np.abs(dense).max()
+        assert np.linalg.eigvalsh(dense).min() >= -1e-10 * np.abs(dense).max()
+
+    @MATERIALS
+    def test_rest_shape_has_no_force_and_no_energy(self, name, material, mesh, rng):
+        forces = Forces(mesh, material)
+        motion = forces.motion(mesh.nodes @ rotation(rng).T + rng.normal(size=3))
+        assert abs(forces.energy(name, motion)) < 1e-20
+        assert np.abs(forces.force(name, motion)).max() < 1e-12
+
+    @MATERIALS
+    def test_rigid_motion_turns_forces_and_keeps_energy(self, name, material, mesh, rng):
+        forces, turn, at = Forces(mesh, material), rotation(rng), crumpled(mesh, rng)
+        motion, moved = forces.motion(at), forces.motion(at @ turn.T + rng.normal(size=3))
+        assert forces.energy(name, moved) == pytest.approx(forces.energy(name, motion))
+        np.testing.assert_allclose(forces.force(name, moved), forces.force(name, motion) @ turn.T, rtol=1e-8, atol=1e-12)
+
+    @MATERIALS
+    def test_forces_have_no_resultant_and_no_moment(self, name, material, mesh, rng):
+        forces, at = Forces(mesh, material), crumpled(mesh, rng)
+        found = forces.force(name, forces.motion(at))
+        scale = np.abs(found).max()
+        assert np.abs(found.sum(0)).max() < 1e-12 * scale
+        assert np.abs(np.cross(at, found).sum(0)).max() < 1e-12 * scale
+
+
+def test_constant_stretching_stiffness_is_the_jacobian_under_tension(mesh):
+    """With constant coefficients, no shear and tension everywhere nothing is dropped: Gauss-Newton is Newton."""
+    forces = Forces(mesh, isotropic("no shear", density=0.2, stretching=40.0, bending=1e-4, shear=0.0))
+    motion = forces.motion(mesh.nodes * [1.2, 1.1, 1.0])
+    exact = forces.jacobian("stretching", motion, 0.0, 1.0) / forces.timing.time_step
+    np.testing.assert_allclose(forces.stiffness("stretching", motion, 1.0, 0.0), exact, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("strain", "expected"),
+    [
+        ((0.0, 0.0, 0.0), (62.292396, 0.0, 88.057334, 63.792714)),
+        ((0.06, 0.0, 0.06), (84.941187, 4.716322, 157.327509, 63.523593)),
+        ((0.1, 0.02, 0.0), (119.245183, 26.00082, 354.764724, 55.777019)),
+        ((-0.05, 0.01, 0.2), (287.86673, 99.309646, 383.555176, 78.98211)),
+    ],
+)
+def test_stretching_table_gives_the_reference_simulators_values(strain, expected):
+    e00, e01, e11 = (torch.tensor(value, dtype=torch.float64) for value in strain)
+    samples = torch.as_tensor(_sampled(CAMEL.stretching))
+    for sheared in (e01, -e01):
+        assert coefficients(samples, e00, e11, sheared).tolist() == pytest.approx(expected, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("curvature", "direction", "expected"),
+    [
+        (0.0, 0.0, 36.348366),
+        (0.5, 0.0, 46.276244),
+        (1.0, np.pi / 4, 35.103642),
+        (1.5, np.pi / 2, 28.624136),
+        (-1.0, np.pi / 4, 33.013252),
+        (0.8, -np.pi / 3, 33.046229),
+        (3.0, 2.8, 19.768623),
+    ],
+)
+def test_bending_table_gives_the_reference_simulators_values(curvature, direction, expected):
+    """By the force of one hinge at an angle of one radian, with constants such that K is the table's value."""
+    from diffcloud.sim.terms.bending import _rows_at
+
+    one = grid_cloth(2, 2, 1.0, 1.0)
+    forces = Forces(one, CAMEL)
+    of = forces.of("bending")._replace(
+        rows=_rows_at(CAMEL.bending, np.array([[direction, direction]])),
+        stiffness=np.ones(1),
+        curvature=np.full(1, 2.5 * curvature),
+    )
+    forces.terms = forces.terms._replace(bending=of)
+    energy = forces.energy("bending", forces.motion(folded(one, np.rad2deg(1.0))))
+    assert 2e6 * energy == pytest.approx(expected, rel=1e-6)
+
+
+def folded(one, degrees: float) -> np.ndarray:
+    """The nodes of a mesh of one hinge, bent by an angle."""
+    nodes = one.nodes.copy()
+    first, second, tip, _ = one.hinges.nodes[0]
+    axis = (one.nodes[second] - one.nodes[first]) / np.linalg.norm(one.nodes[second] - one.nodes[first])
+    arm, turn = one.nodes[tip] - one.nodes[first], np.deg2rad(degrees)
+    across = arm - axis * (axis @ arm)
+    nodes[tip] += across * (np.cos(turn) - 1) + np.cross(axis, across) * np.sin(turn)
+    return nodes
+
+
+def test_bent_cylinder_has_the_energy_of_a_plate():
+    """B = k_b/4 for a cylinder about a grid axis: the derivation in materials.py, by numbers."""
+    radius, table_entry = 5.0, 3e-4
+    fine = grid_cloth(5, 41, 0.1, 1.0)
+    forces = Forces(fine, Material("m", 0.2, CONSTANT.stretching, np.full((3, 5), table_entry)))
+    x = fine.nodes[:, 0]
+    rolled = np.column_stack([radius * np.sin(x / radius), fine.nodes[:, 1], radius * (1 - np.cos(x / radius))])
+    # 39 inner edges of 40 cells bend
+    expected = 0.5 * table_entry / 4 / radius**2 * 0.1 * (39 / 40)
+    assert forces.energy("bending", forces.motion(rolled)) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("lagged", [False, True])
+def test_air_pushes_against_the_motion_and_as_formulas_say(lagged, mesh):
+    forces = Forces(mesh, CONSTANT, Surrounding(wind=(0.0, 0.0, 0.5), lagged_air=lagged))
+    forces.parameters = forces.parameters._replace(air_drag=np.array([0.3]))
+    velocities = np.tile([2.0, 0.0, -1.0], (len(mesh.nodes), 1))
+    total = forces.force("air", forces.motion(mesh.nodes, velocities, velocities)).sum(0)
+    area = 0.3 * 0.4
+    assert total.tolist() == pytest.approx([-0.3 * area * 2.0, 0.0, 1.0 * area * 1.5 * 1.5])
+
+
+class TestShaped:
+    """Hinges at rest as the mesh stands."""
+
+    @pytest.fixture
+    def bent(self, mesh, rng):
+        return replace(mesh, nodes=mesh.nodes + 0.02 * rng.normal(size=mesh.nodes.shape))
+
+    def test_no_force_as_it_stands_wherever_it_stands(self, bent, rng):
+        shaped, flat = Forces(bent, CAMEL, shaped=True), Forces(bent, CAMEL)
+        motion = shaped.motion(bent.nodes @ rotation(rng).T + rng.normal(size=3))
+        least = np.abs(flat.force("bending", motion)).max()
+        assert least > 1e-6
+        assert np.abs(shaped.force("bending", motion)).max() < 1e-9 * least
+
+    def test_a_fold_beyond_a_half_turn_goes_the_short_way(self):
+        """From folded up by 175 degrees to folded down by 175: 10 degrees away, not 350."""
+        one = grid_cloth(2, 2, 1.0, 1.0)
+        assert len(one.hinges.length) == 1
+        up = Forces(replace(one, nodes=folded(one, 175.0)), CONSTANT, shaped=True)
+        flat = Forces(one, CONSTANT)
+        down = up.energy("bending", up.motion(folded(one, -175.0)))
+        assert down == pytest.approx(flat.energy("bending", flat.motion(folded(one, 10.0))), rel=1e-9)

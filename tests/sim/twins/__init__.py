@@ -1,0 +1,1 @@
+"""Plain torch twins of the kernels, written like the equations: their specification."""

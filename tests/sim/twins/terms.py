@@ -1,0 +1,127 @@
+"""Each force on one element, as a function of torch tensors that autograd differentiates.
+
+All take the element's constants and parameters by name, and `motion`: positions, before, after and displacement [n, 3], and
+`time_step` and `ahead`; they give the force on each node [n, 3].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Numbers = Mapping[str, Tensor]
+TINY = 1e-30
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Without the fused products of torch's own, so that parallel vectors give exactly zero."""
+    return torch.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def norm(vector: Tensor) -> Tensor:
+    return vector.square().sum(-1).clamp(min=TINY).sqrt()
+
+
+def gravity(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
+    return parameters["node_mass"][:, None] * constants["gravity"]
+
+
+def coefficients(samples: Tensor, e00: Tensor, e11: Tensor, e01: Tensor) -> Tensor:
+    """(k0, k1, k2, k3) at a strain, as ARCSim samples its grid: samples [4, 30, 30, 30] over (C00, C11, C01)."""
+    grid = torch.stack([e01.abs() * 60 / 29 - 1, (e11 + 0.25) * 60 / 29 - 1, (e00 + 0.25) * 60 / 29 - 1])
+    found = torch.nn.functional.grid_sample(
+        samples[None], grid.view(1, 1, 1, 1, 3), mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return found.flatten()
+
+
+def stretching(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
+    """-∂W/∂x - H d with W = a (k0 E00²/2 + k1 E00 E11 + k2 E11²/2 + k3 E01²)."""
+
+    def along_material(field: Tensor) -> Tensor:
+        return torch.stack([field[1] - field[0], field[2] - field[0]], dim=1) @ constants["inverse_rest"]  # [3, 2]
+
+    gradient, moved = along_material(motion.positions), along_material(motion.displacement)
+    strain = 0.5 * (gradient.T @ gradient - torch.eye(2, dtype=gradient.dtype))
+    k0, k1, k2, k3 = parameters["stretching"] * coefficients(constants["samples"], strain[0, 0], strain[1, 1], strain[0, 1])
+    stiffness = torch.stack([torch.stack([k0, k1]), torch.stack([k1, k2])])
+    after = strain + 0.5 * (gradient.T @ moved + moved.T @ gradient)
+    axial, shear = stiffness @ after.diagonal(), k3 * after[0, 1]
+    stress = torch.stack([torch.stack([axial[0], shear]), torch.stack([shear, axial[1]])])
+    tension = stiffness @ strain.diagonal().clamp(min=0)
+    pull = -constants["area"] * (gradient @ stress + moved * tension) @ constants["inverse_rest"].T  # [3, 2] on 1 and 2
+    return torch.stack([-pull.sum(1), pull[:, 0], pull[:, 1]])
+
+
+def dihedral(nodes: Tensor) -> tuple[Tensor, Tensor]:
+    """(angle, its gradient as it is used in forces [4, 3]) of a hinge: edge 0-1, opposite nodes 2 and 3."""
+    edge = nodes[1] - nodes[0]
+    squared = edge.square().sum().clamp(min=TINY)
+    length = squared.sqrt()
+    arms = nodes[2:] - nodes[0]
+    normals = torch.stack([cross(edge, arms[0]), cross(arms[1], edge)])
+    sine = -(edge * cross(normals[0], normals[1])).sum() / length
+    cosine = (normals[0] * normals[1]).sum()
+    flat = sine.detach().abs() + cosine.detach().abs() < TINY
+    angle = torch.atan2(sine, cosine + flat)
+    along = arms @ edge / squared
+    area = norm(normals)
+    height = torch.maximum(area / length, 1e-3 * length)
+    tilts = normals / (area * height)[:, None]
+    return angle, torch.stack([(along - 1) @ tilts, -along @ tilts, tilts[0], tilts[1]])
+
+
+def bending(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
+    """-K (θ + ∇θ · d) ∇θ"""
+    angle, gradient = dihedral(motion.positions)
+    angle = angle - constants["rest_angle"]
+    angle = angle - 2 * math.pi * torch.floor(angle.detach() / (2 * math.pi) + 0.5)
+    column = (constants["curvature"] * angle - 0.5).clamp(0, 4)
+    low = min(int(column.detach()), 3)
+    left, right = constants["rows"][:, low], constants["rows"][:, low + 1]
+    table = (left + (right - left) * (column - low)).clamp(min=0).amin()
+    stiffness = table * constants["stiffness"] * parameters["bending"]
+    return -stiffness * (angle + (gradient * motion.displacement).sum()) * gradient
+
+
+def air(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
+    """A third of f = ρ a |u_n| v_n N + drag a v_t on each corner."""
+    a, b, c = motion.positions
+    normal = cross(b - a, c - a)
+    normal = normal / norm(normal)
+    before, after = constants["wind"] - motion.before.mean(0), constants["wind"] - motion.after.mean(0)
+    relative = before if constants["lagged"] > 0 else after
+    across = relative @ normal
+    pressure = parameters["air_density"] * (before @ normal).abs() * across * normal
+    return (constants["area"] * (pressure + parameters["air_drag"] * (relative - across * normal)) / 3).expand(3, 3)
+
+
+def handles(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
+    return parameters["hold"] * (parameters["target"] - motion.positions - motion.ahead * motion.after)
+
+
+def planes(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
+    """Repulsion K c²/(2 τ) to first order in the motion of the step, and friction -γ P v."""
+    normal, thickness = constants["normal"], constants["thickness"]
+    violation = (thickness + constants["offset"] - motion.positions @ normal).clamp(min=0)
+    pushing = constants["stiffness"] * violation.square() / (2 * thickness)
+    limit = parameters["friction_obstacle"] * pushing
+    across = torch.eye(3, dtype=normal.dtype) - torch.outer(normal, normal)
+    speed = norm(motion.before @ across)
+    sticking = limit * motion.time_step / parameters["node_mass"] + 1e-12
+    gamma = limit / torch.maximum(speed, sticking)
+    approach = constants["stiffness"] * violation / thickness * (motion.ahead * motion.after @ normal)
+    return (pushing - approach)[:, None] * normal - gamma[:, None] * (motion.after @ across)
+
+
+TWINS = {twin.__name__: twin for twin in (gravity, stretching, bending, air, handles, planes)}
+
+
+def sampled(name: str, samples: np.ndarray) -> dict[str, Tensor]:
+    """What a twin needs beside its element's constants."""
+    return {"samples": torch.as_tensor(samples)} if name == "stretching" else {}
