@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,8 +33,8 @@ _PROPERTIES = Parameters._fields[:1] + Parameters._fields[2:10]
 
 
 class Batch:
-    """Episodes of one system. Inputs are arrays with a leading batch axis [B, ...]: positions and velocities [B, V, 3], poses of
-    the bodies [B, N, 18], the gripper's track [B, S, 3], and those of `Properties`."""
+    """Episodes of one system. Inputs have a leading batch axis: positions and velocities [B, V, 3], poses of the bodies
+    [B, N, 18], the gripper's track [B, S, 3], and those of `Properties`."""
 
     def __init__(self, system: System, steps: int, *, tracked: bool, progress: Callable[[int], None] | None = None) -> None:
         self.system, self.steps = system, steps
@@ -154,11 +155,9 @@ class Batch:
         for entry, (end, step, kept) in enumerate(self._ends):
             fault = self._failed(entry, end, step, kept) if end != status.DONE else None
             last = self.steps if fault is None else step
-            course = (
-                implausible(self._course(entry, last), lambda at, entry=entry: self._stored(entry, at)) if last else None
-            )
-            if course is not None:
-                fault = DivergedError(course[0], [entry], course[1])
+            earlier = implausible(self._course(entry, last), partial(self._stored, entry)) if last else None
+            if earlier is not None:
+                fault = DivergedError(earlier[0], [entry], earlier[1])
             if fault is not None:
                 found[entry] = fault
         return found
@@ -184,21 +183,21 @@ class Batch:
 
     def _read(self, properties: Sequence[Floats]) -> Parameters:
         """Of one entry, in the order of `_PROPERTIES`."""
-        node_mass, *rest = (np.atleast_1d(one) for one in properties)
-        handles = len(self.held.node)
+        fields = dict(zip(_PROPERTIES, map(np.atleast_1d, properties), strict=True))
         inverse = np.zeros(self.system.point_count)
-        inverse[: len(node_mass)] = 1 / node_mass
-        return Parameters(node_mass, inverse, *rest, np.zeros(handles), np.zeros((handles, 3)))
+        inverse[: len(fields["node_mass"])] = 1 / fields["node_mass"]
+        handles = len(self.held.node)
+        return Parameters(**fields, inverse_mass=inverse, hold=np.zeros(handles), target=np.zeros((handles, 3)))
 
     def _read_rates(self, parameters: Parameters, properties: Sequence[Floats]) -> Parameters:
         """The same with a leading axis K."""
-        node_mass, *rest = (np.ascontiguousarray(one.reshape(len(one), -1)) for one in properties)
-        handles = len(self.held.node)
-        inverse = np.zeros((len(node_mass), self.system.point_count))
-        inverse[:, : node_mass.shape[1]] = -node_mass / parameters.node_mass**2
-        return Parameters(
-            node_mass, inverse, *rest, np.zeros((len(node_mass), handles)), np.zeros((len(node_mass), handles, 3))
-        )
+        flat = (np.ascontiguousarray(one.reshape(len(one), -1)) for one in properties)
+        fields = dict(zip(_PROPERTIES, flat, strict=True))
+        directions, nodes = fields["node_mass"].shape
+        inverse = np.zeros((directions, self.system.point_count))
+        inverse[:, :nodes] = -fields["node_mass"] / parameters.node_mass**2
+        hold = np.zeros((directions, len(self.held.node)))
+        return Parameters(**fields, inverse_mass=inverse, hold=hold, target=np.zeros((*hold.shape, 3)))
 
     # --- running -----------------------------------------------------------------------------------------------------
 
@@ -210,7 +209,7 @@ class Batch:
         def stop() -> None:
             self._control[:, 1] = 1
 
-        run_all([lambda entry=entry: job(entry) for entry in range(count)], look=look, stop=stop)  # type: ignore[misc]
+        run_all([partial(job, entry) for entry in range(count)], look=look, stop=stop)
 
     # --- what became of them -----------------------------------------------------------------------------------------
 
@@ -230,11 +229,11 @@ class Batch:
         change, kind, *points = self._fault[entry].tolist()
         name = ("point-face", "edge-edge", "point-plane")[int(kind)] if kind >= 0 else "no"
         closest = f"{name} pair of points {[int(point) for point in points if point >= 0]}"
-        parameters = self._parameters[entry]
+        of = self._parameters[entry]
         return (
-            f"the implicit step did not converge (relative change {change:.1e}; closest: {closest}); sub-steps did not help "
-            f"(mean stretching multiplier {parameters.stretching.mean():.3g}, mean node mass "
-            f"{parameters.node_mass.mean():.3g} kg). Try a smaller time step, a thicker or stiffer contact, or slower handles"
+            f"the implicit step did not converge (relative change {change:.1e}; closest: {closest}); sub-steps did not "
+            f"help (mean stretching multiplier {of.stretching.mean():.3g}, mean node mass {of.node_mass.mean():.3g} kg). "
+            "Try a smaller time step, a thicker or stiffer contact, or slower handles"
         )
 
     def _course(self, entry: int, last: int) -> Course:

@@ -68,7 +68,8 @@ def rollout(
     drop_diverged: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Rollout:
-    """Simulate `steps` steps, on the CPU in double precision. Differentiable in reverse mode in all tensors that it is given.
+    """Simulate `steps` steps, on the CPU in double precision. Differentiable in reverse mode in all tensors that it
+    is given.
 
     Args:
         properties: of a batch of parameter sets; default the basis material, batch 1.
@@ -152,7 +153,7 @@ class _Episodes(torch.autograd.Function):
         return batch.simulate(inputs, keep=any(ctx.needs_input_grad))
 
     @staticmethod
-    @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
+    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         found = ctx.batch.gradients(gradients)
         return (None, *found)

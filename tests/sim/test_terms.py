@@ -1,4 +1,4 @@
-"""Each force: kernels against plain twins, laws of the energies, and the published look-up values of the material tables."""
+"""Each force: kernels against plain twins, laws of the energies, published look-up values of the material tables."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from diffcloud.sim.materials import Material, isotropic
 from diffcloud.sim.surrounding import ContactSettings, Surrounding
 from diffcloud.sim.terms import TERMS
 from diffcloud.sim.terms.stretching import _sampled
+from tests.sim.twins import terms as twins
 from tests.sim.twins.forces import Forces, twin_force
-from tests.sim.twins.terms import TWINS, coefficients, sampled
+from tests.sim.twins.terms import coefficients, sampled
 
 # ARCSim's camel-ponte-roma (Wang et al. 2011), whose sampled values are known
 CAMEL = Material(
@@ -93,7 +94,7 @@ def test_kernels_are_as_their_twins_say(name, state, around, mesh, rng):
     forces = Forces(bent, CAMEL, AROUND[around], shaped=True, rng=rng)
     moves = [0.5 * rng.normal(size=mesh.nodes.shape) for _ in range(3)]
     motion = forces.motion(states(mesh, rng)[state], *moves)
-    extra, twin = sampled(name, _sampled(CAMEL.stretching)), TWINS[name]
+    extra, twin = sampled(name, _sampled(CAMEL.stretching)), getattr(twins, name)
     inputs = {
         key: torch.as_tensor(value).requires_grad_()
         for key, value in (*motion._asdict().items(), *forces.parameters._asdict().items())

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 
 class Parameters(NamedTuple):
@@ -41,8 +42,8 @@ class Parameters(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """All points in one step, as terms see them: the cloth's nodes, then points of obstacles and of bodies. Gradients and rates
-    have the same fields."""
+    """All points in one step, as terms see them: the cloth's nodes, then points of obstacles and of bodies. Gradients
+    and rates have the same fields."""
 
     positions: Floats
     """[N, 3] where the forces are evaluated [m]."""

@@ -14,8 +14,8 @@ class Function:
     """outputs = formula(inputs, constants), all flat lists of numbers.
 
     Generated: `<name>_value(inputs, constants, outputs)`, `<name>_reverse(inputs, constants, adjoint, gradients)` adds the
-    gradients of adjoint · outputs, `<name>_tangent(inputs, constants, rates, output_rates)` gives the rates [K, outputs] along
-    the directions [K, inputs].
+    gradients of adjoint · outputs, `<name>_tangent(inputs, constants, rates, output_rates)` gives the rates [K,
+    outputs] along the directions [K, inputs].
     """
 
     name: str

@@ -1,9 +1,10 @@
 """From the list of terms to a module of kernels.
 
-For each term five functions over its elements: `<name>_force` adds its forces, `<name>_assemble` also gives its part of the
-symmetric step matrix, `<name>_jacobian` its exact derivatives for the implicit step, `<name>_reverse` adds the gradients of
-y · f, `<name>_tangent` how f changes along some directions; `<name>_energy` adds what its elements store. Matrices come as 3 x 3 blocks, row by row, for each pair of an
-element's nodes. The module is written into the cache folder, where it can be read.
+For each term five functions over its elements: `<name>_force` adds its forces, `<name>_assemble` also gives its part of
+the symmetric step matrix, `<name>_jacobian` its exact derivatives for the implicit step, `<name>_reverse` adds the
+gradients of y · f, `<name>_tangent` how f changes along some directions. `<name>_energy` adds what its elements store.
+Matrices come as 3 x 3 blocks, row by row, for each pair of an element's nodes. The module is written into the cache
+folder, where it can be read.
 """
 
 from __future__ import annotations
@@ -162,7 +163,7 @@ def _reverse(term: Term) -> str:
     code = Code()
     code.compute(slopes)
     lines = [
-        f"{source.replace('parameters.', 'parameter_gradients.').replace('motion.', 'motion_gradients.')} += {code.name(slope)}"
+        f"{_renamed(source, 'gradients')} += {code.name(slope)}"
         for (source, _), slope in zip(formula.inputs, slopes, strict=True)
         if slope.value != 0
     ]
@@ -226,9 +227,13 @@ def _numbers(vectors: Iterable[Vector]) -> list[Scalar]:
 
 def _rate_source(source: str) -> str:
     """parameters.x[e] -> parameter_rates.x[k, e]"""
-    name, index = source.split("[", 1)
-    renamed = name.replace("parameters.", "parameter_rates.").replace("motion.", "motion_rates.")
-    return f"{renamed}[k, {index}"
+    name, index = _renamed(source, "rates").split("[", 1)
+    return f"{name}[k, {index}"
+
+
+def _renamed(source: str, of: str) -> str:
+    """The same place of the arrays that hold gradients, or rates."""
+    return source.replace("parameters.", f"parameter_{of}.").replace("motion.", f"motion_{of}.")
 
 
 def _independent(outputs: Sequence[Scalar], of: set[int]) -> list[Scalar]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import cast
 
 from diffcloud.sim.compiled.trace import Scalar, ordered
 
@@ -66,6 +67,6 @@ class Code:
             case "sign":
                 return f"(1.0 if {names[0]} > 0 else 0.0) - (1.0 if {names[0]} < 0 else 0.0)"
             case "pick":
-                before, after = node.payload  # type: ignore[misc]  # of `terms.term.Element`
+                before, after = cast(tuple[str, str], node.payload)  # of `terms.term.Element`
                 return f"{before}int({names[0]}){after}"
         raise ValueError(f"No code for {operation}.")

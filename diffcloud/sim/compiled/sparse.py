@@ -1,13 +1,14 @@
 """Sparse direct solvers for the matrices of a step: 3 x 3 blocks, one for each pair of nodes that share an element.
 
 Nodes are numbered anew by their *place* in an order that keeps the factors small (minimum degree, as SuperLU finds it). The
-lower half is stored column by column; an element finds its blocks by *slots* that are worked out once. Contact between parts
-of the cloth that share no element adds blocks in single steps, and the pattern of the factor is then found again, which costs
-about as much as the factor.
+lower half is stored column by column; an element finds its blocks by *slots* that are worked out once. Contact
+between parts
+of the cloth that share no element adds blocks in single steps, and the pattern of the factor is then found again,
+which costs about as much as the factor.
 
 Cholesky for the linearised step. For the exact Jacobian of the implicit step, which is not symmetric but has a symmetric
-pattern, LU by blocks: the upper half is stored transposed, in the pattern of the lower. It does not exchange rows beyond the
-blocks; `solve_general` looks at what is left over and turns to a dense factor where that has gone wrong.
+pattern, LU by blocks: the upper half is stored transposed, in the pattern of the lower. It does not exchange rows
+beyond the blocks; `solve_general` looks at what is left over and turns to a dense factor where that has gone wrong.
 """
 
 from __future__ import annotations
@@ -164,8 +165,8 @@ def _add_transposed(target, block):  # type: ignore[no-untyped-def]
 
 @kernel
 def find_slot(of: Pattern, first: int, second: int) -> int:
-    """Where the block (first, second) of two nodes lies, as `slots` says; where the pattern has none, or one of them is no node,
-    the spare place after the last."""
+    """Where the block (first, second) of two nodes lies, as `slots` says; where the pattern has none, or one of them
+    is no node, the spare place after the last."""
     spare = len(of.rows)
     if first >= len(of.place) or second >= len(of.place):
         return spare
@@ -242,7 +243,8 @@ def widened(of: Pattern, first: Ints, second: Ints) -> tuple[Pattern, Ints]:
 
 @kernel
 def cholesky(of: Pattern, matrix: Floats, factor: Floats) -> bool:
-    """Factor [L, 9] of a matrix [A, 9]; its diagonal blocks hold the inverse of their diagonals. False: not positive definite.
+    """Factor [L, 9] of a matrix [A, 9]; its diagonal blocks hold the inverse of their diagonals. False: not positive
+    definite.
 
     Column after column: each takes off what the finished columns that reach it contribute (left-looking).
     """

@@ -1,14 +1,15 @@
 """Expressions of numbers that differentiate themselves: a force is written once, as a formula, and everything that a step
 needs of it (its value, its stiffness, its derivatives in both modes) is generated from that.
 
-A formula is an ordinary Python function of `Scalar` and `Vector`. Calling it builds a graph; equal expressions are one node.
+A formula is an ordinary Python function of `Scalar` and `Vector`. Calling it builds a graph; equal expressions are
+one node.
 `gradient` walks the graph backwards (reverse accumulation), which gives another graph. `compiled.source` writes graphs as
 straight-line Python code, which numba compiles.
 
 Conditions are values (`where`), not branches: both sides are computed. Where a function has a corner its derivative is the
 one that torch takes, since the twins in tests/ are written in torch: that of the side which holds for `maximum` with a
-constant (the argument's own at equality), half of both for `minimum` of two arguments, zero for `absolute` at zero, and zero
-for everything that picks a place in a table.
+constant (the argument's own at equality), half of both for `minimum` of two arguments, zero for `absolute` at zero,
+and zero for everything that picks a place in a table.
 """
 
 from __future__ import annotations
@@ -133,7 +134,7 @@ class Vector:
     y: Scalar
     z: Scalar
 
-    def __iter__(self) -> Iterable[Scalar]:  # type: ignore[misc]  # unpacking is all it is for
+    def __iter__(self) -> Iterable[Scalar]:
         return iter((self.x, self.y, self.z))
 
     def __getitem__(self, axis: int) -> Scalar:

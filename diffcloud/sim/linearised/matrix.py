@@ -69,7 +69,8 @@ def repelling(scene: Scene, pattern: Pattern, corners: Ints, constants: Floats):
 
 @kernel
 def pattern_with(base: Pattern, corners: Ints) -> tuple[Pattern, Ints]:
-    """The pattern that also couples the nodes of pairs [C, 5], and where the base's blocks lie in it; empty: as they are."""
+    """The pattern that also couples the nodes of pairs [C, 5], and where the base's blocks lie in it; empty: as they
+    are."""
     nodes = len(base.place)
     first, second = np.empty(6 * len(corners), np.int64), np.empty(6 * len(corners), np.int64)
     count = 0

@@ -1,4 +1,5 @@
-"""How an episode of linearised steps changes along K directions, carried from its start to its end with the steps' factors."""
+"""How an episode of linearised steps changes along K directions, carried from its start to its end with the steps'
+factors."""
 
 from __future__ import annotations
 

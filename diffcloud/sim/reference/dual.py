@@ -11,7 +11,7 @@ from math import sqrt
 
 import numpy as np
 
-from diffcloud.sim.compiled.data import Floats, Ints
+from diffcloud.sim.compiled.data import Flags, Floats, Ints
 from diffcloud.sim.compiled.dense import lu, lu_solve
 from diffcloud.sim.compiled.kernel import kernel
 
@@ -123,7 +123,7 @@ def _lacking(matrix: Floats, right: Floats, force: Floats, row: int) -> float:
 
 
 @kernel
-def solve_active(matrix: Floats, right: Floats, active: Floats, regular: float) -> Floats:
+def solve_active(matrix: Floats, right: Floats, active: Flags, regular: float) -> Floats:
     """λ [m] of the active rows of a problem with unit diagonal, zero for the others."""
     count = 0
     for i in range(len(right)):
@@ -148,7 +148,7 @@ def solve_active(matrix: Floats, right: Floats, active: Floats, regular: float) 
 
 
 @kernel
-def least_distance(matrix: Floats, right: Floats, regular: float):  # type: ignore[no-untyped-def]
+def least_distance(matrix: Floats, right: Floats, regular: float) -> Flags:
     """The active set bool [m] of min ½ λᵀ A λ - rightᵀ λ over λ >= 0, by the method of Lawson and Hanson."""
     count = len(right)
     active, force = np.zeros(count, np.bool_), np.zeros(count)

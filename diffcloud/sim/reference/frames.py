@@ -12,6 +12,7 @@ where c·d = 0.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from math import sqrt
 from typing import Literal
 
@@ -57,7 +58,7 @@ def _meeting(kind: Kind, inputs: Sequence[Scalar], constants: Sequence[Scalar]) 
     volume = dot(cross(a, b), d)
     rate = dot(cross(a, b), dd) + dot(cross(da, b) + cross(a, db), d)
     # a grazing pair has no derivative of its time: call it constant
-    sides = [absolute(second[axis] - first[axis]) for first, second in zip(at, at[1:], strict=False) for axis in range(3)]
+    sides = [absolute(second[axis] - first[axis]) for first, second in pairwise(at) for axis in range(3)]
     size = sides[0]
     for side in sides[1:]:
         size = larger(size, side)

@@ -2,8 +2,8 @@
 
 A pass moves the points of a zone to x = x̂ + c M⁻¹ Wᵀ λ, where the active rows obey (G + ε diag G) λ = h - W x̂ with
 G = W M⁻¹ Wᵀ. Which rows are active, and which zones a pass solves, has no derivative. A row's weights and normal come from
-the pass that found it: they belong to the time at which its four points meet on their way from the start of the step to where
-they were before that pass.
+the pass that found it: they belong to the time at which its four points meet on their way from the start of the step
+to where they were before that pass.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _point_face_tangent, _edge_edge_tangent = kernels.point_face_meeting_tangent, ke
 
 
 @kernel
-def resolve_reverse(  # type: ignore[no-untyped-def]
+def resolve_reverse(
     choices: Projection,
     record: Impacts,
     begin: Ints,
@@ -95,7 +95,7 @@ def resolve_reverse(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def resolve_tangent(  # type: ignore[no-untyped-def]
+def resolve_tangent(
     choices: Projection,
     record: Impacts,
     begin: Ints,
@@ -165,7 +165,7 @@ def resolve_tangent(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _replayed(  # type: ignore[no-untyped-def]
+def _replayed(
     choices: Projection, record: Impacts, begin: Ints, passes: int, candidate: Floats, inverse_mass: Floats
 ) -> Floats:
     """[P + 1, N, 3] places before each pass, and after the last."""
@@ -231,7 +231,7 @@ def _factorised(points: Ints, rows: Floats, force: Floats, regular: float, inver
 
 
 @kernel
-def _zone_reverse(  # type: ignore[no-untyped-def]
+def _zone_reverse(
     points: Ints,
     rows: Floats,
     force: Floats,
@@ -243,11 +243,11 @@ def _zone_reverse(  # type: ignore[no-untyped-def]
     before: Floats,
     mass_gradient: Floats,
 ) -> Floats:
-    """One zone of one pass: from the gradient by its points, which is taken away, to those by the candidate, the inverse masses
-    and the rows' weights and normals, [m, 7].
+    """One zone of one pass: from the gradient by its points, which is taken away, to those by the candidate, the
+    inverse masses and the rows' weights and normals, [m, 7].
 
-    With q the gradient by the places, μ the adjoint of λ, z = Wᵀ λ, s = Wᵀ μ and Q = c q - s the sums over rows are those of
-    λ_j W_j M⁻¹ Q - μ_j W_j (x̂ + M⁻¹ z).
+    With q the gradient by the places, μ the adjoint of λ, z = Wᵀ λ, s = Wᵀ μ and Q = c q - s the sums over rows are
+    those of λ_j W_j M⁻¹ Q - μ_j W_j (x̂ + M⁻¹ z).
     """
     matrix, pivots, active = _factorised(points, rows, force, regular, inverse_mass)
     adjoint = np.zeros(len(force))

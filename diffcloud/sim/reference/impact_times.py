@@ -66,7 +66,7 @@ def coplanarity_cubic(edges: int, start: Floats, end: Floats) -> tuple[float, fl
 @kernel
 def unit_root(cubic: tuple[float, float, float, float], number: int) -> float:
     """The root in the given one (0, 1, 2) of the three intervals of [0, 1] in which a cubic is monotone, else `NEVER`."""
-    c0, c1, c2, c3 = cubic
+    _, c1, c2, c3 = cubic
     # critical points 3 c3 t² + 2 c2 t + c1 = 0 in the form without cancellation; those outside fall on 0 or 1
     root = sqrt(max(c2 * c2 - 3 * c3 * c1, 0.0))
     q = -(c2 - root) if c2 < 0 else -(c2 + root)

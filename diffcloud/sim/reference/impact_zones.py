@@ -24,8 +24,8 @@ from diffcloud.sim.reference.impact_times import NEVER, first_impact
 
 PASSES = 100
 _REACH = 0.01
-"""[m] Candidate pairs are listed this far around the boxes that their points sweep, and again once a point leaves its box by
-almost half of that."""
+"""[m] Candidate pairs are listed this far around the boxes that their points sweep, and again once a point leaves its
+box by almost half of that."""
 _TIME_TIE = 1e-4
 """Impacts in one interval of this length (of the step) count as simultaneous; then the order is that of the primitives."""
 _TOUCH = 1e-5
@@ -280,7 +280,7 @@ def zones(met: Ints, inverse_mass: Floats) -> Ints:
 
 
 @kernel
-def move(  # type: ignore[no-untyped-def]
+def move(
     points: Ints, rows: Floats, force: Floats, part: float, inverse_mass: Floats, candidate: Floats, places: Floats
 ) -> None:
     """places = candidate + part · M⁻¹ Wᵀ λ at the points of rows that can move."""

@@ -16,8 +16,8 @@ from diffcloud.sim.reference.frames import covers, cross3, dot3, frame_at, heigh
 
 _OUTSIDE = 1e-6
 _PARALLEL = 1e-12
-"""Squared sine of the angle between two edges below which they never repel: they have no common normal, and derivatives without
-bound; what is there to hold apart points and faces do."""
+"""Squared sine of the angle between two edges below which they never repel: they have no common normal, and
+derivatives without bound; what is there to hold apart points and faces do."""
 _TINY = 1e-30
 _TINIEST = 1e-300
 
@@ -34,7 +34,8 @@ class Repulsion(NamedTuple):
     count_once: bool
     """Whether a pair that holds the slots of both its primitives counts once (ARCSim: twice)."""
     held: Floats
-    """[2 (P + F + E)] distance of the nearest pair of two obstacles, infinite where none, which keeps cloth pairs out [m]."""
+    """[2 (P + F + E)] distance of the nearest pair of two obstacles, infinite where none, which keeps cloth pairs out
+    [m]."""
 
 
 @kernel
@@ -42,8 +43,8 @@ def nearest_pairs(surface: Surface, repulsion: Repulsion, points: Floats) -> tup
     """The pairs that repel at points [N, 3].
 
     Returns:
-        (kind and points [C, 5]: 0 for a point and a face, 1 for two edges; sign, count, stiffness and whether an obstacle takes
-        part [C, 4]).
+        (kind and points [C, 5]: 0 for a point and a face, 1 for two edges; sign, count, stiffness and whether an
+        obstacle takes part [C, 4]).
     """
     pairs, found = _near(surface, repulsion, points, 0)
     count = len(pairs)
@@ -119,7 +120,8 @@ def _near(surface: Surface, repulsion: Repulsion, points: Floats, among_fixed: i
                     x[k, axis] = points[corners[k], axis]
             square = frame_at(edges, x, place)
             distance = height(place, x)
-            # pairs between one and two thicknesses hold slots in the original, but without force, and never against a nearer one
+            # pairs between one and two thicknesses hold slots in the original, but without force, and never against a
+            # nearer one
             if not (square > _PARALLEL * _spanned(edges, x) and square >= repulsion.smallest):
                 continue
             if not abs(distance) < repulsion.thickness:
@@ -179,8 +181,8 @@ def _set_slots(surface: Surface, pairs: Ints, c: int, place: Floats, around: Flo
 
 @kernel
 def _on_outer_side(surface: Surface, edge: int, x: Floats, ends: int, others: int, place: Floats, faces: Floats) -> bool:
-    """Whether the place on the other edge (rows `others` of x) lies beyond this edge (rows `ends`) for each face at it; a missing
-    face does not object."""
+    """Whether the place on the other edge (rows `others` of x) lies beyond this edge (rows `ends`) for each face at
+    it; a missing face does not object."""
     s, t = abs(place[others]), abs(place[others + 1])
     for side in range(2):
         face = surface.edge_faces[edge, side]

@@ -5,8 +5,8 @@ K = k_c times the smaller area; force K c²/(2 τ) along n, stiffness K c/τ, sh
 Friction is γ = min(μ f_n/|P v|, 1/(Δt Σ w_k²/m_k)) times the sliding velocity P v, P = I - n nᵀ. In γ the force f_n and
 the velocity v = Σ w_k v_k are those of the start of the step; the sliding velocity itself is implicit.
 
-`nearest` says which pairs: each point, edge and face has a slot on each of its two sides that keeps only the nearest pair. A
-pair that holds two slots counts twice in the original (`count_once` off).
+`nearest` says which pairs: each point, edge and face has a slot on each of its two sides that keeps only the nearest
+pair. A pair that holds two slots counts twice in the original (`count_once` off).
 """
 
 from __future__ import annotations
@@ -56,5 +56,5 @@ def _term(kind: Kind) -> Term:
 
 PROXIMITY_POINT_FACE = _term("point_face")
 PROXIMITY_EDGE_EDGE = _term("edge_edge")
-"""Constants: what turns the normal towards the first primitive; how often the pair counts; k_c times the area [N/m]; 1 where an
-obstacle takes part; τ [m]."""
+"""Constants: what turns the normal towards the first primitive; how often the pair counts; k_c times the area [N/m];
+1 where an obstacle takes part; τ [m]."""

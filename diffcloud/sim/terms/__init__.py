@@ -1,19 +1,26 @@
-"""The forces of a step, one file each; `term.py` says what a force is.
+"""The forces of a step, one file each; `term.py` says what a force is, `compiled.module` what is generated from it.
 
-A new force is a file here and its name in `TERMS`.
+A new force is a file here and a line in `TERMS`.
 """
+
+from importlib import import_module
 
 from diffcloud.sim.compiled.module import terms_module
 from diffcloud.sim.reference.frames import EDGE_EDGE_MEETING, POINT_FACE_MEETING
 from diffcloud.sim.reference.proximity import PROXIMITY_EDGE_EDGE, PROXIMITY_POINT_FACE
-from diffcloud.sim.terms.air import AIR
-from diffcloud.sim.terms.bending import BENDING
-from diffcloud.sim.terms.gravity import GRAVITY
-from diffcloud.sim.terms.handles import HANDLES
-from diffcloud.sim.terms.planes import PLANES
-from diffcloud.sim.terms.stretching import STRETCHING
+from diffcloud.sim.terms.term import Term
 
-TERMS = (GRAVITY, STRETCHING, BENDING, AIR, HANDLES, PLANES)
+TERMS: tuple[Term, ...] = tuple(
+    import_module(f"{__name__}.{file}").TERM
+    for file in (
+        "gravity",
+        "stretching",
+        "bending",
+        "air",
+        "handles",
+        "planes",
+    )
+)
 """Forces between nodes that are known before the motion. Both steps go through this list."""
 CONTACTS = (PROXIMITY_POINT_FACE, PROXIMITY_EDGE_EDGE)
 """Forces between points that each step finds."""

@@ -25,7 +25,7 @@ def force(face: Element) -> Sequence[Vector]:
     wind = face.vector("wind")
     before, after = (wind - total(field) / 3.0 for field in (face.before, face.after))
     lagged = face.constant("lagged") > 0.0
-    relative = Vector(*(where(lagged, old, new) for old, new in zip(before, after, strict=True)))
+    relative = Vector(*(where(lagged, before[axis], after[axis]) for axis in range(3)))
     speed = dot(relative, unit)
     drag = face.parameter("air_drag")
     pressure = (face.parameter("air_density") * absolute(dot(before, unit)) - drag) * speed
@@ -48,7 +48,7 @@ def build(setup: Setup) -> Elements:
     )
 
 
-AIR = Term(
+TERM = Term(
     "air",
     corners=3,
     force=force,

@@ -88,7 +88,7 @@ def build(setup: Setup) -> Elements:
     )
 
 
-BENDING = Term(
+TERM = Term(
     "bending",
     corners=4,
     force=force,

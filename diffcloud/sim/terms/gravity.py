@@ -21,7 +21,5 @@ def build(setup: Setup) -> Elements:
     return Elements(nodes, {"gravity": np.tile(np.array(setup.surrounding.gravity, dtype=np.float64), (len(nodes), 1))})
 
 
-GRAVITY = Term(
-    "gravity", corners=1, force=force, build=build, constants={"gravity": (3,)}, parameters={"node_mass": "corner"}
-)
+TERM = Term("gravity", corners=1, force=force, build=build, constants={"gravity": (3,)}, parameters={"node_mass": "corner"})
 """Constants: g [m/s²]."""

@@ -25,4 +25,4 @@ def build(setup: Setup) -> Elements:
     return Elements(np.array(setup.handles.nodes, dtype=np.int64).reshape(-1, 1))
 
 
-HANDLES = Term("handles", corners=1, force=force, build=build, parameters={"hold": "element", "target": "vector"})
+TERM = Term("handles", corners=1, force=force, build=build, parameters={"hold": "element", "target": "vector"})

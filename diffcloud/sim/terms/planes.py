@@ -7,7 +7,8 @@ Friction (lagged: normal force and sliding direction of the start of the step): 
 -γ P v with P = I - n nᵀ, implicit in v. The second branch is sticking: it halves the sliding velocity in each
 step, so a node on an incline of angle α creeps at g sin(α) Δt, which vanishes with the step.
 
-Projection (`project`): a node whose candidate position is behind the plane is put at the projection thickness above it. For a
+Projection (`project`): a node whose candidate position is behind the plane is put at the projection thickness above
+it. For a
 single static plane this is the exact solution of the impact-zone problem (nodes do not couple), and inelastic.
 
 Not reproduced from ARCSim: the doubled constraint of the node nearest to each obstacle face, contacts of cloth edges
@@ -62,7 +63,7 @@ def build(setup: Setup) -> Elements | None:
     )
 
 
-PLANES = Term(
+TERM = Term(
     "planes",
     corners=1,
     force=force,
@@ -74,8 +75,8 @@ PLANES = Term(
 
 
 def half_spaces(mesh: ClothMesh, surrounding: Surrounding) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Planar obstacles as (normals [P, 3], offsets [P]), on the side where most of the cloth starts; none where contact with
-    meshes covers them."""
+    """Planar obstacles as (normals [P, 3], offsets [P]), on the side where most of the cloth starts; none where
+    contact with meshes covers them."""
     found = [obstacle.plane() for obstacle in surrounding.obstacles if surrounding.reference_contact is None]
     planes = [plane for plane in found if plane is not None]
     normals = np.array([normal for normal, _ in planes]).reshape(-1, 3)

@@ -62,12 +62,12 @@ def build(setup: Setup) -> Elements:
     mesh = setup.mesh
     return Elements(
         nodes=mesh.faces,
-        constants={"area": mesh.face_area, "inverse_rest": np.linalg.inv(mesh.material_edges)},
+        constants={"area": mesh.face_area, "inverse_rest": np.linalg.inv(mesh.material_edges).astype(np.float64)},
         tables={"cells": _cell_polynomials(_sampled(setup.material.stretching))},
     )
 
 
-STRETCHING = Term(
+TERM = Term(
     "stretching",
     corners=3,
     force=force,

@@ -1,7 +1,7 @@
 """What a force is, to the step: a formula for one element, and the elements it acts on.
 
-The formula is written with `compiled.trace`; its value, stiffness and derivatives are generated from it. Every quantity of an
-element is asked for by name, so that a term's file is all there is to say about it.
+The formula is written with `compiled.trace`; its value, stiffness and derivatives are generated from it. Every
+quantity of an element is asked for by name, so that a term's file is all there is to say about it.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ class Term:
     parameters: Mapping[str, Place] = field(default_factory=dict)
     """What it can be differentiated by: fields of `Parameters`."""
     resistance: Callable[[Element], Sequence[Vector]] | None = None
-    """The force whose derivative by displacement and velocity is the positive semidefinite stiffness, where it is not `force`."""
+    """The force whose derivative by displacement and velocity is the positive semidefinite stiffness, where it is not
+    `force`."""
 
     energy: Callable[[Element], Scalar] | None = None
     """[J] that an element stores, where it does; tells explosions from motions."""

@@ -119,9 +119,6 @@ def planes(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> 
     return (pushing - approach)[:, None] * normal - gamma[:, None] * (motion.after @ across)
 
 
-TWINS = {twin.__name__: twin for twin in (gravity, stretching, bending, air, handles, planes)}
-
-
 def sampled(name: str, samples: np.ndarray) -> dict[str, Tensor]:
     """What a twin needs beside its element's constants."""
     return {"samples": torch.as_tensor(samples)} if name == "stretching" else {}
