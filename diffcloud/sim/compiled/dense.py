@@ -36,8 +36,9 @@ def lu(matrix: Floats, pivots: Ints) -> bool:
 def lu_solve(matrix: Floats, pivots: Ints, right: Floats) -> None:
     """Solve with a factorised matrix; `right` [n] takes the solution."""
     count = len(matrix)
-    for k in range(count):
+    for k in range(count):  # all exchanges first: later ones have moved the rows of the factor, too
         right[k], right[pivots[k]] = right[pivots[k]], right[k]
+    for k in range(count):
         for i in range(k + 1, count):
             right[i] -= matrix[i, k] * right[k]
     for k in range(count - 1, -1, -1):
