@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.kernel import kernel
 

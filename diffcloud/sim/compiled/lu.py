@@ -9,10 +9,9 @@ is looked at, and where it is large the system is solved again by dense LU with 
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
+from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats
 from diffcloud.sim.compiled.dense import lu, lu_solve, lu_solve_transposed
 from diffcloud.sim.compiled.kernel import kernel
@@ -22,18 +21,23 @@ _GOOD = 1e-9
 """Residual, relative to the sizes of the matrix and of both sides, below which a solution counts."""
 
 
-class General(NamedTuple):
-    """A matrix without symmetry, and its factors."""
+class GeneralType(BoxType):
+    """Of `General`."""
 
-    pattern: Pattern
-    lower: Floats
-    """[A + 1, 9] blocks of the lower half and the diagonal."""
-    upper: Floats
-    """[A + 1, 9] blocks of the upper half, transposed; its diagonal counts for nothing."""
-    below: Floats
-    """[L, 9] L, with the inverse of D in the place of its diagonal."""
-    above: Floats
-    """[L, 9] U transposed, without its diagonal."""
+
+class General(Box):
+    """A matrix without symmetry, and its factors.
+
+    Fields:
+        pattern: `sparse.Pattern`
+        lower: [A + 1, 9] blocks of the lower half and the diagonal.
+        upper: [A + 1, 9] blocks of the upper half, transposed; its diagonal counts for nothing.
+        below: [L, 9] L, with the inverse of D in the place of its diagonal.
+        above: [L, 9] U transposed, without its diagonal.
+    """
+
+
+define(General, GeneralType, ["pattern", "lower", "upper", "below", "above"])
 
 
 @kernel
@@ -90,25 +94,27 @@ def _invert(m: Floats, found: Floats) -> None:
 def solve_general(of: General, right: Floats, transposed: int, solution: Floats) -> bool:
     """solution [V, 3] of A x = right, or of Aᵀ x = right; False: the matrix is singular."""
     if transposed > 0:
-        _substitute(of, of.above, of.below, right, 1, solution)
+        _substitute(of.pattern, of.below, of.above, of.below, right, 1, solution)
     else:
-        _substitute(of, of.below, of.above, right, 0, solution)
+        _substitute(of.pattern, of.below, of.below, of.above, right, 0, solution)
     if _good(of, right, transposed, solution):
         return True
     return _dense(of, right, transposed, solution)
 
 
 @kernel
-def _substitute(of: General, first: Floats, second: Floats, right: Floats, transposed: int, solution: Floats) -> None:
+def _substitute(
+    of: Pattern, below: Floats, first: Floats, second: Floats, right: Floats, transposed: int, solution: Floats
+) -> None:
     """Forwards through one half, backwards through the other one."""
-    place, starts, rows = of.pattern.place, of.pattern.factor_starts, of.pattern.factor_rows
+    place, starts, rows = of.place, of.factor_starts, of.factor_rows
     count = len(place)
     work = np.empty((count, 3))
     for node in range(count):
         for axis in range(3):
             work[place[node], axis] = right[node, axis]
     for j in range(count):
-        own, d = work[j], of.below[starts[j]]
+        own, d = work[j], below[starts[j]]
         a, b, c = own[0], own[1], own[2]
         if transposed > 0:  # the diagonal blocks belong to U, which comes first then
             own[0], own[1], own[2] = (
@@ -123,7 +129,7 @@ def _substitute(of: General, first: Floats, second: Floats, right: Floats, trans
             w[1] -= f[3] * a + f[4] * b + f[5] * c
             w[2] -= f[6] * a + f[7] * b + f[8] * c
     for j in range(count - 1, -1, -1):
-        own, d = work[j], of.below[starts[j]]
+        own, d = work[j], below[starts[j]]
         a, b, c = own[0], own[1], own[2]
         for p in range(starts[j] + 1, starts[j + 1]):
             f, w = second[p], work[rows[p]]
@@ -146,7 +152,7 @@ def _substitute(of: General, first: Floats, second: Floats, right: Floats, trans
 @kernel
 def _good(of: General, right: Floats, transposed: int, solution: Floats) -> bool:
     """Whether what a solution leaves over is small."""
-    pattern = of.pattern
+    pattern, low, high = of.pattern, of.lower, of.upper
     count = len(pattern.place)
     node = np.empty(count, np.int64)
     for i in range(count):
@@ -159,7 +165,7 @@ def _good(of: General, right: Floats, transposed: int, solution: Floats) -> bool
         for p in range(pattern.starts[j], pattern.starts[j + 1]):
             i = pattern.rows[p]
             row, column = node[i], node[j]
-            lower, upper = (of.upper[p], of.lower[p]) if transposed > 0 and i != j else (of.lower[p], of.upper[p])
+            lower, upper = (high[p], low[p]) if transposed > 0 and i != j else (low[p], high[p])
             for r in range(3):
                 for c in range(3):
                     place = 3 * c + r if transposed > 0 and i == j else 3 * r + c
@@ -182,7 +188,7 @@ def _good(of: General, right: Floats, transposed: int, solution: Floats) -> bool
 @kernel
 def _dense(of: General, right: Floats, transposed: int, solution: Floats) -> bool:
     """The solution by dense LU; False: singular."""
-    pattern = of.pattern
+    pattern, low, high = of.pattern, of.lower, of.upper
     count = len(pattern.place)
     matrix = np.zeros((3 * count, 3 * count))
     for j in range(count):
@@ -190,9 +196,9 @@ def _dense(of: General, right: Floats, transposed: int, solution: Floats) -> boo
             i = pattern.rows[p]
             for r in range(3):
                 for c in range(3):
-                    matrix[3 * i + r, 3 * j + c] = of.lower[p, 3 * r + c]
+                    matrix[3 * i + r, 3 * j + c] = low[p, 3 * r + c]
                     if i != j:
-                        matrix[3 * j + c, 3 * i + r] = of.upper[p, 3 * r + c]
+                        matrix[3 * j + c, 3 * i + r] = high[p, 3 * r + c]
     pivots, work = np.empty(3 * count, np.int64), np.empty(3 * count)
     if not lu(matrix, pivots):
         return False

@@ -6,10 +6,11 @@ falls on the same point, edge or face is one place with the sum of the shares, w
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.contact.distance import closest, on_segment
@@ -37,14 +38,15 @@ class Planes(NamedTuple):
     """[Q] [m²]"""
 
 
-class Touching(NamedTuple):
+class TouchingType(BoxType):
+    """Of `Touching`."""
+
+
+class Touching(Box):
     """The places that touch, as elements."""
 
-    point_point: Any
-    point_edge: Any
-    point_face: Any
-    edge_edge: Any
-    plane: Any
+
+define(Touching, TouchingType, ["point_point", "point_edge", "point_face", "edge_edge", "plane"])
 
 
 @kernel

@@ -7,11 +7,10 @@ import numpy as np
 from diffcloud.sim.compiled.data import Floats, Motion, Parameters, Timing
 from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.lu import solve_general
-from diffcloud.sim.contact.places import Touching
 from diffcloud.sim.held import Held, aim, aim_reverse, holders, take_anchors_reverse
-from diffcloud.sim.implicit.equation import arm_of, contact_force, room_for_motion, spin_inputs
-from diffcloud.sim.implicit.parts import Solved, along, solved_part
-from diffcloud.sim.implicit.scene import BODY, Kept, Scene
+from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
+from diffcloud.sim.implicit.parts import Solved, solved_part
+from diffcloud.sim.implicit.scene import BODY, Kept, Scene, Work, new_work
 from diffcloud.sim.terms import kernels
 
 _reverse, _spin_reverse = kernels.reverse, kernels.spin_reverse
@@ -48,12 +47,14 @@ def reverse(
         track_gradients: [S, 3] zeros, takes those by the track.
     """
     steps, nodes, count = len(positions) - 1, positions.shape[1], bodies.shape[1]
-    motion, slopes = room_for_motion(scene), room_for_motion(scene)
+    work, points = new_work(scene, parameters, nodes, count), scene.surface.point_count
+    speeds = np.empty((points, 3))  # gradients by the velocities before and after a step are one array
+    slopes = Motion(np.empty((points, 3)), speeds, speeds, np.empty((points, 3)))
     anchor_gradients, target = np.zeros((len(held.node), 3)), np.empty((len(held.node), 3))
     x, v, own = np.empty((nodes, 3)), np.empty((nodes, 3)), np.empty((count, BODY))
     for step in range(steps - 1, -1, -1):
         aim(held, track, step, anchors, parameters)
-        holder = holders(held, step, nodes)
+        holder = work.holder = holders(held, step, nodes)
         parameter_gradients.target[:] = 0.0
         for i in range(nodes):
             for axis in range(3):
@@ -63,11 +64,12 @@ def reverse(
                 own[b, k] = body_gradients[step + 1, b, k]
         for part in range(kept.begins[step + 1] - 1, kept.begins[step] - 1, -1):
             solved = solved_part(
-                scene, parameters, obstacles, step, part, positions[step], velocities[step], bodies[step], holder, kept, motion
-            )
+                work, scene.time_step, obstacles[step], obstacles[step + 1], kept.begins[step], part, positions[step],
+                velocities[step], bodies[step], kept,
+            )  # fmt: skip
             target[:] = 0.0
-            _part(scene, parameters, solved, motion, slopes, x, v, own, parameter_gradients, target)
-            gone = along(solved.end)
+            _part(work, solved, slopes, x, v, own, parameter_gradients, target)
+            gone = solved.gone
             for i in range(nodes):
                 h = holder[i]
                 if h >= 0:
@@ -92,30 +94,29 @@ def reverse(
 
 @kernel
 def _part(
-    scene: Scene,
-    parameters: Parameters,
+    work: Work,
     solved: Solved,
-    motion: Motion,
     slopes: Motion,
     x: Floats,
     v: Floats,
     own: Floats,
     gradients: Parameters,
-    target: Floats,
+    wanted: Floats,
 ) -> None:
-    """Gradients by the end of a part (x, v [V, 3], own [B, 18]) become those by its start; target [H, 3] takes its own."""
-    start, w = solved.start, solved.velocity
-    dt, nodes, count = start.time_step, len(x), len(own)
+    """Gradients by the end of a part (x, v [V, 3], own [B, 18]) become those by its start; wanted [H, 3] takes those by its targets."""
+    time_step, parameters, holder, start_velocities = work.time_step, work.parameters, work.holder, work.start_velocities
+    w = solved.velocity
+    dt, nodes, count = time_step, len(x), len(own)
     right, y = np.zeros((len(w), 3)), np.zeros((len(w), 3))
     for i in range(nodes):
-        if start.holder[i] < 0:
+        if holder[i] < 0:
             for axis in range(3):
                 right[i, axis] = v[i, axis] + dt * x[i, axis]
     inputs, constants = np.empty(15), np.empty(10)
     pull, pulled = np.zeros(12), np.empty(15)
     for b in range(count):
         row = nodes + 2 * b
-        spin_inputs(scene, start, b, w[row + 1], inputs, constants)
+        spin_inputs(work, b, w[row + 1], inputs, constants)
         for k in range(9):
             pull[k] = own[b, 3 + k]
         pulled[:] = 0.0
@@ -125,43 +126,44 @@ def _part(
             right[row + 1, axis] = own[b, 15 + axis] + pulled[12 + axis]
     solve_general(solved.matrix, right, 1, y)
     for i in range(nodes):
-        if start.holder[i] >= 0:
+        if holder[i] >= 0:
             y[i, 0] = y[i, 1] = y[i, 2] = 0.0
-    _forces(scene, parameters, solved, motion, y, gradients, slopes)
+    _forces(work, solved, y, gradients, slopes)
     damping = parameters.damping[0]
     for i in range(nodes):
-        h = start.holder[i]
+        h = holder[i]
         for axis in range(3):
             moved, bent = slopes.after[i, axis], slopes.displacement[i, axis]
             gradients.damping[0] += bent * w[i, axis]
             if h >= 0:  # its end is the target, and its velocity leads there
                 speed = v[i, axis] + moved + damping * bent
-                target[h, axis] += x[i, axis] + slopes.positions[i, axis] + speed / dt
+                wanted[h, axis] += x[i, axis] + slopes.positions[i, axis] + speed / dt
                 x[i, axis] = -speed / dt
                 v[i, axis] = 0.0
             else:
-                gradients.node_mass[i] -= (w[i, axis] - start.velocities[i, axis]) * y[i, axis]
+                gradients.node_mass[i] -= (w[i, axis] - start_velocities[i, axis]) * y[i, axis]
                 x[i, axis] += slopes.positions[i, axis]
                 v[i, axis] = parameters.node_mass[i] * y[i, axis]
     if count > 0:
-        _bodies(scene, parameters, solved, motion, slopes, y, own, gradients)
+        _bodies(work, solved, slopes, y, own, gradients)
 
 
 @kernel
 def _forces(
-    scene: Scene, parameters: Parameters, solved: Solved, motion: Motion, y: Floats, gradients: Parameters, slopes: Motion
+    work: Work, solved: Solved, y: Floats, gradients: Parameters, slopes: Motion
 ) -> None:
     """Gradients of Δt y · f, of forces on cloth nodes and on bodies."""
-    start = solved.start
-    dt, nodes = start.time_step, len(start.positions)
-    adjoint = np.zeros((len(motion.positions), 3))
+    first_body_point, time_step, terms, parameters = work.first_body_point, work.time_step, work.terms, work.parameters
+    motion, start_positions, rigid = work.motion, work.start_positions, work.rigid
+    dt, nodes = time_step, len(start_positions)
+    adjoint, ended = np.zeros((len(motion.positions), 3)), solved.turned
     for i in range(nodes):
         for axis in range(3):
             adjoint[i, axis] = dt * y[i, axis]
-    first = nodes + scene.obstacle_points
-    for p in range(len(scene.rigid.body)):
-        row = nodes + 2 * scene.rigid.body[p]
-        a0, a1, a2 = arm_of(scene, solved.turned, p)
+    first = first_body_point
+    for p in range(len(rigid.body)):
+        row = nodes + 2 * rigid.body[p]
+        a0, a1, a2 = arm_of(rigid, ended, p)
         turn = y[row + 1]
         adjoint[first + p, 0] = dt * (y[row, 0] + turn[1] * a2 - turn[2] * a1)
         adjoint[first + p, 1] = dt * (y[row, 1] + turn[2] * a0 - turn[0] * a2)
@@ -169,15 +171,8 @@ def _forces(
     slopes.positions[:] = 0.0
     slopes.after[:] = 0.0  # those by the velocities before the step are the same array
     slopes.displacement[:] = 0.0
-    timing = Timing(dt, 0.0)
-    _reverse(scene.terms, parameters, motion, timing, adjoint, gradients, slopes)
-    _contacts(solved.touching, parameters, motion, timing, adjoint, gradients, slopes)
-
-
-@kernel
-def _contacts(  # type: ignore[no-untyped-def]
-    touching: Touching, parameters: Parameters, motion: Motion, timing: Timing, adjoint: Floats, gradients: Parameters, slopes
-):
+    timing, touching = Timing(dt, 0.0), solved.touching
+    _reverse(terms, parameters, motion, timing, adjoint, gradients, slopes)
     _point_point(touching.point_point, parameters, motion, timing, adjoint, gradients, slopes)
     _point_edge(touching.point_edge, parameters, motion, timing, adjoint, gradients, slopes)
     _point_face(touching.point_face, parameters, motion, timing, adjoint, gradients, slopes)
@@ -187,23 +182,18 @@ def _contacts(  # type: ignore[no-untyped-def]
 
 @kernel
 def _bodies(
-    scene: Scene,
-    parameters: Parameters,
-    solved: Solved,
-    motion: Motion,
-    slopes: Motion,
-    y: Floats,
-    own: Floats,
-    gradients: Parameters,
+    work: Work, solved: Solved, slopes: Motion, y: Floats, own: Floats, gradients: Parameters
 ) -> None:
     """The rigid bodies' part of `_part`."""
-    start, w = solved.start, solved.velocity
-    dt, nodes, count = start.time_step, len(start.positions), len(own)
+    time_step, first_body_point, start_positions, rigid = work.time_step, work.first_body_point, work.start_positions, work.rigid
+    motion, parameters, start_bodies, gravity = work.motion, work.parameters, work.start_bodies, work.gravity
+    w, ended = solved.velocity, solved.turned
+    dt, nodes, count = time_step, len(start_positions), len(own)
     force = np.zeros((len(motion.positions), 3))
-    contact_force(solved.touching, parameters, motion, Timing(dt, 0.0), force)
-    turned, before, first = np.zeros((count, 12)), np.zeros((count, 9)), nodes + scene.obstacle_points
-    for p in range(len(scene.rigid.body)):
-        b = scene.rigid.body[p]
+    contact_force(work, solved.touching, force)
+    turned, before, first = np.zeros((count, 12)), np.zeros((count, 9)), first_body_point
+    for p in range(len(rigid.body)):
+        b = rigid.body[p]
         turn, f = y[nodes + 2 * b + 1], force[first + p]
         lever = (f[1] * turn[2] - f[2] * turn[1], f[2] * turn[0] - f[0] * turn[2], f[0] * turn[1] - f[1] * turn[0])
         for axis in range(3):
@@ -211,18 +201,18 @@ def _bodies(
             new = slopes.positions[first + p, axis] + old
             own[b, axis] += new - old
             for k in range(3):
-                turned[b, 3 * axis + k] += (new + dt * lever[axis]) * scene.rigid.points[p, k]
-                before[b, 3 * axis + k] -= old * scene.rigid.points[p, k]
+                turned[b, 3 * axis + k] += (new + dt * lever[axis]) * rigid.points[p, k]
+                before[b, 3 * axis + k] -= old * rigid.points[p, k]
     inputs, constants, pulled = np.empty(15), np.empty(10), np.empty(15)
     for b in range(count):
         row, mass = nodes + 2 * b, parameters.body_mass[b]
         for k in range(9):
             turned[b, k] += own[b, 3 + k]
         for axis in range(3):
-            change = w[row, axis] - start.bodies[b, 12 + axis] - dt * scene.gravity[axis]
-            gradients.body_mass[b] -= change * y[row, axis] + solved.turned[b, 9 + axis] * y[row + 1, axis]
+            change = w[row, axis] - start_bodies[b, 12 + axis] - dt * gravity[axis]
+            gradients.body_mass[b] -= change * y[row, axis] + ended[b, 9 + axis] * y[row + 1, axis]
             turned[b, 9 + axis] = -mass * y[row + 1, axis]
-        spin_inputs(scene, start, b, w[row + 1], inputs, constants)
+        spin_inputs(work, b, w[row + 1], inputs, constants)
         pulled[:] = 0.0
         _spin_reverse(inputs, constants, turned[b], pulled)
         for k in range(9):

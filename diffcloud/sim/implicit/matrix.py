@@ -4,46 +4,41 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
+from diffcloud.sim.compiled.data import Floats, Ints, Timing
 from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.lu import General, factorised
 from diffcloud.sim.compiled.sparse import Pattern, find_slot, widened
 from diffcloud.sim.contact.places import Touching, corners
 from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
-from diffcloud.sim.implicit.scene import Scene, Start
+from diffcloud.sim.implicit.scene import Work
 from diffcloud.sim.terms import kernels
 
 _assemble, _jacobian, _spin_tangent = kernels.assemble, kernels.jacobian, kernels.spin_tangent
-_assembled = (
+_pp_assemble, _pe_assemble, _pf_assemble, _ee_assemble, _plane_assemble = (
     kernels.barrier_point_point_assemble,
     kernels.barrier_point_edge_assemble,
     kernels.barrier_point_face_assemble,
     kernels.barrier_edge_edge_assemble,
     kernels.barrier_plane_assemble,
 )
-_pp_assemble, _pe_assemble, _pf_assemble, _ee_assemble, _plane_assemble = _assembled
 _pp_jacobian, _pe_jacobian = kernels.barrier_point_point_jacobian, kernels.barrier_point_edge_jacobian
 _pf_jacobian, _ee_jacobian = kernels.barrier_point_face_jacobian, kernels.barrier_edge_edge_jacobian
 _plane_jacobian = kernels.barrier_plane_jacobian
 
 
 @kernel
-def pattern_for(scene: Scene, pattern: Pattern, moved: Ints, listed: Ints) -> tuple[Pattern, Ints]:
-    """A pattern that also couples what touches, and where the blocks of the scene's own lie in it.
-
-    Args:
-        pattern, moved: of the matrix before, which is kept where it does.
-        listed: [E, 5] places that touch.
-    """
-    spare = len(pattern.rows)
+def widen(work: Work, listed: Ints) -> None:
+    """Let the pattern couple the places that touch, listed [E, 5], too; what it couples already stays."""
+    wide, moved, freedom = work.wide, work.moved, work.freedom
+    spare = len(wide.rows)
     first, second = np.empty(64, np.int64), np.empty(64, np.int64)
     count = 0
     for e in range(len(listed)):
         for a in range(1, 1 + corners(listed, e)):
             for b in range(a + 1, 1 + corners(listed, e)):
                 for k in range(4):
-                    i, j = _freedom(scene, listed[e, a], k % 2), _freedom(scene, listed[e, b], k // 2)
-                    if i < 0 or j < 0 or find_slot(pattern, i, j) != spare:
+                    i, j = freedom[listed[e, a], k % 2], freedom[listed[e, b], k // 2]
+                    if i < 0 or j < 0 or find_slot(wide, i, j) != spare:
                         continue
                     if count == len(first):
                         more, others = np.empty(2 * count, np.int64), np.empty(2 * count, np.int64)
@@ -53,140 +48,119 @@ def pattern_for(scene: Scene, pattern: Pattern, moved: Ints, listed: Ints) -> tu
                     first[count], second[count] = i, j
                     count += 1
     if count == 0:
-        return pattern, moved
-    wide, places = widened(pattern, first[:count], second[:count])
+        return
+    work.wide, places = widened(wide, first[:count], second[:count])
     found = np.empty(len(moved), np.int64)
     for p in range(len(moved)):
         found[p] = places[moved[p]]
-    return wide, found
-
-
-@kernel
-def _freedom(scene: Scene, point: int, turns: int) -> int:
-    """The row of a point's motion: its own, or its body's centre or rotation; below zero: it has none."""
-    nodes = scene.surface.cloth_points
-    if point < nodes:
-        return point if turns == 0 else -1
-    p = point - nodes - scene.obstacle_points
-    return nodes + 2 * scene.rigid.body[p] + turns if p >= 0 else -1
+    work.moved = found
 
 
 @kernel
 def newton_matrix(
-    scene: Scene,
-    start: Start,
-    parameters: Parameters,
-    motion: Motion,
-    velocity: Floats,
-    turned: Floats,
-    listed: Ints,
-    touching: Touching,
-    caution: float,
-    pattern: Pattern,
-    moved: Ints,
+    work: Work, velocity: Floats, turned: Floats, listed: Ints, touching: Touching, caution: float
 ) -> General:
-    """The factorised matrix at a motion (`equation.set_motion`); caution in [0, 1] is the part of the cautious one."""
-    dt, own = start.time_step, len(scene.pattern.rows)
+    """The factorised matrix at the motion; caution in [0, 1] is the part of the cautious one."""
+    time_step, start_positions, wide, terms = work.time_step, work.start_positions, work.wide, work.terms
+    parameters, motion, start_bodies, pattern = work.parameters, work.motion, work.start_bodies, work.pattern
+    rigid, moved = work.rigid, work.moved
+    widen(work, listed)
+    dt, own = time_step, len(pattern.rows)
     reach = dt * (dt + parameters.damping[0])
     lower, upper = np.zeros((own + 1, 9)), np.zeros((own + 1, 9))
     if caution < 1:
         timing = Timing(dt, 0.0)
-        _jacobian(scene.terms, parameters, motion, timing, dt * parameters.damping[0], dt, lower, upper)
+        _jacobian(terms, parameters, motion, timing, dt * parameters.damping[0], dt, lower, upper)
     if caution > 0:
         safe, unused = np.zeros((own + 1, 9)), np.zeros((len(motion.positions), 3))
-        _assemble(scene.terms, parameters, motion, Timing(dt, dt), reach, dt, unused, safe)
+        _assemble(terms, parameters, motion, Timing(dt, dt), reach, dt, unused, safe)
         for p in range(own):
             for k in range(9):
                 lower[p, k] += caution * (safe[p, k] - lower[p, k])
                 upper[p, k] += caution * (safe[p, k] - upper[p, k])
-    if len(pattern.rows) > own:
-        below, above = np.zeros((len(pattern.rows) + 1, 9)), np.zeros((len(pattern.rows) + 1, 9))
+    if len(wide.rows) > own:
+        below, above = np.zeros((len(wide.rows) + 1, 9)), np.zeros((len(wide.rows) + 1, 9))
         for p in range(own):
             for k in range(9):
                 below[moved[p], k], above[moved[p], k] = lower[p, k], upper[p, k]
         lower, upper = below, above
-    nodes = len(start.positions)
+    nodes = len(start_positions)
     for i in range(nodes):
-        block = lower[pattern.starts[pattern.place[i]]]
+        block = lower[wide.starts[wide.place[i]]]
         for axis in range(3):
             block[4 * axis] += parameters.node_mass[i]
-    swing = np.zeros((len(scene.rigid.body), 9))
-    if len(start.bodies) > 0:
-        _add_inertia(scene, start, parameters, velocity, swing, pattern, lower)
+    swing = np.zeros((len(rigid.body), 9))
+    if len(start_bodies) > 0:
+        _add_inertia(work, velocity, swing, lower)
     if len(listed) > 0:
-        _add_contact(scene, parameters, motion, dt, turned, touching, caution, swing, pattern, lower, upper)
-    _let_go(start, parameters, pattern, lower, upper)
-    return factorised(pattern, lower, upper)
+        _add_contact(work, turned, touching, caution, swing, lower, upper)
+    _let_go(work, lower, upper)
+    return factorised(wide, lower, upper)
 
 
 @kernel
-def _let_go(start: Start, parameters: Parameters, of: Pattern, lower: Floats, upper: Floats) -> None:
+def _let_go(work: Work, lower: Floats, upper: Floats) -> None:
     """The row of a prescribed node says only what its own change is."""
-    prescribed = np.zeros(len(of.place), np.int64)
+    holder, wide, parameters = work.holder, work.wide, work.parameters
+    prescribed = np.zeros(len(wide.place), np.int64)
     some = False
-    for i in range(len(start.holder)):
-        if start.holder[i] >= 0:
-            prescribed[of.place[i]], some = 1, True
+    for i in range(len(holder)):
+        if holder[i] >= 0:
+            prescribed[wide.place[i]], some = 1, True
     if not some:
         return
-    for j in range(len(of.place)):
-        for p in range(of.starts[j], of.starts[j + 1]):
-            if prescribed[of.rows[p]] > 0:
+    for j in range(len(wide.place)):
+        for p in range(wide.starts[j], wide.starts[j + 1]):
+            if prescribed[wide.rows[p]] > 0:
                 lower[p] = 0.0
             if prescribed[j] > 0:
                 upper[p] = 0.0
-    for i in range(len(start.holder)):
-        if start.holder[i] >= 0:
-            block = lower[of.starts[of.place[i]]]
+    for i in range(len(holder)):
+        if holder[i] >= 0:
+            block = lower[wide.starts[wide.place[i]]]
             block[0] = block[4] = block[8] = parameters.node_mass[i]
 
 
 @kernel
 def _add_inertia(
-    scene: Scene, start: Start, parameters: Parameters, velocity: Floats, swing: Floats, of: Pattern, lower: Floats
+    work: Work, velocity: Floats, swing: Floats, lower: Floats
 ) -> None:
     """Mass and turning inertia of bodies; swing [P, 9] takes d point / d angular velocity over Δt."""
-    nodes = len(start.positions)
+    start_positions, start_bodies, parameters, wide = work.start_positions, work.start_bodies, work.parameters, work.wide
+    rigid, time_step = work.rigid, work.time_step
+    nodes = len(start_positions)
     inputs, constants = np.empty(15), np.empty(10)
     rates, found = np.zeros((3, 15)), np.empty((3, 12))
     for axis in range(3):
         rates[axis, 12 + axis] = 1.0
-    for b in range(len(start.bodies)):
-        spin_inputs(scene, start, b, velocity[nodes + 2 * b + 1], inputs, constants)
+    for b in range(len(start_bodies)):
+        spin_inputs(work, b, velocity[nodes + 2 * b + 1], inputs, constants)
         _spin_tangent(inputs, constants, rates, found)
         mass = parameters.body_mass[b]
-        linear = lower[of.starts[of.place[nodes + 2 * b]]]
-        turning = lower[of.starts[of.place[nodes + 2 * b + 1]]]
+        linear = lower[wide.starts[wide.place[nodes + 2 * b]]]
+        turning = lower[wide.starts[wide.place[nodes + 2 * b + 1]]]
         for row in range(3):
             linear[4 * row] += mass
             for column in range(3):
                 turning[3 * row + column] += mass * found[column, 9 + row]
         for p in range(len(swing)):
-            if scene.rigid.body[p] != b:
+            if rigid.body[p] != b:
                 continue
             for row in range(3):
                 for column in range(3):
                     part = 0.0
                     for k in range(3):
-                        part += found[column, 3 * row + k] * scene.rigid.points[p, k]
-                    swing[p, 3 * row + column] = part / start.time_step
+                        part += found[column, 3 * row + k] * rigid.points[p, k]
+                    swing[p, 3 * row + column] = part / time_step
 
 
 @kernel
 def _add_contact(
-    scene: Scene,
-    parameters: Parameters,
-    motion: Motion,
-    dt: float,
-    turned: Floats,
-    touching: Touching,
-    caution: float,
-    swing: Floats,
-    pattern: Pattern,
-    lower: Floats,
-    upper: Floats,
+    work: Work, turned: Floats, touching: Touching, caution: float, swing: Floats, lower: Floats, upper: Floats
 ) -> None:
     """Blocks of all places that touch, and how the moments of their forces change as arms turn."""
+    freedom, time_step, rigid, motion = work.freedom, work.time_step, work.rigid, work.motion
+    first_body_point, wide = work.first_body_point, work.wide
     for kind in range(5):
         nodes = _nodes_of(touching, kind)
         count, width = len(nodes), nodes.shape[1]
@@ -194,21 +168,19 @@ def _add_contact(
             continue
         exact = np.zeros((count, width * width, 9))
         if caution < 1:
-            _exact(touching, kind, parameters, motion, Timing(dt, 0.0), dt, exact)
+            _exact(work, touching, kind, exact)
         if caution > 0:
             safe = np.zeros((count, width * (width + 1) // 2, 9))
-            _safe(touching, kind, parameters, motion, Timing(dt, 0.0), dt, safe)
+            _safe(work, touching, kind, safe)
             _blend(safe, caution, width, exact)
-        _couple(scene, turned, swing, pattern, nodes, exact, lower, upper)
-    if len(scene.rigid.body) == 0 or not caution < 1:
+        _couple(work, turned, swing, nodes, exact, lower, upper)
+    if len(rigid.body) == 0 or not caution < 1:
         return
     force = np.zeros((len(motion.positions), 3))
-    contact_force(touching, parameters, motion, Timing(dt, 0.0), force)
-    first = scene.surface.cloth_points + scene.obstacle_points
+    contact_force(work, touching, force)
     for p in range(len(swing)):  # -Δt d arm × f = Δt f × d arm
-        row = scene.surface.cloth_points + 2 * scene.rigid.body[p] + 1
-        block, f = lower[pattern.starts[pattern.place[row]]], force[first + p]
-        _add_cross(f[0], f[1], f[2], swing[p], dt * dt, block)
+        row, f = freedom[first_body_point + p, 1], force[first_body_point + p]
+        _add_cross(f[0], f[1], f[2], swing[p], time_step * time_step, lower[wide.starts[wide.place[row]]])
 
 
 @kernel
@@ -234,10 +206,10 @@ def _nodes_of(touching: Touching, kind: int) -> Ints:
 
 
 @kernel
-def _exact(  # type: ignore[no-untyped-def]
-    touching: Touching, kind: int, parameters: Parameters, motion: Motion, timing: Timing, dt: float, blocks: Floats
-):
+def _exact(work: Work, touching: Touching, kind: int, blocks: Floats) -> None:
     """Blocks [E, n², 9] of -Δt d force / d velocity."""
+    time_step, parameters, motion = work.time_step, work.parameters, work.motion
+    dt, timing = time_step, Timing(time_step, 0.0)
     if kind == 0:
         _pp_jacobian(touching.point_point, parameters, motion, timing, 0.0, dt, blocks)
     elif kind == 1:
@@ -251,10 +223,10 @@ def _exact(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _safe(  # type: ignore[no-untyped-def]
-    touching: Touching, kind: int, parameters: Parameters, motion: Motion, timing: Timing, dt: float, blocks: Floats
-):
+def _safe(work: Work, touching: Touching, kind: int, blocks: Floats) -> None:
     """The cautious blocks [E, pairs, 9]."""
+    time_step, parameters, motion = work.time_step, work.parameters, work.motion
+    dt, timing = time_step, Timing(time_step, 0.0)
     unused = np.zeros((len(motion.positions), 3))
     if kind == 0:
         _pp_assemble(touching.point_point, parameters, motion, timing, 0.0, dt, unused, blocks)
@@ -286,17 +258,18 @@ def _blend(safe: Floats, caution: float, width: int, blocks: Floats) -> None:
 
 @kernel
 def _couple(
-    scene: Scene, turned: Floats, swing: Floats, pattern: Pattern, nodes: Ints, blocks: Floats, lower: Floats, upper: Floats
+    work: Work, turned: Floats, swing: Floats, nodes: Ints, blocks: Floats, lower: Floats, upper: Floats
 ) -> None:
     """Add blocks [E, n², 9] between points to those between rows of the matrix: of nodes, or of bodies' centres and rotations."""
-    width, first = nodes.shape[1], scene.surface.cloth_points + scene.obstacle_points
+    first_body_point, wide, freedom, rigid = work.first_body_point, work.wide, work.freedom, work.rigid
+    width, first = nodes.shape[1], first_body_point
     right, both = np.empty(9), np.empty(9)
     for e in range(len(nodes)):
         for a in range(width):
             for b in range(width):
                 block = blocks[e, a * width + b]
                 for k in range(4):
-                    row, column = _freedom(scene, nodes[e, a], k // 2), _freedom(scene, nodes[e, b], k % 2)
+                    row, column = freedom[nodes[e, a], k // 2], freedom[nodes[e, b], k % 2]
                     if row < 0 or column < 0:
                         continue
                     part = block
@@ -309,11 +282,11 @@ def _couple(
                                 )
                         part = right
                     if k // 2 > 0:
-                        x, y, z = arm_of(scene, turned, nodes[e, a] - first)
+                        x, y, z = arm_of(rigid, turned, nodes[e, a] - first)
                         both[:] = 0.0
                         _add_cross(x, y, z, part, 1.0, both)
                         part = both
-                    _add_at(pattern, row, column, part, lower, upper)
+                    _add_at(wide, row, column, part, lower, upper)
 
 
 @kernel

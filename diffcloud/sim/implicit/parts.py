@@ -2,77 +2,83 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters
+from diffcloud.sim.compiled.box import Box, BoxType, define
+from diffcloud.sim.compiled.data import Floats
 from diffcloud.sim.compiled.kernel import kernel
-from diffcloud.sim.compiled.lu import General
-from diffcloud.sim.contact.places import Touching, as_elements
+from diffcloud.sim.contact.places import as_elements
 from diffcloud.sim.implicit.equation import place_points, set_motion
-from diffcloud.sim.implicit.matrix import newton_matrix, pattern_for
-from diffcloud.sim.implicit.scene import BODY, PARTS, Kept, Scene, Start
-from diffcloud.sim.implicit.step import part_of_step
+from diffcloud.sim.implicit.matrix import newton_matrix
+from diffcloud.sim.implicit.scene import BODY, PARTS, Kept, Work
+from diffcloud.sim.implicit.step import begin_part
 
 
-class Solved(NamedTuple):
-    """The end of a part."""
+class SolvedType(BoxType):
+    """Of `Solved`."""
 
-    start: Start
-    velocity: Floats
-    """[D, 3]"""
-    turned: Floats
-    """[B, 12] as of `rigid.spin`."""
-    touching: Touching
-    matrix: General
-    """The exact one, factorised."""
-    end: int
-    """Where the part ends, of `PARTS`."""
+
+class Solved(Box):
+    """The end of a part.
+
+    Fields:
+        velocity: [D, 3]
+        turned: [B, 12] as of `rigid.spin`.
+        touching: what touches, as elements.
+        matrix: the exact one, factorised.
+        gone: which part of its way a prescribed node has gone; the rest is where the step began.
+    """
+
+
+define(Solved, SolvedType, ["velocity", "turned", "touching", "matrix", "gone"])
 
 
 @kernel
 def solved_part(
-    scene: Scene,
-    parameters: Parameters,
-    obstacles: Floats,
-    step: int,
+    work: Work,
+    time_step: float,
+    before: Floats,
+    after: Floats,
+    first: int,
     part: int,
     positions: Floats,
     velocities: Floats,
     bodies: Floats,
-    holder: Ints,
     kept: Kept,
-    motion: Motion,
 ) -> Solved:
-    """A part of a step whose start is positions, velocities [V, 3] and bodies [B, 18]; `motion` takes its motion."""
+    """A part of a step: sets its start and its motion in `work`.
+
+    Args:
+        time_step: of the whole step [s].
+        before, after: [O, 3] obstacles at its ends [m].
+        first: its first part.
+        positions, velocities, bodies: at its start.
+    """
     nodes, count = len(positions), len(bodies)
     begin, end = 0, kept.ends[part]
-    first, x, v, own = positions, positions, velocities, bodies
-    if part > kept.begins[step]:
+    x, v, own = positions, velocities, bodies
+    if part > first:
         begin = kept.ends[part - 1]
         x, v, own = np.empty((nodes, 3)), np.empty((nodes, 3)), np.empty((count, BODY))
         _read(kept.states[part - 1], x, v, own)
-    start = part_of_step(scene, parameters, obstacles, step, begin, end, first, x, v, own, holder)
-    last, after, others = np.empty((nodes, 3)), np.empty((nodes, 3)), np.empty((count, BODY))
-    _read(kept.states[part], last, after, others)
+    begin_part(work, time_step, before, after, begin, end, positions, x, v, own)
+    last, speed, others = np.empty((nodes, 3)), np.empty((nodes, 3)), np.empty((count, BODY))
+    _read(kept.states[part], last, speed, others)
     velocity = np.empty((nodes + 2 * count, 3))
     for axis in range(3):
         for i in range(nodes):
-            velocity[i, axis] = after[i, axis]
+            velocity[i, axis] = speed[i, axis]
         for b in range(count):
             velocity[nodes + 2 * b, axis], velocity[nodes + 2 * b + 1, axis] = others[b, 12 + axis], others[b, 15 + axis]
-    points, turned = np.empty((len(start.points), 3)), np.empty((count, 12))
-    place_points(scene, start, velocity, start.final, points, turned)
-    set_motion(start, parameters, velocity, points, motion)
-    a, b = kept.first_place[part], kept.first_place[part + 1]
-    listed = kept.listed[a:b]
-    touching = as_elements(scene.planes, scene.law, listed, kept.numbers[a:b])
-    pattern, moved = pattern_for(scene, scene.pattern, np.arange(len(scene.pattern.rows)), listed)
-    matrix = newton_matrix(
-        scene, start, parameters, motion, velocity, turned, listed, touching, 0.0, pattern, moved
-    )
-    return Solved(start, velocity, turned, touching, matrix, end)
+    points, turned = np.empty((len(work.start_points), 3)), np.empty((count, 12))
+    place_points(work, velocity, work.final_scenery, points, turned)
+    set_motion(work, velocity, points)
+    listed = kept.listed[kept.first_place[part] : kept.first_place[part + 1]]
+    numbers = kept.numbers[kept.first_place[part] : kept.first_place[part + 1]]
+    touching = as_elements(work.planes, work.law, listed, numbers)
+    work.wide, work.moved = work.pattern, np.arange(len(work.pattern.rows))
+    matrix = newton_matrix(work, velocity, turned, listed, touching, 0.0)
+    return Solved(velocity, turned, touching, matrix, end / PARTS)
 
 
 @kernel
@@ -86,8 +92,3 @@ def _read(state: Floats, positions: Floats, velocities: Floats, bodies: Floats) 
         for k in range(BODY):
             bodies[b, k] = state[6 * nodes + BODY * b + k]
 
-
-@kernel
-def along(end: int) -> float:
-    """Which part of its way a prescribed node has gone at the end of a part; the rest is where the step began."""
-    return end / PARTS

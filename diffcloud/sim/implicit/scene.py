@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffcloud.sim.compiled.data import Floats, Ints
+from diffcloud.sim.compiled.box import Box, BoxType, define
+from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters
 from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.sparse import Pattern
 from diffcloud.sim.contact.places import Planes
@@ -52,27 +53,96 @@ class Scene(NamedTuple):
     """O, of static and moving obstacles."""
 
 
-class Start(NamedTuple):
-    """What one part of a step starts from, and where it is to go."""
+class WorkType(BoxType):
+    """Of `Work`."""
 
-    time_step: float
-    """[s]"""
-    positions: Floats
-    """[V, 3] [m]"""
-    velocities: Floats
-    """[V, 3] [m/s]"""
-    bodies: Floats
-    """[B, 18]"""
-    scenery: Floats
-    """[O, 3] where obstacles are [m]."""
-    final: Floats
-    """[O, 3] where they go [m]."""
-    points: Floats
-    """[N, 3] all points [m]."""
-    holder: Ints
-    """[V] the handle that prescribes each node; -1: none."""
-    target: Floats
-    """[H, 3] where prescribed nodes go [m]."""
+
+class Work(Box):
+    """A scene, and the part of a step that is worked on.
+
+    Fields that are no scene's:
+        freedom: [N, 2] the rows of each point's motion: its own, or its body's centre and rotation; below zero: none.
+        first_body_point: V + O.
+        parameters, motion: of the whole cloth; `motion` is room.
+        time_step: of the part [s].
+        start_positions, start_velocities: [V, 3] the cloth where the part starts [m], [m/s].
+        start_bodies: [B, 18]
+        start_scenery, final_scenery: [O, 3] where obstacles are, and where they go [m].
+        start_points: [N, 3] all points where the part starts [m].
+        holder: [V] the handle that prescribes each node; -1: none.
+        target: [H, 3] where prescribed nodes go [m].
+        wide, moved: the pattern that also couples what touches, and where the blocks of the scene's own lie in it.
+    """
+
+
+define(
+    Work,
+    WorkType,
+    [
+        "terms",
+        "pattern",
+        "gravity",
+        "surface",
+        "planes",
+        "law",
+        "moves",
+        "rigid",
+        "freedom",
+        "first_body_point",
+        "parameters",
+        "motion",
+        "time_step",
+        "start_positions",
+        "start_velocities",
+        "start_bodies",
+        "start_scenery",
+        "final_scenery",
+        "start_points",
+        "holder",
+        "target",
+        "wide",
+        "moved",
+    ],
+)
+
+
+@kernel
+def new_work(scene: Scene, parameters: Parameters, nodes: int, bodies: int) -> Work:
+    """Room to work on a scene."""
+    count, others = scene.surface.point_count, scene.obstacle_points
+    velocities = np.zeros((count, 3))  # before and after a step are one array here, that of its end
+    motion = Motion(np.zeros((count, 3)), velocities, velocities, np.zeros((count, 3)))
+    freedom = np.full((count, 2), -1, np.int64)
+    for i in range(nodes):
+        freedom[i, 0] = i
+    for p in range(len(scene.rigid.body)):
+        for turns in range(2):
+            freedom[nodes + others + p, turns] = nodes + 2 * scene.rigid.body[p] + turns
+    return Work(
+        scene.terms,
+        scene.pattern,
+        scene.gravity,
+        scene.surface,
+        scene.planes,
+        scene.law,
+        scene.moves,
+        scene.rigid,
+        freedom,
+        nodes + others,
+        parameters,
+        motion,
+        scene.time_step,
+        np.empty((nodes, 3)),
+        np.empty((nodes, 3)),
+        np.empty((bodies, BODY)),
+        np.empty((others, 3)),
+        np.empty((others, 3)),
+        np.empty((count, 3)),
+        np.empty(nodes, np.int64),
+        np.empty((len(parameters.target), 3)),
+        scene.pattern,
+        np.arange(len(scene.pattern.rows)),
+    )
 
 
 class Kept(NamedTuple):

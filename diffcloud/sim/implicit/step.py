@@ -9,10 +9,10 @@ from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.contact.places import gap_of
 from diffcloud.sim.held import Held, aim, first_anchors, holders, take_anchors
-from diffcloud.sim.implicit.equation import body_points, finish, room_for_motion
-from diffcloud.sim.implicit.newton import Place, converge
-from diffcloud.sim.implicit.room import Room, distance_of
-from diffcloud.sim.implicit.scene import BODY, PARTS, Kept, Scene, Start, nothing_kept
+from diffcloud.sim.implicit.equation import body_points, finish
+from diffcloud.sim.implicit.newton import converge
+from diffcloud.sim.implicit.room import distance_of
+from diffcloud.sim.implicit.scene import BODY, PARTS, Kept, Scene, Work, new_work, nothing_kept
 from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE, STUCK
 
 
@@ -51,13 +51,13 @@ def simulate(
     kept = nothing_kept(steps if keep >= 0 else 0, 6 * nodes + BODY * bodies.shape[1])
     parts = 0
     anchors[:] = first_anchors(held, positions[0])
-    motion = room_for_motion(scene)
+    work = new_work(scene, parameters, nodes, bodies.shape[1])
     for step in range(steps):
         if control[1] != 0:
             return INTERRUPTED, step, kept
         take_anchors(held, track, step, positions[step], anchors)
         aim(held, track, step, anchors, parameters)
-        holder = holders(held, step, nodes)
+        work.holder = holders(held, step, nodes)
         for i in range(nodes):
             for axis in range(3):
                 positions[step + 1, i, axis], velocities[step + 1, i, axis] = positions[step, i, axis], velocities[step, i, axis]
@@ -66,23 +66,25 @@ def simulate(
                 bodies[step + 1, b, k] = bodies[step, b, k]
         place, length = 0, PARTS
         while place < PARTS:
-            start = part_of_step(
-                scene, parameters, obstacles, step, place, place + length, positions[step],
-                positions[step + 1], velocities[step + 1], bodies[step + 1], holder,
+            begin_part(
+                work, scene.time_step, obstacles[step], obstacles[step + 1], place, place + length, positions[step],
+                positions[step + 1], velocities[step + 1], bodies[step + 1],
             )  # fmt: skip
-            done, here, room, change = converge(scene, start, parameters, motion)
+            done, here, room, change = converge(work)
             if not done:
                 if length == 1:
                     fault[0] = change
-                    _closest(scene, here, room, fault)
+                    _closest(work, here.points, room.pairs, fault)
                     return STUCK, step, kept
                 length //= 2
                 continue
-            finish(start, here.velocity, here.turned, positions[step + 1], velocities[step + 1], bodies[step + 1])
+            finish(work, here.velocity, here.turned, positions[step + 1], velocities[step + 1], bodies[step + 1])
             place += length
             length = place & -place  # the other half, or that of the part which both make up
             if keep >= 0:
-                kept = _remember(kept, parts, place, positions[step + 1], velocities[step + 1], bodies[step + 1], here)
+                kept = _remember(
+                    kept, parts, place, positions[step + 1], velocities[step + 1], bodies[step + 1], here.listed, here.numbers
+                )
                 parts += 1
         if not _finite(positions[step + 1]):
             return NOT_FINITE, step, kept
@@ -93,50 +95,50 @@ def simulate(
 
 
 @kernel
-def part_of_step(
-    scene: Scene,
-    parameters: Parameters,
-    obstacles: Floats,
-    step: int,
+def begin_part(
+    work: Work,
+    time_step: float,
+    before: Floats,
+    after: Floats,
     begin: int,
     end: int,
     first: Floats,
     positions: Floats,
     velocities: Floats,
     bodies: Floats,
-    holder: Ints,
-) -> Start:
-    """What the part [begin, end] of a step starts from, of `PARTS`; prescribed nodes and obstacles go straight.
+) -> None:
+    """Set what the part [begin, end] of a step starts from, of `PARTS`; prescribed nodes and obstacles go straight.
 
     Args:
-        first: [V, 3] positions at the start of the whole step [m].
+        time_step: of the whole step [s].
+        before, after: [O, 3] obstacles at its ends [m].
+        first: [V, 3] positions at its start [m].
         positions, velocities, bodies: at the start of this part.
     """
-    count = scene.surface.point_count
-    nodes, others = len(positions), scene.obstacle_points
-    scenery, final, points = np.empty((others, 3)), np.empty((others, 3)), np.empty((count, 3))
     a, b = begin / PARTS, end / PARTS
-    for o in range(others):
+    work.time_step = (b - a) * time_step
+    scenery, final, points, nodes = work.start_scenery, work.final_scenery, work.start_points, len(positions)
+    for o in range(len(scenery)):
         for axis in range(3):
-            x, y = obstacles[step, o, axis], obstacles[step + 1, o, axis]
+            x, y = before[o, axis], after[o, axis]
             scenery[o, axis] = x + a * (y - x)
             final[o, axis] = y if end == PARTS else x + b * (y - x)
             points[nodes + o, axis] = scenery[o, axis]
+    x0, v0, own = work.start_positions, work.start_velocities, work.start_bodies
+    holder, target, wanted = work.holder, work.target, work.parameters.target
     for i in range(nodes):
+        h = holder[i]
         for axis in range(3):
-            points[i, axis] = positions[i, axis]
-    body_points(scene, bodies, points, nodes + others)
-    target = parameters.target.copy()
-    if end < PARTS:
-        for i in range(nodes):
-            h = holder[i]
+            points[i, axis] = x0[i, axis] = positions[i, axis]
+            v0[i, axis] = velocities[i, axis]
             if h >= 0:
-                for axis in range(3):
-                    target[h, axis] = first[i, axis] + b * (parameters.target[h, axis] - first[i, axis])
-    part = (end - begin) / PARTS * scene.time_step
-    return Start(
-        part, positions.copy(), velocities.copy(), bodies.copy(), scenery, final, points, holder, target
-    )
+                way = wanted[h, axis] - first[i, axis]
+                target[h, axis] = wanted[h, axis] if end == PARTS else first[i, axis] + b * way
+    for body in range(len(own)):
+        for k in range(BODY):
+            own[body, k] = bodies[body, k]
+    if len(own) > 0:
+        body_points(work.rigid, own, points, work.first_body_point)
 
 
 @kernel
@@ -150,7 +152,7 @@ def _finite(positions: Floats) -> bool:
 
 @kernel
 def _remember(
-    kept: Kept, part: int, end: int, positions: Floats, velocities: Floats, bodies: Floats, here: Place
+    kept: Kept, part: int, end: int, positions: Floats, velocities: Floats, bodies: Floats, listed: Ints, numbers: Floats
 ) -> Kept:
     """The record with one part more."""
     ends, states, first = kept.ends, kept.states, kept.first_place
@@ -169,33 +171,33 @@ def _remember(
     for b in range(len(bodies)):
         for k in range(BODY):
             row[6 * nodes + BODY * b + k] = bodies[b, k]
-    used, more = first[part], len(here.listed)
-    listed, numbers = with_room(kept.listed, used, more), with_room(kept.numbers, used, more)
+    used, more = first[part], len(listed)
+    places, areas = with_room(kept.listed, used, more), with_room(kept.numbers, used, more)
     for e in range(more):
         for k in range(5):
-            listed[used + e, k] = here.listed[e, k]
+            places[used + e, k] = listed[e, k]
         for k in range(4):
-            numbers[used + e, k] = here.numbers[e, k]
+            areas[used + e, k] = numbers[e, k]
     first[part + 1] = used + more
-    return Kept(kept.begins, ends, states, first, listed, numbers)
+    return Kept(kept.begins, ends, states, first, places, areas)
 
 
 @kernel
-def _closest(scene: Scene, here: Place, room: Room, fault: Floats) -> None:
-    """The closest pair of all, into fault [6]."""
+def _closest(work: Work, points: Floats, pairs: Ints, fault: Floats) -> None:
+    """The closest pair of all at points [N, 3], into fault [6]."""
     smallest = np.inf
     fault[1] = -1.0
-    planes = scene.planes
+    planes = work.planes
     for q in range(len(planes.points)):
         for w in range(len(planes.offsets)):
-            gap = gap_of(planes, w, here.points, planes.points[q])
+            gap = gap_of(planes, w, points, planes.points[q])
             if gap < smallest:
                 smallest = gap
                 fault[1], fault[2], fault[3], fault[4], fault[5] = 2.0, planes.points[q], w, -1.0, -1.0
     x, found = np.empty((4, 3)), np.empty(6)
-    for c in range(len(room.pairs)):
-        distance = distance_of(room.pairs, c, here.points, x, found)
+    for c in range(len(pairs)):
+        distance = distance_of(pairs, c, points, x, found)
         if distance < smallest:
             smallest = distance
             for k in range(5):
-                fault[1 + k] = room.pairs[c, k]
+                fault[1 + k] = pairs[c, k]

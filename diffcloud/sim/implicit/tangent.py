@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.sim.compiled.data import Floats, Motion, Parameters, Timing
+from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
 from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.lu import solve_general
-from diffcloud.sim.contact.places import Touching
 from diffcloud.sim.held import Held, aim, aim_tangent, holders, take_anchors_tangent
-from diffcloud.sim.implicit.equation import arm_of, contact_force, room_for_motion, spin_inputs
-from diffcloud.sim.implicit.parts import Solved, along, solved_part
-from diffcloud.sim.implicit.scene import BODY, Kept, Scene
+from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
+from diffcloud.sim.implicit.parts import Solved, solved_part
+from diffcloud.sim.implicit.scene import BODY, Kept, Scene, Work, new_work
 from diffcloud.sim.terms import kernels
 
 _tangent, _spin_tangent = kernels.tangent, kernels.spin_tangent
@@ -48,7 +47,7 @@ def forward(
             those of the start, the others are taken.
     """
     steps, nodes, count, directions = len(positions) - 1, positions.shape[1], bodies.shape[1], position_rates.shape[1]
-    motion, points = room_for_motion(scene), scene.surface.point_count
+    work, points = new_work(scene, parameters, nodes, count), scene.surface.point_count
     rates = Motion(
         np.zeros((directions, points, 3)),
         np.zeros((directions, points, 3)),
@@ -64,7 +63,7 @@ def forward(
         take_anchors_tangent(held, track_rates, step, position_rates[step], anchor_rates)
         aim(held, track, step, anchors, parameters)
         aim_tangent(held, track_rates, step, anchor_rates, parameter_rates.target)
-        holder = holders(held, step, nodes)
+        work.holder = holders(held, step, nodes)
         x, v, own = position_rates[step + 1], velocity_rates[step + 1], body_rates[step + 1]
         for d in range(directions):
             for i in range(nodes):
@@ -75,17 +74,18 @@ def forward(
                     own[d, b, k] = body_rates[step, d, b, k]
         for part in range(kept.begins[step], kept.begins[step + 1]):
             solved = solved_part(
-                scene, parameters, obstacles, step, part, positions[step], velocities[step], bodies[step], holder, kept, motion
-            )
-            _aimed(solved, along(solved.end), position_rates[step], parameter_rates.target, target)
-            _part(scene, parameters, parameter_rates, solved, motion, rates, target, x, v, own)
+                work, scene.time_step, obstacles[step], obstacles[step + 1], kept.begins[step], part, positions[step],
+                velocities[step], bodies[step], kept,
+            )  # fmt: skip
+            _aimed(work.holder, solved.gone, position_rates[step], parameter_rates.target, target)
+            _part(work, parameter_rates, solved, rates, target, x, v, own)
 
 
 @kernel
-def _aimed(solved: Solved, gone: float, first: Floats, wanted: Floats, target: Floats) -> None:
+def _aimed(holder: Ints, gone: float, first: Floats, wanted: Floats, target: Floats) -> None:
     """Rates of where prescribed nodes go in a part, from those at the step's start and of its targets."""
-    for i in range(len(solved.start.holder)):
-        h = solved.start.holder[i]
+    for i in range(len(holder)):
+        h = holder[i]
         if h >= 0:
             for d in range(len(target)):
                 for axis in range(3):
@@ -94,27 +94,27 @@ def _aimed(solved: Solved, gone: float, first: Floats, wanted: Floats, target: F
 
 @kernel
 def _part(
-    scene: Scene,
-    parameters: Parameters,
+    work: Work,
     parameter_rates: Parameters,
     solved: Solved,
-    motion: Motion,
     rates: Motion,
-    target: Floats,
+    wanted: Floats,
     x: Floats,
     v: Floats,
     own: Floats,
 ) -> None:
     """Rates of the start of a part (x, v [K, V, 3], own [K, B, 18]) become those of its end."""
-    start, w = solved.start, solved.velocity
-    dt, nodes, count, directions = start.time_step, x.shape[1], own.shape[1], len(x)
+    time_step, holder, motion, parameters = work.time_step, work.holder, work.motion, work.parameters
+    start_velocities = work.start_velocities
+    w = solved.velocity
+    dt, nodes, count, directions = time_step, x.shape[1], own.shape[1], len(x)
     speeds = np.zeros((directions, nodes, 3))  # of prescribed nodes
     for d in range(directions):
         for i in range(nodes):
-            h = start.holder[i]
+            h = holder[i]
             for axis in range(3):
                 if h >= 0:
-                    speeds[d, i, axis] = (target[d, h, axis] - x[d, i, axis]) / dt
+                    speeds[d, i, axis] = (wanted[d, h, axis] - x[d, i, axis]) / dt
                 speed = speeds[d, i, axis]
                 rates.positions[d, i, axis] = x[d, i, axis] + dt * speed
                 rates.before[d, i, axis] = rates.after[d, i, axis] = speed
@@ -124,41 +124,42 @@ def _part(
     turned = np.zeros((count, directions, 12))
     turns = np.zeros((directions, 15))
     for b in range(count):
-        _turned(scene, solved, b, own, turns, turned[b])
-    _body_points(scene, solved, own, turned, rates)
-    timing, change = Timing(dt, 0.0), np.zeros((directions, len(motion.positions), 3))
-    _tangent(scene.terms, parameters, motion, timing, parameter_rates, rates, change)
-    _contacts(solved.touching, parameters, motion, timing, parameter_rates, rates, change)
+        _turned(work, solved, b, own, turns, turned[b])
+    _body_points(work, own, turned, rates)
+    change = np.zeros((directions, len(motion.positions), 3))
+    _forces(work, solved, parameter_rates, rates, change)
     right, found = np.zeros((len(w), 3)), np.empty((len(w), 3))
     force = np.zeros((len(motion.positions), 3))
     if count > 0:
-        contact_force(solved.touching, parameters, motion, timing, force)
+        contact_force(work, solved.touching, force)
     for d in range(directions):
         for i in range(nodes):
             for axis in range(3):
                 right[i, axis] = 0.0
-                if start.holder[i] < 0:
+                if holder[i] < 0:
                     right[i, axis] = dt * change[d, i, axis] + parameters.node_mass[i] * v[d, i, axis]
-                    right[i, axis] -= parameter_rates.node_mass[d, i] * (w[i, axis] - start.velocities[i, axis])
-        _body_rows(scene, parameters, parameter_rates, solved, d, own, turned, force, change, right)
+                    right[i, axis] -= parameter_rates.node_mass[d, i] * (w[i, axis] - start_velocities[i, axis])
+        if count > 0:
+            _body_rows(work, parameter_rates, solved, d, own, turned, force, change, right)
         solve_general(solved.matrix, right, 0, found)
         for i in range(nodes):
             for axis in range(3):
-                v[d, i, axis] = speeds[d, i, axis] if start.holder[i] >= 0 else found[i, axis]
+                v[d, i, axis] = speeds[d, i, axis] if holder[i] >= 0 else found[i, axis]
                 x[d, i, axis] += dt * v[d, i, axis]
         for b in range(count):
             for axis in range(3):
                 turns[d, 12 + axis] = found[nodes + 2 * b + 1, axis]
                 own[d, b, 12 + axis] = found[nodes + 2 * b, axis]
                 own[d, b, axis] += dt * found[nodes + 2 * b, axis]
-            _finish(scene, solved, b, d, own, turns, turned[b])
+            _finish(work, solved, b, d, own, turns, turned[b])
 
 
 @kernel
-def _turned(scene: Scene, solved: Solved, b: int, own: Floats, turns: Floats, found: Floats) -> None:
+def _turned(work: Work, solved: Solved, b: int, own: Floats, turns: Floats, found: Floats) -> None:
     """Rates [K, 12] of `spin` of a body, while its new angular velocity is held."""
+    start_positions = work.start_positions
     inputs, constants = np.empty(15), np.empty(10)
-    spin_inputs(scene, solved.start, b, solved.velocity[len(solved.start.positions) + 2 * b + 1], inputs, constants)
+    spin_inputs(work, b, solved.velocity[len(start_positions) + 2 * b + 1], inputs, constants)
     for d in range(len(own)):
         for k in range(9):
             turns[d, k] = own[d, b, 3 + k]
@@ -169,11 +170,12 @@ def _turned(scene: Scene, solved: Solved, b: int, own: Floats, turns: Floats, fo
 
 @kernel
 def _finish(
-    scene: Scene, solved: Solved, b: int, d: int, own: Floats, turns: Floats, found: Floats
+    work: Work, solved: Solved, b: int, d: int, own: Floats, turns: Floats, found: Floats
 ) -> None:
     """The rates of a body's orientation and angular velocity, whose new rate is in turns[d, 12:]."""
+    start_positions = work.start_positions
     inputs, constants = np.empty(15), np.empty(10)
-    spin_inputs(scene, solved.start, b, solved.velocity[len(solved.start.positions) + 2 * b + 1], inputs, constants)
+    spin_inputs(work, b, solved.velocity[len(start_positions) + 2 * b + 1], inputs, constants)
     for k in range(9):
         turns[d, k] = own[d, b, 3 + k]
     for k in range(3):
@@ -186,25 +188,25 @@ def _finish(
 
 
 @kernel
-def _body_points(scene: Scene, solved: Solved, own: Floats, turned: Floats, rates: Motion) -> None:
+def _body_points(work: Work, own: Floats, turned: Floats, rates: Motion) -> None:
     """Rates of the bodies' points and of their straight way through the step."""
-    dt, first = solved.start.time_step, scene.surface.cloth_points + scene.obstacle_points
-    for p in range(len(scene.rigid.body)):
-        b = scene.rigid.body[p]
+    time_step, first_body_point, rigid = work.time_step, work.first_body_point, work.rigid
+    dt, first = time_step, first_body_point
+    for p in range(len(rigid.body)):
+        b = rigid.body[p]
         for d in range(len(own)):
             for axis in range(3):
                 new = old = 0.0
                 for k in range(3):
-                    new += turned[b, d, 3 * axis + k] * scene.rigid.points[p, k]
-                    old += own[d, b, 3 + 3 * axis + k] * scene.rigid.points[p, k]
+                    new += turned[b, d, 3 * axis + k] * rigid.points[p, k]
+                    old += own[d, b, 3 + 3 * axis + k] * rigid.points[p, k]
                 rates.positions[d, first + p, axis] = own[d, b, axis] + new
                 rates.before[d, first + p, axis] = rates.after[d, first + p, axis] = (new - old) / dt
 
 
 @kernel
 def _body_rows(
-    scene: Scene,
-    parameters: Parameters,
+    work: Work,
     parameter_rates: Parameters,
     solved: Solved,
     d: int,
@@ -215,31 +217,35 @@ def _body_rows(
     right: Floats,
 ) -> None:
     """The bodies' rows of -dr along direction d."""
-    start, w, nodes = solved.start, solved.velocity, scene.surface.cloth_points
-    dt, first = start.time_step, nodes + scene.obstacle_points
+    time_step, first_body_point, start_positions, rigid = work.time_step, work.first_body_point, work.start_positions, work.rigid
+    parameters, start_bodies, gravity = work.parameters, work.start_bodies, work.gravity
+    w, ended, nodes, dt, first = solved.velocity, solved.turned, len(start_positions), time_step, first_body_point
     for b in range(own.shape[1]):
         row, mass, rate = nodes + 2 * b, parameters.body_mass[b], parameter_rates.body_mass[d, b]
         for axis in range(3):
-            gone = w[row, axis] - start.bodies[b, 12 + axis] - dt * scene.gravity[axis]
+            gone = w[row, axis] - start_bodies[b, 12 + axis] - dt * gravity[axis]
             right[row, axis] = mass * own[d, b, 12 + axis] - rate * gone
-            right[row + 1, axis] = -rate * solved.turned[b, 9 + axis] - mass * turned[b, d, 9 + axis]
-    for p in range(len(scene.rigid.body)):
-        b = scene.rigid.body[p]
+            right[row + 1, axis] = -rate * ended[b, 9 + axis] - mass * turned[b, d, 9 + axis]
+    along = turned[:, d].copy()
+    for p in range(len(rigid.body)):
+        b = rigid.body[p]
         row = nodes + 2 * b
-        arm, push, pushed = arm_of(scene, solved.turned, p), force[first + p], change[d, first + p]
-        moved = arm_of(scene, turned[:, d], p)
+        arm, push, pushed = arm_of(rigid, ended, p), force[first + p], change[d, first + p]
+        lever = arm_of(rigid, along, p)
         for axis in range(3):
             j, k = (axis + 1) % 3, (axis + 2) % 3
             right[row, axis] += dt * pushed[axis]
             right[row + 1, axis] += dt * (
-                arm[j] * pushed[k] - arm[k] * pushed[j] + moved[j] * push[k] - moved[k] * push[j]
+                arm[j] * pushed[k] - arm[k] * pushed[j] + lever[j] * push[k] - lever[k] * push[j]
             )
 
 
 @kernel
-def _contacts(  # type: ignore[no-untyped-def]
-    touching: Touching, parameters: Parameters, motion: Motion, timing: Timing, parameter_rates, rates: Motion, change: Floats
-):
+def _forces(work: Work, solved: Solved, parameter_rates: Parameters, rates: Motion, change: Floats) -> None:
+    """Rates [K, N, 3] of all forces."""
+    terms, parameters, motion, time_step = work.terms, work.parameters, work.motion, work.time_step
+    timing, touching = Timing(time_step, 0.0), solved.touching
+    _tangent(terms, parameters, motion, timing, parameter_rates, rates, change)
     _point_point(touching.point_point, parameters, motion, timing, parameter_rates, rates, change)
     _point_edge(touching.point_edge, parameters, motion, timing, parameter_rates, rates, change)
     _point_face(touching.point_face, parameters, motion, timing, parameter_rates, rates, change)
