@@ -47,3 +47,9 @@ def kernel(function: F) -> F:
         return numba.njit(cache=True, nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
     finally:
         numba.config.CACHE_DIR = given
+
+
+def inlined(function: F) -> F:
+    """A kernel whose code is put where it is called. Of kernels that call large ones: each kernel is compiled with all that it
+    calls, so that deep calls are compiled again on every level."""
+    return function if UNCOMPILED else numba.njit(inline="always", nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]

@@ -29,7 +29,7 @@ from math import atan2, cos, floor, log, sin, sqrt
 
 import numpy as np
 
-from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.kernel import inlined, kernel
 from diffcloud.sim.compiled.sparse import add_assemble, add_jacobian
 '''
 
@@ -100,7 +100,7 @@ def _all(kind: str, terms: Sequence[Term], stiff: set[str]) -> str:
     given = arguments if target is None else arguments.replace("blocks", target)
     if target is not None:
         lines.insert(0, "blocks = np.empty((0, 0, 9))")
-    return "\n".join([f"@kernel\ndef {kind}(terms, {given}):", *(f"    {line}" for line in lines)])
+    return "\n".join([f"@inlined\ndef {kind}(terms, {given}):", *(f"    {line}" for line in lines)])
 
 
 def _force(term: Term) -> str:

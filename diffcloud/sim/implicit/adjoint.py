@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from diffcloud.sim.compiled.data import Floats, Motion, Parameters, Timing
-from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.kernel import inlined, kernel
 from diffcloud.sim.compiled.lu import solve_general
 from diffcloud.sim.held import Held, aim, aim_reverse, holders, take_anchors_reverse
 from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
@@ -92,7 +92,7 @@ def reverse(
     parameter_gradients.hold[:] = 0.0
 
 
-@kernel
+@inlined
 def _part(
     work: Work,
     solved: Solved,
@@ -148,7 +148,7 @@ def _part(
         _bodies(work, solved, slopes, y, own, gradients)
 
 
-@kernel
+@inlined
 def _forces(
     work: Work, solved: Solved, y: Floats, gradients: Parameters, slopes: Motion
 ) -> None:
@@ -180,7 +180,7 @@ def _forces(
     _plane(touching.plane, parameters, motion, timing, adjoint, gradients, slopes)
 
 
-@kernel
+@inlined
 def _bodies(
     work: Work, solved: Solved, slopes: Motion, y: Floats, own: Floats, gradients: Parameters
 ) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from diffcloud.sim.compiled.data import Floats, Ints, Timing
-from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.kernel import inlined, kernel
 from diffcloud.sim.compiled.lu import General, factorised
 from diffcloud.sim.compiled.sparse import Pattern, find_slot, widened
 from diffcloud.sim.contact.places import Touching, corners
@@ -26,7 +26,7 @@ _pf_jacobian, _ee_jacobian = kernels.barrier_point_face_jacobian, kernels.barrie
 _plane_jacobian = kernels.barrier_plane_jacobian
 
 
-@kernel
+@inlined
 def widen(work: Work, listed: Ints) -> None:
     """Let the pattern couple the places that touch, listed [E, 5], too; what it couples already stays."""
     wide, moved, freedom = work.wide, work.moved, work.freedom
@@ -61,10 +61,10 @@ def newton_matrix(
     work: Work, velocity: Floats, turned: Floats, listed: Ints, touching: Touching, caution: float
 ) -> General:
     """The factorised matrix at the motion; caution in [0, 1] is the part of the cautious one."""
+    widen(work, listed)
     time_step, start_positions, wide, terms = work.time_step, work.start_positions, work.wide, work.terms
     parameters, motion, start_bodies, pattern = work.parameters, work.motion, work.start_bodies, work.pattern
     rigid, moved = work.rigid, work.moved
-    widen(work, listed)
     dt, own = time_step, len(pattern.rows)
     reach = dt * (dt + parameters.damping[0])
     lower, upper = np.zeros((own + 1, 9)), np.zeros((own + 1, 9))
@@ -154,7 +154,7 @@ def _add_inertia(
                     swing[p, 3 * row + column] = part / time_step
 
 
-@kernel
+@inlined
 def _add_contact(
     work: Work, turned: Floats, touching: Touching, caution: float, swing: Floats, lower: Floats, upper: Floats
 ) -> None:
@@ -192,7 +192,7 @@ def _add_cross(x: float, y: float, z: float, right: Floats, factor: float, block
         block[6 + c] += factor * (x * right[3 + c] - y * right[c])
 
 
-@kernel
+@inlined
 def _nodes_of(touching: Touching, kind: int) -> Ints:
     if kind == 0:
         return touching.point_point.nodes
@@ -205,7 +205,7 @@ def _nodes_of(touching: Touching, kind: int) -> Ints:
     return touching.plane.nodes
 
 
-@kernel
+@inlined
 def _exact(work: Work, touching: Touching, kind: int, blocks: Floats) -> None:
     """Blocks [E, n², 9] of -Δt d force / d velocity."""
     time_step, parameters, motion = work.time_step, work.parameters, work.motion
@@ -222,7 +222,7 @@ def _exact(work: Work, touching: Touching, kind: int, blocks: Floats) -> None:
         _plane_jacobian(touching.plane, parameters, motion, timing, 0.0, dt, blocks)
 
 
-@kernel
+@inlined
 def _safe(work: Work, touching: Touching, kind: int, blocks: Floats) -> None:
     """The cautious blocks [E, pairs, 9]."""
     time_step, parameters, motion = work.time_step, work.parameters, work.motion

@@ -6,7 +6,7 @@ import numpy as np
 
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats
-from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.kernel import inlined, kernel
 from diffcloud.sim.compiled.lu import solve_general
 from diffcloud.sim.contact.places import as_elements, places
 from diffcloud.sim.implicit.equation import first_velocities, place_points, residual, set_motion
@@ -53,7 +53,7 @@ class Place(Box):
 define(Place, PlaceType, ["velocity", "scenery", "points", "turned", "distances", "listed", "numbers", "touching"])
 
 
-@kernel
+@inlined
 def _place(work: Work, room: Room, velocity: Floats, scenery: Floats, points: Floats, turned: Floats) -> Place:
     """The place with what touches there."""
     surface, planes, law = work.surface, work.planes, work.law
@@ -63,7 +63,7 @@ def _place(work: Work, room: Room, velocity: Floats, scenery: Floats, points: Fl
     return Place(velocity, scenery, points, turned, distances, listed, numbers, touching)
 
 
-@kernel
+@inlined
 def converge(work: Work) -> tuple[bool, Place, Room, float]:
     """Solve one part of a step: (whether it converged, where, the room, the last relative change)."""
     work.wide, work.moved = work.pattern, np.arange(len(work.pattern.rows))
@@ -129,7 +129,7 @@ def _arrived(scenery: Floats, final: Floats) -> bool:
     return True
 
 
-@kernel
+@inlined
 def _pushed(work: Work, here: Place, left_over: Floats, found: Floats) -> None:
     """The residual, and how it changes as moving obstacles go the rest of their way, to first order.
 
@@ -152,7 +152,7 @@ def _pushed(work: Work, here: Place, left_over: Floats, found: Floats) -> None:
             found[i, axis] += (ahead[i, axis] - left_over[i, axis]) / _PROBE
 
 
-@kernel
+@inlined
 def _search(
     work: Work, here: Place, direction: Floats, downhill: float, room: Room, rough: bool, found: Floats
 ) -> tuple[Place, bool]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats
-from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.kernel import inlined, kernel
 from diffcloud.sim.contact.places import as_elements
 from diffcloud.sim.implicit.equation import place_points, set_motion
 from diffcloud.sim.implicit.matrix import newton_matrix
@@ -33,7 +33,7 @@ class Solved(Box):
 define(Solved, SolvedType, ["velocity", "turned", "touching", "matrix", "gone"])
 
 
-@kernel
+@inlined
 def solved_part(
     work: Work,
     time_step: float,

@@ -7,7 +7,7 @@ import numpy as np
 
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints
-from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.kernel import inlined, kernel
 from diffcloud.sim.contact.additive_ccd import safe_fraction
 from diffcloud.sim.contact.broad_phase import candidates, corners_of
 from diffcloud.sim.contact.distance import closest
@@ -43,7 +43,7 @@ class Room(Box):
 define(Room, RoomType, ["begin", "predicted", "size", "longest", "pairs", "distances"])
 
 
-@kernel
+@inlined
 def room_around(work: Work, begin: Floats, predicted: Floats) -> Room:
     """The room of a path between points [N, 3]."""
     law = work.law
@@ -59,7 +59,7 @@ def room_around(work: Work, begin: Floats, predicted: Floats) -> Room:
     return room
 
 
-@kernel
+@inlined
 def cover(work: Work, room: Room, distance: float) -> None:
     """Let points be so far from the path [m]."""
     room.size = min(2 * distance, room.longest)

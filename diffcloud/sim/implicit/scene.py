@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters
-from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.kernel import inlined, kernel
 from diffcloud.sim.compiled.sparse import Pattern
 from diffcloud.sim.contact.places import Planes
 from diffcloud.sim.contact.surface import Surface
@@ -106,7 +106,7 @@ define(
 )
 
 
-@kernel
+@inlined
 def new_work(scene: Scene, parameters: Parameters, nodes: int, bodies: int) -> Work:
     """Room to work on a scene."""
     count, others = scene.surface.point_count, scene.obstacle_points

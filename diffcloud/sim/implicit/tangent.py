@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
-from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.sim.compiled.kernel import inlined, kernel
 from diffcloud.sim.compiled.lu import solve_general
 from diffcloud.sim.held import Held, aim, aim_tangent, holders, take_anchors_tangent
 from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
@@ -92,7 +92,7 @@ def _aimed(holder: Ints, gone: float, first: Floats, wanted: Floats, target: Flo
                     target[d, h, axis] = first[d, i, axis] + gone * (wanted[d, h, axis] - first[d, i, axis])
 
 
-@kernel
+@inlined
 def _part(
     work: Work,
     parameter_rates: Parameters,
@@ -204,7 +204,7 @@ def _body_points(work: Work, own: Floats, turned: Floats, rates: Motion) -> None
                 rates.before[d, first + p, axis] = rates.after[d, first + p, axis] = (new - old) / dt
 
 
-@kernel
+@inlined
 def _body_rows(
     work: Work,
     parameter_rates: Parameters,
@@ -240,7 +240,7 @@ def _body_rows(
             )
 
 
-@kernel
+@inlined
 def _forces(work: Work, solved: Solved, parameter_rates: Parameters, rates: Motion, change: Floats) -> None:
     """Rates [K, N, 3] of all forces."""
     terms, parameters, motion, time_step = work.terms, work.parameters, work.motion, work.time_step
