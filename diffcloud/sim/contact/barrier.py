@@ -19,14 +19,14 @@ Friction: -μ λ f(|v_t|) v_t/|v_t| with λ = -φ'(d), v_t the sliding velocity 
 to the sticking speed v_s and 1 beyond: a resting contact creeps slower than v_s. Normal force, normal and sliding all
 belong to the end of the step (nothing is lagged), so forces are smooth in all inputs.
 
-The cautious matrix (`resistance`) holds places and normals, and leaves out shares below zero: positive semidefinite.
+The cautious matrix is in `resistance`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from diffcloud.sim.compiled.trace import Scalar, Vector, cross, dot, held, logarithm, maximum, norm, total, where
+from diffcloud.sim.compiled.trace import Scalar, Vector, cross, dot, logarithm, norm, total, where
 from diffcloud.sim.terms.term import Element, Term
 
 _PARALLEL = 1e-3
@@ -49,20 +49,6 @@ def _force(place: Place, pair: Element) -> Sequence[Vector]:
     return [weight * push for weight in weights]
 
 
-def _resistance(place: Place, pair: Element) -> Sequence[Vector]:
-    """What of the force resists motion, linear in the velocities at the end of the step."""
-    weights, gap, share, coefficient = place(pair)
-    distance = norm(gap)
-    normal = _held(gap / distance)
-    weights = [held(weight) for weight in weights]
-    counted = maximum(share, 0.0)
-    rubbing = counted * _pressure(pair, distance) * coefficient * _per_speed(pair, norm(_sliding(weights, normal, pair)))
-    along, rubbing = held(pair.time_step * counted * _stiffness(pair, distance)), held(rubbing)
-    velocity = _velocity(weights, pair)
-    push = ((rubbing - along) * dot(normal, velocity)) * normal - rubbing * velocity
-    return [weight * push for weight in weights]
-
-
 def _velocity(weights: Sequence[Scalar], pair: Element) -> Vector:
     return total(weight * one for weight, one in zip(weights, pair.after, strict=True))
 
@@ -70,10 +56,6 @@ def _velocity(weights: Sequence[Scalar], pair: Element) -> Vector:
 def _sliding(weights: Sequence[Scalar], normal: Vector, pair: Element) -> Vector:
     velocity = _velocity(weights, pair)
     return velocity - dot(velocity, normal) * normal
-
-
-def _held(vector: Vector) -> Vector:
-    return Vector(held(vector.x), held(vector.y), held(vector.z))
 
 
 def _law(pair: Element, number: int) -> Scalar:
@@ -89,15 +71,6 @@ def _pressure(pair: Element, distance: Scalar) -> Scalar:
     safe = where(below, ratio, 0.5)
     slope = 2.0 * (safe - 1) * logarithm(safe) + (safe - 1) * (safe - 1) / safe
     return where(below, scale / 6.0 * thickness * slope, 0.0)
-
-
-def _stiffness(pair: Element, distance: Scalar) -> Scalar:
-    """d²φ/dd² per area [N/m³]."""
-    ratio = distance / _law(pair, 1)
-    below = ratio < 1.0
-    safe = where(below, ratio, 0.5)
-    part = (safe - 1) / safe
-    return where(below, _law(pair, 0) / 6.0 * (part * part - 2.0 * logarithm(safe) - 4.0 * part), 0.0)
 
 
 def _per_speed(pair: Element, speed: Scalar) -> Scalar:
@@ -152,24 +125,16 @@ def _edge_edge(pair: Element) -> tuple[list[Scalar], Vector, Scalar, Scalar]:
 
 def _plane(node: Element) -> Sequence[Vector]:
     """Barrier and friction of a half-space n · x >= offset."""
-    pressing, sliding, _ = _at_plane(node)
+    pressing, sliding = _at_plane(node)
     rubbing = node.parameter("friction_obstacle") * pressing * _per_speed(node, norm(sliding))
     return [pressing * node.vector("normal") - rubbing * sliding]
 
 
-def _plane_resistance(node: Element) -> Sequence[Vector]:
-    """As `_resistance`."""
-    pressing, sliding, distance = _at_plane(node)
-    rubbing = held(node.parameter("friction_obstacle") * pressing * _per_speed(node, norm(sliding)))
-    along = held(node.time_step * node.constant("share") * _stiffness(node, distance))
-    return [-along * dot(node.vector("normal"), node.after[0]) * node.vector("normal") - rubbing * sliding]
-
-
-def _at_plane(node: Element) -> tuple[Scalar, Vector, Scalar]:
-    """(normal force [N], sliding velocity [m/s], distance [m])."""
+def _at_plane(node: Element) -> tuple[Scalar, Vector]:
+    """(normal force [N], sliding velocity [m/s])."""
     normal, velocity = node.vector("normal"), node.after[0]
     distance = dot(node.positions[0], normal) - node.constant("offset")
-    return node.constant("share") * _pressure(node, distance), velocity - dot(velocity, normal) * normal, distance
+    return node.constant("share") * _pressure(node, distance), velocity - dot(velocity, normal) * normal
 
 
 def _term(name: str, corners: int, place: Place, *more: str) -> Term:
@@ -177,7 +142,6 @@ def _term(name: str, corners: int, place: Place, *more: str) -> Term:
         f"barrier_{name}",
         corners=corners,
         force=lambda pair: _force(place, pair),
-        resistance=lambda pair: _resistance(place, pair),
         constants={constant: () for constant in ("share", "mixed", *more)},
         tables={"law": 2},
         parameters={"friction_obstacle": "episode", "friction_cloth": "episode"},
@@ -194,7 +158,6 @@ BARRIER_PLANE = Term(
     "barrier_plane",
     corners=1,
     force=_plane,
-    resistance=_plane_resistance,
     constants={"share": (), "normal": (3,), "offset": ()},
     tables={"law": 2},
     parameters={"friction_obstacle": "episode"},

@@ -9,18 +9,12 @@ from diffcloud.sim.compiled.kernel import inlined, kernel
 from diffcloud.sim.compiled.lu import General, factorised
 from diffcloud.sim.compiled.sparse import Pattern, find_slot, widened
 from diffcloud.sim.contact.places import Touching, corners
+from diffcloud.sim.contact.resistance import resistance
 from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
-from diffcloud.sim.implicit.scene import Work
+from diffcloud.sim.implicit.scene import Rigid, Work
 from diffcloud.sim.terms import kernels
 
 _assemble, _jacobian, _spin_tangent = kernels.assemble, kernels.jacobian, kernels.spin_tangent
-_pp_assemble, _pe_assemble, _pf_assemble, _ee_assemble, _plane_assemble = (
-    kernels.barrier_point_point_assemble,
-    kernels.barrier_point_edge_assemble,
-    kernels.barrier_point_face_assemble,
-    kernels.barrier_edge_edge_assemble,
-    kernels.barrier_plane_assemble,
-)
 _pp_jacobian, _pe_jacobian = kernels.barrier_point_point_jacobian, kernels.barrier_point_edge_jacobian
 _pf_jacobian, _ee_jacobian = kernels.barrier_point_face_jacobian, kernels.barrier_edge_edge_jacobian
 _plane_jacobian = kernels.barrier_plane_jacobian
@@ -58,7 +52,7 @@ def widen(work: Work, listed: Ints) -> None:
 
 @kernel
 def newton_matrix(
-    work: Work, velocity: Floats, turned: Floats, listed: Ints, touching: Touching, caution: float
+    work: Work, velocity: Floats, turned: Floats, listed: Ints, numbers: Floats, touching: Touching, caution: float
 ) -> General:
     """The factorised matrix at the motion; caution in [0, 1] is the part of the cautious one."""
     widen(work, listed)
@@ -93,7 +87,7 @@ def newton_matrix(
     if len(start_bodies) > 0:
         _add_inertia(work, velocity, swing, lower)
     if len(listed) > 0:
-        _add_contact(work, turned, touching, caution, swing, lower, upper)
+        _add_contact(work, turned, listed, numbers, touching, caution, swing, lower, upper)
     _let_go(work, lower, upper)
     return factorised(wide, lower, upper)
 
@@ -156,31 +150,57 @@ def _add_inertia(
 
 @inlined
 def _add_contact(
-    work: Work, turned: Floats, touching: Touching, caution: float, swing: Floats, lower: Floats, upper: Floats
+    work: Work,
+    turned: Floats,
+    listed: Ints,
+    numbers: Floats,
+    touching: Touching,
+    caution: float,
+    swing: Floats,
+    lower: Floats,
+    upper: Floats,
 ) -> None:
     """Blocks of all places that touch, and how the moments of their forces change as arms turn."""
-    freedom, time_step, rigid, motion = work.freedom, work.time_step, work.rigid, work.motion
-    first_body_point, wide = work.first_body_point, work.wide
+    if caution > 0:
+        _add_resistance(work, turned, listed, numbers, caution, swing, lower, upper)
+    if not caution < 1:
+        return
     for kind in range(5):
         nodes = _nodes_of(touching, kind)
-        count, width = len(nodes), nodes.shape[1]
-        if count == 0:
-            continue
-        exact = np.zeros((count, width * width, 9))
-        if caution < 1:
-            _exact(work, touching, kind, exact)
-        if caution > 0:
-            safe = np.zeros((count, width * (width + 1) // 2, 9))
-            _safe(work, touching, kind, safe)
-            _blend(safe, caution, width, exact)
-        _couple(work, turned, swing, nodes, exact, lower, upper)
-    if len(rigid.body) == 0 or not caution < 1:
+        if len(nodes) > 0:
+            blocks = np.zeros((len(nodes), nodes.shape[1] * nodes.shape[1], 9))
+            _exact(work, touching, kind, blocks)
+            for e in range(len(nodes)):
+                _couple(work.freedom, work.wide, work.rigid, work.first_body_point, turned, swing, nodes[e], blocks[e], 1 - caution, lower, upper)
+    rigid = work.rigid
+    if len(rigid.body) == 0:
         return
-    force = np.zeros((len(motion.positions), 3))
+    wide, freedom, first, dt = work.wide, work.freedom, work.first_body_point, work.time_step
+    force = np.zeros((len(freedom), 3))
     contact_force(work, touching, force)
     for p in range(len(swing)):  # -Δt d arm × f = Δt f × d arm
-        row, f = freedom[first_body_point + p, 1], force[first_body_point + p]
-        _add_cross(f[0], f[1], f[2], swing[p], time_step * time_step, lower[wide.starts[wide.place[row]]])
+        row, f = freedom[first + p, 1], force[first + p]
+        _add_cross(f[0], f[1], f[2], swing[p], dt * dt, lower[wide.starts[wide.place[row]]])
+
+
+@kernel
+def _add_resistance(
+    work: Work, turned: Floats, listed: Ints, numbers: Floats, caution: float, swing: Floats, lower: Floats, upper: Floats
+) -> None:
+    """The cautious blocks of what touches."""
+    parameters, motion, planes, law, dt = work.parameters, work.motion, work.planes, work.law, work.time_step
+    friction = (parameters.friction_obstacle[0], parameters.friction_cloth[0])
+    x, weights, local, blocks = np.empty((4, 3)), np.empty(6), np.empty(18), np.empty((16, 9))
+    freedom, wide, rigid, first = work.freedom, work.wide, work.rigid, work.first_body_point
+    for e in range(len(listed)):
+        if resistance(planes, law, friction, motion.positions, motion.after, listed, numbers, e, x, weights, local):
+            width = corners(listed, e)
+            for a in range(width):
+                for b in range(width):
+                    factor = weights[a] * weights[b]
+                    for k in range(9):
+                        blocks[a * width + b, k] = factor * (dt * dt * local[k] + dt * local[9 + k])
+            _couple(freedom, wide, rigid, first, turned, swing, listed[e, 1 : 1 + width], blocks, caution, lower, upper)
 
 
 @kernel
@@ -222,81 +242,56 @@ def _exact(work: Work, touching: Touching, kind: int, blocks: Floats) -> None:
         _plane_jacobian(touching.plane, parameters, motion, timing, 0.0, dt, blocks)
 
 
-@inlined
-def _safe(work: Work, touching: Touching, kind: int, blocks: Floats) -> None:
-    """The cautious blocks [E, pairs, 9]."""
-    time_step, parameters, motion = work.time_step, work.parameters, work.motion
-    dt, timing = time_step, Timing(time_step, 0.0)
-    unused = np.zeros((len(motion.positions), 3))
-    if kind == 0:
-        _pp_assemble(touching.point_point, parameters, motion, timing, 0.0, dt, unused, blocks)
-    elif kind == 1:
-        _pe_assemble(touching.point_edge, parameters, motion, timing, 0.0, dt, unused, blocks)
-    elif kind == 2:
-        _pf_assemble(touching.point_face, parameters, motion, timing, 0.0, dt, unused, blocks)
-    elif kind == 3:
-        _ee_assemble(touching.edge_edge, parameters, motion, timing, 0.0, dt, unused, blocks)
-    else:
-        _plane_assemble(touching.plane, parameters, motion, timing, 0.0, dt, unused, blocks)
-
-
-@kernel
-def _blend(safe: Floats, caution: float, width: int, blocks: Floats) -> None:
-    """blocks += caution (safe - blocks); those below the diagonal are the transposed of those above."""
-    for e in range(len(blocks)):
-        pair = 0
-        for a in range(width):
-            for b in range(a, width):
-                one, block, mirrored = safe[e, pair], blocks[e, a * width + b], blocks[e, b * width + a]
-                pair += 1
-                for r in range(3):
-                    for c in range(3):
-                        block[3 * r + c] += caution * (one[3 * r + c] - block[3 * r + c])
-                        if b > a:
-                            mirrored[3 * c + r] += caution * (one[3 * r + c] - mirrored[3 * c + r])
-
-
 @kernel
 def _couple(
-    work: Work, turned: Floats, swing: Floats, nodes: Ints, blocks: Floats, lower: Floats, upper: Floats
+    freedom: Ints,
+    wide: Pattern,
+    rigid: Rigid,
+    first: int,
+    turned: Floats,
+    swing: Floats,
+    nodes: Ints,
+    blocks: Floats,
+    factor: float,
+    lower: Floats,
+    upper: Floats,
 ) -> None:
-    """Add blocks [E, n², 9] between points to those between rows of the matrix: of nodes, or of bodies' centres and rotations."""
-    first_body_point, wide, freedom, rigid = work.first_body_point, work.wide, work.freedom, work.rigid
-    width, first = nodes.shape[1], first_body_point
+    """Add the blocks [n², 9] between points, times a factor, to those between rows of the matrix: of nodes, or of bodies' centres
+    and rotations. `first` is the first point of a body."""
+    width = len(nodes)
     right, both = np.empty(9), np.empty(9)
-    for e in range(len(nodes)):
-        for a in range(width):
-            for b in range(width):
-                block = blocks[e, a * width + b]
-                for k in range(4):
-                    row, column = freedom[nodes[e, a], k // 2], freedom[nodes[e, b], k % 2]
-                    if row < 0 or column < 0:
-                        continue
-                    part = block
-                    if k % 2 > 0:
-                        own = swing[nodes[e, b] - first]
-                        for r in range(3):
-                            for c in range(3):
-                                right[3 * r + c] = (
-                                    block[3 * r] * own[c] + block[3 * r + 1] * own[3 + c] + block[3 * r + 2] * own[6 + c]
-                                )
-                        part = right
-                    if k // 2 > 0:
-                        x, y, z = arm_of(rigid, turned, nodes[e, a] - first)
-                        both[:] = 0.0
-                        _add_cross(x, y, z, part, 1.0, both)
-                        part = both
-                    _add_at(wide, row, column, part, lower, upper)
+    for a in range(width):
+        for b in range(width):
+            block = blocks[a * width + b]
+            for k in range(4):
+                row, column = freedom[nodes[a], k // 2], freedom[nodes[b], k % 2]
+                if row < 0 or column < 0:
+                    continue
+                part = block
+                if k % 2 > 0:
+                    own = swing[nodes[b] - first]
+                    for r in range(3):
+                        for c in range(3):
+                            right[3 * r + c] = (
+                                block[3 * r] * own[c] + block[3 * r + 1] * own[3 + c] + block[3 * r + 2] * own[6 + c]
+                            )
+                    part = right
+                if k // 2 > 0:
+                    x, y, z = arm_of(rigid, turned, nodes[a] - first)
+                    both[:] = 0.0
+                    _add_cross(x, y, z, part, 1.0, both)
+                    part = both
+                _add_at(wide, row, column, part, factor, lower, upper)
 
 
 @kernel
-def _add_at(of: Pattern, row: int, column: int, block: Floats, lower: Floats, upper: Floats) -> None:
-    """Add the block (row, column)."""
+def _add_at(of: Pattern, row: int, column: int, block: Floats, factor: float, lower: Floats, upper: Floats) -> None:
+    """Add the block (row, column), times a factor."""
     slot = find_slot(of, row, column)
     if slot >= 0:
         for k in range(9):
-            lower[slot, k] += block[k]
+            lower[slot, k] += factor * block[k]
     else:
         for r in range(3):
             for c in range(3):
-                upper[~slot, 3 * c + r] += block[3 * r + c]
+                upper[~slot, 3 * c + r] += factor * block[3 * r + c]

@@ -82,7 +82,7 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
     for _ in range(_ITERATIONS):
         if not fresh:
             set_motion(work, here.velocity, here.points)
-            matrix = newton_matrix(work, here.velocity, here.turned, here.listed, here.touching, caution)
+            matrix = newton_matrix(work, here.velocity, here.turned, here.listed, here.numbers, here.touching, caution)
             fresh = True
         _pushed(work, here, left_over, right)
         if not solve_general(matrix, right, 0, direction):

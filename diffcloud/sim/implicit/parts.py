@@ -77,7 +77,7 @@ def solved_part(
     numbers = kept.numbers[kept.first_place[part] : kept.first_place[part + 1]]
     touching = as_elements(work.planes, work.law, listed, numbers)
     work.wide, work.moved = work.pattern, np.arange(len(work.pattern.rows))
-    matrix = newton_matrix(work, velocity, turned, listed, touching, 0.0)
+    matrix = newton_matrix(work, velocity, turned, listed, numbers, touching, 0.0)
     return Solved(velocity, turned, touching, matrix, end / PARTS)
 
 
