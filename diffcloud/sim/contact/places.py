@@ -61,7 +61,8 @@ def places(
 
     Returns:
         (kind and points [E, 5], of a plane its number in the place of the second point; area [m²], whether an obstacle takes
-        part, and where along two edges [E, 4]).
+        part, and where along two edges, or of points the area before anything is taken off [E, 4]). Places whose area
+        vanishes are listed too, for the cautious matrix; they are no elements.
     """
     room = len(planes.points) * len(planes.offsets)
     for c in range(len(pairs)):
@@ -95,18 +96,23 @@ def places(
             )
     kept = 0
     for e in range(count):
-        if listed[e, 0] == EDGE_EDGE or abs(numbers[e, 0]) > _VANISHING * numbers[e, 2]:
-            for k in range(5):
-                listed[kept, k] = listed[e, k]
-            for k in range(4):
-                numbers[kept, k] = numbers[e, k]
-            kept += 1
+        if listed[e, 0] != EDGE_EDGE:
+            if abs(numbers[e, 0]) < _VANISHING * numbers[e, 2]:
+                numbers[e, 0] = 0.0
+            numbers[e, 2] = 0.5 * (numbers[e, 0] + numbers[e, 2])  # what was added only
+            if numbers[e, 2] == 0 and numbers[e, 0] == 0:
+                continue
+        for k in range(5):
+            listed[kept, k] = listed[e, k]
+        for k in range(4):
+            numbers[kept, k] = numbers[e, k]
+        kept += 1
     for q in range(len(planes.points)):
         i = planes.points[q]
         for w in range(len(planes.offsets)):
             if gap_of(planes, w, points, i) < thickness:
                 listed[kept, 0], listed[kept, 1], listed[kept, 2], listed[kept, 3], listed[kept, 4] = PLANE, i, w, i, i
-                numbers[kept, 0], numbers[kept, 1] = planes.areas[q], 1.0
+                numbers[kept, 0], numbers[kept, 1], numbers[kept, 2] = planes.areas[q], 1.0, planes.areas[q]
                 kept += 1
     return listed[:kept], numbers[:kept]
 
@@ -201,12 +207,12 @@ def _of_kind(listed: Ints, numbers: Floats, kind: int, width: int) -> tuple[Ints
     """(points [E, width], second column [E], numbers [4, E]) of the places of one kind."""
     count = 0
     for e in range(len(listed)):
-        if listed[e, 0] == kind:
+        if listed[e, 0] == kind and numbers[e, 0] != 0:
             count += 1
     nodes, second, found = np.empty((count, width), np.int64), np.empty(count, np.int64), np.empty((4, count))
     count = 0
     for e in range(len(listed)):
-        if listed[e, 0] == kind:
+        if listed[e, 0] == kind and numbers[e, 0] != 0:
             for k in range(width):
                 nodes[count, k] = listed[e, 1 + k]
             second[count] = listed[e, 2]

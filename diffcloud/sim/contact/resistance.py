@@ -28,8 +28,8 @@ def resistance(
     found: Floats,
     local: Floats,
 ) -> bool:
-    """The stiffness w_a w_b S of place e, whose share must be positive: S less friction's part into local [9] [N/m], that into
-    local[9:18] [N·s/m]; found [6] takes the weights. False: it resists nothing.
+    """The stiffness w_a w_b S of place e: that of the barrier into local[:9] [N/m], of friction into local[9:18] [N·s/m];
+    found [6] takes the weights. False: it resists nothing.
 
     Args:
         friction: coefficients of obstacles and of the cloth with itself.
@@ -37,7 +37,8 @@ def resistance(
         listed, numbers: of `places`.
         x: [4, 3] room.
     """
-    kind, count, share = listed[e, 0], corners(listed, e), numbers[e, 0]
+    kind, count = listed[e, 0], corners(listed, e)
+    share = numbers[e, 0] if kind == EDGE_EDGE else numbers[e, 2]  # negative ones do not count
     if not share > 0:
         return False
     for k in range(count):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.sim.compiled.data import Floats, Ints, Timing
+from diffcloud.sim.compiled.data import Floats, Ints, Parameters, Timing
 from diffcloud.sim.compiled.kernel import inlined, kernel
 from diffcloud.sim.compiled.lu import General, factorised
 from diffcloud.sim.compiled.sparse import Pattern, find_slot, widened
@@ -67,7 +67,7 @@ def newton_matrix(
         _jacobian(terms, parameters, motion, timing, dt * parameters.damping[0], dt, lower, upper)
     if caution > 0:
         safe, unused = np.zeros((own + 1, 9)), np.zeros((len(motion.positions), 3))
-        _assemble(terms, parameters, motion, Timing(dt, dt), reach, dt, unused, safe)
+        _assemble(terms, _without_air(parameters), motion, Timing(dt, dt), reach, dt, unused, safe)
         for p in range(own):
             for k in range(9):
                 lower[p, k] += caution * (safe[p, k] - lower[p, k])
@@ -90,6 +90,16 @@ def newton_matrix(
         _add_contact(work, turned, listed, numbers, touching, caution, swing, lower, upper)
     _let_go(work, lower, upper)
     return factorised(wide, lower, upper)
+
+
+@kernel
+def _without_air(p: Parameters) -> Parameters:
+    """The cautious matrix has elastic forces and contact only."""
+    none = np.zeros(1)
+    return Parameters(
+        p.node_mass, p.inverse_mass, p.stretching, p.bending, p.damping, none, none, p.friction_obstacle, p.friction_cloth,
+        p.body_mass, p.hold, p.target,
+    )  # fmt: skip
 
 
 @kernel

@@ -174,11 +174,14 @@ def _remember(
     used, more = first[part], len(listed)
     places, areas = with_room(kept.listed, used, more), with_room(kept.numbers, used, more)
     for e in range(more):
+        if numbers[e, 0] == 0:
+            continue
         for k in range(5):
-            places[used + e, k] = listed[e, k]
+            places[used, k] = listed[e, k]
         for k in range(4):
-            areas[used + e, k] = numbers[e, k]
-    first[part + 1] = used + more
+            areas[used, k] = numbers[e, k]
+        used += 1
+    first[part + 1] = used
     return Kept(kept.begins, ends, states, first, places, areas)
 
 
