@@ -28,6 +28,8 @@ _LEAST_CAUTION = 0.05
 """Of the step after one that the exact matrix led astray."""
 _REUSE = 1e-4
 """A relative change below this is followed by one correction with the same matrix instead of a new one."""
+_WHOLE = 1 - 1e-9
+"""A way that is free so far is free: where it has been shortened before, only rounding keeps it from being whole."""
 _PROBE = 1e-4
 """Part of the obstacles' way over which its effect is measured."""
 
@@ -208,7 +210,7 @@ def _towards(work: Work, here: Place, direction: Floats, alpha: float, room: Roo
             cover(work, room, far)
             here.distances = distances_at(work, room, here.points)
         fraction = free_way(work, room, here.distances, here.points, points)
-        if fraction == 1:
+        if fraction > _WHOLE:
             return _place(work, room, velocity, scenery, points, turned)
         # what is straight in velocities is not quite straight in space where bodies turn: look again at the shorter step
         alpha *= 0.0 if halving >= _HALVINGS else (fraction * 0.9 if halving > 0 else fraction)
