@@ -19,10 +19,10 @@ from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.surrounding import Surrounding
 from diffcloud.sim.terms.term import Setup
 
-# isort: split
 from diffcloud.sim.compiled.data import Parameters
+from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.lu import factorised, solve_general
-from diffcloud.sim.compiled.sparse import pattern
+from diffcloud.sim.compiled.sparse import Pattern, pattern
 from diffcloud.sim.held import Held
 from diffcloud.sim.implicit import Scene, build_scene
 from diffcloud.sim.implicit.adjoint import reverse
@@ -223,6 +223,11 @@ def test_a_body_and_the_cloth_fall_freely_alike() -> None:
     np.testing.assert_allclose(run.bodies[:, 0, 2] - run.bodies[0, 0, 2], fall, atol=1e-10)
 
 
+@kernel
+def _solved(of: Pattern, lower: Floats, upper: Floats, right: Floats, transposed: int, found: Floats) -> bool:
+    return solve_general(factorised(of, lower, upper), right, transposed, found)
+
+
 @pytest.mark.parametrize("singular", [False, True])
 def test_block_lu_solves_both_ways(singular: bool) -> None:
     """Also where a pivot is singular and dense LU has to help."""
@@ -242,8 +247,7 @@ def test_block_lu_solves_both_ways(singular: bool) -> None:
                 dense[j, :, i] = upper[at].reshape(3, 3).T
     matrix = dense[of.place][:, :, of.place].reshape(3 * count, 3 * count)
     right, found = rng.normal(size=(count, 3)), np.empty((count, 3))
-    factor = factorised(of, lower, upper)
     for transposed in (0, 1):
-        assert solve_general(factor, right, transposed, found)
+        assert _solved(of, lower, upper, right, transposed, found)
         expected = np.linalg.solve(matrix.T if transposed else matrix, right.ravel())
         np.testing.assert_allclose(found.ravel(), expected, rtol=1e-9, atol=1e-12)
