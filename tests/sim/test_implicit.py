@@ -1,5 +1,5 @@
-"""Laws of the implicit step's kernels: both modes of derivatives agree with each other and with differences, and nothing passes
-through anything."""
+"""Laws of the implicit step's kernels: both modes of derivatives agree with each other and with differences, and
+nothing passes through anything."""
 
 from __future__ import annotations
 
@@ -106,9 +106,13 @@ _CASES = {
     "soft": Case(_cloth(), Handles((Handle(0), Handle(3, _UP, start=0.025))), Surrounding(wind=(0.5, 0.2, 0.1))),
     "moving": Case(_cloth(), Handles((Handle(0), Handle(3, _UP)), hard=True), Surrounding()),
     "plane": Case(
-        _cloth(0.0031), Handles(()), Surrounding(gravity=(3.0, 0.0, -9.0), obstacles=(rectangle_surface((0, 0), (1, 1), 0.0),))
+        _cloth(0.0031),
+        Handles(()),
+        Surrounding(gravity=(3.0, 0.0, -9.0), obstacles=(rectangle_surface((0, 0), (1, 1), 0.0),)),
     ),
-    "box": Case(_cloth(0.0031), Handles(()), Surrounding(obstacles=(box_surface((-0.02, -0.03, -0.1), (0.03, 0.02, 0.0)),))),
+    "box": Case(
+        _cloth(0.0031), Handles(()), Surrounding(obstacles=(box_surface((-0.02, -0.03, -0.1), (0.03, 0.02, 0.0)),))
+    ),
     "pushed": Case(
         _cloth(0.0031),
         Handles(_CORNERS, hard=True),

@@ -1,8 +1,8 @@
 """Boxes: what many kernels share, passed as one pointer.
 
-A kernel that is given a named tuple of fifty arrays gets their hundreds of numbers one by one, and compiling each call takes a
-second. A box is a place in memory with named fields, which kernels read and write; only the fields that a kernel names cost it
-anything. A module makes one in three lines:
+A kernel that is given a named tuple of fifty arrays gets their hundreds of numbers one by one, and compiling each
+call takes a second. A box is a place in memory with named fields, which kernels read and write; only the fields that
+a kernel names cost it anything. A module makes one in three lines:
 
     class RoomType(BoxType): ...
     class Room(Box): ...

@@ -1,11 +1,12 @@
 """Compiled functions and where they are kept.
 
-numba compiles a kernel when it is first called and keeps the machine code in the user's cache folder. The folder's name holds
-a fingerprint of every source that goes into kernels, since numba itself looks at one function's file and not at those it calls;
-so an upgrade compiles again and never mixes versions. Several processes may compile at once: files are written whole.
+numba compiles a kernel when it is first called and keeps the machine code in the user's cache folder. The folder's
+name holds a fingerprint of every source that goes into kernels, since numba itself looks at one function's file and
+not at those it calls; so an upgrade compiles again and never mixes versions. Several processes may compile at once:
+files are written whole.
 
-`DIFFCLOUD_CACHE_DIR` puts the folder elsewhere. `DIFFCLOUD_UNCOMPILED=1` runs all kernels as plain Python, for a debugger; a
-step then takes seconds.
+`DIFFCLOUD_CACHE_DIR` puts the folder elsewhere. `DIFFCLOUD_UNCOMPILED=1` runs all kernels as plain Python, for a
+debugger; a step then takes seconds.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ def cache_folder() -> Path:
 
 
 def kernel(function: F) -> F:
-    """A function that numba compiles: of arrays, numbers and named tuples of them. It releases the interpreter's lock."""
+    """A function that numba compiles: of arrays, numbers and named tuples of them. It releases the interpreter's
+    lock."""
     if UNCOMPILED:
         return function
     given, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(cache_folder())  # of other people's functions, and of this
@@ -50,6 +52,8 @@ def kernel(function: F) -> F:
 
 
 def inlined(function: F) -> F:
-    """A kernel whose code is put where it is called. Of kernels that call large ones: each kernel is compiled with all that it
-    calls, so that deep calls are compiled again on every level."""
-    return function if UNCOMPILED else numba.njit(inline="always", nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+    """A kernel whose code is put where it is called. Of kernels that call large ones: each kernel is compiled with
+    all that it calls, so that deep calls are compiled again on every level."""
+    if UNCOMPILED:
+        return function
+    return numba.njit(inline="always", nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]

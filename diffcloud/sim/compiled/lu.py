@@ -3,8 +3,8 @@
     A = L U,   L_jj = I,   U_jj = D_j
 
 Both halves are kept in the pattern of the lower factor: L as it is, with D_j⁻¹ in the place of its diagonal, and U
-transposed. No rows are exchanged beyond the blocks, which is fine where the diagonal is strong; the residual of each solution
-is looked at, and where it is large the system is solved again by dense LU with pivots.
+transposed. No rows are exchanged beyond the blocks, which is fine where the diagonal is strong; the residual of each
+solution is looked at, and where it is large the system is solved again by dense LU with pivots.
 """
 
 from __future__ import annotations

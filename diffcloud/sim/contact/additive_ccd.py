@@ -1,8 +1,8 @@
 """How far points can move along straight lines before a pair touches: additive continuous collision detection.
 
 Li et al. 2021 (Codimensional IPC): advance by no more than the distance that is left, divided by the speed bound, until
-the distance falls to a fixed part of what it was. No polynomial is solved, so nothing goes wrong for parallel edges, flat
-motions or zero thickness, and the answer is always on the safe side.
+the distance falls to a fixed part of what it was. No polynomial is solved, so nothing goes wrong for parallel edges,
+flat motions or zero thickness, and the answer is always on the safe side.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def safe_fraction(pairs: Ints, distances: Floats, start: Floats, end: Floats, li
 
 @kernel
 def _bound(pairs: Ints, c: int, start: Floats, end: Floats, x: Floats, motion: Floats) -> float:
-    """How fast a pair can come closer [m]; x, motion [4, 3] take where its points start and how they go, without what they
-    have in common."""
+    """How fast a pair can come closer [m]; x, motion [4, 3] take where its points start and how they go, without what
+    they have in common."""
     for axis in range(3):
         mean = 0.0
         for k in range(4):

@@ -4,20 +4,21 @@ The potential of one place at distance d below the thickness d̂ is
 
     φ(d) = -(K/6) (d - d̂)² ln(d / d̂),      K = k_c A,
 
-twice continuously differentiable at d̂, infinite at d = 0 (Li et al. 2020, Incremental Potential Contact), weighted by area
-(Li et al. 2023, Convergent IPC) and scaled so that near d̂ it equals ARCSim's K (d̂ - d)³ / (6 d̂).
+twice continuously differentiable at d̂, infinite at d = 0 (Li et al. 2020, Incremental Potential Contact), weighted
+by area (Li et al. 2023, Convergent IPC) and scaled so that near d̂ it equals ARCSim's K (d̂ - d)³ / (6 d̂).
 
-A point near a mesh feels every face within d̂. Where faces meet, the sum would count a place twice; so the shared edge is
-taken off once and an interior point added back once (inclusion and exclusion, as in Convergent IPC), which leaves
-exactly one contact over a flat surface however it is cut into triangles, and is smooth over all features. `places` sums what
-falls on the same point, edge or face beforehand: each is an element with its share of the area, which may be negative.
+A point near a mesh feels every face within d̂. Where faces meet, the sum would count a place twice; so the shared
+edge is taken off once and an interior point added back once (inclusion and exclusion, as in Convergent IPC), which
+leaves exactly one contact over a flat surface however it is cut into triangles, and is smooth over all features.
+`places` sums what falls on the same point, edge or face beforehand: each is an element with its share of the area,
+which may be negative.
 
 Two edges that become parallel have no unique closest places; their force fades out with the squared sine of the angle
 (as IPC's mollifier; the fading itself adds no force).
 
-Friction: -μ λ f(|v_t|) v_t/|v_t| with λ = -φ'(d), v_t the sliding velocity of the step and f = 2y - y², y = |v_t|/v_s, up
-to the sticking speed v_s and 1 beyond: a resting contact creeps slower than v_s. Normal force, normal and sliding all
-belong to the end of the step (nothing is lagged), so forces are smooth in all inputs.
+Friction: -μ λ f(|v_t|) v_t/|v_t| with λ = -φ'(d), v_t the sliding velocity of the step and f = 2y - y², y =
+|v_t|/v_s, up to the sticking speed v_s and 1 beyond: a resting contact creeps slower than v_s. Normal force, normal
+and sliding all belong to the end of the step (nothing is lagged), so forces are smooth in all inputs.
 
 The cautious matrix is in `resistance`.
 """
@@ -152,8 +153,8 @@ BARRIER_POINT_POINT = _term("point_point", 2, _point_point)
 BARRIER_POINT_EDGE = _term("point_edge", 3, _point_edge)
 BARRIER_POINT_FACE = _term("point_face", 4, _point_face)
 BARRIER_EDGE_EDGE = _term("edge_edge", 4, _edge_edge, "s", "t")
-"""Constants: area that counts [m²]; 1 where an obstacle takes part; of two edges the fractions along them at which they are
-closest, 0 or 1, or below zero where that is between their ends. Tables: [1, 3] of the law (`_law`)."""
+"""Constants: area that counts [m²]; 1 where an obstacle takes part; of two edges the fractions along them at which
+they are closest, 0 or 1, or below zero where that is between their ends. Tables: [1, 3] of the law (`_law`)."""
 BARRIER_PLANE = Term(
     "barrier_plane",
     corners=1,

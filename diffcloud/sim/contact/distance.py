@@ -20,8 +20,8 @@ _CROSSING = 1e-14
 def closest(edges: int, x: Floats, found: Floats) -> float:
     """Distance of the primitives of four points x [4, 3]: a point and a face, or two edges [m].
 
-    `found` [6] takes the weights, then where the place is: of a point and a face, 0 for its interior, 1..3 for its edges 01,
-    12, 20 and 4..6 for its corners; of two edges, where along each (0 or 1, below zero: between its ends).
+    `found` [6] takes the weights, then where the place is: of a point and a face, 0 for its interior, 1..3 for its
+    edges 01, 12, 20 and 4..6 for its corners; of two edges, where along each (0 or 1, below zero: between its ends).
     """
     if edges > 0:
         _edge_edge(x, found)

@@ -1,7 +1,8 @@
 """Which places of near pairs touch, as elements of the barrier's terms.
 
-A point and a face meet at up to seven places: the face, its edges, its corners (inclusion and exclusion, see `barrier`). What
-falls on the same point, edge or face is one place with the sum of the shares, which vanishes for most of them.
+A point and a face meet at up to seven places: the face, its edges, its corners (inclusion and exclusion, see
+`barrier`). What falls on the same point, edge or face is one place with the sum of the shares, which vanishes for
+most of them.
 """
 
 from __future__ import annotations
@@ -60,9 +61,9 @@ def places(
         distances: [C] [m].
 
     Returns:
-        (kind and points [E, 5], of a plane its number in the place of the second point; area [m²], whether an obstacle takes
-        part, and where along two edges, or of points the area before anything is taken off [E, 4]). Places whose area
-        vanishes are listed too, for the cautious matrix; they are no elements.
+        (kind and points [E, 5], of a plane its number in the place of the second point; area [m²], whether an
+        obstacle takes part, and where along two edges, or of points the area before anything is taken off [E, 4]).
+        Places whose area vanishes are listed too, for the cautious matrix; they are no elements.
     """
     room = len(planes.points) * len(planes.offsets)
     for c in range(len(pairs)):
@@ -135,7 +136,7 @@ def _point_face(  # type: ignore[no-untyped-def]
             share, here = area, region
         elif place < 4:
             a, b = place, 1 + place % 3
-            kept, fraction, square = on_segment(x, 0, a, b)
+            _, fraction, square = on_segment(x, 0, a, b)
             share = -area * surface.edge_share[face, place - 1]
             here = 3 + a if fraction < 0 else (3 + b if fraction > 1 else place)
             if not square < thickness * thickness:

@@ -1,4 +1,5 @@
-"""What of the contact forces resists motion, with places and normals held: positive semidefinite stiffness for cautious steps."""
+"""What of the contact forces resists motion, with places and normals held: positive semidefinite stiffness for
+cautious steps."""
 
 from __future__ import annotations
 
@@ -28,8 +29,8 @@ def resistance(
     found: Floats,
     local: Floats,
 ) -> bool:
-    """The stiffness w_a w_b S of place e: that of the barrier into local[:9] [N/m], of friction into local[9:18] [N·s/m];
-    found [6] takes the weights. False: it resists nothing.
+    """The stiffness w_a w_b S of place e: that of the barrier into local[:9] [N/m], of friction into local[9:18]
+    [N·s/m]; found [6] takes the weights. False: it resists nothing.
 
     Args:
         friction: coefficients of obstacles and of the cloth with itself.

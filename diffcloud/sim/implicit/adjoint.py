@@ -41,8 +41,8 @@ def reverse(
 
     Args:
         track, obstacles, anchors, positions, velocities, bodies: as `simulate` took and left them.
-        position_gradients, velocity_gradients, body_gradients: [S + 1, V, 3], [S + 1, V, 3], [S + 1, B, 18] of a loss by each
-            step's outcome; the first rows take those by the start.
+        position_gradients, velocity_gradients, body_gradients: [S + 1, V, 3], [S + 1, V, 3], [S + 1, B, 18] of a loss
+            by each step's outcome; the first rows take those by the start.
         parameter_gradients: zeros, takes the sums.
         track_gradients: [S, 3] zeros, takes those by the track.
     """
@@ -103,7 +103,8 @@ def _part(
     gradients: Parameters,
     wanted: Floats,
 ) -> None:
-    """Gradients by the end of a part (x, v [V, 3], own [B, 18]) become those by its start; wanted [H, 3] takes those by its targets."""
+    """Gradients by the end of a part (x, v [V, 3], own [B, 18]) become those by its start; wanted [H, 3] takes those
+    by its targets."""
     time_step, parameters, holder, start_velocities = work.time_step, work.parameters, work.holder, work.start_velocities
     w = solved.velocity
     dt, nodes, count = time_step, len(x), len(own)
@@ -149,9 +150,7 @@ def _part(
 
 
 @inlined
-def _forces(
-    work: Work, solved: Solved, y: Floats, gradients: Parameters, slopes: Motion
-) -> None:
+def _forces(work: Work, solved: Solved, y: Floats, gradients: Parameters, slopes: Motion) -> None:
     """Gradients of Δt y · f, of forces on cloth nodes and on bodies."""
     first_body_point, time_step, terms, parameters = work.first_body_point, work.time_step, work.terms, work.parameters
     motion, start_positions, rigid = work.motion, work.start_positions, work.rigid
@@ -181,11 +180,14 @@ def _forces(
 
 
 @inlined
-def _bodies(
-    work: Work, solved: Solved, slopes: Motion, y: Floats, own: Floats, gradients: Parameters
-) -> None:
+def _bodies(work: Work, solved: Solved, slopes: Motion, y: Floats, own: Floats, gradients: Parameters) -> None:
     """The rigid bodies' part of `_part`."""
-    time_step, first_body_point, start_positions, rigid = work.time_step, work.first_body_point, work.start_positions, work.rigid
+    time_step, first_body_point, start_positions, rigid = (
+        work.time_step,
+        work.first_body_point,
+        work.start_positions,
+        work.rigid,
+    )
     motion, parameters, start_bodies, gravity = work.motion, work.parameters, work.start_bodies, work.gravity
     w, ended = solved.velocity, solved.turned
     dt, nodes, count = time_step, len(start_positions), len(own)

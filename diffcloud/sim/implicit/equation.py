@@ -28,11 +28,15 @@ def spin_inputs(work: Work, b: int, turning: Floats, inputs: Floats, constants: 
 
 
 @kernel
-def place_points(
-    work: Work, velocity: Floats, scenery: Floats, points: Floats, turned: Floats
-) -> None:
-    """Points [N, 3] at the end of the step with velocities [D, 3] and obstacles at `scenery`; turned [B, 12] takes `spin`."""
-    first_body_point, time_step, start_positions, start_bodies = work.first_body_point, work.time_step, work.start_positions, work.start_bodies
+def place_points(work: Work, velocity: Floats, scenery: Floats, points: Floats, turned: Floats) -> None:
+    """Points [N, 3] at the end of the step with velocities [D, 3] and obstacles at `scenery`; turned [B, 12] takes
+    `spin`."""
+    first_body_point, time_step, start_positions, start_bodies = (
+        work.first_body_point,
+        work.time_step,
+        work.start_positions,
+        work.start_bodies,
+    )
     rigid = work.rigid
     dt, nodes = time_step, len(start_positions)
     for i in range(nodes):
@@ -96,7 +100,8 @@ def contact_force(work: Work, touching: Touching, force: Floats) -> None:
 
 @kernel
 def residual(
-    work: Work, velocity: Floats,
+    work: Work,
+    velocity: Floats,
     points: Floats,
     turned: Floats,
     touching: Touching,
@@ -140,7 +145,8 @@ def residual(
 
 @kernel
 def arm_of(rigid: Rigid, turned: Floats, p: int) -> tuple[float, float, float]:
-    """From the centre of mass to a body's point, in the world's axes [m]; turned [B, 9 or more] starts with orientations."""
+    """From the centre of mass to a body's point, in the world's axes [m]; turned [B, 9 or more] starts with
+    orientations."""
     own, t = rigid.points[p], turned[rigid.body[p]]
     return (
         t[0] * own[0] + t[1] * own[1] + t[2] * own[2],

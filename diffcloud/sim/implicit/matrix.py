@@ -126,9 +126,7 @@ def _let_go(work: Work, lower: Floats, upper: Floats) -> None:
 
 
 @kernel
-def _add_inertia(
-    work: Work, velocity: Floats, swing: Floats, lower: Floats
-) -> None:
+def _add_inertia(work: Work, velocity: Floats, swing: Floats, lower: Floats) -> None:
     """Mass and turning inertia of bodies; swing [P, 9] takes d point / d angular velocity over Δt."""
     start_positions, start_bodies, parameters, wide = work.start_positions, work.start_bodies, work.parameters, work.wide
     rigid, time_step = work.rigid, work.time_step
@@ -181,7 +179,19 @@ def _add_contact(
             blocks = np.zeros((len(nodes), nodes.shape[1] * nodes.shape[1], 9))
             _exact(work, touching, kind, blocks)
             for e in range(len(nodes)):
-                _couple(work.freedom, work.wide, work.rigid, work.first_body_point, turned, swing, nodes[e], blocks[e], 1 - caution, lower, upper)
+                _couple(
+                    work.freedom,
+                    work.wide,
+                    work.rigid,
+                    work.first_body_point,
+                    turned,
+                    swing,
+                    nodes[e],
+                    blocks[e],
+                    1 - caution,
+                    lower,
+                    upper,
+                )
     rigid = work.rigid
     if len(rigid.body) == 0:
         return
@@ -266,8 +276,8 @@ def _couple(
     lower: Floats,
     upper: Floats,
 ) -> None:
-    """Add the blocks [n², 9] between points, times a factor, to those between rows of the matrix: of nodes, or of bodies' centres
-    and rotations. `first` is the first point of a body."""
+    """Add the blocks [n², 9] between points, times a factor, to those between rows of the matrix: of nodes, or of
+    bodies' centres and rotations. `first` is the first point of a body."""
     width = len(nodes)
     right, both = np.empty(9), np.empty(9)
     for a in range(width):

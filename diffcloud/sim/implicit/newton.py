@@ -110,7 +110,8 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
 
 @kernel
 def _judge(left_over: Floats, direction: Floats, velocity: Floats) -> tuple[float, float]:
-    """Turn a direction [D, 3] round; (how steeply the residual leads downhill along it, its size relative to velocities)."""
+    """Turn a direction [D, 3] round; (how steeply the residual leads downhill along it, its size relative to
+    velocities)."""
     downhill, speed, size = 0.0, _SLOWEST, 0.0
     for i in range(len(direction)):
         for axis in range(3):

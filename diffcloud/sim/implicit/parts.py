@@ -91,4 +91,3 @@ def _read(state: Floats, positions: Floats, velocities: Floats, bodies: Floats) 
     for b in range(len(bodies)):
         for k in range(BODY):
             bodies[b, k] = state[6 * nodes + BODY * b + k]
-

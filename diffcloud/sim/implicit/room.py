@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import sqrt
+
 import numpy as np
 
 from diffcloud.sim.compiled.box import Box, BoxType, define
@@ -78,7 +79,9 @@ def away(room: Room, points: Floats) -> float:
 
 
 @kernel
-def prescribed(work: Work, ) -> Ints:
+def prescribed(
+    work: Work,
+) -> Ints:
     """[N] 1 for points whose motion is prescribed; all zero where no node's is."""
     moves, holder = work.moves, work.holder
     found = np.zeros(len(moves), np.int64)

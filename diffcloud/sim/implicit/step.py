@@ -41,7 +41,8 @@ def simulate(
         bodies: [S + 1, B, 18] centre, orientation row by row, velocity, angular velocity; the first is the start.
         keep: below zero: nothing is kept for the derivatives.
         control: [2] finished steps are added to the first; the second one stops the run when it is not zero.
-        fault: [6] where the run got stuck: the relative change, the kind of the closest pair (0: point and face, 1: two edges,
+        fault: [6] where the run got stuck: the relative change, the kind of the closest pair (0: point and face, 1:
+            two edges,
             2: point and plane, -1: none) and its points.
 
     Returns:
@@ -60,7 +61,10 @@ def simulate(
         work.holder = holders(held, step, nodes)
         for i in range(nodes):
             for axis in range(3):
-                positions[step + 1, i, axis], velocities[step + 1, i, axis] = positions[step, i, axis], velocities[step, i, axis]
+                positions[step + 1, i, axis], velocities[step + 1, i, axis] = (
+                    positions[step, i, axis],
+                    velocities[step, i, axis],
+                )
         for b in range(bodies.shape[1]):
             for k in range(BODY):
                 bodies[step + 1, b, k] = bodies[step, b, k]
@@ -83,7 +87,14 @@ def simulate(
             length = place & -place  # the other half, or that of the part which both make up
             if keep >= 0:
                 kept = _remember(
-                    kept, parts, place, positions[step + 1], velocities[step + 1], bodies[step + 1], here.listed, here.numbers
+                    kept,
+                    parts,
+                    place,
+                    positions[step + 1],
+                    velocities[step + 1],
+                    bodies[step + 1],
+                    here.listed,
+                    here.numbers,
                 )
                 parts += 1
         if not _finite(positions[step + 1]):

@@ -1,4 +1,5 @@
-"""Derivatives of an episode of implicit steps forwards, along several directions at once: one factor for each part of a step."""
+"""Derivatives of an episode of implicit steps forwards, along several directions at once: one factor for each part of
+a step."""
 
 from __future__ import annotations
 
@@ -43,8 +44,8 @@ def forward(
         parameter_rates: each field with a leading axis K; its `target` is room, its `hold` is zero.
         track_rates: [K, S, 3]
         track, obstacles, anchors, positions, velocities, bodies: as `simulate` took and left them.
-        position_rates, velocity_rates, body_rates: [S + 1, K, V, 3], [S + 1, K, V, 3], [S + 1, K, B, 18]; the first rows are
-            those of the start, the others are taken.
+        position_rates, velocity_rates, body_rates: [S + 1, K, V, 3], [S + 1, K, V, 3], [S + 1, K, B, 18]; the first
+            rows are those of the start, the others are taken.
     """
     steps, nodes, count, directions = len(positions) - 1, positions.shape[1], bodies.shape[1], position_rates.shape[1]
     work, points = new_work(scene, parameters, nodes, count), scene.surface.point_count
@@ -118,9 +119,7 @@ def _part(
                 speed = speeds[d, i, axis]
                 rates.positions[d, i, axis] = x[d, i, axis] + dt * speed
                 rates.before[d, i, axis] = rates.after[d, i, axis] = speed
-                rates.displacement[d, i, axis] = (
-                    parameter_rates.damping[d, 0] * w[i, axis] + parameters.damping[0] * speed
-                )
+                rates.displacement[d, i, axis] = parameter_rates.damping[d, 0] * w[i, axis] + parameters.damping[0] * speed
     turned = np.zeros((count, directions, 12))
     turns = np.zeros((directions, 15))
     for b in range(count):
@@ -169,9 +168,7 @@ def _turned(work: Work, solved: Solved, b: int, own: Floats, turns: Floats, foun
 
 
 @kernel
-def _finish(
-    work: Work, solved: Solved, b: int, d: int, own: Floats, turns: Floats, found: Floats
-) -> None:
+def _finish(work: Work, solved: Solved, b: int, d: int, own: Floats, turns: Floats, found: Floats) -> None:
     """The rates of a body's orientation and angular velocity, whose new rate is in turns[d, 12:]."""
     start_positions = work.start_positions
     inputs, constants = np.empty(15), np.empty(10)
@@ -217,7 +214,12 @@ def _body_rows(
     right: Floats,
 ) -> None:
     """The bodies' rows of -dr along direction d."""
-    time_step, first_body_point, start_positions, rigid = work.time_step, work.first_body_point, work.start_positions, work.rigid
+    time_step, first_body_point, start_positions, rigid = (
+        work.time_step,
+        work.first_body_point,
+        work.start_positions,
+        work.rigid,
+    )
     parameters, start_bodies, gravity = work.parameters, work.start_bodies, work.gravity
     w, ended, nodes, dt, first = solved.velocity, solved.turned, len(start_positions), time_step, first_body_point
     for b in range(own.shape[1]):
@@ -235,9 +237,7 @@ def _body_rows(
         for axis in range(3):
             j, k = (axis + 1) % 3, (axis + 2) % 3
             right[row, axis] += dt * pushed[axis]
-            right[row + 1, axis] += dt * (
-                arm[j] * pushed[k] - arm[k] * pushed[j] + lever[j] * push[k] - lever[k] * push[j]
-            )
+            right[row + 1, axis] += dt * (arm[j] * pushed[k] - arm[k] * pushed[j] + lever[j] * push[k] - lever[k] * push[j])
 
 
 @inlined

@@ -1,12 +1,12 @@
 """Movable obstacles: mass and inertia of their meshes, and their states.
 
-A step moves a body with its new velocities: centre c₁ = c₀ + Δt v₁, orientation R₁ = exp(Δt ω₁) R₀. The equations are the
-balances of linear and of angular momentum,
+A step moves a body with its new velocities: centre c₁ = c₀ + Δt v₁, orientation R₁ = exp(Δt ω₁) R₀. The equations are
+the balances of linear and of angular momentum,
 
     M (v₁ - v₀) = Δt (M g + Σ f),      I(R₁) ω₁ - I(R₀) ω₀ = Δt Σ (p - c₁) × f,
 
-so that a body without contact keeps its angular momentum exactly (`rigid.spin`). (The reference simulator uses Euler angles, a
-point mass per node and no angular acceleration; PHYSICS section 9.)
+so that a body without contact keeps its angular momentum exactly (`rigid.spin`). (The reference simulator uses Euler
+angles, a point mass per node and no angular acceleration; PHYSICS section 9.)
 """
 
 from __future__ import annotations

@@ -17,7 +17,8 @@ _SMALL = 1e-8
 
 
 def _spin(inputs: Sequence[Scalar], constants: Sequence[Scalar]) -> list[Scalar]:
-    """From R₀ [9], ω₀ and ω₁ with constants Δt and G [9] to R₁ [9] and the change of angular momentum per mass [m²/s]."""
+    """From R₀ [9], ω₀ and ω₁ with constants Δt and G [9] to R₁ [9] and the change of angular momentum per mass
+    [m²/s]."""
     before = [Vector(*inputs[3 * row : 3 * row + 3]) for row in range(3)]
     first, last = Vector(*inputs[9:12]), Vector(*inputs[12:15])
     gyration = [Vector(*constants[1 + 3 * row : 4 + 3 * row]) for row in range(3)]
