@@ -31,6 +31,7 @@ from platformdirs import user_cache_path
 UNCOMPILED = os.environ.get("DIFFCLOUD_UNCOMPILED", "") not in ("", "0")
 _PACKAGE = Path(__file__).parent
 _KEPT_DAYS = 30
+_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _MARK = "complete"
 """A file in the folder, once everything has been compiled ahead."""
 _log = logging.getLogger(__name__)
@@ -42,7 +43,12 @@ def kernel_sources(package: Path = _PACKAGE) -> Iterator[Path]:
     """The files whose change compiles again: those that hold kernels, and those that kernels are generated from."""
     for source in sorted(package.rglob("*.py")):
         text = b"\n" + source.read_bytes()
-        if b"\n@kernel\n" in text or b"sim.compiled" in text or source.parent == package / "sim" / "compiled":
+        if (
+            b"\n@kernel\n" in text
+            or b"\n@inlined\n" in text
+            or b"sim.compiled" in text
+            or source.parent == package / "sim" / "compiled"
+        ):
             yield source
 
 
@@ -101,9 +107,17 @@ def kernel(function: F) -> F:
     config: Any = numba.config
     given, config.CACHE_DIR = config.CACHE_DIR, str(cache_folder())  # of other people's functions, and of this
     try:
-        return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+        return cast(F, numba.njit(cache=True, **_OPTIONS)(function))
     finally:
         config.CACHE_DIR = given
+
+
+def inlined(function: F) -> F:
+    """A kernel whose code is put where it is called. Of kernels that call large ones: each kernel is compiled with all
+    that it calls, so that deep calls are compiled again on every level."""
+    if UNCOMPILED:
+        return function
+    return cast(F, numba.njit(inline="always", **_OPTIONS)(function))
 
 
 class _Announcement(event.Listener):

@@ -14,7 +14,7 @@ from diffcloud.sim.build import build_system
 from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import preset
 from diffcloud.sim.properties import scaled_properties
-from diffcloud.sim.reference.nearest import nearest_pairs
+from diffcloud.sim.reference.nearest import pairs_at
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
 from diffcloud.sim.system import System
@@ -105,7 +105,7 @@ def time_contact(side: int, *, steps: int = 25, repeats: int = 3) -> ContactTimi
         positions = rollout(touching, steps).positions[0].numpy()
     scene = touching.scene
     contacts = sum(
-        len(nearest_pairs(scene.surface, scene.repulsion, np.concatenate([one, scene.obstacles]))[0]) for one in positions
+        len(pairs_at(scene.surface, scene.repulsion, np.concatenate([one, scene.obstacles]))[0]) for one in positions
     )
     return ContactTiming(
         nodes=len(mesh.nodes),

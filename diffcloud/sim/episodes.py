@@ -70,7 +70,7 @@ class Batch:
                 self.held,
                 self._parameters[entry],
                 self._track[entry],
-                *self._more(entry),
+                *self._obstacles,
                 self._anchors[entry],
                 self.positions[entry],
                 self.velocities[entry],
@@ -97,7 +97,8 @@ class Batch:
                 self.held,
                 parameters,
                 self._track[entry],
-                *self._more(entry),
+                *self._obstacles,
+                self._anchors[entry],
                 self.positions[entry],
                 self.velocities[entry],
                 *self._bodies(self.poses[entry]),
@@ -136,7 +137,8 @@ class Batch:
                 moves,
                 self._track[entry],
                 np.ascontiguousarray(track[:, entry]),
-                *self._more(entry),
+                *self._obstacles,
+                self._anchors[entry],
                 self.positions[entry],
                 self.velocities[entry],
                 *self._bodies(self.poses[entry]),
@@ -168,7 +170,8 @@ class Batch:
     def _moves_bodies(self) -> bool:
         return self._integrator is implicit
 
-    def _more(self, entry: int) -> tuple[Any, ...]:
+    @property
+    def _obstacles(self) -> tuple[Floats, ...]:
         """What the implicit step needs in addition."""
         return (self._scenery,) if self._moves_bodies else ()
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Parameters
-from diffcloud.sim.compiled.kernel import kernel
 
 
 class Held(NamedTuple):

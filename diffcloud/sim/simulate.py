@@ -161,8 +161,9 @@ class _Episodes(torch.autograd.Function):
 
 def _start(system: System, state: State) -> tuple[Tensor, Tensor, Tensor]:
     """Positions and velocities [B, V, 3] and poses of the bodies [B or 1, N, 18]."""
-    bodies = system.bodies.start if state.bodies is None else state.bodies
-    return state.positions, state.velocities, torch.cat([part.flatten(2) for part in bodies.tensors()], dim=2)
+    if state.bodies is None:
+        return state.positions, state.velocities, torch.from_numpy(system.bodies.start)[None]
+    return state.positions, state.velocities, torch.cat([part.flatten(2) for part in state.bodies.tensors()], dim=2)
 
 
 def _expanded(tensor: Tensor, count: int) -> Tensor:

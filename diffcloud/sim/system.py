@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
-from diffcloud.sim import linearised
+from diffcloud.sim import implicit, linearised
 from diffcloud.sim.handles import Handles
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.rigid.bodies import Bodies, BodyState
@@ -59,11 +59,8 @@ class System:
     @cached_property
     def scene(self) -> Any:
         """What the kernels of the integrator are given."""
-        if self.setup.integrator == "linearised":
-            return linearised.build_scene(self.setup, self.time_step)
-        from diffcloud.sim import implicit
-
-        return implicit.build_scene(self.setup, self.time_step)
+        integrator = implicit if self.setup.integrator == "implicit" else linearised
+        return integrator.build_scene(self.setup, self.time_step)
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
-from diffcloud.sim.compiled.kernel import kernel
 
 
 @kernel

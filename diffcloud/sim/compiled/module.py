@@ -15,10 +15,10 @@ from collections.abc import Iterable, Sequence
 from functools import cache
 from types import ModuleType
 
+from diffcloud.compiled import cache_folder
 from diffcloud.io.files import write_text
 from diffcloud.sim.compiled.data import Motion
 from diffcloud.sim.compiled.function import Function
-from diffcloud.sim.compiled.kernel import cache_folder
 from diffcloud.sim.compiled.source import Code
 from diffcloud.sim.compiled.trace import Graph, Scalar, Vector, directional, gradient, ordered
 from diffcloud.sim.terms.term import Element, Term, parameter_source
@@ -30,7 +30,7 @@ from math import atan2, cos, floor, log, sin, sqrt
 
 import numpy as np
 
-from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.compiled import inlined, kernel
 from diffcloud.sim.compiled.sparse import add_assemble, add_jacobian
 '''
 
@@ -104,7 +104,7 @@ def _all(kind: str, terms: Sequence[Term], stiff: set[str]) -> str:
     given = arguments if target is None else arguments.replace("blocks", target)
     if target is not None:
         lines.insert(0, "blocks = np.empty((0, 0, 9))")
-    return "\n".join([f"@kernel\ndef {kind}(terms, {given}):", *(f"    {line}" for line in lines)])
+    return "\n".join([f"@inlined\ndef {kind}(terms, {given}):", *(f"    {line}" for line in lines)])
 
 
 def _force(term: Term) -> str:
@@ -140,17 +140,30 @@ def _assemble(term: Term) -> str:
 
 
 def _jacobian(term: Term) -> str:
-    """blocks [a, b] of displaced (-∂f/∂d) + moved (-∂f/∂before - ∂f/∂after) + moved · time_step (-∂f/∂x)."""
+    """blocks [a, b] of displaced (-∂f/∂d) + moved (-∂f/∂before - ∂f/∂after) + moved · time_step (-∂f/∂x).
+
+    One column after the other, in a loop: written out, the code would take seconds to compile.
+    """
     formula = _Formula(term)
-    displaced, moved = formula.graph.input("displaced"), formula.graph.input("moved")
-    rates = [-moved * formula.graph.input("timing.time_step"), -displaced, -moved, -moved]
     groups = (formula.positions, formula.displacement, formula.before, formula.after)
-    columns = [directional(formula.force, [g[c] for g in groups], rates) for c in range(3 * term.corners)]
-    corners = range(term.corners)
-    found = [[columns[3 * b + c][3 * a + r] for r in range(3) for c in range(3)] for a in corners for b in corners]
+    names = ("-moved * timing.time_step", "-displaced", "-moved", "-moved")
+    inputs, rates = [], []
+    for group, name in zip(groups, names, strict=True):
+        inputs += group
+        rates += [formula.graph.input(f"{name} if c == {k} else 0.0") for k in range(len(group))]
+    changes = directional(formula.force, inputs, rates)
+    if all(change.value == 0 for change in changes):
+        return _loop(term, "jacobian", ["pass"])
     code = Code()
-    lines = _stored(found, code)
-    return _loop(term, "jacobian", code.lines + lines)
+    code.compute(_independent(changes, {rate.number for rate in rates}))  # once for all columns
+    shared = len(code.lines)
+    code.compute(changes)
+    size = 3 * term.corners
+    inner = ["column, place = c // 3, c % 3", *code.lines[shared:]]
+    for k, change in enumerate(changes):
+        inner.append(f"blocks[e, {k // 3 * term.corners} + column, {3 * (k % 3)} + place] = {code.name(change)}")
+    lines = [*code.lines[:shared], f"for c in range({size}):", *(f"    {line}" for line in inner)]
+    return _loop(term, "jacobian", lines)
 
 
 def _reverse(term: Term) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.sim.compiled.kernel import kernel
+from diffcloud.compiled import kernel
 
 
 @kernel

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
-from diffcloud.sim.compiled.kernel import kernel
 
 
 @kernel

@@ -21,8 +21,8 @@ import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
-from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.sorting import sort_part
 
 

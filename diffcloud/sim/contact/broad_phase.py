@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
-from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.compiled.sorting import ascending
-from diffcloud.sim.contact.surface import Surface
+from diffcloud.sim.contact.surface import SurfaceBox
 
 
 @kernel
-def candidates(surface: Surface, places: Floats, others: Floats, margin: float, among_fixed: int) -> tuple[Ints, Ints]:
+def candidates(surface: SurfaceBox, places: Floats, others: Floats, margin: float, among_fixed: int) -> tuple[Ints, Ints]:
     """Pairs whose boxes come within `margin` of each other [m]: (point-face [C, 2], edge-edge [C, 2]) in no order.
 
     Pairs that share a point, that lie on one obstacle, or of which neither can move are left out.
@@ -52,7 +52,7 @@ def _boxes(places: Floats, others: Floats, primitives: Ints, margin: float) -> F
 
 
 @kernel
-def _overlapping(surface: Surface, first: Floats, second: Floats, edges: int, among_fixed: int) -> Ints:
+def _overlapping(surface: SurfaceBox, first: Floats, second: Floats, edges: int, among_fixed: int) -> Ints:
     """[C, 2] of two lists of boxes: one of each pair begins within the other, along the axis on which they spread most."""
     axis = _widest(second)
     order_a, order_b = ascending(first[:, axis]), ascending(second[:, axis])
@@ -109,7 +109,7 @@ def _meet(a: Floats, i: int, b: Floats, j: int) -> bool:
 
 
 @kernel
-def _eligible(surface: Surface, a: int, b: int, edges: int, among_fixed: int) -> bool:
+def _eligible(surface: SurfaceBox, a: int, b: int, edges: int, among_fixed: int) -> bool:
     """Whether contact can bring two primitives together; of two edges, in one order only."""
     second = surface.edges[b, 0] if edges else surface.faces[b, 0]
     first = surface.edges[a, 0] if edges else surface.points[a]
@@ -131,7 +131,7 @@ def _eligible(surface: Surface, a: int, b: int, edges: int, among_fixed: int) ->
 
 
 @kernel
-def corners_of(surface: Surface, edges: int, a: int, b: int) -> tuple[int, int, int, int]:
+def corners_of(surface: SurfaceBox, edges: int, a: int, b: int) -> tuple[int, int, int, int]:
     """The four points of a pair."""
     if edges:
         return surface.edges[a, 0], surface.edges[a, 1], surface.edges[b, 0], surface.edges[b, 1]

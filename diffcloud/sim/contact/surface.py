@@ -15,7 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from diffcloud.compiled import inlined
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh, directed_edges
+from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints
 
 _FLAT = 1e-6
@@ -55,6 +57,39 @@ class Surface(NamedTuple):
     """[owners]: the cloth, and bodies that contact can move."""
     touches_itself: bool
     """Whether the cloth's own parts are paired with each other."""
+
+
+class SurfaceBoxType(BoxType):
+    """Of `SurfaceBox`."""
+
+
+class SurfaceBox(Box):
+    """A surface inside kernels, with the same fields."""
+
+
+define(SurfaceBox, SurfaceBoxType, Surface._fields)
+
+
+@inlined
+def boxed(surface: Surface) -> SurfaceBox:
+    """The surface as kernels pass it on."""
+    return SurfaceBox(
+        surface.cloth_points,
+        surface.point_count,
+        surface.points,
+        surface.edges,
+        surface.edge_faces,
+        surface.faces,
+        surface.owner,
+        surface.point_area,
+        surface.edge_area,
+        surface.face_area,
+        surface.typical_face_area,
+        surface.edge_share,
+        surface.corner_share,
+        surface.movable,
+        surface.touches_itself,
+    )
 
 
 def contact_surface(

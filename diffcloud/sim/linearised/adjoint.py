@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.compiled import inlined, kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
-from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.sparse import cholesky, solve
-from diffcloud.sim.held import Held, aim, aim_reverse, first_anchors, holders, take_anchors, take_anchors_reverse
+from diffcloud.sim.held import Held, aim, aim_reverse, holders, take_anchors_reverse
 from diffcloud.sim.linearised.matrix import linear_system, pattern_with, repelling
 from diffcloud.sim.linearised.record import Kept
 from diffcloud.sim.linearised.scene import Scene
@@ -30,6 +30,7 @@ def reverse(
     held: Held,
     parameters: Parameters,
     track: Floats,
+    anchors: Floats,
     positions: Floats,
     velocities: Floats,
     kept: Kept,
@@ -41,7 +42,7 @@ def reverse(
     """Sweep the steps of an episode backwards.
 
     Args:
-        positions, velocities: [S + 1, V, 3] as `simulate` found them.
+        anchors, positions, velocities: as `simulate` left them.
         position_gradients, velocity_gradients: [S + 1, V, 3] of a loss by each; the first rows take those by the start.
         gradients: zeros; takes the sums over all steps.
         track_gradients: [S, 3] zeros; takes those by the gripper's track.
@@ -50,9 +51,6 @@ def reverse(
     steps, nodes = len(positions) - 1, positions.shape[1]
     motion, slopes = still(scene, nodes), still(scene, nodes)
     points = len(motion.positions)
-    anchors = first_anchors(held, positions[0])
-    for step in range(steps):
-        take_anchors(held, track, step, positions[step], anchors)
     anchor_gradient, start_gradient = np.zeros(anchors.shape), np.zeros((points, 3))
     places, adjoint = np.zeros((points, 3)), np.zeros((points, 3))
     right, mass_gradient = np.empty((nodes, 3)), np.zeros(points)
@@ -109,7 +107,7 @@ def reverse(
         gradients.target[:] = 0.0
         _reverse(scene.terms, parameters, motion, timing, adjoint, gradients, slopes)
         if len(corners) > 0:
-            point_face, edge_edge = repelling(scene, pattern, corners, constants)
+            point_face, edge_edge = repelling(scene.repulsion.thickness, pattern, corners, constants)
             _point_face_reverse(point_face, parameters, motion, timing, adjoint, gradients, slopes)
             _edge_edge_reverse(edge_edge, parameters, motion, timing, adjoint, gradients, slopes)
         reach = dt + parameters.damping[0]
@@ -133,7 +131,7 @@ def reverse(
         gradients.node_mass[i] -= parameters.inverse_mass[i] ** 2 * gradients.inverse_mass[i]
 
 
-@kernel
+@inlined
 def restore(
     scene: Scene, parameters: Parameters, positions: Floats, velocities: Floats, solved: Floats, motion: Motion
 ) -> None:
@@ -145,7 +143,7 @@ def restore(
     displace(scene, parameters, nodes, motion)
 
 
-@kernel
+@inlined
 def candidates(scene: Scene, motion: Motion):  # type: ignore[no-untyped-def]
     """([N, 3] points before the impacts of a step, [P, V] whether each plane left each node where it was)."""
     nodes = len(scene.pattern.place)
@@ -159,7 +157,7 @@ def candidates(scene: Scene, motion: Motion):  # type: ignore[no-untyped-def]
     return points, above
 
 
-@kernel
+@inlined
 def project_reverse(scene: Scene, above, places: Floats) -> None:  # type: ignore[no-untyped-def]
     """What planes stop does not move along their normals."""
     for p in range(len(above) - 1, -1, -1):
@@ -171,7 +169,7 @@ def project_reverse(scene: Scene, above, places: Floats) -> None:  # type: ignor
                     places[i, axis] -= along * normal[axis]
 
 
-@kernel
+@inlined
 def factor_of(  # type: ignore[no-untyped-def]
     scene: Scene,
     parameters: Parameters,
@@ -194,7 +192,7 @@ def factor_of(  # type: ignore[no-untyped-def]
     return pattern, factor
 
 
-@kernel
+@inlined
 def clear(motion: Motion) -> None:
     motion.positions[:] = 0.0
     motion.before[:] = 0.0

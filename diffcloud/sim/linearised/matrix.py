@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.compiled import inlined, kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
-from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.sparse import Pattern, add_assemble, find_slot, hold, widened
 from diffcloud.sim.linearised.scene import Scene
 from diffcloud.sim.terms import kernels
@@ -19,8 +19,9 @@ _point_face_assemble, _edge_edge_assemble = (
 
 
 @kernel
-def repelling(scene: Scene, pattern: Pattern, corners: Ints, constants: Floats):  # type: ignore[no-untyped-def]
-    """The pairs that repel [C, 5] and their constants [C, 4] as elements (point-face, edge-edge)."""
+def repelling(reach: float, pattern: Pattern, corners: Ints, constants: Floats):  # type: ignore[no-untyped-def]
+    """The pairs that repel [C, 5] and their constants [C, 4] as elements (point-face, edge-edge), within a thickness
+    [m]."""
     edges = 0
     for c in range(len(corners)):
         edges += corners[c, 0]
@@ -44,7 +45,7 @@ def repelling(scene: Scene, pattern: Pattern, corners: Ints, constants: Floats):
             for k in range(4):
                 numbers[k, place] = constants[c, k]
             place += 1
-    thickness = np.full(len(corners), scene.repulsion.thickness)
+    thickness = np.full(len(corners), reach)
     return (
         _PointFace(
             nodes[:faces],
@@ -86,7 +87,7 @@ def pattern_with(base: Pattern, corners: Ints) -> tuple[Pattern, Ints]:
     return widened(base, first[:count], second[:count])
 
 
-@kernel
+@inlined
 def linear_system(  # type: ignore[no-untyped-def]
     scene: Scene,
     parameters: Parameters,
@@ -109,7 +110,7 @@ def linear_system(  # type: ignore[no-untyped-def]
             wide[moved[p]] = matrix[p]
         matrix = wide
     if len(corners) > 0:
-        point_face, edge_edge = repelling(scene, pattern, corners, constants)
+        point_face, edge_edge = repelling(scene.repulsion.thickness, pattern, corners, constants)
         blocks = np.empty((len(corners), 10, 9))
         faces = len(point_face.nodes)
         _point_face_assemble(point_face, parameters, motion, timing, 0.0, dt, force, blocks[:faces])

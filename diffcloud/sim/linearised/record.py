@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffcloud.compiled import inlined
 from diffcloud.sim.compiled.data import Floats, Ints
-from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.reference.impact_zones import Impacts, no_impacts
 
@@ -29,7 +29,7 @@ class Kept(NamedTuple):
     """[., 9]"""
 
 
-@kernel
+@inlined
 def nothing_kept(steps: int, nodes: int) -> Kept:
     """An empty record."""
     corners, constants, factors = np.empty((16, 5), np.int64), np.empty((16, 4)), np.empty((16, 9))
@@ -37,7 +37,7 @@ def nothing_kept(steps: int, nodes: int) -> Kept:
     return Kept(np.empty((steps, nodes, 3)), begins, corners, constants, no_impacts(), factors)
 
 
-@kernel
+@inlined
 def remember(kept: Kept, step: int, solved: Floats, corners: Ints, constants: Floats, factor: Floats, limit: int) -> Kept:
     """What a step adds to the record, but for its impacts."""
     kept.solved[step] = solved
@@ -58,7 +58,7 @@ def remember(kept: Kept, step: int, solved: Floats, corners: Ints, constants: Fl
     return Kept(kept.solved, begins, more, numbers, kept.impacts, factors)
 
 
-@kernel
+@inlined
 def with_impacts(kept: Kept, impacts: Impacts, step: int, keep: int) -> Kept:
     """The record with the impacts of a step; without derivatives its room is used again."""
     if keep >= 0:

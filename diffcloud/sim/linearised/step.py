@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.compiled import inlined, kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters
-from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.sparse import cholesky, solve
+from diffcloud.sim.contact.surface import boxed
 from diffcloud.sim.held import Held, aim, first_anchors, holders, take_anchors
 from diffcloud.sim.linearised.matrix import linear_system, pattern_with
 from diffcloud.sim.linearised.record import Kept, nothing_kept, remember, with_impacts
@@ -42,6 +43,7 @@ def simulate(
     """
     steps, nodes = len(positions) - 1, positions.shape[1]
     kept = nothing_kept(steps if keep >= 0 else 0, nodes)
+    surface = boxed(scene.surface)
     anchors[:] = first_anchors(held, positions[0])
     points, motion = with_obstacles(scene, positions[0]), still(scene, nodes)
     force, above = np.empty((len(points), 3)), np.empty((len(scene.plane_offsets), nodes), np.bool_)
@@ -52,7 +54,7 @@ def simulate(
         aim(held, track, step, anchors, parameters)
         begin_motion(scene, held, parameters, step, positions[step], velocities[step], motion)
         if scene.repels:
-            corners, constants = nearest_pairs(scene.surface, scene.repulsion, motion.positions)
+            corners, constants = nearest_pairs(surface, scene.repulsion, motion.positions)
         else:
             corners, constants = np.empty((0, 5), np.int64), np.empty((0, 4))
         pattern, moved = pattern_with(scene.pattern, corners)
@@ -82,7 +84,7 @@ def simulate(
         project(scene, points, above)
         if scene.collides:
             mobile = mobility(scene, parameters, holder)
-            resolved, impacts = resolve(scene.surface, scene.projection, motion.positions, points, mobile, kept.impacts)
+            resolved, impacts = resolve(surface, scene.projection, motion.positions, points, mobile, kept.impacts)
             kept = with_impacts(kept, impacts, step, keep)
             if not resolved:
                 return UNRESOLVED, step, kept
@@ -95,7 +97,7 @@ def simulate(
     return DONE, steps, kept
 
 
-@kernel
+@inlined
 def with_obstacles(scene: Scene, cloth: Floats) -> Floats:
     """[N, 3] all points, of the cloth's [V, 3]."""
     points = np.empty((len(cloth) + len(scene.obstacles), 3))
@@ -104,7 +106,7 @@ def with_obstacles(scene: Scene, cloth: Floats) -> Floats:
     return points
 
 
-@kernel
+@inlined
 def still(scene: Scene, nodes: int) -> Motion:
     """Room for the motion of all points; obstacles rest."""
     count = nodes + len(scene.obstacles)
@@ -113,7 +115,7 @@ def still(scene: Scene, nodes: int) -> Motion:
     return motion
 
 
-@kernel
+@inlined
 def begin_motion(
     scene: Scene, held: Held, parameters: Parameters, step: int, positions: Floats, velocities: Floats, motion: Motion
 ) -> None:
@@ -132,7 +134,7 @@ def begin_motion(
     displace(scene, parameters, len(positions), motion)
 
 
-@kernel
+@inlined
 def displace(scene: Scene, parameters: Parameters, nodes: int, motion: Motion) -> None:
     """The displacement in which elastic forces are linear: (Δt + β) v."""
     reach = scene.time_step + parameters.damping[0]
@@ -141,7 +143,7 @@ def displace(scene: Scene, parameters: Parameters, nodes: int, motion: Motion) -
             motion.displacement[i, axis] = reach * motion.after[i, axis]
 
 
-@kernel
+@inlined
 def project(scene: Scene, points: Floats, above) -> None:  # type: ignore[no-untyped-def]
     """Put nodes that are behind a plane back above it; `above` bool [P, V] takes which of them were not."""
     for p in range(len(scene.plane_offsets)):
@@ -154,7 +156,7 @@ def project(scene: Scene, points: Floats, above) -> None:  # type: ignore[no-unt
                     points[i, axis] += (scene.projection.thickness - gap) * normal[axis]
 
 
-@kernel
+@inlined
 def mobility(scene: Scene, parameters: Parameters, holder: Ints) -> Floats:
     """[N] inverse masses of the impact stage: prescribed nodes do not give way."""
     found = parameters.inverse_mass.copy()

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Motion, Parameters, Timing
-from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.sparse import solve
 from diffcloud.sim.held import (
     Held,
@@ -14,7 +14,6 @@ from diffcloud.sim.held import (
     aim_tangent,
     first_anchors,
     holders,
-    take_anchors,
     take_anchors_tangent,
 )
 from diffcloud.sim.linearised.adjoint import candidates, factor_of, project_reverse, restore
@@ -38,6 +37,7 @@ def tangents(
     rates: Parameters,
     track: Floats,
     track_rates: Floats,
+    anchors: Floats,
     positions: Floats,
     velocities: Floats,
     kept: Kept,
@@ -49,14 +49,13 @@ def tangents(
     Args:
         rates: of the parameters, with a leading axis K; its targets are overwritten.
         track_rates: [K, S, 3]
-        positions, velocities: [S + 1, V, 3] as `simulate` found them.
+        anchors, positions, velocities: as `simulate` left them.
         position_rates, velocity_rates: [S + 1, K, V, 3] the first rows are those of the start; take the others.
     """
     dt = scene.time_step
     steps, nodes, directions = len(positions) - 1, positions.shape[1], position_rates.shape[1]
     motion = still(scene, nodes)
     points = len(motion.positions)
-    anchors = first_anchors(held, positions[0])
     anchor_rates = np.empty((directions, len(held.node), 3))
     for k in range(directions):
         anchor_rates[k] = first_anchors(held, position_rates[0, k])
@@ -65,7 +64,6 @@ def tangents(
     force, places = np.zeros(shape), np.zeros(shape)
     solution = np.empty((nodes, 3))
     for step in range(steps):
-        take_anchors(held, track, step, positions[step], anchors)
         take_anchors_tangent(held, track_rates, step, position_rates[step], anchor_rates)
         aim(held, track, step, anchors, parameters)
         aim_tangent(held, track_rates, step, anchor_rates, rates.target)
@@ -89,7 +87,7 @@ def tangents(
         timing = Timing(dt, dt)
         _tangent(scene.terms, parameters, motion, timing, rates, changes, force)
         if len(corners) > 0:
-            point_face, edge_edge = repelling(scene, pattern, corners, constants)
+            point_face, edge_edge = repelling(scene.repulsion.thickness, pattern, corners, constants)
             _point_face_tangent(point_face, parameters, motion, timing, rates, changes, force)
             _edge_edge_tangent(edge_edge, parameters, motion, timing, rates, changes, force)
         for k in range(directions):

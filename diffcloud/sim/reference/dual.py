@@ -11,9 +11,9 @@ from math import sqrt
 
 import numpy as np
 
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Flags, Floats, Ints
 from diffcloud.sim.compiled.dense import lu, lu_solve
-from diffcloud.sim.compiled.kernel import kernel
 
 _EXCHANGES = 10
 """Most exchanges of the active set before the slower, certain solver takes over: of 10,000 problems of folded cloths none

@@ -16,9 +16,9 @@ from itertools import pairwise
 from math import sqrt
 from typing import Literal
 
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats
 from diffcloud.sim.compiled.function import Function
-from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.trace import Scalar, Vector, absolute, cross, dot, held, larger, maximum, squareroot, where
 
 Kind = Literal["point_face", "edge_edge"]

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.dense import lu, lu_solve
-from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.reference.dual import gram
 from diffcloud.sim.reference.impact_zones import Impacts, Projection, move, take_zone, zones
 from diffcloud.sim.terms import kernels

@@ -10,8 +10,8 @@ from math import sqrt
 
 import numpy as np
 
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats
-from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.reference.frames import covers, cross3, dot3, frame_at, height
 
 _ITERATIONS = 80

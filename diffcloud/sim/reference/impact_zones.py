@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
-from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.compiled.sorting import ascending
 from diffcloud.sim.contact.broad_phase import candidates, corners_of
-from diffcloud.sim.contact.surface import Surface
+from diffcloud.sim.contact.surface import SurfaceBox
 from diffcloud.sim.reference.dual import applied, gram, solve_dual
 from diffcloud.sim.reference.impact_times import NEVER, first_impact
 
@@ -68,7 +68,7 @@ def no_impacts() -> Impacts:
 
 @kernel
 def resolve(
-    surface: Surface, choices: Projection, start: Floats, places: Floats, inverse_mass: Floats, record: Impacts
+    surface: SurfaceBox, choices: Projection, start: Floats, places: Floats, inverse_mass: Floats, record: Impacts
 ) -> tuple[bool, Impacts]:
     """Positions after the impacts of a step.
 
@@ -108,7 +108,7 @@ def resolve(
 
 
 @kernel
-def _listed(surface: Surface, start: Floats, places: Floats) -> Ints:
+def _listed(surface: SurfaceBox, start: Floats, places: Floats) -> Ints:
     """Candidate pairs [C, 7]: kind, points and primitives."""
     point_face, edge_edge = candidates(surface, start, places, _REACH, 0)
     found = np.empty((len(point_face) + len(edge_edge), 7), np.int64)
@@ -130,7 +130,7 @@ def _listed(surface: Surface, start: Floats, places: Floats) -> Ints:
 
 @kernel
 def _impacts(  # type: ignore[no-untyped-def]
-    surface: Surface,
+    surface: SurfaceBox,
     choices: Projection,
     pairs: Ints,
     start: Floats,

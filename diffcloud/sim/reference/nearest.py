@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
-from diffcloud.sim.compiled.kernel import kernel
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.contact.broad_phase import candidates, corners_of
-from diffcloud.sim.contact.surface import Surface
+from diffcloud.sim.contact.surface import Surface, SurfaceBox, boxed
 from diffcloud.sim.reference.frames import covers, cross3, dot3, frame_at, height
 
 _OUTSIDE = 1e-6
@@ -39,7 +39,7 @@ class Repulsion(NamedTuple):
 
 
 @kernel
-def nearest_pairs(surface: Surface, repulsion: Repulsion, points: Floats) -> tuple[Ints, Floats]:
+def nearest_pairs(surface: SurfaceBox, repulsion: Repulsion, points: Floats) -> tuple[Ints, Floats]:
     """The pairs that repel at points [N, 3].
 
     Returns:
@@ -78,9 +78,15 @@ def nearest_pairs(surface: Surface, repulsion: Repulsion, points: Floats) -> tup
 
 
 @kernel
+def pairs_at(surface: Surface, repulsion: Repulsion, points: Floats) -> tuple[Ints, Floats]:
+    """The same, to be called from outside of kernels."""
+    return nearest_pairs(boxed(surface), repulsion, points)
+
+
+@kernel
 def held_slots(surface: Surface, repulsion: Repulsion, points: Floats) -> Floats:
     """`Repulsion.held` of obstacles that do not move."""
-    pairs, found = _near(surface, repulsion, points, 1)
+    pairs, found = _near(boxed(surface), repulsion, points, 1)
     held = np.full(2 * (len(surface.points) + len(surface.faces) + len(surface.edges)), np.inf)
     for c in range(len(pairs)):
         first, second = surface.owner[pairs[c, 1]], surface.owner[pairs[c, 4]]
@@ -101,7 +107,7 @@ def _comes_before(pairs: Ints, c: int, other: int) -> bool:
 
 
 @kernel
-def _near(surface: Surface, repulsion: Repulsion, points: Floats, among_fixed: int) -> tuple[Ints, Floats]:
+def _near(surface: SurfaceBox, repulsion: Repulsion, points: Floats, among_fixed: int) -> tuple[Ints, Floats]:
     """The pairs nearer than the thickness: (kind, points, primitives and slots [C, 9]; distance, sign and area [C, 3])."""
     point_face, edge_edge = candidates(surface, points, points, repulsion.thickness, among_fixed)
     pairs, found = np.empty((64, 9), np.int64), np.empty((64, 3))
@@ -163,7 +169,7 @@ def _spanned(edges: int, x: Floats) -> float:
 
 
 @kernel
-def _set_slots(surface: Surface, pairs: Ints, c: int, place: Floats, around: Floats) -> None:
+def _set_slots(surface: SurfaceBox, pairs: Ints, c: int, place: Floats, around: Floats) -> None:
     """The slot that a pair takes of each of its primitives."""
     normal = (place[4], place[5], place[6])
     points, faces = len(surface.points), len(surface.faces)
@@ -180,7 +186,7 @@ def _set_slots(surface: Surface, pairs: Ints, c: int, place: Floats, around: Flo
 
 
 @kernel
-def _on_outer_side(surface: Surface, edge: int, x: Floats, ends: int, others: int, place: Floats, faces: Floats) -> bool:
+def _on_outer_side(surface: SurfaceBox, edge: int, x: Floats, ends: int, others: int, place: Floats, faces: Floats) -> bool:
     """Whether the place on the other edge (rows `others` of x) lies beyond this edge (rows `ends`) for each face at
     it; a missing face does not object."""
     s, t = abs(place[others]), abs(place[others + 1])
@@ -200,7 +206,7 @@ def _on_outer_side(surface: Surface, edge: int, x: Floats, ends: int, others: in
 
 
 @kernel
-def _normals(surface: Surface, points: Floats) -> tuple[Floats, Floats]:
+def _normals(surface: SurfaceBox, points: Floats) -> tuple[Floats, Floats]:
     """Unit normals of faces [F, 3] and points [N, 3]; these after Max 1999: along the sum over corners of
     (e1 × e2)/(|e1|² |e2|²)."""
     faces, around = np.empty((len(surface.faces), 3)), np.zeros((len(points), 3))

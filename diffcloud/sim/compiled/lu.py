@@ -1,0 +1,217 @@
+"""LU by 3 x 3 blocks, for matrices without symmetry in a symmetric pattern, and dense LU where that goes wrong.
+
+    A = L U,   L_jj = I,   U_jj = D_j
+
+Both halves are kept in the pattern of the lower factor: L as it is, with D_j⁻¹ in the place of its diagonal, and U
+transposed. No rows are exchanged beyond the blocks, which is fine where the diagonal is strong; the residual of each
+solution is looked at, and where it is large the system is solved again by dense LU with pivots.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffcloud.compiled import kernel
+from diffcloud.sim.compiled.box import Box, BoxType, define
+from diffcloud.sim.compiled.data import Floats
+from diffcloud.sim.compiled.dense import lu, lu_solve, lu_solve_transposed
+from diffcloud.sim.compiled.sparse import Pattern, _await_next, _take_off
+
+_GOOD = 1e-9
+"""Residual, relative to the sizes of the matrix and of both sides, below which a solution counts."""
+
+
+class GeneralType(BoxType):
+    """Of `General`."""
+
+
+class General(Box):
+    """A matrix without symmetry, and its factors.
+
+    Fields:
+        pattern: `sparse.Pattern`
+        lower: [A + 1, 9] blocks of the lower half and the diagonal.
+        upper: [A + 1, 9] blocks of the upper half, transposed; its diagonal counts for nothing.
+        below: [L, 9] L, with the inverse of D in the place of its diagonal.
+        above: [L, 9] U transposed, without its diagonal.
+    """
+
+
+define(General, GeneralType, ["pattern", "lower", "upper", "below", "above"])
+
+
+@kernel
+def factorised(of: Pattern, lower: Floats, upper: Floats) -> General:
+    """The matrix with its factors; where a pivot is singular they hold numbers that are not finite."""
+    count = len(of.place)
+    starts, rows = of.factor_starts, of.factor_rows
+    below, above = np.empty((len(rows), 9)), np.empty((len(rows), 9))
+    work, other = np.zeros((count, 9)), np.zeros((count, 9))
+    reached = np.empty(count, np.int64)  # as in `sparse.cholesky`
+    waiting = np.full(count, -1, np.int64)
+    following = np.empty(count, np.int64)
+    for j in range(count):
+        for p in range(of.starts[j], of.starts[j + 1]):
+            work[of.rows[p]] = lower[p]
+            other[of.rows[p]] = upper[p]
+        k = waiting[j]
+        while k >= 0:
+            after = following[k]
+            _take_off(work, below, above, rows, reached[k], starts[k + 1])
+            _take_off(other, above, below, rows, reached[k], starts[k + 1])
+            _await_next(k, reached, waiting, following, rows, starts)
+            k = after
+        begin = starts[j]
+        d = below[begin]
+        _invert(work[j], d)
+        work[j] = 0.0
+        other[j] = 0.0
+        above[begin] = 0.0
+        for p in range(begin + 1, starts[j + 1]):
+            w, u, l, a = work[rows[p]], other[rows[p]], below[p], above[p]
+            for r in range(0, 9, 3):
+                for c in range(3):
+                    l[r + c] = w[r] * d[c] + w[r + 1] * d[3 + c] + w[r + 2] * d[6 + c]
+            for k9 in range(9):
+                a[k9] = u[k9]
+                w[k9] = u[k9] = 0.0
+        reached[j] = begin
+        _await_next(j, reached, waiting, following, rows, starts)
+    return General(of, lower, upper, below, above)
+
+
+@kernel
+def _invert(m: Floats, found: Floats) -> None:
+    """The inverse of a block [9]."""
+    a, b, c = m[4] * m[8] - m[5] * m[7], m[5] * m[6] - m[3] * m[8], m[3] * m[7] - m[4] * m[6]
+    scale = 1.0 / (m[0] * a + m[1] * b + m[2] * c)
+    found[0], found[1], found[2] = a * scale, (m[2] * m[7] - m[1] * m[8]) * scale, (m[1] * m[5] - m[2] * m[4]) * scale
+    found[3], found[4], found[5] = b * scale, (m[0] * m[8] - m[2] * m[6]) * scale, (m[2] * m[3] - m[0] * m[5]) * scale
+    found[6], found[7], found[8] = c * scale, (m[1] * m[6] - m[0] * m[7]) * scale, (m[0] * m[4] - m[1] * m[3]) * scale
+
+
+@kernel
+def solve_general(of: General, right: Floats, transposed: int, solution: Floats) -> bool:
+    """solution [V, 3] of A x = right, or of Aᵀ x = right; False: the matrix is singular."""
+    if transposed > 0:
+        _substitute(of.pattern, of.below, of.above, of.below, right, 1, solution)
+    else:
+        _substitute(of.pattern, of.below, of.below, of.above, right, 0, solution)
+    if _good(of, right, transposed, solution):
+        return True
+    return _dense(of, right, transposed, solution)
+
+
+@kernel
+def _substitute(
+    of: Pattern, below: Floats, first: Floats, second: Floats, right: Floats, transposed: int, solution: Floats
+) -> None:
+    """Forwards through one half, backwards through the other one."""
+    place, starts, rows = of.place, of.factor_starts, of.factor_rows
+    count = len(place)
+    work = np.empty((count, 3))
+    for node in range(count):
+        for axis in range(3):
+            work[place[node], axis] = right[node, axis]
+    for j in range(count):
+        own, d = work[j], below[starts[j]]
+        a, b, c = own[0], own[1], own[2]
+        if transposed > 0:  # the diagonal blocks belong to U, which comes first then
+            own[0], own[1], own[2] = (
+                d[0] * a + d[3] * b + d[6] * c,
+                d[1] * a + d[4] * b + d[7] * c,
+                d[2] * a + d[5] * b + d[8] * c,
+            )
+            a, b, c = own[0], own[1], own[2]
+        for p in range(starts[j] + 1, starts[j + 1]):
+            f, w = first[p], work[rows[p]]
+            w[0] -= f[0] * a + f[1] * b + f[2] * c
+            w[1] -= f[3] * a + f[4] * b + f[5] * c
+            w[2] -= f[6] * a + f[7] * b + f[8] * c
+    for j in range(count - 1, -1, -1):
+        own, d = work[j], below[starts[j]]
+        a, b, c = own[0], own[1], own[2]
+        for p in range(starts[j] + 1, starts[j + 1]):
+            f, w = second[p], work[rows[p]]
+            a -= f[0] * w[0] + f[3] * w[1] + f[6] * w[2]
+            b -= f[1] * w[0] + f[4] * w[1] + f[7] * w[2]
+            c -= f[2] * w[0] + f[5] * w[1] + f[8] * w[2]
+        if transposed > 0:
+            own[0], own[1], own[2] = a, b, c
+        else:
+            own[0], own[1], own[2] = (
+                d[0] * a + d[1] * b + d[2] * c,
+                d[3] * a + d[4] * b + d[5] * c,
+                d[6] * a + d[7] * b + d[8] * c,
+            )
+    for node in range(count):
+        for axis in range(3):
+            solution[node, axis] = work[place[node], axis]
+
+
+@kernel
+def _good(of: General, right: Floats, transposed: int, solution: Floats) -> bool:
+    """Whether what a solution leaves over is small."""
+    pattern, low, high = of.pattern, of.lower, of.upper
+    count = len(pattern.place)
+    node = np.empty(count, np.int64)
+    for i in range(count):
+        node[pattern.place[i]] = i
+    left, size = np.zeros((count, 3)), np.zeros((count, 3))
+    for i in range(count):
+        for axis in range(3):
+            left[i, axis], size[i, axis] = right[i, axis], abs(right[i, axis])
+    for j in range(count):
+        for p in range(pattern.starts[j], pattern.starts[j + 1]):
+            i = pattern.rows[p]
+            row, column = node[i], node[j]
+            lower, upper = (high[p], low[p]) if transposed > 0 and i != j else (low[p], high[p])
+            for r in range(3):
+                for c in range(3):
+                    place = 3 * c + r if transposed > 0 and i == j else 3 * r + c
+                    part = lower[place] * solution[column, c]
+                    left[row, r] -= part
+                    size[row, r] += abs(part)
+                    if i != j:
+                        part = upper[3 * r + c] * solution[row, r]  # the block (j, i), transposed
+                        left[column, c] -= part
+                        size[column, c] += abs(part)
+    worst, largest = 0.0, 0.0
+    for i in range(count):
+        for axis in range(3):
+            if not np.isfinite(left[i, axis]):
+                return False
+            worst, largest = max(worst, abs(left[i, axis])), max(largest, size[i, axis])
+    return worst <= _GOOD * largest
+
+
+@kernel
+def _dense(of: General, right: Floats, transposed: int, solution: Floats) -> bool:
+    """The solution by dense LU; False: singular."""
+    pattern, low, high = of.pattern, of.lower, of.upper
+    count = len(pattern.place)
+    matrix = np.zeros((3 * count, 3 * count))
+    for j in range(count):
+        for p in range(pattern.starts[j], pattern.starts[j + 1]):
+            i = pattern.rows[p]
+            for r in range(3):
+                for c in range(3):
+                    matrix[3 * i + r, 3 * j + c] = low[p, 3 * r + c]
+                    if i != j:
+                        matrix[3 * j + c, 3 * i + r] = high[p, 3 * r + c]
+    pivots, work = np.empty(3 * count, np.int64), np.empty(3 * count)
+    if not lu(matrix, pivots):
+        return False
+    for i in range(count):
+        for axis in range(3):
+            work[3 * pattern.place[i] + axis] = right[i, axis]
+    if transposed > 0:
+        lu_solve_transposed(matrix, pivots, work)
+    else:
+        lu_solve(matrix, pivots, work)
+    finite = True
+    for i in range(count):
+        for axis in range(3):
+            solution[i, axis] = work[3 * pattern.place[i] + axis]
+            finite = finite and np.isfinite(solution[i, axis])
+    return finite

@@ -1,0 +1,317 @@
+"""Newton's matrix ∂r/∂w: exact, or positive semidefinite near it (cautious), or something in between."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffcloud.compiled import inlined, kernel
+from diffcloud.sim.compiled.data import Floats, Ints, Parameters, Timing
+from diffcloud.sim.compiled.lu import General, factorised
+from diffcloud.sim.compiled.sparse import Pattern, find_slot, widened
+from diffcloud.sim.contact.places import Touching, corners
+from diffcloud.sim.contact.resistance import resistance
+from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
+from diffcloud.sim.implicit.scene import Rigid, Work
+from diffcloud.sim.terms import kernels
+
+_assemble, _jacobian, _spin_tangent = kernels.assemble, kernels.jacobian, kernels.spin_tangent
+_pp_jacobian, _pe_jacobian = kernels.barrier_point_point_jacobian, kernels.barrier_point_edge_jacobian
+_pf_jacobian, _ee_jacobian = kernels.barrier_point_face_jacobian, kernels.barrier_edge_edge_jacobian
+_plane_jacobian = kernels.barrier_plane_jacobian
+
+
+@inlined
+def widen(work: Work, listed: Ints) -> None:
+    """Let the pattern couple the places that touch, listed [E, 5], too; what it couples already stays."""
+    wide, moved, freedom = work.wide, work.moved, work.freedom
+    spare = len(wide.rows)
+    first, second = np.empty(64, np.int64), np.empty(64, np.int64)
+    count = 0
+    for e in range(len(listed)):
+        for a in range(1, 1 + corners(listed, e)):
+            for b in range(a + 1, 1 + corners(listed, e)):
+                for k in range(4):
+                    i, j = freedom[listed[e, a], k % 2], freedom[listed[e, b], k // 2]
+                    if i < 0 or j < 0 or find_slot(wide, i, j) != spare:
+                        continue
+                    if count == len(first):
+                        more, others = np.empty(2 * count, np.int64), np.empty(2 * count, np.int64)
+                        for k2 in range(count):
+                            more[k2], others[k2] = first[k2], second[k2]
+                        first, second = more, others
+                    first[count], second[count] = i, j
+                    count += 1
+    if count == 0:
+        return
+    work.wide, places = widened(wide, first[:count], second[:count])
+    found = np.empty(len(moved), np.int64)
+    for p in range(len(moved)):
+        found[p] = places[moved[p]]
+    work.moved = found
+
+
+@kernel
+def newton_matrix(
+    work: Work, velocity: Floats, turned: Floats, listed: Ints, numbers: Floats, touching: Touching, caution: float
+) -> General:
+    """The factorised matrix at the motion; caution in [0, 1] is the part of the cautious one."""
+    widen(work, listed)
+    time_step, start_positions, wide, terms = work.time_step, work.start_positions, work.wide, work.terms
+    parameters, motion, start_bodies, pattern = work.parameters, work.motion, work.start_bodies, work.pattern
+    rigid, moved = work.rigid, work.moved
+    dt, own = time_step, len(pattern.rows)
+    reach = dt * (dt + parameters.damping[0])
+    lower, upper = np.zeros((own + 1, 9)), np.zeros((own + 1, 9))
+    if caution < 1:
+        timing = Timing(dt, 0.0)
+        _jacobian(terms, parameters, motion, timing, dt * parameters.damping[0], dt, lower, upper)
+    if caution > 0:
+        safe, unused = np.zeros((own + 1, 9)), np.zeros((len(motion.positions), 3))
+        _assemble(terms, _without_air(parameters), motion, Timing(dt, dt), reach, dt, unused, safe)
+        for p in range(own):
+            for k in range(9):
+                lower[p, k] += caution * (safe[p, k] - lower[p, k])
+                upper[p, k] += caution * (safe[p, k] - upper[p, k])
+    if len(wide.rows) > own:
+        below, above = np.zeros((len(wide.rows) + 1, 9)), np.zeros((len(wide.rows) + 1, 9))
+        for p in range(own):
+            for k in range(9):
+                below[moved[p], k], above[moved[p], k] = lower[p, k], upper[p, k]
+        lower, upper = below, above
+    nodes = len(start_positions)
+    for i in range(nodes):
+        block = lower[wide.starts[wide.place[i]]]
+        for axis in range(3):
+            block[4 * axis] += parameters.node_mass[i]
+    swing = np.zeros((len(rigid.body), 9))
+    if len(start_bodies) > 0:
+        _add_inertia(work, velocity, swing, lower)
+    if len(listed) > 0:
+        _add_contact(work, turned, listed, numbers, touching, caution, swing, lower, upper)
+    _let_go(work, lower, upper)
+    return factorised(wide, lower, upper)
+
+
+@kernel
+def _without_air(p: Parameters) -> Parameters:
+    """The cautious matrix has elastic forces and contact only."""
+    none = np.zeros(1)
+    return Parameters(
+        p.node_mass, p.inverse_mass, p.stretching, p.bending, p.damping, none, none, p.friction_obstacle, p.friction_cloth,
+        p.body_mass, p.hold, p.target,
+    )  # fmt: skip
+
+
+@kernel
+def _let_go(work: Work, lower: Floats, upper: Floats) -> None:
+    """The row of a prescribed node says only what its own change is."""
+    holder, wide, parameters = work.holder, work.wide, work.parameters
+    prescribed = np.zeros(len(wide.place), np.int64)
+    some = False
+    for i in range(len(holder)):
+        if holder[i] >= 0:
+            prescribed[wide.place[i]], some = 1, True
+    if not some:
+        return
+    for j in range(len(wide.place)):
+        for p in range(wide.starts[j], wide.starts[j + 1]):
+            if prescribed[wide.rows[p]] > 0:
+                lower[p] = 0.0
+            if prescribed[j] > 0:
+                upper[p] = 0.0
+    for i in range(len(holder)):
+        if holder[i] >= 0:
+            block = lower[wide.starts[wide.place[i]]]
+            block[0] = block[4] = block[8] = parameters.node_mass[i]
+
+
+@kernel
+def _add_inertia(work: Work, velocity: Floats, swing: Floats, lower: Floats) -> None:
+    """Mass and turning inertia of bodies; swing [P, 9] takes d point / d angular velocity over Δt."""
+    start_positions, start_bodies, parameters, wide = work.start_positions, work.start_bodies, work.parameters, work.wide
+    rigid, time_step = work.rigid, work.time_step
+    nodes = len(start_positions)
+    inputs, constants = np.empty(15), np.empty(10)
+    rates, found = np.zeros((3, 15)), np.empty((3, 12))
+    for axis in range(3):
+        rates[axis, 12 + axis] = 1.0
+    for b in range(len(start_bodies)):
+        spin_inputs(work, b, velocity[nodes + 2 * b + 1], inputs, constants)
+        _spin_tangent(inputs, constants, rates, found)
+        mass = parameters.body_mass[b]
+        linear = lower[wide.starts[wide.place[nodes + 2 * b]]]
+        turning = lower[wide.starts[wide.place[nodes + 2 * b + 1]]]
+        for row in range(3):
+            linear[4 * row] += mass
+            for column in range(3):
+                turning[3 * row + column] += mass * found[column, 9 + row]
+        for p in range(len(swing)):
+            if rigid.body[p] != b:
+                continue
+            for row in range(3):
+                for column in range(3):
+                    part = 0.0
+                    for k in range(3):
+                        part += found[column, 3 * row + k] * rigid.points[p, k]
+                    swing[p, 3 * row + column] = part / time_step
+
+
+@inlined
+def _add_contact(
+    work: Work,
+    turned: Floats,
+    listed: Ints,
+    numbers: Floats,
+    touching: Touching,
+    caution: float,
+    swing: Floats,
+    lower: Floats,
+    upper: Floats,
+) -> None:
+    """Blocks of all places that touch, and how the moments of their forces change as arms turn."""
+    if caution > 0:
+        _add_resistance(work, turned, listed, numbers, caution, swing, lower, upper)
+    if not caution < 1:
+        return
+    for kind in range(5):
+        nodes = _nodes_of(touching, kind)
+        if len(nodes) > 0:
+            blocks = np.zeros((len(nodes), nodes.shape[1] * nodes.shape[1], 9))
+            _exact(work, touching, kind, blocks)
+            for e in range(len(nodes)):
+                _couple(
+                    work.freedom,
+                    work.wide,
+                    work.rigid,
+                    work.first_body_point,
+                    turned,
+                    swing,
+                    nodes[e],
+                    blocks[e],
+                    1 - caution,
+                    lower,
+                    upper,
+                )
+    rigid = work.rigid
+    if len(rigid.body) == 0:
+        return
+    wide, freedom, first, dt = work.wide, work.freedom, work.first_body_point, work.time_step
+    force = np.zeros((len(freedom), 3))
+    contact_force(work, touching, force)
+    for p in range(len(swing)):  # -Δt d arm × f = Δt f × d arm
+        row, f = freedom[first + p, 1], force[first + p]
+        _add_cross(f[0], f[1], f[2], swing[p], dt * dt, lower[wide.starts[wide.place[row]]])
+
+
+@kernel
+def _add_resistance(
+    work: Work, turned: Floats, listed: Ints, numbers: Floats, caution: float, swing: Floats, lower: Floats, upper: Floats
+) -> None:
+    """The cautious blocks of what touches."""
+    parameters, motion, planes, law, dt = work.parameters, work.motion, work.planes, work.law, work.time_step
+    friction = (parameters.friction_obstacle[0], parameters.friction_cloth[0])
+    x, weights, local, blocks = np.empty((4, 3)), np.empty(6), np.empty(18), np.empty((16, 9))
+    freedom, wide, rigid, first = work.freedom, work.wide, work.rigid, work.first_body_point
+    for e in range(len(listed)):
+        if resistance(planes, law, friction, motion.positions, motion.after, listed, numbers, e, x, weights, local):
+            width = corners(listed, e)
+            for a in range(width):
+                for b in range(width):
+                    factor = weights[a] * weights[b]
+                    for k in range(9):
+                        blocks[a * width + b, k] = factor * (dt * dt * local[k] + dt * local[9 + k])
+            _couple(freedom, wide, rigid, first, turned, swing, listed[e, 1 : 1 + width], blocks, caution, lower, upper)
+
+
+@kernel
+def _add_cross(x: float, y: float, z: float, right: Floats, factor: float, block: Floats) -> None:
+    """block += factor [x, y, z]× right."""
+    for c in range(3):
+        block[c] += factor * (y * right[6 + c] - z * right[3 + c])
+        block[3 + c] += factor * (z * right[c] - x * right[6 + c])
+        block[6 + c] += factor * (x * right[3 + c] - y * right[c])
+
+
+@inlined
+def _nodes_of(touching: Touching, kind: int) -> Ints:
+    if kind == 0:
+        return touching.point_point.nodes
+    if kind == 1:
+        return touching.point_edge.nodes
+    if kind == 2:
+        return touching.point_face.nodes
+    if kind == 3:
+        return touching.edge_edge.nodes
+    return touching.plane.nodes
+
+
+@inlined
+def _exact(work: Work, touching: Touching, kind: int, blocks: Floats) -> None:
+    """Blocks [E, n², 9] of -Δt d force / d velocity."""
+    time_step, parameters, motion = work.time_step, work.parameters, work.motion
+    dt, timing = time_step, Timing(time_step, 0.0)
+    if kind == 0:
+        _pp_jacobian(touching.point_point, parameters, motion, timing, 0.0, dt, blocks)
+    elif kind == 1:
+        _pe_jacobian(touching.point_edge, parameters, motion, timing, 0.0, dt, blocks)
+    elif kind == 2:
+        _pf_jacobian(touching.point_face, parameters, motion, timing, 0.0, dt, blocks)
+    elif kind == 3:
+        _ee_jacobian(touching.edge_edge, parameters, motion, timing, 0.0, dt, blocks)
+    else:
+        _plane_jacobian(touching.plane, parameters, motion, timing, 0.0, dt, blocks)
+
+
+@kernel
+def _couple(
+    freedom: Ints,
+    wide: Pattern,
+    rigid: Rigid,
+    first: int,
+    turned: Floats,
+    swing: Floats,
+    nodes: Ints,
+    blocks: Floats,
+    factor: float,
+    lower: Floats,
+    upper: Floats,
+) -> None:
+    """Add the blocks [n², 9] between points, times a factor, to those between rows of the matrix: of nodes, or of
+    bodies' centres and rotations. `first` is the first point of a body."""
+    width = len(nodes)
+    right, both = np.empty(9), np.empty(9)
+    for a in range(width):
+        for b in range(width):
+            block = blocks[a * width + b]
+            for k in range(4):
+                row, column = freedom[nodes[a], k // 2], freedom[nodes[b], k % 2]
+                if row < 0 or column < 0:
+                    continue
+                part = block
+                if k % 2 > 0:
+                    own = swing[nodes[b] - first]
+                    for r in range(3):
+                        for c in range(3):
+                            right[3 * r + c] = (
+                                block[3 * r] * own[c] + block[3 * r + 1] * own[3 + c] + block[3 * r + 2] * own[6 + c]
+                            )
+                    part = right
+                if k // 2 > 0:
+                    x, y, z = arm_of(rigid, turned, nodes[a] - first)
+                    both[:] = 0.0
+                    _add_cross(x, y, z, part, 1.0, both)
+                    part = both
+                _add_at(wide, row, column, part, factor, lower, upper)
+
+
+@kernel
+def _add_at(of: Pattern, row: int, column: int, block: Floats, factor: float, lower: Floats, upper: Floats) -> None:
+    """Add the block (row, column), times a factor."""
+    slot = find_slot(of, row, column)
+    if slot >= 0:
+        for k in range(9):
+            lower[slot, k] += factor * block[k]
+    else:
+        for r in range(3):
+            for c in range(3):
+                upper[~slot, 3 * c + r] += factor * block[3 * r + c]

@@ -1,0 +1,218 @@
+"""Newton's method for one part of a step."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffcloud.compiled import inlined, kernel
+from diffcloud.sim.compiled.box import Box, BoxType, define
+from diffcloud.sim.compiled.data import Floats
+from diffcloud.sim.compiled.lu import solve_general
+from diffcloud.sim.contact.places import as_elements, places
+from diffcloud.sim.implicit.equation import first_velocities, place_points, residual, set_motion
+from diffcloud.sim.implicit.matrix import newton_matrix
+from diffcloud.sim.implicit.room import Room, away, cover, distances_at, free_way, room_around
+from diffcloud.sim.implicit.scene import Work
+
+_TOLERANCE = 1e-8
+"""Expected next change of velocity, relative to the largest, at which Newton's method has converged.
+
+It is overestimated: convergence is quadratic in the end, so what is left is far smaller."""
+_ROUNDING = 1e-7
+"""Below this relative change a step that no longer shrinks has reached the arithmetic's precision."""
+_ITERATIONS = 30
+_HALVINGS = 8
+_SLOWEST = 1e-1
+"""Velocities below this are at rest for the tolerance [m/s]."""
+_LEAST_CAUTION = 0.05
+"""Of the step after one that the exact matrix led astray."""
+_REUSE = 1e-4
+"""A relative change below this is followed by one correction with the same matrix instead of a new one."""
+_WHOLE = 1 - 1e-9
+"""A way that is free so far is free: where it has been shortened before, only rounding keeps it from being whole."""
+_PROBE = 1e-4
+"""Part of the obstacles' way over which its effect is measured."""
+
+
+class PlaceType(BoxType):
+    """Of `Place`."""
+
+
+class Place(Box):
+    """Where Newton's method is.
+
+    Fields:
+        velocity: [D, 3]
+        scenery: [O, 3] how far obstacles have come [m].
+        points: [N, 3] [m]
+        turned: [B, 12] as of `rigid.spin`.
+        distances: [C] of the room's pairs [m].
+        listed, numbers: [E, 5], [E, 4] what touches (`contact.places`).
+        touching: the same as elements.
+    """
+
+
+define(Place, PlaceType, ["velocity", "scenery", "points", "turned", "distances", "listed", "numbers", "touching"])
+
+
+@inlined
+def _place(work: Work, room: Room, velocity: Floats, scenery: Floats, points: Floats, turned: Floats) -> Place:
+    """The place with what touches there."""
+    surface, planes, law = work.surface, work.planes, work.law
+    distances = distances_at(work, room, points)
+    listed, numbers = places(surface, planes, law[0, 1], room.pairs, distances, points)
+    touching = as_elements(planes, law, listed, numbers)
+    return Place(velocity, scenery, points, turned, distances, listed, numbers, touching)
+
+
+@inlined
+def converge(work: Work) -> tuple[bool, Place, Room, float]:
+    """Solve one part of a step: (whether it converged, where, the room, the last relative change)."""
+    work.wide, work.moved = work.pattern, np.arange(len(work.pattern.rows))
+    count, first = len(work.start_points), first_velocities(work)
+    turned, still = np.empty((len(work.start_bodies), 12)), np.zeros((len(first), 3))
+    begin, predicted = np.empty((count, 3)), np.empty((count, 3))
+    place_points(work, first, work.final_scenery, predicted, turned)
+    place_points(work, still, work.start_scenery, begin, turned)
+    room = room_around(work, begin, predicted)
+    # velocities go on, as far as nothing is in the way
+    here = _towards(work, _place(work, room, still, work.start_scenery, begin, turned), first, 1.0, room)
+    left_over, trial_left = np.empty((len(first), 3)), np.empty((len(first), 3))
+    residual(work, here.velocity, here.points, here.turned, here.touching, left_over)
+    fresh, change, caution = False, np.inf, 1.0
+    right, direction = np.empty((len(first), 3)), np.empty((len(first), 3))
+    for _ in range(_ITERATIONS):
+        if not fresh:
+            set_motion(work, here.velocity, here.points)
+            matrix = newton_matrix(work, here.velocity, here.turned, here.listed, here.numbers, here.touching, caution)
+            fresh = True
+        _pushed(work, here, left_over, right)
+        if not solve_general(matrix, right, 0, direction):
+            return False, here, room, change
+        downhill, size = _judge(left_over, direction, here.velocity)
+        rough = size > _REUSE
+        bad = rough and downhill <= 0
+        if not bad:
+            here, short = _search(work, here, direction, downhill, room, rough, trial_left)
+            left_over, trial_left = trial_left, left_over
+            before, change = change, size
+            expected = change * min(change / before, 1.0) if np.isfinite(before) else change
+            settled = expected < _TOLERANCE or (change < _ROUNDING and change > 0.3 * before)
+            if settled and _arrived(here.scenery, work.final_scenery):
+                return True, here, room, change
+            bad = short
+            if not bad and not rough and caution == 0:
+                continue
+        fresh = False
+        caution = min(max(4 * caution, _LEAST_CAUTION), 1.0) if bad else 0.0
+    return False, here, room, change
+
+
+@kernel
+def _judge(left_over: Floats, direction: Floats, velocity: Floats) -> tuple[float, float]:
+    """Turn a direction [D, 3] round; (how steeply the residual leads downhill along it, its size relative to
+    velocities)."""
+    downhill, speed, size = 0.0, _SLOWEST, 0.0
+    for i in range(len(direction)):
+        for axis in range(3):
+            direction[i, axis] = -direction[i, axis]
+            downhill -= left_over[i, axis] * direction[i, axis]
+            speed = max(speed, abs(velocity[i, axis]))
+            size = max(size, abs(direction[i, axis]))
+    return downhill, size / speed
+
+
+@kernel
+def _arrived(scenery: Floats, final: Floats) -> bool:
+    """Whether obstacles [O, 3] are where they go."""
+    for o in range(len(scenery)):
+        for axis in range(3):
+            if scenery[o, axis] != final[o, axis]:
+                return False
+    return True
+
+
+@inlined
+def _pushed(work: Work, here: Place, left_over: Floats, found: Floats) -> None:
+    """The residual, and how it changes as moving obstacles go the rest of their way, to first order.
+
+    Without it a step would not know that they come, and they would eat up the gap instead of pushing.
+    """
+    for i in range(len(found)):
+        for axis in range(3):
+            found[i, axis] = left_over[i, axis]
+    scenery, final = here.scenery, work.final_scenery
+    if _arrived(scenery, final):
+        return
+    points, nodes = here.points.copy(), len(work.start_positions)
+    for o in range(len(final)):
+        for axis in range(3):
+            points[nodes + o, axis] += _PROBE * (final[o, axis] - scenery[o, axis])
+    ahead = np.empty((len(found), 3))
+    residual(work, here.velocity, points, here.turned, here.touching, ahead)
+    for i in range(len(found)):
+        for axis in range(3):
+            found[i, axis] += (ahead[i, axis] - left_over[i, axis]) / _PROBE
+
+
+@inlined
+def _search(
+    work: Work, here: Place, direction: Floats, downhill: float, room: Room, rough: bool, found: Floats
+) -> tuple[Place, bool]:
+    """The step along `direction` at whose end it leads downhill still, or uphill less steeply than it began.
+
+    Where forces have a potential, that is a step along which it falls; friction, drag and damping are judged alike.
+    `found` [D, 3] takes the residual at its end.
+
+    Returns:
+        (the place, whether the step had to be shortened for it)
+    """
+    alpha, short, trial = 1.0, False, here
+    most = 1e-300
+    for i in range(len(direction)):
+        for axis in range(3):
+            most = max(most, abs(direction[i, axis]))
+    for _ in range(_HALVINGS):
+        trial = _towards(work, here, direction, alpha, room)
+        residual(work, trial.velocity, trial.points, trial.turned, trial.touching, found)
+        uphill = gone = 0.0
+        new, old = trial.velocity, here.velocity
+        for i in range(len(direction)):
+            for axis in range(3):
+                uphill += found[i, axis] * direction[i, axis]
+                gone = max(gone, abs(new[i, axis] - old[i, axis]))
+        if not rough or uphill <= 0.9 * downhill:
+            break
+        short = True
+        alpha = 0.5 * gone / most
+    return trial, short
+
+
+@kernel
+def _towards(work: Work, here: Place, direction: Floats, alpha: float, room: Room) -> Place:
+    """`here` + α direction with the longest α up to the given one that has no collision on the way."""
+    old, began, final = here.velocity, here.scenery, work.final_scenery
+    for halving in range(_HALVINGS + 2):
+        velocity, scenery = np.empty((len(direction), 3)), np.empty((len(final), 3))
+        for i in range(len(direction)):
+            for axis in range(3):
+                velocity[i, axis] = old[i, axis] + alpha * direction[i, axis]
+        for o in range(len(scenery)):
+            for axis in range(3):
+                a, b = began[o, axis], final[o, axis]
+                scenery[o, axis] = b if alpha == 1 else a + alpha * (b - a)
+        points, turned = np.empty((len(here.points), 3)), np.empty((len(here.turned), 12))
+        place_points(work, velocity, scenery, points, turned)
+        far = away(room, points)
+        if far > room.longest:
+            alpha *= 0.5 * room.longest / far
+            continue
+        if far > room.size:
+            cover(work, room, far)
+            here.distances = distances_at(work, room, here.points)
+        fraction = free_way(work, room, here.distances, here.points, points)
+        if fraction > _WHOLE:
+            return _place(work, room, velocity, scenery, points, turned)
+        # what is straight in velocities is not quite straight in space where bodies turn: look again at the shorter step
+        alpha *= 0.0 if halving >= _HALVINGS else (fraction * 0.9 if halving > 0 else fraction)
+    return here  # no step this way is free of collisions

@@ -1,0 +1,93 @@
+"""A solved part of a step, found again for its derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffcloud.compiled import inlined, kernel
+from diffcloud.sim.compiled.box import Box, BoxType, define
+from diffcloud.sim.compiled.data import Floats
+from diffcloud.sim.contact.places import as_elements
+from diffcloud.sim.implicit.equation import place_points, set_motion
+from diffcloud.sim.implicit.matrix import newton_matrix
+from diffcloud.sim.implicit.scene import BODY, PARTS, Kept, Work
+from diffcloud.sim.implicit.step import begin_part
+
+
+class SolvedType(BoxType):
+    """Of `Solved`."""
+
+
+class Solved(Box):
+    """The end of a part.
+
+    Fields:
+        velocity: [D, 3]
+        turned: [B, 12] as of `rigid.spin`.
+        touching: what touches, as elements.
+        matrix: the exact one, factorised.
+        gone: which part of its way a prescribed node has gone; the rest is where the step began.
+    """
+
+
+define(Solved, SolvedType, ["velocity", "turned", "touching", "matrix", "gone"])
+
+
+@inlined
+def solved_part(
+    work: Work,
+    time_step: float,
+    before: Floats,
+    after: Floats,
+    first: int,
+    part: int,
+    positions: Floats,
+    velocities: Floats,
+    bodies: Floats,
+    kept: Kept,
+) -> Solved:
+    """A part of a step: sets its start and its motion in `work`.
+
+    Args:
+        time_step: of the whole step [s].
+        before, after: [O, 3] obstacles at its ends [m].
+        first: its first part.
+        positions, velocities, bodies: at its start.
+    """
+    nodes, count = len(positions), len(bodies)
+    begin, end = 0, kept.ends[part]
+    x, v, own = positions, velocities, bodies
+    if part > first:
+        begin = kept.ends[part - 1]
+        x, v, own = np.empty((nodes, 3)), np.empty((nodes, 3)), np.empty((count, BODY))
+        _read(kept.states[part - 1], x, v, own)
+    begin_part(work, time_step, before, after, begin, end, positions, x, v, own)
+    last, speed, others = np.empty((nodes, 3)), np.empty((nodes, 3)), np.empty((count, BODY))
+    _read(kept.states[part], last, speed, others)
+    velocity = np.empty((nodes + 2 * count, 3))
+    for axis in range(3):
+        for i in range(nodes):
+            velocity[i, axis] = speed[i, axis]
+        for b in range(count):
+            velocity[nodes + 2 * b, axis], velocity[nodes + 2 * b + 1, axis] = others[b, 12 + axis], others[b, 15 + axis]
+    points, turned = np.empty((len(work.start_points), 3)), np.empty((count, 12))
+    place_points(work, velocity, work.final_scenery, points, turned)
+    set_motion(work, velocity, points)
+    listed = kept.listed[kept.first_place[part] : kept.first_place[part + 1]]
+    numbers = kept.numbers[kept.first_place[part] : kept.first_place[part + 1]]
+    touching = as_elements(work.planes, work.law, listed, numbers)
+    work.wide, work.moved = work.pattern, np.arange(len(work.pattern.rows))
+    matrix = newton_matrix(work, velocity, turned, listed, numbers, touching, 0.0)
+    return Solved(velocity, turned, touching, matrix, end / PARTS)
+
+
+@kernel
+def _read(state: Floats, positions: Floats, velocities: Floats, bodies: Floats) -> None:
+    """A row of `Kept.states`."""
+    nodes = len(positions)
+    for i in range(nodes):
+        for axis in range(3):
+            positions[i, axis], velocities[i, axis] = state[3 * i + axis], state[3 * (nodes + i) + axis]
+    for b in range(len(bodies)):
+        for k in range(BODY):
+            bodies[b, k] = state[6 * nodes + BODY * b + k]

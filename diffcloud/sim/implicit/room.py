@@ -1,0 +1,177 @@
+"""Pairs near each other while all points stay within a distance of the straight path of a step."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+
+from diffcloud.compiled import inlined, kernel
+from diffcloud.sim.compiled.box import Box, BoxType, define
+from diffcloud.sim.compiled.data import Floats, Ints
+from diffcloud.sim.contact.additive_ccd import safe_fraction
+from diffcloud.sim.contact.broad_phase import candidates, corners_of
+from diffcloud.sim.contact.distance import closest
+from diffcloud.sim.contact.places import gap_of
+from diffcloud.sim.implicit.scene import Work
+
+_ROOM = 0.5
+"""First guess of how far points leave their predicted path, as part of the thickness and of the path."""
+_LONGEST = 5.0
+"""Newton's steps are kept within this many times the thickness and the path."""
+_CLOSEST = 1e-6
+"""Part of the thickness below which nothing may come closer."""
+_LEFT = 0.2
+"""Part of the distance to a half-space that a step leaves."""
+
+
+class RoomType(BoxType):
+    """Of `Room`."""
+
+
+class Room(Box):
+    """A path, and the pairs that may touch near it.
+
+    Fields:
+        begin, predicted: [N, 3] [m]
+        size: how far from the path points may be [m].
+        longest: how far they may ever be [m].
+        pairs: [C, 7] kind (1: two edges), points and primitives.
+        distances: [C] at the beginning [m].
+    """
+
+
+define(Room, RoomType, ["begin", "predicted", "size", "longest", "pairs", "distances"])
+
+
+@inlined
+def room_around(work: Work, begin: Floats, predicted: Floats) -> Room:
+    """The room of a path between points [N, 3]."""
+    law = work.law
+    path = 0.0
+    for i in range(len(begin)):
+        for axis in range(3):
+            path = max(path, abs(begin[i, axis] - predicted[i, axis]))
+    thickness = law[0, 1]
+    size = _ROOM * (thickness + 0.2 * path)
+    none = np.empty((0, 7), np.int64)
+    room = Room(begin, predicted, size, _LONGEST * (thickness + path), none, np.empty(0))
+    _list(work, room)
+    return room
+
+
+@inlined
+def cover(work: Work, room: Room, distance: float) -> None:
+    """Let points be so far from the path [m]."""
+    room.size = min(2 * distance, room.longest)
+    _list(work, room)
+
+
+@kernel
+def away(room: Room, points: Floats) -> float:
+    """How far the farthest point is from the path [m]."""
+    begin, predicted, most = room.begin, room.predicted, 0.0
+    for i in range(len(points)):
+        for axis in range(3):
+            a, b, x = begin[i, axis], predicted[i, axis], points[i, axis]
+            most = max(most, min(a, b) - x, x - max(a, b))
+    return most
+
+
+@kernel
+def prescribed(
+    work: Work,
+) -> Ints:
+    """[N] 1 for points whose motion is prescribed; all zero where no node's is."""
+    moves, holder = work.moves, work.holder
+    found = np.zeros(len(moves), np.int64)
+    some = False
+    for i in range(len(holder)):
+        if holder[i] >= 0:
+            found[i], some = 1, True
+    if some:
+        for i in range(len(found)):
+            if not moves[i]:
+                found[i] = 1
+    return found
+
+
+@kernel
+def _list(work: Work, room: Room) -> None:
+    """Find the room's pairs; what only prescribed points could resolve is left out."""
+    surface, law = work.surface, work.law
+    begin = room.begin
+    point_face, edge_edge = candidates(surface, begin, room.predicted, 2 * room.size + law[0, 1], 0)
+    pairs = np.empty((len(point_face) + len(edge_edge), 7), np.int64)
+    distances = np.empty(len(pairs))
+    fixed = prescribed(work)
+    x, found = np.empty((4, 3)), np.empty(6)
+    count = 0
+    for kind in range(2):
+        listed = edge_edge if kind > 0 else point_face
+        for c in range(len(listed)):
+            i, j, k, l = corners_of(surface, kind, listed[c, 0], listed[c, 1])
+            if fixed[i] + fixed[j] + fixed[k] + fixed[l] == 4:
+                continue
+            row = pairs[count]
+            row[0], row[1], row[2], row[3], row[4], row[5], row[6] = kind, i, j, k, l, listed[c, 0], listed[c, 1]
+            distances[count] = distance_of(pairs, count, begin, x, found)
+            count += 1
+    room.pairs, room.distances = pairs[:count], distances[:count]
+
+
+@kernel
+def distance_of(pairs: Ints, c: int, points: Floats, x: Floats, found: Floats) -> float:
+    """Of the primitives of a pair [m]; x [4, 3] and found [6] are room."""
+    for k in range(4):
+        for axis in range(3):
+            x[k, axis] = points[pairs[c, 1 + k], axis]
+    return closest(pairs[c, 0], x, found)
+
+
+@kernel
+def distances_at(work: Work, room: Room, points: Floats) -> Floats:
+    """Distances [C] of the room's pairs at points [N, 3], or lower bounds where those are beyond the thickness [m]."""
+    law = work.law
+    pairs, begin, old, thickness = room.pairs, room.begin, room.distances, law[0, 1]
+    distances = np.empty(len(pairs))
+    if len(distances) == 0:
+        return distances
+    moved = np.empty(len(points))
+    for i in range(len(points)):
+        square = 0.0
+        for axis in range(3):
+            square += (points[i, axis] - begin[i, axis]) ** 2
+        moved[i] = sqrt(square)
+    x, found = np.empty((4, 3)), np.empty(6)
+    for c in range(len(distances)):
+        # a pair cannot have come closer than its points have moved: most need no look at their geometry
+        i, j, k, l = pairs[c, 1], pairs[c, 2], pairs[c, 3], pairs[c, 4]
+        if pairs[c, 0] > 0:
+            reach = max(moved[i], moved[j]) + max(moved[k], moved[l])
+        else:
+            reach = moved[i] + max(moved[j], moved[k], moved[l])
+        distances[c] = old[c] - reach
+        if distances[c] < thickness:
+            distances[c] = distance_of(pairs, c, points, x, found)
+    return distances
+
+
+@kernel
+def free_way(work: Work, room: Room, distances: Floats, points: Floats, ends: Floats) -> float:
+    """In [0, 1]: how far all points may go straight from `points` to `ends` [N, 3] without touching.
+
+    Args:
+        distances: [C] of the room's pairs at `points`.
+    """
+    planes, law = work.planes, work.law
+    allowed = 1.0
+    if len(planes.offsets) > 0:
+        fixed = prescribed(work)
+        for q in range(len(planes.points)):
+            i = planes.points[q]
+            for w in range(len(planes.offsets)):
+                before, after = gap_of(planes, w, points, i), gap_of(planes, w, ends, i)
+                if after < 0.5 * _LEFT * before and fixed[i] == 0:
+                    allowed = min(allowed, (1 - _LEFT) * before / max(before - after, 1e-300))
+    return safe_fraction(room.pairs, distances, points, ends, allowed, _CLOSEST * law[0, 1])
