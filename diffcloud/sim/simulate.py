@@ -55,7 +55,10 @@ def init(system: System, batch: int = 1, *, positions: Tensor | None = None, vel
         positions = torch.as_tensor(system.mesh.nodes, dtype=torch.float64)[None]
     positions = positions.expand(batch, -1, -1)
     velocities = torch.zeros_like(positions) if velocities is None else velocities.expand(batch, -1, -1)
-    return State(positions, velocities)
+    bodies = _body_state(torch.from_numpy(system.bodies.start).expand(batch, 1, -1, -1))
+    if bodies is not None:
+        bodies = BodyState(*(part[:, 0] for part in bodies.tensors()))
+    return State(positions, velocities, bodies)
 
 
 def rollout(
@@ -104,7 +107,7 @@ def rollout_tangents(
     properties: Properties,
     tangents: Properties,
     state: State | None = None,
-    state_tangents: tuple[Tensor | None, Tensor | None] = (None, None),
+    state_tangents: State | None = None,
     track: Tensor | None = None,
     track_tangents: Tensor | None = None,
 ) -> tuple[Rollout, Tensor]:
@@ -113,7 +116,7 @@ def rollout_tangents(
     Args:
         properties: [B, ...].
         tangents: [K · B, ...] directions of the properties, directions outermost.
-        state, state_tangents: start, and directions [K · B, V, 3] of its positions and velocities.
+        state, state_tangents: start, and directions of it, each field [K · B, ...].
         track, track_tangents: gripper displacement [B or 1, S, 3] and its directions [K · B, S, 3].
 
     Returns:
@@ -128,7 +131,9 @@ def rollout_tangents(
     batch = Batch(system, steps, tracked=track is not None)
     start = _start(system, state)
     given = [*start, torch.zeros(1, steps, 3, dtype=torch.float64) if track is None else track, *properties.tensors()]
-    moves: list[Tensor | None] = [*state_tangents, None, track_tangents, *tangents.tensors()]
+    moves: list[Tensor | None] = [None, None, None, track_tangents, *tangents.tensors()]
+    if state_tangents is not None:
+        moves[:3] = _packed(state_tangents)
     values = [_expanded(tensor.detach(), count) for tensor in given]
     rates = [
         torch.zeros(directions, *value.shape, dtype=torch.float64)
@@ -161,9 +166,14 @@ class _Episodes(torch.autograd.Function):
 
 def _start(system: System, state: State) -> tuple[Tensor, Tensor, Tensor]:
     """Positions and velocities [B, V, 3] and poses of the bodies [B or 1, N, 18]."""
-    if state.bodies is None:
-        return state.positions, state.velocities, torch.from_numpy(system.bodies.start)[None]
-    return state.positions, state.velocities, torch.cat([part.flatten(2) for part in state.bodies.tensors()], dim=2)
+    positions, velocities, poses = _packed(state)
+    return positions, velocities, torch.from_numpy(system.bodies.start)[None] if poses is None else poses
+
+
+def _packed(state: State) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The same with None for bodies that are not given."""
+    parts = None if state.bodies is None else [part.flatten(2) for part in state.bodies.tensors()]
+    return state.positions, state.velocities, None if parts is None else torch.cat(parts, dim=2)
 
 
 def _expanded(tensor: Tensor, count: int) -> Tensor:

@@ -18,6 +18,7 @@ from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.rigid.body import RigidBody
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.surrounding import ContactSettings, Surrounding
+from tests.sim.twins.rigid import angular_momenta
 
 FABRIC = isotropic("test-fabric", density=0.2, stretching=200.0, shear=80.0, bending=1e-5, source="test")
 GROUND = SurfaceMesh(np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
@@ -87,32 +88,21 @@ def test_a_spinning_body_keeps_its_angular_momentum():
     body = RigidBody(box((0.1, 0.2, 0.4), (0, 0, 1.0)), velocity=(0.3, 0, 0), angular_velocity=(3.0, 0.2, 5.0))
     system = system_of([body], gravity=(0, 0, 0), obstacles=())
     run = rollout(system, 200)
-    bodies = system.implicit.bodies
-    momentum = torch.stack(
-        [
-            bodies.angular_momentum(bodies.mass[None], run.bodies.orientation[:, k], run.bodies.angular_velocity[:, k])[
-                0, 0
-            ]
-            for k in range(201)
-        ]
-    )
+    momentum = angular_momenta(system.bodies, run.bodies.orientation[0], run.bodies.angular_velocity[0])[:, 0]
     assert float((momentum - momentum[0]).abs().max() / momentum[0].norm()) < 1e-9
     assert float((run.bodies.orientation[0, -1, 0] @ run.bodies.orientation[0, -1, 0].T - torch.eye(3)).abs().max()) < 1e-10
 
 
 def momenta(system, run, step):
     """Linear and angular momentum of cloth and bodies together."""
-    bodies = system.implicit.bodies
     mass = system.properties.node_mass[0, :, None]
     dt = system.time_step
     position = run.positions[0, step]
     velocity = (run.positions[0, step + 1] - position) / dt
     centre, moving = run.bodies.centre[0, step], run.bodies.velocity[0, step + 1]
-    body_mass = bodies.mass[:, None]
+    body_mass = system.properties.body_mass[0][:, None]
     linear = (mass * velocity).sum(0) + (body_mass * moving).sum(0)
-    spin = bodies.angular_momentum(
-        bodies.mass[None], run.bodies.orientation[:, step + 1], run.bodies.angular_velocity[:, step + 1]
-    )[0]
+    spin = angular_momenta(system.bodies, run.bodies.orientation[0, step + 1], run.bodies.angular_velocity[0, step + 1])
     angular = (
         torch.linalg.cross(position, mass * velocity).sum(0)
         + torch.linalg.cross(centre, body_mass * moving).sum(0)

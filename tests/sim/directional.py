@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim import Properties, init, rollout, rollout_tangents
+from diffcloud.sim import Properties, State, init, rollout, rollout_tangents
 from diffcloud.sim.system import System
 
 SCALARS = ("stretch", "mass", "density", "bending", "damping", "drag", "friction_obstacle")
@@ -102,7 +102,7 @@ class Episode:
             properties=self.properties(inputs),
             tangents=tangents,
             state=init(self.system, 1, positions=inputs["positions"], velocities=inputs["velocities"]),
-            state_tangents=(stacked["positions"], stacked["velocities"]),
+            state_tangents=State(stacked["positions"], stacked["velocities"]),
             track=inputs["track"],
             track_tangents=stacked["track"],
         )

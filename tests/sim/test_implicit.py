@@ -1,44 +1,33 @@
-"""Laws of the implicit step's kernels: both modes of derivatives agree with each other and with differences, and
-nothing passes through anything."""
+"""Laws of implicit steps: both modes of derivatives agree with each other and with differences, nothing passes through
+anything, and steps that are halved are derived like others."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
+from torch import Tensor
 
 from diffcloud.compiled import kernel
-from diffcloud.mesh.shapes import box_surface, grid_cloth, rectangle_surface
-from diffcloud.mesh.topology import ClothMesh
-from diffcloud.sim.compiled.data import Parameters
+from diffcloud.errors import DivergedError
+from diffcloud.mesh import ClothMesh, box_surface, grid_cloth, rectangle_surface
+from diffcloud.sim import Properties, Rollout, State, init, rollout, rollout_tangents
+from diffcloud.sim.build import build_system
+from diffcloud.sim.compiled.data import Floats
 from diffcloud.sim.compiled.lu import factorised, solve_general
 from diffcloud.sim.compiled.sparse import Pattern, pattern
 from diffcloud.sim.handles import Handle, Handles
-from diffcloud.sim.held import Held
-from diffcloud.sim.implicit import Scene, build_scene
-from diffcloud.sim.implicit.adjoint import reverse
-from diffcloud.sim.implicit.step import simulate
-from diffcloud.sim.implicit.tangent import tangents
 from diffcloud.sim.materials import preset
 from diffcloud.sim.motion import Keyframe, Motion
-from diffcloud.sim.rigid.bodies import Bodies
+from diffcloud.sim.rigid.bodies import BodyState
 from diffcloud.sim.rigid.body import RigidBody
-from diffcloud.sim.scenery import MovingObstacle, Scenery
-from diffcloud.sim.status import DONE
+from diffcloud.sim.scenery import MovingObstacle
 from diffcloud.sim.surrounding import Surrounding
-from diffcloud.sim.terms.term import Setup
+from diffcloud.sim.system import System
 
-Floats = NDArray[np.float64]
-_MATERIAL = preset("jersey-knit")
-_SIDE = 4
-_DIFFERENTIATED = (
-    "node_mass", "stretching", "bending", "damping", "air_density", "air_drag", "friction_obstacle", "friction_cloth",
-    "body_mass",
-)  # fmt: skip
+STEPS, _SIDE = 8, 4
 
 
 @dataclass(frozen=True)
@@ -48,54 +37,22 @@ class Case:
     mesh: ClothMesh
     handles: Handles
     surrounding: Surrounding
-    steps: int = 8
     time_step: float = 0.01
 
-    def scene(self) -> Scene:
-        return build_scene(Setup(self.mesh, _MATERIAL, self.surrounding, self.handles, "implicit", False), self.time_step)
-
-    def held(self) -> Held:
-        schedule = self.handles.schedule(np.cumsum(np.full(self.steps, self.time_step)))
-        first = np.minimum(schedule.first_step, self.steps - 1)
-        inverse = [np.linalg.inv(schedule.linear[step, h]) for h, step in enumerate(first)]
-        return Held(
-            np.array(self.handles.nodes, dtype=np.int64),
-            self.handles.hard,
-            self.handles.stiffness,
-            schedule.strength,
-            np.ascontiguousarray(schedule.linear),
-            schedule.translation,
-            schedule.first_step.astype(np.int64),
-            np.array(inverse).reshape(-1, 3, 3),
-            schedule.tracked.astype(np.int64),
+    def system(self) -> System:
+        return build_system(
+            self.mesh,
+            preset("jersey-knit"),
+            time_step=self.time_step,
+            handles=self.handles,
+            surrounding=self.surrounding,
+            integrator="implicit",
         )
-
-    def parameters(self, scene: Scene) -> Parameters:
-        around, count = self.surrounding, len(self.handles.nodes)
-        mass = _MATERIAL.density * self.mesh.node_area
-        return Parameters(
-            mass,
-            np.concatenate([1 / mass, np.zeros(scene.surface.point_count - len(mass))]),
-            np.ones(len(self.mesh.faces)),
-            np.ones(len(self.mesh.hinges.length)),
-            *(np.array([float(value)]) for value in (
-                _MATERIAL.damping, around.air_density, around.air_drag, around.friction_obstacle, around.friction_cloth
-            )),
-            Bodies.build(around.bodies).mass,
-            np.zeros(count),
-            np.zeros((count, 3)),
-        )  # fmt: skip
-
-    def obstacles(self) -> Floats:
-        around = self.surrounding
-        scenery = Scenery.build([one for one in around.obstacles if one.plane() is None], around.moving)
-        times = np.arange(self.steps + 1) * self.time_step
-        return np.ascontiguousarray(scenery.at(times, dtype=torch.float64, device=torch.device("cpu")).numpy())
 
 
 def _cloth(height: float = 0.0) -> ClothMesh:
     mesh = grid_cloth(_SIDE, _SIDE, 0.12, 0.12)
-    return replace(mesh, nodes=[*mesh.nodes, 0.004, 0.003, height])
+    return replace(mesh, nodes=np.add(mesh.nodes, (0.004, 0.003, height)))
 
 
 _CORNERS = (Handle(0), Handle(_SIDE - 1))
@@ -134,96 +91,112 @@ _CASES = {
 }
 
 
-@dataclass
-class Run:
-    """An episode and what it was made with."""
-
-    scene: Scene
-    held: Held
-    parameters: Parameters
-    obstacles: Floats
-    anchors: Floats
-    positions: Floats
-    velocities: Floats
-    bodies: Floats
-    kept: Any
-
-
-def _run(case: Case, parameters: Parameters | None = None, start: tuple[Floats, Floats, Floats] | None = None) -> Run:
-    scene, held, own = case.scene(), case.held(), Bodies.build(case.surrounding.bodies)
-    parameters = case.parameters(scene) if parameters is None else parameters
-    nodes = len(case.mesh.nodes)
-    positions, velocities = np.zeros((case.steps + 1, nodes, 3)), np.zeros((case.steps + 1, nodes, 3))
-    bodies, anchors, obstacles = np.zeros((case.steps + 1, len(own), 18)), np.zeros((len(held.node), 3)), case.obstacles()
-    positions[0], bodies[0] = case.mesh.nodes, own.start
-    if start is not None:
-        positions[0], velocities[0], bodies[0] = start
-    track, control = np.zeros((case.steps, 3)), np.zeros(2, np.int64)
-    status, _, kept = simulate(
-        scene, held, parameters, track, obstacles, anchors, positions, velocities, bodies, 0, control, np.zeros(6)
-    )
-    assert status == DONE
-    assert control[0] == case.steps
-    return Run(scene, held, parameters, obstacles, anchors, positions, velocities, bodies, kept)
+def moved(value: Tensor, rate: Tensor, step: float) -> Tensor:
+    return value + step * rate
 
 
 @pytest.mark.parametrize("name", _CASES)
-def test_both_modes_agree_with_each_other_and_with_differences(name: str) -> None:
-    case, rng = _CASES[name], np.random.default_rng(3)
-    run = _run(case)
-    p, nodes, count = run.parameters, len(case.mesh.nodes), run.bodies.shape[1]
-    weights, body_weights = rng.normal(size=run.positions.shape), rng.normal(size=run.bodies.shape)
-    track = np.zeros((case.steps, 3))
+def test_both_modes_agree_with_each_other_and_with_differences(name):
+    system, rng = _CASES[name].system(), np.random.default_rng(3)
+    tracked = system.handles.moving.any()
 
-    slopes, speeds, own = weights.copy(), np.zeros_like(weights), body_weights.copy()
-    gradients, track_slopes = Parameters(*(np.zeros_like(one) for one in p)), np.zeros_like(track)
-    given = (run.obstacles, run.anchors, run.positions, run.velocities, run.bodies, run.kept)
-    reverse(run.scene, run.held, p, track, *given, slopes, speeds, own, gradients, track_slopes)
+    def random(like: Tensor, scale: Tensor | float) -> Tensor:
+        return torch.as_tensor(rng.normal(size=like.shape)) * scale
 
-    rates = Parameters(*(np.zeros((1, *one.shape)) for one in p))
-    for field in _DIFFERENTIATED:
-        value = getattr(p, field)
-        getattr(rates, field)[0] = rng.normal(size=value.shape) * (np.abs(value) + 1e-4)
-    steps = case.steps + 1
-    x, v, b = np.zeros((steps, 1, nodes, 3)), np.zeros((steps, 1, nodes, 3)), np.zeros((steps, 1, count, 18))
-    x[0], v[0], b[0] = (1e-3 * rng.normal(size=one.shape) for one in (x[0], v[0], b[0]))
-    tangents(run.scene, run.held, p, rates, track, np.zeros((1, *track.shape)), *given, x, v, b)
-    change = (weights * x[:, 0]).sum() + (body_weights * b[:, 0]).sum()
+    start = init(system)
+    track = 1e-3 * torch.arange(1.0, STEPS + 1).double()[None, :, None].expand(1, STEPS, 3) if tracked else None
+    fields = list(system.properties.tensors())
+    rates = [random(field, field.abs() + 1e-4) for field in fields]
+    places = [start.positions, start.velocities, *([] if start.bodies is None else start.bodies.tensors())]
+    moves = [random(place, 1e-3) for place in places]
+    pull = None if track is None else random(track, 1e-3)
+    weights = random(torch.zeros(STEPS + 1, *start.positions.shape[1:]), 1.0)
 
-    backwards = (slopes[0] * x[0, 0]).sum() + (speeds[0] * v[0, 0]).sum() + (own[0] * b[0, 0]).sum()
-    backwards += sum((getattr(gradients, field) * getattr(rates, field)[0]).sum() for field in _DIFFERENTIATED)
-    assert backwards == pytest.approx(change, rel=1e-10)
+    def state(parts: list[Tensor]) -> State:
+        return State(parts[0], parts[1], BodyState(*parts[2:]) if len(parts) > 2 else None)
 
-    def loss(step: float) -> float:
-        moved = p._replace(**{field: getattr(p, field) + step * getattr(rates, field)[0] for field in _DIFFERENTIATED})
-        other = _run(
-            case,
-            moved._replace(hold=p.hold.copy(), target=p.target.copy()),
-            (run.positions[0] + step * x[0, 0], run.velocities[0] + step * v[0, 0], run.bodies[0] + step * b[0, 0]),
+    def value(step: float) -> Tensor:
+        run = rollout(
+            system,
+            STEPS,
+            properties=Properties(*(moved(f, r, step) for f, r in zip(fields, rates, strict=True))),
+            state=state([moved(p, m, step) for p, m in zip(places, moves, strict=True)]),
+            track=None if track is None else moved(track, pull, step),
         )
-        return float((weights * other.positions).sum() + (body_weights * other.bodies).sum())
+        return (run.positions[0] * weights).sum()
 
-    assert (loss(1e-5) - loss(-1e-5)) / 2e-5 == pytest.approx(change, rel=1e-5)
+    inputs = [one.clone().requires_grad_(True) for one in [*fields, *places, *([] if track is None else [track])]]
+    own = inputs[len(fields) :]
+    run = rollout(
+        system,
+        STEPS,
+        properties=Properties(*inputs[: len(fields)]),
+        state=state(own[: len(places)]),
+        track=None if track is None else own[-1],
+    )
+    gradients = torch.autograd.grad((run.positions[0] * weights).sum(), inputs, materialize_grads=True)
+    along = [*rates, *moves, *([] if pull is None else [pull])]
+    backwards = float(sum((g * a).sum() for g, a in zip(gradients, along, strict=True)))
+    _, found = rollout_tangents(
+        system,
+        STEPS,
+        properties=system.properties,
+        tangents=Properties(*rates),
+        state=state(places),
+        state_tangents=state(moves),
+        track=track,
+        track_tangents=pull,
+    )
+    assert backwards == pytest.approx(float((found[0, 0] * weights).sum()), rel=1e-10)
+    with torch.no_grad():
+        assert float(value(1e-5) - value(-1e-5)) / 2e-5 == pytest.approx(backwards, rel=1e-5)
 
 
-def test_cloth_stays_above_the_box() -> None:
-    run = _run(_CASES["box"])
-    x = run.positions
+def test_a_step_that_does_not_converge_is_halved_and_its_gradient_holds():
+    """A corner that is jerked away by many thicknesses within a step, beside a box."""
+    jerk = Motion((Keyframe(0.0), Keyframe(0.02, translation=(0.05, 0.03, 0.12))))
+    case = replace(_CASES["box"], handles=Handles((Handle(0, jerk), Handle(15)), hard=True), time_step=0.02)
+    system = case.system()
+
+    def last(values: Tensor) -> Tensor:
+        properties = replace(system.properties.repeated(len(values)), damping=values)
+        run = rollout(system, 4, properties=properties)
+        return run.positions[:, -1].square().sum((1, 2))
+
+    damping = torch.tensor([2e-3], dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(last(damping).sum(), damping)
+    with torch.no_grad():
+        plus, minus = last(torch.tensor([2e-3 + 1e-7, 2e-3 - 1e-7], dtype=torch.float64))
+    assert float(gradient) == pytest.approx(float(plus - minus) / 2e-7, rel=1e-4)
+
+
+def test_a_step_without_solution_names_itself():
+    """A plate that presses the cloth through a table."""
+    plate, table = box_surface((-0.1, -0.1, 0.02), (0.1, 0.1, 0.1)), rectangle_surface((0, 0), (1, 1), 0.0)
+    crush = MovingObstacle(plate, Motion((Keyframe(0.0), Keyframe(0.05, translation=(0.0, 0.0, -0.05)))))
+    system = Case(_cloth(0.004), Handles(()), Surrounding(obstacles=(table,), moving=(crush,))).system()
+    with pytest.raises(DivergedError, match=r"step \d.*did not converge.*closest: .*pair of points"):
+        rollout(system, STEPS)
+
+
+def test_cloth_stays_above_the_box():
+    x = rollout(_CASES["box"].system(), STEPS).positions[0].numpy()
     inside = (x[..., 0] > -0.02) & (x[..., 0] < 0.03) & (x[..., 1] > -0.03) & (x[..., 1] < 0.02)
     assert (x[..., 2][inside] > 0).all()
     assert (x[-1, :, 2] < x[0, :, 2]).any()
 
 
-def test_a_body_and_the_cloth_fall_freely_alike() -> None:
-    case = replace(_CASES["body"], handles=Handles(()), surrounding=replace(
-        _CASES["body"].surrounding, air_density=0.0,
-        bodies=(replace(_CASES["body"].surrounding.bodies[0], mesh=box_surface((-0.02, -0.02, 0.05), (0.03, 0.02, 0.08)),
-                        velocity=(0.0, 0.0, 0.0)),),
-    ))  # fmt: skip
-    run = _run(case)
-    fall = -9.81 * case.time_step**2 * np.arange(case.steps + 1) * (np.arange(case.steps + 1) + 1) / 2
-    np.testing.assert_allclose(run.positions[:, :, 2] - run.positions[0, :, 2], np.tile(fall[:, None], 16), atol=1e-10)
-    np.testing.assert_allclose(run.bodies[:, 0, 2] - run.bodies[0, 0, 2], fall, atol=1e-10)
+def test_a_body_and_the_cloth_fall_freely_alike():
+    around = _CASES["body"].surrounding
+    far = box_surface((-0.02, -0.02, 0.05), (0.03, 0.02, 0.08))
+    body = replace(around.bodies[0], mesh=far, velocity=(0.0, 0.0, 0.0))
+    free = replace(_CASES["body"], handles=Handles(()), surrounding=replace(around, air_density=0.0, bodies=(body,)))
+    run: Rollout = rollout(free.system(), STEPS)
+    fall = -9.81 * free.time_step**2 * np.arange(STEPS + 1) * (np.arange(STEPS + 1) + 1) / 2
+    heights = run.positions[0, :, :, 2].numpy()
+    np.testing.assert_allclose(heights - heights[0], np.tile(fall[:, None], 16), atol=1e-10)
+    centre = run.bodies.centre[0, :, 0, 2].numpy()
+    np.testing.assert_allclose(centre - centre[0], fall, atol=1e-10)
 
 
 @kernel
