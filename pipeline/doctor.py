@@ -20,7 +20,7 @@ def doctor(
     arm: Annotated[str | None, typer.Option(help="Address of the arm, to see whether it answers.")] = None,
     folder: Annotated[Path, typer.Option(help="Where episodes would be written.")] = Path("."),
     compile_: Annotated[
-        bool, typer.Option("--compile", help="Compile the kernels now rather than at first use (up to a minute).")
+        bool, typer.Option("--compile", help="Compile the kernels now rather than at first use (a minute or two).")
     ] = False,
     json: JsonFlag = False,
 ) -> None:
@@ -50,9 +50,13 @@ def _compiled() -> dict[str, Any]:
 
 
 def _compile() -> None:
-    from diffcloud.clouds.neighbours import compile_neighbours
     from diffcloud.sim.compiled.warm import compile_all
+    from diffcloud.sim.threads import cores
 
-    work = [("nearest neighbours", compile_neighbours)]
+    work = [
+        ("linearised steps", "diffcloud.sim.warm:linearised"),
+        ("implicit steps", "diffcloud.sim.warm:implicit"),
+        ("nearest neighbours", "diffcloud.clouds.neighbours:compile_neighbours"),
+    ]
     with progress_bar("compiling", len(work)) as update:
-        compile_all(update, work)
+        compile_all(update, work, processes=cores())

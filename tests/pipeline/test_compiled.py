@@ -12,6 +12,7 @@ import time
 import pytest
 
 from diffcloud import compiled
+from diffcloud.errors import DiffCloudError
 from diffcloud.sim.compiled.warm import compile_all
 from tests.pipeline.invoke import DIFFCLOUD, ROOT
 
@@ -25,13 +26,14 @@ def run(tmp_path):
     def started(*command):
         env = {**os.environ, "PYTHONPATH": str(ROOT), "DIFFCLOUD_CACHE_DIR": str(tmp_path / "cache")}
         env.pop("DIFFCLOUD_UNCOMPILED", None)
-        done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120)
+        done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=600)
         assert done.returncode == 0, done.stderr
         return done
 
     return started
 
 
+@pytest.mark.slow  # everything, with a cache of its own
 def test_doctor_compiles_ahead(run, tmp_path):
     def doctor(*options):
         done = run(*DIFFCLOUD, "doctor", "--json", *options)
@@ -56,15 +58,18 @@ def test_first_use_says_once_that_it_compiles(run):
 
 def test_compile_all_tells_its_progress(monkeypatch, tmp_path):
     monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path / "made")
-    monkeypatch.setattr(compiled.announcement, "silent", False)
-    told, made = [], []
+    told = []
     assert not compiled.is_built()
-    compile_all(
-        lambda done, name: told.append((done, name)), [("a", lambda: made.append(1)), ("b", lambda: made.append(2))]
-    )
+    compile_all(lambda *now: told.append(now), [("a", "gc:collect"), ("b", "gc:enable")], processes=1)
     assert told == [(0, "a"), (1, "b"), (2, "")]
-    assert made == [1, 2]
     assert compiled.is_built()
+
+
+def test_what_fails_to_compile_is_named_and_not_marked(monkeypatch, tmp_path):
+    monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path / "made")
+    with pytest.raises(DiffCloudError, match=r"Compiling gc:nothing failed.*has no attribute"):
+        compile_all(lambda *now: None, [("a", "gc:nothing")], processes=2)
+    assert not compiled.is_built()
 
 
 def test_old_folders_of_other_versions_go(tmp_path):

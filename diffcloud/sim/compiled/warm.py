@@ -2,24 +2,45 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 
-from diffcloud.compiled import announcement, mark_built
+from diffcloud.compiled import mark_built
+from diffcloud.errors import DiffCloudError
 
-Work = Sequence[tuple[str, Callable[[], object]]]
-"""Names, and functions that call each kernel once with arguments of the types that it is used with."""
+Work = Sequence[tuple[str, str]]
+"""Names, and functions as "module:function" that call each kernel once with arguments of the types it is used with."""
 
 
-def compile_all(progress: Callable[[int, str], None], work: Work) -> None:
+def compile_all(progress: Callable[[int, str], None], work: Work, *, processes: int) -> None:
     """Compile everything that is not in the cache folder, and remember that it is complete.
 
     Args:
-        progress: called before each piece of work with how many are done and its name, and at the end.
-        work: what compiles.
+        progress: called with how many pieces of work are done, and the name of one that is not.
+        work: what compiles, each in a process of its own.
+        processes: at once.
+
+    Raises:
+        DiffCloudError: a piece failed.
     """
-    announcement.silent = True  # whoever asks for it need not be told
-    for done, (name, function) in enumerate(work):
-        progress(done, name)
-        function()
-    progress(len(work), "")
+    left = [name for name, _ in work]
+    progress(0, left[0])
+    with ThreadPoolExecutor(processes) as pool:
+        jobs = {pool.submit(_run, place): name for name, place in work}
+        for job in as_completed(jobs):
+            job.result()
+            left.remove(jobs[job])
+            progress(len(work) - len(left), left[0] if left else "")
     mark_built()
+
+
+def _run(place: str) -> None:
+    module, function = place.split(":")
+    code = (
+        f"from diffcloud.compiled import announcement; announcement.silent = True; import {module}; {module}.{function}()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise DiffCloudError(f"Compiling {place} failed: {done.stderr.strip().splitlines()[-1:]}")

@@ -1,0 +1,46 @@
+"""Short episodes that call every kernel of the simulator, to compile them ahead (`diffcloud doctor --compile`)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import torch
+
+from diffcloud.mesh.shapes import grid_cloth, rectangle_surface
+from diffcloud.sim.build import build_system
+from diffcloud.sim.handles import Handle, Handles
+from diffcloud.sim.materials import isotropic
+from diffcloud.sim.properties import Properties
+from diffcloud.sim.simulate import rollout, rollout_tangents
+from diffcloud.sim.surrounding import ReferenceContact, Surrounding
+
+
+def linearised() -> None:
+    """Kernels of the linearised step."""
+    _episode("linearised", ReferenceContact())
+
+
+def implicit() -> None:
+    """Kernels of the implicit step."""
+    _episode("implicit", None)
+
+
+def _episode(integrator: Literal["linearised", "implicit"], contact: ReferenceContact | None) -> None:
+    mesh = grid_cloth(3, 3, 0.1, 0.1)
+    mesh = replace(mesh, nodes=np.add(mesh.nodes, (0.0, 0.0, 0.002)))
+    system = build_system(
+        mesh,
+        isotropic("any", density=0.2, stretching=50.0, bending=1e-5),
+        time_step=0.01,
+        handles=Handles((Handle(0),)),
+        surrounding=Surrounding(obstacles=(rectangle_surface((0.0, 0.0), (1.0, 1.0), 0.0),), reference_contact=contact),
+        integrator=integrator,
+    )
+    given = system.properties
+    rollout(
+        system, 2, properties=Properties(*(one.clone().requires_grad_() for one in given.tensors()))
+    ).positions.sum().backward()
+    with torch.no_grad():
+        rollout_tangents(system, 1, properties=given, tangents=given)
