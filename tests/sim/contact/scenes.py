@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from diffcloud.mesh import SurfaceMesh
+from diffcloud.mesh import SurfaceMesh, grid_cloth
 from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.contact.surface import Surface, contact_surface
 from diffcloud.sim.surrounding import ReferenceContact
 from tests.conftest import small_lift
 
@@ -28,3 +29,12 @@ def over_box(contact: ReferenceContact, *, proximity: bool = True, height: float
     obstacle = box((-0.047, -0.061, -0.2), (0.053, 0.043, 0.0))
     surrounding = replace(scenario.scene.surrounding, obstacles=(obstacle,), reference_contact=contact, proximity=proximity)
     return replace(scenario, scene=replace(scenario.scene, surrounding=surrounding))
+
+
+def crumpled(rng: np.random.Generator) -> tuple[Surface, np.ndarray]:
+    """A crumpled cloth partly in the shell of two boxes that nearly touch: the surface and its points [N, 3]."""
+    cloth = grid_cloth(5, 5, 0.3, 0.3)
+    obstacles = [box((-0.1, -0.1, -0.2), (0.08, 0.11, 0.0)), box((-0.4, -0.4, -0.6), (0.4, 0.4, -0.211))]
+    points = np.concatenate([cloth.nodes, *(mesh.nodes for mesh in obstacles)])
+    points[:25] += rng.normal(size=(25, 3)) * [0.05, 0.05, 0.02]
+    return contact_surface(cloth, obstacles, all_edges=True), points

@@ -217,12 +217,12 @@ def test_meeting_has_the_derivatives_of_root_and_frame(kind, rng):
 
 @KINDS
 def test_a_grazing_pair_keeps_its_time(kind):
-    """Points that stay in one plane have no derivative of the time: weights and normal are those of a pair that does not move."""
+    """Points that stay in one plane have no derivative of the time, only of weights and normal there."""
     _, tangent, reverse = meeting_kernels(kind)
     x = np.array(
         [[0, 0, 0.0], [1, 1, 0], [0, 1, 0], [1, 0, 0]] if kind else [[0.2, 0.2, 0.0], [0, 0, 0], [1, 0, 0], [0, 1, 0]]
     )
-    inputs = np.concatenate([x.ravel(), (x + [0.1, 0.2, 0.0]).ravel()])
+    inputs = np.concatenate([x.ravel(), np.add(x, (0.1, 0.2, 0.0)).ravel()])
     for time, rate in itertools.product((0.0, 0.5), np.eye(24)):
         found, gradients = np.empty((1, 7)), np.zeros(24)
         tangent(inputs, np.array([time]), rate[None], found)

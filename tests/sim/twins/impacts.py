@@ -56,7 +56,7 @@ def impact_time(kind: int, start: Floats, end: Floats, smallest: float = 0.0) ->
     for time in real_roots(polynomial):
         at = start + time * (end - start)
         area = square(kind, at)
-        if 0 <= time <= 1 and 0 < area and smallest <= area and on_both(kind, meeting(kind, at)[0]):
+        if 0 <= time <= 1 and area > 0 and area >= smallest and on_both(kind, meeting(kind, at)[0]):
             return float(time)
     return NEVER
 

@@ -24,7 +24,7 @@ def square(kind: int, corners: Floats) -> float:
 
 
 def meeting(kind: int, corners: Floats) -> tuple[Floats, Floats]:
-    """(weights [4], unit normal [3]) such that Σ w_k x_k = h n: one place on each primitive, joined by the common normal."""
+    """(weights [4], unit normal [3]) with Σ w_k x_k = h n: one place on each primitive, joined by the normal."""
     a, b, d = spans(kind, corners)
     normal = np.cross(a, b)
     normal = normal / np.sqrt(normal @ normal)  # not the norm, which has no complex step

@@ -104,7 +104,7 @@ def nearest_pairs(
             slots[key] = (abs(height), pair, height)
 
     def look(kind: int, corners: tuple[int, ...]) -> tuple[Floats, Floats, float] | None:
-        """(weights, normal, height) of a pair that may be in contact. Beyond the thickness a pair holds slots, but without force."""
+        """(weights, normal, height) of what may touch; beyond the thickness a pair holds slots, but without force."""
         x = points[list(corners)]
         if square(kind, x) == 0 or square(kind, x) < smallest:
             return None
