@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from diffcloud.mesh import SurfaceMesh, grid_cloth
+from diffcloud.mesh import ClothMesh, SurfaceMesh, grid_cloth
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.contact.surface import Surface, contact_surface
 from diffcloud.sim.surrounding import ReferenceContact
@@ -19,6 +19,17 @@ def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Su
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
     return SurfaceMesh(np.array(low) + corners * (np.array(high) - np.array(low)), np.array(faces))
+
+
+def together(*cloths: ClothMesh) -> ClothMesh:
+    """Several cloths as one mesh, whose numbers follow each other."""
+    begin = np.cumsum([0, *(len(cloth.nodes) for cloth in cloths)])
+    return ClothMesh(
+        np.concatenate([cloth.nodes for cloth in cloths]),
+        np.concatenate([cloth.verts + 10.0 * index for index, cloth in enumerate(cloths)]),
+        np.arange(begin[-1]),
+        np.concatenate([cloth.face_verts + first for cloth, first in zip(cloths, begin[:-1], strict=True)]),
+    )
 
 
 def over_box(contact: ReferenceContact, *, proximity: bool = True, height: float = 0.012, **changes: object) -> Scenario:

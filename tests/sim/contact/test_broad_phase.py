@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from diffcloud.mesh import ClothMesh, grid_cloth
+from diffcloud.mesh import grid_cloth
 from diffcloud.sim.contact.broad_phase import candidates, corners_of
 from diffcloud.sim.contact.surface import Surface, contact_surface
-from tests.sim.contact.scenes import crumpled
+from tests.sim.contact.scenes import crumpled, together
 from tests.sim.twins import broad_phase as twin
 
 MARGIN = 0.02
@@ -42,13 +44,7 @@ def test_boxes_that_touch_exactly_are_candidates(axis, side):
     lower, upper = grid_cloth(2, 2, 1.0, 1.0), grid_cloth(2, 2, 1.0, 1.0)
     turn = np.roll(np.eye(3), axis + 1, axis=1)  # the normal along each axis
     nodes = np.concatenate([lower.nodes, np.add(upper.nodes, (0.0, 0.0, side * 0.25))]) @ turn
-    mesh = ClothMesh(
-        nodes,
-        np.concatenate([lower.verts, upper.verts + 2.0]),
-        np.arange(8),
-        np.concatenate([lower.face_verts, upper.face_verts + 4]),
-    )
-    surface = contact_surface(mesh, [])
+    surface = contact_surface(together(lower, upper), [])
     touching = compared(surface, nodes, nodes, 0.25)
     apart = compared(surface, nodes, nodes, 0.25 - 2.0**-20)
     assert touching == apart + 8 * 2 + 5 * 5 - 4  # all but opposite sides, which are one apart
@@ -58,13 +54,7 @@ def test_boxes_that_touch_exactly_are_candidates(axis, side):
 def test_many_equal_coordinates(spacing):
     """A lattice has the same lowest coordinate many times, on all axes, and points that coincide."""
     mesh = grid_cloth(4, 5, 0.75, 1.0)
-    layers = [np.add(mesh.nodes, (0.0, 0.0, spacing * layer)) for layer in range(3)]
-    whole = ClothMesh(
-        np.concatenate(layers),
-        np.concatenate([mesh.verts + 2.0 * layer for layer in range(3)]),
-        np.arange(3 * len(mesh.nodes)),
-        np.concatenate([mesh.face_verts + layer * len(mesh.nodes) for layer in range(3)]),
-    )
+    whole = together(*(replace(mesh, nodes=np.add(mesh.nodes, (0.0, 0.0, spacing * layer))) for layer in range(3)))
     for margin in (0.0, 0.125, 0.25):
         assert compared(contact_surface(whole, []), whole.nodes, whole.nodes, margin) > 100
 
