@@ -230,7 +230,7 @@ def two_strips(distance: float = 0.05) -> Fall:
     return Fall(contact_surface(mesh, []), start, candidate, np.where(upper, 1.0, 2.0))
 
 
-def folded(distance: float = 0.03) -> Fall:
+def folded(distance: float = 0.07) -> Fall:
     """A cloth folded once: its upper half falls on the lower one, and all of it on a box."""
     mesh = grid_cloth(4, 7, 0.12, 0.24)
     along = mesh.nodes[:, 1] - mesh.nodes[:, 1].min()
@@ -248,10 +248,11 @@ def folded(distance: float = 0.03) -> Fall:
 
 
 def held_fold() -> Fall:
-    """The same with two nodes of the upper half in a handle that presses them down, half of the way."""
+    """The same with two nodes of the upper half in a handle that carries them down through the lower one."""
     fall = folded()
-    fall.inverse_mass[[26, 27]] = 0.0
-    fall.candidate[[26, 27]] = fall.start[[26, 27]] + [0.0, 0.0, -0.01]
+    held = [12, 19]
+    fall.inverse_mass[held] = 0.0
+    fall.candidate[held] = fall.start[held] + [0.0, 0.0, -0.05]
     return fall
 
 
@@ -265,6 +266,17 @@ def two_corners() -> Fall:
     candidate[0] += [0.02, 0.0, -0.03]
     inverse_mass = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0])
     return Fall(contact_surface(cloth, [table], all_edges=True), start, candidate, inverse_mass)
+
+
+def between_plates(*heights: float) -> Fall:
+    """A triangle falls fast between level plates."""
+    nodes = np.array([[0.0, 0, 0], [0.3, 0.1, 0.0], [-0.1, 0.3, 0.0]])
+    cloth = ClothMesh(nodes, nodes[:, :2], np.arange(3), np.array([[0, 1, 2]]))
+    plates = [SurfaceMesh(np.array([[-5, -5, z], [5, -5, z], [0, 9, z]]), np.array([[0, 1, 2]])) for z in heights]
+    start = np.concatenate([nodes, *(plate.nodes for plate in plates)])
+    inverse_mass = np.where(np.arange(len(start)) < 3, 1.0, 0.0)
+    candidate = start - inverse_mass[:, None] * [0.0, 0.0, 0.01]
+    return Fall(contact_surface(cloth, plates, all_edges=True), start, candidate, inverse_mass)
 
 
 FALLS = {"strips": two_strips, "fold": folded, "held fold": held_fold, "two corners": two_corners}
@@ -340,17 +352,6 @@ def test_the_residue_is_left_out_of_each_correction():
         np.testing.assert_allclose(part - fall.candidate, (1 - 1e-6) * (whole - fall.candidate), atol=1e-15)
     np.testing.assert_allclose(part, whole, atol=1e-6)
     assert np.abs(part - whole).max() > 1e-9
-
-
-def between_plates(*heights: float) -> Fall:
-    """A triangle falls fast between level plates."""
-    nodes = np.array([[0.0, 0, 0], [0.3, 0.1, 0.0], [-0.1, 0.3, 0.0]])
-    cloth = ClothMesh(nodes, nodes[:, :2], np.arange(3), np.array([[0, 1, 2]]))
-    plates = [SurfaceMesh(np.array([[-5, -5, z], [5, -5, z], [0, 9, z]]), np.array([[0, 1, 2]])) for z in heights]
-    start = np.concatenate([nodes, *(plate.nodes for plate in plates)])
-    inverse_mass = np.where(np.arange(len(start)) < 3, 1.0, 0.0)
-    candidate = start - inverse_mass[:, None] * [0.0, 0.0, 0.01]
-    return Fall(contact_surface(cloth, plates, all_edges=True), start, candidate, inverse_mass)
 
 
 def test_between_plates_closer_than_the_thickness_it_stays_between():
@@ -439,6 +440,39 @@ def check_transposed(derivatives: Derivatives, rng: np.random.Generator, toleran
 
 def test_reverse_is_the_transpose_of_tangent(fall, rng):
     check_transposed(Derivatives(fall), rng, 1e-12)
+
+
+def doubled(derivatives: Derivatives) -> Derivatives:
+    """The same passes with each impact found twice, so that both share its force."""
+    record, used = derivatives.record, derivatives.record.used
+    forces = np.repeat(record.forces[: used[2]], 2, axis=0)
+    forces[:, 0] /= 2
+    met, places = np.repeat(record.met, 2, axis=0), np.repeat(record.places, 2, axis=0)
+    found = Derivatives(derivatives.fall)
+    found.record = Impacts(met, places, 2 * record.passes, forces, used * [2, 1, 2])
+    found.end = limits(found.record.used)
+    return found
+
+
+def test_redundant_impacts_have_the_derivatives_of_one(fall, rng):
+    once = Derivatives(fall)
+    twice = doubled(once)
+    check_transposed(twice, rng, 1e-12)
+    directions, adjoint = once.directions(rng, 3), rng.normal(size=fall.start.shape)
+    np.testing.assert_allclose(twice.tangent(*directions), once.tangent(*directions), atol=1e-9)
+    for found, expected in zip(twice.reverse(adjoint), once.reverse(adjoint), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_contradictory_impacts_have_the_derivatives_of_the_compromise(rng):
+    """Halfway between the plates: it follows the mean of both, but not its own candidate."""
+    derivatives = Derivatives(between_plates(-1e-4, 1e-4))
+    check_transposed(derivatives, rng, 1e-9)
+    up = np.zeros((3, len(derivatives.places), 3))
+    for row, points in enumerate((slice(0, 3), slice(3, 6), slice(6, 9))):
+        up[row, points, 2] = 1.0
+    found = derivatives.tangent(up, up, np.zeros(up.shape[:2]))
+    np.testing.assert_allclose(found[:, :3, 2], np.array([[0.0], [0.5], [0.5]]) * np.ones(3), atol=1e-6)
 
 
 def test_reverse_is_the_transpose_of_tangent_in_a_later_step(fall, rng):
