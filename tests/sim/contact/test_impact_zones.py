@@ -17,6 +17,7 @@ from tests.sim.contact.scenes import box, together
 from tests.sim.twins import impacts as twin
 
 THICKNESS = 5e-4
+CHOICES = Projection(THICKNESS, 0.0, 0.0)
 
 
 # --- one zone ----------------------------------------------------------------------------------------------------------
@@ -199,7 +200,7 @@ class Fall:
     start: np.ndarray
     candidate: np.ndarray
     inverse_mass: np.ndarray
-    choices: Projection = Projection(THICKNESS, 0.0, 0.0)
+    choices: Projection = CHOICES
 
     def resolve(self, record: Impacts | None = None) -> tuple[np.ndarray, Impacts]:
         """(places, record)"""
@@ -232,7 +233,7 @@ def two_strips(distance: float = 0.05) -> Fall:
 
 def folded(distance: float = 0.07) -> Fall:
     """A cloth folded once: its upper half falls on the lower one, and all of it on a box."""
-    mesh = grid_cloth(4, 7, 0.12, 0.24)
+    mesh = grid_cloth(7, 4, 0.24, 0.12)
     along = mesh.nodes[:, 1] - mesh.nodes[:, 1].min()
     arc = np.clip((along - 0.1) / 0.02, 0.0, np.pi)
     flat = np.minimum(along, 0.1) + 0.02 * np.sin(arc) - np.maximum(along - 0.1 - 0.02 * np.pi, 0.0)
@@ -250,7 +251,7 @@ def folded(distance: float = 0.07) -> Fall:
 def held_fold() -> Fall:
     """The same with two nodes of the upper half in a handle that carries them down through the lower one."""
     fall = folded()
-    held = [12, 19]
+    held = [21, 22]
     fall.inverse_mass[held] = 0.0
     fall.candidate[held] = fall.start[held] + [0.0, 0.0, -0.05]
     return fall
@@ -301,7 +302,7 @@ def test_passes_are_those_of_the_slow_twin(fall):
 
 
 def test_nothing_has_passed_and_what_is_fixed_stays(fall):
-    places, record = fall.resolve()
+    places, _ = fall.resolve()
     assert np.abs(places - fall.candidate).max() > 1e-3
     fixed = fall.inverse_mass == 0
     np.testing.assert_array_equal(places[fixed], fall.candidate[fixed])
@@ -379,7 +380,13 @@ def test_a_record_holds_step_after_step(fall):
     used = record.used.copy()
     places, record = fall.resolve(record)
     np.testing.assert_array_equal(places, alone)
-    for name, begin, end, count in zip(("met", "places", "passes", "forces"), used[[0, 0, 1, 2]], record.used[[0, 0, 1, 2]], own.used[[0, 0, 1, 2]], strict=True):
+    for name, begin, end, count in zip(
+        ("met", "places", "passes", "forces"),
+        used[[0, 0, 1, 2]],
+        record.used[[0, 0, 1, 2]],
+        own.used[[0, 0, 1, 2]],
+        strict=True,
+    ):
         np.testing.assert_array_equal(getattr(record, name)[begin:end], getattr(own, name)[:count])
 
 
@@ -429,9 +436,7 @@ def check_transposed(derivatives: Derivatives, rng: np.random.Generator, toleran
     directions = derivatives.directions(rng, 3)
     for adjoint in rng.normal(size=(3, *derivatives.places.shape)):
         gradients = derivatives.reverse(adjoint)
-        products = [
-            (gradient * rates).reshape(3, -1) for gradient, rates in zip(gradients, directions, strict=True)
-        ]
+        products = [(gradient * rates).reshape(3, -1) for gradient, rates in zip(gradients, directions, strict=True)]
         found = np.concatenate(products, axis=1)
         forward = derivatives.tangent(*directions) * adjoint
         scale = np.abs(found).sum(axis=1).max()
@@ -486,15 +491,19 @@ def test_a_later_step_has_the_derivatives_of_a_first(fall, rng):
     np.testing.assert_allclose(later.tangent(*directions), first.tangent(*directions), rtol=1e-9, atol=1e-12)
 
 
+def same_impacts(one: Impacts, other: Impacts) -> bool:
+    return (one.used == other.used).all() and (one.met[: one.used[0]] == other.met[: one.used[0]]).all()
+
+
 def test_tangent_is_the_central_difference(fall, rng):
-    """The step is swept: far ones see curvature, near ones rounding."""
+    """The step is swept: far ones see curvature and other impacts, near ones rounding."""
     derivatives = Derivatives(fall)
     for index in range(3):  # by each input
         rates = [direction * (k == index) for k, direction in enumerate(derivatives.directions(rng, 2))]
         found = derivatives.tangent(*rates)
         for d in range(2):
             errors = []
-            for h in (1e-5, 1e-6, 1e-7):
+            for h in (1e-6, 1e-7, 1e-8):
                 ends = [
                     replace(
                         fall,
@@ -504,8 +513,8 @@ def test_tangent_is_the_central_difference(fall, rng):
                     ).resolve()
                     for step in (h, -h)
                 ]
-                assert ends[0][1].used.tolist() == ends[1][1].used.tolist() == derivatives.record.used.tolist()
-                errors.append(np.abs((ends[0][0] - ends[1][0]) / (2 * h) - found[d]).max())
+                if all(same_impacts(record, derivatives.record) for _, record in ends):
+                    errors.append(np.abs((ends[0][0] - ends[1][0]) / (2 * h) - found[d]).max())
             assert min(errors) < 1e-6 * max(1.0, np.abs(found[d]).max())
 
 
