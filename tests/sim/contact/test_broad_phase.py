@@ -73,7 +73,7 @@ def test_corners_of_pairs():
 
 
 def test_candidates_agree_with_another_library(rng):
-    """On the cloth alone, where it has no obstacles; it enlarges each box by the margin's half, too, and rounds outwards."""
+    """On a cloth alone; it enlarges each box by the margin's half, too."""
     ipctk = pytest.importorskip("ipctk")
     mesh = grid_cloth(6, 6, 0.3, 0.3)
     surface = contact_surface(mesh, [])

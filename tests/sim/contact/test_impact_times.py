@@ -109,7 +109,7 @@ def test_first_impact_is_the_first_root_on_both(kind, rng):
 
 @KINDS
 def test_first_impact_agrees_with_dense_sampling(kind, rng):
-    """A twin without algebra: the volume changes its sign between two samples while the places are on both primitives."""
+    """Without algebra: the volume changes its sign between two samples while the places are on both primitives."""
     samples = 1001
     wrong = met = 0
     for start, end in motions(rng, 300):
@@ -147,7 +147,7 @@ def test_first_impact_agrees_with_another_library(kind, rng):
 @KINDS
 @pytest.mark.parametrize("way", ["together", "along a normal", "in the plane", "apart", "not at all"])
 def test_degenerate_motions(kind, way, rng):
-    """Primitives that cross in one plane, and go nowhere, in it, or out of it; or one passes straight through the other."""
+    """Primitives that cross in one plane and go nowhere, in it, or out of it; or one goes straight through the other."""
     x = np.array(
         [[0, 0, 0.0], [1, 1, 0], [0, 1, 0], [1, 0, 0]] if kind else [[0.2, 0.2, 0.0], [0, 0, 0], [1, 0, 0], [0, 1, 0]]
     )

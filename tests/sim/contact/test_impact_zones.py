@@ -1,4 +1,4 @@
-"""Impact zones: projection and passes against slow twins, conservation laws, derivatives, and what happens when it cannot work."""
+"""Impact zones: projection and passes against slow twins, conservation laws, derivatives, and what cannot work."""
 
 from __future__ import annotations
 
@@ -12,7 +12,16 @@ from diffcloud.mesh import ClothMesh, SurfaceMesh, grid_cloth
 from diffcloud.sim.contact.surface import Surface, contact_surface
 from diffcloud.sim.reference.dual import HARD, REGULAR, applied, gram, least_distance, solve_active, solve_dual
 from diffcloud.sim.reference.impact_derivatives import resolve_reverse, resolve_tangent
-from diffcloud.sim.reference.impact_zones import PASSES, Impacts, Projection, move, no_impacts, resolve, take_zone, zones
+from diffcloud.sim.reference.impact_zones import (
+    PASSES,
+    Impacts,
+    Projection,
+    move,
+    no_impacts,
+    resolve,
+    take_zone,
+    zones,
+)
 from tests.sim.contact.scenes import box, together
 from tests.sim.twins import impacts as twin
 
@@ -20,7 +29,7 @@ THICKNESS = 5e-4
 CHOICES = Projection(THICKNESS, 0.0, 0.0)
 
 
-# --- one zone ----------------------------------------------------------------------------------------------------------
+# --- one zone --------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -141,7 +150,8 @@ def cycles(matrix: np.ndarray, right: np.ndarray) -> bool:
 
 @pytest.mark.parametrize("size", [1.0, 1e-6, 1e-12])
 def test_where_the_active_set_goes_round_in_circles_the_certain_solver_decides(size):
-    matrix = np.array([[4.6, -1.1, -0.7, 4.2], [-1.1, 2.7, -2.0, -0.9], [-0.7, -2.0, 2.7, -1.2], [4.2, -0.9, -1.2, 4.3]])
+    rows = "4.6 -1.1 -0.7 4.2; -1.1 2.7 -2.0 -0.9; -0.7 -2.0 2.7 -1.2; 4.2 -0.9 -1.2 4.3"
+    matrix = np.array([[float(number) for number in row.split()] for row in rows.split(";")])
     target = size * np.array([-0.9, 1.5, -0.4, -1.4])
     scale = 1 / np.sqrt(np.diag(matrix))
     assert cycles(matrix * scale * scale[:, None], target * scale)
@@ -189,7 +199,7 @@ def test_zones_are_the_impacts_joined_by_points_that_move(rng):
         assert (label[chosen] == -1).all()
 
 
-# --- whole steps -------------------------------------------------------------------------------------------------------
+# --- whole steps -----------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -390,7 +400,7 @@ def test_a_record_holds_step_after_step(fall):
         np.testing.assert_array_equal(getattr(record, name)[begin:end], getattr(own, name)[:count])
 
 
-# --- derivatives -------------------------------------------------------------------------------------------------------
+# --- derivatives -----------------------------------------------------------------------------------------------------
 
 
 def limits(used: np.ndarray) -> np.ndarray:

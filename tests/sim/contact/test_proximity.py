@@ -60,7 +60,8 @@ def forces_of(corners: np.ndarray, constants: np.ndarray, motion: Motion, invers
     """[N, 3] of all pairs together."""
     found = np.zeros_like(motion.positions)
     for kind in (0, 1):
-        kernel(kind, "force")(elements(kind, corners, constants), parameters(inverse_mass), motion, Timing(DT, DT), found)
+        own = elements(kind, corners, constants)
+        kernel(kind, "force")(own, parameters(inverse_mass), motion, Timing(DT, DT), found)
     return found
 
 
@@ -68,7 +69,7 @@ def moving(positions: np.ndarray, before: np.ndarray, after: np.ndarray) -> Moti
     return Motion(positions, before, after, np.zeros_like(positions))
 
 
-# --- one pair ----------------------------------------------------------------------------------------------------------
+# --- one pair --------------------------------------------------------------------------------------------------------
 
 
 def pairs(kind: int, state: str, rng: np.random.Generator, count: int = 20) -> Iterator[twin.Pair]:
@@ -183,7 +184,7 @@ def test_repulsion_is_the_gradient_of_its_energy(kind, rng):
             violation = (THICKNESS - pair.sign * normal @ (weights @ x)).clamp(min=0)
             return pair.stiffness * violation**3 / (6 * THICKNESS)
 
-        element, known, motion, timing = given(replace(pair, after=torch.zeros(4, 3, dtype=torch.float64)), "no friction")
+        element, known, motion, timing = given(replace(pair, after=0 * pair.after), "no friction")
         force, blocks = np.zeros((4, 3)), np.empty((1, 10, 9))
         kernel(kind, "assemble")(element, known, motion, timing, 0.0, DT, force, blocks)
         close(force, -torch.autograd.functional.jacobian(energy, pair.positions), 1e-11)
@@ -236,7 +237,7 @@ def test_a_pair_at_the_thickness_exactly_has_no_force():
     assert not slopes.after.any()
 
 
-# --- which pairs -------------------------------------------------------------------------------------------------------
+# --- which pairs -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("smallest", [1e-6, 1e-4])
@@ -333,7 +334,7 @@ def test_directed_edges_of_an_obstacle():
     assert (sides >= 0).all()
 
 
-# --- all pairs of a scene ----------------------------------------------------------------------------------------------
+# --- all pairs of a scene --------------------------------------------------------------------------------------------
 
 
 def test_cloth_on_cloth_conserves_momentum(rng):
@@ -394,7 +395,8 @@ def test_pairs_add_the_twins_to_the_step_matrix(rng):
         matrices.append(dense(pattern, matrix))
         forces.append(force)
     expected, pushes = np.zeros((nodes, nodes, 3, 3)), np.zeros_like(points)
-    for (kind, *corner), (sign, count, stiffness, with_obstacle) in zip(corners.tolist(), constants.tolist(), strict=True):
+    for (kind, *corner), numbers in zip(corners.tolist(), constants.tolist(), strict=True):
+        sign, count, stiffness, with_obstacle = numbers
         tensors = (points[corner], velocities[corner], velocities[corner], known.inverse_mass[corner])
         friction = torch.tensor(MU_OBSTACLE if with_obstacle else MU_CLOTH, dtype=torch.float64)
         numbers = (sign, count, stiffness, THICKNESS, scene.time_step)

@@ -16,7 +16,7 @@ Pairs = set[tuple[int, int]]
 def candidates(
     surface: Surface, places: NDArray[np.float64], others: NDArray[np.float64], margin: float, among_fixed: bool
 ) -> tuple[Pairs, Pairs]:
-    """(points and faces, edges and edges with the smaller number first) whose boxes come within a margin of each other."""
+    """(points and faces, edges twice with the smaller number first) whose boxes come within a margin."""
 
     def box(corners: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         both = np.concatenate([places[corners], others[corners]])

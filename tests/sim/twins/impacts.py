@@ -27,9 +27,9 @@ def volume(kind: int, corners: Floats) -> float:
 
 def volume_over_time(kind: int, start: Floats, end: Floats) -> Polynomial:
     """The same while the points go straight from start to end in the time from 0 to 1."""
-    vectors = zip(spans(kind, start), spans(kind, end), strict=True)
+    vectors = zip(spans(kind, start), spans(kind, end - start), strict=True)
     (ax, ay, az), (bx, by, bz), (dx, dy, dz) = (
-        [Polynomial([first, last - first]) for first, last in zip(before, after, strict=True)] for before, after in vectors
+        [Polynomial(line) for line in zip(first, change, strict=True)] for first, change in vectors
     )
     return (ay * bz - az * by) * dx + (az * bx - ax * bz) * dy + (ax * by - ay * bx) * dz
 
@@ -88,7 +88,8 @@ def least_move(rows: Floats, target: Floats, inverse_mass: Floats) -> Floats:
     tolerance = 1e-9 * np.abs(target).max()
     for size in range(len(rows) + 1):
         for active in itertools.combinations(range(len(rows)), size):
-            y = np.linalg.pinv(scaled[list(active)], rcond=1e-10) @ target[list(active)] if size else np.zeros(len(scale))
+            chosen = list(active)
+            y = np.linalg.pinv(scaled[chosen], rcond=1e-10) @ target[chosen] if size else np.zeros(len(scale))
             if (scaled @ y >= target - tolerance).all() and y @ y < best - tolerance**2:
                 best, found = y @ y, scale * y
     return found
@@ -97,7 +98,8 @@ def least_move(rows: Floats, target: Floats, inverse_mass: Floats) -> Floats:
 def least_move_of_many(rows: Floats, target: Floats, inverse_mass: Floats) -> Floats:
     """The same by the least distance programming of Lawson and Hanson, for more rows than sets can be tried of."""
     scale = np.repeat(np.sqrt(inverse_mass), 3)
-    unit = 1 / np.maximum(np.linalg.norm(rows * scale, axis=1), 1e-300)  # neither changes the problem, but its condition
+    # units of rows and of targets change the condition of the problem, not its solution
+    unit = 1 / np.maximum(np.linalg.norm(rows * scale, axis=1), 1e-300)
     size = np.abs(target * unit).max()
     stacked = np.vstack([(rows * scale).T * unit, target * unit / size])
     wanted = np.append(np.zeros(rows.shape[1]), 1.0)
@@ -154,7 +156,8 @@ def _apart(kind: int, start: Floats, end: Floats) -> bool:
     """Whether the boxes of both paths do not touch, so that roots need not be looked for."""
     split = 2 if kind == EDGES else 1
     one, other = (np.concatenate([start[part], end[part]]) for part in (slice(split), slice(split, None)))
-    return bool((one.min(axis=0) > other.max(axis=0) + 1e-5).any() or (other.min(axis=0) > one.max(axis=0) + 1e-5).any())
+    gap = np.maximum(one.min(axis=0) - other.max(axis=0), other.min(axis=0) - one.max(axis=0))
+    return bool((gap > 1e-5).any())
 
 
 def momentum(change: NDArray[np.float64], inverse_mass: Floats) -> Floats:

@@ -11,7 +11,7 @@ EDGES = 1
 
 
 def spans(kind: int, corners: Floats) -> tuple[Floats, Floats, Floats]:
-    """Two vectors along a pair's primitives and one from the second of them to the first (or back), of corners [4, 3]."""
+    """Two vectors along a pair's primitives and one between them, of corners [4, 3]."""
     if kind == EDGES:
         return corners[1] - corners[0], corners[3] - corners[2], corners[2] - corners[0]
     return corners[2] - corners[1], corners[3] - corners[1], corners[0] - corners[1]

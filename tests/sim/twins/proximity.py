@@ -1,4 +1,4 @@
-"""Repulsion and lagged friction of one pair in torch, line by line as they are defined, and the nearest pairs by loops."""
+"""Repulsion and lagged friction of one pair in torch, line by line as defined, and the nearest pairs by loops."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Pair:
         return self.count * weights[:, None] * (repulsion + friction)
 
     def step_matrix(self) -> Tensor:
-        """[4, 4, 3, 3] count · w_a w_b (Δt² K c/τ n nᵀ + Δt γ (I - n nᵀ)): minus Δt times the derivative by velocities."""
+        """[4, 4, 3, 3] count · w_a w_b (Δt² K c/τ n nᵀ + Δt γ (I - n nᵀ)): -Δt times the derivative by velocities."""
         weights, normal, _, stiffness, gamma = self.at()
         along = torch.outer(normal, normal)
         across = torch.eye(3, dtype=torch.float64) - along
