@@ -147,7 +147,7 @@ def test_first_impact_agrees_with_another_library(kind, rng):
 @KINDS
 @pytest.mark.parametrize("way", ["together", "along a normal", "in the plane", "apart", "not at all"])
 def test_degenerate_motions(kind, way, rng):
-    """Primitives that cross in one plane and go nowhere, in it, or out of it; or one goes straight through the other."""
+    """Primitives that cross in one plane and go nowhere, in it or out of it; or one goes straight through."""
     x = np.array(
         [[0, 0, 0.0], [1, 1, 0], [0, 1, 0], [1, 0, 0]] if kind else [[0.2, 0.2, 0.0], [0, 0, 0], [1, 0, 0], [0, 1, 0]]
     )
