@@ -1,1 +1,1 @@
-"""Twins of kernels: the same equations once more, plain, slow and unbatched, to compare the kernels with."""
+"""Plain torch twins of the kernels, written like the equations: their specification."""
