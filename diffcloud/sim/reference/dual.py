@@ -150,7 +150,9 @@ def solve_active(matrix: Floats, right: Floats, active: Flags, regular: float) -
 @kernel
 def least_distance(matrix: Floats, right: Floats, regular: float) -> Flags:
     """The active set bool [m] of min ½ λᵀ A λ - rightᵀ λ over λ >= 0, by the method of Lawson and Hanson."""
-    count = len(right)
+    count, largest = len(right), 0.0
+    for i in range(count):
+        largest = max(largest, abs(right[i]))
     active, force = np.zeros(count, np.bool_), np.zeros(count)
     for _ in range(30 * count):
         best, most = -1, 0.0
@@ -158,7 +160,7 @@ def least_distance(matrix: Floats, right: Floats, regular: float) -> Flags:
             lacking = _lacking(matrix, right, force, i) - regular * force[i]
             if not active[i] and lacking > most:
                 best, most = i, lacking
-        if best < 0 or most <= regular:
+        if best < 0 or most <= regular * largest:
             break
         active[best] = True
         while True:

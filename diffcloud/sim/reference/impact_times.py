@@ -70,7 +70,7 @@ def unit_root(cubic: tuple[float, float, float, float], number: int) -> float:
     # critical points 3 c3 t² + 2 c2 t + c1 = 0 in the form without cancellation; those outside fall on 0 or 1
     root = sqrt(max(c2 * c2 - 3 * c3 * c1, 0.0))
     q = -(c2 - root) if c2 < 0 else -(c2 + root)
-    one, other = _unit(q / (3 * c3)), _unit(c1 / q)
+    one, other = _unit(q, 3 * c3), _unit(c1, q)
     low = 0.0 if number == 0 else (min(one, other) if number == 1 else max(one, other))
     high = 1.0 if number == 2 else (min(one, other) if number == 0 else max(one, other))
     at_low, at_high = _value(cubic, low), _value(cubic, high)
@@ -87,7 +87,8 @@ def unit_root(cubic: tuple[float, float, float, float], number: int) -> float:
             high = time
         if not (above and value != 0):
             low = time
-        newton = time - value / ((3 * c3 * time + 2 * c2) * time + c1)
+        slope = (3 * c3 * time + 2 * c2) * time + c1
+        newton = time - value / slope if slope != 0 else NEVER
         following = newton if low <= newton <= high else 0.5 * (low + high)
         done = abs(following - time) <= _TIME
         time = following
@@ -102,8 +103,11 @@ def _value(cubic: tuple[float, float, float, float], time: float) -> float:
 
 
 @kernel
-def _unit(time: float) -> float:
-    """Within [0, 1]; what is not a number falls on 0."""
+def _unit(part: float, whole: float) -> float:
+    """part / whole within [0, 1]; what is not a number falls on 0."""
+    if whole == 0:
+        return 1.0 if part > 0 else 0.0
+    time = part / whole
     if not time > 0:
         return 0.0
     return min(time, 1.0)

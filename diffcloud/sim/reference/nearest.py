@@ -61,7 +61,7 @@ def nearest_pairs(surface: SurfaceBox, repulsion: Repulsion, points: Floats) -> 
     constants = np.empty((count, 4))
     kept = 0
     for c in range(count):
-        wins = (first[pairs[c, 7]] == c) + (first[pairs[c, 8]] == c)
+        wins = (1 if first[pairs[c, 7]] == c else 0) + (1 if first[pairs[c, 8]] == c else 0)
         if wins == 0:
             continue
         corners[kept] = pairs[c, :5]

@@ -1,264 +1,548 @@
-"""Impact zones: selection and projection against slow twins, conservation laws, and what happens when it cannot work."""
+"""Impact zones: projection and passes against slow twins, conservation laws, derivatives, and what cannot work."""
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pytest
-import torch
-from scipy.optimize import nnls
 
-from diffcloud.errors import UnresolvedContactError
-from diffcloud.mesh import grid_cloth
-from diffcloud.sim.contact import impact_zones
-from diffcloud.sim.contact.frames import MeetingPairs
-from diffcloud.sim.contact.impact_zones import (
-    Constraints,
-    DualRows,
-    ImpactSettings,
-    dual_rows,
+from diffcloud.mesh import ClothMesh, SurfaceMesh, grid_cloth
+from diffcloud.sim.contact.surface import Surface, contact_surface
+from diffcloud.sim.reference.dual import HARD, REGULAR, applied, gram, least_distance, solve_active, solve_dual
+from diffcloud.sim.reference.impact_derivatives import resolve_reverse, resolve_tangent
+from diffcloud.sim.reference.impact_zones import (
+    PASSES,
+    Impacts,
+    Projection,
+    move,
+    no_impacts,
     resolve,
-    select_disjoint,
-    solve_dual,
+    take_zone,
+    zones,
 )
-from diffcloud.sim.contact.surface import ContactSurface
+from tests.sim.contact.scenes import box, together
+from tests.sim.twins import impacts as twin
 
 THICKNESS = 5e-4
-NO_FRICTION = (torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+CHOICES = Projection(THICKNESS, 0.0, 0.0)
 
 
-def constraints(rng: np.random.Generator, batch: int, count: int, points: int) -> Constraints:
-    """Random rows on random points, some of them twice."""
-    entry = torch.arange(batch).repeat_interleave(count)
-    nodes = torch.as_tensor(np.stack([rng.choice(points, 4, replace=False) for _ in entry]))
-    normals = torch.as_tensor(rng.normal(size=(len(entry), 3)))
-    normals /= normals.norm(dim=1, keepdim=True)
-    share = torch.as_tensor(rng.random(len(entry)))
-    weights = torch.stack([torch.ones_like(share), -share, -0.5 * (1 - share), -0.5 * (1 - share)], dim=1)
-    for start in range(0, len(entry), count):  # a constraint found twice
-        nodes[start + 1], normals[start + 1], weights[start + 1] = nodes[start], normals[start], weights[start]
-    place = torch.arange(count).repeat(batch)
-    pairs = MeetingPairs(torch.zeros_like(entry), entry, nodes, nodes[:, :2], torch.ones_like(share))
-    return Constraints(pairs, share, share, weights, normals, place)
+# --- one zone --------------------------------------------------------------------------------------------------------
 
 
-def test_selection_is_the_sequential_greedy_one(rng):
-    for _ in range(50):
-        count = 40
-        entry = torch.as_tensor(np.sort(rng.integers(0, 3, count)))
-        points = torch.as_tensor(np.stack([rng.choice(15, 4, replace=False) for _ in range(count)]))
-        movable = points < 11
-        time = torch.as_tensor(rng.random(count))
-        expected, used = [], set()
-        for index in np.argsort(np.floor(time.numpy() * 1e4), kind="stable"):
-            own = {(int(entry[index]), int(p)) for p, free in zip(points[index], movable[index], strict=True) if free}
-            if own and not own & used:
-                expected.append(int(index))
-                used |= own
-        assert select_disjoint(entry, points, movable, time, 15).tolist() == expected
+@dataclass
+class Zone:
+    """Rows on some points."""
+
+    points: np.ndarray
+    """[m, 4]"""
+    rows: np.ndarray
+    """[m, 9] weights and normal, as in `Impacts.places`."""
+    target: np.ndarray
+    """[m]"""
+    inverse_mass: np.ndarray
+    """[N]"""
+
+    def force(self, guess: float = 0.0) -> tuple[np.ndarray, float]:
+        found = np.full(len(self.target), guess)
+        regular = solve_dual(gram(self.points, self.rows, self.inverse_mass), self.target, found)
+        return found, regular
+
+    def moved(self, force: np.ndarray) -> np.ndarray:
+        """[N, 3]"""
+        found = np.zeros((len(self.inverse_mass), 3))
+        move(self.points, self.rows, force, 1.0, self.inverse_mass, np.zeros_like(found), found)
+        return found
+
+    def matrix(self) -> np.ndarray:
+        """W [m, 3 N]."""
+        listed = zip(self.points.tolist(), self.rows, strict=True)
+        return np.array([twin.Impact(0, p, r[:4], r[4:7]).row(len(self.inverse_mass)) for p, r in listed])
 
 
-def test_projection_is_the_least_distance(rng):
-    """Against Lawson & Hanson's least distance programming, entry by entry."""
-    batch, count, points = 6, 9, 14
-    found = constraints(rng, batch, count, points)
-    inverse_mass = torch.as_tensor(0.5 + rng.random((batch, points)))
-    inverse_mass[:, 0] = 0.0
-    target = torch.as_tensor(rng.normal(size=(batch, count)))
-    target[:, 1] = target[:, 0]
-    rows = dual_rows(found, inverse_mass)
-    force, _ = solve_dual(rows, target, torch.zeros_like(rows.used))
-    assert (force >= 0).all()
-    moved = rows.move(force)
-    for entry in range(batch):
-        matrix = rows.matrix[entry].flatten(1).numpy()
-        scale = np.repeat(np.sqrt(inverse_mass[entry, rows.points].numpy()), 3)
-        g, h = matrix * scale, target[entry].numpy()
-        u, _ = nnls(np.vstack([g.T, h[None]]), np.append(np.zeros(g.shape[1]), 1.0))
-        r = np.vstack([g.T, h[None]]) @ u - np.append(np.zeros(g.shape[1]), 1.0)
-        expected = (-r[:-1] / r[-1]) * scale
-        np.testing.assert_allclose(moved[entry, rows.points].numpy().ravel(), expected, atol=1e-9)
+def random_zone(rng: np.random.Generator, count: int, points: int, *, twice: bool = True) -> Zone:
+    """Random rows on random points, one of them twice."""
+    nodes = np.stack([rng.choice(points, 4, replace=False) for _ in range(count)])
+    share, normal = rng.random(count), rng.normal(size=(count, 3))
+    rows = np.zeros((count, 9))
+    rows[:, :4] = np.stack([np.ones(count), -share, -0.5 * (1 - share), -0.5 * (1 - share)], axis=1)
+    rows[:, 4:7] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    target, inverse_mass = rng.normal(size=count), 0.5 + rng.random(points)
+    if twice:
+        nodes[1], rows[1], target[1] = nodes[0], rows[0], target[0]
+    inverse_mass[0] = 0.0
+    return Zone(nodes, rows, target, inverse_mass)
+
+
+def test_rows_are_applied_as_the_matrix(rng):
+    zone = random_zone(rng, 9, 14)
+    x, matrix = rng.normal(size=(14, 3)), zone.matrix()
+    np.testing.assert_allclose(applied(zone.points, zone.rows, x), matrix @ x.ravel(), rtol=1e-13, atol=1e-13)
+    expected = matrix * np.repeat(zone.inverse_mass, 3) @ matrix.T
+    np.testing.assert_allclose(gram(zone.points, zone.rows, zone.inverse_mass), expected, rtol=1e-13, atol=1e-13)
+    force = rng.random(9)
+    expected = np.repeat(zone.inverse_mass, 3) * (matrix.T @ force)
+    np.testing.assert_allclose(zone.moved(force).ravel(), expected, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("guess", [0.0, 1.0], ids=["cold", "all rows active before"])
+@pytest.mark.parametrize("twice", [False, True])
+def test_projection_of_a_zone_is_the_quadratic_programme(rng, twice, guess):
+    """Against a search through all sets of active rows."""
+    for _ in range(12):
+        zone = random_zone(rng, 6, 14, twice=twice)
+        force, _ = zone.force(guess)
+        assert (force >= 0).all()
+        expected = twin.least_move(zone.matrix(), zone.target, zone.inverse_mass)
+        # redundant rows share their force by a regularisation of this size
+        tolerance = (100 * REGULAR if twice else 1e-12) * np.linalg.cond(zone.matrix()[1:]) ** 2
+        np.testing.assert_allclose(zone.moved(force).ravel(), expected, rtol=0, atol=max(tolerance, 1e-12))
+
+
+def test_projection_of_many_rows_is_the_least_distance(rng):
+    for _ in range(6):
+        zone = random_zone(rng, 24, 26)
+        expected = twin.least_move_of_many(zone.matrix(), zone.target, zone.inverse_mass)
+        np.testing.assert_allclose(zone.moved(zone.force()[0]).ravel(), expected, atol=1e-9)
 
 
 def test_projection_conserves_momentum(rng):
     """Σ m Δx = 0 where nothing is fixed: the weights of an impact sum to zero."""
-    found = constraints(rng, 4, 6, 20)
-    mass = torch.as_tensor(0.5 + rng.random((4, 20)))
-    rows = dual_rows(found, 1 / mass)
-    force, _ = solve_dual(rows, torch.as_tensor(rng.normal(size=(4, 6))), torch.zeros_like(rows.used))
-    momentum = (mass[..., None] * rows.move(force)).sum(1)
-    assert momentum.abs().max() < 1e-12
-    assert rows.move(force).abs().max() > 0.1
+    zone = random_zone(rng, 6, 20)
+    zone.inverse_mass[0] = 1.0
+    change = zone.moved(zone.force()[0])
+    assert np.abs(twin.momentum(change, zone.inverse_mass)).max() < 1e-12
+    assert np.abs(change).max() > 0.1
 
 
-def test_cycling_entries_take_the_certain_solver(rng, monkeypatch):
-    found = constraints(rng, 5, 12, 10)
-    rows = dual_rows(found, torch.ones(5, 10, dtype=torch.float64))
-    target = torch.as_tensor(rng.normal(size=(5, 12)))
-    target[:, 1] = target[:, 0]
-    expected = rows.move(solve_dual(rows, target, torch.zeros_like(rows.used))[0])
-    monkeypatch.setattr(impact_zones, "_EXCHANGES", 1)
-    torch.testing.assert_close(
-        rows.move(solve_dual(rows, target, torch.zeros_like(rows.used))[0]), expected, atol=1e-9, rtol=1e-9
-    )
+def unit_problem(zone: Zone) -> tuple[np.ndarray, np.ndarray]:
+    matrix = gram(zone.points, zone.rows, zone.inverse_mass)
+    scale = 1 / np.sqrt(np.diag(matrix))
+    return matrix * scale * scale[:, None], zone.target * scale
 
 
-def test_contradictory_constraints_give_a_finite_compromise(rng):
-    found = constraints(rng, 1, 3, 6)
-    normals = found.normals.clone()
-    normals[1] = -normals[0]
-    found = Constraints(found.pairs, found.time, found.sign, found.weights, normals, found.place)
-    rows = dual_rows(found, torch.ones(1, 6, dtype=torch.float64))
-    target = torch.tensor([[1.0, 1.0, -5.0]], dtype=torch.float64)
-    force, _ = solve_dual(rows, target, torch.zeros_like(rows.used))
-    assert torch.isfinite(force).all()
-    # asked to move both ways by the same amount, it stays
-    assert rows.move(force).abs().max() < 1e-6
+@pytest.mark.parametrize("size", [1.0, 1e-6, 1e-12])
+def test_the_certain_solver_finds_the_same(rng, size):
+    """Whatever the unit: corrections of light cloth are small numbers."""
+    for _ in range(10):
+        matrix, right = unit_problem(random_zone(rng, 8, 14))
+        active = least_distance(matrix, size * right, 10 * REGULAR)
+        force = solve_active(matrix, size * right, active, REGULAR)
+        assert (force >= 0).all()
+        lacking = size * right - matrix @ force
+        assert lacking.max() < 1e-9 * size
+        assert np.abs(lacking[active]).max() < 1e-9 * size
 
 
+def cycles(matrix: np.ndarray, right: np.ndarray) -> bool:
+    """Whether exchanging all wrong rows at once, of a problem with unit diagonal, does not end within ten exchanges."""
+    active = right > 0
+    for _ in range(10):
+        force = solve_active(matrix, right, active, REGULAR)
+        following = np.where(active, force > 0, right - matrix @ force > 10 * REGULAR * np.abs(right).max())
+        if (following == active).all():
+            return False
+        active = following
+    return True
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-6, 1e-12])
+def test_where_the_active_set_goes_round_in_circles_the_certain_solver_decides(size):
+    rows = "4.6 -1.1 -0.7 4.2; -1.1 2.7 -2.0 -0.9; -0.7 -2.0 2.7 -1.2; 4.2 -0.9 -1.2 4.3"
+    matrix = np.array([[float(number) for number in row.split()] for row in rows.split(";")])
+    target = size * np.array([-0.9, 1.5, -0.4, -1.4])
+    scale = 1 / np.sqrt(np.diag(matrix))
+    assert cycles(matrix * scale * scale[:, None], target * scale)
+    force = np.zeros(4)
+    assert solve_dual(matrix, target, force) == REGULAR
+    excess = matrix @ force - target
+    assert (force >= 0).all()
+    np.testing.assert_allclose(np.minimum(force, excess), 0.0, atol=1e-11 * size)  # complementary
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-6, 1e-12])
+def test_contradictory_constraints_give_a_finite_compromise(rng, size):
+    """Asked to move both ways by the same amount, it stays; what else is asked for is done."""
+    zone = random_zone(rng, 3, 12, twice=False)
+    zone.points[:] = [[1, 2, 3, 4], [1, 2, 3, 4], [5, 6, 7, 8]]
+    zone.rows[1] = zone.rows[0]
+    zone.rows[1, 4:7] *= -1
+    for wanted in (-5.0, 0.01):
+        zone = replace(zone, target=size * np.array([1.0, 1.0, wanted]))
+        force, regular = zone.force()
+        assert regular == HARD
+        assert np.isfinite(force).all()
+        moved = zone.moved(force)
+        assert np.abs(moved[:5]).max() < 1e-6 * size
+        reached = applied(zone.points, zone.rows, moved)[2]
+        assert reached == pytest.approx(size * max(wanted, 0.0), rel=1e-6, abs=1e-9 * size)
+
+
+def test_zones_are_the_impacts_joined_by_points_that_move(rng):
+    for _ in range(50):
+        met = np.column_stack([np.zeros(20, np.int64), *(rng.integers(0, 60, 20) for _ in range(4))])
+        movable = rng.random(60) < 0.7
+        label = zones(met, movable.astype(float))
+        free = [{int(i) for i in row[1:] if movable[i]} for row in met]
+        reached = np.eye(20, dtype=bool)
+        for i, j in itertools.combinations(range(20), 2):
+            reached[i, j] = reached[j, i] = bool(free[i] & free[j])
+        for _ in range(5):  # paths of 2, 4, ... 32 steps
+            reached = reached @ reached
+        for i in range(20):
+            assert (label[i] < 0) == (not free[i])
+            if label[i] >= 0:
+                np.testing.assert_array_equal(reached[i], label == label[i])
+        chosen = take_zone(label, int(np.argmax(label >= 0)))
+        assert (label[chosen] == -1).all()
+
+
+# --- whole steps -----------------------------------------------------------------------------------------------------
+
+
+@dataclass
 class Fall:
-    """Two crossing strips: the upper one falls through the lower one within the step."""
+    """Points that go straight from start to candidate within a step."""
 
-    def __init__(self) -> None:
-        cloth = grid_cloth(2, 4, 0.1, 0.3)
-        turned = cloth.nodes[:, [1, 0, 2]] * np.array([1, -1, 1]) + np.array([0.013, 0.017, 0.02])
-        from diffcloud.mesh.topology import ClothMesh
+    surface: Surface
+    start: np.ndarray
+    candidate: np.ndarray
+    inverse_mass: np.ndarray
+    choices: Projection = CHOICES
 
-        count = len(cloth.nodes)
-        mesh = ClothMesh(
-            np.concatenate([cloth.nodes, turned]),
-            np.concatenate([cloth.verts, cloth.verts + 1.0]),
-            np.concatenate([cloth.vert_node, cloth.vert_node + count]),
-            np.concatenate([cloth.face_verts, cloth.face_verts + len(cloth.verts)]),
+    def resolve(self, record: Impacts | None = None) -> tuple[np.ndarray, Impacts]:
+        """(places, record)"""
+        places = self.candidate.copy()
+        resolved, record = resolve(
+            self.surface, self.choices, self.start, places, self.inverse_mass, record or no_impacts()
         )
-        self.surface = ContactSurface.build(mesh, [], all_edges=True)
-        self.start = torch.as_tensor(mesh.nodes)[None]
-        self.upper = torch.arange(2 * count) >= count
-        self.inverse_mass = torch.where(self.upper, 1.0, 2.0)[None].double()
+        assert resolved
+        return places, record
 
-    def candidate(self, distance: float) -> torch.Tensor:
-        down = torch.tensor([0.004, -0.003, -distance], dtype=torch.float64)
-        return self.start + torch.where(self.upper[:, None], down, 0.0)
+    def passes(self, record: Impacts) -> np.ndarray:
+        """[P, 2]"""
+        return record.passes[: record.used[1]]
 
 
-def test_nothing_has_passed_and_momentum_is_kept():
-    fall = Fall()
-    candidate = fall.candidate(0.05).requires_grad_(True)
-    settings = ImpactSettings(THICKNESS)
-    found = resolve(fall.surface, settings, fall.start, candidate, fall.inverse_mass, NO_FRICTION, step=1)
-    change = (found - candidate) / fall.inverse_mass[..., None]
-    assert change.abs().max() > 1e-3
-    assert change.sum(1).abs().max() < 1e-12
+def strips() -> ClothMesh:
+    cloth = grid_cloth(2, 4, 0.1, 0.3)
+    turned = cloth.nodes[:, [1, 0, 2]] * np.array([1, -1, 1]) + np.array([0.013, 0.017, 0.02])
+    return together(cloth, replace(cloth, nodes=turned))
+
+
+def two_strips(distance: float = 0.05) -> Fall:
+    """Two crossing strips: the upper one falls through the lower one within the step."""
+    mesh = strips()
+    start = mesh.nodes + 1e-3 * np.random.default_rng(1).normal(size=mesh.nodes.shape)
+    upper = np.arange(len(start)) >= len(start) // 2
+    candidate = start + upper[:, None] * np.array([0.004, -0.003, -distance])
+    return Fall(contact_surface(mesh, []), start, candidate, np.where(upper, 1.0, 2.0))
+
+
+def folded(distance: float = 0.07) -> Fall:
+    """A cloth folded once: its upper half falls on the lower one, and all of it on a box."""
+    mesh = grid_cloth(7, 4, 0.24, 0.12)
+    along = mesh.nodes[:, 1] - mesh.nodes[:, 1].min()
+    arc = np.clip((along - 0.1) / 0.02, 0.0, np.pi)
+    flat = np.minimum(along, 0.1) + 0.02 * np.sin(arc) - np.maximum(along - 0.1 - 0.02 * np.pi, 0.0)
+    nodes = np.stack([mesh.nodes[:, 0], flat, 0.02 * (1 - np.cos(arc))], axis=1)
+    nodes += 1e-3 * np.random.default_rng(2).normal(size=nodes.shape)
+    obstacle = box((-0.031, 0.013, -0.2), (0.047, 0.2, -0.012))
+    start = np.concatenate([nodes, obstacle.nodes])
+    falls = np.where(arc > np.pi / 2, distance, 0.02)[:, None] * np.array([0.05, -0.1, -1.0])
+    candidate = start.copy()
+    candidate[: len(nodes)] += falls
+    inverse_mass = np.concatenate([1 / np.random.default_rng(3).uniform(0.5, 1.0, len(nodes)), np.zeros(8)])
+    return Fall(contact_surface(mesh, [obstacle], all_edges=True), start, candidate, inverse_mass)
+
+
+def held_fold() -> Fall:
+    """The same with two nodes of the upper half in a handle that carries them down through the lower one."""
+    fall = folded()
+    held = [21, 22]
+    fall.inverse_mass[held] = 0.0
+    fall.candidate[held] = fall.start[held] + [0.0, 0.0, -0.05]
+    return fall
+
+
+def two_corners() -> Fall:
+    """A cloth's corner falls onto a table's inner edge, and meets the faces on both sides of it at the same time."""
+    nodes = np.array([[0.0, 0, 0.01], [0.3, 0.1, 0.5], [-0.1, 0.3, 0.5]])
+    cloth = ClothMesh(nodes, nodes[:, :2], np.arange(3), np.array([[0, 1, 2]]))
+    table = SurfaceMesh(np.array([[-1, 0, 0], [1, 0, 0.0], [0, 1, 0], [0, -1, 0]]), np.array([[0, 1, 2], [0, 3, 1]]))
+    start = np.concatenate([nodes, table.nodes])
+    candidate = start.copy()
+    candidate[0] += [0.02, 0.0, -0.03]
+    inverse_mass = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0])
+    return Fall(contact_surface(cloth, [table], all_edges=True), start, candidate, inverse_mass)
+
+
+def between_plates(*heights: float) -> Fall:
+    """A triangle falls fast between level plates."""
+    nodes = np.array([[0.0, 0, 0], [0.3, 0.1, 0.0], [-0.1, 0.3, 0.0]])
+    cloth = ClothMesh(nodes, nodes[:, :2], np.arange(3), np.array([[0, 1, 2]]))
+    plates = [SurfaceMesh(np.array([[-5, -5, z], [5, -5, z], [0, 9, z]]), np.array([[0, 1, 2]])) for z in heights]
+    start = np.concatenate([nodes, *(plate.nodes for plate in plates)])
+    inverse_mass = np.where(np.arange(len(start)) < 3, 1.0, 0.0)
+    candidate = start - inverse_mass[:, None] * [0.0, 0.0, 0.01]
+    return Fall(contact_surface(cloth, plates, all_edges=True), start, candidate, inverse_mass)
+
+
+FALLS = {"strips": two_strips, "fold": folded, "held fold": held_fold, "two corners": two_corners}
+
+
+@pytest.fixture(params=FALLS)
+def fall(request) -> Fall:
+    return FALLS[request.param]()
+
+
+def test_passes_are_those_of_the_slow_twin(fall):
+    places, record = fall.resolve()
+    expected, passes = twin.resolve(fall.surface, fall.start, fall.candidate, fall.inverse_mass, THICKNESS)
+    assert fall.passes(record)[:, 1].tolist() == [len(fresh) for fresh in passes]
+    listed = [impact for fresh in passes for impact in fresh]
+    assert record.met[: len(listed)].tolist() == [[impact.kind, *impact.points] for impact in listed]
+    for row, impact in zip(record.places, listed, strict=False):
+        np.testing.assert_allclose(row[:4], impact.weights, atol=1e-8)
+        np.testing.assert_allclose(row[4:7], impact.normal, atol=1e-8)
+    np.testing.assert_allclose(places, expected, atol=1e-10)
+    assert len(listed) >= 1
+
+
+def test_nothing_has_passed_and_what_is_fixed_stays(fall):
+    places, _ = fall.resolve()
+    assert np.abs(places - fall.candidate).max() > 1e-3
+    fixed = fall.inverse_mass == 0
+    np.testing.assert_array_equal(places[fixed], fall.candidate[fixed])
     # a second resolution finds no impact any more
-    again = resolve(fall.surface, settings, fall.start, found.detach(), fall.inverse_mass, NO_FRICTION, step=1)
-    assert torch.equal(again, found.detach())
+    again, after = replace(fall, candidate=places).resolve()
+    np.testing.assert_array_equal(again, places)
+    assert after.used.tolist() == [0, 0, 0]
+
+
+def test_momentum_is_kept():
+    fall = two_strips()
+    places, _ = fall.resolve()
+    assert np.abs(twin.momentum(places - fall.candidate, fall.inverse_mass)).max() < 1e-12
 
 
 def test_no_impact_leaves_the_candidate_alone():
-    fall = Fall()
-    candidate = fall.candidate(0.01)
-    assert resolve(
-        fall.surface, ImpactSettings(THICKNESS), fall.start, candidate, fall.inverse_mass, NO_FRICTION, step=1
-    ) is (candidate)
+    fall = two_strips(0.01)
+    places, record = fall.resolve()
+    np.testing.assert_array_equal(places, fall.candidate)
+    assert record.used.tolist() == [0, 0, 0]
 
 
-def test_entries_of_a_batch_do_not_see_each_other(monkeypatch):
-    """Nor are those solved again that a pass has left alone."""
-    fall = Fall()
-    solved = []
-    original = impact_zones.solve_dual
-
-    def counted(rows: DualRows, target: torch.Tensor, guess: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        solved.append(len(target))
-        return original(rows, target, guess)
-
-    monkeypatch.setattr(impact_zones, "solve_dual", counted)
-    distances = (0.01, 0.04, 0.08)
-    candidate = torch.cat([fall.candidate(d) for d in distances])
-    settings = ImpactSettings(THICKNESS)
-    batch = resolve(
-        fall.surface,
-        settings,
-        fall.start.expand(3, -1, -1),
-        candidate,
-        fall.inverse_mass.expand(3, -1),
-        NO_FRICTION,
-        step=1,
+def test_what_a_pass_has_left_alone_is_not_solved_again():
+    """Two falls side by side are two zones; the one that needs fewer passes keeps its forces in the others."""
+    near, far = two_strips(0.04), two_strips(0.08)
+    single = [fall.resolve() for fall in (near, far)]
+    count = len(near.start)
+    shift = np.array([5.0, 0.0, 0.0])
+    both = Fall(
+        contact_surface(together(strips(), strips()), []),
+        np.concatenate([near.start, far.start + shift]),
+        np.concatenate([near.candidate, far.candidate + shift]),
+        np.tile(near.inverse_mass, 2),
     )
-    assert solved[0] == 2  # nothing meets in the first entry
-    assert solved[-1] == 1  # and one of the others takes more passes
-    for index, distance in enumerate(distances):
-        single = resolve(
-            fall.surface, settings, fall.start, fall.candidate(distance), fall.inverse_mass, NO_FRICTION, step=1
+    places, record = both.resolve()
+    for (expected, _), found in zip(single, (places[:count], places[count:] - shift), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-11)
+    rounds = [len(fall.passes(own)) for fall, (_, own) in zip((near, far), single, strict=True)]
+    assert len(both.passes(record)) == max(rounds)
+    assert min(rounds) < max(rounds)
+
+
+def test_the_residue_is_left_out_of_each_correction():
+    fall = two_strips()
+    whole, _ = fall.resolve()
+    part, record = replace(fall, choices=Projection(THICKNESS, 0.0, 1e-6)).resolve()
+    if record.used[1] == 1:
+        np.testing.assert_allclose(part - fall.candidate, (1 - 1e-6) * (whole - fall.candidate), atol=1e-15)
+    np.testing.assert_allclose(part, whole, atol=1e-6)
+    assert np.abs(part - whole).max() > 1e-9
+
+
+def test_between_plates_closer_than_the_thickness_it_stays_between():
+    """Both ask for more room than there is, and get half of it."""
+    places, record = between_plates(-1e-4, 1e-4).resolve()
+    np.testing.assert_allclose(places[:3, 2], 0.0, atol=1e-6)
+    assert record.forces[record.used[2] - 1, 1] == HARD
+
+
+def test_passes_that_do_not_end_are_reported():
+    """A cloth that starts within a plate has no side to be kept on."""
+    fall = between_plates(0.0)
+    places = fall.candidate.copy()
+    resolved, record = resolve(fall.surface, fall.choices, fall.start, places, fall.inverse_mass, no_impacts())
+    assert not resolved
+    assert record.used[1] == PASSES
+    assert np.isfinite(places).all()
+    assert set(record.met[record.used[0] - 1, 1:].tolist()) & {0, 1, 2}
+
+
+def test_a_record_holds_step_after_step(fall):
+    """Rows of a step follow those of the steps before, whatever these found."""
+    alone, own = fall.resolve()
+    _, record = two_strips().resolve()
+    used = record.used.copy()
+    places, record = fall.resolve(record)
+    np.testing.assert_array_equal(places, alone)
+    for name, begin, end, count in zip(
+        ("met", "places", "passes", "forces"),
+        used[[0, 0, 1, 2]],
+        record.used[[0, 0, 1, 2]],
+        own.used[[0, 0, 1, 2]],
+        strict=True,
+    ):
+        np.testing.assert_array_equal(getattr(record, name)[begin:end], getattr(own, name)[:count])
+
+
+# --- derivatives -----------------------------------------------------------------------------------------------------
+
+
+def limits(used: np.ndarray) -> np.ndarray:
+    """A row of `Kept.begins`."""
+    return np.array([0, *used, 0], np.int64)
+
+
+class Derivatives:
+    """Of a fall's places by start, candidate and inverse masses."""
+
+    def __init__(self, fall: Fall, record: Impacts | None = None) -> None:
+        self.fall = fall
+        self.begin = limits(np.zeros(3, np.int64) if record is None else record.used.copy())
+        self.places, self.record = fall.resolve(record)
+        self.end = limits(self.record.used)
+
+    def tangent(self, start: np.ndarray, candidate: np.ndarray, inverse_mass: np.ndarray) -> np.ndarray:
+        """[K, N, 3] of directions [K, ...]."""
+        fall, found = self.fall, candidate.copy()
+        resolve_tangent(
+            *(fall.choices, self.record, self.begin, self.end, fall.start, fall.candidate, fall.inverse_mass),
+            *(start, inverse_mass, found),
         )
-        torch.testing.assert_close(batch[index], single[0], atol=1e-11, rtol=0)
+        return found
 
-
-@pytest.mark.parametrize("friction", [False, True])
-def test_derivatives_of_a_projection(friction):
-    fall = Fall()
-    settings = ImpactSettings(THICKNESS, friction=friction)
-    coefficients = torch.full((1,), 0.3, dtype=torch.float64)
-
-    def run(start: torch.Tensor, candidate: torch.Tensor, inverse_mass: torch.Tensor, coefficient: torch.Tensor):
-        return resolve(fall.surface, settings, start, candidate, inverse_mass, (coefficient, coefficient), step=1)
-
-    generator = torch.Generator().manual_seed(1)
-    start = fall.start + 1e-3 * torch.randn(fall.start.shape, dtype=torch.float64, generator=generator)
-    inputs = [start, start + fall.candidate(0.06) - fall.start, fall.inverse_mass, coefficients]
-    inputs = [value.clone().requires_grad_(True) for value in inputs]
-    assert torch.autograd.gradcheck(run, inputs, eps=1e-7, atol=2e-5, check_forward_ad=True, fast_mode=True)
-
-
-def test_constant_normals_give_the_projection_as_derivative():
-    """P = I - M⁻¹ Wᵀ (W M⁻¹ Wᵀ)⁻¹ W: idempotent, and its rows do not move."""
-    fall = Fall()
-    settings = ImpactSettings(THICKNESS, differentiate_normals=False)
-
-    def run(candidate: torch.Tensor) -> torch.Tensor:
-        return resolve(fall.surface, settings, fall.start, candidate, fall.inverse_mass, NO_FRICTION, step=1)
-
-    candidate = fall.candidate(0.05)
-    size = candidate.numel()
-    jacobian = torch.autograd.functional.jacobian(run, candidate).reshape(size, size)
-    torch.testing.assert_close(jacobian @ jacobian, jacobian, atol=1e-9, rtol=0)
-    weighted = jacobian / fall.inverse_mass.repeat_interleave(3)[:, None]
-    torch.testing.assert_close(weighted, weighted.T, atol=1e-9, rtol=0)
-
-
-def test_friction_takes_at_most_the_coulomb_share():
-    """One node on a face: sliding is shortened by μ times the normal correction, and never reversed."""
-    from diffcloud.mesh import SurfaceMesh
-    from diffcloud.mesh.topology import ClothMesh
-
-    nodes = np.array([[0, 0, 0.01], [0.3, 0, 0.5], [0, 0.3, 0.5]])
-    cloth = ClothMesh(nodes, nodes[:, :2], np.arange(3), np.array([[0, 1, 2]]))
-    floor = SurfaceMesh(np.array([[-5, -5, 0], [5, -5, 0], [0, 9, 0.0]]), np.array([[0, 1, 2]]))
-    surface = ContactSurface.build(cloth, [floor], all_edges=True)
-    start = torch.cat([torch.as_tensor(nodes), torch.as_tensor(floor.nodes)])[None]
-    candidate = start.clone()
-    candidate[0, 0] += torch.tensor([0.02, 0.0, -0.03], dtype=torch.float64)
-    inverse_mass = torch.tensor([[1.0, 1.0, 1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
-    lift = 0.02 + THICKNESS
-    for coefficient, left in ((0.0, 0.02), (0.4, 0.02 - 0.4 * lift), (2.0, 0.0)):
-        mu = torch.full((1,), coefficient, dtype=torch.float64)
-        found = resolve(surface, ImpactSettings(THICKNESS, friction=True), start, candidate, inverse_mass, (mu, mu), step=1)
-        assert float(found[0, 0, 2]) == pytest.approx(THICKNESS, abs=1e-12)
-        assert float(found[0, 0, 0]) == pytest.approx(left, abs=1e-12)
-
-
-def test_passes_that_do_not_end_are_reported(monkeypatch):
-    monkeypatch.setattr(impact_zones, "_PASSES", 1)
-    fall = Fall()
-    candidate = torch.cat([fall.candidate(0.0), fall.candidate(0.05)])
-    with pytest.raises(UnresolvedContactError, match=r"step 7, batch entries \[1\].*points \d+ \(cloth\)") as caught:
-        resolve(
-            fall.surface,
-            ImpactSettings(THICKNESS),
-            fall.start.expand(2, -1, -1),
-            candidate,
-            fall.inverse_mass.expand(2, -1),
-            NO_FRICTION,
-            step=7,
+    def reverse(self, adjoint: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gradients of adjoint · places by the start, the candidate and the inverse masses."""
+        fall, candidate = self.fall, adjoint.copy()
+        start, inverse_mass = np.zeros_like(adjoint), np.zeros(len(adjoint))
+        resolve_reverse(
+            *(fall.choices, self.record, self.begin, self.end, fall.start, fall.candidate, fall.inverse_mass),
+            *(candidate, start, inverse_mass),
         )
-    assert caught.value.entries == [1]
-    assert "smaller time step" in str(caught.value)
+        return start, candidate, inverse_mass
+
+    def directions(self, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        shape = (count, *self.places.shape)
+        moves = rng.normal(size=shape[:2]) * (self.fall.inverse_mass > 0)
+        return rng.normal(size=shape), rng.normal(size=shape), moves
+
+
+def check_transposed(derivatives: Derivatives, rng: np.random.Generator, tolerance: float) -> None:
+    directions = derivatives.directions(rng, 3)
+    for adjoint in rng.normal(size=(3, *derivatives.places.shape)):
+        gradients = derivatives.reverse(adjoint)
+        products = [(gradient * rates).reshape(3, -1) for gradient, rates in zip(gradients, directions, strict=True)]
+        found = np.concatenate(products, axis=1)
+        forward = derivatives.tangent(*directions) * adjoint
+        scale = np.abs(found).sum(axis=1).max()
+        np.testing.assert_allclose(found.sum(axis=1), forward.sum(axis=(1, 2)), rtol=0, atol=tolerance * scale)
+
+
+def test_reverse_is_the_transpose_of_tangent(fall, rng):
+    check_transposed(Derivatives(fall), rng, 1e-12)
+
+
+def doubled(derivatives: Derivatives) -> Derivatives:
+    """The same passes with each impact found twice, so that both share its force."""
+    record, used = derivatives.record, derivatives.record.used
+    forces = np.repeat(record.forces[: used[2]], 2, axis=0)
+    forces[:, 0] /= 2
+    met, places = np.repeat(record.met, 2, axis=0), np.repeat(record.places, 2, axis=0)
+    found = Derivatives(derivatives.fall)
+    found.record = Impacts(met, places, 2 * record.passes, forces, used * [2, 1, 2])
+    found.end = limits(found.record.used)
+    return found
+
+
+def test_redundant_impacts_have_the_derivatives_of_one(fall, rng):
+    once = Derivatives(fall)
+    twice = doubled(once)
+    check_transposed(twice, rng, 1e-12)
+    directions, adjoint = once.directions(rng, 3), rng.normal(size=fall.start.shape)
+    np.testing.assert_allclose(twice.tangent(*directions), once.tangent(*directions), atol=1e-9)
+    for found, expected in zip(twice.reverse(adjoint), once.reverse(adjoint), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_contradictory_impacts_have_the_derivatives_of_the_compromise(rng):
+    """Halfway between the plates: it follows the mean of both, but not its own candidate."""
+    derivatives = Derivatives(between_plates(-1e-4, 1e-4))
+    check_transposed(derivatives, rng, 1e-9)
+    up = np.zeros((3, len(derivatives.places), 3))
+    for row, points in enumerate((slice(0, 3), slice(3, 6), slice(6, 9))):
+        up[row, points, 2] = 1.0
+    found = derivatives.tangent(up, up, np.zeros(up.shape[:2]))
+    np.testing.assert_allclose(found[:, :3, 2], np.array([[0.0], [0.5], [0.5]]) * np.ones(3), atol=1e-6)
+
+
+def test_reverse_is_the_transpose_of_tangent_in_a_later_step(fall, rng):
+    _, record = two_strips().resolve()
+    check_transposed(Derivatives(fall, record), rng, 1e-12)
+
+
+def test_a_later_step_has_the_derivatives_of_a_first(fall, rng):
+    first, later = Derivatives(fall), Derivatives(fall, two_strips().resolve()[1])
+    directions = first.directions(rng, 2)
+    np.testing.assert_allclose(later.tangent(*directions), first.tangent(*directions), rtol=1e-9, atol=1e-12)
+
+
+def same_impacts(one: Impacts, other: Impacts) -> bool:
+    return (one.used == other.used).all() and (one.met[: one.used[0]] == other.met[: one.used[0]]).all()
+
+
+def test_tangent_is_the_central_difference(fall, rng):
+    """The step is swept: far ones see curvature and other impacts, near ones rounding."""
+    derivatives = Derivatives(fall)
+    for index in range(3):  # by each input
+        rates = [direction * (k == index) for k, direction in enumerate(derivatives.directions(rng, 2))]
+        found = derivatives.tangent(*rates)
+        for d in range(2):
+            errors = []
+            for h in (1e-6, 1e-7, 1e-8):
+                ends = [
+                    replace(
+                        fall,
+                        start=fall.start + step * rates[0][d],
+                        candidate=fall.candidate + step * rates[1][d],
+                        inverse_mass=fall.inverse_mass + step * rates[2][d],
+                    ).resolve()
+                    for step in (h, -h)
+                ]
+                if all(same_impacts(record, derivatives.record) for _, record in ends):
+                    errors.append(np.abs((ends[0][0] - ends[1][0]) / (2 * h) - found[d]).max())
+            assert min(errors) < 1e-6 * max(1.0, np.abs(found[d]).max())
+
+
+def test_what_is_fixed_has_derivatives_of_its_own_motion_only(rng):
+    """A held node goes where its handle is, whatever pushes; its mass does not matter."""
+    derivatives = Derivatives(held_fold())
+    fixed = derivatives.fall.inverse_mass == 0
+    start, candidate, _ = derivatives.directions(rng, 2)
+    masses = rng.normal(size=candidate.shape[:2]) * fixed
+    found = derivatives.tangent(start, candidate, masses)
+    np.testing.assert_array_equal(found[:, fixed], candidate[:, fixed])
+    np.testing.assert_array_equal(found, derivatives.tangent(start, candidate, 0 * masses))
+    assert not derivatives.reverse(rng.normal(size=start.shape[1:]))[2][fixed].any()
+
+
+def test_translation_passes_through(fall):
+    """Everything moved alike moves the result alike."""
+    derivatives = Derivatives(fall)
+    rates = np.tile(np.eye(3)[:, None], (1, len(fall.start), 1))
+    found = derivatives.tangent(rates, rates, np.zeros(rates.shape[:2]))
+    np.testing.assert_allclose(found, rates, atol=1e-9)

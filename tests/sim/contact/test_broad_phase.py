@@ -1,0 +1,89 @@
+"""Candidate pairs against a look at all of them, with boxes that touch exactly, and against another library."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from diffcloud.mesh import grid_cloth
+from diffcloud.sim.contact.broad_phase import candidates, corners_of
+from diffcloud.sim.contact.surface import Surface, contact_surface
+from tests.sim.contact.scenes import crumpled, together
+from tests.sim.twins import broad_phase as twin
+
+MARGIN = 0.02
+
+
+def compared(surface: Surface, places: np.ndarray, others: np.ndarray, margin: float, among_fixed: bool = False) -> int:
+    """How many pairs the kernel finds; each once, and the same as the twin."""
+    point_face, edge_edge = candidates(surface, places, others, margin, int(among_fixed))
+    expected = twin.candidates(surface, places, others, margin, among_fixed)
+    for found, wanted in zip((point_face, np.sort(edge_edge, axis=1)), expected, strict=True):
+        told = [tuple(pair) for pair in found.tolist()]
+        assert len(told) == len(set(told)), "each pair once"
+        assert set(told) == wanted
+    return sum(map(len, expected))
+
+
+@pytest.mark.parametrize("among_fixed", [False, True])
+@pytest.mark.parametrize("touches_itself", [False, True])
+@pytest.mark.parametrize("movable", [(False, False), (True, False), (True, True)])
+def test_candidates_are_all_pairs_that_may_touch_once(rng, among_fixed, touches_itself, movable):
+    surface, points = crumpled(rng)
+    surface = surface._replace(movable=np.array([True, *movable]), touches_itself=touches_itself)
+    for _ in range(2):
+        assert compared(surface, points, points + 0.02 * rng.normal(size=points.shape), MARGIN, among_fixed) > 10
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_boxes_that_touch_exactly_are_candidates(axis, side):
+    """Two flat squares a quarter apart, in numbers without rounding: at this margin boxes touch, at none below."""
+    lower, upper = grid_cloth(2, 2, 1.0, 1.0), grid_cloth(2, 2, 1.0, 1.0)
+    turn = np.roll(np.eye(3), axis + 1, axis=1)  # the normal along each axis
+    nodes = np.concatenate([lower.nodes, np.add(upper.nodes, (0.0, 0.0, side * 0.25))]) @ turn
+    surface = contact_surface(together(lower, upper), [])
+    touching = compared(surface, nodes, nodes, 0.25)
+    apart = compared(surface, nodes, nodes, 0.25 - 2.0**-20)
+    assert touching == apart + 8 * 2 + 5 * 5 - 4  # all but opposite sides, which are one apart
+
+
+@pytest.mark.parametrize("spacing", [0.0, 0.125, 0.25])
+def test_many_equal_coordinates(spacing):
+    """A lattice has the same lowest coordinate many times, on all axes, and points that coincide."""
+    mesh = grid_cloth(4, 5, 0.75, 1.0)
+    whole = together(*(replace(mesh, nodes=np.add(mesh.nodes, (0.0, 0.0, spacing * layer))) for layer in range(3)))
+    for margin in (0.0, 0.125, 0.25):
+        assert compared(contact_surface(whole, []), whole.nodes, whole.nodes, margin) > 100
+
+
+def test_nothing_can_touch():
+    mesh = grid_cloth(2, 2, 1.0, 1.0)
+    surface = contact_surface(mesh, [], touches_itself=False)
+    assert compared(surface, mesh.nodes, mesh.nodes, 1.0) == 0
+    assert compared(contact_surface(mesh, []), mesh.nodes, mesh.nodes, 1.0) == 2 + 2  # opposite corners and sides
+
+
+def test_corners_of_pairs():
+    surface, _ = crumpled(np.random.default_rng(0))
+    assert corners_of(surface, 1, 3, 7) == (*surface.edges[3], *surface.edges[7])
+    assert corners_of(surface, 0, 3, 7) == (surface.points[3], *surface.faces[7])
+
+
+def test_candidates_agree_with_another_library(rng):
+    """On a cloth alone; it enlarges each box by the margin's half, too."""
+    ipctk = pytest.importorskip("ipctk")
+    mesh = grid_cloth(6, 6, 0.3, 0.3)
+    surface = contact_surface(mesh, [])
+    start = mesh.nodes + rng.normal(size=mesh.nodes.shape) * [0.05, 0.05, 0.02]
+    end = start + 0.02 * rng.normal(size=start.shape)
+    theirs = ipctk.CollisionMesh(start, surface.edges.astype(np.int32), surface.faces.astype(np.int32))
+    listed = ipctk.Candidates()
+    listed.build(theirs, np.asfortranarray(start), np.asfortranarray(end), 0.5 * MARGIN, ipctk.BruteForce())
+    point_face, edge_edge = candidates(surface, start, end, MARGIN, 0)
+    assert {tuple(pair) for pair in point_face.tolist()} == {(c.vertex_id, c.face_id) for c in listed.fv_candidates}
+    expected = {tuple(sorted((c.edge0_id, c.edge1_id))) for c in listed.ee_candidates}
+    assert {tuple(sorted(pair)) for pair in edge_edge.tolist()} == expected
+    assert len(expected) > 100
