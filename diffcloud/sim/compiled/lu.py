@@ -21,11 +21,11 @@ _GOOD = 1e-9
 """Residual, relative to the sizes of the matrix and of both sides, below which a solution counts."""
 
 
-class GeneralType(BoxType):
+class GeneralType(BoxType):  # type: ignore[misc]
     """Of `General`."""
 
 
-class General(Box):
+class General(Box):  # type: ignore[misc]
     """A matrix without symmetry, and its factors.
 
     Fields:

@@ -16,14 +16,13 @@ from diffcloud.sim.contact.surface import SurfaceBox
 
 
 @kernel
-def candidates(surface: SurfaceBox, places: Floats, others: Floats, margin: float, among_fixed: int) -> tuple[Ints, Ints]:
+def candidates(surface: SurfaceBox, places: Floats, others: Floats, margin: float) -> tuple[Ints, Ints]:
     """Pairs whose boxes come within `margin` of each other [m]: (point-face [C, 2], edge-edge [C, 2]) in no order.
 
     Pairs that share a point, that lie on one obstacle, or of which neither can move are left out.
 
     Args:
         places, others: [N, 3] positions of all points; a box holds a primitive at both (start and end of a motion).
-        among_fixed: keep the pairs of which neither can move.
 
     Returns:
         Indices into the surface's points and faces, and into its edges (twice).
@@ -31,10 +30,8 @@ def candidates(surface: SurfaceBox, places: Floats, others: Floats, margin: floa
     points = _boxes(places, others, surface.points.reshape(-1, 1), 0.5 * margin)
     faces = _boxes(places, others, surface.faces, 0.5 * margin)
     edges = _boxes(places, others, surface.edges, 0.5 * margin)
-    return (
-        _overlapping(surface, points, faces, 0, among_fixed),
-        _overlapping(surface, edges, edges, 1, among_fixed),
-    )
+    kind = np.arange(2)  # not literally 0 and 1, for which numba would compile everything twice
+    return _overlapping(surface, points, faces, kind[0]), _overlapping(surface, edges, edges, kind[1])
 
 
 @kernel
@@ -52,7 +49,7 @@ def _boxes(places: Floats, others: Floats, primitives: Ints, margin: float) -> F
 
 
 @kernel
-def _overlapping(surface: SurfaceBox, first: Floats, second: Floats, edges: int, among_fixed: int) -> Ints:
+def _overlapping(surface: SurfaceBox, first: Floats, second: Floats, edges: int) -> Ints:
     """[C, 2] of two lists of boxes: one of each pair begins within the other, along the axis on which they spread most."""
     axis = _widest(second)
     order_a, order_b = ascending(first[:, axis]), ascending(second[:, axis])
@@ -65,7 +62,7 @@ def _overlapping(surface: SurfaceBox, first: Floats, second: Floats, edges: int,
         for j in range(begin, len(b)):
             if b[j, axis] > a[i, 3 + axis]:
                 break
-            if _meet(a, i, b, j) and _eligible(surface, order_a[i], order_b[j], edges, among_fixed):
+            if _meet(a, i, b, j) and _eligible(surface, order_a[i], order_b[j], edges):
                 found = with_room(found, count, 1)
                 found[count, 0], found[count, 1] = order_a[i], order_b[j]
                 count += 1
@@ -76,7 +73,7 @@ def _overlapping(surface: SurfaceBox, first: Floats, second: Floats, edges: int,
         for i in range(begin, len(a)):
             if a[i, axis] > b[j, 3 + axis]:
                 break
-            if _meet(a, i, b, j) and _eligible(surface, order_a[i], order_b[j], edges, among_fixed):
+            if _meet(a, i, b, j) and _eligible(surface, order_a[i], order_b[j], edges):
                 found = with_room(found, count, 1)
                 found[count, 0], found[count, 1] = order_a[i], order_b[j]
                 count += 1
@@ -109,14 +106,14 @@ def _meet(a: Floats, i: int, b: Floats, j: int) -> bool:
 
 
 @kernel
-def _eligible(surface: SurfaceBox, a: int, b: int, edges: int, among_fixed: int) -> bool:
+def _eligible(surface: SurfaceBox, a: int, b: int, edges: int) -> bool:
     """Whether contact can bring two primitives together; of two edges, in one order only."""
     second = surface.edges[b, 0] if edges else surface.faces[b, 0]
     first = surface.edges[a, 0] if edges else surface.points[a]
     owner_a, owner_b = surface.owner[first], surface.owner[second]
     if owner_a == owner_b and (owner_a > 0 or not surface.touches_itself):
         return False
-    moves_a, moves_b = surface.movable[owner_a] or among_fixed > 0, surface.movable[owner_b] or among_fixed > 0
+    moves_a, moves_b = surface.movable[owner_a], surface.movable[owner_b]
     if edges:
         if not moves_a or (moves_b and a >= b):
             return False

@@ -39,11 +39,11 @@ class Planes(NamedTuple):
     """[Q] [m²]"""
 
 
-class TouchingType(BoxType):
+class TouchingType(BoxType):  # type: ignore[misc]
     """Of `Touching`."""
 
 
-class Touching(Box):
+class Touching(Box):  # type: ignore[misc]
     """The places that touch, as elements."""
 
 

@@ -59,11 +59,11 @@ class Surface(NamedTuple):
     """Whether the cloth's own parts are paired with each other."""
 
 
-class SurfaceBoxType(BoxType):
+class SurfaceBoxType(BoxType):  # type: ignore[misc]
     """Of `SurfaceBox`."""
 
 
-class SurfaceBox(Box):
+class SurfaceBox(Box):  # type: ignore[misc]
     """A surface inside kernels, with the same fields."""
 
 

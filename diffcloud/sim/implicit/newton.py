@@ -34,11 +34,11 @@ _PROBE = 1e-4
 """Part of the obstacles' way over which its effect is measured."""
 
 
-class PlaceType(BoxType):
+class PlaceType(BoxType):  # type: ignore[misc]
     """Of `Place`."""
 
 
-class Place(Box):
+class Place(Box):  # type: ignore[misc]
     """Where Newton's method is.
 
     Fields:

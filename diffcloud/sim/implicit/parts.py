@@ -14,11 +14,11 @@ from diffcloud.sim.implicit.scene import BODY, PARTS, Kept, Work
 from diffcloud.sim.implicit.step import begin_part
 
 
-class SolvedType(BoxType):
+class SolvedType(BoxType):  # type: ignore[misc]
     """Of `Solved`."""
 
 
-class Solved(Box):
+class Solved(Box):  # type: ignore[misc]
     """The end of a part.
 
     Fields:

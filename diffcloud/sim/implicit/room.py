@@ -25,11 +25,11 @@ _LEFT = 0.2
 """Part of the distance to a half-space that a step leaves."""
 
 
-class RoomType(BoxType):
+class RoomType(BoxType):  # type: ignore[misc]
     """Of `Room`."""
 
 
-class Room(Box):
+class Room(Box):  # type: ignore[misc]
     """A path, and the pairs that may touch near it.
 
     Fields:
@@ -101,7 +101,7 @@ def _list(work: Work, room: Room) -> None:
     """Find the room's pairs; what only prescribed points could resolve is left out."""
     surface, law = work.surface, work.law
     begin = room.begin
-    point_face, edge_edge = candidates(surface, begin, room.predicted, 2 * room.size + law[0, 1], 0)
+    point_face, edge_edge = candidates(surface, begin, room.predicted, 2 * room.size + law[0, 1])
     pairs = np.empty((len(point_face) + len(edge_edge), 7), np.int64)
     distances = np.empty(len(pairs))
     fixed = prescribed(work)

@@ -53,11 +53,11 @@ class Scene(NamedTuple):
     """O, of static and moving obstacles."""
 
 
-class WorkType(BoxType):
+class WorkType(BoxType):  # type: ignore[misc]
     """Of `Work`."""
 
 
-class Work(Box):
+class Work(Box):  # type: ignore[misc]
     """A scene, and the part of a step that is worked on.
 
     Fields that are no scene's:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from diffcloud.sim.compiled.sparse import pattern, slots
+from diffcloud.sim.compiled.sparse import Pattern, pattern, slots
 from diffcloud.sim.contact.surface import contact_surface
 from diffcloud.sim.linearised.scene import Scene
 from diffcloud.sim.reference.impact_zones import Projection
@@ -15,7 +17,7 @@ from diffcloud.sim.terms.planes import half_spaces
 from diffcloud.sim.terms.term import Setup
 
 
-def elements(setup: Setup):
+def elements(setup: Setup) -> tuple[Any, Pattern]:
     """(`kernels.Terms`, the pattern of the step matrix)."""
     found = [term.build(setup) for term in TERMS]
     nodes = [
@@ -48,7 +50,9 @@ def build_scene(setup: Setup, time_step: float) -> Scene:
     given = choices or ReferenceContact()
     repulsion = Repulsion(numbers.stiffness, numbers.repulsion_thickness, given.smallest, given.count_once, np.zeros(0))
     if choices is not None:
-        repulsion = repulsion._replace(held=held_slots(surface, repulsion, np.concatenate([mesh.nodes, points])))
+        all_move = surface._replace(movable=np.ones_like(surface.movable))
+        held = held_slots(all_move, repulsion, np.concatenate([mesh.nodes, points]))
+        repulsion = repulsion._replace(held=held)
     normals, offsets = half_spaces(mesh, surrounding)
     return Scene(
         terms,

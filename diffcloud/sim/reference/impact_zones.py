@@ -110,7 +110,7 @@ def resolve(
 @kernel
 def _listed(surface: SurfaceBox, start: Floats, places: Floats) -> Ints:
     """Candidate pairs [C, 7]: kind, points and primitives."""
-    point_face, edge_edge = candidates(surface, start, places, _REACH, 0)
+    point_face, edge_edge = candidates(surface, start, places, _REACH)
     found = np.empty((len(point_face) + len(edge_edge), 7), np.int64)
     for c in range(len(found)):
         edges = 1 if c >= len(point_face) else 0

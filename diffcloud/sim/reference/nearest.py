@@ -46,7 +46,7 @@ def nearest_pairs(surface: SurfaceBox, repulsion: Repulsion, points: Floats) -> 
         (kind and points [C, 5]: 0 for a point and a face, 1 for two edges; sign, count, stiffness and whether an
         obstacle takes part [C, 4]).
     """
-    pairs, found = _near(surface, repulsion, points, 0)
+    pairs, found = _near(surface, repulsion, points)
     count = len(pairs)
     shortest = repulsion.held.copy()
     first = np.full(len(shortest), -1, np.int64)
@@ -85,8 +85,8 @@ def pairs_at(surface: Surface, repulsion: Repulsion, points: Floats) -> tuple[In
 
 @kernel
 def held_slots(surface: Surface, repulsion: Repulsion, points: Floats) -> Floats:
-    """`Repulsion.held` of obstacles that do not move."""
-    pairs, found = _near(boxed(surface), repulsion, points, 1)
+    """`Repulsion.held` of obstacles that do not move; of a surface on which all owners count as movable."""
+    pairs, found = _near(boxed(surface), repulsion, points)
     held = np.full(2 * (len(surface.points) + len(surface.faces) + len(surface.edges)), np.inf)
     for c in range(len(pairs)):
         first, second = surface.owner[pairs[c, 1]], surface.owner[pairs[c, 4]]
@@ -107,9 +107,9 @@ def _comes_before(pairs: Ints, c: int, other: int) -> bool:
 
 
 @kernel
-def _near(surface: SurfaceBox, repulsion: Repulsion, points: Floats, among_fixed: int) -> tuple[Ints, Floats]:
+def _near(surface: SurfaceBox, repulsion: Repulsion, points: Floats) -> tuple[Ints, Floats]:
     """The pairs nearer than the thickness: (kind, points, primitives and slots [C, 9]; distance, sign and area [C, 3])."""
-    point_face, edge_edge = candidates(surface, points, points, repulsion.thickness, among_fixed)
+    point_face, edge_edge = candidates(surface, points, points, repulsion.thickness)
     pairs, found = np.empty((64, 9), np.int64), np.empty((64, 3))
     count = 0
     if len(point_face) + len(edge_edge) == 0:

@@ -18,7 +18,8 @@ MARGIN = 0.02
 
 def compared(surface: Surface, places: np.ndarray, others: np.ndarray, margin: float, among_fixed: bool = False) -> int:
     """How many pairs the kernel finds; each once, and the same as the twin."""
-    point_face, edge_edge = candidates(surface, places, others, margin, int(among_fixed))
+    asked = surface._replace(movable=np.ones_like(surface.movable)) if among_fixed else surface
+    point_face, edge_edge = candidates(asked, places, others, margin)
     expected = twin.candidates(surface, places, others, margin, among_fixed)
     for found, wanted in zip((point_face, np.sort(edge_edge, axis=1)), expected, strict=True):
         told = [tuple(pair) for pair in found.tolist()]
@@ -82,7 +83,7 @@ def test_candidates_agree_with_another_library(rng):
     theirs = ipctk.CollisionMesh(start, surface.edges.astype(np.int32), surface.faces.astype(np.int32))
     listed = ipctk.Candidates()
     listed.build(theirs, np.asfortranarray(start), np.asfortranarray(end), 0.5 * MARGIN, ipctk.BruteForce())
-    point_face, edge_edge = candidates(surface, start, end, MARGIN, 0)
+    point_face, edge_edge = candidates(surface, start, end, MARGIN)
     assert {tuple(pair) for pair in point_face.tolist()} == {(c.vertex_id, c.face_id) for c in listed.fv_candidates}
     expected = {tuple(sorted((c.edge0_id, c.edge1_id))) for c in listed.ee_candidates}
     assert {tuple(sorted(pair)) for pair in edge_edge.tolist()} == expected
