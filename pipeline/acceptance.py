@@ -21,6 +21,7 @@ from diffcloud.io.files import files_in, write_bytes, write_text
 from diffcloud.io.imports import release_episodes
 from diffcloud.scene.scenarios import PAPER_THRESHOLD, load_scenario
 from diffcloud.sim.simulate import rollout
+from diffcloud.sim.threads import thread_count
 from pipeline.bench import (
     CONTACT_HEAD,
     HEAD,
@@ -278,7 +279,7 @@ def _trajectories(release: Path, reference: Path) -> str:
 
 
 def _speed(timings: list[dict[str, Any]], costs: list[dict[str, Any]]) -> str:
-    note = f"Seconds, fastest of three, {torch.get_num_threads()} thread(s), all in one run (`diffcloud bench`)."
+    note = f"Milliseconds per episode, fastest of three, {thread_count()} thread(s), all in one run (`diffcloud bench`)."
     contact = (
         "The same cloth, meshed finer and finer, falls freely, or onto a sphere of 1,280 faces, 25 steps of 10 ms with "
         "gradient (`diffcloud bench --contact`). Contacts are the pairs that repel, the mean over the steps."

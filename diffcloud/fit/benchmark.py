@@ -15,9 +15,11 @@ from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import preset
 from diffcloud.sim.properties import scaled_properties
 from diffcloud.sim.reference.nearest import pairs_at
-from diffcloud.sim.simulate import rollout
+from diffcloud.sim.simulate import rollout, rollout_tangents
 from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
 from diffcloud.sim.system import System
+
+TANGENTS = 10
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,8 @@ class Timing:
     batch: int
     forward: float
     forward_backward: float
+    forward_tangents: float
+    """With ten directions of the parameters carried along."""
 
 
 def time_episode(scenario: Scenario, *, batch: int, repeats: int = 3) -> Timing:
@@ -51,13 +55,23 @@ def time_episode(scenario: Scenario, *, batch: int, repeats: int = 3) -> Timing:
             loss.backward()
         return time.perf_counter() - begin
 
+    def along() -> float:
+        values = {name: torch.linspace(0.5, 2.0, batch, dtype=torch.float64) for name in ("stretch", "mass")}
+        properties = scenario.properties(system, values)
+        tangents = properties.repeated(TANGENTS)
+        begin = time.perf_counter()
+        rollout_tangents(system, scenario.steps, properties=properties, tangents=tangents)
+        return time.perf_counter() - begin
+
     once(True)
+    along()
     return Timing(
         nodes=len(system.mesh.nodes),
         steps=scenario.steps,
         batch=batch,
         forward=min(once(False) for _ in range(repeats)),
         forward_backward=min(once(True) for _ in range(repeats)),
+        forward_tangents=min(along() for _ in range(repeats)),
     )
 
 

@@ -50,8 +50,7 @@ def build_scene(setup: Setup, time_step: float) -> Scene:
     given = choices or ReferenceContact()
     repulsion = Repulsion(numbers.stiffness, numbers.repulsion_thickness, given.smallest, given.count_once, np.zeros(0))
     if choices is not None:
-        all_move = surface._replace(movable=np.ones_like(surface.movable))
-        held = held_slots(all_move, repulsion, np.concatenate([mesh.nodes, points]))
+        held = held_slots(surface, repulsion, np.concatenate([mesh.nodes, points]))
         repulsion = repulsion._replace(held=held)
     normals, offsets = half_spaces(mesh, surrounding)
     return Scene(

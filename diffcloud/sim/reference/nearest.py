@@ -83,9 +83,14 @@ def pairs_at(surface: Surface, repulsion: Repulsion, points: Floats) -> tuple[In
     return nearest_pairs(boxed(surface), repulsion, points)
 
 
-@kernel
 def held_slots(surface: Surface, repulsion: Repulsion, points: Floats) -> Floats:
-    """`Repulsion.held` of obstacles that do not move; of a surface on which all owners count as movable."""
+    """`Repulsion.held` of obstacles that do not move."""
+    everything = surface._replace(movable=np.ones_like(surface.movable))  # else pairs of two obstacles are left out
+    return _held_slots(everything, repulsion, points)
+
+
+@kernel
+def _held_slots(surface: Surface, repulsion: Repulsion, points: Floats) -> Floats:
     pairs, found = _near(boxed(surface), repulsion, points)
     held = np.full(2 * (len(surface.points) + len(surface.faces) + len(surface.edges)), np.inf)
     for c in range(len(pairs)):
