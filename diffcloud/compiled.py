@@ -128,7 +128,7 @@ class _Announcement(event.Listener):
 
     def on_start(self, compiling: Any) -> None:
         function = compiling.data["dispatcher"].py_func
-        if not self.silent and function.__module__.startswith("diffcloud"):
+        if not self.silent and (function.__module__ or "").startswith("diffcloud"):
             self.silent = True
             _log.warning(
                 "Compiling kernels, once for this version and computer (a minute or two); kept in %s.", cache_folder()

@@ -1,4 +1,4 @@
-"""Which pairs of primitives can touch: those whose axis-aligned boxes overlap, found by sweeping along one axis.
+"""Which pairs of primitives can touch: those whose axis-aligned boxes overlap, found by a uniform grid.
 
 Both kinds of pair are four points with signed weights that sum to zero, and the vector between the closest places is
 Σ w_k x_k: a point and a face have (1, -b0, -b1, -b2), two edges (a0, a1, -b0, -b1).
@@ -6,13 +6,22 @@ Both kinds of pair are four points with signed weights that sum to zero, and the
 
 from __future__ import annotations
 
+from math import exp, floor, log
+from typing import NamedTuple
+
 import numpy as np
 
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
-from diffcloud.sim.compiled.sorting import ascending
 from diffcloud.sim.contact.surface import SurfaceBox
+
+_SMALLEST = 1e-9
+"""[m] Boxes count as at least so large when the size of cells is chosen."""
+_CELLS = 8
+"""Most cells for each box."""
+_REACH = 1.6
+"""Boxes so many times larger than a usual one are looked at one by one."""
 
 
 @kernel
@@ -50,47 +59,106 @@ def _boxes(places: Floats, others: Floats, primitives: Ints, margin: float) -> F
 
 @kernel
 def _overlapping(surface: SurfaceBox, first: Floats, second: Floats, edges: int) -> Ints:
-    """[C, 2] of two lists of boxes: one of each pair begins within the other, along the axis on which they spread most."""
-    axis = _widest(second)
-    order_a, order_b = ascending(first[:, axis]), ascending(second[:, axis])
-    a, b = first[order_a], second[order_b]
+    """[C, 2] of two lists of boxes. The second ones lie in the cells of their low corners; a box meets those in the
+    cells from which they can reach it, and the few that reach farther."""
+    cells = _cells(second)
     found = np.empty((4 * len(first) + 64, 2), np.int64)
-    count = begin = 0
-    for i in range(len(a)):
-        while begin < len(b) and b[begin, axis] < a[i, axis]:
-            begin += 1
-        for j in range(begin, len(b)):
-            if b[j, axis] > a[i, 3 + axis]:
-                break
-            if _meet(a, i, b, j) and _eligible(surface, order_a[i], order_b[j], edges):
+    begin, end = np.empty(3, np.int64), np.empty(3, np.int64)
+    count = 0
+    for i in range(len(first)):
+        for axis in range(3):
+            low = first[i, axis] - cells.reach - cells.origin[axis]
+            high = first[i, 3 + axis] - cells.origin[axis]
+            begin[axis] = min(max(floor(low / cells.size), 0.0), float(cells.shape[axis]))
+            end[axis] = min(max(floor(high / cells.size) + 1, 0.0), float(cells.shape[axis]))
+        for x in range(begin[0], end[0] if begin[2] < end[2] else begin[0]):
+            for y in range(begin[1], end[1]):
+                row = (x * cells.shape[1] + y) * cells.shape[2]
+                for p in range(cells.starts[row + begin[2]], cells.starts[row + end[2]]):  # one after the other along z
+                    j = cells.order[p]
+                    if _meet(first, i, second, j) and _eligible(surface, i, j, edges):
+                        found = with_room(found, count, 1)
+                        found[count, 0], found[count, 1] = i, j
+                        count += 1
+        for p in range(len(cells.far)):
+            j = cells.far[p]
+            if _meet(first, i, second, j) and _eligible(surface, i, j, edges):
                 found = with_room(found, count, 1)
-                found[count, 0], found[count, 1] = order_a[i], order_b[j]
-                count += 1
-    begin = 0
-    for j in range(len(b)):
-        while begin < len(a) and a[begin, axis] <= b[j, axis]:
-            begin += 1
-        for i in range(begin, len(a)):
-            if a[i, axis] > b[j, 3 + axis]:
-                break
-            if _meet(a, i, b, j) and _eligible(surface, order_a[i], order_b[j], edges):
-                found = with_room(found, count, 1)
-                found[count, 0], found[count, 1] = order_a[i], order_b[j]
+                found[count, 0], found[count, 1] = i, j
                 count += 1
     return found[:count]
 
 
+class Cells(NamedTuple):
+    """Boxes by the cell of a grid that their low corner lies in."""
+
+    origin: Floats
+    """[3] low corner of the grid [m]."""
+    size: float
+    """Of a cell [m]."""
+    reach: float
+    """Largest extent of the boxes in `order` [m]."""
+    shape: Ints
+    """[3] cells along each axis; they are numbered along z first."""
+    starts: Ints
+    """[cells + 1] of each cell in `order`."""
+    order: Ints
+    far: Ints
+    """Boxes that are larger."""
+
+
 @kernel
-def _widest(boxes: Floats) -> int:
-    """The axis along which boxes [M, 6] spread most."""
-    best, axis = -1.0, 0
-    for k in range(3):
-        low, high = np.inf, -np.inf
-        for m in range(len(boxes)):
-            low, high = min(low, boxes[m, k]), max(high, boxes[m, k])
-        if high - low > best:
-            best, axis = high - low, k
-    return axis
+def _cells(boxes: Floats) -> Cells:
+    """A grid for boxes [M, 6], with cells about as large as a usual box, or larger where that would be too many."""
+    usual = 0.0
+    for m in range(len(boxes)):
+        usual += log(max(_extent(boxes, m), _SMALLEST))
+    reach = _REACH * exp(usual / max(len(boxes), 1))
+    small = 0
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for m in range(len(boxes)):
+        if _extent(boxes, m) <= reach:
+            small += 1
+            for axis in range(3):
+                low[axis], high[axis] = min(low[axis], boxes[m, axis]), max(high[axis], boxes[m, axis])
+    size, shape = reach / _REACH, np.ones(3, np.int64)
+    while small > 0:
+        total = 1.0
+        for axis in range(3):
+            total *= floor((high[axis] - low[axis]) / size) + 1
+        if total <= _CELLS * small:
+            for axis in range(3):
+                shape[axis] = floor((high[axis] - low[axis]) / size) + 1
+            break
+        size *= 1.5
+    starts = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)
+    place, order, far = np.empty(len(boxes), np.int64), np.empty(small, np.int64), np.empty(len(boxes) - small, np.int64)
+    others = 0
+    for m in range(len(boxes)):
+        if _extent(boxes, m) <= reach:
+            cell = 0
+            for axis in range(3):
+                cell = cell * shape[axis] + floor((boxes[m, axis] - low[axis]) / size)
+            place[m] = cell
+            starts[cell] += 1
+        else:
+            place[m] = -1
+            far[others] = m
+            others += 1
+    total_before = 0
+    for cell in range(len(starts)):
+        total_before += starts[cell]
+        starts[cell] = total_before  # the end of each cell; filling from the back makes it the start
+    for m in range(len(boxes) - 1, -1, -1):
+        if place[m] >= 0:
+            starts[place[m]] -= 1
+            order[starts[place[m]]] = m
+    return Cells(low, size, reach, shape, starts, order, far)
+
+
+@kernel
+def _extent(boxes: Floats, m: int) -> float:
+    return max(boxes[m, 3] - boxes[m, 0], boxes[m, 4] - boxes[m, 1], boxes[m, 5] - boxes[m, 2])
 
 
 @kernel

@@ -8,7 +8,7 @@ stay; those that share points that can move are a zone, and `dual` solves each.
 
 from __future__ import annotations
 
-from math import floor
+from math import floor, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -23,9 +23,9 @@ from diffcloud.sim.reference.dual import applied, gram, solve_dual
 from diffcloud.sim.reference.impact_times import NEVER, first_impact
 
 PASSES = 100
-_REACH = 0.01
-"""[m] Candidate pairs are listed this far around the boxes that their points sweep, and again once a point leaves its
-box by almost half of that."""
+_REACH = 0.2
+"""Candidate pairs are listed so many typical edges of the cloth around the boxes that their points sweep, and again once
+a point leaves its box by almost half of that."""
 _TIME_TIE = 1e-4
 """Impacts in one interval of this length (of the step) count as simultaneous; then the order is that of the primitives."""
 _TOUCH = 1e-5
@@ -80,7 +80,8 @@ def resolve(
     Returns:
         (whether 100 passes sufficed, the record with the passes of this step)
     """
-    pairs = _listed(surface, start, places)
+    reach = _REACH * sqrt(surface.typical_face_area[0])
+    pairs = _listed(surface, start, places, reach)
     if len(pairs) == 0:
         return True, record
     candidate, listed_at, before = places.copy(), places.copy(), places.copy()
@@ -100,17 +101,17 @@ def resolve(
                 before[i, axis] = x
                 low = min(start[i, axis], listed_at[i, axis])
                 high = max(start[i, axis], listed_at[i, axis])
-                stray = stray or x < low - 0.4 * _REACH or x > high + 0.4 * _REACH
+                stray = stray or x < low - 0.4 * reach or x > high + 0.4 * reach
         if stray:
-            pairs = _listed(surface, start, places)
+            pairs = _listed(surface, start, places, reach)
             listed_at = places.copy()
     return False, record
 
 
 @kernel
-def _listed(surface: SurfaceBox, start: Floats, places: Floats) -> Ints:
+def _listed(surface: SurfaceBox, start: Floats, places: Floats, reach: float) -> Ints:
     """Candidate pairs [C, 7]: kind, points and primitives."""
-    point_face, edge_edge = candidates(surface, start, places, _REACH)
+    point_face, edge_edge = candidates(surface, start, places, reach)
     found = np.empty((len(point_face) + len(edge_edge), 7), np.int64)
     for c in range(len(found)):
         edges = 1 if c >= len(point_face) else 0
