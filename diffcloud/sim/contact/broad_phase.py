@@ -1,4 +1,5 @@
-"""Which pairs of primitives can touch: those whose axis-aligned boxes overlap, found by a uniform grid.
+"""Which pairs of primitives can touch: those whose axis-aligned boxes overlap, found by sweeping along one
+axis, or by a grid where there are many.
 
 Both kinds of pair are four points with signed weights that sum to zero, and the vector between the closest places is
 Σ w_k x_k: a point and a face have (1, -b0, -b1, -b2), two edges (a0, a1, -b0, -b1).
@@ -14,8 +15,11 @@ import numpy as np
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
+from diffcloud.sim.compiled.sorting import ascending
 from diffcloud.sim.contact.surface import SurfaceBox
 
+_FEW = 300
+"""Of fewer boxes than these sweeping is the quicker way."""
 _SMALLEST = 1e-9
 """[m] Boxes count as at least so large when the size of cells is chosen."""
 _CELLS = 8
@@ -59,8 +63,61 @@ def _boxes(places: Floats, others: Floats, primitives: Ints, margin: float) -> F
 
 @kernel
 def _overlapping(surface: SurfaceBox, first: Floats, second: Floats, edges: int) -> Ints:
-    """[C, 2] of two lists of boxes. The second ones lie in the cells of their low corners; a box meets those in the
-    cells from which they can reach it, and the few that reach farther."""
+    """[C, 2] of two lists of boxes: those that overlap."""
+    if len(second) < _FEW:
+        return _swept(surface, first, second, edges)
+    return _in_cells(surface, first, second, edges)
+
+
+@kernel
+def _swept(surface: SurfaceBox, first: Floats, second: Floats, edges: int) -> Ints:
+    """[C, 2] by sweeping along the axis on which boxes spread most: one of each pair begins within the other."""
+    axis = _widest(second)
+    order_a, order_b = ascending(first[:, axis]), ascending(second[:, axis])
+    a, b = first[order_a], second[order_b]
+    found = np.empty((4 * len(first) + 64, 2), np.int64)
+    count = begin = 0
+    for i in range(len(a)):
+        while begin < len(b) and b[begin, axis] < a[i, axis]:
+            begin += 1
+        for j in range(begin, len(b)):
+            if b[j, axis] > a[i, 3 + axis]:
+                break
+            if _meet(a, i, b, j) and _eligible(surface, order_a[i], order_b[j], edges):
+                found = with_room(found, count, 1)
+                found[count, 0], found[count, 1] = order_a[i], order_b[j]
+                count += 1
+    begin = 0
+    for j in range(len(b)):
+        while begin < len(a) and a[begin, axis] <= b[j, axis]:
+            begin += 1
+        for i in range(begin, len(a)):
+            if a[i, axis] > b[j, 3 + axis]:
+                break
+            if _meet(a, i, b, j) and _eligible(surface, order_a[i], order_b[j], edges):
+                found = with_room(found, count, 1)
+                found[count, 0], found[count, 1] = order_a[i], order_b[j]
+                count += 1
+    return found[:count]
+
+
+@kernel
+def _widest(boxes: Floats) -> int:
+    """The axis along which boxes [M, 6] spread most."""
+    best, axis = -1.0, 0
+    for k in range(3):
+        low, high = np.inf, -np.inf
+        for m in range(len(boxes)):
+            low, high = min(low, boxes[m, k]), max(high, boxes[m, k])
+        if high - low > best:
+            best, axis = high - low, k
+    return axis
+
+
+@kernel
+def _in_cells(surface: SurfaceBox, first: Floats, second: Floats, edges: int) -> Ints:
+    """[C, 2] by a grid: the second boxes lie in the cells of their low corners; a box meets those in the cells from
+    which they can reach it, and the few that reach farther."""
     cells = _cells(second)
     found = np.empty((4 * len(first) + 64, 2), np.int64)
     begin, end = np.empty(3, np.int64), np.empty(3, np.int64)
