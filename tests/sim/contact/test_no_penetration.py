@@ -42,7 +42,7 @@ TABLE = rectangle_surface([0, 0], [1, 1], 0.0)
 def assert_no_penetration(scenario: Scenario, parameters: Sequence[tuple[float, float]] = ((1.0, 1.0),)) -> np.ndarray:
     """Simulate (stretch, mass) pairs in one batch and search every step of each; gives positions [B, S + 1, V, 3]."""
     system, _ = scenario.scene.build()
-    stretch, mass = (torch.tensor(values, dtype=system.dtype) for values in zip(*parameters, strict=True))
+    stretch, mass = (torch.tensor(values, dtype=torch.float64) for values in zip(*parameters, strict=True))
     with torch.no_grad():
         run = rollout(system, scenario.steps, properties=scenario.properties(system, {"stretch": stretch, "mass": mass}))
     positions = run.positions.numpy()
