@@ -132,8 +132,8 @@ class SimulateConfig(Section):
     """Those that the pipeline makes sets of."""
     parameters: Annotated[list[str], Field(min_length=1)] = ["stretch", "mass"]
     draws: Literal["uniform", "sobol", "logarithmic", "modes"] = "uniform"
-    """Over the bounds: `uniform`, `sobol`, or `logarithmic` (uniform in the logarithms); or `modes`: the published code's
-    mixture of soft, medium and stiff cloths."""
+    """Over the bounds: `uniform`, `sobol`, or `logarithmic` (uniform in the logarithms where the lower bound is positive);
+    or `modes`: the published code's mixture of soft, medium and stiff cloths."""
     train: Annotated[int, Field(ge=0)] = 1500
     test: Annotated[int, Field(ge=0)] = 375
     seed: Annotated[int, Field(ge=0)] = 0

@@ -102,15 +102,13 @@ class ParameterBox:
 
     def logarithmic(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """[count, k] uniform in the logarithms: as many from 0.1 to 0.2 as from 5 to 10, which suits regressors that are
-        measured by relative errors. A longer draw begins with a shorter one.
-
-        Raises:
-            ConfigError: a bound that is not positive.
+        measured by relative errors. A parameter whose bounds begin at zero is drawn uniformly, as fits do with their
+        starts. A longer draw begins with a shorter one.
         """
         low, high = self.bounds.T
-        if (low <= 0).any():
-            raise ConfigError(f"Logarithmic draws need positive bounds, got {self.bounds.tolist()}; draw uniformly.")
-        drawn = np.exp(rng.uniform(np.log(low), np.log(high), (count, len(self.names))))
+        fraction = rng.random((count, len(self.names)))
+        safe = np.where(low > 0, low, 1.0)
+        drawn = np.where(low > 0, safe * (high / safe) ** fraction, low + (high - low) * fraction)
         return np.clip(drawn, low, high)  # which rounding may have left
 
     def mixture(self, modes: Sequence[Mode], rng: np.random.Generator, count: int) -> NDArray[np.float64]:

@@ -37,10 +37,10 @@ def test_logarithmic_draws_fill_every_factor_alike():
     assert np.bincount(halves) == pytest.approx([256] * 4, abs=60)
 
 
-def test_logarithmic_draws_need_positive_bounds():
-    box = ParameterBox.build(["mass"], {"mass": (0.0, 3.0)})
-    with pytest.raises(ConfigError, match="positive bounds"):
-        draws("logarithmic", box=box).first("train", 3)
+def test_logarithmic_draws_are_uniform_where_the_bounds_begin_at_zero():
+    box = ParameterBox.build(["mass", "damping"], {"mass": (0.1, 10.0), "damping": (0.0, 3.0)})
+    halves = (draws("logarithmic", box=box).first("train", 1024) > [1.0, 1.5]) @ [1, 2]
+    assert np.bincount(halves) == pytest.approx([256] * 4, abs=60)
 
 
 @pytest.mark.parametrize("scenario", MODES)
