@@ -50,7 +50,7 @@ def _compiled() -> dict[str, Any]:
 
 
 def _compile() -> None:
-    from diffcloud.sim.compiled.warm import compile_all
+    from diffcloud.compiled import compile_all
     from diffcloud.sim.threads import cores
 
     work = [

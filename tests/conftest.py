@@ -19,7 +19,7 @@ if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(1)  # as the commands do: beside another busy process spinning threads cost tenfold
 
 # a shell without job control starts background jobs deaf to Ctrl-C, and nohup deafens them to a closed terminal; processes
-# inherit that, and tests send both
+# inherit that, and tests send all three
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 for number in (signal.SIGHUP, signal.SIGQUIT):

@@ -18,7 +18,7 @@ from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import Rollout, rollout
 
 _CHUNK = 20
-"""Parameter sets simulated together: about where a batch of 49-node cloths leaves a core's cache."""
+"""Parameter sets whose motions, derivatives and sampled clouds are in memory at the same time."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Objective:
         """
         batch = len(next(iter(parameters.values()))) if parameters else 1
         losses = []
-        for begin in range(0, batch, _CHUNK):  # chunks that fit the cache; nothing inside loops over the batch
+        for begin in range(0, batch, _CHUNK):  # nothing inside loops over the batch
             part = {name: value[begin : begin + _CHUNK] for name, value in parameters.items()}
             shift = {name: value[begin : begin + _CHUNK] for name, value in (offset or {}).items()}
             try:

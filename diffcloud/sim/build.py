@@ -67,4 +67,4 @@ def build_system(
             )
         },
     )
-    return System(Setup(mesh, material, surrounding, handles, integrator, shaped), time_step, properties, bodies)
+    return System(Setup(mesh, material, surrounding, handles, bodies, integrator, shaped), time_step, properties)

@@ -187,7 +187,7 @@ class Batch:
     def _read(self, properties: Sequence[Floats]) -> Parameters:
         """Of one entry, in the order of `_PROPERTIES`."""
         fields = dict(zip(_PROPERTIES, map(np.atleast_1d, properties), strict=True))
-        inverse = np.zeros(self.system.point_count)
+        inverse = np.zeros(self.system.scene.surface.point_count)
         inverse[: len(fields["node_mass"])] = 1 / fields["node_mass"]
         handles = len(self.held.node)
         return Parameters(**fields, inverse_mass=inverse, hold=np.zeros(handles), target=np.zeros((handles, 3)))
@@ -197,7 +197,7 @@ class Batch:
         flat = (np.ascontiguousarray(one.reshape(len(one), -1)) for one in properties)
         fields = dict(zip(_PROPERTIES, flat, strict=True))
         directions, nodes = fields["node_mass"].shape
-        inverse = np.zeros((directions, self.system.point_count))
+        inverse = np.zeros((directions, self.system.scene.surface.point_count))
         inverse[:, :nodes] = -fields["node_mass"] / parameters.node_mass**2
         hold = np.zeros((directions, len(self.held.node)))
         return Parameters(**fields, inverse_mass=inverse, hold=hold, target=np.zeros((*hold.shape, 3)))

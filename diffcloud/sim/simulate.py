@@ -89,8 +89,7 @@ def rollout(
     state = init(system, properties.batch) if state is None else state
     count = max(properties.batch, len(state.positions), 0 if track is None else len(track))
     batch = Batch(system, steps, tracked=track is not None, progress=progress)
-    start = _start(system, state)
-    given = [*start, torch.zeros(1, steps, 3, dtype=torch.float64) if track is None else track, *properties.tensors()]
+    given = _inputs(system, steps, properties, state, track)
     positions, velocities, poses = _Episodes.apply(batch, *(_expanded(tensor, count) for tensor in given))
     diverged = batch.diverged()
     if diverged and not drop_diverged:
@@ -129,8 +128,7 @@ def rollout_tangents(
     directions = tangents.batch // count
     state = init(system, count) if state is None else state
     batch = Batch(system, steps, tracked=track is not None)
-    start = _start(system, state)
-    given = [*start, torch.zeros(1, steps, 3, dtype=torch.float64) if track is None else track, *properties.tensors()]
+    given = _inputs(system, steps, properties, state, track)
     moves: list[Tensor | None] = [None, None, None, track_tangents, *tangents.tensors()]
     if state_tangents is not None:
         moves[:3] = _packed(state_tangents)
@@ -164,14 +162,18 @@ class _Episodes(torch.autograd.Function):
         return (None, *found)
 
 
-def _start(system: System, state: State) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions and velocities [B, V, 3] and poses of the bodies [B or 1, N, 18]."""
+def _inputs(system: System, steps: int, properties: Properties, state: State, track: Tensor | None) -> list[Tensor]:
+    """What `Batch.simulate` takes, each for the batch or for all of it."""
     positions, velocities, poses = _packed(state)
-    return positions, velocities, torch.from_numpy(system.bodies.start)[None] if poses is None else poses
+    if poses is None:
+        poses = torch.from_numpy(system.bodies.start)[None]
+    if track is None:
+        track = torch.zeros(1, steps, 3, dtype=torch.float64)
+    return [positions, velocities, poses, track, *properties.tensors()]
 
 
 def _packed(state: State) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The same with None for bodies that are not given."""
+    """Positions and velocities [B, V, 3] and poses of the bodies [B, N, 18]; None: not given."""
     parts = None if state.bodies is None else [part.flatten(2) for part in state.bodies.tensors()]
     return state.positions, state.velocities, None if parts is None else torch.cat(parts, dim=2)
 

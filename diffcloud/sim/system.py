@@ -25,7 +25,10 @@ class System:
     """[s]"""
     properties: Properties
     """Of the basis material, batch 1."""
-    bodies: Bodies
+
+    @property
+    def bodies(self) -> Bodies:
+        return self.setup.bodies
 
     @property
     def mesh(self) -> ClothMesh:
@@ -40,16 +43,6 @@ class System:
         """Meshes to draw: static, moving, and rigid bodies."""
         around = self.setup.surrounding
         return (*around.obstacles, *(moving.mesh for moving in around.moving), *(body.mesh for body in around.bodies))
-
-    @cached_property
-    def point_count(self) -> int:
-        """N, all points that kernels know: nodes of the cloth, then points of obstacles and bodies that can touch it."""
-        around = self.setup.surrounding
-        static = [o for o in around.obstacles if o.plane() is None or self.setup.integrator == "linearised"]
-        meshes = [*static, *(moving.mesh for moving in around.moving), *(body.mesh for body in around.bodies)]
-        if self.setup.integrator == "linearised" and around.reference_contact is None:
-            meshes = []
-        return len(self.mesh.nodes) + sum(len(mesh.nodes) for mesh in meshes)
 
     @property
     def moving_points(self) -> int:

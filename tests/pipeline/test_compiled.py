@@ -12,8 +12,8 @@ import time
 import pytest
 
 from diffcloud import compiled
+from diffcloud.compiled import compile_all
 from diffcloud.errors import DiffCloudError
-from diffcloud.sim.compiled.warm import compile_all
 from tests.pipeline.invoke import DIFFCLOUD, ROOT
 
 DAY = 86400

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from diffcloud.sim.compiled.derivatives import directional, gradient
 from diffcloud.sim.compiled.source import Code
-from diffcloud.sim.compiled.trace import Graph, Scalar, directional, gradient
+from diffcloud.sim.compiled.trace import Graph, Scalar
 
 
 @dataclass(frozen=True, eq=False)

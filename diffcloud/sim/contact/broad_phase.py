@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 
 from diffcloud.compiled import kernel
-from diffcloud.sim.compiled.data import Floats, Ints
+from diffcloud.sim.compiled.data import Flags, Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.compiled.sorting import ascending
 from diffcloud.sim.contact.surface import SurfaceBox
 
-_FEW = 300
+_FEW = 600
 """Of fewer boxes than these sweeping is the quicker way."""
 _SMALLEST = 1e-9
 """[m] Boxes count as at least so large when the size of cells is chosen."""
@@ -38,13 +38,30 @@ def candidates(surface: SurfaceBox, places: Floats, others: Floats, margin: floa
         places, others: [N, 3] positions of all points; a box holds a primitive at both (start and end of a motion).
 
     Returns:
-        Indices into the surface's points and faces, and into its edges (twice).
+        Indices into the surface's points and faces, and into its edges (twice): first one that can move.
     """
     points = _boxes(places, others, surface.points.reshape(-1, 1), 0.5 * margin)
     faces = _boxes(places, others, surface.faces, 0.5 * margin)
     edges = _boxes(places, others, surface.edges, 0.5 * margin)
+    points_move, faces_move = _moving(surface, surface.points), _moving(surface, surface.faces[:, 0])
+    edges_move = _moving(surface, surface.edges[:, 0])
     kind = np.arange(2)  # not literally 0 and 1, for which numba would compile everything twice
-    return _overlapping(surface, points, faces, kind[0]), _overlapping(surface, edges, edges, kind[1])
+    if len(faces) < _FEW:
+        point_face = _swept_between(surface, points, faces, points_move, faces_move, kind[0])
+    else:
+        point_face = _in_cells(surface, points, faces, points_move, faces_move, kind[0])
+    if len(edges) < _FEW:
+        return point_face, _swept_among(surface, edges, edges_move, kind[1])
+    return point_face, _in_cells(surface, edges, edges, edges_move, edges_move, kind[1])
+
+
+@kernel
+def _moving(surface: SurfaceBox, points: Ints) -> Flags:
+    """Whether contact can move the owner of each point."""
+    found = np.empty(len(points), np.bool_)
+    for k in range(len(points)):
+        found[k] = surface.movable[surface.owner[points[k]]]
+    return found
 
 
 @kernel
@@ -62,19 +79,13 @@ def _boxes(places: Floats, others: Floats, primitives: Ints, margin: float) -> F
 
 
 @kernel
-def _overlapping(surface: SurfaceBox, first: Floats, second: Floats, edges: int) -> Ints:
-    """[C, 2] of two lists of boxes: those that overlap."""
-    if len(second) < _FEW:
-        return _swept(surface, first, second, edges)
-    return _in_cells(surface, first, second, edges)
-
-
-@kernel
-def _swept(surface: SurfaceBox, first: Floats, second: Floats, edges: int) -> Ints:
+def _swept_between(
+    surface: SurfaceBox, first: Floats, second: Floats, first_moves: Flags, second_moves: Flags, edges: int
+) -> Ints:
     """[C, 2] by sweeping along the axis on which boxes spread most: one of each pair begins within the other."""
     axis = _widest(second)
     order_a, order_b = ascending(first[:, axis]), ascending(second[:, axis])
-    a, b = first[order_a], second[order_b]
+    a, b, a_moves, b_moves = first[order_a], second[order_b], first_moves[order_a], second_moves[order_b]
     found = np.empty((4 * len(first) + 64, 2), np.int64)
     count = begin = 0
     for i in range(len(a)):
@@ -83,10 +94,8 @@ def _swept(surface: SurfaceBox, first: Floats, second: Floats, edges: int) -> In
         for j in range(begin, len(b)):
             if b[j, axis] > a[i, 3 + axis]:
                 break
-            if _meet(a, i, b, j) and _eligible(surface, order_a[i], order_b[j], edges):
-                found = with_room(found, count, 1)
-                found[count, 0], found[count, 1] = order_a[i], order_b[j]
-                count += 1
+            if (a_moves[i] | b_moves[j]) & _meet(a, i, b, j):
+                found, count = _noted(surface, found, count, order_a[i], order_b[j], edges)
     begin = 0
     for j in range(len(b)):
         while begin < len(a) and a[begin, axis] <= b[j, axis]:
@@ -94,10 +103,25 @@ def _swept(surface: SurfaceBox, first: Floats, second: Floats, edges: int) -> In
         for i in range(begin, len(a)):
             if a[i, axis] > b[j, 3 + axis]:
                 break
-            if _meet(a, i, b, j) and _eligible(surface, order_a[i], order_b[j], edges):
-                found = with_room(found, count, 1)
-                found[count, 0], found[count, 1] = order_a[i], order_b[j]
-                count += 1
+            if (a_moves[i] | b_moves[j]) & _meet(a, i, b, j):
+                found, count = _noted(surface, found, count, order_a[i], order_b[j], edges)
+    return found[:count]
+
+
+@kernel
+def _swept_among(surface: SurfaceBox, boxes: Floats, moves: Flags, edges: int) -> Ints:
+    """[C, 2] of one list of boxes in the same way."""
+    axis = _widest(boxes)
+    order = ascending(boxes[:, axis])
+    a, a_moves = boxes[order], moves[order]
+    found = np.empty((4 * len(boxes) + 64, 2), np.int64)
+    count = 0
+    for i in range(len(a)):
+        for j in range(i + 1, len(a)):
+            if a[j, axis] > a[i, 3 + axis]:
+                break
+            if (a_moves[i] | a_moves[j]) & _meet(a, i, a, j):
+                found, count = _noted(surface, found, count, order[i], order[j], edges)
     return found[:count]
 
 
@@ -115,7 +139,9 @@ def _widest(boxes: Floats) -> int:
 
 
 @kernel
-def _in_cells(surface: SurfaceBox, first: Floats, second: Floats, edges: int) -> Ints:
+def _in_cells(
+    surface: SurfaceBox, first: Floats, second: Floats, first_moves: Flags, second_moves: Flags, edges: int
+) -> Ints:
     """[C, 2] by a grid: the second boxes lie in the cells of their low corners; a box meets those in the cells from
     which they can reach it, and the few that reach farther."""
     cells = _cells(second)
@@ -133,16 +159,12 @@ def _in_cells(surface: SurfaceBox, first: Floats, second: Floats, edges: int) ->
                 row = (x * cells.shape[1] + y) * cells.shape[2]
                 for p in range(cells.starts[row + begin[2]], cells.starts[row + end[2]]):  # one after the other along z
                     j = cells.order[p]
-                    if _meet(first, i, second, j) and _eligible(surface, i, j, edges):
-                        found = with_room(found, count, 1)
-                        found[count, 0], found[count, 1] = i, j
-                        count += 1
+                    if (edges == 0 or i < j) and (first_moves[i] | second_moves[j]) & _meet(first, i, second, j):
+                        found, count = _noted(surface, found, count, i, j, edges)
         for p in range(len(cells.far)):
             j = cells.far[p]
-            if _meet(first, i, second, j) and _eligible(surface, i, j, edges):
-                found = with_room(found, count, 1)
-                found[count, 0], found[count, 1] = i, j
-                count += 1
+            if (edges == 0 or i < j) and (first_moves[i] | second_moves[j]) & _meet(first, i, second, j):
+                found, count = _noted(surface, found, count, i, j, edges)
     return found[:count]
 
 
@@ -220,36 +242,37 @@ def _extent(boxes: Floats, m: int) -> float:
 
 @kernel
 def _meet(a: Floats, i: int, b: Floats, j: int) -> bool:
-    return (
-        a[i, 0] <= b[j, 3]
-        and b[j, 0] <= a[i, 3]
-        and a[i, 1] <= b[j, 4]
-        and b[j, 1] <= a[i, 4]
-        and a[i, 2] <= b[j, 5]
-        and b[j, 2] <= a[i, 5]
+    return (  # not `and`, which would branch six times
+        (a[i, 0] <= b[j, 3])
+        & (b[j, 0] <= a[i, 3])
+        & (a[i, 1] <= b[j, 4])
+        & (b[j, 1] <= a[i, 4])
+        & (a[i, 2] <= b[j, 5])
+        & (b[j, 2] <= a[i, 5])
     )
 
 
 @kernel
-def _eligible(surface: SurfaceBox, a: int, b: int, edges: int) -> bool:
-    """Whether contact can bring two primitives together; of two edges, in one order only."""
+def _noted(surface: SurfaceBox, found: Ints, count: int, a: int, b: int, edges: int) -> tuple[Ints, int]:
+    """The list and its length with a pair whose boxes meet, if contact can bring its primitives together."""
     second = surface.edges[b, 0] if edges else surface.faces[b, 0]
     first = surface.edges[a, 0] if edges else surface.points[a]
     owner_a, owner_b = surface.owner[first], surface.owner[second]
     if owner_a == owner_b and (owner_a > 0 or not surface.touches_itself):
-        return False
-    moves_a, moves_b = surface.movable[owner_a], surface.movable[owner_b]
+        return found, count
     if edges:
-        if not moves_a or (moves_b and a >= b):
-            return False
         for k in range(2):
             for l in range(2):
                 if surface.edges[a, k] == surface.edges[b, l]:
-                    return False
-        return True
-    if not moves_a and not moves_b:
-        return False
-    return surface.faces[b, 0] != first and surface.faces[b, 1] != first and surface.faces[b, 2] != first
+                    return found, count
+        moves_a, moves_b = surface.movable[owner_a], surface.movable[owner_b]
+        if not moves_a or (moves_b and b < a):
+            a, b = b, a
+    elif surface.faces[b, 0] == first or surface.faces[b, 1] == first or surface.faces[b, 2] == first:
+        return found, count
+    found = with_room(found, count, 1)
+    found[count, 0], found[count, 1] = a, b
+    return found, count + 1
 
 
 @kernel

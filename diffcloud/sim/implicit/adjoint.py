@@ -7,7 +7,7 @@ import numpy as np
 from diffcloud.compiled import inlined, kernel
 from diffcloud.sim.compiled.data import Floats, Motion, Parameters, Timing
 from diffcloud.sim.compiled.lu import solve_general
-from diffcloud.sim.held import Held, aim, aim_reverse, holders, take_anchors_reverse
+from diffcloud.sim.held import Held, aim, aim_reverse, first_anchors_reverse, holders, take_anchors_reverse
 from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
 from diffcloud.sim.implicit.parts import Solved, solved_part
 from diffcloud.sim.implicit.scene import BODY, Kept, Scene, Work, new_work
@@ -85,9 +85,7 @@ def reverse(
                 body_gradients[step, b, k] += own[b, k]
         aim_reverse(held, step, parameter_gradients.target, anchor_gradients, track_gradients)
         take_anchors_reverse(held, step, anchor_gradients, position_gradients[step], track_gradients)
-    for h in range(len(held.node)):
-        for axis in range(3):
-            position_gradients[0, held.node[h], axis] += anchor_gradients[h, axis]
+    first_anchors_reverse(held, anchor_gradients, position_gradients[0])
     parameter_gradients.target[:] = 0.0
     parameter_gradients.hold[:] = 0.0
 

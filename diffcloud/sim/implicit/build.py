@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from diffcloud.sim.compiled.sparse import Pattern, pattern, slots
 from diffcloud.sim.contact.places import Planes
 from diffcloud.sim.contact.surface import contact_surface
 from diffcloud.sim.implicit.scene import Rigid, Scene
-from diffcloud.sim.rigid.bodies import Bodies
-from diffcloud.sim.terms import TERMS, kernels
+from diffcloud.sim.terms.elements import elements
 from diffcloud.sim.terms.planes import half_spaces
 from diffcloud.sim.terms.term import Setup
 
 
 def build_scene(setup: Setup, time_step: float) -> Scene:
     """Everything constant in a run with steps so long [s]."""
-    surrounding, mesh = setup.surrounding, setup.mesh
-    bodies = Bodies.build(surrounding.bodies)
+    surrounding, mesh, bodies = setup.surrounding, setup.mesh, setup.bodies
     fixed = [o for o in surrounding.obstacles if o.plane() is None] + [o.mesh for o in surrounding.moving]
     meshes = [*fixed, *(body.mesh for body in surrounding.bodies)]
     surface = contact_surface(
@@ -34,7 +29,7 @@ def build_scene(setup: Setup, time_step: float) -> Scene:
     if not len(offsets):
         meets[:] = False
     settings = surrounding.contact
-    terms, of = _elements(setup, len(bodies))
+    terms, of = elements(setup, len(bodies))
     return Scene(
         terms=terms,
         pattern=of,
@@ -49,27 +44,3 @@ def build_scene(setup: Setup, time_step: float) -> Scene:
         rigid=Rigid(bodies.points, bodies.body, bodies.gyration.reshape(-1, 9)),
         obstacle_points=others,
     )
-
-
-def _elements(setup: Setup, bodies: int) -> tuple[Any, Pattern]:
-    """(`kernels.Terms`, the pattern of the matrix: cloth nodes, then the centre and the rotation of each body)."""
-    found = [term.build(setup) for term in TERMS]
-    nodes = [
-        np.zeros((0, term.corners), np.int64) if one is None else np.ascontiguousarray(one.nodes, dtype=np.int64)
-        for term, one in zip(TERMS, found, strict=True)
-    ]
-    count = len(setup.mesh.nodes)
-    own = count + np.arange(2 * bodies, dtype=np.int64).reshape(-1, 2)
-    of = pattern(count + 2 * bodies, [*nodes, own])
-    parts = []
-    for term, one, group in zip(TERMS, found, nodes, strict=True):
-        numbers = [
-            np.zeros((0, *shape)) if one is None else np.ascontiguousarray(one.constants[name], dtype=np.float64)
-            for name, shape in term.constants.items()
-        ]
-        numbers += [
-            np.zeros((0,) * axes) if one is None else np.ascontiguousarray(one.tables[name], dtype=np.float64)
-            for name, axes in term.tables.items()
-        ]
-        parts.append(getattr(kernels, term.class_name)(group, slots(of, group), *numbers))
-    return kernels.Terms(*parts), of

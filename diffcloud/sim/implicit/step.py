@@ -41,9 +41,8 @@ def simulate(
         bodies: [S + 1, B, 18] centre, orientation row by row, velocity, angular velocity; the first is the start.
         keep: below zero: nothing is kept for the derivatives.
         control: [2] finished steps are added to the first; the second one stops the run when it is not zero.
-        fault: [6] where the run got stuck: the relative change, the kind of the closest pair (0: point and face, 1:
-            two edges,
-            2: point and plane, -1: none) and its points.
+        fault: [6] where the run got stuck: the relative change, the kind of the closest pair (0: point and face,
+            1: two edges, 2: point and plane, -1: none) and its points.
 
     Returns:
         (how it ended (`status`), the step in which it did, what the derivatives need)

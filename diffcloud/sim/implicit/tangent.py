@@ -8,7 +8,7 @@ import numpy as np
 from diffcloud.compiled import inlined, kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
 from diffcloud.sim.compiled.lu import solve_general
-from diffcloud.sim.held import Held, aim, aim_tangent, holders, take_anchors_tangent
+from diffcloud.sim.held import Held, aim, aim_tangent, first_anchors, holders, take_anchors_tangent
 from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
 from diffcloud.sim.implicit.parts import Solved, solved_part
 from diffcloud.sim.implicit.scene import BODY, Kept, Scene, Work, new_work
@@ -57,9 +57,7 @@ def tangents(
     )
     anchor_rates, target = np.empty((directions, len(held.node), 3)), np.empty((directions, len(held.node), 3))
     for d in range(directions):
-        for h in range(len(held.node)):
-            for axis in range(3):
-                anchor_rates[d, h, axis] = position_rates[0, d, held.node[h], axis]
+        anchor_rates[d] = first_anchors(held, position_rates[0, d])
     for step in range(steps):
         take_anchors_tangent(held, track_rates, step, position_rates[step], anchor_rates)
         aim(held, track, step, anchors, parameters)

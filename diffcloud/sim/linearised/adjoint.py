@@ -11,7 +11,7 @@ import numpy as np
 from diffcloud.compiled import inlined, kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
 from diffcloud.sim.compiled.sparse import cholesky, solve
-from diffcloud.sim.held import Held, aim, aim_reverse, holders, take_anchors_reverse
+from diffcloud.sim.held import Held, aim, aim_reverse, first_anchors_reverse, holders, take_anchors_reverse
 from diffcloud.sim.linearised.matrix import linear_system, pattern_with, repelling
 from diffcloud.sim.linearised.record import Kept
 from diffcloud.sim.linearised.scene import Scene
@@ -66,7 +66,7 @@ def reverse(
                 places[i, axis] = position_gradients[step + 1, i, axis] + after[i, axis] / dt
         candidate, above = candidates(scene, motion)
         if scene.collides and kept.begins[step + 1, 2] > kept.begins[step, 2]:
-            mobile = mobility(scene, parameters, holder)
+            mobile = mobility(parameters, holder)
             mass_gradient[:] = 0.0
             resolve_reverse(
                 scene.projection,
@@ -124,9 +124,7 @@ def reverse(
                     x[i, axis] -= slope / dt
         aim_reverse(held, step, gradients.target, anchor_gradient, track_gradients)
         take_anchors_reverse(held, step, anchor_gradient, x, track_gradients)
-    for h in range(len(held.node)):  # those that no step took
-        for axis in range(3):
-            position_gradients[0, held.node[h], axis] += anchor_gradient[h, axis]
+    first_anchors_reverse(held, anchor_gradient, position_gradients[0])
     for i in range(nodes):
         gradients.node_mass[i] -= parameters.inverse_mass[i] ** 2 * gradients.inverse_mass[i]
 

@@ -18,8 +18,8 @@ class Kept(NamedTuple):
     solved: Floats
     """[S, V, 3] velocities after the linear system, before contact [m/s]."""
     begins: Ints
-    """[S + 1, 5] the first row of each step in `corners`, `impacts.met`, `impacts.passes`, `impacts.forces`, `factors`; -1
-    where the factor is to be made again."""
+    """[S + 1, 5] the first row of each step in `corners`, `impacts.met`, `impacts.passes`, `impacts.forces`, `factors`. No
+    rows of `factors`: the step's factor is to be made again."""
     corners: Ints
     """[., 5] kind and points of the pairs that repel."""
     constants: Floats

@@ -7,12 +7,13 @@ import numpy as np
 from diffcloud.compiled import inlined, kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters
 from diffcloud.sim.compiled.sparse import cholesky, solve
+from diffcloud.sim.contact.neighbours import no_neighbours
 from diffcloud.sim.contact.surface import boxed
 from diffcloud.sim.held import Held, aim, first_anchors, holders, take_anchors
 from diffcloud.sim.linearised.matrix import linear_system, pattern_with
 from diffcloud.sim.linearised.record import Kept, nothing_kept, remember, with_impacts
 from diffcloud.sim.linearised.scene import Scene
-from diffcloud.sim.reference.impact_zones import resolve
+from diffcloud.sim.reference.impact_zones import TOUCH, resolve
 from diffcloud.sim.reference.nearest import nearest_pairs
 from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE, NOT_POSITIVE_DEFINITE, UNRESOLVED
 
@@ -44,6 +45,7 @@ def simulate(
     steps, nodes = len(positions) - 1, positions.shape[1]
     kept = nothing_kept(steps if keep >= 0 else 0, nodes)
     surface = boxed(scene.surface)
+    near = no_neighbours(surface, max(scene.repulsion.thickness, TOUCH))
     anchors[:] = first_anchors(held, positions[0])
     points, motion = with_obstacles(scene, positions[0]), still(scene, nodes)
     force, above = np.empty((len(points), 3)), np.empty((len(scene.plane_offsets), nodes), np.bool_)
@@ -54,7 +56,7 @@ def simulate(
         aim(held, track, step, anchors, parameters)
         begin_motion(scene, held, parameters, step, positions[step], velocities[step], motion)
         if scene.repels:
-            corners, constants = nearest_pairs(surface, scene.repulsion, motion.positions)
+            corners, constants = nearest_pairs(surface, near, scene.repulsion, motion.positions)
         else:
             corners, constants = np.empty((0, 5), np.int64), np.empty((0, 4))
         pattern, moved = pattern_with(scene.pattern, corners)
@@ -83,8 +85,8 @@ def simulate(
             kept = remember(kept, step, velocities[step + 1], corners, constants, factor, keep)
         project(scene, points, above)
         if scene.collides:
-            mobile = mobility(scene, parameters, holder)
-            resolved, impacts = resolve(surface, scene.projection, motion.positions, points, mobile, kept.impacts)
+            mobile = mobility(parameters, holder)
+            resolved, impacts = resolve(surface, near, scene.projection, motion.positions, points, mobile, kept.impacts)
             kept = with_impacts(kept, impacts, step, keep)
             if not resolved:
                 return UNRESOLVED, step, kept
@@ -157,7 +159,7 @@ def project(scene: Scene, points: Floats, above) -> None:  # type: ignore[no-unt
 
 
 @inlined
-def mobility(scene: Scene, parameters: Parameters, holder: Ints) -> Floats:
+def mobility(parameters: Parameters, holder: Ints) -> Floats:
     """[N] inverse masses of the impact stage: prescribed nodes do not give way."""
     found = parameters.inverse_mass.copy()
     for i in range(len(holder)):

@@ -8,14 +8,7 @@ import numpy as np
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Motion, Parameters, Timing
 from diffcloud.sim.compiled.sparse import solve
-from diffcloud.sim.held import (
-    Held,
-    aim,
-    aim_tangent,
-    first_anchors,
-    holders,
-    take_anchors_tangent,
-)
+from diffcloud.sim.held import Held, aim, aim_tangent, first_anchors, holders, take_anchors_tangent
 from diffcloud.sim.linearised.adjoint import candidates, factor_of, project_reverse, restore
 from diffcloud.sim.linearised.matrix import repelling
 from diffcloud.sim.linearised.record import Kept
@@ -112,7 +105,7 @@ def tangents(
                 kept.begins[step + 1],
                 motion.positions,
                 candidate,
-                mobility(scene, parameters, holder),
+                mobility(parameters, holder),
                 changes.positions,
                 rates.inverse_mass,
                 places,

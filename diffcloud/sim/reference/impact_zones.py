@@ -8,7 +8,7 @@ stay; those that share points that can move are a zone, and `dual` solves each.
 
 from __future__ import annotations
 
-from math import floor, sqrt
+from math import floor
 from typing import NamedTuple
 
 import numpy as np
@@ -17,18 +17,15 @@ from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.compiled.sorting import ascending
-from diffcloud.sim.contact.broad_phase import candidates, corners_of
+from diffcloud.sim.contact.neighbours import Neighbours, boxes_meet, neighbours_of
 from diffcloud.sim.contact.surface import SurfaceBox
 from diffcloud.sim.reference.dual import applied, gram, solve_dual
 from diffcloud.sim.reference.impact_times import NEVER, first_impact
 
 PASSES = 100
-_REACH = 0.2
-"""Candidate pairs are listed so many typical edges of the cloth around the boxes that their points sweep, and again once
-a point leaves its box by almost half of that."""
 _TIME_TIE = 1e-4
 """Impacts in one interval of this length (of the step) count as simultaneous; then the order is that of the primitives."""
-_TOUCH = 1e-5
+TOUCH = 1e-5
 """[m] Added to the boxes; covers the tolerances of the detection."""
 
 
@@ -68,11 +65,18 @@ def no_impacts() -> Impacts:
 
 @kernel
 def resolve(
-    surface: SurfaceBox, choices: Projection, start: Floats, places: Floats, inverse_mass: Floats, record: Impacts
+    surface: SurfaceBox,
+    near: Neighbours,
+    choices: Projection,
+    start: Floats,
+    places: Floats,
+    inverse_mass: Floats,
+    record: Impacts,
 ) -> tuple[bool, Impacts]:
     """Positions after the impacts of a step.
 
     Args:
+        near: pairs that come within `TOUCH` of each other.
         start: [N, 3] points at the start of the step, free of intersections.
         places: [N, 3] points at its end before contact; take those after it.
         inverse_mass: [N] [1/kg]; zero for points that cannot move.
@@ -80,53 +84,21 @@ def resolve(
     Returns:
         (whether 100 passes sufficed, the record with the passes of this step)
     """
-    reach = _REACH * sqrt(surface.typical_face_area[0])
-    pairs = _listed(surface, start, places, reach)
-    if len(pairs) == 0:
-        return True, record
-    candidate, listed_at, before = places.copy(), places.copy(), places.copy()
+    candidate, before = places.copy(), places.copy()
     changed = np.ones(len(places), np.bool_)
     first = record.used[0]
     for _ in range(PASSES):
+        pairs = neighbours_of(surface, near, start, places)
         fresh, record = _impacts(surface, choices, pairs, start, places, changed, inverse_mass, record)
         if fresh == 0:
             return True, record
         record = _project(choices, candidate, places, inverse_mass, record, first, fresh)
-        stray = False
         for i in range(len(places)):
             changed[i] = False
             for axis in range(3):
-                x = places[i, axis]
-                changed[i] = changed[i] or x != before[i, axis]
-                before[i, axis] = x
-                low = min(start[i, axis], listed_at[i, axis])
-                high = max(start[i, axis], listed_at[i, axis])
-                stray = stray or x < low - 0.4 * reach or x > high + 0.4 * reach
-        if stray:
-            pairs = _listed(surface, start, places, reach)
-            listed_at = places.copy()
+                changed[i] = changed[i] or places[i, axis] != before[i, axis]
+                before[i, axis] = places[i, axis]
     return False, record
-
-
-@kernel
-def _listed(surface: SurfaceBox, start: Floats, places: Floats, reach: float) -> Ints:
-    """Candidate pairs [C, 7]: kind, points and primitives."""
-    point_face, edge_edge = candidates(surface, start, places, reach)
-    found = np.empty((len(point_face) + len(edge_edge), 7), np.int64)
-    for c in range(len(found)):
-        edges = 1 if c >= len(point_face) else 0
-        a, b = (
-            (edge_edge[c - len(point_face), 0], edge_edge[c - len(point_face), 1])
-            if edges
-            else (
-                point_face[c, 0],
-                point_face[c, 1],
-            )
-        )
-        found[c, 0] = edges
-        found[c, 1], found[c, 2], found[c, 3], found[c, 4] = corners_of(surface, edges, a, b)
-        found[c, 5], found[c, 6] = a, b
-    return found
 
 
 @kernel
@@ -147,7 +119,7 @@ def _impacts(  # type: ignore[no-untyped-def]
     for c in range(len(pairs)):
         if not (changed[pairs[c, 1]] or changed[pairs[c, 2]] or changed[pairs[c, 3]] or changed[pairs[c, 4]]):
             continue
-        if not _boxes_meet(pairs, c, start, places):
+        if not boxes_meet(pairs, c, start, places, TOUCH):
             continue
         for k in range(4):
             for axis in range(3):
@@ -296,21 +268,3 @@ def move(
             i = points[j, k]
             for axis in range(3):
                 places[i, axis] += part * inverse_mass[i] * rows[j, k] * rows[j, 4 + axis] * force[j]
-
-
-@kernel
-def _boxes_meet(pairs: Ints, c: int, start: Floats, places: Floats) -> bool:
-    """Whether the boxes that both primitives sweep touch."""
-    split = 3 if pairs[c, 0] > 0 else 2
-    for axis in range(3):
-        low, high = np.inf, -np.inf
-        for k in range(1, split):
-            first, last = start[pairs[c, k], axis], places[pairs[c, k], axis]
-            low, high = min(low, first, last), max(high, first, last)
-        other_low, other_high = np.inf, -np.inf
-        for k in range(split, 5):
-            first, last = start[pairs[c, k], axis], places[pairs[c, k], axis]
-            other_low, other_high = min(other_low, first, last), max(other_high, first, last)
-        if not (low <= other_high + _TOUCH and other_low <= high + _TOUCH):
-            return False
-    return True

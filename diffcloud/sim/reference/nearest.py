@@ -10,7 +10,7 @@ import numpy as np
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
-from diffcloud.sim.contact.broad_phase import candidates, corners_of
+from diffcloud.sim.contact.neighbours import Neighbours, boxes_meet, neighbours_of, no_neighbours
 from diffcloud.sim.contact.surface import Surface, SurfaceBox, boxed
 from diffcloud.sim.reference.frames import covers, cross3, dot3, frame_at, height
 
@@ -39,14 +39,14 @@ class Repulsion(NamedTuple):
 
 
 @kernel
-def nearest_pairs(surface: SurfaceBox, repulsion: Repulsion, points: Floats) -> tuple[Ints, Floats]:
-    """The pairs that repel at points [N, 3].
+def nearest_pairs(surface: SurfaceBox, near: Neighbours, repulsion: Repulsion, points: Floats) -> tuple[Ints, Floats]:
+    """The pairs that repel at points [N, 3]; `near` knows those that come within the thickness.
 
     Returns:
         (kind and points [C, 5]: 0 for a point and a face, 1 for two edges; sign, count, stiffness and whether an
         obstacle takes part [C, 4]).
     """
-    pairs, found = _near(surface, repulsion, points)
+    pairs, found = _near(surface, near, repulsion, points)
     count = len(pairs)
     shortest = repulsion.held.copy()
     first = np.full(len(shortest), -1, np.int64)
@@ -80,7 +80,8 @@ def nearest_pairs(surface: SurfaceBox, repulsion: Repulsion, points: Floats) -> 
 @kernel
 def pairs_at(surface: Surface, repulsion: Repulsion, points: Floats) -> tuple[Ints, Floats]:
     """The same, to be called from outside of kernels."""
-    return nearest_pairs(boxed(surface), repulsion, points)
+    box = boxed(surface)
+    return nearest_pairs(box, no_neighbours(box, repulsion.thickness), repulsion, points)
 
 
 def held_slots(surface: Surface, repulsion: Repulsion, points: Floats) -> Floats:
@@ -91,7 +92,8 @@ def held_slots(surface: Surface, repulsion: Repulsion, points: Floats) -> Floats
 
 @kernel
 def _held_slots(surface: Surface, repulsion: Repulsion, points: Floats) -> Floats:
-    pairs, found = _near(boxed(surface), repulsion, points)
+    box = boxed(surface)
+    pairs, found = _near(box, no_neighbours(box, repulsion.thickness), repulsion, points)
     held = np.full(2 * (len(surface.points) + len(surface.faces) + len(surface.edges)), np.inf)
     for c in range(len(pairs)):
         first, second = surface.owner[pairs[c, 1]], surface.owner[pairs[c, 4]]
@@ -112,50 +114,47 @@ def _comes_before(pairs: Ints, c: int, other: int) -> bool:
 
 
 @kernel
-def _near(surface: SurfaceBox, repulsion: Repulsion, points: Floats) -> tuple[Ints, Floats]:
+def _near(surface: SurfaceBox, near: Neighbours, repulsion: Repulsion, points: Floats) -> tuple[Ints, Floats]:
     """The pairs nearer than the thickness: (kind, points, primitives and slots [C, 9]; distance, sign and area [C, 3])."""
-    point_face, edge_edge = candidates(surface, points, points, repulsion.thickness)
+    listed = neighbours_of(surface, near, points, points)
     pairs, found = np.empty((64, 9), np.int64), np.empty((64, 3))
     count = 0
-    if len(point_face) + len(edge_edge) == 0:
+    if len(listed) == 0:
         return pairs[:0], found[:0]
     faces, around = _normals(surface, points)
     x, place = np.empty((4, 3)), np.empty(7)
-    for edges in range(2):
-        listed = edge_edge if edges > 0 else point_face
-        for c in range(len(listed)):
-            a, b = listed[c, 0], listed[c, 1]
-            corners = corners_of(surface, edges, a, b)
-            for k in range(4):
-                for axis in range(3):
-                    x[k, axis] = points[corners[k], axis]
-            square = frame_at(edges, x, place)
-            distance = height(place, x)
-            # pairs between one and two thicknesses hold slots in the original, but without force, and never against a
-            # nearer one
-            if not (square > _PARALLEL * _spanned(edges, x) and square >= repulsion.smallest):
-                continue
-            if not abs(distance) < repulsion.thickness:
-                continue
-            if not covers(edges, place, _OUTSIDE):
-                continue
-            if edges > 0 and not (
-                _on_outer_side(surface, b, x, 2, 0, place, faces) and _on_outer_side(surface, a, x, 0, 2, place, faces)
-            ):
-                continue
-            pairs, found = with_room(pairs, count, 1), with_room(found, count, 1)
-            pairs[count, 0] = edges
-            for k in range(4):
-                pairs[count, 1 + k] = corners[k]
-            pairs[count, 5], pairs[count, 6] = a, b
-            _set_slots(surface, pairs, count, place, around)
-            area = (
-                min(surface.edge_area[a], surface.edge_area[b])
-                if edges > 0
-                else min(surface.point_area[a], surface.face_area[b])
-            )
-            found[count, 0], found[count, 1], found[count, 2] = abs(distance), (-1.0 if distance < 0 else 1.0), area
-            count += 1
+    for c in range(len(listed)):
+        if not boxes_meet(listed, c, points, points, repulsion.thickness):
+            continue
+        edges, a, b = listed[c, 0], listed[c, 5], listed[c, 6]
+        for k in range(4):
+            for axis in range(3):
+                x[k, axis] = points[listed[c, 1 + k], axis]
+        square = frame_at(edges, x, place)
+        distance = height(place, x)
+        # pairs between one and two thicknesses hold slots in the original, but without force, and never against a
+        # nearer one
+        if not (square > _PARALLEL * _spanned(edges, x) and square >= repulsion.smallest):
+            continue
+        if not abs(distance) < repulsion.thickness:
+            continue
+        if not covers(edges, place, _OUTSIDE):
+            continue
+        if edges > 0 and not (
+            _on_outer_side(surface, b, x, 2, 0, place, faces) and _on_outer_side(surface, a, x, 0, 2, place, faces)
+        ):
+            continue
+        pairs, found = with_room(pairs, count, 1), with_room(found, count, 1)
+        for k in range(7):
+            pairs[count, k] = listed[c, k]
+        _set_slots(surface, pairs, count, place, around)
+        area = (
+            min(surface.edge_area[a], surface.edge_area[b])
+            if edges > 0
+            else min(surface.point_area[a], surface.face_area[b])
+        )
+        found[count, 0], found[count, 1], found[count, 2] = abs(distance), (-1.0 if distance < 0 else 1.0), area
+        count += 1
     return pairs[:count], found[:count]
 
 

@@ -17,6 +17,7 @@ from diffcloud.mesh.topology import ClothMesh
 from diffcloud.sim.compiled.trace import Graph, Scalar, Vector
 from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import Material
+from diffcloud.sim.rigid.bodies import Bodies
 from diffcloud.sim.surrounding import Integrator, Surrounding
 
 Place = Literal["element", "corner", "episode", "vector"]
@@ -31,6 +32,7 @@ class Setup:
     material: Material
     surrounding: Surrounding
     handles: Handles
+    bodies: Bodies
     integrator: Integrator
     shaped: bool
     """Whether the cloth's hinges are at rest as the mesh stands, not flat."""
@@ -68,10 +70,6 @@ class Term:
     """Name -> number of axes."""
     parameters: Mapping[str, Place] = field(default_factory=dict)
     """What it can be differentiated by: fields of `Parameters`."""
-    resistance: Callable[[Element], Sequence[Vector]] | None = None
-    """The force whose derivative by displacement and velocity is the positive semidefinite stiffness, where it is not
-    `force`."""
-
     energy: Callable[[Element], Scalar] | None = None
     """[J] that an element stores, where it does; tells explosions from motions."""
 

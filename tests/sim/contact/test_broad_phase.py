@@ -10,7 +10,7 @@ import pytest
 from diffcloud.mesh import grid_cloth
 from diffcloud.sim.contact.broad_phase import candidates, corners_of
 from diffcloud.sim.contact.surface import Surface, contact_surface
-from tests.sim.contact.scenes import crumpled, together
+from tests.sim.contact.scenes import box, crumpled, together
 from tests.sim.twins import broad_phase as twin
 
 MARGIN = 0.02
@@ -58,6 +58,35 @@ def test_many_equal_coordinates(spacing):
     whole = together(*(replace(mesh, nodes=np.add(mesh.nodes, (0.0, 0.0, spacing * layer))) for layer in range(3)))
     for margin in (0.0, 0.125, 0.25):
         assert compared(contact_surface(whole, []), whole.nodes, whole.nodes, margin) > 100
+
+
+@pytest.mark.parametrize("stretch", [1.0, 20.0])
+def test_many_boxes(rng, stretch):
+    """A cloth of a thousand faces over a box of a few: those lie in cells, not in a sweep; some may be far larger."""
+    cloth = grid_cloth(24, 24, 0.5, 0.5)
+    obstacles = [box((-0.2, -0.2, -0.2), (0.15, 0.2, -0.01))]
+    surface = contact_surface(cloth, obstacles, all_edges=True)
+    points = np.concatenate([cloth.nodes, obstacles[0].nodes])
+    points[: len(cloth.nodes)] += rng.normal(size=cloth.nodes.shape) * [0.02, 0.02, 0.02]
+    ends = points.copy()
+    ends[: len(cloth.nodes)] += 0.01 * rng.normal(size=cloth.nodes.shape)
+    ends[:40] += 0.01 * (stretch - 1) * rng.normal(size=(40, 3))
+    point_face, edge_edge = candidates(surface, points, ends, MARGIN)
+    for found, one, other in (
+        (point_face, surface.points[:, None], surface.faces),
+        (edge_edge, surface.edges, surface.edges),
+    ):
+        (low, high), (other_low, other_high) = (
+            (np.minimum(points, ends)[of].min(axis=1), np.maximum(points, ends)[of].max(axis=1)) for of in (one, other)
+        )
+        hits = ((low[:, None] <= other_high + MARGIN) & (other_low <= high[:, None] + MARGIN)).all(axis=-1)
+        wanted = {
+            (a, b)
+            for a, b in np.argwhere(hits).tolist()
+            if (one is not other or a < b) and twin.may_touch(surface, one[a].tolist(), other[b].tolist())
+        }
+        assert {tuple(sorted(pair) if one is other else pair) for pair in found.tolist()} == wanted
+        assert len(found) == len(wanted) > 1000
 
 
 def test_nothing_can_touch():

@@ -8,12 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from diffcloud.compiled import kernel
 from diffcloud.mesh import ClothMesh, SurfaceMesh, grid_cloth
+from diffcloud.sim.contact.neighbours import no_neighbours
 from diffcloud.sim.contact.surface import Surface, contact_surface
 from diffcloud.sim.reference.dual import HARD, REGULAR, applied, gram, least_distance, solve_active, solve_dual
 from diffcloud.sim.reference.impact_derivatives import resolve_reverse, resolve_tangent
 from diffcloud.sim.reference.impact_zones import (
     PASSES,
+    TOUCH,
     Impacts,
     Projection,
     move,
@@ -202,6 +205,12 @@ def test_zones_are_the_impacts_joined_by_points_that_move(rng):
 # --- whole steps -----------------------------------------------------------------------------------------------------
 
 
+@kernel
+def resolve_alone(surface, choices, start, places, inverse_mass, record):
+    """One step, with pairs of its own."""
+    return resolve(surface, no_neighbours(surface, TOUCH), choices, start, places, inverse_mass, record)
+
+
 @dataclass
 class Fall:
     """Points that go straight from start to candidate within a step."""
@@ -215,7 +224,7 @@ class Fall:
     def resolve(self, record: Impacts | None = None) -> tuple[np.ndarray, Impacts]:
         """(places, record)"""
         places = self.candidate.copy()
-        resolved, record = resolve(
+        resolved, record = resolve_alone(
             self.surface, self.choices, self.start, places, self.inverse_mass, record or no_impacts()
         )
         assert resolved
@@ -376,7 +385,7 @@ def test_passes_that_do_not_end_are_reported():
     """A cloth that starts within a plate has no side to be kept on."""
     fall = between_plates(0.0)
     places = fall.candidate.copy()
-    resolved, record = resolve(fall.surface, fall.choices, fall.start, places, fall.inverse_mass, no_impacts())
+    resolved, record = resolve_alone(fall.surface, fall.choices, fall.start, places, fall.inverse_mass, no_impacts())
     assert not resolved
     assert record.used[1] == PASSES
     assert np.isfinite(places).all()

@@ -14,7 +14,7 @@ from diffcloud.mesh.topology import directed_edges
 from diffcloud.sim.compiled.data import Motion, Parameters, Timing
 from diffcloud.sim.contact.surface import Surface, contact_surface
 from diffcloud.sim.linearised.matrix import linear_system, pattern_with
-from diffcloud.sim.reference.nearest import Repulsion, held_slots, nearest_pairs
+from diffcloud.sim.reference.nearest import Repulsion, held_slots, pairs_at
 from diffcloud.sim.surrounding import ReferenceContact
 from diffcloud.sim.terms import kernels
 from tests.sim.contact.scenes import box, crumpled, over_box, together
@@ -47,7 +47,7 @@ def kernel(kind: int, way: str):
 
 
 def elements(kind: int, corners: np.ndarray, constants: np.ndarray, thickness: float = THICKNESS):
-    """The pairs of one kind as `nearest_pairs` gives them."""
+    """The pairs of one kind as `pairs_at` gives them."""
     own = corners[:, 0] == kind
     numbers = np.ascontiguousarray(constants[own].T)
     nodes, slots = np.ascontiguousarray(corners[own, 1:]), np.zeros((own.sum(), 10), np.int64)
@@ -246,7 +246,7 @@ def test_pairs_and_counts_are_those_of_the_slow_twin(rng, smallest):
     for _ in range(4):
         surface, points = crumpled(rng)
         settings = repulsion(surface, points, smallest)
-        corners, constants = nearest_pairs(surface, settings, points)
+        corners, constants = pairs_at(surface, settings, points)
         expected = twin.nearest_pairs(surface, points, THICKNESS, smallest)
         told = {tuple(pair): numbers for pair, numbers in zip(corners.tolist(), constants, strict=True)}
         assert len(told) == len(corners), "each pair once"
@@ -256,7 +256,7 @@ def test_pairs_and_counts_are_those_of_the_slow_twin(rng, smallest):
             assert (sign, count) == (np.sign(height), slots)
             assert with_obstacle == (max(pair[1:]) >= surface.cloth_points)
             assert stiffness == pytest.approx(STIFFNESS * smaller_area(surface, *pair), rel=1e-14)
-        once, numbers = nearest_pairs(surface, settings._replace(count_once=True), points)
+        once, numbers = pairs_at(surface, settings._replace(count_once=True), points)
         np.testing.assert_array_equal(once, corners)
         assert (numbers[:, 1] == 1).all()
         doubled += (constants[:, 1] == 2).sum()
@@ -283,7 +283,7 @@ def test_of_equally_near_pairs_the_first_has_the_slot():
     shift = np.array([0.0625, 0.03125, 0.015625])
     whole = together(*(replace(mesh, nodes=mesh.nodes + layer * shift) for layer in range(3)))
     surface = contact_surface(whole, [])
-    corners, constants = nearest_pairs(surface, repulsion(surface, whole.nodes), whole.nodes)
+    corners, constants = pairs_at(surface, repulsion(surface, whole.nodes), whole.nodes)
     expected = twin.nearest_pairs(surface, whole.nodes, THICKNESS)
     assert len(expected) > 20
     found = zip(corners.tolist(), constants, strict=True)
@@ -302,7 +302,7 @@ def test_obstacles_hold_slots_against_the_cloth():
         surface = contact_surface(cloth, obstacles, all_edges=True)
         points = np.concatenate([cloth.nodes, *(mesh.nodes for mesh in obstacles)])
         points[0, 2] -= 0.001
-        _, constants = nearest_pairs(surface, repulsion(surface, points), points)
+        _, constants = pairs_at(surface, repulsion(surface, points), points)
         counts.append(sorted(constants[:, 1].tolist()))
     assert counts == [[1, 1, 1, 1], [1, 1, 1, 2]]
 
@@ -315,7 +315,7 @@ def test_parallel_edges_do_not_repel():
         above = np.array([[-0.1, -0.1 * turn, 0.01], [0.1, 0.1 * turn, 0.01], [0, 0, 0.11]])
         points = np.concatenate([below, above])
         surface = contact_surface(ClothMesh(points, flat, np.arange(6), np.array([[0, 1, 2], [3, 4, 5]])), [])
-        corners, _ = nearest_pairs(surface, repulsion(surface, points), points)
+        corners, _ = pairs_at(surface, repulsion(surface, points), points)
         assert ([1, 0, 1, 3, 4] in corners.tolist()) == repels
 
 
@@ -323,7 +323,7 @@ def test_nothing_near_is_none():
     surface, points = crumpled(np.random.default_rng(0))
     settings = repulsion(surface, points)
     points[:25, 2] = 1.0 + 0.1 * np.arange(25)
-    corners, constants = nearest_pairs(surface, settings._replace(thickness=1e-6), points)
+    corners, constants = pairs_at(surface, settings._replace(thickness=1e-6), points)
     assert corners.shape == (0, 5)
     assert constants.shape == (0, 4)
 
@@ -340,7 +340,7 @@ def test_directed_edges_of_an_obstacle():
 def test_cloth_on_cloth_conserves_momentum(rng):
     """Self-contact alone: forces sum to zero, and repulsion has no moment."""
     surface, points = crumpled(rng)
-    corners, constants = nearest_pairs(surface, repulsion(surface, points), points)
+    corners, constants = pairs_at(surface, repulsion(surface, points), points)
     own = constants[:, 3] == 0
     corners, constants = corners[own], constants[own]
     inverse_mass = np.concatenate([1 / rng.uniform(0.01, 0.02, 25), np.zeros(len(points) - 25)])
@@ -383,7 +383,7 @@ def test_pairs_add_the_twins_to_the_step_matrix(rng):
     motion, holder = moving(points, velocities, velocities.copy()), np.full(nodes, -1)
     surface, settings = scene.surface, scene.repulsion._replace(smallest=0.0, thickness=THICKNESS)
     scene = scene._replace(repulsion=settings)
-    corners, constants = nearest_pairs(surface, settings, points)
+    corners, constants = pairs_at(surface, settings, points)
     assert (constants[:, 3] == 0).any()
     assert (constants[:, 3] == 1).any()
 

@@ -1,0 +1,35 @@
+"""The elements of all terms in one system, for the kernels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from diffcloud.sim.compiled.sparse import Pattern, pattern, slots
+from diffcloud.sim.terms import TERMS, kernels
+from diffcloud.sim.terms.term import Elements, Setup, Term
+
+
+def elements(setup: Setup, bodies: int = 0) -> tuple[Any, Pattern]:
+    """(`kernels.Terms`, the pattern of the step matrix: cloth nodes, then the centre and the rotation of each body)."""
+    found = [term.build(setup) or _none(term) for term in TERMS]
+    groups = [np.ascontiguousarray(one.nodes, dtype=np.int64) for one in found]
+    count = len(setup.mesh.nodes)
+    of_bodies = count + np.arange(2 * bodies, dtype=np.int64).reshape(-1, 2)
+    of = pattern(count + 2 * bodies, [*groups, of_bodies])
+    parts = []
+    for term, one, group in zip(TERMS, found, groups, strict=True):
+        numbers = [*(one.constants[name] for name in term.constants), *(one.tables[name] for name in term.tables)]
+        arrays = [np.ascontiguousarray(array, dtype=np.float64) for array in numbers]
+        parts.append(getattr(kernels, term.class_name)(group, slots(of, group), *arrays))
+    return kernels.Terms(*parts), of
+
+
+def _none(term: Term) -> Elements:
+    """A term that has nothing to act on."""
+    return Elements(
+        np.zeros((0, term.corners), np.int64),
+        {name: np.zeros((0, *shape)) for name, shape in term.constants.items()},
+        {name: np.zeros((0,) * axes) for name, axes in term.tables.items()},
+    )
