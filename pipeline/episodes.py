@@ -19,9 +19,9 @@ from diffcloud.io.files import files_in, folders_in, staged
 from diffcloud.io.manifests import remove_files
 from diffcloud.io.raw_episodes import raw_episode_files, read_description, read_raw_episode
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sensing import sample_surface
 from diffcloud.sensing.depth_camera import DepthNoise, published_cameras
 from diffcloud.sensing.recorder import ClothMotion, record
+from diffcloud.sensing.whole_surface import sample_surface
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import rollout
 from pipeline.config import EpisodesConfig, load_config

@@ -1,4 +1,4 @@
-"""Commands whose files are imported when they are run: the list of all of them, with its help, imports none."""
+"""Commands whose files are imported when they are run, not for their list, their help or a mistyped option."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import ast
 import importlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -62,7 +62,7 @@ class _Commands(Mapping[str, Any]):
 
 def _load(name: str, place: str) -> Any:
     module, _, attribute = place.partition(":")
-    found: typer.Typer | Callable[..., Any] = getattr(importlib.import_module(module), attribute)
+    found: typer.Typer | Callable[..., Any] = _signature(module, attribute) or _imported(module, attribute)
     if isinstance(found, typer.Typer):
         command = get_command(found)
     else:
@@ -73,12 +73,53 @@ def _load(name: str, place: str) -> Any:
     return command
 
 
+def _imported(module: str, attribute: str) -> Any:
+    return getattr(importlib.import_module(module), attribute)
+
+
+def _parsed(module: str) -> list[ast.stmt]:
+    path = Path(__file__).parents[1].joinpath(*module.split(".")).with_suffix(".py")
+    return ast.parse(path.read_text(encoding="utf-8")).body
+
+
+def _signature(module: str, attribute: str) -> Callable[..., Any] | None:
+    """A command with its options and docstring that imports its file when it is called; None for a group.
+
+    Of the file only the function's head is read, and those imports and constants that the head names: what it does may need
+    libraries that take seconds to import.
+    """
+    statements = _parsed(module)
+    command = next((one for one in statements if isinstance(one, ast.FunctionDef) and one.name == attribute), None)
+    if command is None:
+        return None
+    wanted = _names(command.args)
+    needed: list[ast.stmt] = []
+    for statement in reversed(statements):  # what a constant is made of comes before it
+        if isinstance(statement, ast.Import | ast.ImportFrom):
+            statement.names = [one for one in statement.names if (one.asname or one.name) in wanted]
+            if statement.names:
+                needed.append(statement)
+        elif isinstance(statement, ast.Assign) and any(_names(target) & wanted for target in statement.targets):
+            needed.append(statement)
+            wanted |= _names(statement.value)
+    run = ast.parse("return _imported()(**locals())", mode="exec").body
+    command.decorator_list, command.body = [], [*command.body[: ast.get_docstring(command) is not None], *run]
+    future = ast.parse("from __future__ import annotations").body
+    code = ast.fix_missing_locations(ast.Module([*future, *reversed(needed), command], type_ignores=[]))
+    found: dict[str, Any] = {"_imported": lambda: _imported(module, attribute)}
+    exec(compile(code, f"<options of {module}>", "exec"), found)  # of this package's own files
+    return cast(Callable[..., Any], found[attribute])
+
+
+def _names(node: ast.AST) -> set[str]:
+    return {one.id for one in ast.walk(node) if isinstance(one, ast.Name)}
+
+
 def _summary(name: str, place: str) -> TyperCommand:
     """The command's name and help, read from its file: the function's docstring, or `help` of a group."""
     module, _, attribute = place.partition(":")
-    path = Path(__file__).parents[1].joinpath(*module.split(".")).with_suffix(".py")
     text = ""
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+    for node in _parsed(module):
         if isinstance(node, ast.FunctionDef) and node.name == attribute:
             text = ast.get_docstring(node) or ""
         elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id == attribute:

@@ -17,7 +17,7 @@ from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import files_in, folders_in, together
 from diffcloud.io.images import write_color
 from diffcloud.io.raw_episodes import RawEpisode, read_description, read_raw_episode
-from diffcloud.sensing import clean_frame
+from diffcloud.sensing.filters import clean_frame
 from diffcloud.sensing.fusion import Seen, fuse
 from diffcloud.sensing.masking import RobotMask
 from diffcloud.sensing.pictures import cloud_picture, mask_picture

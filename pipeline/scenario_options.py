@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from diffcloud.scene.scenarios import SCENARIO_NAMES, Scenario, load_scenario
 from pipeline.console import warn
+
+if TYPE_CHECKING:
+    from diffcloud.scene.scenarios import Scenario
 
 OWN_SCENARIOS = Path("raw/scenes")
 """A person's own scenario files, found by name."""
 
 ScenarioName = Annotated[
     str | None,
-    typer.Option("--scenario", help=f"{', '.join(SCENARIO_NAMES)}, a YAML file, or the name of one in {OWN_SCENARIOS}."),
+    typer.Option(
+        "--scenario",
+        help="lift, fold, band_stretch, vest_hang, release_lift, release_fold, release_hang, release_band, a YAML file, or "
+        f"the name of one in {OWN_SCENARIOS}.",
+    ),
 ]
 SceneFile = Annotated[Path | None, typer.Option("--scene", help="ARCSim scene JSON.")]
 
 
 def choose_scenario(name: str | None, scene: Path | None = None) -> Scenario:
     """Load a scenario and say what of its scene is not simulated."""
+    from diffcloud.scene.scenarios import SCENARIO_NAMES, load_scenario  # takes seconds, which help does without
+
     if name is not None and name not in SCENARIO_NAMES and (OWN_SCENARIOS / f"{name}.yaml").is_file():
         name = str(OWN_SCENARIOS / f"{name}.yaml")
     scenario = load_scenario(name, scene)

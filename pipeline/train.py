@@ -15,8 +15,6 @@ from diffcloud.errors import CheckpointError, ConfigError, DatasetError, DiffClo
 from diffcloud.io.files import read_json
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.regressors import (
-    MODEL_NAMES,
-    PROFILE_NAMES,
     ModelName,
     Regressor,
     SimulatedSet,
@@ -43,9 +41,9 @@ def train(
         ),
     ],
     scenario: Annotated[str | None, typer.Option(help="That was simulated. Default: all of train.scenarios.")] = None,
-    model: Annotated[list[str] | None, typer.Option(help=f"{', '.join(MODEL_NAMES)}; repeatable. Default: all.")] = None,
+    model: Annotated[list[str] | None, typer.Option(help="mlp, pointnet2 or meteornet; repeatable. Default: all.")] = None,
     params: ParamsFile = None,
-    profile: Annotated[str | None, typer.Option(help=", ".join(PROFILE_NAMES))] = None,
+    profile: Annotated[str | None, typer.Option(help="quick, reduced or paper.")] = None,
     epochs: Annotated[int | None, typer.Option(help="Passes over the training draws.")] = None,
     draws: Annotated[int | None, typer.Option(help="Training draws used; default: all.")] = None,
     points: Annotated[int | None, typer.Option(help="Sampled per frame.")] = None,

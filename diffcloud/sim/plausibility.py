@@ -1,13 +1,18 @@
 """Whether a motion can be one: a step that has become unstable does not always leave the numbers.
 
-Two laws that a held cloth keeps, with room: no node is farther than three times the cloth's size from every place where a
-handle has been, and its kinetic energy E is not far above what can have come into it,
+What moves a held cloth is its weight, its handles and the wind. With the mass M, the size l, the handles' path s and
+greatest speed v (the wind's, where that is greater), the kinetic and elastic energies E and U, and the work P of gravity
+since the start, a motion keeps, with room,
 
-    E ≤ 3 (E₀ + M |g| (l + s) + ½ M v² + W),
+    E ≤ 3 (K + W) + P,      K = E₀ + M |g| (l + s) + ½ M v²,
 
-with the mass M, the size l, the handles' path s and greatest speed v (the wind's, where that is greater), and W the most
-elastic energy that was stored before. Nodes that nothing holds may have fallen freely since they were let go; moving
-obstacles and rigid bodies count like handles.
+with W the most elastic energy that was stored before. Where a node is farther than three times the cloth's size from every
+place where a handle has been, its weight must have stretched the cloth so far:
+
+    E + U ≤ 3 (K + U₀) + P.
+
+Nodes that nothing holds may have fallen freely since they were let go; moving obstacles and rigid bodies count like
+handles.
 """
 
 from __future__ import annotations
@@ -40,8 +45,8 @@ class Motion:
     """[S + 1, H, 3] where the handles are, at the start and after each step."""
     held: NDArray[np.bool_]
     """[S, H] which of them hold in each step."""
-    gravity: float
-    """Its size."""
+    gravity: Floats
+    """[3]"""
     wind: float
     """Speed of the air."""
     velocities: Floats
@@ -56,11 +61,30 @@ def implausible(motion: Motion, stored: Callable[[int], float]) -> tuple[int, st
     Args:
         stored: elastic energy after so many steps; asked only where the other terms do not explain the motion.
     """
-    found = [fault for fault in (_too_far(motion), _too_quick(motion, stored)) if fault is not None]
-    return min(found, default=None)
+    given, work, kinetic = _energies(motion)
+    found = [_too_far(motion, given, work - kinetic, stored), _too_quick(given, work, kinetic, stored)]
+    return min((fault for fault in found if fault is not None), default=None)
 
 
-def _too_far(motion: Motion) -> tuple[int, str] | None:
+def _energies(motion: Motion) -> tuple[Floats, Floats, Floats]:
+    """[S] each, after every step: what can have come into the cloth but for its weight (K), what that did (P), and the
+    kinetic energy (E)."""
+    step, mass = motion.time_step, float(motion.mass.sum())
+    velocities = np.diff(motion.positions, axis=0) / step
+    kinetic = 0.5 * np.einsum("svi,svi,v->s", velocities, velocities, motion.mass)
+    handles = np.linalg.norm(np.diff(motion.places, axis=0), axis=-1) * motion.held
+    others = np.linalg.norm(np.diff(motion.others, axis=0), axis=-1)
+    moved = np.concatenate([handles, others], axis=1).max(axis=1, initial=0.0)
+    speed = np.maximum(np.maximum.accumulate(moved) / step, motion.wind)
+    start = 0.5 * float(motion.mass @ (motion.velocities**2).sum(axis=-1))
+    weight = mass * float(np.linalg.norm(motion.gravity))
+    given = start + weight * (motion.size + np.cumsum(moved) + _fallen(motion)) + 0.5 * mass * speed**2
+    work = np.einsum("svi,i,v->s", motion.positions[1:] - motion.positions[0], motion.gravity, motion.mass)
+    return given, work, kinetic
+
+
+def _too_far(motion: Motion, given: Floats, spent: Floats, stored: Callable[[int], float]) -> tuple[int, str] | None:
+    """Args: given, spent: [S] K, and P - E."""
     places = np.concatenate([motion.places[1:][motion.held], motion.others.reshape(-1, 3)])
     if not len(places):
         places = motion.positions[0]
@@ -70,13 +94,14 @@ def _too_far(motion: Motion) -> tuple[int, str] | None:
         return None
     distance, _ = cKDTree(places).query(motion.positions[1:])
     worst = distance.max(axis=1)
-    beyond = np.flatnonzero(worst > allowed)
-    if not len(beyond):
-        return None
-    step = int(beyond[0])
-    return step + 1, (
-        f"a node is {worst[step]:.3g} from everything that held the cloth, whose size is {motion.size:.3g} (scene's unit)"
-    )
+    for step in np.flatnonzero(worst > allowed):
+        stretched = motion.held[step].any() or motion.others.shape[1] > 0  # what nothing holds has no weight to bear
+        if not stretched or stored(int(step) + 1) > _ENERGIES * (given[step] + stored(0)) + spent[step]:
+            return int(step) + 1, (
+                f"a node is {worst[step]:.3g} from everything that held the cloth, whose size is {motion.size:.3g} "
+                "(scene's unit), and its weight cannot have stretched it so far"
+            )
+    return None
 
 
 def _fallen(motion: Motion) -> Floats:
@@ -87,29 +112,20 @@ def _fallen(motion: Motion) -> Floats:
     free = (np.arange(1, count + 1) - last) * motion.time_step
     speed = np.linalg.norm(np.diff(motion.positions, axis=0), axis=-1).max(axis=1) / motion.time_step
     begin = np.concatenate([[np.linalg.norm(motion.velocities, axis=-1).max()], speed])[last]
-    return np.asarray(0.5 * motion.gravity * free**2 + (begin + motion.wind) * free)
+    return np.asarray(0.5 * np.linalg.norm(motion.gravity) * free**2 + (begin + motion.wind) * free)
 
 
-def _too_quick(motion: Motion, stored: Callable[[int], float]) -> tuple[int, str] | None:
-    step, mass = motion.time_step, float(motion.mass.sum())
-    velocities = np.diff(motion.positions, axis=0) / step
-    kinetic = 0.5 * np.einsum("svi,svi,v->s", velocities, velocities, motion.mass)
-    handles = np.linalg.norm(np.diff(motion.places, axis=0), axis=-1) * motion.held
-    others = np.linalg.norm(np.diff(motion.others, axis=0), axis=-1)
-    moved = np.concatenate([handles, others], axis=1).max(axis=1, initial=0.0)
-    speed = np.maximum(np.maximum.accumulate(moved) / step, motion.wind)
-    fallen = _fallen(motion)
-    start = 0.5 * float(motion.mass @ (motion.velocities**2).sum(axis=-1))
-    given = start + mass * motion.gravity * (motion.size + np.cumsum(moved) + fallen) + 0.5 * mass * speed**2
+def _too_quick(given: Floats, work: Floats, kinetic: Floats, stored: Callable[[int], float]) -> tuple[int, str] | None:
     most = 0.0
     known = 0
-    for after in np.flatnonzero(kinetic > _ENERGIES * given):  # none, where the motion is plausible
+    for after in np.flatnonzero(kinetic > _ENERGIES * given + work):  # none, where the motion is plausible
         while known <= after:
             most = max(most, stored(known))
             known += 1
-        if kinetic[after] > _ENERGIES * (given[after] + most):
+        allowed = _ENERGIES * (given[after] + most) + work[after]
+        if kinetic[after] > allowed:
             return int(after) + 1, (
                 f"the cloth has a kinetic energy of {kinetic[after]:.3g}, where gravity and handles can have given it "
-                f"{given[after] + most:.3g} (energies of the scene)"
+                f"{allowed:.3g} at most (energies of the scene)"
             )
     return None

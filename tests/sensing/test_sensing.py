@@ -7,9 +7,9 @@ import pytest
 
 from diffcloud.errors import EpisodeError
 from diffcloud.mesh import box_surface, grid_cloth
-from diffcloud.sensing import clean_frame, sample_surface
 from diffcloud.sensing.cameras import looking_at
-from diffcloud.sensing.filters import in_large_clusters
+from diffcloud.sensing.filters import clean_frame, in_large_clusters
+from diffcloud.sensing.whole_surface import sample_surface
 
 
 def sheet(height, size, count, rng):

@@ -7,7 +7,7 @@ Both kinds of pair are four points with signed weights that sum to zero, and the
 
 from __future__ import annotations
 
-from math import exp, floor, log
+from math import ceil, exp, floor, log
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +24,7 @@ _SMALLEST = 1e-9
 """[m] Boxes count as at least so large when the size of cells is chosen."""
 _CELLS = 8
 """Most cells for each box."""
-_REACH = 1.6
-"""Boxes so many times larger than a usual one are looked at one by one."""
+_ROUNDING = 1e-9
 
 
 @kernel
@@ -142,29 +141,39 @@ def _widest(boxes: Floats) -> int:
 def _in_cells(
     surface: SurfaceBox, first: Floats, second: Floats, first_moves: Flags, second_moves: Flags, edges: int
 ) -> Ints:
-    """[C, 2] by a grid: the second boxes lie in the cells of their low corners; a box meets those in the cells from
-    which they can reach it, and the few that reach farther."""
-    cells = _cells(second)
+    """[C, 2] by grids, one for all second boxes up to the usual size and one for each doubling of it: boxes lie in the cell
+    of their low corner, and another box meets those in the cells from which they can reach it."""
+    level, levels = np.full(len(second), -1, np.int64), 1  # what is not finite meets nothing
+    total, finite = 0.0, 0
+    for m in range(len(second)):
+        if 0 <= _extent(second, m) < np.inf:
+            total += log(max(_extent(second, m), _SMALLEST))
+            finite += 1
+    usual = exp(total / max(finite, 1))
+    for m in range(len(second)):
+        if 0 <= _extent(second, m) < np.inf:
+            level[m] = max(ceil(log(_extent(second, m) / usual) / log(2.0)), 0) if _extent(second, m) > 0 else 0
+            levels = max(levels, level[m] + 1)
     found = np.empty((4 * len(first) + 64, 2), np.int64)
     begin, end = np.empty(3, np.int64), np.empty(3, np.int64)
     count = 0
-    for i in range(len(first)):
-        for axis in range(3):
-            low = first[i, axis] - cells.reach - cells.origin[axis]
-            high = first[i, 3 + axis] - cells.origin[axis]
-            begin[axis] = min(max(floor(low / cells.size), 0.0), float(cells.shape[axis]))
-            end[axis] = min(max(floor(high / cells.size) + 1, 0.0), float(cells.shape[axis]))
-        for x in range(begin[0], end[0] if begin[2] < end[2] else begin[0]):
-            for y in range(begin[1], end[1]):
-                row = (x * cells.shape[1] + y) * cells.shape[2]
-                for p in range(cells.starts[row + begin[2]], cells.starts[row + end[2]]):  # one after the other along z
-                    j = cells.order[p]
-                    if (edges == 0 or i < j) and (first_moves[i] | second_moves[j]) & _meet(first, i, second, j):
-                        found, count = _noted(surface, found, count, i, j, edges)
-        for p in range(len(cells.far)):
-            j = cells.far[p]
-            if (edges == 0 or i < j) and (first_moves[i] | second_moves[j]) & _meet(first, i, second, j):
-                found, count = _noted(surface, found, count, i, j, edges)
+    for grid in range(levels):
+        cells = _cells(second, level, grid, usual * 2.0**grid * (1 + _ROUNDING))
+        boxes = second[cells.order]  # side by side as they are looked at
+        for i in range(len(first) if len(boxes) > 0 else 0):
+            for axis in range(3):
+                low = first[i, axis] - cells.reach - cells.origin[axis]
+                high = first[i, 3 + axis] - cells.origin[axis]
+                begin[axis] = min(max(floor(low / cells.size), 0.0), float(cells.shape[axis]))
+                end[axis] = min(max(floor(high / cells.size) + 1, 0.0), float(cells.shape[axis]))
+            for x in range(begin[0], end[0] if begin[2] < end[2] else begin[0]):
+                for y in range(begin[1], end[1]):
+                    row = (x * cells.shape[1] + y) * cells.shape[2]
+                    for p in range(cells.starts[row + begin[2]], cells.starts[row + end[2]]):  # one by one along z
+                        if _meet(first, i, boxes, p):
+                            j = cells.order[p]
+                            if (edges == 0 or i < j) and (first_moves[i] or second_moves[j]):
+                                found, count = _noted(surface, found, count, i, j, edges)
     return found[:count]
 
 
@@ -176,63 +185,54 @@ class Cells(NamedTuple):
     size: float
     """Of a cell [m]."""
     reach: float
-    """Largest extent of the boxes in `order` [m]."""
+    """No box is larger [m]."""
     shape: Ints
     """[3] cells along each axis; they are numbered along z first."""
     starts: Ints
     """[cells + 1] of each cell in `order`."""
     order: Ints
-    far: Ints
-    """Boxes that are larger."""
+    """Boxes, cell after cell."""
 
 
 @kernel
-def _cells(boxes: Floats) -> Cells:
-    """A grid for boxes [M, 6], with cells about as large as a usual box, or larger where that would be too many."""
-    usual = 0.0
-    for m in range(len(boxes)):
-        usual += log(max(_extent(boxes, m), _SMALLEST))
-    reach = _REACH * exp(usual / max(len(boxes), 1))
-    small = 0
+def _cells(boxes: Floats, level: Ints, grid: int, reach: float) -> Cells:
+    """A grid for those of the boxes [M, 6] that have its level, none larger than `reach` [m]: with cells of half that size,
+    or larger where that would be too many."""
+    taken = 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for m in range(len(boxes)):
-        if _extent(boxes, m) <= reach:
-            small += 1
+        if level[m] == grid:
+            taken += 1
             for axis in range(3):
                 low[axis], high[axis] = min(low[axis], boxes[m, axis]), max(high[axis], boxes[m, axis])
-    size, shape = reach / _REACH, np.ones(3, np.int64)
-    while small > 0:
+    size, shape = 0.5 * reach, np.ones(3, np.int64)
+    while taken > 0:
         total = 1.0
         for axis in range(3):
             total *= floor((high[axis] - low[axis]) / size) + 1
-        if total <= _CELLS * small:
+        if total <= _CELLS * taken:
             for axis in range(3):
                 shape[axis] = floor((high[axis] - low[axis]) / size) + 1
             break
         size *= 1.5
     starts = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)
-    place, order, far = np.empty(len(boxes), np.int64), np.empty(small, np.int64), np.empty(len(boxes) - small, np.int64)
-    others = 0
+    place, order = np.empty(len(boxes), np.int64), np.empty(taken, np.int64)
     for m in range(len(boxes)):
-        if _extent(boxes, m) <= reach:
+        if level[m] == grid:
             cell = 0
             for axis in range(3):
                 cell = cell * shape[axis] + floor((boxes[m, axis] - low[axis]) / size)
             place[m] = cell
             starts[cell] += 1
-        else:
-            place[m] = -1
-            far[others] = m
-            others += 1
     total_before = 0
     for cell in range(len(starts)):
         total_before += starts[cell]
         starts[cell] = total_before  # the end of each cell; filling from the back makes it the start
     for m in range(len(boxes) - 1, -1, -1):
-        if place[m] >= 0:
+        if level[m] == grid:
             starts[place[m]] -= 1
             order[starts[place[m]]] = m
-    return Cells(low, size, reach, shape, starts, order, far)
+    return Cells(low, size, reach, shape, starts, order)
 
 
 @kernel

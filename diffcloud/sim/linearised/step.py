@@ -17,6 +17,9 @@ from diffcloud.sim.reference.impact_zones import TOUCH, resolve
 from diffcloud.sim.reference.nearest import nearest_pairs
 from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE, NOT_POSITIVE_DEFINITE, UNRESOLVED
 
+_LARGEST = 1e100
+"""[m] A coordinate beyond this is none any more: differences of its kind are not finite."""
+
 
 @kernel
 def simulate(
@@ -78,7 +81,7 @@ def simulate(
                 v = motion.after[i, axis] + change[i, axis]  # prescribed nodes have it already
                 velocities[step + 1, i, axis] = v
                 points[i, axis] = positions[step, i, axis] + scene.time_step * v
-                finite = finite and np.isfinite(points[i, axis])
+                finite = finite and abs(points[i, axis]) < _LARGEST
         if not finite:
             return NOT_FINITE, step, kept
         if keep >= 0:

@@ -89,6 +89,17 @@ def test_many_boxes(rng, stretch):
         assert len(found) == len(wanted) > 1000
 
 
+@pytest.mark.parametrize("side", [5, 24])
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_what_is_not_finite_does_no_harm(side, wrong):
+    surface = contact_surface(grid_cloth(side, side, 0.5, 0.5), [])
+    for points in (np.full((side * side, 3), wrong), grid_cloth(side, side, 0.5, 0.5).nodes):
+        points[0] = wrong
+        for found in candidates(surface, points, points, MARGIN):
+            assert (found >= 0).all()
+            assert found.max(initial=0) < len(surface.edges)
+
+
 def test_nothing_can_touch():
     mesh = grid_cloth(2, 2, 1.0, 1.0)
     surface = contact_surface(mesh, [], touches_itself=False)
