@@ -39,9 +39,7 @@ def candidates(surface: SurfaceBox, places: Floats, others: Floats, margin: floa
     Returns:
         Indices into the surface's points and faces, and into its edges (twice): first one that can move.
     """
-    points = _boxes(places, others, surface.points.reshape(-1, 1), 0.5 * margin)
-    faces = _boxes(places, others, surface.faces, 0.5 * margin)
-    edges = _boxes(places, others, surface.edges, 0.5 * margin)
+    points, faces, edges = boxes_of(surface, places, others, margin)
     points_move, faces_move = _moving(surface, surface.points), _moving(surface, surface.faces[:, 0])
     edges_move = _moving(surface, surface.edges[:, 0])
     kind = np.arange(2)  # not literally 0 and 1, for which numba would compile everything twice
@@ -64,8 +62,18 @@ def _moving(surface: SurfaceBox, points: Ints) -> Flags:
 
 
 @kernel
+def boxes_of(surface: SurfaceBox, places: Floats, others: Floats, margin: float) -> tuple[Floats, Floats, Floats]:
+    """[P, 6], [F, 6], [E, 6] of points, faces and edges at both places [N, 3]: the lowest, then the highest coordinates.
+    Boxes meet where those of the primitives come within `margin` of each other [m]."""
+    return (
+        _boxes(places, others, surface.points.reshape(-1, 1), 0.5 * margin),
+        _boxes(places, others, surface.faces, 0.5 * margin),
+        _boxes(places, others, surface.edges, 0.5 * margin),
+    )
+
+
+@kernel
 def _boxes(places: Floats, others: Floats, primitives: Ints, margin: float) -> Floats:
-    """[M, 6] the lowest, then the highest coordinates."""
     found = np.empty((len(primitives), 6))
     for m in range(len(primitives)):
         for axis in range(3):
@@ -88,22 +96,24 @@ def _swept_between(
     found = np.empty((4 * len(first) + 64, 2), np.int64)
     count = begin = 0
     for i in range(len(a)):
+        found = with_room(found, count, len(b))
         while begin < len(b) and b[begin, axis] < a[i, axis]:
             begin += 1
         for j in range(begin, len(b)):
             if b[j, axis] > a[i, 3 + axis]:
                 break
-            if (a_moves[i] | b_moves[j]) & _meet(a, i, b, j):
-                found, count = _noted(surface, found, count, order_a[i], order_b[j], edges)
+            if (a_moves[i] | b_moves[j]) & meet(a, i, b, j):
+                count = _note(surface, found, count, order_a[i], order_b[j], edges)
     begin = 0
     for j in range(len(b)):
+        found = with_room(found, count, len(a))
         while begin < len(a) and a[begin, axis] <= b[j, axis]:
             begin += 1
         for i in range(begin, len(a)):
             if a[i, axis] > b[j, 3 + axis]:
                 break
-            if (a_moves[i] | b_moves[j]) & _meet(a, i, b, j):
-                found, count = _noted(surface, found, count, order_a[i], order_b[j], edges)
+            if (a_moves[i] | b_moves[j]) & meet(a, i, b, j):
+                count = _note(surface, found, count, order_a[i], order_b[j], edges)
     return found[:count]
 
 
@@ -116,11 +126,12 @@ def _swept_among(surface: SurfaceBox, boxes: Floats, moves: Flags, edges: int) -
     found = np.empty((4 * len(boxes) + 64, 2), np.int64)
     count = 0
     for i in range(len(a)):
+        found = with_room(found, count, len(a))
         for j in range(i + 1, len(a)):
             if a[j, axis] > a[i, 3 + axis]:
                 break
-            if (a_moves[i] | a_moves[j]) & _meet(a, i, a, j):
-                found, count = _noted(surface, found, count, order[i], order[j], edges)
+            if (a_moves[i] | a_moves[j]) & meet(a, i, a, j):
+                count = _note(surface, found, count, order[i], order[j], edges)
     return found[:count]
 
 
@@ -161,6 +172,7 @@ def _in_cells(
         cells = _cells(second, level, grid, usual * 2.0**grid * (1 + _ROUNDING))
         boxes = second[cells.order]  # side by side as they are looked at
         for i in range(len(first) if len(boxes) > 0 else 0):
+            found = with_room(found, count, len(boxes))
             for axis in range(3):
                 low = first[i, axis] - cells.reach - cells.origin[axis]
                 high = first[i, 3 + axis] - cells.origin[axis]
@@ -170,10 +182,10 @@ def _in_cells(
                 for y in range(begin[1], end[1]):
                     row = (x * cells.shape[1] + y) * cells.shape[2]
                     for p in range(cells.starts[row + begin[2]], cells.starts[row + end[2]]):  # one by one along z
-                        if _meet(first, i, boxes, p):
+                        if meet(first, i, boxes, p):
                             j = cells.order[p]
                             if (edges == 0 or i < j) and (first_moves[i] or second_moves[j]):
-                                found, count = _noted(surface, found, count, i, j, edges)
+                                count = _note(surface, found, count, i, j, edges)
     return found[:count]
 
 
@@ -241,7 +253,8 @@ def _extent(boxes: Floats, m: int) -> float:
 
 
 @kernel
-def _meet(a: Floats, i: int, b: Floats, j: int) -> bool:
+def meet(a: Floats, i: int, b: Floats, j: int) -> bool:
+    """Whether two boxes of lists [., 6] have a place in common."""
     return (  # not `and`, which would branch six times
         (a[i, 0] <= b[j, 3])
         & (b[j, 0] <= a[i, 3])
@@ -253,26 +266,25 @@ def _meet(a: Floats, i: int, b: Floats, j: int) -> bool:
 
 
 @kernel
-def _noted(surface: SurfaceBox, found: Ints, count: int, a: int, b: int, edges: int) -> tuple[Ints, int]:
-    """The list and its length with a pair whose boxes meet, if contact can bring its primitives together."""
+def _note(surface: SurfaceBox, found: Ints, count: int, a: int, b: int, edges: int) -> int:
+    """Add a pair whose boxes meet to a list with room, if contact can bring its primitives together; its length then."""
     second = surface.edges[b, 0] if edges else surface.faces[b, 0]
     first = surface.edges[a, 0] if edges else surface.points[a]
     owner_a, owner_b = surface.owner[first], surface.owner[second]
     if owner_a == owner_b and (owner_a > 0 or not surface.touches_itself):
-        return found, count
+        return count
     if edges:
         for k in range(2):
             for l in range(2):
                 if surface.edges[a, k] == surface.edges[b, l]:
-                    return found, count
+                    return count
         moves_a, moves_b = surface.movable[owner_a], surface.movable[owner_b]
         if not moves_a or (moves_b and b < a):
             a, b = b, a
     elif surface.faces[b, 0] == first or surface.faces[b, 1] == first or surface.faces[b, 2] == first:
-        return found, count
-    found = with_room(found, count, 1)
+        return count
     found[count, 0], found[count, 1] = a, b
-    return found, count + 1
+    return count + 1
 
 
 @kernel

@@ -13,7 +13,7 @@ import numpy as np
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints
-from diffcloud.sim.contact.broad_phase import candidates, corners_of
+from diffcloud.sim.contact.broad_phase import boxes_of, candidates, corners_of, meet
 from diffcloud.sim.contact.surface import SurfaceBox
 
 _MARGIN = 0.5
@@ -89,18 +89,14 @@ def _listed(surface: SurfaceBox, low: Floats, high: Floats, distance: float) -> 
 
 
 @kernel
-def boxes_meet(pairs: Ints, c: int, start: Floats, end: Floats, distance: float) -> bool:
-    """Whether the boxes that both primitives of a pair sweep come within a distance of each other [m]."""
-    split = 3 if pairs[c, 0] > 0 else 2
-    for axis in range(3):
-        low, high = np.inf, -np.inf
-        for k in range(1, split):
-            first, last = start[pairs[c, k], axis], end[pairs[c, k], axis]
-            low, high = min(low, first, last), max(high, first, last)
-        other_low, other_high = np.inf, -np.inf
-        for k in range(split, 5):
-            first, last = start[pairs[c, k], axis], end[pairs[c, k], axis]
-            other_low, other_high = min(other_low, first, last), max(other_high, first, last)
-        if not (low <= other_high + distance and other_low <= high + distance):
-            return False
-    return True
+def meeting(surface: SurfaceBox, pairs: Ints, start: Floats, end: Floats, distance: float) -> Ints:
+    """The rows of the pairs whose boxes come within a distance of each other [m] while points go from start to end."""
+    points, faces, edges = boxes_of(surface, start, end, distance)
+    found = np.empty(len(pairs), np.int64)
+    count = 0
+    for c in range(len(pairs)):
+        a, b = pairs[c, 5], pairs[c, 6]
+        if meet(edges, a, edges, b) if pairs[c, 0] > 0 else meet(points, a, faces, b):
+            found[count] = c
+            count += 1
+    return found[:count]

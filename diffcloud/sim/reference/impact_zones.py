@@ -17,7 +17,7 @@ from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.compiled.sorting import ascending
-from diffcloud.sim.contact.neighbours import Neighbours, boxes_meet, neighbours_of
+from diffcloud.sim.contact.neighbours import Neighbours, meeting, neighbours_of
 from diffcloud.sim.contact.surface import SurfaceBox
 from diffcloud.sim.reference.dual import applied, gram, solve_dual
 from diffcloud.sim.reference.impact_times import NEVER, first_impact
@@ -116,10 +116,8 @@ def _impacts(  # type: ignore[no-untyped-def]
     hits, times, found = np.empty((16, 1), np.int64), np.empty((16, 2)), np.empty((16, 7))
     count = 0
     x, y, place = np.empty((4, 3)), np.empty((4, 3)), np.empty(7)
-    for c in range(len(pairs)):
+    for c in meeting(surface, pairs, start, places, TOUCH):
         if not (changed[pairs[c, 1]] or changed[pairs[c, 2]] or changed[pairs[c, 3]] or changed[pairs[c, 4]]):
-            continue
-        if not boxes_meet(pairs, c, start, places, TOUCH):
             continue
         for k in range(4):
             for axis in range(3):

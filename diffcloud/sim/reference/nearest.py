@@ -10,7 +10,7 @@ import numpy as np
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
-from diffcloud.sim.contact.neighbours import Neighbours, boxes_meet, neighbours_of, no_neighbours
+from diffcloud.sim.contact.neighbours import Neighbours, meeting, neighbours_of, no_neighbours
 from diffcloud.sim.contact.surface import Surface, SurfaceBox, boxed
 from diffcloud.sim.reference.frames import covers, cross3, dot3, frame_at, height
 
@@ -123,9 +123,7 @@ def _near(surface: SurfaceBox, near: Neighbours, repulsion: Repulsion, points: F
         return pairs[:0], found[:0]
     faces, around = _normals(surface, points)
     x, place = np.empty((4, 3)), np.empty(7)
-    for c in range(len(listed)):
-        if not boxes_meet(listed, c, points, points, repulsion.thickness):
-            continue
+    for c in meeting(surface, listed, points, points, repulsion.thickness):
         edges, a, b = listed[c, 0], listed[c, 5], listed[c, 6]
         for k in range(4):
             for axis in range(3):

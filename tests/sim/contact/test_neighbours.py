@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from diffcloud.compiled import kernel
-from diffcloud.sim.contact.neighbours import boxes_meet, neighbours_of, no_neighbours
+from diffcloud.sim.contact.neighbours import meeting, neighbours_of, no_neighbours
 from tests.sim.contact.scenes import crumpled
 from tests.sim.twins import broad_phase as twin
 
@@ -20,9 +20,8 @@ def followed(surface, walk, distance):
     found = []
     for step in range(len(walk) - 1):
         pairs = neighbours_of(surface, known, walk[step], walk[step + 1])
-        meet = np.empty(len(pairs), np.bool_)
-        for c in range(len(pairs)):
-            meet[c] = boxes_meet(pairs, c, walk[step], walk[step + 1], distance)
+        meet = np.zeros(len(pairs), np.bool_)
+        meet[meeting(surface, pairs, walk[step], walk[step + 1], distance)] = True
         low = known.low
         found.append((pairs, meet, low.copy()))
     return found
