@@ -1,9 +1,10 @@
 """Compiled functions and where they are kept.
 
-numba compiles a kernel when it is first called and keeps the machine code in the user's cache folder. The folder's name
-holds a fingerprint of every source that goes into kernels, since numba itself looks at one function's file and not at
-those it calls; so an upgrade compiles again and never mixes versions. Several processes may compile at once: files are
-written whole. Folders of other versions that nobody has used for 30 days are removed when a new one is made.
+numba compiles a kernel when it is first called and keeps the machine code in a subfolder of the user's cache folder.
+The subfolder is named after a fingerprint of every source that goes into kernels, since numba itself looks at one
+function's file and not at those it calls; so an upgrade compiles again and never mixes versions. Several processes may
+compile at once: files are written atomically. Folders of other versions that nobody has used for 30 days are removed
+when a new one is made.
 
 `DIFFCLOUD_CACHE_DIR` puts the folder elsewhere. `DIFFCLOUD_UNCOMPILED=1` runs all kernels as plain Python, for a
 debugger; a step then takes seconds.

@@ -282,13 +282,21 @@ def _trajectories(release: Path, reference: Path) -> str:
 
 
 def _speed(timings: list[dict[str, Any]], costs: list[dict[str, Any]]) -> str:
-    note = "Milliseconds per episode, fastest of three, one thread, all in one run (`diffcloud bench --threads 1`)."
-    few, many = (next(of for of in timings if of["nodes"] == nodes) for nodes in (256, 4096))
-    power = math.log(many["forward"] / few["forward"]) / math.log(many["nodes"] / few["nodes"])
-    growth = f"From 256 to 4,096 nodes the time of a motion grows as the number of nodes to the power {power:.2f}."
+    note = (
+        "Milliseconds per episode with one thread, all in one run on two cores of a server; of a batch, the time of all "
+        "divided by their number. `diffcloud bench --threads 1` times the built-in scenarios, `make acceptance` the "
+        "published scenes (`release_`) too. The last column carries forward-mode derivatives in ten directions along."
+    )
+    few, some, many = (next(of["forward"] for of in timings if of["nodes"] == nodes) for nodes in (256, 1024, 4096))
+    growth = (
+        "A forward motion takes time that grows as the number of nodes to the power "
+        f"{math.log(some / few, 4):.2f} from 256 to 1,024 nodes and {math.log(many / some, 4):.2f} from there to 4,096."
+    )
     contact = (
-        "The same cloth, meshed finer and finer, falls freely, or onto a sphere of 1,280 faces, 25 steps of 10 ms with "
-        "gradient (`diffcloud bench --contact`). Contacts are the pairs that repel, the mean over the steps."
+        "One cloth with ever finer meshes, once in free fall without contact handling, once dropped onto a sphere of "
+        "1,280 faces: 25 steps of 10 ms of simulated time, with gradient (`diffcloud bench --contact --threads 1`). "
+        "Contacts: the mean number of repelling pairs per step; what each costs includes the search for pairs, impacts "
+        "and their gradients."
     )
     lines = [
         "# Speed",

@@ -1,4 +1,7 @@
-"""Commands whose files are imported when they are run, not for their list, their help or a mistyped option."""
+"""Commands whose modules are imported when they run, not to list them, to show their help or to refuse a mistyped option.
+
+Commands that are groups of their own are imported for their help.
+"""
 
 from __future__ import annotations
 

@@ -1,18 +1,19 @@
-"""Whether a motion can be one: a step that has become unstable does not always leave the numbers.
+"""Whether a motion is physically possible: an unstable simulation does not always end in NaN or infinity.
 
-What moves a held cloth is its weight, its handles and the wind. With the mass M, the size l, the handles' path s and
-greatest speed v (the wind's, where that is greater), the kinetic and elastic energies E and U, and the work P of gravity
-since the start, a motion keeps, with room,
+What moves a held cloth is its weight, its handles and the wind. With the mass M, the size l, the distance s that the
+handles have moved and their greatest speed v (the wind's, where that is greater), the kinetic and elastic energies E
+and U (E₀ and U₀ at the start), and the work P of gravity since the start, a possible motion satisfies
 
     E ≤ 3 (K + W) + P,      K = E₀ + M |g| (l + s) + ½ M v²,
 
-with W the most elastic energy that was stored before. Where a node is farther than three times the cloth's size from every
-place where a handle has been, its weight must have stretched the cloth so far:
+where W is the largest elastic energy that was stored at any earlier step, and 3 is a factor of safety: K is a rule of thumb
+for what handles and wind can do. Where a node is farther than three times the cloth's size from every place where a handle
+is in the course of the motion, the available energy must explain how far the cloth has stretched:
 
     E + U ≤ 3 (K + U₀) + P.
 
-Nodes that nothing holds may have fallen freely since they were let go; moving obstacles and rigid bodies count like
-handles.
+Moving obstacles and rigid bodies count like handles. Once no handle holds the cloth at all, its nodes may also have fallen
+freely since then, but they are not stretched: what is farther is not possible.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ class ScenarioOptions(Checked):
     rate_hz: Positive = 10.0
     steps_per_frame: Annotated[int, Field(ge=1)] = 4
     integrator: Integrator = "linearised"
-    """"implicit" has smooth contact, whose gradients are better behaved; its steps take about ten times as long."""
+    """"implicit" has smooth contact, whose gradients are better behaved; its steps take four to ten times as long."""
     shaped: bool = False
     """Whether the cloth is at rest in bending as it starts, not flat."""
     soft_handles: bool = False

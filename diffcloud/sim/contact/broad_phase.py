@@ -1,8 +1,5 @@
-"""Which pairs of primitives can touch: those whose axis-aligned boxes overlap, found by sweeping along one
-axis, or by a grid where there are many.
-
-Both kinds of pair are four points with signed weights that sum to zero, and the vector between the closest places is
-Σ w_k x_k: a point and a face have (1, -b0, -b1, -b2), two edges (a0, a1, -b0, -b1).
+"""Which pairs of primitives can touch: those whose axis-aligned boxes overlap, found by sweeping along one axis, or by
+grids, one for each size of box, when there are many.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Pairs that can touch for a while (Verlet 1967): listed with a margin, so that one list does for several steps.
+"""Pairs that can touch for a while (Verlet 1967): listed with a margin, so that one list serves several steps.
 
-Points are watched by the boxes they moved in when the pairs were listed, and the list is made again once one leaves its box
-by half of the margin: two primitives whose boxes are near each other then have been listed.
+When the list is made, each point gets a box around its motion in this step and one step ahead. While all points stay within
+half of the margin around their boxes, every pair that can touch is on the list; once one leaves, the list is made again.
 """
 
 from __future__ import annotations
