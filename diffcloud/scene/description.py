@@ -13,7 +13,7 @@ from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import Material
 from diffcloud.sim.properties import Basis
 from diffcloud.sim.simulate import init
-from diffcloud.sim.surrounding import Integrator, Surrounding
+from diffcloud.sim.surrounding import Integrator, Order, Surrounding
 from diffcloud.sim.system import State, System
 
 
@@ -34,6 +34,8 @@ class Scene:
     """Gives the node masses where it differs from `material` (see `load.load_scene`)."""
     integrator: Integrator = "linearised"
     """"implicit": converged steps with smooth contact and rigid bodies; "linearised": ARCSim's steps."""
+    order: Order = 2
+    """Of the implicit integrator: 2, BDF2, or 1, backward Euler, which scenes with rigid bodies always have."""
     shaped: bool = False
     """Whether the cloth's hinges are at rest as the mesh stands (something sewn or moulded), not flat."""
 
@@ -90,6 +92,7 @@ class Scene:
             surrounding=self.surrounding,
             mass_material=self.mass_material,
             integrator=self.integrator,
+            order=self.order,
             shaped=self.shaped,
         )
         return system, init(system)

@@ -11,7 +11,7 @@ from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import Material
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.rigid.bodies import Bodies
-from diffcloud.sim.surrounding import Integrator, Surrounding
+from diffcloud.sim.surrounding import Integrator, Order, Surrounding
 from diffcloud.sim.system import System
 from diffcloud.sim.terms.term import Setup
 
@@ -25,6 +25,7 @@ def build_system(
     surrounding: Surrounding | None = None,
     mass_material: Material | None = None,
     integrator: Integrator = "linearised",
+    order: Order = 2,
     shaped: bool = False,
 ) -> System:
     """Assemble a System.
@@ -34,6 +35,7 @@ def build_system(
         mass_material: material whose density gives the node masses, where it differs from `material` (the published
             experiments reload their tables after the masses were computed).
         integrator: "implicit" for the converged step with smooth contact and rigid bodies, "linearised" for ARCSim's.
+        order: 2 for BDF2, 1 for backward Euler; the linearised integrator and scenes with rigid bodies are always of order 1.
         shaped: whether the cloth's hinges are at rest as the mesh stands, not flat.
 
     Raises:
@@ -67,4 +69,4 @@ def build_system(
             )
         },
     )
-    return System(Setup(mesh, material, surrounding, handles, bodies, integrator, shaped), time_step, properties)
+    return System(Setup(mesh, material, surrounding, handles, bodies, integrator, order, shaped), time_step, properties)

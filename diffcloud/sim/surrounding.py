@@ -13,6 +13,7 @@ from diffcloud.sim.scenery import MovingObstacle
 _ARCSIM_SMALLEST = 1e-6
 
 Integrator = Literal["implicit", "linearised"]
+Order = Literal[1, 2]
 
 
 @dataclass(frozen=True)

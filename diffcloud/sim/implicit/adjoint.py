@@ -52,6 +52,7 @@ def reverse(
     slopes = Motion(np.empty((points, 3)), speeds, speeds, np.empty((points, 3)))
     anchor_gradients, target = np.zeros((len(held.node), 3)), np.empty((len(held.node), 3))
     x, v, own = np.empty((nodes, 3)), np.empty((nodes, 3)), np.empty((count, BODY))
+    early_x, early_v = np.zeros((nodes, 3)), np.zeros((nodes, 3))  # by the start of a part, through the part after it
     for step in range(steps - 1, -1, -1):
         aim(held, track, step, anchors, parameters)
         holder = work.holder = holders(held, step, nodes)
@@ -63,12 +64,15 @@ def reverse(
             for k in range(BODY):
                 own[b, k] = body_gradients[step + 1, b, k]
         for part in range(kept.begins[step + 1] - 1, kept.begins[step] - 1, -1):
-            solved = solved_part(
-                work, scene.time_step, obstacles[step], obstacles[step + 1], kept.begins[step], part, positions[step],
-                velocities[step], bodies[step], kept,
-            )  # fmt: skip
+            solved = solved_part(work, scene, obstacles, step, part, positions, velocities, bodies, kept)
             target[:] = 0.0
             _part(work, solved, slopes, x, v, own, parameter_gradients, target)
+            keep, back = work.keep, work.back
+            for i in range(nodes):
+                for axis in range(3):
+                    by_x, by_v = x[i, axis], v[i, axis]
+                    x[i, axis], early_x[i, axis] = keep * by_x + early_x[i, axis], -back * by_x
+                    v[i, axis], early_v[i, axis] = keep * by_v + early_v[i, axis], -back * by_v
             gone = solved.gone
             for i in range(nodes):
                 h = holder[i]
@@ -101,7 +105,7 @@ def _part(
     gradients: Parameters,
     wanted: Floats,
 ) -> None:
-    """Gradients by the end of a part (x, v [V, 3], own [B, 18]) become those by its start; wanted [H, 3] takes those
+    """Gradients by the end of a part (x, v [V, 3], own [B, 18]) become those by what it starts from; wanted [H, 3] takes those
     by its targets."""
     time_step, parameters, holder, start_velocities = work.time_step, work.parameters, work.holder, work.start_velocities
     w = solved.velocity

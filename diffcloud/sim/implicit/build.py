@@ -34,6 +34,7 @@ def build_scene(setup: Setup, time_step: float) -> Scene:
         terms=terms,
         pattern=of,
         time_step=float(time_step),
+        second_order=setup.order == 2 and len(bodies.start) == 0,
         gravity=np.array(surrounding.gravity, dtype=np.float64),
         surface=surface,
         planes=Planes(

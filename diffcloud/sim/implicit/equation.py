@@ -72,8 +72,8 @@ def body_points(rigid: Rigid, bodies: Floats, points: Floats, first: int) -> Non
 
 @kernel
 def set_motion(work: Work, velocity: Floats, points: Floats) -> None:
-    """Set the motion as terms see it: velocities are those of the straight way through the step."""
-    start_positions, motion, time_step, parameters = work.start_positions, work.motion, work.time_step, work.parameters
+    """Set the motion as terms see it: velocities of obstacles and bodies are those of their straight way."""
+    start_positions, motion, parameters = work.start_positions, work.motion, work.parameters
     start_points = work.start_points
     nodes = len(start_positions)
     for i in range(len(points)):
@@ -83,7 +83,7 @@ def set_motion(work: Work, velocity: Floats, points: Floats) -> None:
                 motion.after[i, axis] = velocity[i, axis]
                 motion.displacement[i, axis] = parameters.damping[0] * velocity[i, axis]
             else:
-                motion.after[i, axis] = (points[i, axis] - start_points[i, axis]) / time_step
+                motion.after[i, axis] = (points[i, axis] - start_points[i, axis]) / work.length
 
 
 @kernel
@@ -157,17 +157,32 @@ def arm_of(rigid: Rigid, turned: Floats, p: int) -> tuple[float, float, float]:
 
 @kernel
 def first_velocities(work: Work) -> Floats:
-    """[D, 3]: of the cloth, then of each body and its rotation."""
+    """[D, 3] those of before, but for prescribed nodes: of the cloth, then of each body and its rotation."""
     start_positions, start_bodies, start_velocities = work.start_positions, work.start_bodies, work.start_velocities
+    holder, target, dt = work.holder, work.target, work.time_step
     nodes, count = len(start_positions), len(start_bodies)
     found = np.empty((nodes + 2 * count, 3))
     for i in range(nodes):
+        h = holder[i]
         for axis in range(3):
             found[i, axis] = start_velocities[i, axis]
+            if h >= 0:
+                found[i, axis] = (target[h, axis] - start_positions[i, axis]) / dt
     for b in range(count):
         for axis in range(3):
             found[nodes + 2 * b, axis] = start_bodies[b, 12 + axis]
             found[nodes + 2 * b + 1, axis] = start_bodies[b, 15 + axis]
+    return found
+
+
+@kernel
+def resting_velocities(work: Work) -> Floats:
+    """[D, 3] those with which nothing moves from where it is."""
+    start_points, start_positions, time_step = work.start_points, work.start_positions, work.time_step
+    found = np.zeros((len(start_positions) + 2 * len(work.start_bodies), 3))
+    for i in range(len(start_positions)):
+        for axis in range(3):
+            found[i, axis] = (start_points[i, axis] - start_positions[i, axis]) / time_step
     return found
 
 

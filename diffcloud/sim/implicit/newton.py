@@ -6,10 +6,10 @@ import numpy as np
 
 from diffcloud.compiled import inlined, kernel
 from diffcloud.sim.compiled.box import Box, BoxType, define
-from diffcloud.sim.compiled.data import Floats
+from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.lu import solve_general
 from diffcloud.sim.contact.places import as_elements, places
-from diffcloud.sim.implicit.equation import first_velocities, place_points, residual, set_motion
+from diffcloud.sim.implicit.equation import first_velocities, place_points, residual, resting_velocities, set_motion
 from diffcloud.sim.implicit.matrix import newton_matrix
 from diffcloud.sim.implicit.room import Room, away, cover, distances_at, free_way, room_around
 from diffcloud.sim.implicit.scene import Work
@@ -26,8 +26,11 @@ _SLOWEST = 1e-1
 """Velocities below this are at rest for the tolerance [m/s]."""
 _LEAST_CAUTION = 0.05
 """Of the step after one that the exact matrix led astray."""
-_REUSE = 1e-4
-"""A relative change below this is followed by one correction with the same matrix instead of a new one."""
+_ROUGH = 1e-4
+"""Relative changes above this are checked, and shortened where they lead astray."""
+_REUSE = 1e-3
+"""After a relative change below this the matrix serves once more, and then as long as changes shrink tenfold."""
+_SHRINKING = 0.1
 _WHOLE = 1 - 1e-9
 """A way that is free so far is free: where it has been shortened before, only rounding keeps it from being whole."""
 _PROBE = 1e-4
@@ -70,28 +73,28 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
     """Solve one part of a step: (whether it converged, where, the room, the last relative change)."""
     work.wide, work.moved = work.pattern, np.arange(len(work.pattern.rows))
     count, first = len(work.start_points), first_velocities(work)
-    turned, still = np.empty((len(work.start_bodies), 12)), np.zeros((len(first), 3))
+    turned, still = np.empty((len(work.start_bodies), 12)), resting_velocities(work)
     begin, predicted = np.empty((count, 3)), np.empty((count, 3))
     place_points(work, first, work.final_scenery, predicted, turned)
     place_points(work, still, work.start_scenery, begin, turned)
     room = room_around(work, begin, predicted)
     # velocities go on, as far as nothing is in the way
-    here = _towards(work, _place(work, room, still, work.start_scenery, begin, turned), first, 1.0, room)
+    here = _towards(work, _place(work, room, still, work.start_scenery, begin, turned), first - still, 1.0, room)
     left_over, trial_left = np.empty((len(first), 3)), np.empty((len(first), 3))
     residual(work, here.velocity, here.points, here.turned, here.touching, left_over)
-    fresh, change, caution = False, np.inf, 1.0
+    stale, change, caution = True, np.inf, 1.0
     right, direction = np.empty((len(first), 3)), np.empty((len(first), 3))
     for _ in range(_ITERATIONS):
-        if not fresh:
+        fresh = stale
+        if stale:
             set_motion(work, here.velocity, here.points)
             matrix = newton_matrix(work, here.velocity, here.turned, here.listed, here.numbers, here.touching, caution)
-            fresh = True
         _pushed(work, here, left_over, right)
         if not solve_general(matrix, right, 0, direction):
             return False, here, room, change
-        downhill, size = _judge(left_over, direction, here.velocity)
-        rough = size > _REUSE
-        bad = rough and downhill <= 0
+        downhill, size = _judge(work.holder, left_over, direction, here.velocity)
+        rough = size > _ROUGH
+        bad = rough and downhill <= 0 and caution < 1
         if not bad:
             here, short = _search(work, here, direction, downhill, room, rough, trial_left)
             left_over, trial_left = trial_left, left_over
@@ -101,22 +104,24 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
             if settled and _arrived(here.scenery, work.final_scenery):
                 return True, here, room, change
             bad = short
-            if not bad and not rough and caution == 0:
+            stale = bad or caution > 0 or change > _REUSE or not (fresh or change < _SHRINKING * before)
+            if not stale:
                 continue
-        fresh = False
+        stale = True
         caution = min(max(4 * caution, _LEAST_CAUTION), 1.0) if bad else 0.0
     return False, here, room, change
 
 
 @kernel
-def _judge(left_over: Floats, direction: Floats, velocity: Floats) -> tuple[float, float]:
+def _judge(holder: Ints, left_over: Floats, direction: Floats, velocity: Floats) -> tuple[float, float]:
     """Turn a direction [D, 3] round; (how steeply the residual leads downhill along it, its size relative to
     velocities)."""
     downhill, speed, size = 0.0, _SLOWEST, 0.0
     for i in range(len(direction)):
         for axis in range(3):
             direction[i, axis] = -direction[i, axis]
-            downhill -= left_over[i, axis] * direction[i, axis]
+            if i >= len(holder) or holder[i] < 0:
+                downhill -= left_over[i, axis] * direction[i, axis]
             speed = max(speed, abs(velocity[i, axis]))
             size = max(size, abs(direction[i, axis]))
     return downhill, size / speed
@@ -167,7 +172,7 @@ def _search(
     Returns:
         (the place, whether the step had to be shortened for it)
     """
-    alpha, short, trial = 1.0, False, here
+    alpha, short, trial, holder = 1.0, False, here, work.holder
     most = 1e-300
     for i in range(len(direction)):
         for axis in range(3):
@@ -179,9 +184,10 @@ def _search(
         new, old = trial.velocity, here.velocity
         for i in range(len(direction)):
             for axis in range(3):
-                uphill += found[i, axis] * direction[i, axis]
+                if i >= len(holder) or holder[i] < 0:
+                    uphill += found[i, axis] * direction[i, axis]
                 gone = max(gone, abs(new[i, axis] - old[i, axis]))
-        if not rough or uphill <= 0.9 * downhill:
+        if not rough or uphill <= 0.9 * max(downhill, 0.0):
             break
         short = True
         alpha = 0.5 * gone / most

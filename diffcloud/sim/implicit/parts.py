@@ -10,7 +10,7 @@ from diffcloud.sim.compiled.data import Floats
 from diffcloud.sim.contact.places import as_elements
 from diffcloud.sim.implicit.equation import place_points, set_motion
 from diffcloud.sim.implicit.matrix import newton_matrix
-from diffcloud.sim.implicit.scene import BODY, PARTS, Kept, Work
+from diffcloud.sim.implicit.scene import BODY, PARTS, Kept, Scene, Work, follow, no_past
 from diffcloud.sim.implicit.step import begin_part
 
 
@@ -36,10 +36,9 @@ define(Solved, SolvedType, ["velocity", "turned", "touching", "matrix", "gone"])
 @inlined
 def solved_part(
     work: Work,
-    time_step: float,
-    before: Floats,
-    after: Floats,
-    first: int,
+    scene: Scene,
+    obstacles: Floats,
+    step: int,
     part: int,
     positions: Floats,
     velocities: Floats,
@@ -49,19 +48,23 @@ def solved_part(
     """A part of a step: sets its start and its motion in `work`.
 
     Args:
-        time_step: of the whole step [s].
-        before, after: [O, 3] obstacles at its ends [m].
-        first: its first part.
-        positions, velocities, bodies: at its start.
+        obstacles: [S + 1, O, 3] [m]
+        positions, velocities, bodies: [S + 1, ...] after each step.
     """
-    nodes, count = len(positions), len(bodies)
-    begin, end = 0, kept.ends[part]
-    x, v, own = positions, velocities, bodies
-    if part > first:
-        begin = kept.ends[part - 1]
-        x, v, own = np.empty((nodes, 3)), np.empty((nodes, 3)), np.empty((count, BODY))
+    nodes, count = positions.shape[1], bodies.shape[1]
+    x, v, own = positions[0].copy(), velocities[0].copy(), bodies[0].copy()
+    past = no_past(nodes)
+    if scene.second_order and part > 0:
+        if part > 1:
+            _read(kept.states[part - 2], x, v, own)
+        follow(past, (kept.ends[part - 1] - _begin(kept, part - 1)) / PARTS, x, v)
+    if part > 0:
         _read(kept.states[part - 1], x, v, own)
-    begin_part(work, time_step, before, after, begin, end, positions, x, v, own)
+    end = kept.ends[part]
+    begin_part(
+        work, scene.time_step, obstacles[step], obstacles[step + 1], _begin(kept, part), end, positions[step], x, v, own,
+        past,
+    )  # fmt: skip
     last, speed, others = np.empty((nodes, 3)), np.empty((nodes, 3)), np.empty((count, BODY))
     _read(kept.states[part], last, speed, others)
     velocity = np.empty((nodes + 2 * count, 3))
@@ -79,6 +82,12 @@ def solved_part(
     work.wide, work.moved = work.pattern, np.arange(len(work.pattern.rows))
     matrix = newton_matrix(work, velocity, turned, listed, numbers, touching, 0.0)
     return Solved(velocity, turned, touching, matrix, end / PARTS)
+
+
+@kernel
+def _begin(kept: Kept, part: int) -> int:
+    """Where in its step a part begins."""
+    return 0 if part == 0 or kept.ends[part - 1] == PARTS else kept.ends[part - 1]
 
 
 @kernel

@@ -40,6 +40,8 @@ class Scene(NamedTuple):
     """Over V + 2 B places."""
     time_step: float
     """[s]"""
+    second_order: bool
+    """Whether steps are BDF2's; else backward Euler's."""
     gravity: Floats
     """[3] [m/s²]"""
     surface: Surface
@@ -64,8 +66,10 @@ class Work(Box):  # type: ignore[misc]
         freedom: [N, 2] the rows of each point's motion: its own, or its body's centre and rotation; below zero: none.
         first_body_point: V + O.
         parameters, motion: of the whole cloth; `motion` is room.
-        time_step: of the part [s].
-        start_positions, start_velocities: [V, 3] the cloth where the part starts [m], [m/s].
+        length: of the part [s].
+        keep, back: weights of the last and the last but one state in `start_positions` and `start_velocities`.
+        time_step: by which velocities and forces at the part's end act [s]; shorter than `length` in BDF2.
+        start_positions, start_velocities: [V, 3] what they act on: the start, or where two last states lead [m], [m/s].
         start_bodies: [B, 18]
         start_scenery, final_scenery: [O, 3] where obstacles are, and where they go [m].
         start_points: [N, 3] all points where the part starts [m].
@@ -91,6 +95,9 @@ define(
         "first_body_point",
         "parameters",
         "motion",
+        "length",
+        "keep",
+        "back",
         "time_step",
         "start_positions",
         "start_velocities",
@@ -132,6 +139,9 @@ def new_work(scene: Scene, parameters: Parameters, nodes: int, bodies: int) -> W
         parameters,
         motion,
         scene.time_step,
+        1.0,
+        0.0,
+        scene.time_step,
         np.empty((nodes, 3)),
         np.empty((nodes, 3)),
         np.empty((bodies, BODY)),
@@ -143,6 +153,32 @@ def new_work(scene: Scene, parameters: Parameters, nodes: int, bodies: int) -> W
         scene.pattern,
         np.arange(len(scene.pattern.rows)),
     )
+
+
+class Past(NamedTuple):
+    """The state before the part that is worked on."""
+
+    positions: Floats
+    """[V, 3] [m]"""
+    velocities: Floats
+    """[V, 3] [m/s]"""
+    length: Floats
+    """[1] of the part between, as part of a step; 0: there is none."""
+
+
+@kernel
+def no_past(nodes: int) -> Past:
+    """Before an episode."""
+    return Past(np.zeros((nodes, 3)), np.zeros((nodes, 3)), np.zeros(1))
+
+
+@kernel
+def follow(past: Past, length: float, positions: Floats, velocities: Floats) -> None:
+    """The start of a part that is done becomes the past of the next one."""
+    past.length[0] = length
+    for i in range(len(positions)):
+        for axis in range(3):
+            past.positions[i, axis], past.velocities[i, axis] = positions[i, axis], velocities[i, axis]
 
 
 class Kept(NamedTuple):

@@ -12,8 +12,11 @@ from diffcloud.sim.held import Held, aim, first_anchors, holders, take_anchors
 from diffcloud.sim.implicit.equation import body_points, finish
 from diffcloud.sim.implicit.newton import converge
 from diffcloud.sim.implicit.room import distance_of
-from diffcloud.sim.implicit.scene import BODY, PARTS, Kept, Scene, Work, new_work, nothing_kept
+from diffcloud.sim.implicit.scene import BODY, PARTS, Kept, Past, Scene, Work, follow, new_work, no_past, nothing_kept
 from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE, STUCK
+
+_GROWTH = 2.0
+"""A part may be so many times as long as the one before it; BDF2 is stable up to 1 + √2."""
 
 
 @kernel
@@ -51,7 +54,7 @@ def simulate(
     kept = nothing_kept(steps if keep >= 0 else 0, 6 * nodes + BODY * bodies.shape[1])
     parts = 0
     anchors[:] = first_anchors(held, positions[0])
-    work = new_work(scene, parameters, nodes, bodies.shape[1])
+    work, past = new_work(scene, parameters, nodes, bodies.shape[1]), no_past(nodes)
     for step in range(steps):
         if control[1] != 0:
             return INTERRUPTED, step, kept
@@ -71,7 +74,7 @@ def simulate(
         while place < PARTS:
             begin_part(
                 work, scene.time_step, obstacles[step], obstacles[step + 1], place, place + length, positions[step],
-                positions[step + 1], velocities[step + 1], bodies[step + 1],
+                positions[step + 1], velocities[step + 1], bodies[step + 1], past,
             )  # fmt: skip
             done, here, room, change = converge(work)
             if not done:
@@ -81,6 +84,8 @@ def simulate(
                     return STUCK, step, kept
                 length //= 2
                 continue
+            if scene.second_order:
+                follow(past, length / PARTS, positions[step + 1], velocities[step + 1])
             finish(work, here.velocity, here.turned, positions[step + 1], velocities[step + 1], bodies[step + 1])
             place += length
             length = place & -place  # the other half, or that of the part which both make up
@@ -116,6 +121,7 @@ def begin_part(
     positions: Floats,
     velocities: Floats,
     bodies: Floats,
+    past: Past,
 ) -> None:
     """Set what the part [begin, end] of a step starts from, of `PARTS`; prescribed nodes and obstacles go straight.
 
@@ -124,9 +130,13 @@ def begin_part(
         before, after: [O, 3] obstacles at its ends [m].
         first: [V, 3] positions at its start [m].
         positions, velocities, bodies: at the start of this part.
+        past: of the part before.
     """
     a, b = begin / PARTS, end / PARTS
-    work.time_step = (b - a) * time_step
+    work.length = (b - a) * time_step
+    work.keep, work.back, share = _weights(b - a, past.length[0])
+    work.time_step = share * work.length
+    keep, back = work.keep, work.back
     scenery, final, points, nodes = work.start_scenery, work.final_scenery, work.start_points, len(positions)
     for o in range(len(scenery)):
         for axis in range(3):
@@ -139,8 +149,9 @@ def begin_part(
     for i in range(nodes):
         h = holder[i]
         for axis in range(3):
-            points[i, axis] = x0[i, axis] = positions[i, axis]
-            v0[i, axis] = velocities[i, axis]
+            points[i, axis] = positions[i, axis]
+            x0[i, axis] = keep * positions[i, axis] - back * past.positions[i, axis]
+            v0[i, axis] = keep * velocities[i, axis] - back * past.velocities[i, axis]
             if h >= 0:
                 way = wanted[h, axis] - first[i, axis]
                 target[h, axis] = wanted[h, axis] if end == PARTS else first[i, axis] + b * way
@@ -149,6 +160,19 @@ def begin_part(
             own[body, k] = bodies[body, k]
     if len(own) > 0:
         body_points(work.rigid, own, points, work.first_body_point)
+
+
+@kernel
+def _weights(length: float, before: float) -> tuple[float, float, float]:
+    """Of the last state, of that before it, and of the rate at the end in BDF2 with a part so long and one before it.
+
+    Without one before, or one that is too short for the method's stability, those of backward Euler.
+    """
+    if before == 0 or length > _GROWTH * before:
+        return 1.0, 0.0, 1.0
+    ratio = length / before
+    whole = 1 + 2 * ratio
+    return (1 + ratio) ** 2 / whole, ratio**2 / whole, (1 + ratio) / whole
 
 
 @kernel

@@ -58,6 +58,7 @@ def tangents(
     anchor_rates, target = np.empty((directions, len(held.node), 3)), np.empty((directions, len(held.node), 3))
     for d in range(directions):
         anchor_rates[d] = first_anchors(held, position_rates[0, d])
+    early_x, early_v = np.zeros((directions, nodes, 3)), np.zeros((directions, nodes, 3))  # before the part before
     for step in range(steps):
         take_anchors_tangent(held, track_rates, step, position_rates[step], anchor_rates)
         aim(held, track, step, anchors, parameters)
@@ -72,11 +73,15 @@ def tangents(
                 for k in range(BODY):
                     own[d, b, k] = body_rates[step, d, b, k]
         for part in range(kept.begins[step], kept.begins[step + 1]):
-            solved = solved_part(
-                work, scene.time_step, obstacles[step], obstacles[step + 1], kept.begins[step], part, positions[step],
-                velocities[step], bodies[step], kept,
-            )  # fmt: skip
+            solved = solved_part(work, scene, obstacles, step, part, positions, velocities, bodies, kept)
             _aimed(work.holder, solved.gone, position_rates[step], parameter_rates.target, target)
+            keep, back = work.keep, work.back
+            for d in range(directions):
+                for i in range(nodes):
+                    for axis in range(3):
+                        old_x, old_v = x[d, i, axis], v[d, i, axis]
+                        x[d, i, axis], early_x[d, i, axis] = keep * old_x - back * early_x[d, i, axis], old_x
+                        v[d, i, axis], early_v[d, i, axis] = keep * old_v - back * early_v[d, i, axis], old_v
             _part(work, parameter_rates, solved, rates, target, x, v, own)
 
 
@@ -102,7 +107,7 @@ def _part(
     v: Floats,
     own: Floats,
 ) -> None:
-    """Rates of the start of a part (x, v [K, V, 3], own [K, B, 18]) become those of its end."""
+    """Rates of what a part starts from (x, v [K, V, 3], own [K, B, 18]) become those of its end."""
     time_step, holder, motion, parameters = work.time_step, work.holder, work.motion, work.parameters
     start_velocities = work.start_velocities
     w = solved.velocity

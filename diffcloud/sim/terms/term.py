@@ -18,7 +18,7 @@ from diffcloud.sim.compiled.trace import Graph, Scalar, Vector
 from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import Material
 from diffcloud.sim.rigid.bodies import Bodies
-from diffcloud.sim.surrounding import Integrator, Surrounding
+from diffcloud.sim.surrounding import Integrator, Order, Surrounding
 
 Place = Literal["element", "corner", "episode", "vector"]
 """Whether a parameter has a value for each element, for each node, one for the whole motion, or three for each element."""
@@ -34,6 +34,7 @@ class Setup:
     handles: Handles
     bodies: Bodies
     integrator: Integrator
+    order: Order
     shaped: bool
     """Whether the cloth's hinges are at rest as the mesh stands, not flat."""
 
