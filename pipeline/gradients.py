@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import pandas as pd
@@ -26,7 +26,9 @@ _COLUMNS = [f"{kind}{name}" for kind in ("", "gradient_", "difference_") for nam
 def gradients(
     scenario: ScenarioName = None,
     scene: SceneFile = None,
-    implicit: Annotated[bool, typer.Option("--implicit", help="Instead of the scenario's own integrator.")] = False,
+    integrator: Annotated[
+        Literal["implicit", "linearised"] | None, typer.Option(help="Instead of the scenario's own.")
+    ] = None,
     pairs: Annotated[int, typer.Option(min=1, help="Random (stretch, mass), uniform over their bounds.")] = 50,
     seed: Annotated[int, typer.Option(min=0, help="Of the pairs.")] = 0,
     out: Annotated[Path | None, typer.Option(help="CSV of all pairs; one that is there is gone on with.")] = None,
@@ -37,8 +39,8 @@ def gradients(
     distance at the loss frame to the run at (1, 1)."""
     use_threads(threads)
     chosen = choose_scenario(scenario, scene)
-    if implicit:
-        chosen = replace(chosen, scene=chosen.scene.implicit())
+    if integrator is not None:
+        chosen = replace(chosen, scene=chosen.scene.stepped(integrator))
     drawn = random_parameters(chosen, pairs, seed=seed)
     done = _read(out, drawn)
     with progress_bar("gradients", pairs) as update:

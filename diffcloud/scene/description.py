@@ -13,7 +13,7 @@ from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import Material
 from diffcloud.sim.properties import Basis
 from diffcloud.sim.simulate import init
-from diffcloud.sim.surrounding import Integrator, Order, Surrounding
+from diffcloud.sim.surrounding import Integrator, Order, ReferenceContact, Surrounding
 from diffcloud.sim.system import State, System
 
 
@@ -78,9 +78,11 @@ class Scene:
             case "body_mass":
                 return float(self.build()[0].properties.body_mass.sum()) if self.surrounding.bodies else 0.0
 
-    def implicit(self) -> Scene:
-        """The same scene with the implicit integrator, whose contact is its own."""
-        return replace(self, integrator="implicit", surrounding=replace(self.surrounding, reference_contact=None))
+    def stepped(self, integrator: Integrator, order: Order = 2) -> Scene:
+        """The same scene with an integrator and the contact that is its own."""
+        contact = (self.surrounding.reference_contact or ReferenceContact()) if integrator == "linearised" else None
+        surrounding = replace(self.surrounding, reference_contact=contact)
+        return replace(self, integrator=integrator, order=order, surrounding=surrounding)
 
     def build(self) -> tuple[System, State]:
         """(System, State at time zero with batch 1)."""

@@ -35,7 +35,7 @@ def build_system(
         mass_material: material whose density gives the node masses, where it differs from `material` (the published
             experiments reload their tables after the masses were computed).
         integrator: "implicit" for the converged step with smooth contact and rigid bodies, "linearised" for ARCSim's.
-        order: 2 for BDF2, 1 for backward Euler; the linearised integrator and scenes with rigid bodies are always of order 1.
+        order: of the implicit integrator: 2 for BDF2, 1 for backward Euler, which scenes with rigid bodies always have.
         shaped: whether the cloth's hinges are at rest as the mesh stands, not flat.
 
     Raises:

@@ -375,8 +375,8 @@ class TestPatience:
 
 class TestGradientAgreement:
     def test_smooth_losses_agree(self, monkeypatch):
-        """In the air, where only truncation is between them."""
-        monkeypatch.setattr("diffcloud.fit.agreement.STEP", 1e-4)
+        """In the air, where only truncation is between them, and kinks of the material's table, if the step is longer."""
+        monkeypatch.setattr("diffcloud.fit.agreement.STEP", 1e-5)
         scenario = small_lift(gap_m=0.5)
         (found,) = gradient_agreement(scenario, np.array([[0.5, 0.3], [2.0, 1.5], [1.2, 0.8]]))
         assert found.same_sign.all()

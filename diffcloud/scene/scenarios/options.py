@@ -32,8 +32,9 @@ class ScenarioOptions(Checked):
     frames: Annotated[int, Field(ge=1)] = 25
     rate_hz: Positive = 10.0
     steps_per_frame: Annotated[int, Field(ge=1)] = 4
-    integrator: Integrator = "linearised"
-    """"implicit" has smooth contact, whose gradients are better behaved; its steps take four to ten times as long."""
+    integrator: Integrator = "implicit"
+    """"implicit" has steps of second order and smooth contact; "linearised" are ARCSim's steps, a quarter to a tenth as
+    long to compute and less exact (docs/results/discretisation.md)."""
     shaped: bool = False
     """Whether the cloth is at rest in bending as it starts, not flat."""
     soft_handles: bool = False

@@ -105,8 +105,8 @@ def _part(
     gradients: Parameters,
     wanted: Floats,
 ) -> None:
-    """Gradients by the end of a part (x, v [V, 3], own [B, 18]) become those by what it starts from; wanted [H, 3] takes those
-    by its targets."""
+    """Gradients by the end of a part (x, v [V, 3], own [B, 18]) become those by what it starts from; wanted [H, 3]
+    takes those by its targets."""
     time_step, parameters, holder, start_velocities = work.time_step, work.parameters, work.holder, work.start_velocities
     w = solved.velocity
     dt, nodes, count = time_step, len(x), len(own)
