@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from diffcloud.evaluation.discretisation import FINER, NUDGE, MeshRow, StepRow, mesh_study, step_study
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.io.files import write_text
+from diffcloud.scene.description import Scene
 from diffcloud.sim.surrounding import Integrator, Order
-from pipeline.console import errors, output, progress_bar, writes
+from pipeline.console import JsonFlag, errors, finish, progress_bar, writes
 from pipeline.scenario_options import choose_scenario
 
 NAMES = ("lift", "fold", "band_stretch", "vest_hang")
@@ -27,6 +28,7 @@ def discretisation(
     scenario: Annotated[list[str] | None, typer.Option(help="Built-in or YAML file; default: all built-ins.")] = None,
     cuts: Annotated[int, typer.Option(min=0, max=3, help="How often meshes are cut finer.")] = 2,
     out: Annotated[Path, typer.Option(help="Markdown page.")] = Path("docs/results/discretisation.md"),
+    json: JsonFlag = False,
 ) -> None:
     """Errors of step size and mesh at the loss frame, for nine pairs of stretch and mass; writes a Markdown page."""
     chosen = [choose_scenario(name) for name in scenario or NAMES]
@@ -40,13 +42,15 @@ def discretisation(
                 steps += step_study(one, one.scene.stepped(integrator, order), sizes)
             update(place * (len(STEPPERS) + 1) + len(STEPPERS), f"{one.name}, meshes")
             meshes += mesh_study(one, cuts) if cuts else []
-    page = _page({one.name: one.scene.frame_steps for one in chosen}, steps, meshes)
-    write_text(out, page)
-    output.print(page, markup=False)
+    own = {one.name: one.scene for one in chosen}
+    write_text(out, _page(own, steps, meshes))
     errors.print(f"Wrote {out}.")
+    largest = {row.scenario: float(1e3 * row.errors.max()) for row in steps if _is_default(own, row)}
+    largest_mm = {name: value if np.isfinite(value) else None for name, value in largest.items()}
+    finish({"out": str(out), "largest_mm": largest_mm}, json)
 
 
-def _page(own: dict[str, int], steps: list[StepRow], meshes: list[MeshRow]) -> str:
+def _page(own: dict[str, Scene], steps: list[StepRow], meshes: list[MeshRow]) -> str:
     head = [
         "scenario",
         "step",
@@ -75,7 +79,7 @@ def _page(own: dict[str, int], steps: list[StepRow], meshes: list[MeshRow]) -> s
         "stretch and mass: the middles of nine equal parts of their bounds, on the logarithmic scale. The last distance is "
         f"to a run whose start was changed by {NUDGE:.0e} m at random: where it is large, the motion is chaotic, and no "
         "step size makes it repeat. Milliseconds are processor time as far as the loss frame, of one core. "
-        "`diffcloud discretisation` makes this page.",
+        "`diffcloud discretisation` makes this page; `towel` is the tutorial's cloth ([own-clouds.md](../own-clouds.md)).",
         "",
         *markdown_table(head, rows),
         "",
@@ -120,8 +124,10 @@ def _cheapest(steps: list[StepRow]) -> list[str]:
     ]
 
 
-def _is_default(own: dict[str, int], row: StepRow) -> bool:
-    return (row.integrator, row.order, row.steps_per_frame) == ("implicit", 2, own[row.scenario])
+def _is_default(own: dict[str, Scene], row: StepRow) -> bool:
+    scene = own[row.scenario]
+    order = scene.order if scene.integrator == "implicit" else 1
+    return (row.integrator, row.order, row.steps_per_frame) == (scene.integrator, order, scene.frame_steps)
 
 
 def _stepper(row: StepRow) -> str:

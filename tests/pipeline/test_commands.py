@@ -310,3 +310,12 @@ def test_a_study_of_gradients_goes_on_where_it_stopped(work):
     assert run(*options, "--pairs", 3, cwd=work).result["pairs"] == 3
     assert (work / "pairs.csv").read_text().splitlines()[:3] == first
     assert "other pairs" in run(*options, "--pairs", 3, "--seed", 1, cwd=work, code=1).errors
+
+
+def test_a_study_of_steps_and_meshes_writes_its_page(work):
+    (work / "tiny.yaml").write_text(yaml.safe_dump(SMALL | {"nodes": [3, 3], "frames": 1}))
+    run("discretisation", "--scenario", "tiny.yaml", "--cuts", 1, "--out", "page.md", cwd=work)
+    page = (work / "page.md").read_text()
+    assert "| tiny | implicit, BDF2 | 2 (default) |" in page
+    assert "| tiny | linearised | 32 |" in page
+    assert "## Meshes" in page

@@ -1,0 +1,43 @@
+"""Errors of step size and mesh."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from diffcloud.evaluation.discretisation import _finer, mesh_study, pairs, step_study
+from diffcloud.scene.scenarios import load_scenario
+from tests.conftest import small_lift
+
+
+def test_nine_pairs_are_the_middles_of_the_bounds_parts():
+    found = pairs(small_lift())
+    np.testing.assert_allclose(found["stretch"].unique(), 10 ** np.array([-2 / 3, 0, 2 / 3]), rtol=1e-6)
+    assert len({*zip(found["stretch"].tolist(), found["mass"].tolist(), strict=True)}) == 9
+
+
+def test_smaller_steps_are_nearer_to_still_smaller_ones():
+    scenario = small_lift(integrator="implicit", gap_m=0.5)
+    coarse, fine = step_study(scenario, scenario.scene, [1, 4])
+    assert (fine.errors < coarse.errors).all()
+    assert 0 < coarse.nudged.max() < 1e-7
+    assert (coarse.integrator, coarse.order, fine.steps_per_frame) == ("implicit", 2, 4)
+
+
+def test_a_finer_mesh_is_compared_at_the_nodes_of_the_scenario():
+    scenario = small_lift(gap_m=0.5)
+    (row,) = mesh_study(scenario, 1)
+    assert row.nodes == len(scenario.scene.mesh.nodes)
+    assert row.errors.shape == (9,)
+    assert (row.errors > 0).all()
+
+
+def test_what_lies_between_held_nodes_is_held():
+    scene = load_scenario("band_stretch").scene  # a gripper holds three by two nodes
+    finer = _finer(scene)
+    held = finer.mesh.nodes[finer.handles.nodes]
+    low, high = scene.mesh.nodes[scene.handles.nodes].min(0), scene.mesh.nodes[scene.handles.nodes].max(0)
+    inside = ((finer.mesh.nodes >= low - 1e-9) & (finer.mesh.nodes <= high + 1e-9)).all(1)
+    assert len(held) == inside.sum() == 15
+    assert replace(finer.handles, handles=finer.handles.handles[: len(scene.handles.handles)]) == scene.handles
