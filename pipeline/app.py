@@ -26,6 +26,7 @@ COMMANDS = {
     "rollout": "pipeline.rollout:rollout",
     "visibility": "pipeline.visibility:visibility",
     "gradients": "pipeline.gradients:gradients",
+    "materials": "pipeline.materials:materials",
     "discretisation": "pipeline.discretisation:discretisation",
     "bench": "pipeline.bench:bench",
     "capture": "pipeline.capture:record",

@@ -33,6 +33,8 @@ TABLE_ENTRY_TO_STRETCHING = 2.0
 TABLE_ENTRY_TO_BENDING = 0.2
 """Bending stiffness per width B [N·m] per table entry, for a strip with free edges."""
 
+_LEAST = 1e-300
+
 
 @dataclass(frozen=True)
 class Material:
@@ -73,8 +75,27 @@ class Material:
 
     @property
     def resting_stretching_stiffness(self) -> float:
-        """Mean of k0 and k2 at zero strain [N/m]: what a multiplier of 1 means in SI."""
-        return TABLE_ENTRY_TO_STRETCHING * float(self.stretching[0, [0, 2]].mean())
+        """Force per width per strain at rest of a strip whose sides are free [N/m], mean of both directions: what a
+        multiplier of 1 means in SI."""
+        k0, k1, k2 = (float(entry) for entry in self.stretching[0, :3])
+        coupled = k1**2 / max(k0, _LEAST) + k1**2 / max(k2, _LEAST)
+        return TABLE_ENTRY_TO_STRETCHING * 0.5 * (k0 + k2 - coupled)
+
+    @property
+    def strained_stretching_stiffness(self) -> float:
+        """Mean of k0 and k2 [N/m] at the tables' reference strain, to which a fabric may have stiffened."""
+        return TABLE_ENTRY_TO_STRETCHING * float(self.stretching[1:, [0, 2]].mean())
+
+    @property
+    def resting_shear_stiffness(self) -> float:
+        """Shear force per width per shear angle at rest [N/m]."""
+        return TABLE_ENTRY_TO_STRETCHING * 0.5 * float(self.stretching[0, 3])
+
+    @property
+    def resting_poisson_ratio(self) -> float:
+        """By how much a strip at rest contracts across for each part it is stretched along, mean of both directions."""
+        k0, k1, k2 = (float(entry) for entry in self.stretching[0, :3])
+        return 0.5 * (k1 / max(k0, _LEAST) + k1 / max(k2, _LEAST))
 
     @property
     def resting_bending_stiffness(self) -> float:
@@ -88,24 +109,34 @@ def isotropic(
     density: float,
     stretching: float,
     bending: float,
+    poisson: float = 0.0,
     shear: float | None = None,
     stiffening: float = 1.0,
     damping: float = 0.0,
     source: str = "",
 ) -> Material:
-    """A material from SI numbers that a data sheet or a hand test gives.
+    """A material from SI numbers that a data sheet or a hand test gives: an isotropic sheet, unless `shear` says
+    otherwise.
 
     Args:
         density: [kg/m²].
-        stretching: force per width per strain at rest [N/m].
-        bending: bending stiffness per width B [N·m] (ASTM D1388: density · g · (overhang / 2)³).
-        shear: shear coefficient k3 [N/m]; default as an isotropic sheet without Poisson effect, equal to `stretching`
-            (energy k3 E01² per area).
+        stretching: force per width per strain at rest of a strip whose sides are free [N/m]; of a solid sheet E h.
+        bending: bending stiffness per width B [N·m] (ASTM D1388: density · g · (overhang / 2)³); of a solid sheet
+            E h³/12.
+        poisson: contraction across for each part it is stretched along, in [0, 1); the tables hold no negative one.
+        shear: shear force per width per shear angle [N/m]; default that of an isotropic sheet, stretching / (2 (1 + ν)).
+            The table's k3 is twice that, since its energy is k3 E01² per area, and the shear angle 2 E01.
         stiffening: factor on the stretching coefficients at the reference strain of the tables.
         damping: [s].
+
+    Raises:
+        SceneError: a Poisson's ratio beyond its limits, or what `Material` refuses.
     """
-    shear = stretching if shear is None else shear
-    row = np.array([stretching, 0.0, stretching, shear]) / TABLE_ENTRY_TO_STRETCHING
+    if not 0 <= poisson < 1:
+        raise SceneError(f"Material {name!r}: Poisson's ratio is at least 0 and below 1 here, got {poisson}.")
+    plane = stretching / (1 - poisson**2)
+    shear = stretching / (2 * (1 + poisson)) if shear is None else shear
+    row = np.array([plane, poisson * plane, plane, 2 * shear]) / TABLE_ENTRY_TO_STRETCHING
     table = np.vstack([row, np.tile(row * stiffening, (5, 1))])
     return Material(
         name=name,
@@ -119,7 +150,8 @@ def isotropic(
 
 _BASIS_SOURCE = (
     "chosen, not measured: soft enough that the whole box [0.1, 10]² of multipliers moves a hand-sized cloth by more "
-    "than a depth camera's noise (docs/scenarios.md); most real fabrics lie at its stiff edge"
+    "than a depth camera's noise (docs/scenarios.md); most real fabrics lie at its stiff edge. Its shear is half of "
+    "an isotropic sheet's, as a knit's is lower"
 )
 _FOAM_SOURCE = (
     "chosen, not measured: so soft in its plane and so stiff across it that weight, stretching and bending are of one size "
@@ -134,7 +166,7 @@ _KES_SOURCE = (
     "Standardization and Analysis of Hand Evaluation, 1980); measure your own before you rely on it"
 )
 
-_FABRIC_DAMPING = 0.005
+FABRIC_DAMPING = 0.005
 """[s] Chosen, not measured. An elastic vibration of 2 Hz loses a fifth of its amplitude in each period, and one at the size
 of the mesh is gone within a few milliseconds; without damping those last, and no step is short enough for them."""
 
@@ -145,17 +177,17 @@ _PRESETS = {
             "basis-knit",
             density=0.2,
             stretching=4.0,
-            shear=2.0,
+            shear=1.0,
             bending=4e-6,
             stiffening=3.0,
-            damping=_FABRIC_DAMPING,
+            damping=FABRIC_DAMPING,
             source=_BASIS_SOURCE,
         ),
         isotropic(
             "basis-foam",
             density=0.2,
             stretching=2.0,
-            shear=1.0,
+            shear=0.5,
             bending=0.12,
             stiffening=7.0,
             damping=0.25,
@@ -165,7 +197,7 @@ _PRESETS = {
             "basis-soft-foam",
             density=0.2,
             stretching=1.0,
-            shear=0.5,
+            shear=0.25,
             bending=0.12,
             stiffening=3.0,
             damping=0.05,
@@ -175,33 +207,33 @@ _PRESETS = {
             "jersey-knit",
             density=0.16,
             stretching=60.0,
-            shear=30.0,
+            shear=15.0,
             bending=3e-6,
-            damping=_FABRIC_DAMPING,
+            damping=FABRIC_DAMPING,
             source=_KES_SOURCE,
         ),
         isotropic(
             "cotton-shirting",
             density=0.12,
             stretching=800.0,
-            shear=60.0,
+            shear=30.0,
             bending=8e-6,
-            damping=_FABRIC_DAMPING,
+            damping=FABRIC_DAMPING,
             source=_KES_SOURCE,
         ),
         isotropic(
-            "silk", density=0.06, stretching=700.0, shear=20.0, bending=2e-6, damping=_FABRIC_DAMPING, source=_KES_SOURCE
+            "silk", density=0.06, stretching=700.0, shear=10.0, bending=2e-6, damping=FABRIC_DAMPING, source=_KES_SOURCE
         ),
         isotropic(
-            "denim", density=0.4, stretching=2500.0, shear=250.0, bending=8e-5, damping=_FABRIC_DAMPING, source=_KES_SOURCE
+            "denim", density=0.4, stretching=2500.0, shear=125.0, bending=8e-5, damping=FABRIC_DAMPING, source=_KES_SOURCE
         ),
         isotropic(
             "paper-towel",
             density=0.045,
             stretching=1500.0,
-            shear=700.0,
+            shear=350.0,
             bending=4e-5,
-            damping=_FABRIC_DAMPING,
+            damping=FABRIC_DAMPING,
             source=_KES_SOURCE,
         ),
     )

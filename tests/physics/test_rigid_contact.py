@@ -20,7 +20,7 @@ from diffcloud.sim.simulate import rollout
 from diffcloud.sim.surrounding import ContactSettings, Surrounding
 from tests.sim.twins.rigid import angular_momenta
 
-FABRIC = isotropic("test-fabric", density=0.2, stretching=200.0, shear=80.0, bending=1e-5, source="test")
+FABRIC = isotropic("test-fabric", density=0.2, stretching=200.0, shear=40.0, bending=1e-5, source="test")
 GROUND = SurfaceMesh(np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
@@ -180,7 +180,7 @@ def test_a_band_around_a_pole_holds_as_the_capstan_says():
     x = -lift * np.cos(angle)
     z = lift * np.sin(angle) - np.clip(straight - along, 0, None) - np.clip(along - straight - arc, 0, None)
     band = ClothMesh(np.stack([x, flat.nodes[:, 1], z], 1), flat.verts, flat.vert_node, flat.face_verts)
-    fabric = isotropic("band", density=0.05, stretching=2000.0, shear=500.0, bending=1e-7, source="test")
+    fabric = isotropic("band", density=0.05, stretching=2000.0, shear=250.0, bending=1e-7, source="test")
     ends = [0, columns], [columns - 1, 2 * columns - 1]
     pole = cylinder_surface([0, -0.05, 0], [0, 0.05, 0], radius, 96)
     # pulled on one side, the band slips towards it: tension falls from that side to the other

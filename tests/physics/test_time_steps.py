@@ -23,7 +23,7 @@ from diffcloud.sim.system import System
 from diffcloud.sim.terms import kernels
 from tests.sim.twins.forces import Forces
 
-_MATERIAL = isotropic("m", density=0.2, stretching=50.0, bending=1e-5, shear=20.0)
+_MATERIAL = isotropic("m", density=0.2, stretching=50.0, bending=1e-5, shear=10.0)
 _NOTHING = Surrounding(gravity=(0.0, 0.0, 0.0), air_density=0.0)
 
 

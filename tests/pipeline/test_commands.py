@@ -312,6 +312,13 @@ def test_a_study_of_gradients_goes_on_where_it_stopped(work):
     assert "other pairs" in run(*options, "--pairs", 3, "--seed", 1, cwd=work, code=1).errors
 
 
+def test_materials_are_listed_with_all_their_numbers(work):
+    found = run("materials", cwd=work).result
+    assert found["jersey-knit"]["stretching_n_m"] == pytest.approx(60.0)
+    assert found["jersey-knit"]["shear_n_m"] == pytest.approx(15.0)
+    assert "Kawabata" in found["silk"]["source"]
+
+
 def test_a_study_of_steps_and_meshes_writes_its_page(work):
     (work / "tiny.yaml").write_text(yaml.safe_dump(SMALL | {"nodes": [3, 3], "frames": 1}))
     run("discretisation", "--scenario", "tiny.yaml", "--cuts", 1, "--out", "page.md", cwd=work)

@@ -320,6 +320,39 @@ class TestScenarios:
         assert scenario.scene.material.name == "silk"
         assert scenario.scene.surrounding.obstacles[0].plane()[1] == pytest.approx(0.1)
 
+    def test_a_material_in_the_users_own_numbers(self, tmp_path):
+        path = tmp_path / "rubber.yaml"
+        path.write_text(
+            "material: {youngs_modulus_pa: 1.0e+6, thickness_m: 0.002, density_kg_m3: 1100, poisson: 0.45, "
+            "damping_s: 0.01}\n"
+        )
+        material = load_scenario(path).scene.material
+        assert (material.name, material.damping) == ("rubber", 0.01)
+        assert material.density == pytest.approx(2.2)
+        assert material.resting_stretching_stiffness == pytest.approx(2000.0)
+        assert material.resting_shear_stiffness == pytest.approx(2000.0 / 2.9)
+        assert material.resting_bending_stiffness == pytest.approx(1e6 * 0.002**3 / 12)
+        path.write_text("material: {stretching_n_m: 300, bending_n_m: 1.0e-5, density_kg_m2: 0.2, shear_n_m: 20}\n")
+        material = load_scenario(path).scene.material
+        assert (material.density, material.resting_shear_stiffness) == (0.2, 20.0)
+
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ("{stretching_n_m: 300, thickness_m: 0.1}", "a material has either density_kg_m2"),
+            ("{}", "none of them"),
+            ("{stretching_n_m: -1, bending_n_m: 1, density_kg_m2: 1}", "stretching_n_m: Input should be greater than 0"),
+            ("{stretching_n_m: 1, bending_n_m: 1, density_kg_m2: 1, poisson: 1}", "poisson: Input should be less than 1"),
+            ("{stretch: 1}", "unknown or unsupported field"),
+            ("3", "material"),
+        ],
+    )
+    def test_wrong_materials(self, tmp_path, given, message):
+        path = tmp_path / "t.yaml"
+        path.write_text(f"material: {given}\n")
+        with pytest.raises(SceneError, match=message):
+            load_scenario(path)
+
     def test_own_material_file_is_found_beside_the_yaml(self, tmp_path):
         (tmp_path / "m.json").write_text(json.dumps(MATERIAL))
         (tmp_path / "t.yaml").write_text("material: m.json\n")

@@ -22,7 +22,7 @@ from diffcloud.sim.surrounding import ContactSettings, Surrounding
 from tests.sim.twins.rigid import rotation
 
 STEPS = 25
-FABRIC = isotropic("test", density=0.3, stretching=60.0, bending=1e-4, shear=30.0)
+FABRIC = isotropic("test", density=0.3, stretching=60.0, bending=1e-4, shear=15.0)
 NAMES = ("stretch", "mass", "bending", "drag", "damping", "friction_obstacle", "friction_cloth", "body_mass")
 
 

@@ -24,7 +24,7 @@ from diffcloud.sim.threads import use_threads
 from tests.conftest import small_lift
 from tests.sim.twins.forces import Forces
 
-MATERIAL = isotropic("test", density=0.2, stretching=50.0, bending=1e-5, shear=20.0)
+MATERIAL = isotropic("test", density=0.2, stretching=50.0, bending=1e-5, shear=10.0)
 G = 9.81
 
 

@@ -41,7 +41,7 @@ CAMEL = Material(
         ]
     ),
 )
-CONSTANT = isotropic("constant", density=0.2, stretching=40.0, bending=1e-4, shear=15.0)
+CONSTANT = isotropic("constant", density=0.2, stretching=40.0, bending=1e-4, shear=7.5)
 TABLE = SurfaceMesh(np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0.3], [-1, 1, 0.3]]), np.array([[0, 1, 2], [0, 2, 3]]))
 AROUND = {
     name: Surrounding(

@@ -14,9 +14,10 @@ from diffcloud.errors import SceneError
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.scene.description import Scene
 from diffcloud.scene.scenarios.scenario import Recorder, Scenario
+from diffcloud.scene.scenarios.sheet import Sheet
 from diffcloud.scene.schema import Checked, NonNegative, Positive, Vector
 from diffcloud.sim.handles import Handle, Handles
-from diffcloud.sim.materials import preset, read_material
+from diffcloud.sim.materials import Material, preset, read_material
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.surrounding import ContactSettings, Integrator, ReferenceContact, Surrounding
 
@@ -25,8 +26,8 @@ class ScenarioOptions(Checked):
     """The fields that all built-in scenarios share (SI units)."""
 
     name: str
-    material: str = "basis-knit"
-    """A preset, or the path of an ARCSim material JSON."""
+    material: str | Sheet = "basis-knit"
+    """A preset, the path of an ARCSim material JSON, or an isotropic sheet in SI units."""
     path: Annotated[list[tuple[float, float, float, float]], Field(min_length=2)]
     """Keyframes (time s, dx, dy, dz m) of the gripper's displacement, in the world's axes."""
     frames: Annotated[int, Field(ge=1)] = 25
@@ -61,6 +62,16 @@ class ScenarioOptions(Checked):
         return float(np.abs([key[1:] for key in self.path]).max())
 
 
+def _material(options: ScenarioOptions) -> Material:
+    match options.material:
+        case Sheet() as sheet:
+            return sheet.material(options.name)
+        case str() as name if name.endswith(".json"):
+            return read_material(Path(name))
+        case name:
+            return preset(name)
+
+
 def assemble(
     options: ScenarioOptions,
     mesh: ClothMesh,
@@ -88,11 +99,10 @@ def assemble(
         raise SceneError(f"Scenario {options.name}: loss_frames {list(options.loss_frames)} leave 0..{options.frames}.")
     motion = Motion(tuple(Keyframe(time, (x, y, z)) for time, x, y, z in options.path))
     handles = (*(Handle(node, motion) for node in grasped), *(Handle(node) for node in held))
-    material = options.material
     thickness = options.contact_thickness_m
     scene = Scene(
         mesh=mesh,
-        material=read_material(Path(material)) if material.endswith(".json") else preset(material),
+        material=_material(options),
         handles=Handles(handles, hard=not options.soft_handles),
         frame_time=1 / options.rate_hz,
         frame_steps=options.steps_per_frame,

@@ -27,7 +27,7 @@ from diffcloud.sim.terms import kernels
 from tests.sim.twins import barrier
 from tests.sim.twins.rigid import angular_momentum, rotation
 
-FABRIC = isotropic("test", density=0.2, stretching=50.0, shear=20.0, bending=1e-5)
+FABRIC = isotropic("test", density=0.2, stretching=50.0, shear=10.0, bending=1e-5)
 GRAVITY = (0.0, 0.0, -9.81)
 SCALE, THICKNESS, STICKING = 1e4, 3e-3, 1e-3
 WEIGHTS = {0: barrier.point_face_weights, 1: barrier.edge_edge_weights}
