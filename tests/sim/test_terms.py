@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from diffcloud.errors import SceneError
 from diffcloud.mesh import SurfaceMesh, grid_cloth
 from diffcloud.sim.compiled.data import Motion, Parameters
+from diffcloud.sim.compiled.trace import Graph
 from diffcloud.sim.materials import Material, isotropic
 from diffcloud.sim.surrounding import ContactSettings, Surrounding
 from diffcloud.sim.terms import TERMS
@@ -86,6 +88,22 @@ def states(mesh, rng) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("around", AROUND)
+@pytest.mark.parametrize("name", [term.name for term in TERMS])
+def test_what_velocities_at_the_end_do_is_symmetric_and_does_not_drive(name, around, mesh, rng):
+    """So that the linearised step's matrix is symmetric and positive definite."""
+    forces = Forces(mesh, CAMEL, AROUND[around], rng=rng)
+    moves = [0.5 * rng.normal(size=mesh.nodes.shape) for _ in range(3)]
+    motion = forces.motion(crumpled(mesh, rng), *moves)
+    u, w = (rng.normal(size=mesh.nodes.shape) for _ in range(2))
+
+    def pulled(adjoint: np.ndarray) -> np.ndarray:
+        return forces.reverse(name, motion, adjoint)[1].after
+
+    assert (pulled(u) * w).sum() == pytest.approx((pulled(w) * u).sum(), rel=1e-9, abs=1e-12)
+    assert (pulled(u) * u).sum() <= 1e-12
+
+
+@pytest.mark.parametrize("around", AROUND)
 @pytest.mark.parametrize("state", ["crumpled", "torn", "collapsed", "inverted", "flat", "folded"])
 @pytest.mark.parametrize("name", [term.name for term in TERMS])
 def test_kernels_are_as_their_twins_say(name, state, around, mesh, rng):
@@ -100,6 +118,7 @@ def test_kernels_are_as_their_twins_say(name, state, around, mesh, rng):
         for key, value in (*motion._asdict().items(), *forces.parameters._asdict().items())
     }
     found, expected = forces.force(name, motion), twin_force(forces, name, twin, inputs, extra)
+    assert state != "crumpled" or np.abs(found).max() > 0, "The force acts on no node: give it settings in AROUND."
     scale = max(np.abs(found).max(), 1e-9)
     np.testing.assert_allclose(found, expected.detach().numpy(), rtol=0, atol=1e-12 * scale)
 
@@ -140,6 +159,16 @@ def test_matrices_are_the_derivatives_of_the_forces(name, mesh, rng):
     whole = assembled - moved * by["before"] - moved * forces.timing.time_step * by["positions"]
     scale = max(np.abs(whole).max(), 1e-9)
     np.testing.assert_allclose(forces.jacobian(name, motion, displaced, moved), whole, rtol=0, atol=1e-12 * scale)
+
+
+def test_a_formula_that_asks_for_the_truth_of_a_number_is_refused():
+    with pytest.raises(TypeError, match="`where` instead of `if`"):
+        bool(Graph().constant(1.0))
+
+
+def test_settings_of_an_unknown_force_are_refused(mesh):
+    with pytest.raises(SceneError, match="wind_box"):
+        Forces(mesh, CAMEL, Surrounding(forces={"wind_box": {}}))
 
 
 KINDS = pytest.mark.parametrize("name", ["stretching", "bending"])

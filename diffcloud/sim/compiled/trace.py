@@ -59,6 +59,12 @@ class Scalar:
     operands: tuple[Scalar, ...]
     payload: object = None
 
+    def __bool__(self) -> bool:
+        raise TypeError(
+            "A formula is recorded before its numbers are known: `where` instead of `if`, `&` and `|` instead of `and` and "
+            "`or`."
+        )
+
     @property
     def value(self) -> float | None:
         """Of a constant."""

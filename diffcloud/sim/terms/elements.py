@@ -6,13 +6,22 @@ from typing import Any
 
 import numpy as np
 
+from diffcloud.errors import SceneError, unknown_name
 from diffcloud.sim.compiled.sparse import Pattern, pattern, slots
 from diffcloud.sim.terms import TERMS, kernels
 from diffcloud.sim.terms.term import Elements, Setup, Term
 
 
 def elements(setup: Setup, bodies: int = 0) -> tuple[Any, Pattern]:
-    """(`kernels.Terms`, the pattern of the step matrix: cloth nodes, then the centre and the rotation of each body)."""
+    """(`kernels.Terms`, the pattern of the step matrix: cloth nodes, then the centre and the rotation of each body).
+
+    Raises:
+        SceneError: the surrounding has settings of a force that there is not.
+    """
+    names = [term.name for term in TERMS]
+    for name in setup.surrounding.forces:
+        if name not in names:
+            raise SceneError(unknown_name("force", name, names))
     found = [term.build(setup) or _none(term) for term in TERMS]
     groups = [np.ascontiguousarray(one.nodes, dtype=np.int64) for one in found]
     count = len(setup.mesh.nodes)
