@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export PATH := $(CURDIR)/$(BIN):$(PATH)
+# the tests start hundreds of processes; without byte code each would compile the package again
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: venv repro test test-slow lint format bench acceptance comparison simulated recordings docs clean
 
@@ -21,7 +23,7 @@ repro: venv
 	$(if $(PROFILE),cp "$(PROFILE)" params.yaml)
 	dvc repro
 
-# one process per core, each with one thread: a simulation step gains nothing from a second one
+# one process per core and one more (tests/conftest.py), each with one thread: a step gains nothing from a second one
 TESTS := python -m pytest -n auto --maxprocesses 8 --dist worksteal
 
 test: lint

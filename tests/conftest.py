@@ -14,6 +14,7 @@ import torch
 from diffcloud.io.simulated import SimulatedSet
 from diffcloud.mesh import grid_cloth
 from diffcloud.scene.scenarios import Scenario, built_in, grid_scenario
+from diffcloud.sim.threads import cores
 
 if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(1)  # as the commands do: beside another busy process spinning threads cost tenfold
@@ -25,6 +26,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 for number in (signal.SIGHUP, signal.SIGQUIT):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, signal.SIG_DFL)
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """Of `-n auto`: one more than there are cores, since many tests of cameras, arm and processes wait."""
+    return cores() + 1
 
 
 @pytest.fixture

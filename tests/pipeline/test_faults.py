@@ -146,7 +146,7 @@ class TestKilledWhileWriting:
 
 
 class TestFullDisk:
-    @pytest.mark.parametrize("limit", [300, 3_000, 30_000, 300_000])
+    @pytest.mark.parametrize("limit", [300, 30_000])
     def test_a_training_leaves_all_or_nothing(self, work, limit):
         sets = {"train": sagging_sheet(24, scenario="small"), "test": sagging_sheet(10, seed=1, scenario="small")}
         write_simulated(work / "sim", sets, about={}, replaced="")
