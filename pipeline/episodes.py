@@ -86,6 +86,11 @@ def _synthetic(
             episode = sample_surface(nodes[repeat], faces, times, obstacle, points=scenario.points, seed=seed, meta=meta)
             write_episode(out / f"{name}.npz", episode)
         else:
+            if len(grippers := system.handles.grippers) > 1:
+                raise ConfigError(
+                    f"Scenario {scenario.name} has the grippers {', '.join(grippers)}, but the recorder by depth cameras "
+                    "has one arm; choose recorder: whole_surface."
+                )
             _replaceable(out / name, "synthetic")  # refused before it is recorded
             height = float(obstacles[0].nodes[:, 2].max()) if obstacles else float(nodes[:, 0, :, 2].min())
             motion = ClothMotion(nodes[repeat], faces, times, scenario.grasped, height)

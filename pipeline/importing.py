@@ -15,6 +15,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.hardware.realsense import play_recordings
 from diffcloud.io.depth_folders import depth_folders
 from diffcloud.io.episodes import write_episode
+from diffcloud.io.grippers import named_files
 from diffcloud.io.imports import cloud_folder, release_episodes
 from diffcloud.io.recordings import Recording, read_joint_log, write_recording
 from diffcloud.io.ros.joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
@@ -46,15 +47,21 @@ def release(
 def clouds(
     folder: Annotated[Path, typer.Argument(help="Numbered clouds (npy, ply, xyz, pcd), one a frame, in metres.")],
     out: Annotated[Path, typer.Option(help="Episode file (.npz).")],
-    gripper: Annotated[Path | None, typer.Option(help="CSV with x, y, z [m] and optionally t_s; one row a frame.")] = None,
+    gripper: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="CSV with x, y, z [m] and optionally t_s, one row a frame. Of several grippers: one with a column gripper "
+            "that names them, or NAME=PATH, repeated."
+        ),
+    ] = None,
     rate_hz: Annotated[float | None, typer.Option(help="Frame rate, if the CSV has no t_s.")] = None,
     scenario: Annotated[str | None, typer.Option(help="Name kept in the episode's metadata.")] = None,
     fabric: Annotated[str | None, typer.Option(help="Fabric kept in the episode's metadata.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Import a folder of clouds and a gripper track."""
+    """Import a folder of clouds and the tracks of grippers."""
     meta = {name: value for name, value in (("scenario", scenario), ("fabric", fabric)) if value is not None}
-    episode = cloud_folder(folder, gripper=gripper, rate_hz=rate_hz, meta=meta)
+    episode = cloud_folder(folder, grippers=named_files(gripper) if gripper else None, rate_hz=rate_hz, meta=meta)
     write_episode(out, episode)
     errors.print(f"Wrote {episode.frame_count} frames, {len(episode.points)} points to {out}.")
     finish({"out": str(out), "frames": episode.frame_count, "points": len(episode.points)}, json)

@@ -77,7 +77,7 @@ class _Fits:
 
 def _fit_all(scenario: Scenario, name: str, episode: Episode, raw: RawEpisode, truth: Truth, config: FitConfig) -> _Fits:
     hidden = episode.meta["truth"]
-    held = raw.placement.to_scene(truth.nodes[:, scenario.grasped].mean(axis=1))
+    held = raw.placement.to_scene(truth.nodes[:, scenario.grasped].mean(axis=1))[:, None]
     clouds = [raw.placement.to_scene(cloud) for cloud in visible_clouds(raw, truth)]
     noise_free = Episode.from_frames(clouds, episode.times, gripper=held)
     ratios = [_ratio(scenario, cloud, hidden["mass"], config) for cloud in (episode, noise_free, _of_first_camera(episode))]

@@ -57,7 +57,7 @@ def rollout(
         recorded = read_episode(episode)
         if recorded.gripper is None:
             raise ConfigError(f"{episode} has no gripper track; leave --episode out to use the scene's own motion.")
-        track = torch.as_tensor(track_displacement(recorded, steps, system.time_step))[None]
+        track = torch.as_tensor(track_displacement(recorded, system.handles.grippers, steps, system.time_step))[None]
     with progress_bar("simulating", steps) as update, torch.no_grad():
         try:
             run = simulate(system, steps, properties=properties, track=track, progress=lambda done: update(done, ""))

@@ -14,6 +14,7 @@ import torch
 from diffcloud.io.simulated import SimulatedSet
 from diffcloud.mesh import grid_cloth
 from diffcloud.scene.scenarios import Scenario, built_in, grid_scenario
+from diffcloud.scene.scenarios.grid import Gripper
 from diffcloud.sim.threads import cores
 
 if "OMP_NUM_THREADS" not in os.environ:
@@ -55,6 +56,15 @@ def small_lift(**changes: object) -> Scenario:
         "path": [(0.0, 0.0, 0.0, 0.0), (0.5, 0.0, -0.05, 0.15)],
     }
     return grid_scenario(built_in("lift").model_copy(update={**defaults, **changes}))
+
+
+def shaken(**changes: object) -> Scenario:
+    """The small cloth in the hands of two grippers, one of which holds two corners."""
+    grippers = {
+        "left": Gripper(grasped=("left_top",)),
+        "right": Gripper(grasped=("right_top", "right_bottom"), path=[(0.0, 0.0, 0.0, 0.0), (0.5, 0.03, 0.0, 0.12)]),
+    }
+    return small_lift(**{"yaw_deg": 0.0, "grasped": (), "grippers": grippers, **changes})
 
 
 def flat_set(

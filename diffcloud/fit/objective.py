@@ -31,7 +31,7 @@ class _Target:
     centre: Tensor
     """[3] about which the yaw of the offset turns."""
     track: Tensor | None
-    """[1, S, 3] displacement of the gripper."""
+    """[1, S, G, 3] displacement of the grippers."""
 
 
 class Objective:
@@ -151,23 +151,35 @@ class Objective:
         track = None
         if episode.gripper is not None:
             track = torch.as_tensor(
-                track_displacement(episode, self.scenario.steps, system.time_step),
+                track_displacement(episode, system.handles.grippers, self.scenario.steps, system.time_step),
                 dtype=torch.float64,
             )[None]
         centre = torch.cat([cloud.points for cloud in clouds]).mean(0)
         return _Target(torch.as_tensor(np.array(times), dtype=torch.float64), tuple(clouds), centre, track)
 
 
-def track_displacement(episode: Episode, steps: int, time_step: float) -> np.ndarray:
-    """[S, 3] displacement of the gripper since time zero at the end of each step [m].
+def track_displacement(episode: Episode, grippers: Sequence[str], steps: int, time_step: float) -> np.ndarray:
+    """[S, G, 3] displacement of the scene's grippers since time zero at the end of each step [m].
 
     A cubic spline through the recorded positions, constant after the last. Recorded positions begin with the motion: a
     track whose first frame is later than time zero is held at its first position until then.
+
+    Raises:
+        EpisodeError: other grippers were recorded than the scene has. (A single one needs no name.)
     """
     assert episode.gripper is not None
+    if len(grippers) == len(episode.grippers) == 1:
+        recorded = [0]
+    elif set(grippers) == set(episode.grippers):
+        recorded = [episode.grippers.index(name) for name in grippers]
+    else:
+        raise EpisodeError(
+            f"The scene's grippers are {', '.join(grippers) or 'none'}, the episode's {', '.join(episode.grippers)}; give "
+            "both the same names, in the scenario's `grippers` or in the tracks that are imported."
+        )
     if len(episode.times) < 2:
-        return np.zeros((steps, 3))
-    times, positions = episode.times, episode.gripper
+        return np.zeros((steps, len(grippers), 3))
+    times, positions = episode.times, episode.gripper[:, recorded]
     at = np.clip(np.cumsum(np.full(steps, time_step)), times[0], times[-1])
     from scipy.interpolate import CubicSpline  # slow to import, and needed for recorded grippers alone
 

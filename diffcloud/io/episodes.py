@@ -1,8 +1,8 @@
 """Episodes: recorded point clouds over time, as one `.npz` without pickles (DESIGN: data contracts).
 
 Fields: `points` float32 [P, 3] of all frames joined, `offsets` int64 [T+1], `times` [T] since the start [s], optional
-`gripper` [T, 3], optional per-point `camera` uint8, `pixel` uint16 [P, 2], `sigma` float32 [P] [m], and `meta`, a JSON
-string. All in the frame and length unit of the scenario's scene.
+`gripper` [T, G, 3] of the `grippers` [G] (names), optional per-point `camera` uint8, `pixel` uint16 [P, 2], `sigma`
+float32 [P] [m], and `meta`, a JSON string. All in the frame and length unit of the scenario's scene.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 from diffcloud.errors import EpisodeError
 from diffcloud.io.files import write_npz
 
-_OPTIONAL = {"gripper", "camera", "pixel", "sigma"}
+_OPTIONAL = {"gripper", "grippers", "camera", "pixel", "sigma"}
 _REQUIRED = {"points", "offsets", "times", "meta"}
+ONLY_GRIPPER = ("gripper",)
+"""The name of a single one."""
 _LARGEST_BYTES = 4 * 2**30
 
 
@@ -40,7 +42,9 @@ class Episode:
     times: NDArray[np.float64]
     """[T] since the start of the motion [s]."""
     gripper: NDArray[np.float64] | None = None
-    """[T, 3] tool position; None: the scene's own motion drives the handles."""
+    """[T, G, 3] position of each gripper's tool; None: the scene's own motion drives the handles."""
+    grippers: tuple[str, ...] = ONLY_GRIPPER
+    """[G] their names, as scenarios know them."""
     camera: NDArray[np.uint8] | None = None
     """[P] which camera saw the point."""
     pixel: NDArray[np.uint16] | None = None
@@ -73,8 +77,15 @@ class Episode:
             value = getattr(self, name)
             if value is not None and value.shape != (len(points), *width):
                 raise EpisodeError(f"{name} must have shape {[len(points), *width]}, got {list(value.shape)}.")
-        if self.gripper is not None and (self.gripper.shape != (count, 3) or not np.isfinite(self.gripper).all()):
-            raise EpisodeError(f"gripper must be {count} finite positions [frames, 3], got {list(self.gripper.shape)}.")
+        if self.gripper is not None:
+            names = self.grippers
+            if len(set(names)) < len(names) or not all(names):
+                raise EpisodeError(f"Each gripper needs a name of its own, got {list(names)}.")
+            if self.gripper.shape != (count, len(names), 3) or not np.isfinite(self.gripper).all():
+                raise EpisodeError(
+                    f"gripper must be finite positions {[count, len(names), 3]} (frames, grippers, axes), got "
+                    f"{list(self.gripper.shape)}."
+                )
 
     @property
     def frame_count(self) -> int:
@@ -100,9 +111,10 @@ class Episode:
         times: NDArray[np.float64],
         *,
         gripper: NDArray[np.float64] | None = None,
+        grippers: tuple[str, ...] = ONLY_GRIPPER,
         meta: Mapping[str, Any] | None = None,
     ) -> Episode:
-        """Join clouds [N_t, 3]."""
+        """Join clouds [N_t, 3]; the rest as of the fields."""
         for index, frame in enumerate(frames):
             if frame.ndim != 2 or frame.shape[1] != 3:
                 raise EpisodeError(f"Frame {index} must have shape [points, 3], got {list(frame.shape)}.")
@@ -113,6 +125,7 @@ class Episode:
             offsets=np.cumsum([0, *(len(frame) for frame in frames)], dtype=np.int64),
             times=np.asarray(times, dtype=np.float64),
             gripper=gripper,
+            grippers=grippers,
             meta=dict(meta or {}),
         )
 
@@ -121,12 +134,15 @@ def write_episode(path: Path, episode: Episode) -> None:
     """Write atomically; the same episode gives the same bytes."""
     arrays: dict[str, Any] = {"points": episode.points, "offsets": episode.offsets, "times": episode.times}
     arrays |= {name: getattr(episode, name) for name in sorted(_OPTIONAL) if getattr(episode, name) is not None}
+    arrays.pop("grippers")
+    if episode.gripper is not None:
+        arrays["grippers"] = np.array(episode.grippers)
     arrays["meta"] = np.array(json.dumps(dict(episode.meta), sort_keys=True, allow_nan=False))
     write_npz(path, **arrays)
 
 
 def read_episode(path: Path) -> Episode:
-    """Read and check an episode.
+    """Read and check an episode. A track [T, 3], as earlier versions wrote it, is that of the only gripper.
 
     Raises:
         EpisodeError: missing, damaged, not an episode, or wrong inside; names the file and the field.
@@ -153,12 +169,15 @@ def read_episode(path: Path) -> Episode:
     except (zipfile.BadZipFile, ValueError, OSError, KeyError, EOFError) as error:
         raise EpisodeError(f"{path} is not a readable episode: {error}.") from error
     kinds = {"points": np.float32, "offsets": np.int64, "times": np.float64, "gripper": np.float64}
-    kinds |= {"camera": np.uint8, "pixel": np.uint16, "sigma": np.float32}
+    kinds |= {"grippers": np.str_, "camera": np.uint8, "pixel": np.uint16, "sigma": np.float32}
     try:
         converted = {name: array.astype(kinds[name], casting="same_kind") for name, array in arrays.items()}
         if not isinstance(meta, dict):
             raise EpisodeError(f"meta must be a JSON object, got {type(meta).__name__}.")
-        return Episode(**converted, meta=meta)
+        gripper, grippers = converted.pop("gripper", None), converted.pop("grippers", np.array(ONLY_GRIPPER))
+        if gripper is not None and gripper.ndim == 2:
+            gripper = gripper[:, None]
+        return Episode(**converted, gripper=gripper, grippers=tuple(map(str, grippers.ravel())), meta=meta)
     except TypeError as error:
         raise EpisodeError(f"{path}: a field has the wrong type: {error}.") from error
     except EpisodeError as error:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
-from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.clouds import FORMATS, read_cloud
 from diffcloud.io.episodes import Episode
 from diffcloud.io.files import files_in, folders_in
+from diffcloud.io.grippers import read_tracks
 from diffcloud.io.pickles import load_npy
 
 RELEASE_FRAME_TIME = 0.04
@@ -70,13 +69,17 @@ def release_episodes(folder: Path) -> Iterator[tuple[str, str, Episode]]:
 
 
 def cloud_folder(
-    folder: Path, *, gripper: Path | None = None, rate_hz: float | None = None, meta: dict[str, Any] | None = None
+    folder: Path,
+    *,
+    grippers: Mapping[str, Path] | None = None,
+    rate_hz: float | None = None,
+    meta: dict[str, Any] | None = None,
 ) -> Episode:
     """An episode from a folder of numbered clouds, one file a frame.
 
     Args:
         folder: files `<anything><number>.(npy|ply|xyz|pcd)`, numbers without gaps, in metres in the scene's frame.
-        gripper: CSV with columns x, y, z [m] and optionally t_s [s]; one row a frame.
+        grippers: name -> CSV, as `io.grippers` reads them.
         rate_hz: frame rate where the CSV has no t_s.
 
     Raises:
@@ -84,37 +87,16 @@ def cloud_folder(
     """
     paths = _numbered(Path(folder), FORMATS)
     frames = [read_cloud(path) for path in paths]
-    times: NDArray[np.float64] | None = None
-    track: NDArray[np.float64] | None = None
-    if gripper is not None:
-        table = _read_csv(Path(gripper))
-        missing = [name for name in ("x", "y", "z") if name not in table.columns]
-        if missing:
-            raise EpisodeError(f"{gripper}: columns {missing} are missing; it has {list(table.columns)}.")
-        if len(table) != len(frames):
-            raise EpisodeError(f"{gripper} has {len(table)} rows for {len(frames)} clouds; give one row a frame.")
-        track = table[["x", "y", "z"]].to_numpy(np.float64)
-        extent = float(np.ptp(track, axis=0).max())
-        if extent > 20:
-            raise EpisodeError(f"{gripper}: the gripper moves by {extent:.0f}; positions are metres, not millimetres.")
-        if "t_s" in table.columns:
-            times = table["t_s"].to_numpy(np.float64)
-            times = times - times[0]
+    tracks = read_tracks(grippers, len(frames)) if grippers else None
+    times = None if tracks is None else tracks.times
     if times is None:
         if rate_hz is None or rate_hz <= 0:
             raise EpisodeError("Frame times are unknown: give --rate-hz, or a gripper CSV with a t_s column.")
         times = np.arange(len(frames)) / rate_hz
-    return Episode.from_frames(frames, times, gripper=track, meta={"source": "clouds", **(meta or {})})
-
-
-def _read_csv(path: Path) -> pd.DataFrame:
-    try:
-        table = pd.read_csv(path)
-        return table.astype(float)
-    except FileNotFoundError as error:
-        raise EpisodeError(f"No such gripper file: {path}.") from error
-    except (OSError, ValueError) as error:
-        raise EpisodeError(f"{path} is not a CSV of numbers: {error}.") from error
+    about = {"source": "clouds", **(meta or {})}
+    if tracks is None:
+        return Episode.from_frames(frames, times, meta=about)
+    return Episode.from_frames(frames, times, gripper=tracks.positions, grippers=tracks.names, meta=about)
 
 
 def _numbered(folder: Path, formats: tuple[str, ...]) -> list[Path]:

@@ -118,6 +118,7 @@ def _contact(scene: SceneFile) -> ReferenceContact | None:
 
 def _handles(path: Path, scene: SceneFile, mesh: ClothMesh) -> tuple[Handle, ...]:
     motions = [Motion(tuple(_keyframe(key) for key in keys)) for keys in scene.motions]
+    several = len({block.motion for block in scene.handles} - {None}) > 1
     handles = []
     for index, block in enumerate(scene.handles):
         for node in block.nodes:
@@ -127,7 +128,8 @@ def _handles(path: Path, scene: SceneFile, mesh: ClothMesh) -> tuple[Handle, ...
                     f"0..{len(mesh.nodes) - 1}."
                 )
             motion = None if block.motion is None else motions[block.motion]
-            handles.append(Handle(node, motion, block.start_time, block.end_time, block.fade_time))
+            gripper = f"motion_{block.motion}" if several else "gripper"  # each motion is a gripper's
+            handles.append(Handle(node, motion, block.start_time, block.end_time, block.fade_time, gripper))
     return tuple(handles)
 
 

@@ -418,7 +418,7 @@ def _episode(
         points=placement.to_scene(np.concatenate([part.points for _, part in parts])).astype(np.float32),
         offsets=np.cumsum([0, *sizes], dtype=np.int64),
         times=times - times[0],
-        gripper=None if tool is None else placement.to_scene(tool),
+        gripper=None if tool is None else placement.to_scene(tool)[:, None],
         camera=np.concatenate([np.full(len(part.points), index, dtype=np.uint8) for index, part in parts]),
         pixel=np.concatenate([part.pixels for _, part in parts]).astype(np.uint16),
         sigma=np.concatenate([part.depth_m**2 * settings.sigma_per_m for _, part in parts]).astype(np.float32),

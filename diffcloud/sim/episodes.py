@@ -34,7 +34,7 @@ _PROPERTIES = Parameters._fields[:1] + Parameters._fields[2:10]
 
 class Batch:
     """Episodes of one system. Inputs have a leading batch axis: positions and velocities [B, V, 3], poses of the bodies
-    [B, N, 18], the gripper's track [B, S, 3], and those of `Properties`."""
+    [B, N, 18], the grippers' tracks [B, S, G, 3], and those of `Properties`."""
 
     def __init__(self, system: System, steps: int, *, tracked: bool, progress: Callable[[int], None] | None = None) -> None:
         self.system, self.steps = system, steps
@@ -242,7 +242,9 @@ class Batch:
     def _course(self, entry: int, last: int) -> Course:
         """The motion up to a step, for `implausible`."""
         system, schedule = self.system, self.schedule
-        translation = schedule.translation[:last] + self.held.tracked[:, None] * self._track[entry, :last, None]
+        followed = schedule.gripper >= 0
+        translation = schedule.translation[:last].copy()
+        translation[:, followed] += self._track[entry, :last, schedule.gripper[followed]].swapaxes(0, 1)
         targets = translation + np.einsum("shij,hj->shi", schedule.linear[:last], self._anchors[entry])
         moving = self._scenery[: last + 1, len(self._scenery[0]) - system.moving_points :]
         centres = self.poses[entry, : last + 1, :, :3]
@@ -290,5 +292,5 @@ def _held(system: System, schedule: HandleSchedule) -> Held:
         translation=np.ascontiguousarray(schedule.translation),
         first_step=schedule.first_step.astype(np.int64),
         inverse=inverse,
-        tracked=schedule.tracked.astype(np.int64),
+        gripper=schedule.gripper.astype(np.int64),
     )

@@ -30,6 +30,8 @@ class Handle:
     end: float = float("inf")
     fade: float = 0.0
     """Seconds over which a soft handle lets go after `end`."""
+    gripper: str = "gripper"
+    """Which one moves the node, if one does."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +43,11 @@ class HandleSchedule:
     linear: NDArray[np.float64]
     """[S, H, 3, 3] scale times rotation."""
     translation: NDArray[np.float64]
-    """[S, H, 3] [m]; of handles that follow a track, what comes on top of it."""
+    """[S, H, 3] [m]; of handles that follow a gripper's track, what comes on top of it."""
     first_step: NDArray[np.int64]
     """[H] the step index (from 0) that takes the anchor; S where none does."""
-    tracked: NDArray[np.bool_]
-    """[H] whether the handle follows the gripper's track."""
+    gripper: NDArray[np.int64]
+    """[H] whose track the handle follows, a number in `Handles.grippers`; -1: none."""
 
     @property
     def active(self) -> NDArray[np.bool_]:
@@ -76,6 +78,11 @@ class Handles:
         """[H] those with a motion."""
         return np.array([handle.motion is not None for handle in self.handles], dtype=np.bool_)
 
+    @property
+    def grippers(self) -> tuple[str, ...]:
+        """Those that move nodes, in the order of the handles."""
+        return tuple(dict.fromkeys(handle.gripper for handle in self.handles if handle.motion is not None))
+
     def schedule(self, times: NDArray[np.float64]) -> HandleSchedule:
         """Strength and targets at the end of each step, times [S] [s], as the scene says."""
         shape = (len(times), len(self.handles))
@@ -89,10 +96,10 @@ class Handles:
                 linear[:, index], translation[:, index] = handle.motion.at(times)
         active = strength > 0
         first = np.where(active.any(axis=0), active.argmax(axis=0), len(times))
-        return HandleSchedule(strength, linear, translation, first, np.zeros(len(self.handles), dtype=np.bool_))
+        return HandleSchedule(strength, linear, translation, first, np.full(len(self.handles), -1))
 
     def tracked_schedule(self, times: NDArray[np.float64]) -> HandleSchedule:
-        """The schedule with moving handles displaced as a gripper is, from where their nodes start.
+        """The schedule with moving handles displaced as their grippers are, from where their nodes start.
 
         Raises:
             SceneError: no handle moves.
@@ -110,4 +117,6 @@ class Handles:
         schedule.strength[:, twins] = 0.0
         # a node's own start is its anchor; ARCSim's rule would take it one step late and lag behind the gripper
         first = np.where(self.moving, len(times), schedule.first_step)
-        return HandleSchedule(schedule.strength, schedule.linear, schedule.translation, first, self.moving)
+        names = self.grippers
+        gripper = [-1 if handle.motion is None else names.index(handle.gripper) for handle in self.handles]
+        return HandleSchedule(schedule.strength, schedule.linear, schedule.translation, first, np.array(gripper))

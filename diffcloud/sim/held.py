@@ -1,6 +1,6 @@
 """Handles inside kernels: where each wants its node in a step, and derivatives of that.
 
-    anchor x̂ = L⁻¹(t₀) (x(t₀) - s(t₀)),    target x*(t) = s(t) + L(t) x̂,    s = translation (+ the gripper's track)
+    anchor x̂ = L⁻¹(t₀) (x(t₀) - s(t₀)),    target x*(t) = s(t) + L(t) x̂,    s = translation (+ its gripper's track)
 
 t₀ is the step in which the handle becomes active; a handle that never does, or that follows a track, is anchored where its
 node starts. (`handles` has the schedule.)
@@ -34,8 +34,8 @@ class Held(NamedTuple):
     """[H] the step that takes the anchor; S: none does."""
     inverse: Floats
     """[H, 3, 3] of the linear part in that step."""
-    tracked: Ints
-    """[H] 1 where a handle follows the gripper's track."""
+    gripper: Ints
+    """[H] whose track a handle follows; -1: none."""
 
 
 @kernel
@@ -50,7 +50,7 @@ def first_anchors(held: Held, positions: Floats) -> Floats:
 
 @kernel
 def take_anchors(held: Held, track: Floats, step: int, positions: Floats, anchors: Floats) -> None:
-    """Anchors [H, 3] of the handles that become active in this step."""
+    """Anchors [H, 3] of the handles that become active in this step; the track is [S, G, 3] of G grippers."""
     for h in range(len(held.node)):
         if held.first_step[h] == step:
             for axis in range(3):
@@ -84,13 +84,13 @@ def holders(held: Held, step: int, nodes: int) -> Ints:
 
 @kernel
 def aim_reverse(held: Held, step: int, target: Floats, anchors: Floats, track: Floats) -> None:
-    """From the gradients by the targets [H, 3] to those by the anchors and the track [S, 3]."""
+    """From the gradients by the targets [H, 3] to those by the anchors and the track [S, G, 3]."""
     for h in range(len(held.node)):
         for axis in range(3):
             slope = target[h, axis]
             if slope != 0:
-                if held.tracked[h] > 0:
-                    track[step, axis] += slope
+                if held.gripper[h] >= 0:
+                    track[step, held.gripper[h], axis] += slope
                 for k in range(3):
                     anchors[h, k] += held.linear[step, h, axis, k] * slope
 
@@ -105,8 +105,8 @@ def take_anchors_reverse(held: Held, step: int, anchors: Floats, positions: Floa
                 for axis in range(3):
                     slope += held.inverse[h, axis, k] * anchors[h, axis]
                 positions[held.node[h], k] += slope
-                if held.tracked[h] > 0:
-                    track[step, k] -= slope
+                if held.gripper[h] >= 0:
+                    track[step, held.gripper[h], k] -= slope
             anchors[h] = 0.0
 
 
@@ -120,14 +120,17 @@ def first_anchors_reverse(held: Held, anchors: Floats, positions: Floats) -> Non
 
 @kernel
 def take_anchors_tangent(held: Held, track: Floats, step: int, positions: Floats, anchors: Floats) -> None:
-    """Rates of the anchors [K, H, 3] that this step takes, from those of the track [K, S, 3] and of positions [K, V, 3]."""
+    """Rates of the anchors [K, H, 3] that this step takes, from those of the track [K, S, G, 3] and of positions
+    [K, V, 3]."""
     for h in range(len(held.node)):
         if held.first_step[h] == step:
             for d in range(len(anchors)):
                 for axis in range(3):
                     anchors[d, h, axis] = 0.0
                     for k in range(3):
-                        away = positions[d, held.node[h], k] - (track[d, step, k] if held.tracked[h] > 0 else 0.0)
+                        away = positions[d, held.node[h], k]
+                        if held.gripper[h] >= 0:
+                            away -= track[d, step, held.gripper[h], k]
                         anchors[d, h, axis] += held.inverse[h, axis, k] * away
 
 
@@ -137,7 +140,7 @@ def aim_tangent(held: Held, track: Floats, step: int, anchors: Floats, target: F
     for d in range(len(anchors)):
         for h in range(len(held.node)):
             for axis in range(3):
-                target[d, h, axis] = track[d, step, axis] if held.tracked[h] > 0 else 0.0
+                target[d, h, axis] = track[d, step, held.gripper[h], axis] if held.gripper[h] >= 0 else 0.0
                 for k in range(3):
                     target[d, h, axis] += held.linear[step, h, axis, k] * anchors[d, h, k]
 
@@ -145,6 +148,6 @@ def aim_tangent(held: Held, track: Floats, step: int, anchors: Floats, target: F
 @kernel
 def _shift(held: Held, track: Floats, step: int, h: int, axis: int) -> float:
     shift = held.translation[step, h, axis]
-    if held.tracked[h] > 0:
-        shift += track[step, axis]
+    if held.gripper[h] >= 0:
+        shift += track[step, held.gripper[h], axis]
     return shift

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffcloud.errors import DivergedError
+from diffcloud.errors import DivergedError, SceneError
 from diffcloud.sim.episodes import Batch
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.rigid.bodies import BodyState
@@ -77,13 +77,14 @@ def rollout(
     Args:
         properties: of a batch of parameter sets; default the basis material, batch 1.
         state: where to begin; default rest.
-        track: [B or 1, S, 3] displacement of the gripper since the start at the end of each step [m]; then the moving
-            handles follow it instead of the scene's own motion.
+        track: [B or 1, S, G, 3] displacement of each gripper since the start at the end of each step [m], in the order of
+            `Handles.grippers`; then the moving handles follow them instead of the scene's own motion.
         drop_diverged: go on without batch entries that diverge, and name them in `Rollout.diverged`.
         progress: called now and then with the number of finished steps, of the whole batch on average.
 
     Raises:
         DivergedError: names the batch entries that diverged, and the first step in which one did.
+        SceneError: a track of other than the scene's grippers.
     """
     properties = system.properties if properties is None else properties
     state = init(system, properties.batch) if state is None else state
@@ -116,7 +117,7 @@ def rollout_tangents(
         properties: [B, ...].
         tangents: [K · B, ...] directions of the properties, directions outermost.
         state, state_tangents: start, and directions of it, each field [K · B, ...].
-        track, track_tangents: gripper displacement [B or 1, S, 3] and its directions [K · B, S, 3].
+        track, track_tangents: displacement of the grippers [B or 1, S, G, 3] and its directions [K · B, S, G, 3].
 
     Returns:
         The rollout of the batch B, and d positions [K, B, S + 1, V, 3].
@@ -168,7 +169,11 @@ def _inputs(system: System, steps: int, properties: Properties, state: State, tr
     if poses is None:
         poses = torch.from_numpy(system.bodies.start)[None]
     if track is None:
-        track = torch.zeros(1, steps, 3, dtype=torch.float64)
+        track = torch.zeros(1, steps, len(system.handles.grippers), 3, dtype=torch.float64)
+    elif track.shape[2:] != (len(names := system.handles.grippers), 3):
+        raise SceneError(
+            f"A track has shape [batch, steps, {len(names)}, 3] here ({', '.join(names)}), got {list(track.shape)}."
+        )
     return [positions, velocities, poses, track, *properties.tensors()]
 
 

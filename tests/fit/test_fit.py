@@ -38,7 +38,7 @@ def clouds_of(scenario, *, points=800, seed=5, gripper=True, shift=(0, 0, 0), ya
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
         frames = (frames - middle) @ turn.T + middle + np.array(shift)
     times = run.times[:: scenario.scene.frame_steps].numpy()
-    track = nodes[:, scenario.grasped].mean(1).numpy() if gripper else None
+    track = nodes[:, scenario.grasped].mean(1, keepdim=True).numpy() if gripper else None
     return Episode.from_frames(list(frames), times, gripper=track, meta={"truth": truth})
 
 
@@ -301,14 +301,26 @@ def test_a_track_drives_the_handle_as_the_scenes_motion_does():
 
 def test_track_is_held_after_its_end():
     times = np.array([0.0, 0.1, 0.2])
-    episode = Episode.from_frames([np.zeros((1, 3))] * 3, times, gripper=np.outer(times, [1.0, 0, 2.0]))
-    moved = track_displacement(episode, 6, 0.05)
-    np.testing.assert_allclose(moved[:, 0], [0.05, 0.1, 0.15, 0.2, 0.2, 0.2], atol=1e-12)
+    episode = Episode.from_frames([np.zeros((1, 3))] * 3, times, gripper=np.outer(times, [1.0, 0, 2.0])[:, None])
+    moved = track_displacement(episode, ["any"], 6, 0.05)
+    np.testing.assert_allclose(moved[:, 0, 0], [0.05, 0.1, 0.15, 0.2, 0.2, 0.2], atol=1e-12)
+
+
+def test_tracks_belong_to_grippers_by_name():
+    times, tracks = np.array([0.0, 0.1, 0.2]), np.zeros((3, 2, 3))
+    tracks[:, 0, 0], tracks[:, 1, 2] = times, 2 * times
+    episode = Episode.from_frames([np.zeros((1, 3))] * 3, times, gripper=tracks, grippers=("left", "right"))
+    moved = track_displacement(episode, ["right", "left"], 4, 0.05)
+    np.testing.assert_allclose(moved[:, 0], np.outer([0.1, 0.2, 0.3, 0.4], [0, 0, 1]), atol=1e-12)
+    np.testing.assert_allclose(moved[:, 1], np.outer([0.05, 0.1, 0.15, 0.2], [1, 0, 0]), atol=1e-12)
+    for others in (["left"], ["left", "middle"], []):
+        with pytest.raises(EpisodeError, match="the episode's left, right"):
+            track_displacement(episode, others, 4, 0.05)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("linear", [False, True])
-@pytest.mark.parametrize("name", ["lift", "fold"])
+@pytest.mark.parametrize("name", ["lift", "fold", "shake"])
 def test_the_box_of_parameters_is_visible_at_camera_noise(name, linear):
     """At least 80 % of neighbouring pairs of a 5 x 5 grid differ by more than 4 mm RMS at the loss frame."""
     found = visibility_map(load_scenario(name), size=5, linear=linear)

@@ -357,7 +357,7 @@ class TestPickles:
 
 def episode(**changes):
     frames = [np.full((3, 3), index, dtype=np.float32) for index in range(4)]
-    made = Episode.from_frames(frames, np.arange(4) * 0.1, gripper=np.zeros((4, 3)), meta={"fabric": "navy"})
+    made = Episode.from_frames(frames, np.arange(4) * 0.1, gripper=np.zeros((4, 1, 3)), meta={"fabric": "navy"})
     from dataclasses import replace
 
     return replace(made, **changes) if changes else made
@@ -383,13 +383,24 @@ class TestEpisodes:
             ({"offsets": np.array([0, 3, 3, 6, 12])}, "Frame 1 is empty"),
             ({"offsets": np.array([0, 3, 12])}, "offsets"),
             ({"times": np.array([0.0, 0.2, 0.1, 0.3])}, "increase"),
-            ({"gripper": np.zeros((3, 3))}, "gripper"),
+            ({"gripper": np.zeros((3, 1, 3))}, "gripper"),
+            ({"gripper": np.zeros((4, 2, 3))}, "gripper"),
+            ({"grippers": ("a", "a"), "gripper": np.zeros((4, 2, 3))}, "a name of its own"),
             ({"sigma": np.zeros(5, np.float32)}, "sigma"),
         ],
     )
     def test_bad_content_is_named(self, changes, message):
         with pytest.raises(EpisodeError, match=message):
             episode(**changes)
+
+    def test_a_track_of_an_earlier_version_is_the_only_grippers(self, tmp_path):
+        write_episode(tmp_path / "e.npz", episode(gripper=None))
+        with np.load(tmp_path / "e.npz") as archive:
+            arrays = dict(archive)
+        np.savez(tmp_path / "old.npz", **arrays, gripper=np.arange(12.0).reshape(4, 3))
+        old = read_episode(tmp_path / "old.npz")
+        assert old.grippers == ("gripper",)
+        np.testing.assert_array_equal(old.gripper[:, 0], np.arange(12.0).reshape(4, 3))
 
     def test_missing_frame_says_how_many_there_are(self):
         with pytest.raises(EpisodeError, match="Frame 24 is missing: the episode has 4 frames"):

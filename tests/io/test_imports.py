@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from diffcloud.errors import EpisodeError
+from diffcloud.io.episodes import read_episode, write_episode
+from diffcloud.io.grippers import named_files
 from diffcloud.io.imports import cloud_folder, release_episodes
 
 
@@ -52,10 +54,62 @@ def test_missing_frames_and_folders(tmp_path):
 def test_own_clouds_with_a_gripper_track(tmp_path):
     folder = make_clouds(tmp_path / "clouds")
     (tmp_path / "g.csv").write_text("t_s,x,y,z\n10.0,0,0,0\n10.1,0,0,.1\n10.2,0,0,.2\n10.4,0,0,.3\n")
-    episode = cloud_folder(folder, gripper=tmp_path / "g.csv", meta={"fabric": "towel"})
+    episode = cloud_folder(folder, grippers={"any": tmp_path / "g.csv"}, meta={"fabric": "towel"})
     np.testing.assert_allclose(episode.times, [0, 0.1, 0.2, 0.4])
-    np.testing.assert_allclose(episode.gripper[:, 2], [0, 0.1, 0.2, 0.3])
+    np.testing.assert_allclose(episode.gripper[:, 0, 2], [0, 0.1, 0.2, 0.3])
     assert cloud_folder(folder, rate_hz=5).times.tolist() == pytest.approx([0, 0.2, 0.4, 0.6])
+
+
+class TestSeveralGrippers:
+    """In one file, or one each."""
+
+    ONE = "t_s,x,y,z\n0,0,0,0\n.1,0,0,.1\n.2,0,0,.2\n.3,0,0,.3\n"
+    OTHER = "t_s,x,y,z\n0,1,0,0\n.1,1,.1,0\n.2,1,.2,0\n.3,1,.3,0\n"
+
+    def test_one_file_with_a_column_is_as_one_file_each(self, tmp_path):
+        folder = make_clouds(tmp_path / "clouds")
+        rows = zip(self.ONE.split()[1:], self.OTHER.split()[1:], strict=True)
+        both = "".join(f"left,{one}\nright,{other}\n" for one, other in rows)
+        (tmp_path / "both.csv").write_text("gripper,t_s,x,y,z\n" + both)
+        (tmp_path / "one.csv").write_text(self.ONE)
+        (tmp_path / "other.csv").write_text(self.OTHER)
+        together = cloud_folder(folder, grippers={"any": tmp_path / "both.csv"})
+        apart = cloud_folder(folder, grippers={"left": tmp_path / "one.csv", "right": tmp_path / "other.csv"})
+        assert together.grippers == apart.grippers == ("left", "right")
+        np.testing.assert_allclose(together.gripper[:, 0, 2], [0, 0.1, 0.2, 0.3])
+        np.testing.assert_allclose(together.gripper[:, 1], [[1, 0, 0], [1, 0.1, 0], [1, 0.2, 0], [1, 0.3, 0]])
+        np.testing.assert_array_equal(together.gripper, apart.gripper)
+        np.testing.assert_allclose(together.times, [0, 0.1, 0.2, 0.3])
+        write_episode(tmp_path / "e.npz", apart)
+        again = read_episode(tmp_path / "e.npz")
+        assert again.grippers == ("left", "right")
+        np.testing.assert_array_equal(again.gripper, apart.gripper)
+
+    @pytest.mark.parametrize(
+        ("other", "message"),
+        [
+            ("t_s,x,y,z\n0,1,0,0\n.1,1,0,0\n.2,1,0,0\n", "gripper 'right' has 3 rows for 4 clouds"),
+            ("t_s,x,y,z\n0,1,0,0\n.1,1,0,0\n.2,1,0,0\n.4,1,0,0\n", "times differ"),
+            ("gripper,x,y,z\na,1,0,0\na,1,0,0\na,1,0,0\na,1,0,0\n", "holds all grippers"),
+        ],
+    )
+    def test_files_that_do_not_fit(self, tmp_path, other, message):
+        folder = make_clouds(tmp_path / "clouds")
+        (tmp_path / "one.csv").write_text(self.ONE)
+        (tmp_path / "other.csv").write_text(other)
+        with pytest.raises(EpisodeError, match=message):
+            cloud_folder(folder, grippers={"left": tmp_path / "one.csv", "right": tmp_path / "other.csv"})
+
+    def test_a_gripper_that_is_missing_in_a_frame(self, tmp_path):
+        folder = make_clouds(tmp_path / "clouds")
+        (tmp_path / "both.csv").write_text("gripper,x,y,z\n" + 4 * "left,0,0,0\n" + 3 * "right,0,0,0\n")
+        with pytest.raises(EpisodeError, match="gripper 'right' has 3 rows for 4 clouds"):
+            cloud_folder(folder, grippers={"any": tmp_path / "both.csv"}, rate_hz=10)
+
+    @pytest.mark.parametrize("given", [["a.csv", "b.csv"], ["left=a.csv", "left=b.csv"], ["=a.csv"], ["left="]])
+    def test_names(self, given):
+        with pytest.raises(EpisodeError, match="NAME=PATH, each name once"):
+            named_files(given)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +126,7 @@ def test_bad_gripper_files(tmp_path, text, message):
     folder = make_clouds(tmp_path / "clouds")
     (tmp_path / "g.csv").write_text(text)
     with pytest.raises(EpisodeError, match=message):
-        cloud_folder(folder, gripper=tmp_path / "g.csv")
+        cloud_folder(folder, grippers={"any": tmp_path / "g.csv"})
 
 
 def test_a_folder_without_clouds(tmp_path):

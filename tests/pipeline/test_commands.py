@@ -161,7 +161,7 @@ def test_import_own_clouds_end_to_end(work):
     episode = read_episode(work / "e1.npz")
     for index in range(episode.frame_count):
         np.savetxt(work / "clouds" / f"frame_{index:03d}.xyz", episode.frame(index))
-    rows = np.column_stack([episode.times, episode.gripper])
+    rows = np.column_stack([episode.times, episode.gripper[:, 0]])
     np.savetxt(work / "gripper.csv", rows, delimiter=",", header="t_s,x,y,z", comments="")
     run("import", "clouds", "clouds", "--gripper", "gripper.csv", "--out", "own.npz", cwd=work)
     again = read_episode(work / "own.npz")
@@ -192,6 +192,56 @@ def test_stages_run_in_a_row_and_the_page_is_whole(work):
     first = (work / "reports" / "metrics.json").read_bytes()
     run("evaluate", "--params", "params.yaml", cwd=work)
     assert (work / "reports" / "metrics.json").read_bytes() == first
+
+
+def test_two_grippers_from_csv_to_report(work):
+    """Their tracks come as one CSV, drive the fit, the rollout, and what the page is made of."""
+    (work / "raw" / "scenes").mkdir(parents=True)
+    two = {name: value for name, value in SMALL.items() if name != "path"} | {
+        "yaw_deg": 0,
+        "path": [[0, 0, 0, 0], [0.5, 0, 0, 0.15]],
+        "grippers": {
+            "left": {"grasped": ["left_top"]},
+            "right": {"grasped": ["right_top"], "path": [[0, 0, 0, 0], [0.5, 0, 0.06, 0.1]]},
+        },
+    }
+    (work / "raw" / "scenes" / "two.yaml").write_text(yaml.safe_dump(two))
+    still = {**two, "path": [[0, 0, 0, 0], [0.5, 0, 0, 0.001]], "grippers": {"left": {"grasped": ["left_top"]}}}
+    still["grippers"]["right"] = {"grasped": ["right_top"]}
+    (work / "raw" / "scenes" / "still.yaml").write_text(yaml.safe_dump(still))
+    run("rollout", "--scenario", "raw/scenes/two.yaml", "--set", "stretch=0.6", "--out", "true.npz", cwd=work)
+    with np.load(work / "true.npz") as true:
+        nodes, faces, times = true["nodes"], true["faces"], true["times"]
+    (work / "clouds").mkdir()
+    rows = ["gripper,t_s,x,y,z"]
+    for frame, (time_s, cloth) in enumerate(zip(times, nodes, strict=True)):
+        np.savetxt(work / "clouds" / f"{frame}.xyz", cloth[faces].mean(axis=1))
+        for name, node in (("right", 24), ("left", 20)):  # in another order than the scenario's
+            rows.append(",".join([name, *(f"{number:.9f}" for number in (time_s, *cloth[node]))]))
+    (work / "tracks.csv").write_text("\n".join(rows))
+    episode = "data/episodes/still/own.npz"
+    run("import", "clouds", "clouds", "--gripper", "tracks.csv", "--out", episode, cwd=work)
+    run("rollout", "--scenario", "still", "--episode", episode, "--set", "stretch=0.6", "--out", "again.npz", cwd=work)
+    with np.load(work / "again.npz") as again:
+        np.testing.assert_allclose(again["nodes"][:, [20, 24]], nodes[:, [20, 24]], atol=1e-6)
+        np.testing.assert_allclose(again["nodes"], nodes, atol=5e-3)
+    (work / "params.yaml").write_text(
+        yaml.safe_dump({"scenarios": ["still"], "fit": {"iterations": 2}, "evaluate": {"draws": 1}})
+    )
+    fit = ("fit", "--params", "params.yaml", "--scenario", "still", "--out", "data/fits/still")
+    run(*fit, "data/episodes/still", cwd=work)
+    run("evaluate", "--params", "params.yaml", cwd=work)
+    run("report", "--params", "params.yaml", cwd=work)
+    metrics = json.loads((work / "reports" / "metrics.json").read_text())
+    assert metrics["scenarios"]["still"]["rms_mm"] < 30  # the scenario's own path would leave it on the table
+    assert "own" in (work / "reports" / "index.html").read_text()
+    # one gripper's file alone is refused by the names
+    (work / "one.csv").write_text("\n".join(row[5:] for row in rows if row.startswith("left,")))
+    (work / "one.csv").write_text("t_s,x,y,z\n" + (work / "one.csv").read_text())
+    run("import", "clouds", "clouds", "--gripper", "left=one.csv", "--out", "one.npz", cwd=work)
+    done = run("rollout", "--scenario", "still", "--episode", "one.npz", "--out", "x.npz", cwd=work, code=1)
+    assert "The scene's grippers are left, right, the episode's left" in done.errors
+    assert not (work / "x.npz").exists()
 
 
 def built_in_mesh(name):

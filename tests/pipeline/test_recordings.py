@@ -58,7 +58,7 @@ def test_recordings_are_raw_and_become_clouds_with_pictures(work):
     assert np.abs(episode.points[:, :2]).max() < 0.25  # in the scene's frame, not the arm's
     truth = read_truth(work / "recorded" / "small" / "small_hidden1")
     lifted = truth.nodes[..., 2].max(axis=1)
-    np.testing.assert_allclose(np.ptp(episode.gripper[:, 2]), lifted[3] - lifted[0], atol=0.004)
+    np.testing.assert_allclose(np.ptp(episode.gripper[:, 0, 2]), lifted[3] - lifted[0], atol=0.004)
     assert png_size(work / "episodes" / "small" / "small_hidden1.mask.png") == (2 * 424, 240)
     assert png_size(work / "episodes" / "small" / "small_hidden1.cloud.png") == (720, 240)
 

@@ -197,8 +197,8 @@ def test_damaged_scene_files(folder):
 
 class TestScenarios:
     def test_names(self):
-        assert SCENARIO_NAMES[:4] == ("lift", "fold", "band_stretch", "vest_hang")
-        assert SCENARIO_NAMES[4:] == ("release_lift", "release_fold", "release_hang", "release_band")
+        assert SCENARIO_NAMES[:5] == ("lift", "fold", "band_stretch", "vest_hang", "shake")
+        assert SCENARIO_NAMES[5:] == ("release_lift", "release_fold", "release_hang", "release_band")
         with pytest.raises(ConfigError, match=r"Unknown scenario 'lfit'. Did you mean 'lift'.* Allowed: .*lift"):
             load_scenario("lfit")
         with pytest.raises(ConfigError, match="needs --scene"):
@@ -320,6 +320,23 @@ class TestScenarios:
         assert scenario.scene.material.name == "silk"
         assert scenario.scene.surrounding.obstacles[0].plane()[1] == pytest.approx(0.1)
 
+    def test_grippers_of_ones_own_take_the_place_of_the_bases(self, tmp_path):
+        path = tmp_path / "two.yaml"
+        path.write_text(
+            "base: lift\ngrippers:\n  left: {grasped: [left_top]}\n"
+            "  right: {grasped: [right_top, right_bottom], path: [[0, 0, 0, 0], [1, 0, 0, 2.5]]}\n"
+        )
+        scenario = load_scenario(path)
+        handles = scenario.scene.handles
+        assert handles.grippers == ("left", "right")
+        assert [(one.node, one.gripper) for one in handles.handles] == [(42, "left"), (48, "right"), (6, "right")]
+        ends = [one.motion.at(np.array([9.0]))[1][0, 2] for one in handles.handles]
+        assert ends == pytest.approx([0.4, 2.5, 2.5])  # the base's path, and one's own
+        table = scenario.scene.surrounding.obstacles[0]
+        assert np.ptp(table.nodes[:, 0]) > 2.5  # it reaches as far as any gripper does
+        path.write_text("base: shake\ngrasped: [left_top]\n")
+        assert load_scenario(path).scene.handles.grippers == ("gripper",)
+
     def test_a_material_in_the_users_own_numbers(self, tmp_path):
         path = tmp_path / "rubber.yaml"
         path.write_text(
@@ -365,7 +382,11 @@ class TestScenarios:
             ("size_m: [0.2, -1]\n", "size_m.1"),
             ("grasped: [north]\n", "Unknown corner 'north'"),
             ("grasped: [99]\n", r"node 99 does not exist, the cloth has 0\.\.48"),
-            ("held: [right_top]\n", "both grasped and held"),
+            ("held: [right_top]\n", "held twice"),
+            ("grasped: []\n", "either `grasped` or `grippers`"),
+            ("grippers: {a: {grasped: [right_top]}}\ngrasped: [left_top]\n", "either `grasped` or `grippers`"),
+            ("grippers: {a: {grasped: [right_top]}, b: {grasped: [48]}}\n", "held twice"),
+            ("grippers: {a: {grasped: []}}\n", "grippers.a.grasped"),
             ("base: throw\n", "Unknown base 'throw'"),
             ("loss_frames: [40]\n", "loss_frames"),
             ("- a\n", "mapping"),

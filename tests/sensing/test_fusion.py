@@ -99,7 +99,7 @@ def test_without_a_mask_the_robot_stays(scene):
 
 
 def test_the_gripper_follows_the_joints_into_the_scene(scene, fused, mask):
-    np.testing.assert_allclose(fused.gripper, TOOL_M + np.arange(3)[:, None] * STEP_M, atol=5e-5)
+    np.testing.assert_allclose(fused.gripper[:, 0], TOOL_M + np.arange(3)[:, None] * STEP_M, atol=5e-5)
     placement = ScenePlacement((0.55, 0.1, 0.02), np.pi / 2, 0.35)
     moved = fuse(read_raw_episode(scene.folder), mask, replace(PLAIN, placement=placement))
     np.testing.assert_allclose(moved.points, placement.to_scene(fused.points.astype(float)), atol=1e-5)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
@@ -25,7 +26,7 @@ class Episode:
     system: System
     steps: int
     track: Tensor
-    """[1, S, 3] gripper displacement."""
+    """[1, S, G, 3] displacement of the grippers."""
     weights: Tensor
     """[S + 1, V, 3] of the linear functional whose derivative is taken."""
 
@@ -33,9 +34,10 @@ class Episode:
     def build(scenario: Scenario, steps: int, *, seed: int = 0) -> Episode:
         system, _ = scenario.scene.build()
         generator = torch.Generator().manual_seed(seed)
-        moving = next(h for h in system.handles.handles if h.motion is not None)
+        paths = {handle.gripper: handle.motion for handle in system.handles.handles if handle.motion is not None}
         times = torch.arange(1, steps + 1, dtype=torch.float64) * system.time_step
-        track = torch.as_tensor(moving.motion.at(times.numpy())[1])[None]
+        moved = [path.at(times.numpy())[1] for path in paths.values()]
+        track = torch.as_tensor(np.stack(moved, axis=1))[None]
         nodes = len(system.mesh.nodes)
         weights = torch.zeros(steps + 1, nodes, 3, dtype=torch.float64)
         weights[-1] = torch.randn(nodes, 3, dtype=torch.float64, generator=generator)

@@ -62,7 +62,7 @@ def inputs(system) -> dict[str, Tensor]:
     found = {name: one.clone() for name in NAMES}
     found |= {"friction_obstacle": 0.3 * one, "friction_cloth": 0.5 * one, "damping": 2e-3 * one}
     start = init(system)
-    times = torch.arange(1, STEPS + 1, dtype=torch.float64)[None, :, None] * 0.01
+    times = torch.arange(1, STEPS + 1, dtype=torch.float64)[None, :, None, None] * 0.01
     found |= {
         "centre": start.bodies.centre.clone(),
         "turn": torch.zeros(1, 1, 3, dtype=torch.float64),

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from diffcloud.scene.scenarios import built_in, grid_scenario
-from tests.conftest import small_lift
+from tests.conftest import shaken, small_lift
 from tests.sim.directional import SCALARS, STEPS, Episode, directions
 
 FREE_FALL_GAP = 5.0
@@ -68,6 +68,20 @@ def test_short_episodes(gap):
     for name, (value, forward, central) in found.items():
         assert value != 0.0, name
         assert forward <= 1e-10, name
+        assert central <= 1e-5, name
+
+
+@pytest.mark.parametrize("integrator", ["linearised", "implicit"])
+def test_tracks_of_two_grippers(integrator):
+    """A direction of the track moves both."""
+    episode = Episode.build(shaken(gap_m=FREE_FALL_GAP, integrator=integrator, nodes=(4, 4)), 4)
+    assert episode.track.shape == (1, 4, 2, 3)
+    moves = {name: move for name, move in directions(episode, per_field=2).items() if "track" in move}
+    assert len(moves) == 2
+    found = compare(episode, moves, steps=STEPS[2:])
+    for name, (value, forward, central) in found.items():
+        assert value != 0.0, name
+        assert forward <= 1e-9, name
         assert central <= 1e-5, name
 
 

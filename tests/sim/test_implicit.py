@@ -104,7 +104,7 @@ def test_both_modes_agree_with_each_other_and_with_differences(name):
         return torch.as_tensor(rng.normal(size=like.shape)) * scale
 
     start = init(system)
-    track = 1e-3 * torch.arange(1.0, STEPS + 1).double()[None, :, None].expand(1, STEPS, 3) if tracked else None
+    track = 1e-3 * torch.arange(1.0, STEPS + 1).double()[None, :, None, None].expand(1, STEPS, 1, 3) if tracked else None
     fields = list(system.properties.tensors())
     rates = [random(field, field.abs() + 1e-4) for field in fields]
     places = [start.positions, start.velocities, *([] if start.bodies is None else start.bodies.tensors())]

@@ -21,7 +21,7 @@ from diffcloud.sim.rigid.body import RigidBody
 from diffcloud.sim.surrounding import ContactSettings, Surrounding
 from diffcloud.sim.terms import TERMS
 from diffcloud.sim.threads import use_threads
-from tests.conftest import small_lift
+from tests.conftest import shaken, small_lift
 from tests.sim.twins.forces import Forces
 
 MATERIAL = isotropic("test", density=0.2, stretching=50.0, bending=1e-5, shear=10.0)
@@ -205,15 +205,34 @@ class TestHandles:
     def test_a_recorded_track_moves_the_grasped_node(self):
         scenario = small_lift()
         system, _ = scenario.scene.build()
-        track = torch.zeros(1, 10, 3, dtype=torch.float64)
-        track[0, :, 2] = torch.linspace(0.01, 0.1, 10, dtype=torch.float64)
+        track = torch.zeros(1, 10, 1, 3, dtype=torch.float64)
+        track[0, :, 0, 2] = torch.linspace(0.01, 0.1, 10, dtype=torch.float64)
         node = scenario.grasped[0]
         run = rollout(system, 10, track=track)
-        torch.testing.assert_close(run.positions[0, 1:, node], run.positions[0, :1, node] + track[0])
+        torch.testing.assert_close(run.positions[0, 1:, node], run.positions[0, :1, node] + track[0, :, 0])
+
+    @pytest.mark.parametrize("integrator", ["linearised", "implicit"])
+    def test_each_gripper_has_a_track_of_its_own(self, integrator):
+        scenario = shaken(integrator=integrator, held=("left_bottom",))
+        system, _ = scenario.scene.build()
+        assert system.handles.grippers == ("left", "right")
+        track = 0.002 * torch.randn(1, 6, 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        run = rollout(system, 6, track=track)
+        left, right, right_bottom, held = 20, 24, 4, 0
+        start = run.positions[0, 0]
+        torch.testing.assert_close(run.positions[0, 1:, left], start[left] + track[0, :, 0])
+        torch.testing.assert_close(run.positions[0, 1:, right], start[right] + track[0, :, 1])
+        torch.testing.assert_close(run.positions[0, 1:, right_bottom], start[right_bottom] + track[0, :, 1])
+        torch.testing.assert_close(run.positions[0, 1:, held], start[held].expand(6, 3))
+
+    def test_a_track_of_other_grippers(self):
+        system, _ = shaken().scene.build()
+        with pytest.raises(SceneError, match=r"shape \[batch, steps, 2, 3\] here \(left, right\), got \[1, 6, 1, 3\]"):
+            rollout(system, 6, track=torch.zeros(1, 6, 1, 3, dtype=torch.float64))
 
     def test_a_track_without_a_moving_handle(self):
         with pytest.raises(SceneError, match="no handle of this scene moves"):
-            rollout(cloth_system([Handle(0)]), 2, track=torch.zeros(1, 2, 3, dtype=torch.float64))
+            rollout(cloth_system([Handle(0)]), 2, track=torch.zeros(1, 2, 0, 3, dtype=torch.float64))
 
 
 class TestHalfSpace:
@@ -280,8 +299,8 @@ class TestDivergence:
         scenario = small_lift()
         system, _ = scenario.scene.build()
         stretch = torch.tensor([1.0, 2.0, float("nan"), 4.0, 5.0]).double()
-        track = torch.zeros(5, 4, 3, dtype=torch.float64)
-        track[:, :, 2] = torch.arange(1.0, 6.0)[:, None] * torch.linspace(0.001, 0.004, 4)
+        track = torch.zeros(5, 4, 1, 3, dtype=torch.float64)
+        track[:, :, 0, 2] = torch.arange(1.0, 6.0)[:, None] * torch.linspace(0.001, 0.004, 4)
         track[1, 1:] = torch.nan
         run = rollout(
             system, 4, properties=scenario.properties(system, {"stretch": stretch}), track=track, drop_diverged=True

@@ -89,7 +89,7 @@ def band_scenario(options: BandScenario) -> Scenario:
         options,
         mesh,
         (replace(pole, nodes=pole.nodes @ _ON_EDGE.T + options.center_m),),
-        grasped=[int(row * along + column) for row in range(across) for column in columns],
+        grippers={"gripper": [int(row * along + column) for row in range(across) for column in columns]},
     )
 
 

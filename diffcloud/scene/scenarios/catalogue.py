@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from diffcloud.errors import ConfigError, SceneError, unknown_name
 from diffcloud.scene.load import load_scene
 from diffcloud.scene.scenarios.band import BAND_STRETCH, BandScenario, band_scenario
-from diffcloud.scene.scenarios.grid import FOLD, LIFT, GridScenario, grid_scenario
+from diffcloud.scene.scenarios.grid import FOLD, LIFT, SHAKE, GridScenario, grid_scenario
 from diffcloud.scene.scenarios.release import RELEASE, release_scenario
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.scene.scenarios.vest import VEST_HANG, VestScenario, vest_scenario
@@ -19,7 +19,7 @@ from diffcloud.scene.schema import explain
 
 Options = GridScenario | BandScenario | VestScenario
 
-_BUILT_IN: dict[str, Options] = {options.name: options for options in (LIFT, FOLD, BAND_STRETCH, VEST_HANG)}
+_BUILT_IN: dict[str, Options] = {options.name: options for options in (LIFT, FOLD, BAND_STRETCH, VEST_HANG, SHAKE)}
 SCENARIO_NAMES = (*_BUILT_IN, *RELEASE)
 
 
@@ -72,7 +72,7 @@ def make_scenario(options: Options) -> Scenario:
 
 
 @overload
-def built_in(name: Literal["lift", "fold"]) -> GridScenario: ...
+def built_in(name: Literal["lift", "fold", "shake"]) -> GridScenario: ...
 @overload
 def built_in(name: Literal["band_stretch"]) -> BandScenario: ...
 @overload
@@ -111,7 +111,11 @@ def read_options(path: Path) -> Options:
     if isinstance(material, str) and material.endswith(".json"):
         data["material"] = str((Path(path).parent / material).resolve())
     options = _BUILT_IN[base]
+    given = options.model_dump()
+    for own, other in (("grasped", "grippers"), ("grippers", "grasped")):
+        if own in data:
+            given.pop(other, None)
     try:
-        return type(options).model_validate({**options.model_dump(), "name": Path(path).stem, **data})
+        return type(options).model_validate({**given, "name": Path(path).stem, **data})
     except ValidationError as error:
         raise explain(path, error, SceneError) from error

@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from diffcloud.errors import SceneError, unknown_name
 from diffcloud.mesh.shapes import grid_cloth, rectangle_surface
 from diffcloud.mesh.topology import ClothMesh
-from diffcloud.scene.scenarios.options import ScenarioOptions, assemble
+from diffcloud.scene.scenarios.options import Keyframes, ScenarioOptions, assemble
 from diffcloud.scene.scenarios.scenario import Scenario
-from diffcloud.scene.schema import NonNegative, Positive
+from diffcloud.scene.schema import Checked, NonNegative, Positive
+
+Names = tuple[str | int, ...]
+"""Nodes: corners (left/right_bottom/top of the unrotated cloth) or indices."""
+
+
+class Gripper(Checked):
+    """One of several."""
+
+    grasped: Annotated[Names, Field(min_length=1)]
+    path: Keyframes | None = None
+    """Its displacement; without, the scenario's `path`."""
 
 
 class GridScenario(ScenarioOptions):
@@ -32,11 +44,23 @@ class GridScenario(ScenarioOptions):
     table_height_m: float = 0.0
     gap_m: NonNegative = 0.002
     """Height of the cloth over the table at the start."""
-    grasped: tuple[str | int, ...]
-    """Nodes that the gripper moves: corner names (left/right_bottom/top of the unrotated cloth) or indices."""
-    held: tuple[str | int, ...] = ()
+    grasped: Names = ()
+    """Nodes that the gripper moves."""
+    grippers: dict[str, Gripper] = Field(default_factory=dict)
+    """Instead of `grasped`, where several grippers move the cloth: name -> what it does."""
+    held: Names = ()
     """Nodes that stay where they are."""
     loss_surface: Literal["all", "grasped_half"] = "all"
+
+    @model_validator(mode="after")
+    def _is_grasped_once(self) -> GridScenario:
+        if bool(self.grasped) == bool(self.grippers):
+            raise ValueError("give either `grasped` or `grippers` and what each grasps")
+        return self
+
+    @property
+    def own_paths(self) -> Mapping[str, Keyframes]:
+        return {name: one.path for name, one in self.grippers.items() if one.path is not None}
 
 
 _SIDE = 0.2625
@@ -56,6 +80,21 @@ FOLD = GridScenario(
     loss_frames=(15,),
     loss_surface="grasped_half",
 )
+SHAKE = GridScenario(
+    name="shake",
+    size_m=(_SIDE, _SIDE),
+    yaw_deg=0.0,
+    grippers={"left": Gripper(grasped=("left_top",)), "right": Gripper(grasped=("right_top",))},
+    path=[
+        (0.0, 0.0, 0.0, 0.0),
+        (1.0, 0.0, 0.0, 0.36),
+        (1.5, 0.0, -0.08, 0.36),
+        (2.0, 0.0, 0.08, 0.36),
+        (2.5, 0.0, 0.0, 0.36),
+    ],
+    steps_per_frame=8,
+    recorder="whole_surface",
+)
 
 
 def grid_scenario(options: GridScenario) -> Scenario:
@@ -70,14 +109,16 @@ def grid_scenario(options: GridScenario) -> Scenario:
     turn = np.array([[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])  # for row vectors
     start = np.array([*options.center_m, options.table_height_m + options.gap_m])
     mesh = replace(flat, nodes=flat.nodes @ turn + start)
-    grasped, held = (_named_nodes(options, names) for names in (options.grasped, options.held))
+    named = {name: one.grasped for name, one in options.grippers.items()} or {"gripper": options.grasped}
+    grippers = {name: _named_nodes(options, nodes) for name, nodes in named.items()}
+    grasped = [*chain.from_iterable(grippers.values())]
     extent = 2.0 * max(options.size_m) + options.reach
     return assemble(
         options,
         mesh,
         (rectangle_surface(options.center_m, (extent, extent), options.table_height_m),),
-        grasped=grasped,
-        held=held,
+        grippers=grippers,
+        held=_named_nodes(options, options.held),
         loss_faces=_half(mesh, grasped) if options.loss_surface == "grasped_half" else None,
     )
 

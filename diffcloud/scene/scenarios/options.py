@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -21,6 +21,9 @@ from diffcloud.sim.materials import Material, preset, read_material
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.surrounding import ContactSettings, Integrator, ReferenceContact, Surrounding
 
+Keyframes = Annotated[list[tuple[float, float, float, float]], Field(min_length=2)]
+"""Keyframes (time s, dx, dy, dz m) of a displacement, in the world's axes."""
+
 
 class ScenarioOptions(Checked):
     """The fields that all built-in scenarios share (SI units)."""
@@ -28,8 +31,8 @@ class ScenarioOptions(Checked):
     name: str
     material: str | Sheet = "basis-knit"
     """A preset, the path of an ARCSim material JSON, or an isotropic sheet in SI units."""
-    path: Annotated[list[tuple[float, float, float, float]], Field(min_length=2)]
-    """Keyframes (time s, dx, dy, dz m) of the gripper's displacement, in the world's axes."""
+    path: Keyframes
+    """The gripper's displacement."""
     frames: Annotated[int, Field(ge=1)] = 25
     rate_hz: Positive = 10.0
     steps_per_frame: Annotated[int, Field(ge=1)] = 4
@@ -58,8 +61,13 @@ class ScenarioOptions(Checked):
 
     @property
     def reach(self) -> float:
-        """Largest displacement of the gripper along an axis [m]."""
-        return float(np.abs([key[1:] for key in self.path]).max())
+        """Largest displacement of a gripper along an axis [m]."""
+        return max(abs(way) for path in (self.path, *self.own_paths.values()) for key in path for way in key[1:])
+
+    @property
+    def own_paths(self) -> Mapping[str, Keyframes]:
+        """Gripper -> its path, of those that do not follow `path`."""
+        return {}
 
 
 def _material(options: ScenarioOptions) -> Material:
@@ -77,33 +85,38 @@ def assemble(
     mesh: ClothMesh,
     obstacles: tuple[SurfaceMesh, ...],
     *,
-    grasped: Sequence[int],
+    grippers: Mapping[str, Sequence[int]],
     held: Sequence[int] = (),
     loss_faces: NDArray[np.int64] | None = None,
 ) -> Scenario:
     """The scenario of a cloth and its obstacles in their places.
 
     Args:
-        grasped: nodes that follow the gripper's path.
+        grippers: name -> nodes that follow its path.
         held: nodes that stay where they are.
         loss_faces: faces whose surface the loss samples; None for all.
 
     Raises:
-        SceneError: a node both grasped and held, or a loss frame after the end.
+        SceneError: a node that is held twice, or a loss frame after the end.
     """
-    both = sorted(set(grasped) & set(held))
-    if both:
-        raise SceneError(f"Scenario {options.name}: nodes {both} are both grasped and held.")
+    nodes = [*held, *(node for grasped in grippers.values() for node in grasped)]
+    twice = sorted({node for node in nodes if nodes.count(node) > 1})
+    if twice:
+        raise SceneError(f"Scenario {options.name}: nodes {twice} are held twice, by two grippers or by `held` too.")
     frames = {frame if frame >= 0 else options.frames + 1 + frame for frame in options.loss_frames}
     if not frames or min(frames) < 0 or max(frames) > options.frames:
         raise SceneError(f"Scenario {options.name}: loss_frames {list(options.loss_frames)} leave 0..{options.frames}.")
-    motion = Motion(tuple(Keyframe(time, (x, y, z)) for time, x, y, z in options.path))
-    handles = (*(Handle(node, motion) for node in grasped), *(Handle(node) for node in held))
+    handles = []
+    for name, grasped in grippers.items():
+        path = options.own_paths.get(name, options.path)
+        motion = Motion(tuple(Keyframe(time, (x, y, z)) for time, x, y, z in path))
+        handles += [Handle(node, motion, gripper=name) for node in grasped]
+    handles += [Handle(node) for node in held]
     thickness = options.contact_thickness_m
     scene = Scene(
         mesh=mesh,
         material=_material(options),
-        handles=Handles(handles, hard=not options.soft_handles),
+        handles=Handles(tuple(handles), hard=not options.soft_handles),
         frame_time=1 / options.rate_hz,
         frame_steps=options.steps_per_frame,
         surrounding=Surrounding(

@@ -91,5 +91,5 @@ def vest_scenario(options: VestScenario) -> Scenario:
         options,
         replace(vest, nodes=vest.nodes @ _LEVEL.T + options.center_m),
         (replace(hook, nodes=hook.nodes @ _LEVEL.T + options.center_m),),
-        grasped=held,
+        grippers={"gripper": held},
     )

@@ -44,7 +44,7 @@ def reverse(
         position_gradients, velocity_gradients, body_gradients: [S + 1, V, 3], [S + 1, V, 3], [S + 1, B, 18] of a loss
             by each step's outcome; the first rows take those by the start.
         parameter_gradients: zeros, takes the sums.
-        track_gradients: [S, 3] zeros, takes those by the track.
+        track_gradients: [S, G, 3] zeros, takes those by the track.
     """
     steps, nodes, count = len(positions) - 1, positions.shape[1], bodies.shape[1]
     work, points = new_work(scene, parameters, nodes, count), scene.surface.point_count

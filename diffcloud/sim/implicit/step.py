@@ -37,7 +37,8 @@ def simulate(
     """All steps of one cloth.
 
     Args:
-        track: [S, 3] displacement of the gripper at the end of each step [m]; of any length where no handle follows it.
+        track: [S, G, 3] displacement of each gripper at the end of each step [m]; of any length where no handle follows
+            one.
         obstacles: [S + 1, O, 3] points of static and moving obstacles at the steps' times [m].
         anchors: [H, 3] takes those of the handles.
         positions, velocities: [S + 1, V, 3] the first is the start; take the others.

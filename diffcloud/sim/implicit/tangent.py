@@ -42,7 +42,7 @@ def tangents(
 
     Args:
         parameter_rates: each field with a leading axis K; its `target` is room, its `hold` is zero.
-        track_rates: [K, S, 3]
+        track_rates: [K, S, G, 3]
         track, obstacles, anchors, positions, velocities, bodies: as `simulate` took and left them.
         position_rates, velocity_rates, body_rates: [S + 1, K, V, 3], [S + 1, K, V, 3], [S + 1, K, B, 18]; the first
             rows are those of the start, the others are taken.

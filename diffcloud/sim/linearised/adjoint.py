@@ -45,7 +45,7 @@ def reverse(
         anchors, positions, velocities: as `simulate` left them.
         position_gradients, velocity_gradients: [S + 1, V, 3] of a loss by each; the first rows take those by the start.
         gradients: zeros; takes the sums over all steps.
-        track_gradients: [S, 3] zeros; takes those by the gripper's track.
+        track_gradients: [S, G, 3] zeros; takes those by the track.
     """
     dt = scene.time_step
     steps, nodes = len(positions) - 1, positions.shape[1]

@@ -36,7 +36,8 @@ def simulate(
     """All steps of one cloth.
 
     Args:
-        track: [S, 3] displacement of the gripper at the end of each step [m]; of any length where no handle follows it.
+        track: [S, G, 3] displacement of each gripper at the end of each step [m]; of any length where no handle follows
+            one.
         anchors: [H, 3] takes those of the handles.
         positions, velocities: [S + 1, V, 3] the first is the start; take the others.
         keep: rows of factors that may be kept for the derivatives; below zero: nothing is kept.

@@ -41,7 +41,7 @@ def tangents(
 
     Args:
         rates: of the parameters, with a leading axis K; its targets are overwritten.
-        track_rates: [K, S, 3]
+        track_rates: [K, S, G, 3]
         anchors, positions, velocities: as `simulate` left them.
         position_rates, velocity_rates: [S + 1, K, V, 3] the first rows are those of the start; take the others.
     """

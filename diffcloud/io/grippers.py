@@ -1,0 +1,101 @@
+"""Tracks of grippers from CSV files: one file for all of them, or one each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from diffcloud.errors import EpisodeError
+from diffcloud.io.episodes import ONLY_GRIPPER
+
+_AXES = ["x", "y", "z"]
+_FARTHEST_M = 20.0
+_SAME_TIME_S = 1e-4
+
+
+@dataclass(frozen=True)
+class GripperTracks:
+    """Where each of G grippers was in each of T frames."""
+
+    names: tuple[str, ...]
+    """[G]"""
+    positions: NDArray[np.float64]
+    """[T, G, 3] [m]"""
+    times: NDArray[np.float64] | None
+    """[T] since the first [s]; None where the files have no t_s."""
+
+
+def read_tracks(files: Mapping[str, Path], frames: int) -> GripperTracks:
+    """The tracks of one or several grippers.
+
+    Args:
+        files: name -> CSV with columns x, y, z [m] and optionally t_s [s], one row a frame. A single one may hold several
+            grippers: with a column `gripper` that names them, one row a frame and gripper. These names replace its own.
+        frames: T.
+
+    Raises:
+        EpisodeError: an unreadable file, missing columns or rows, positions in other units, or times that differ.
+    """
+    tables = {name: _read(path) for name, path in files.items()}
+    if len(files) == 1:
+        (path,), (table,) = files.values(), tables.values()
+        if "gripper" in table.columns:
+            tables = {str(name): rows for name, rows in table.groupby("gripper", sort=False)}
+            files = dict.fromkeys(tables, path)
+    elif any("gripper" in table.columns for table in tables.values()):
+        raise EpisodeError("A CSV with a column gripper holds all grippers: give this file alone, or one file each.")
+    positions, times = [], None
+    for name, table in tables.items():
+        place = str(files[name]) if len(tables) == 1 else f"{files[name]}, gripper {name!r}"
+        track = _numbers(table, _AXES, place)
+        if len(track) != frames:
+            raise EpisodeError(f"{place} has {len(track)} rows for {frames} clouds; give one row a frame.")
+        extent = float(np.ptp(track, axis=0).max())
+        if extent > _FARTHEST_M:
+            raise EpisodeError(f"{place}: the gripper moves by {extent:.0f}; positions are metres, not millimetres.")
+        positions.append(track)
+        if "t_s" in table.columns:
+            own = _numbers(table, ["t_s"], place)[:, 0]
+            if times is not None and np.abs(own - times).max() > _SAME_TIME_S:
+                raise EpisodeError(f"{place}: its times differ from those of the other grippers; give one row a frame.")
+            times = own
+    return GripperTracks(tuple(tables), np.stack(positions, axis=1), None if times is None else times - times[0])
+
+
+def named_files(given: list[str]) -> dict[str, Path]:
+    """NAME=PATH, or PATH alone of a single file.
+
+    Raises:
+        EpisodeError: several without names, or one name twice.
+    """
+    if len(given) == 1 and "=" not in given[0]:
+        return {ONLY_GRIPPER[0]: Path(given[0])}
+    pairs = [one.partition("=") for one in given]
+    names = [name for name, _, _ in pairs]
+    if not all(name and path for name, _, path in pairs) or len(set(names)) < len(names):
+        raise EpisodeError(f"Give each gripper's file as NAME=PATH, each name once; got {', '.join(given)}.")
+    return {name: Path(path) for name, _, path in pairs}
+
+
+def _numbers(table: pd.DataFrame, columns: list[str], place: str) -> NDArray[np.float64]:
+    missing = [name for name in columns if name not in table.columns]
+    if missing:
+        raise EpisodeError(f"{place}: columns {missing} are missing; it has {list(table.columns)}.")
+    try:
+        return table[columns].to_numpy(np.float64)
+    except ValueError as error:
+        raise EpisodeError(f"{place} is not a CSV of numbers: {error}.") from error
+
+
+def _read(path: Path) -> pd.DataFrame:
+    try:
+        return pd.read_csv(path, dtype={"gripper": str})
+    except FileNotFoundError as error:
+        raise EpisodeError(f"No such gripper file: {path}.") from error
+    except (OSError, ValueError) as error:
+        raise EpisodeError(f"{path} is not a CSV of numbers: {error}.") from error
