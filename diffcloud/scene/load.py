@@ -145,7 +145,7 @@ def _contradictions(block: ObstacleBlock, scene: SceneFile) -> Iterator[str]:
     if scene.diffcloud.integrator == "linearised":
         advice = 'set `diffcloud.integrator` to "implicit" or leave it out'
         if block.is_body:
-            yield f"movable: rigid bodies need the implicit integrator; {advice}, or set `movable` to 0 (ARCSim's default is 1)"
+            yield f"movable: rigid bodies need the implicit integrator; {advice}, or set `movable` (default 1) to 0"
         elif block.motion is not None:
             yield f"motion: moving obstacles need the implicit integrator; {advice}"
 
