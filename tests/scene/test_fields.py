@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -126,7 +125,7 @@ EFFECTS = [
         "obstacles.0.transform.rotate",
         [0.5, 0, 1, 0],
         table_normal,
-        [math.sin(math.radians(0.5)), 0, math.cos(math.radians(0.5))],
+        [0.008726535, 0, 0.999961923],
     ),
     Effect("obstacles.0.movable", 0, lambda scene: len(scene.surrounding.bodies), 0, falling_with_box),
     Effect("obstacles.0.motion", None, lambda scene: len(scene.surrounding.moving), 0, over_moving_box),
