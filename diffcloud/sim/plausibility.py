@@ -12,8 +12,9 @@ is in the course of the motion, the available energy must explain how far the cl
 
     E + U ≤ 3 (K + U₀) + P.
 
-Moving obstacles and rigid bodies count like handles of twice the speed, with which a cloth can bounce off them. Once no handle holds the cloth at all, its nodes may also have fallen
-freely since then, but they are not stretched: what is farther is not possible.
+Moving obstacles and rigid bodies count like handles of twice their speed, with which cloth can bounce off them. Once no
+handle holds the cloth at all, its nodes may also have fallen freely since then, but they are not stretched: what is
+farther is not possible.
 """
 
 from __future__ import annotations

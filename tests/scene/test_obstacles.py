@@ -68,7 +68,7 @@ def test_a_motion_acts_on_the_transformed_mesh_between_its_times(folder):
         half = np.arctan2(part * np.sin(np.pi / 4), 1 - part + part * np.cos(np.pi / 4))
         cosine, sine = np.cos(2 * half), np.sin(2 * half)
         turned = placed @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]).T
-        np.testing.assert_allclose(moved[0, step], turned + [0, 0, part], atol=1e-12)
+        np.testing.assert_allclose(moved[0, step], np.add(turned, [0, 0, part]), atol=1e-12)
     np.testing.assert_array_equal(faces, MESHES["box"].faces)
 
 
@@ -79,7 +79,7 @@ def test_a_body_turns_and_flies_as_it_was_sent(folder):
     system, _ = load_scene(write_file(folder, data)).build()
     run = rollout(system, 50)
     moved, _ = moved_surfaces(system, run)
-    nodes = MESHES["ball"].nodes + [0, 0, -1]
+    nodes = np.add(MESHES["ball"].nodes, [0, 0, -1])
     centre = run.bodies.centre[0, 0, 0].numpy()
     cosine, sine = np.cos(1.0), np.sin(1.0)  # after 0.5 s
     expected = (nodes - centre) @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]).T + centre + [0, 0.25, 0]
@@ -138,7 +138,7 @@ def test_a_written_scene_has_the_same_obstacles(folder, tmp_path, mass):
             "motion": 0,
             "start_time": 0.01,
             "end_time": 0.1,
-            "transform": {"rotate": [30, 0, 0, 1]},
+            "transform": {"scale": 2},
         },
     ]
     data["handles"] = [{"nodes": [0], "motion": 0}]
