@@ -40,9 +40,9 @@ def rollout(
     episode: Annotated[Path | None, typer.Option(help="Episode whose gripper track moves the handles.")] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Frames to simulate.")] = None,
     obj: Annotated[
-        Path | None, typer.Option(help="Folder for one OBJ a frame; with obstacles that move, for 000_moving.obj ... too.")
+        Path | None, typer.Option(help="Folder for one OBJ a frame, 000.obj, ...; what moves beside is in 000_moving.obj.")
     ] = None,
-    ply: Annotated[Path | None, typer.Option(help="The same as PLY meshes.")] = None,
+    ply: Annotated[Path | None, typer.Option(help="Folder for the same as PLY meshes.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Simulate and export a motion."""
