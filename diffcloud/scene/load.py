@@ -60,7 +60,7 @@ def load_scene(path: Path, *, reload_materials: bool = False) -> Scene:
         stretching=block.thicken * block.stretching_mult,
         bending=block.thicken * block.bending_mult,
     )
-    motions = [Motion(tuple(_keyframe(key) for key in keys)) for keys in scene.motions]
+    motions = [_motion(f"{path}: motions.{index}", keys) for index, keys in enumerate(scene.motions)]
     placed = [
         (block, _transform_surface(read_surface(_inside(root, block.mesh, path)), block.transform))
         for block in scene.obstacles
@@ -187,12 +187,19 @@ def _handles(path: Path, scene: SceneFile, mesh: ClothMesh, motions: list[Motion
     return tuple(handles)
 
 
+def _motion(place: str, keys: list[KeyframeBlock]) -> Motion:
+    try:
+        return Motion(tuple(_keyframe(key) for key in keys))
+    except SceneError as error:
+        raise SceneError(f"{place}: {error}") from error
+
+
 def _keyframe(block: KeyframeBlock) -> Keyframe:
     angle, *axis = block.transform.rotate
     velocity = None
     if block.velocity is not None:
         if block.velocity.rotate[0] != 0:
-            raise SceneError("motions: a keyframe velocity with rotation is not supported.")
+            raise SceneError("A keyframe velocity with rotation is not supported.")
         scale = block.velocity.scale if "scale" in block.velocity.model_fields_set else 0.0
         velocity = (*block.velocity.translate, scale, 0.0, 0.0, 0.0, 0.0)
     return Keyframe(

@@ -14,7 +14,7 @@ from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.description import Scene
 from diffcloud.sim.materials import Material
 from diffcloud.sim.motion import Motion
-from diffcloud.sim.surrounding import ReferenceContact, Surrounding
+from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
 
 
 def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
@@ -24,16 +24,25 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
         The path of the scene file.
 
     Raises:
-        SceneError: masses that come from another material than the tables (the published experiments' reload), which
-            the format cannot say.
+        SceneError: what the format cannot say: masses that come from another material than the tables (the published
+            experiments' reload), further forces, and some settings of the implicit integrator.
     """
     folder = Path(folder)
     if scene.mass_material is not None:
         raise SceneError("A scene whose masses come from another material cannot be written as ARCSim JSON.")
+    around = scene.surrounding
+    unsaid = {
+        "order": scene.integrator == "implicit" and scene.order != 2 and not around.bodies,
+        "self_contact": not around.self_contact,
+        "forces": bool(around.forces),
+        "contact.sticking_speed": around.contact.sticking_speed != ContactSettings().sticking_speed,
+    }
+    if any(unsaid.values()):
+        named = ", ".join(name for name, lost in unsaid.items() if lost)
+        raise SceneError(f"ARCSim JSON has no place for {named} of this scene; take the default, or keep it in Python.")
     cloth, material = f"meshes/{name}/cloth.obj", f"materials/{name}.json"
     write_cloth(folder / cloth, scene.mesh)
     write_json(folder / material, _material(scene.material))
-    around = scene.surrounding
     motions: list[Motion] = []
     obstacles = []
     for index, (surface, obstacle) in enumerate(_obstacles(around, motions)):

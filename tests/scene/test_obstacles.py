@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +13,11 @@ import torch
 
 from diffcloud.errors import MeshError, SceneError
 from diffcloud.scene import load_scene, write_scene
+from diffcloud.scene.schema import BodyBlock, ExtensionBlock
 from diffcloud.sim.moved import moved_surfaces
 from diffcloud.sim.simulate import rollout
+from diffcloud.sim.surrounding import ContactSettings, Surrounding
+from tests.docs.examples import ROOT
 from tests.scene.files import (
     MESHES,
     changed,
@@ -153,16 +159,42 @@ def test_a_written_scene_has_the_same_obstacles(folder, tmp_path, mass):
 
 
 @pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"order": 1}, "order"),
+        ({"surrounding": Surrounding(self_contact=False)}, "self_contact"),
+        ({"surrounding": Surrounding(contact=ContactSettings(sticking_speed=1e-4))}, "sticking_speed"),
+        ({"surrounding": Surrounding(forces={"wind_box": {}})}, "forces"),
+    ],
+)
+def test_what_a_file_cannot_say_is_not_written(folder, tmp_path, changes, named):
+    scene = replace(load_scene(write_file(folder, over_moving_box())), **changes)
+    with pytest.raises(SceneError, match=f"no place for .*{named}"):
+        write_scene(scene, tmp_path / "written")
+    assert not (tmp_path / "written").exists()
+
+
+@pytest.mark.parametrize(
     ("path", "value", "message"),
     [
+        ("motions.0.1.time", 0, "motions.0: .*increasing times"),
         ("obstacles.0.mesh", "meshes/none.obj", "No such mesh: .*none.obj"),
         ("cloths.0.mesh", "meshes/none.obj", "no folder above it holds 'meshes/none.obj'"),
         ("cloths.0.materials.0.data", "materials/none.json", "none.json"),
     ],
 )
-def test_missing_files_are_named(folder, path, value, message):
+def test_missing_files_and_wrong_motions_are_named(folder, path, value, message):
     with pytest.raises((SceneError, MeshError), match=message):
         load_scene(write_file(folder, changed(sheets_over_table(), path, value)))
+
+
+def test_the_page_of_scene_files_names_our_fields_and_shows_what_loads(folder):
+    page = (ROOT / "docs" / "scenarios.md").read_text(encoding="utf-8")
+    for block in (BodyBlock, ExtensionBlock):
+        assert [name for name in block.model_fields if f"`{name}`" not in page] == []
+    (shown,) = re.findall(r"```json\n(.*?)```", page, re.DOTALL)
+    (body,) = load_scene(write_file(folder, sheet_over_box() | json.loads("{" + shown + "}"))).surrounding.bodies
+    assert (body.mass, body.velocity) == (0.05, (0, 0, -1))
 
 
 def test_all_published_scenes_load_and_run(release: Path):
