@@ -15,7 +15,9 @@ from diffcloud.fit.result import read_fit
 from diffcloud.io.clouds import write_ply
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import together, write_npz
-from diffcloud.io.obj import write_cloth
+from diffcloud.io.obj import write_cloth, write_surface
+from diffcloud.mesh.topology import SurfaceMesh
+from diffcloud.sim.moved import moved_surfaces
 from diffcloud.sim.properties import check_values
 from diffcloud.sim.simulate import rollout as simulate
 from pipeline.console import JsonFlag, assignments, errors, finish, progress_bar, writes
@@ -25,7 +27,11 @@ from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, 
 @writes(".npz")
 def rollout(
     out: Annotated[
-        Path, typer.Option(help="NPZ: nodes [T+1, V, 3], faces [F, 3], times [T+1], obstacle_nodes, obstacle_faces.")
+        Path,
+        typer.Option(
+            help="NPZ: nodes [T+1, V, 3], faces [F, 3], times [T+1]; of obstacles that stand obstacle_nodes [N, 3], "
+            "obstacle_faces; of those that move moving_nodes [T+1, M, 3], moving_faces."
+        ),
     ],
     scenario: ScenarioName = None,
     scene: SceneFile = None,
@@ -33,8 +39,10 @@ def rollout(
     fit: Annotated[Path | None, typer.Option(help="JSON of a fit whose parameters are used.")] = None,
     episode: Annotated[Path | None, typer.Option(help="Episode whose gripper track moves the handles.")] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Frames to simulate.")] = None,
-    obj: Annotated[Path | None, typer.Option(help="Folder for one OBJ a frame.")] = None,
-    ply: Annotated[Path | None, typer.Option(help="Folder for one PLY mesh a frame.")] = None,
+    obj: Annotated[
+        Path | None, typer.Option(help="Folder for one OBJ a frame, 000.obj, ...; what moves beside is in 000_moving.obj.")
+    ] = None,
+    ply: Annotated[Path | None, typer.Option(help="Folder for the same as PLY meshes.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Simulate and export a motion."""
@@ -64,8 +72,10 @@ def rollout(
         except DivergedError as error:
             shown = ", ".join(f"{name}={value:g}" for name, value in values.items()) or "the basis material"
             raise DivergedError(error.step, error.entries, error.reason, shown) from error
-    nodes = run.positions[0, :: chosen.scene.frame_steps].numpy()
-    times = run.times[:: chosen.scene.frame_steps].numpy()
+    per_frame = slice(None, None, chosen.scene.frame_steps)
+    nodes, times = run.positions[0, per_frame].numpy(), run.times[per_frame].numpy()
+    moved, moved_faces = moved_surfaces(system, run)
+    moved = moved[0, per_frame]
     bodies = chosen.scene.bodies
     with together():
         for index, frame in enumerate(nodes):
@@ -73,6 +83,10 @@ def rollout(
                 write_cloth(obj / f"{index:03d}.obj", system.mesh, frame)
             if ply is not None:
                 write_ply(ply / f"{index:03d}.ply", frame, system.mesh.faces)
+            if obj is not None and len(moved_faces):
+                write_surface(obj / f"{index:03d}_moving.obj", SurfaceMesh(moved[index], moved_faces))
+            if ply is not None and len(moved_faces):
+                write_ply(ply / f"{index:03d}_moving.ply", moved[index], moved_faces)
         write_npz(
             out,
             nodes=nodes,
@@ -80,6 +94,8 @@ def rollout(
             times=times,
             obstacle_nodes=bodies.nodes,
             obstacle_faces=bodies.faces,
+            moving_nodes=moved,
+            moving_faces=moved_faces,
         )
     errors.print(f"Wrote {len(nodes)} frames of {nodes.shape[1]} nodes to {out}.")
     finish(

@@ -53,7 +53,7 @@ class Scene:
 
     @property
     def bodies(self) -> SurfaceMesh:
-        """All obstacles but the planar ones (tables), as one mesh to draw; without any, no nodes and no faces."""
+        """All static obstacles but the planar ones (tables), as one mesh to draw; without any, no nodes and no faces."""
         bodies = [obstacle for obstacle in self.surrounding.obstacles if obstacle.plane() is None]
         first = np.cumsum([0, *(len(body.nodes) for body in bodies)])
         return SurfaceMesh(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -13,11 +14,14 @@ from diffcloud.io.files import read_json
 from diffcloud.io.obj import read_cloth, read_surface
 from diffcloud.mesh.topology import ClothMesh, FloatArray, SurfaceMesh
 from diffcloud.scene.description import Scene
-from diffcloud.scene.schema import KeyframeBlock, SceneFile, TransformBlock, explain
+from diffcloud.scene.schema import KeyframeBlock, ObstacleBlock, SceneFile, TransformBlock, explain
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import read_material
 from diffcloud.sim.motion import Keyframe, Motion, axis_angle_quaternion
-from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
+from diffcloud.sim.rigid.bodies import Bodies
+from diffcloud.sim.rigid.body import RigidBody
+from diffcloud.sim.scenery import MovingObstacle
+from diffcloud.sim.surrounding import ContactSettings, Integrator, ReferenceContact, Surrounding
 
 _SUPPORTED_SWITCHES = {"remeshing", "proximity", "strainlimiting", "separation", "popfilter", "plasticity"}
 """Of `disable`: those whose stage this simulator has (proximity), or never runs anyway."""
@@ -33,8 +37,8 @@ def load_scene(path: Path, *, reload_materials: bool = False) -> Scene:
 
     Raises:
         SceneError: an unreadable file, an unknown or unsupported field (by name), a path that leaves the scene's
-            folder, or a reference to a motion or node that does not exist.
-        MeshError: a mesh that cannot be simulated.
+            folder, a reference to a motion or node that does not exist, or obstacles that contradict themselves.
+        MeshError: a mesh that is missing or cannot be simulated.
     """
     path = Path(path)
     data = read_json(path, error=SceneError)
@@ -56,13 +60,18 @@ def load_scene(path: Path, *, reload_materials: bool = False) -> Scene:
         stretching=block.thicken * block.stretching_mult,
         bending=block.thicken * block.bending_mult,
     )
+    motions = [_motion(f"{path}: motions.{index}", keys) for index, keys in enumerate(scene.motions)]
+    placed = [
+        (block, _transform_surface(read_surface(_inside(root, block.mesh, path)), block.transform))
+        for block in scene.obstacles
+    ]
     magic = scene.magic
     thickness = magic.repulsion_thickness
     return Scene(
         mesh=mesh,
         material=raw if reload_materials else scaled,
         mass_material=scaled if reload_materials else None,
-        handles=Handles(_handles(path, scene, mesh), magic.handle_stiffness, scene.diffcloud.hard_handles),
+        handles=Handles(_handles(path, scene, mesh, motions), magic.handle_stiffness, scene.diffcloud.hard_handles),
         frame_time=scene.frame_time,
         frame_steps=scene.frame_steps,
         end_time=min(scene.end_time, (scene.end_frame or np.inf) * scene.frame_time),
@@ -81,12 +90,19 @@ def load_scene(path: Path, *, reload_materials: bool = False) -> Scene:
             proximity="proximity" not in scene.disable,
             reference_contact=_contact(scene),
             lagged_air=_contact(scene) == ReferenceContact.as_published(),
-            obstacles=tuple(
-                _transform_surface(read_surface(_inside(root, obstacle.mesh, path)), obstacle.transform)
-                for obstacle in scene.obstacles
+            obstacles=tuple(surface for block, surface in placed if not block.is_body and block.motion is None),
+            moving=tuple(
+                MovingObstacle(surface, motions[block.motion], block.start_time, block.end_time)
+                for block, surface in placed
+                if block.motion is not None
+            ),
+            bodies=tuple(
+                _body(f"{path}: obstacles.{index}", block, surface)
+                for index, (block, surface) in enumerate(placed)
+                if block.is_body
             ),
         ),
-        integrator=scene.diffcloud.integrator,
+        integrator=_integrator(scene),
         shaped=scene.diffcloud.shaped,
     )
 
@@ -96,11 +112,8 @@ def _refuse_unsupported(path: Path, scene: SceneFile) -> None:
     if "remeshing" not in scene.disable:
         faults.append("remeshing is not supported: add it to `disable`")
     faults += [f"disable: {name!r} is not supported" for name in scene.disable if name not in _SUPPORTED_SWITCHES]
-    faults += [
-        f"obstacles.{index}.movable: rigid bodies are not supported, set it to 0"
-        for index, obstacle in enumerate(scene.obstacles)
-        if obstacle.movable
-    ]
+    for index, obstacle in enumerate(scene.obstacles):
+        faults += [f"obstacles.{index}.{fault}" for fault in _contradictions(obstacle, scene)]
     if scene.magic.rib_stiffening != 1.0:
         faults.append("magic.rib_stiffening: only 1 is supported")
     for index, handle in enumerate(scene.handles):
@@ -110,14 +123,57 @@ def _refuse_unsupported(path: Path, scene: SceneFile) -> None:
         raise SceneError(f"{path}: " + "; ".join(faults) + ".")
 
 
+def _contradictions(block: ObstacleBlock, scene: SceneFile) -> Iterator[str]:
+    """What an obstacle's fields, each valid, say against each other."""
+    given = block.model_fields_set
+    if block.motion is None:
+        for name in ("start_time", "end_time"):
+            if name in given:
+                yield f"{name}: of an obstacle with a `motion`; one that comes or goes is not supported, leave it out"
+    elif block.movable:
+        yield "movable: it has a `motion`, which nothing can push it off; set `movable` to 0 or leave `motion` out"
+    elif block.motion >= len(scene.motions):
+        yield f"motion: {block.motion}, but the scene has {len(scene.motions)} motions"
+    elif any(key.transform.scale == 0 for key in scene.motions[block.motion]):
+        yield f"motion: motion {block.motion} shrinks the obstacle to a point; its keyframes need a `scale` above 0"
+    if block.start_time > block.end_time:
+        yield f"end_time: {block.end_time} comes before start_time {block.start_time}"
+    if "diffcloud" in given and not block.is_body:
+        yield "diffcloud: of movable obstacles only; leave it out, or set `movable` to 1 and leave `motion` out"
+    if block.diffcloud.density is not None and block.diffcloud.mass is not None:
+        yield "diffcloud: give either `density` or `mass`"
+    if scene.diffcloud.integrator == "linearised":
+        advice = 'set `diffcloud.integrator` to "implicit" or leave it out'
+        if block.is_body:
+            yield f"movable: rigid bodies need the implicit integrator; {advice}, or set `movable` (default 1) to 0"
+        elif block.motion is not None:
+            yield f"motion: moving obstacles need the implicit integrator; {advice}"
+
+
+def _integrator(scene: SceneFile) -> Integrator:
+    moves = any(block.is_body or block.motion is not None for block in scene.obstacles)
+    return scene.diffcloud.integrator or ("implicit" if moves else "linearised")
+
+
+def _body(place: str, block: ObstacleBlock, mesh: SurfaceMesh) -> RigidBody:
+    own = block.diffcloud
+    body = RigidBody(mesh, mass=own.mass, velocity=own.velocity, angular_velocity=own.angular_velocity)
+    body = body if own.density is None else replace(body, density=own.density)
+    try:
+        Bodies.build([body])
+    except SceneError as error:
+        hint = "If nothing moves it, set its `movable` to 0."
+        raise SceneError(f"{place} is movable (ARCSim's default). {error} {hint}") from error
+    return body
+
+
 def _contact(scene: SceneFile) -> ReferenceContact | None:
-    if scene.diffcloud.integrator == "implicit" or scene.diffcloud.contact == "planes":
+    if _integrator(scene) == "implicit" or scene.diffcloud.contact == "planes":
         return None
     return ReferenceContact.as_published() if scene.diffcloud.contact == "published" else ReferenceContact()
 
 
-def _handles(path: Path, scene: SceneFile, mesh: ClothMesh) -> tuple[Handle, ...]:
-    motions = [Motion(tuple(_keyframe(key) for key in keys)) for keys in scene.motions]
+def _handles(path: Path, scene: SceneFile, mesh: ClothMesh, motions: list[Motion]) -> tuple[Handle, ...]:
     several = len({block.motion for block in scene.handles} - {None}) > 1
     handles = []
     for index, block in enumerate(scene.handles):
@@ -133,12 +189,19 @@ def _handles(path: Path, scene: SceneFile, mesh: ClothMesh) -> tuple[Handle, ...
     return tuple(handles)
 
 
+def _motion(place: str, keys: list[KeyframeBlock]) -> Motion:
+    try:
+        return Motion(tuple(_keyframe(key) for key in keys))
+    except SceneError as error:
+        raise SceneError(f"{place}: {error}") from error
+
+
 def _keyframe(block: KeyframeBlock) -> Keyframe:
     angle, *axis = block.transform.rotate
     velocity = None
     if block.velocity is not None:
         if block.velocity.rotate[0] != 0:
-            raise SceneError("motions: a keyframe velocity with rotation is not supported.")
+            raise SceneError("A keyframe velocity with rotation is not supported.")
         scale = block.velocity.scale if "scale" in block.velocity.model_fields_set else 0.0
         velocity = (*block.velocity.translate, scale, 0.0, 0.0, 0.0, 0.0)
     return Keyframe(

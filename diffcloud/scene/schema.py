@@ -1,6 +1,6 @@
 """The ARCSim/DiffSim scene format. Fields are refused by name when unknown or unsupported, never ignored.
 
-Defaults are ARCSim's. The block `diffcloud` is this project's own addition, for what ARCSim cannot say.
+Defaults are ARCSim's. The blocks `diffcloud` are this project's own additions, for what ARCSim cannot say.
 """
 
 from __future__ import annotations
@@ -62,14 +62,38 @@ class HandleBlock(Checked):
     nodes: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
     motion: Annotated[int, Field(ge=0)] | None = None
     start_time: float = 0.0
-    end_time: float = Field(default=math.inf, allow_inf_nan=True)
+    end_time: float = Field(default=math.inf, gt=-math.inf, allow_inf_nan=True)
     fade_time: NonNegative = 0.0
+
+
+class BodyBlock(Checked):
+    """What ARCSim cannot say of a movable obstacle."""
+
+    density: Positive | None = None
+    """[kg/m³] Default: 1000, water's. ARCSim takes 0.01 kg for each node of the mesh, so that a finer mesh weighs more."""
+    mass: Positive | None = None
+    """[kg], instead of a density."""
+    velocity: Vector = (0.0, 0.0, 0.0)
+    """Of the centre of mass at the start [m/s]."""
+    angular_velocity: Vector = (0.0, 0.0, 0.0)
+    """At the start, in the world's axes [rad/s]."""
 
 
 class ObstacleBlock(Checked):
     mesh: str
     transform: TransformBlock = TransformBlock()
-    movable: Literal[0, 1, False, True] = 1
+    movable: Literal[0, 1, False, True] | None = None
+    """Whether what it touches moves it. Default: 1, as in ARCSim, unless it has a motion."""
+    motion: Annotated[int, Field(ge=0)] | None = None
+    """It acts on the transformed mesh."""
+    start_time: float = 0.0
+    """Before this and after `end_time` [s] the motion stands still, and so does the obstacle; in ARCSim it is absent."""
+    end_time: float = Field(default=math.inf, gt=-math.inf, allow_inf_nan=True)
+    diffcloud: BodyBlock = BodyBlock()
+
+    @property
+    def is_body(self) -> bool:
+        return self.motion is None if self.movable is None else bool(self.movable)
 
 
 class WindBlock(Checked):
@@ -94,8 +118,8 @@ class ExtensionBlock(Checked):
     """What ARCSim cannot say."""
 
     hard_handles: bool = False
-    integrator: Integrator = "linearised"
-    """"implicit": converged steps with smooth contact."""
+    integrator: Integrator | None = None
+    """"implicit": converged steps with smooth contact. Default: "linearised", ARCSim's, unless an obstacle moves."""
     shaped: bool = False
     """Whether hinges are at rest as the mesh stands, not flat."""
     contact: Literal["meshes", "published", "planes"] = "meshes"

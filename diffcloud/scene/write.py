@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from diffcloud.errors import SceneError
 from diffcloud.io.files import write_json
 from diffcloud.io.obj import write_cloth, write_surface
+from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.description import Scene
 from diffcloud.sim.materials import Material
 from diffcloud.sim.motion import Motion
-from diffcloud.sim.surrounding import ReferenceContact
+from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
 
 
 def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
@@ -22,34 +24,41 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
         The path of the scene file.
 
     Raises:
-        SceneError: masses that come from another material than the tables (the published experiments' reload), which
-            the format cannot say.
+        SceneError: what the format cannot say: masses that come from another material than the tables (the published
+            experiments' reload), further forces, and some settings of the implicit integrator.
     """
     folder = Path(folder)
     if scene.mass_material is not None:
         raise SceneError("A scene whose masses come from another material cannot be written as ARCSim JSON.")
+    around = scene.surrounding
+    unsaid = {
+        "order": scene.integrator == "implicit" and scene.order != 2 and not around.bodies,
+        "self_contact": not around.self_contact,
+        "forces": bool(around.forces),
+        "contact.sticking_speed": around.contact.sticking_speed != ContactSettings().sticking_speed,
+    }
+    if any(unsaid.values()):
+        named = ", ".join(name for name, lost in unsaid.items() if lost)
+        raise SceneError(f"ARCSim JSON has no place for {named} of this scene; take the default, or keep it in Python.")
     cloth, material = f"meshes/{name}/cloth.obj", f"materials/{name}.json"
     write_cloth(folder / cloth, scene.mesh)
     write_json(folder / material, _material(scene.material))
-    obstacles = []
-    for index, obstacle in enumerate(scene.surrounding.obstacles):
-        mesh = f"meshes/{name}/obstacle{index}.obj"
-        write_surface(folder / mesh, obstacle)
-        obstacles.append({"mesh": mesh, "movable": 0})
-
     motions: list[Motion] = []
+    obstacles = []
+    for index, (surface, obstacle) in enumerate(_obstacles(around, motions)):
+        mesh = f"meshes/{name}/obstacle{index}.obj"
+        write_surface(folder / mesh, surface)
+        obstacles.append({"mesh": mesh, **obstacle})
+
     handles: list[dict[str, Any]] = []
     for handle in scene.handles.handles:
         block: dict[str, Any] = {"nodes": [handle.node], "start_time": handle.start, "fade_time": handle.fade}
         if math.isfinite(handle.end):
             block["end_time"] = handle.end
         if handle.motion is not None:
-            if handle.motion not in motions:
-                motions.append(handle.motion)
-            block["motion"] = motions.index(handle.motion)
+            block["motion"] = _number(handle.motion, motions)
         handles.append(block)
 
-    around = scene.surrounding
     data: dict[str, Any] = {
         "frame_time": scene.frame_time,
         "frame_steps": scene.frame_steps,
@@ -80,6 +89,26 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
     path = folder / "conf" / f"{name}.json"
     write_json(path, data)
     return path
+
+
+def _obstacles(around: Surrounding, motions: list[Motion]) -> Iterator[tuple[SurfaceMesh, dict[str, Any]]]:
+    """Meshes and blocks; new motions are appended to the list."""
+    for surface in around.obstacles:
+        yield surface, {"movable": 0}
+    for moving in around.moving:
+        block = {"movable": 0, "motion": _number(moving.motion, motions), "start_time": moving.start}
+        yield moving.mesh, block | ({"end_time": moving.end} if math.isfinite(moving.end) else {})
+    for body in around.bodies:
+        weight = {"density": body.density} if body.mass is None else {"mass": body.mass}
+        own = {"velocity": list(body.velocity), "angular_velocity": list(body.angular_velocity)}
+        yield body.mesh, {"movable": 1, "diffcloud": weight | own}
+
+
+def _number(motion: Motion, motions: list[Motion]) -> int:
+    """Of a motion in the list, to which it is appended if it is new."""
+    if motion not in motions:
+        motions.append(motion)
+    return motions.index(motion)
 
 
 def _material(material: Material) -> dict[str, Any]:

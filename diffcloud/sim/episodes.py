@@ -247,7 +247,8 @@ class Batch:
         translation[:, followed] += self._track[entry, :last, schedule.gripper[followed]].swapaxes(0, 1)
         targets = translation + np.einsum("shij,hj->shi", schedule.linear[:last], self._anchors[entry])
         moving = self._scenery[: last + 1, len(self._scenery[0]) - system.moving_points :]
-        centres = self.poses[entry, : last + 1, :, :3]
+        poses = self.poses[entry, : last + 1]
+        bodies = system.bodies.placed(poses[..., :3], poses[..., 3:12].reshape(*poses.shape[:2], 3, 3))
         return Course(
             positions=self.positions[entry, : last + 1],
             time_step=system.time_step,
@@ -258,7 +259,7 @@ class Batch:
             gravity=np.array(system.setup.surrounding.gravity, dtype=np.float64),
             wind=float(np.linalg.norm(system.setup.surrounding.wind)),
             velocities=self.velocities[entry, 0],
-            others=np.concatenate([moving, centres], axis=1),
+            others=np.concatenate([moving, bodies], axis=1),
         )
 
     def _stored(self, entry: int, step: int) -> float:

@@ -12,8 +12,9 @@ is in the course of the motion, the available energy must explain how far the cl
 
     E + U ≤ 3 (K + U₀) + P.
 
-Moving obstacles and rigid bodies count like handles. Once no handle holds the cloth at all, its nodes may also have fallen
-freely since then, but they are not stretched: what is farther is not possible.
+Moving obstacles and rigid bodies count like handles of twice their speed, with which cloth can bounce off them. Once no
+handle holds the cloth at all, its nodes may also have fallen freely since then, but they are not stretched: what is
+farther is not possible.
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ Floats = NDArray[np.float64]
 
 _SIZES = 3.0
 _ENERGIES = 3.0
+_BOUNCE = 2.0
+_ROUNDING = 8 * float(np.finfo(np.float64).eps)
+"""Of positions, relative: without weight and handles nothing else explains the last digits of a cloth at rest."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +78,11 @@ def _energies(motion: Motion) -> tuple[Floats, Floats, Floats]:
     velocities = np.diff(motion.positions, axis=0) / step
     kinetic = 0.5 * np.einsum("svi,svi,v->s", velocities, velocities, motion.mass)
     handles = np.linalg.norm(np.diff(motion.places, axis=0), axis=-1) * motion.held
-    others = np.linalg.norm(np.diff(motion.others, axis=0), axis=-1)
+    others = _BOUNCE * np.linalg.norm(np.diff(motion.others, axis=0), axis=-1)
     moved = np.concatenate([handles, others], axis=1).max(axis=1, initial=0.0)
     speed = np.maximum(np.maximum.accumulate(moved) / step, motion.wind)
-    start = 0.5 * float(motion.mass @ (motion.velocities**2).sum(axis=-1))
+    rounding = _ROUNDING * float(np.abs(motion.positions).max(initial=0.0)) / step
+    start = 0.5 * float(motion.mass @ (motion.velocities**2).sum(axis=-1)) + 0.5 * mass * rounding**2
     weight = mass * float(np.linalg.norm(motion.gravity))
     given = start + weight * (motion.size + np.cumsum(moved) + _fallen(motion)) + 0.5 * mass * speed**2
     work = np.einsum("svi,i,v->s", motion.positions[1:] - motion.positions[0], motion.gravity, motion.mass)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -20,6 +20,15 @@ class MovingObstacle:
     mesh: SurfaceMesh
     """At the motion's identity [m]."""
     motion: Motion
+    start: float = 0.0
+    """Before it, the motion stands as at this time [s]."""
+    end: float = float("inf")
+    """After it, the motion stands as at this time [s]."""
+
+    def at(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points [T, P, 3] [m] at times [T] [s]."""
+        linear, translation = self.motion.at(np.clip(times, self.start, self.end))
+        return np.asarray(np.einsum("tij,oj->toi", linear, self.mesh.nodes) + translation[:, None])
 
 
 @dataclass(frozen=True)
@@ -28,7 +37,7 @@ class Scenery:
 
     fixed: NDArray[np.float64]
     """[O, 3] [m]; of the moving ones, before their motion."""
-    moving: tuple[tuple[slice, Motion], ...] = field(default=())
+    moving: tuple[tuple[slice, MovingObstacle], ...] = ()
 
     @staticmethod
     def build(static: Sequence[SurfaceMesh], moving: Sequence[MovingObstacle]) -> Scenery:
@@ -37,13 +46,12 @@ class Scenery:
         slices = [slice(int(a), int(b)) for a, b in pairwise(ends)]
         return Scenery(
             np.concatenate([*parts, np.zeros((0, 3))]),
-            tuple((place, obstacle.motion) for place, obstacle in zip(slices, moving, strict=True)),
+            tuple(zip(slices, moving, strict=True)),
         )
 
     def at(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """[T, O, 3] at times [T] [s]."""
         points = np.broadcast_to(self.fixed, (len(times), *self.fixed.shape)).copy()
-        for place, motion in self.moving:
-            linear, translation = motion.at(times)
-            points[:, place] = np.einsum("tij,oj->toi", linear, self.fixed[place]) + translation[:, None]
+        for place, obstacle in self.moving:
+            points[:, place] = obstacle.at(times)
         return points

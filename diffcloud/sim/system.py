@@ -40,7 +40,7 @@ class System:
 
     @property
     def obstacles(self) -> tuple[SurfaceMesh, ...]:
-        """Meshes to draw: static, moving, and rigid bodies."""
+        """Meshes: static, moving (before their motion), and rigid bodies (at the start)."""
         around = self.setup.surrounding
         return (*around.obstacles, *(moving.mesh for moving in around.moving), *(body.mesh for body in around.bodies))
 

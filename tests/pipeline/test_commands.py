@@ -17,10 +17,11 @@ import yaml
 
 from diffcloud.fit import Objective
 from diffcloud.io.episodes import Episode, read_episode, write_episode
-from diffcloud.io.obj import read_cloth
+from diffcloud.io.obj import read_cloth, read_surface
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
 from tests.pipeline.invoke import DIFFCLOUD, ROOT, Invoked, invoke
+from tests.scene.files import MESHES, over_moving_box, write_file, write_files
 
 SMALL = {
     "base": "lift",
@@ -279,6 +280,29 @@ def test_rollouts_carry_the_bodies_to_draw(work):
         assert vest["nodes"].shape == (2, 80, 3)
         assert vest["obstacle_faces"].max() == len(vest["obstacle_nodes"]) - 1
         assert lift["obstacle_nodes"].shape == (0, 3)  # the table is not drawn
+        assert lift["moving_nodes"].shape == (2, 0, 3)
+
+
+def test_rollouts_of_scene_files_carry_what_moves(work):
+    data = over_moving_box()
+    data["obstacles"].append({"mesh": "meshes/ball.obj", "transform": {"translate": [0, 0, 0.08]}})
+    data |= {"frame_steps": 2, "gravity": [0, 0, -1]}
+    path = write_file(write_files(work), data)
+    exports = ("--obj", "obj", "--ply", "ply")
+    run("rollout", "--scene", path, "--frames", 3, "--set", "body_mass=2", "--out", "r.npz", *exports, cwd=work)
+    box, ball = len(MESHES["box"].nodes), len(MESHES["ball"].nodes)
+    with np.load(work / "r.npz") as data:
+        assert data["moving_nodes"].shape == (4, box + ball, 3)
+        assert data["moving_faces"].max() == box + ball - 1
+        rise, fall = np.split(data["moving_nodes"][-1] - data["moving_nodes"][0], [box])
+        last, faces = data["moving_nodes"][-1], data["moving_faces"]
+    assert (rise[:, 2] > 1e-5).all()
+    assert (fall[:, 2] < -1e-5).all()
+    written = read_surface(work / "obj" / "003_moving.obj")
+    np.testing.assert_array_equal(written.nodes, last)
+    np.testing.assert_array_equal(written.faces, faces)
+    names = [f"{frame:03d}{what}.ply" for frame in range(4) for what in ("", "_moving")]
+    assert sorted(file.name for file in (work / "ply").iterdir()) == names
 
 
 def test_synthetic_episodes_are_the_same_bytes_for_the_same_seed(work):

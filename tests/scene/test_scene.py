@@ -142,7 +142,7 @@ def test_a_written_scene_loads_to_the_same_system(folder, tmp_path, source):
         ({"disable": []}, "remeshing is not supported"),
         ({"disable": ["remeshing", "physics"]}, "'physics' is not supported"),
         ({"disable": ["remeshing", "everything"]}, "disable.1"),
-        ({"obstacles": [{"mesh": "meshes/plane.obj"}]}, r"obstacles.0.movable: rigid bodies"),
+        ({"obstacles": [{"mesh": "meshes/plane.obj"}]}, r"obstacles.0 is movable .*must be closed.*set its `movable` to 0"),
         ({"handles": [{"nodes": [9]}]}, r"node 9 does not exist, the cloth has nodes 0\.\.8"),
         ({"handles": [{"nodes": [0], "motion": 4}]}, "handles.0.motion: 4, but the scene has 1"),
         ({"handles": [{"nodes": [0], "type": "glue"}]}, "handles.0.type"),

@@ -97,6 +97,24 @@ def test_a_quick_handle_explains_a_quick_cloth():
     assert implausible(replace(made, places=made.positions[:, :1]), nothing_stored) is None
 
 
+def test_the_last_digits_of_a_cloth_at_rest_are_no_motion():
+    """Without weight and handles nothing else explains them."""
+    noise = np.random.default_rng(0).choice([-1, 0, 1], STEPS + 1) * 2.0**-54
+    still = motion(along(noise), **free(gravity=np.zeros(3)))
+    assert implausible(still, nothing_stored) is None
+    step, _ = implausible(motion(along(1e6 * noise), **free(gravity=np.zeros(3))), nothing_stored)
+    assert step <= 5
+
+
+def test_a_cloth_may_bounce_off_an_obstacle_at_twice_its_speed():
+    """Not at four times its speed, nor off nothing."""
+    obstacle = along(0.1 * T)[:, None]
+    quiet = free(gravity=np.zeros(3))
+    assert implausible(motion(along(0.2 * T), others=obstacle, **quiet), nothing_stored) is None
+    assert implausible(motion(along(0.4 * T), others=obstacle, **quiet), nothing_stored) is not None
+    assert implausible(motion(along(0.2 * T), **quiet), nothing_stored) is not None
+
+
 def test_an_explosion_inside_the_bounds_is_a_named_error():
     """Drag that is taken from before the step, as ARCSim does, throws light cloth back harder than it came."""
     scenario = load_scenario("vest_hang")

@@ -66,12 +66,14 @@ class Bodies:
             import trimesh  # slow to import, and most scenes have no bodies
 
             solid = trimesh.Trimesh(body.mesh.nodes, body.mesh.faces, process=False)
-            if not solid.is_watertight or solid.volume <= 0:
+            with np.errstate(divide="ignore", invalid="ignore"):  # trimesh divides by the volume, which may be zero
+                volume = float(solid.volume)
+            if not solid.is_watertight or volume <= 0:
                 raise SceneError(
                     f"Rigid body {number}: its mesh must be closed with faces turned outwards (watertight: "
-                    f"{solid.is_watertight}, volume {solid.volume:.3g} m³); close the holes or flip the faces."
+                    f"{solid.is_watertight}, volume {volume:.3g} m³); close the holes or flip the faces."
                 )
-            mass = body.density * solid.volume if body.mass is None else body.mass
+            mass = body.density * volume if body.mass is None else body.mass
             if not mass > 0:
                 raise SceneError(
                     f"Rigid body {number}: mass and density must be positive, got {body.mass} and {body.density}."
@@ -79,7 +81,7 @@ class Bodies:
             points.append(body.mesh.nodes - solid.center_mass)
             index.append(np.full(len(body.mesh.nodes), float(number)))
             masses.append(mass)
-            gyrations.append(solid.moment_inertia / solid.volume)
+            gyrations.append(solid.moment_inertia / volume)
             starts.append(np.concatenate([solid.center_mass, np.eye(3).ravel(), body.velocity, body.angular_velocity]))
         count = len(bodies)
         return Bodies(
@@ -89,6 +91,11 @@ class Bodies:
             gyration=np.array(gyrations, dtype=np.float64).reshape(count, 3, 3),
             start=np.array(starts, dtype=np.float64).reshape(count, 18),
         )
+
+    def placed(self, centre: NDArray[np.float64], orientation: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[..., P, 3] the points in the world, of centres [..., B, 3] and orientations [..., B, 3, 3]."""
+        turned = np.einsum("...pij,pj->...pi", orientation[..., self.body, :, :], self.points)
+        return np.asarray(centre[..., self.body, :] + turned)
 
     def __len__(self) -> int:
         return len(self.mass)
