@@ -32,7 +32,7 @@ from pipeline.bench import (
     contact_rows,
     run_benchmarks,
 )
-from pipeline.config import FitConfig
+from pipeline.config import SMOOTHING
 from pipeline.console import errors, output, progress_bar, warn, writes
 from pipeline.scenario_options import choose_scenario
 
@@ -92,7 +92,6 @@ class _Fit:
 
 def _real_fits(release: Path, starts: int) -> str:
     fits: list[_Fit] = []
-    smoothing = FitConfig().smoothing
     episodes = [item for item in release_episodes(release) if item[0] in ("release_lift", "release_fold")]
     with progress_bar("real fits", len(episodes)) as update:
         for index, (name, label, episode) in enumerate(episodes):
@@ -100,7 +99,7 @@ def _real_fits(release: Path, starts: int) -> str:
             scenario = choose_scenario(name, _scene(release, name))
             objective = Objective(scenario, [episode])
             space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
-            settings = AdamSettings(learning_rate=scenario.learning_rate, smoothing=smoothing)
+            settings = AdamSettings(learning_rate=scenario.learning_rate, smoothing=SMOOTHING)
             single = fit_adam(objective, space, settings)
             many = fit_adam(objective, space, replace(settings, starts=starts))
             published = episode.meta["predictions"]
@@ -150,7 +149,7 @@ def _fit_report(fits: list[_Fit], starts: int) -> str:
         "",
         "One-sided Chamfer loss in squared release units, 3,500 points, paper's frames and settings (50 Adam iterations, "
         "learning rate 0.2, bounds [0.1, 10], start at the middle). The first start averages its gradient over eight "
-        f"perturbed copies (`--smoothing {FitConfig().smoothing}`, the default). The last columns are the losses of the "
+        f"perturbed copies (`--smoothing {SMOOTHING}`, its default). The last columns are the losses of the "
         "published predictions, clipped to the bounds, under the same simulator, metric and points.",
         "",
         *markdown_table(head, rows),

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Annotated, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
-from diffcloud.fit import AdamSettings
+from diffcloud.fit import AdamSettings, GaussNewtonSettings
 from diffcloud.io.raw_episodes import ScenePlacement
 from diffcloud.regressors.settings import Loss, Profile, Target
 from diffcloud.scene.scenarios import Scenario
@@ -132,11 +132,16 @@ class SimulateConfig(Section):
     """Those that the pipeline makes sets of."""
     parameters: Annotated[list[str], Field(min_length=1)] = ["stretch", "mass"]
     draws: Literal["uniform", "sobol", "logarithmic", "modes"] = "uniform"
-    """Over the bounds: `uniform`, `sobol`, or `logarithmic` (uniform in the logarithms where the lower bound is positive);
-    or `modes`: the published code's mixture of soft, medium and stiff cloths."""
+    """Over the bounds: `uniform`, `sobol`, or `logarithmic` (uniform in the logarithms where the lower bound is
+    positive); or `modes`: the published code's mixture of soft, medium and stiff cloths."""
     train: Annotated[int, Field(ge=0)] = 1500
     test: Annotated[int, Field(ge=0)] = 375
     seed: Annotated[int, Field(ge=0)] = 0
+
+
+SMOOTHING = 0.5
+"""Default of adam's."""
+_OF_ADAM = ("learning_rate", "patience", "smoothing", "resample")
 
 
 class FitConfig(Section):
@@ -145,46 +150,60 @@ class FitConfig(Section):
     parameters: Annotated[list[str], Field(min_length=1)] = ["stretch", "mass"]
     bounds: dict[str, Bounds] = {}
     fixed: dict[str, float] = {}
-    optimizer: Literal["adam"] = "adam"
-    iterations: Count = 50
+    solver: Literal["gauss_newton", "adam"] = "gauss_newton"
+    """`adam` is the paper's."""
+    iterations: Count | None = None
+    """Steps at most; by default 20 of gauss_newton, 50 of adam."""
+    starts: Count | None = None
+    """Descents from as many places; by default 3 of gauss_newton, 1 of adam."""
+    screen: Annotated[int, Field(ge=0)] | None = None
+    """Candidates simulated once to choose the starts from; by default 24 of gauss_newton, none of adam, whose further
+    starts are then spread over the box."""
     learning_rate: Positive | None = None
-    """The scenario's own if not given."""
-    starts: Count = 1
-    screen: Annotated[int, Field(ge=0)] = 0
-    """Candidates simulated once to choose the starts after the first from; 0: these are spread over the box."""
-    patience: Annotated[int, Field(ge=0)] = 10
-    """Iterations without a lower loss after which a further start goes on beside the best place of all; 0: never."""
-    smoothing: NonNegative = 0.5
-    """Standard deviation, on the sigmoid's axis, of the first start's perturbed copies, whose gradients are averaged; 0:
-    the plain gradient, as the paper has it."""
+    """Of adam; the scenario's own if not given."""
+    patience: Annotated[int, Field(ge=0)] | None = None
+    """Of adam: iterations without a lower loss after which a further start goes on beside the best place of all; 0:
+    never; by default 10."""
+    smoothing: NonNegative | None = None
+    """Of adam: standard deviation, on the sigmoid's axis, of the first start's perturbed copies, whose gradients are
+    averaged; 0: the plain gradient, as the paper has it; by default 0.5."""
+    resample: bool | None = None
+    """Of adam: new points in each iteration; by default the same ones."""
     threshold: NonNegative | None = None
     points: Count | None = None
     frames: list[int] | None = None
     seed: int = 0
-    resample: bool = False
     offset: bool = False
     joint: bool = False
     workers: Count = 1
     """Processes, one fit each; they change nothing but the time."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _is_of_now(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "optimizer" in data:
+            raise ValueError("optimizer: now `solver`, gauss_newton or adam")
+        return data
+
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         for name, pair in self.bounds.items():
             _check_bounds(f"bounds.{name}", pair)
+        others = [name for name in _OF_ADAM if getattr(self, name) is not None]
+        if self.solver != "adam" and others:
+            raise ValueError(f"{', '.join(others)}: of solver adam; leave out, or choose that solver")
         return self
 
-    def adam(self, scenario: Scenario) -> AdamSettings:
-        """With what the scenario says where nothing is given."""
+    def solver_settings(self, scenario: Scenario) -> AdamSettings | GaussNewtonSettings:
+        """Of the solver, with what the scenario says where nothing is given."""
+        shared = {"iterations": self.iterations, "starts": self.starts, "screen": self.screen}
+        given: dict[str, Any] = {name: value for name, value in shared.items() if value is not None}
+        given |= {"seed": self.seed, "threshold": scenario.threshold if self.threshold is None else self.threshold}
+        if self.solver == "gauss_newton":
+            return GaussNewtonSettings(**given)
+        own = {name: value for name in _OF_ADAM if (value := getattr(self, name)) is not None}
         return AdamSettings(
-            learning_rate=self.learning_rate or scenario.learning_rate,
-            iterations=self.iterations,
-            threshold=scenario.threshold if self.threshold is None else self.threshold,
-            starts=self.starts,
-            screen=self.screen,
-            patience=self.patience,
-            seed=self.seed,
-            resample=self.resample,
-            smoothing=self.smoothing,
+            **{"learning_rate": scenario.learning_rate, "patience": 10, "smoothing": SMOOTHING} | own | given
         )
 
 

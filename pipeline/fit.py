@@ -13,8 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from diffcloud.errors import ConfigError, DiffCloudError
-from diffcloud.fit import FitSpace, Objective, fit_adam, read_fit, write_fit
-from diffcloud.fit.optimise import Progress
+from diffcloud.fit import FitSpace, Objective, Progress, read_fit, solve, write_fit
 from diffcloud.fit.result import describe_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.fingerprints import fingerprint
@@ -49,13 +48,19 @@ def fit(
     parameters: Annotated[str | None, typer.Option(help="Comma-separated, e.g. stretch,mass,bending.")] = None,
     fix: Annotated[list[str] | None, typer.Option(help="PARAMETER=VALUE that is known, e.g. mass=1.2.")] = None,
     bound: Annotated[list[str] | None, typer.Option(help="PARAMETER=LOW:HIGH, repeatable.")] = None,
-    optimizer: Annotated[str | None, typer.Option(help="adam")] = None,
-    iterations: Annotated[int | None, typer.Option(help="Updates at most.")] = None,
-    learning_rate: Annotated[float | None, typer.Option(help="Default: the scenario's.")] = None,
-    starts: Annotated[int | None, typer.Option(help="Starts fitted together; the first is --init.")] = None,
-    screen: Annotated[int | None, typer.Option(help="Simulate this many candidates and start from the best.")] = None,
+    solver: Annotated[str | None, typer.Option(help="gauss_newton (default), or adam, the paper's.")] = None,
+    iterations: Annotated[int | None, typer.Option(help="Steps at most. Default: 20 of gauss_newton, 50 of adam.")] = None,
+    starts: Annotated[
+        int | None, typer.Option(help="Descents from as many places. Default: 3 of gauss_newton, 1 of adam.")
+    ] = None,
+    screen: Annotated[
+        int | None,
+        typer.Option(help="Simulate this many candidates and start from the best. Default: 24 of gauss_newton."),
+    ] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="Of adam. Default: the scenario's.")] = None,
     patience: Annotated[
-        int | None, typer.Option(help="Move a further start beside the best after so many iterations in vain; 0: never.")
+        int | None,
+        typer.Option(help="Of adam: move a further start beside the best after so many iterations in vain; 0: never."),
     ] = None,
     init: Annotated[
         str,
@@ -63,12 +68,14 @@ def fit(
             help="First start: middle, PARAMETER=VALUE,..., or a regressor's prediction: mlp, ... or its checkpoint."
         ),
     ] = "middle",
-    smoothing: Annotated[float | None, typer.Option(help="Perturbation whose gradients are averaged; 0: none.")] = None,
+    smoothing: Annotated[
+        float | None, typer.Option(help="Of adam: perturbation whose gradients are averaged; 0: none.")
+    ] = None,
     threshold: Annotated[float | None, typer.Option(help="Stop below this loss; default: the scenario's.")] = None,
     points: Annotated[int | None, typer.Option(help="Sampled per frame.")] = None,
     frame: Annotated[list[int] | None, typer.Option(help="Loss frame, repeatable; default: the scenario's.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of all random numbers.")] = None,
-    resample: Annotated[bool | None, typer.Option(help="New points in each iteration.")] = None,
+    resample: Annotated[bool | None, typer.Option(help="Of adam: new points in each iteration.")] = None,
     offset: Annotated[bool | None, typer.Option(help="Fit a rigid offset of the target along.")] = None,
     joint: Annotated[bool | None, typer.Option("--joint", help="One parameter set for all episodes.")] = None,
     workers: Annotated[int | None, typer.Option(help="Fits at once, each in a process with one thread.")] = None,
@@ -83,7 +90,7 @@ def fit(
         parameters=None if parameters is None else [name.strip() for name in parameters.split(",")],
         fixed=assignments(fix, "--fix") or None,
         bounds=_bounds(bound) or None,
-        optimizer=optimizer,
+        solver=solver,
         iterations=iterations,
         learning_rate=learning_rate,
         starts=starts,
@@ -256,11 +263,11 @@ class FitJob:
             check_interrupt()
             values = "  ".join(f"{key} {value:.3g}" for key, value in progress.values.items())
             done = progress.iteration / max(settings.iterations, 1)
-            tell(done, f"{progress.iteration}/{settings.iterations}  best {progress.best:.3e}  {values}")
+            tell(done, f"{progress.iteration} of at most {settings.iterations}  best {progress.best:.3e}  {values}")
 
         objective, space = self.objective(), self.space
-        settings = replace(self.settings.adam(self.scenario), init=self.init)
-        outcome = fit_adam(objective, space, settings, progress=show_progress)
+        settings = replace(self.settings.solver_settings(self.scenario), init=self.init)
+        outcome = solve(objective, space, settings, progress=show_progress)
         result = describe_fit(objective, space, settings, outcome, episodes=list(self.episodes))
         result.summary["fingerprint"] = self._fingerprint
         write_fit(self.folder, self.name, result)

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
-import torch
 import typer
 
 from diffcloud.errors import ConfigError
-from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
+from diffcloud.fit import FitSpace, Objective, solve
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import folders_in, write_text
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
@@ -23,7 +21,6 @@ from pipeline.config import FitConfig, load_config
 from pipeline.console import JsonFlag, ParamsFile, finish, output, progress_bar, writes
 from pipeline.scenario_options import choose_scenario
 
-_RATIOS = np.geomspace(0.15, 6.5, 9)
 """Of stretch to mass: a fit starts from the best of them."""
 
 
@@ -88,18 +85,7 @@ def _ratio(scenario: Scenario, episode: Episode, mass: float, config: FitConfig)
     """Fitted stretch over the weighed mass. With both free, bending and air hardly tell them apart (docs/concepts.md)."""
     objective = Objective(scenario, [episode], points=config.points, seed=config.seed)
     space = FitSpace.build(["stretch"], bounds={**scenario.bounds, **config.bounds}, fixed={"mass": mass})
-    low, high = space.variables[0].low, space.variables[0].high
-    tried = np.clip(_RATIOS * mass, 1.05 * low, 0.95 * high)  # a bound itself is infinitely far away for a fit
-    with torch.no_grad():
-        losses = objective({"stretch": torch.as_tensor(tried), "mass": torch.full((len(tried),), mass).double()})
-    settings = AdamSettings(
-        learning_rate=config.learning_rate or scenario.learning_rate,
-        iterations=config.iterations,
-        smoothing=config.smoothing,
-        seed=config.seed,
-        init={"stretch": float(tried[int(losses.argmin())])},
-    )
-    return fit_adam(objective, space, settings).values["stretch"] / mass
+    return solve(objective, space, config.solver_settings(scenario)).values["stretch"] / mass
 
 
 def _of_first_camera(episode: Episode) -> Episode:
@@ -139,8 +125,8 @@ def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: l
             "",
             "## Fits",
             "",
-            "Stretch-to-mass ratio of a cloth that has been weighed (mass fixed at its truth): the best of "
-            f"{len(_RATIOS)} ratios, then {config.iterations} Adam iterations over the stretching stiffness from there. "
+            "Stretch-to-mass ratio of a cloth that has been weighed (mass fixed at its truth), fitted by "
+            f"{config.solver}. "
             "The noise-free cloud is what both cameras see of the cloth, without noise, holes or masks; the gripper is "
             "then where it truly was.",
             "",

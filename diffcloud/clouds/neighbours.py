@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from diffcloud.clouds.tree import Tree
 
 
+_NEIGHBOURS = 12
+"""Whose plane gives a point's normal."""
+
+
 class NeighbourIndex:
     """A target cloud that answers nearest-neighbour queries. Its search tree is built once, on first use."""
 
@@ -32,6 +36,30 @@ class NeighbourIndex:
         if not bool(torch.isfinite(points).all()):
             raise EpisodeError("A target cloud holds NaN or infinite points; filter them before the loss.")
         self.points = points
+
+    @property
+    def normals(self) -> Tensor:
+        """[P, 3] unit normals of the surface that the points were taken from, by the plane through each one's neighbours;
+        their signs mean nothing. Of fewer than three points: zero."""
+        return self._surface[0]
+
+    @property
+    def spacing(self) -> float:
+        """Median distance between neighbours [m]."""
+        return self._surface[1]
+
+    @cached_property
+    def _surface(self) -> tuple[Tensor, float]:
+        from scipy.spatial import cKDTree  # slow to import, and only second derivatives need it
+
+        points = _as_array(self.points)
+        count = min(_NEIGHBOURS + 1, len(points))
+        if count < 3:
+            return torch.zeros_like(self.points), 0.0
+        distance, index = cKDTree(points).query(points, k=count)
+        around = points[index] - points[index].mean(axis=1, keepdims=True)
+        _, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", around, around))
+        return torch.from_numpy(axes[:, :, 0].copy()).to(self.points), float(np.median(distance[:, 1]))
 
     @cached_property
     def _tree(self) -> Tree:

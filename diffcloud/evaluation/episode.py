@@ -136,9 +136,10 @@ def compare_episode(
 
 
 def _run(rival: Rival, objective: Objective, space: FitSpace, summary: Mapping[str, Any], seed: int) -> Estimate | Gap:
-    """One rival with the budget of a single-start fit; a gap if its simulations fail."""
+    """One rival with the budget of the fit, or of one start of Adam; a gap if its simulations fail."""
     fit = summary["settings"]
-    simulations, threshold = int(fit["iterations"]) + 1, float(fit["threshold"])
+    by_adam = summary["solver"] == "adam"
+    simulations, threshold = int(fit["iterations"]) + 1 if by_adam else int(summary["evaluations"]), float(fit["threshold"])
     objective.reseed(int(fit["seed"]))
     try:
         if rival == "middle":
@@ -151,11 +152,11 @@ def _run(rival: Rival, objective: Objective, space: FitSpace, summary: Mapping[s
         if known is not None:
             return known
         adam = AdamSettings(
-            learning_rate=float(fit["learning_rate"]),
-            iterations=int(fit["iterations"]),
+            learning_rate=float(fit["learning_rate"] if by_adam else objective.scenario.learning_rate),
+            iterations=simulations - 1,
             threshold=threshold,
             seed=int(fit["seed"]),
-            resample=bool(fit["resample"]),
+            resample=bool(fit.get("resample", False)),
         )
         return methods.single_start(objective, space, adam)
     except DiffCloudError as error:

@@ -1,8 +1,8 @@
 """Methods that name the parameters of an episode, on equal terms.
 
 Each gives one parameter set: a gradient fit, a network's prediction, or a rival without gradients or learning. Rivals that
-search see the objective that the fit sees (frames, points, common random numbers, bounds), may simulate as often as a fit
-from one start, and stop below the same threshold.
+search see the objective that the fit sees (frames, points, common random numbers, bounds), may simulate as often as the fit
+(as one start of it, where that was Adam's), and stop below the same threshold.
 """
 
 from __future__ import annotations
@@ -103,8 +103,10 @@ def first_start(summary: Mapping[str, Any], space: FitSpace) -> Estimate | None:
     """What the paper's setting gives, if it is a part of the fit: its first start, from the middle with plain gradients.
 
     Starts do not touch one another, so it need not be run again. Its own wall time is not known then. None if the fit was
-    smoothed, began elsewhere, was stopped by another start, or changed its points.
+    smoothed, began elsewhere, was stopped by another start, or changed its points, or if another solver made it.
     """
+    if summary["solver"] != "adam":
+        return None
     settings, history = summary["settings"], summary["history"]
     losses = [row[0] for row in history["loss"]]
     begin = dict(zip(history["names"], history["values"][0][0], strict=True))

@@ -63,7 +63,7 @@ class Objective:
         self.reseed(seed)
         self._targets = [self._target(episode) for episode in episodes]
         last = max(float(target.times.max()) for target in self._targets)
-        self._steps = min(int(np.ceil(last / self.system.time_step - 1e-6)), scenario.steps)
+        self.loss_steps = min(int(np.ceil(last / self.system.time_step - 1e-6)), scenario.steps)
 
     @property
     def episode_count(self) -> int:
@@ -103,6 +103,15 @@ class Objective:
             losses.append(torch.stack(terms).mean(0))
         return torch.cat(losses)
 
+    @property
+    def residual_count(self) -> int:
+        """M points of all episodes and loss frames."""
+        return self.episode_count * len(self.frames) * self.point_count
+
+    def simulate_to_loss(self, parameters: Mapping[str, Tensor], *, episode: int = 0) -> Rollout:
+        """The rollout up to the last loss frame."""
+        return self.simulate(parameters, episode=episode, steps=self.loss_steps)
+
     def simulate(self, parameters: Mapping[str, Tensor], *, episode: int = 0, steps: int | None = None) -> Rollout:
         """The rollout of parameter sets with an episode's gripper track, by default over the whole scenario."""
         steps = self.scenario.steps if steps is None else steps
@@ -117,9 +126,21 @@ class Objective:
         Args:
             offset: name -> [B] rigid offset of the target, by which the points are displaced.
         """
-        target = self._targets[episode]
-        points = self.sampler.sample(run.at(target.times))
-        return _displaced(points, target.centre, offset) if offset else points
+        return self.points_of(run.at(self.times(episode)), offset, episode=episode)
+
+    def points_of(self, positions: Tensor, offset: Mapping[str, Tensor] | None = None, *, episode: int = 0) -> Tensor:
+        """The same of node positions [B, L, V, 3]."""
+        points = self.sampler.sample(positions)
+        return _displaced(points, self._targets[episode].centre, offset) if offset else points
+
+    def times(self, episode: int) -> Tensor:
+        """[L] of the loss frames [s]."""
+        return self._targets[episode].times
+
+    def track(self, episode: int) -> Tensor | None:
+        """[1, S, G, 3] displacement of the grippers up to the last loss frame [m]; None: the scene's own motion."""
+        track = self._targets[episode].track
+        return None if track is None else track[:, : self.loss_steps]
 
     def clouds(self, *, episode: int = 0) -> tuple[NeighbourIndex, ...]:
         """The recorded clouds of the L loss frames."""
@@ -132,7 +153,7 @@ class Objective:
         return torch.stack([one_sided_chamfer(points[:, index], cloud) for index, cloud in enumerate(clouds)], dim=-1)
 
     def _loss(self, episode: int, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor]) -> Tensor:
-        run = self.simulate(parameters, episode=episode, steps=self._steps)
+        run = self.simulate_to_loss(parameters, episode=episode)
         return self.frame_losses(run, offset, episode=episode).mean(-1)
 
     def _target(self, episode: Episode) -> _Target:

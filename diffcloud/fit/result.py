@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 import diffcloud
 from diffcloud.errors import ConfigError
 from diffcloud.fit.objective import Objective
-from diffcloud.fit.optimise import AdamSettings, FitOutcome
 from diffcloud.fit.parameters import NUISANCE, FitSpace
+from diffcloud.fit.solvers import FitOutcome, GaussNewtonSettings, Settings
 from diffcloud.io.files import read_json, together, write_json, write_npz
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS
 
-_SCHEMA = 1
+_SCHEMA = 2
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def physical_values(scenario: Scenario, values: Mapping[str, float]) -> dict[str
 def describe_fit(
     objective: Objective,
     space: FitSpace,
-    settings: AdamSettings,
+    settings: Settings,
     outcome: FitOutcome,
     *,
     episodes: list[str],
@@ -114,7 +114,7 @@ def describe_fit(
         "schema": _SCHEMA,
         "scenario": scenario.name,
         "episodes": episodes,
-        "optimizer": "adam",
+        "solver": "gauss_newton" if isinstance(settings, GaussNewtonSettings) else "adam",
         "loss": outcome.loss,
         "loss_start": outcome.loss_start,
         "loss_resampled": float(np.mean(resampled)),
@@ -129,14 +129,7 @@ def describe_fit(
         "start": start_values,
         "best_start": outcome.best_start,
         "settings": {
-            "learning_rate": settings.learning_rate,
-            "iterations": settings.iterations,
-            "threshold": settings.threshold,
-            "starts": settings.starts,
-            "seed": settings.seed,
-            "resample": settings.resample,
-            "smoothing": settings.smoothing,
-            "copies": settings.copies if settings.smoothing else 0,
+            **{name: value for name, value in asdict(settings).items() if name != "init"},
             "points": objective.point_count,
             "frames": list(objective.frames),
         },
@@ -180,11 +173,15 @@ def read_fit(path: Path) -> dict[str, Any]:
     """The JSON summary of a fit.
 
     Raises:
-        ConfigError: missing, damaged, or not a fit.
+        ConfigError: missing, damaged, not a fit, or one of another version.
     """
     summary = read_json(path, error=ConfigError)
     if not isinstance(summary, dict) or "parameters" not in summary or "loss" not in summary:
         raise ConfigError(f"{path} is not a fit written by `diffcloud fit`: it lacks `parameters` or `loss`.")
+    if summary.get("schema") != _SCHEMA:
+        raise ConfigError(
+            f"{path} was written by another version (schema {summary.get('schema')}, read here: {_SCHEMA}); fit again."
+        )
     return summary
 
 

@@ -12,7 +12,7 @@ from diffcloud.io.imports import release_episodes
 from diffcloud.scene import load_scenario
 from diffcloud.sim import Properties, rollout, rollout_tangents
 from pipeline.acceptance import SCENES, _simulated_clouds
-from pipeline.config import FitConfig
+from pipeline.config import SMOOTHING
 
 # positions of the reference simulator (float32 prints) at given steps: scenario, (stretch, mass), step, node, position
 REFERENCE = [
@@ -136,9 +136,7 @@ def test_a_single_start_fit_beats_every_published_prediction(release, kind):
     label, episode = next((n, e) for s, n, e in release_episodes(release) if s == name)
     objective = Objective(scenario, [episode])
     space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
-    outcome = fit_adam(
-        objective, space, AdamSettings(learning_rate=scenario.learning_rate, smoothing=FitConfig().smoothing)
-    )
+    outcome = fit_adam(objective, space, AdamSettings(learning_rate=scenario.learning_rate, smoothing=SMOOTHING))
     pairs = episode.meta["predictions"].values()
     values = {key: torch.tensor([np.clip(pair[key], 0.1, 10) for pair in pairs]) for key in space.names}
     with torch.no_grad():
@@ -162,7 +160,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
     profile = yaml.safe_load(
         (Path(__file__).parents[2] / "pipeline" / "profiles" / "release.yaml").read_text(encoding="utf-8")
     )
-    profile["fit"] |= {"iterations": 2, "starts": 2, "smoothing": 0}
+    profile["fit"] |= {"iterations": 2, "starts": 2, "smoothing": 0.0}
     profile["evaluate"] |= {"draws": 2, "landscapes": [], "workers": 1}
     Path("quick.yaml").write_text(yaml.safe_dump(profile))
     command = ("evaluate", "release", release, "--params", "quick.yaml", "--only", "*/fold_tan*", "--markdown", "c.md")

@@ -32,7 +32,12 @@ def summary_of(outcome):
     history = outcome.history
     told = {"names": list(history.names), "loss": [row.tolist() for row in history.losses]}
     told["values"] = [row.tolist() for row in history.values]
-    return {"settings": {"smoothing": 0.0, "resample": False}, "stop_reason": outcome.stop_reason, "history": told}
+    return {
+        "solver": "adam",
+        "settings": {"smoothing": 0.0, "resample": False},
+        "stop_reason": outcome.stop_reason,
+        "history": told,
+    }
 
 
 SEARCHES = [random_search, cma_es]
@@ -85,6 +90,7 @@ def test_one_start_is_the_first_of_many():
     found = first_start(summary, SPACE)
     assert found.values == pytest.approx(alone.values, rel=1e-12)
     assert found.simulations == 13
+    assert first_start({**summary, "solver": "gauss_newton"}, SPACE) is None
     for change in ({"smoothing": 0.5}, {"resample": True}):
         assert first_start({**summary, "settings": {**summary["settings"], **change}}, SPACE) is None
     assert first_start({**summary, "stop_reason": "threshold"}, SPACE) is None

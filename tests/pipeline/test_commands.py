@@ -109,7 +109,8 @@ def test_interrupted_fit_leaves_the_best_so_far_and_goes_on(work, monkeypatch):
     evaluated = Objective.__call__
     monkeypatch.setattr(Objective, "__call__", evaluate)
     write_episode(work / "e2.npz", clouds_of(small_lift(), stretch=1.7, mass=1.0))
-    command = ("fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 10, "e1.npz", "e2.npz")
+    adam = ("--solver", "adam", "--iterations", 10)  # as many steps whatever the loss does
+    command = ("fit", "--scenario", "small.yaml", "--out", "fits", *adam, "e1.npz", "e2.npz")
     done = run(*command, cwd=work, code=130)
     assert "best so far" in done.errors
     first, second = (json.loads((work / "fits" / f"{name}.json").read_text()) for name in ("e1", "e2"))
@@ -140,7 +141,8 @@ def test_ctrl_c_stops_fits_in_processes_and_keeps_their_best(work):
     write_episode(work / "easy.npz", clouds_of(small_lift(), stretch=5.05, mass=5.05))  # below the threshold at once
     moved = clouds_of(small_lift(), stretch=1.7, mass=1.0)
     write_episode(work / "e2.npz", replace(moved, points=moved.points + 0.03))  # out of reach
-    command = [*DIFFCLOUD, "fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", "1000000", "--workers", "2"]
+    command = [*DIFFCLOUD, "fit", "--scenario", "small.yaml", "--out", "fits", "--solver", "adam"]
+    command += ["--iterations", "1000000", "--workers", "2"]
     env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
         [*command, "--threshold", "5e-5", "easy.npz", "e2.npz"], cwd=work, env=env, stderr=subprocess.PIPE, text=True
@@ -327,7 +329,9 @@ class TestBadInput:
             ({"fit": {"bounds": {"stretch": [5, 1]}}}, "must be in order (low < high), got [5.0, 1.0]"),
             ({"episodes": {"hidden_range": [3, 1]}}, "hidden_range must be in order"),
             ({"fits": {}}, "fits: unknown or unsupported field"),
-            ({"fit": {"optimizer": "lbfgs"}}, "fit.optimizer"),
+            ({"fit": {"solver": "lbfgs"}}, "fit.solver"),
+            ({"fit": {"optimizer": "adam"}}, "optimizer: now `solver`"),
+            ({"fit": {"smoothing": 0.5}}, "smoothing: of solver adam"),
         ],
     )
     def test_parameter_files(self, work, params, message):

@@ -8,11 +8,13 @@ import shutil
 import subprocess
 from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 import pytest
 import yaml
 
 import pipeline.comparison
+from diffcloud.fit import read_fit
 from diffcloud.io.episodes import write_episode
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
@@ -22,7 +24,7 @@ from tests.pipeline.test_commands import SMALL
 PARAMS = {
     "scenarios": ["small"],
     "train": {"scenarios": ["other"], "models": ["mlp"]},
-    "fit": {"iterations": 3, "starts": 2, "smoothing": 0},
+    "fit": {"iterations": 3, "starts": 2, "screen": 3},
     "evaluate": {"draws": 2, "landscapes": ["*/tan1"], "landscape_size": 3},
     "report": {"overlay_points": 50},
 }
@@ -83,7 +85,9 @@ def test_tables_hold_methods_repeats_and_transfer(work):
     assert set(tables["repeatability"]["parameter"]) == {"stretch", "mass", "ratio"}
     assert len(tables["identifiability"]) == 4
     metrics = json.loads((work / "reports" / "metrics.json").read_text())
-    assert metrics["comparison"]["methods"]["small"]["cma_es"]["simulations"] == 4
+    budgets = [read_fit(path)["evaluations"] for path in (work / "fits" / "small").glob("*.json")]
+    spent = metrics["comparison"]["methods"]["small"]
+    assert spent["diffcloud"]["simulations"] == spent["cma_es"]["simulations"] == np.mean(budgets)
 
 
 def test_finished_episodes_are_kept_until_their_inputs_change(work, monkeypatch):

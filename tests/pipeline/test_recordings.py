@@ -25,7 +25,7 @@ PARAMS = {
     "scenarios": ["small"],
     "episodes": {"per_scenario": 1},
     "preprocess": {"raw": {"flying_m": 0.03}, "outlier_deviations": 5},
-    "fit": {"iterations": 1, "smoothing": 0},
+    "fit": {"iterations": 1, "screen": 3},
     "evaluate": {"draws": 1},
 }
 

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -15,8 +14,8 @@ from diffcloud.errors import DivergedError
 from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
+from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
 
-StopReason = Literal["iterations", "threshold", "interrupted"]
 _NEAREST, _FARTHEST = 0.01, 0.3
 """Of starts that are moved beside the best iterate, as parts of its values."""
 
@@ -55,52 +54,6 @@ class AdamSettings:
     never. A few per cent from a minimum a rough loss can be ten times as high, and steps of one size pass it by. What is
     moved searches at scales from 1 to 30 % of the values, with steps to match. The first start is never moved: it stays
     the paper's descent."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a progress display gets after each iteration."""
-
-    iteration: int
-    loss: float
-    best: float
-    values: Mapping[str, float]
-    """Of the best so far."""
-
-
-@dataclass
-class FitHistory:
-    """What happened; N iterations, B starts, k variables."""
-
-    names: tuple[str, ...]
-    losses: list[Tensor] = field(default_factory=list)
-    """N of [B], unperturbed; infinite for a start that has diverged."""
-    values: list[Tensor] = field(default_factory=list)
-    """N of [B, k]"""
-    gradients: list[Tensor] = field(default_factory=list)
-    """N of [B, k], by the unbounded variables."""
-
-
-@dataclass(frozen=True)
-class FitOutcome:
-    """The best iterate of all starts."""
-
-    values: dict[str, float]
-    loss: float
-    start: dict[str, float]
-    """Initial values of the first start that did not diverge at once."""
-    loss_start: float
-    """Its loss before the first update."""
-    best_start: int
-    iterations: int
-    """Updates done."""
-    evaluations: int
-    """Simulations run, with their gradients."""
-    stop_reason: StopReason
-    seconds: float
-    history: FitHistory
-    failures: tuple[str, ...]
-    """Messages of starts that diverged."""
 
 
 def fit_adam(

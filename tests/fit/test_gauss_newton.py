@@ -1,0 +1,190 @@
+"""The Gauss–Newton solver: its model of the loss against differences, its steps, its ends."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from diffcloud.clouds.neighbours import NeighbourIndex
+from diffcloud.errors import DivergedError
+from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton, residuals
+from diffcloud.fit.residuals import Axis, linearise
+from tests.conftest import small_lift
+from tests.fit.test_fit import GENTLE, clouds_of
+
+TRUTH = {"stretch": 0.6, "mass": 1.7}
+SPACE = FitSpace.build(["stretch", "mass"])
+
+
+def lifted(**changes):
+    """A slow lift by the implicit integrator, and the objective of a dense recording of the truth."""
+    scenario = small_lift(**{**GENTLE, "integrator": "implicit", "points": 500, **changes})
+    return Objective(scenario, [clouds_of(scenario, points=8000, **TRUTH)])
+
+
+def at(objective, space, places):
+    return objective(*space.split(Axis.of(space).values(places)))
+
+
+class TestLinearisation:
+    @pytest.mark.parametrize("offset", [False, True])
+    def test_the_slope_is_that_of_the_loss(self, offset):
+        """Half of the exact gradient, by reverse mode through the simulation."""
+        objective, space = lifted(), FitSpace.build(["stretch", "mass"], offset=offset)
+        values = space.starts(3, seed=1)[0]
+        if offset:
+            values[:, 2:] = torch.tensor([0.004, -0.003, 0.002, 0.03])
+        places = Axis.of(space).places(values).requires_grad_(True)
+        losses = at(objective, space, places)
+        (gradient,) = torch.autograd.grad(losses.sum(), places)
+        found = linearise(objective, space, places.detach())
+        torch.testing.assert_close(found.losses, losses.detach())
+        torch.testing.assert_close(2 * found.slope, gradient, rtol=1e-8, atol=1e-14)
+        assert found.simulations == 3
+
+    def test_the_mean_over_episodes_is_linearised(self):
+        scenario = small_lift(integrator="implicit", points=300)
+        episodes = [clouds_of(scenario, seed=seed, **TRUTH) for seed in (1, 2)]
+        places = Axis.of(SPACE).places(SPACE.starts(2, seed=1)[0])
+        both = linearise(Objective(scenario, episodes), SPACE, places)
+        one, other = (linearise(Objective(scenario, [episode]), SPACE, places) for episode in episodes)
+        for name in ("losses", "slope", "curvature"):
+            torch.testing.assert_close(getattr(both, name), (getattr(one, name) + getattr(other, name)) / 2)
+        assert both.simulations == 4
+
+    def test_differences_agree_with_tangents(self, monkeypatch):
+        """Of the same motion, with a step so short that the differences are as good."""
+        monkeypatch.setattr(residuals, "STEP", 1e-4)
+        objective, found = lifted(), []
+        places = Axis.of(SPACE).places(torch.tensor([[0.9, 1.2], [2.0, 0.5]], dtype=torch.float64))
+        for integrator in ("implicit", "linearised"):  # which of both ways is taken
+            scenario = objective.scenario
+            objective.scenario = replace(scenario, scene=replace(scenario.scene, integrator=integrator))
+            found.append(linearise(objective, SPACE, places))
+        by_tangents, by_differences = found
+        assert [one.simulations for one in found] == [2, 10]
+        torch.testing.assert_close(by_differences.losses, by_tangents.losses)
+        torch.testing.assert_close(by_differences.slope, by_tangents.slope, rtol=1e-3, atol=1e-10)
+        torch.testing.assert_close(by_differences.curvature, by_tangents.curvature, rtol=1e-3, atol=1e-10)
+
+    @pytest.mark.parametrize("integrator", ["implicit", "linearised"])
+    def test_a_bound_has_a_slope_too(self, integrator):
+        """Differences are halved there, and nothing is simulated beyond."""
+        objective = lifted(integrator=integrator)
+        found = linearise(objective, SPACE, Axis.of(SPACE).ends[1][None])
+        assert bool(torch.isfinite(found.slope).all())
+        assert bool((found.slope != 0).all())
+
+    def test_a_place_that_diverges_is_infinite_and_flat(self, monkeypatch):
+        objective = lifted()
+        whole = objective.scenario.properties
+
+        def broken(system, values):
+            found = whole(system, values)
+            bad = values["stretch"] > 5
+            found.node_mass[bad] = float("nan")
+            return found
+
+        monkeypatch.setattr(type(objective.scenario), "properties", lambda self, system, values: broken(system, values))
+        places = Axis.of(SPACE).places(torch.tensor([[1.0, 1.0], [9.0, 1.0]], dtype=torch.float64))
+        found = linearise(objective, SPACE, places)
+        assert found.losses.isfinite().tolist() == [True, False]
+        assert bool((found.slope[1] == 0).all())
+        assert bool((found.slope[0] != 0).all())
+
+
+class TestSurface:
+    def test_normals_of_a_sphere(self, generator):
+        points = torch.randn(3000, 3, generator=generator, dtype=torch.float64)
+        points /= points.norm(dim=-1, keepdim=True)
+        cloud = NeighbourIndex(points)
+        assert float((cloud.normals * points).sum(-1).abs().min()) > 0.98
+        assert cloud.spacing == pytest.approx(0.5 * math.sqrt(4 * math.pi / 3000), rel=0.1)  # of a Poisson process
+
+    @pytest.mark.parametrize("count", [1, 2])
+    def test_too_few_points_have_none(self, count):
+        cloud = NeighbourIndex(torch.rand(count, 3, dtype=torch.float64))
+        assert bool((cloud.normals == 0).all())
+        assert cloud.spacing == 0.0
+
+
+class TestFits:
+    def test_the_truth_is_found_in_few_runs(self):
+        found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=2, screen=15))
+        assert found.stop_reason == "converged"
+        assert found.evaluations <= 60
+        assert found.values["stretch"] / found.values["mass"] == pytest.approx(TRUTH["stretch"] / TRUTH["mass"], rel=0.05)
+        noise = lifted()({name: torch.tensor([value]).double() for name, value in TRUTH.items()})
+        assert found.loss <= 1.02 * float(noise)  # the fit's own points, to which it adapts
+
+    def test_it_does_not_matter_where_it_starts(self):
+        """From one end of the range or the other."""
+        space = FitSpace.build(["stretch"], fixed={"mass": TRUTH["mass"]})
+        ends = [
+            fit_gauss_newton(
+                lifted(), space, GaussNewtonSettings(screen=0, starts=1, iterations=40, init={"stretch": first})
+            ).values["stretch"]
+            for first in (0.1, 10.0)
+        ]
+        np.testing.assert_allclose(ends, TRUTH["stretch"], rtol=0.02)
+
+    def test_a_start_that_is_given_is_followed(self):
+        found = fit_gauss_newton(
+            lifted(), SPACE, GaussNewtonSettings(starts=2, screen=7, init={"stretch": 9.0, "mass": 9.0})
+        )
+        assert found.start == {"stretch": pytest.approx(9.0), "mass": pytest.approx(9.0)}
+
+    def test_bounds_hold_and_the_rest_goes_on(self):
+        space = FitSpace.build(["stretch", "mass"], bounds={"stretch": (1.0, 10.0)})
+        found = fit_gauss_newton(lifted(), space, GaussNewtonSettings(starts=2, screen=7))
+        assert found.values["stretch"] == pytest.approx(1.0)
+        assert found.values["mass"] > TRUTH["mass"]
+        assert found.stop_reason == "converged"
+
+    def test_an_offset_is_found_along(self):
+        scenario = small_lift(**{**GENTLE, "integrator": "implicit", "points": 500})
+        space = FitSpace.build(["stretch"], fixed={"mass": TRUTH["mass"]}, offset=True)
+        episode = clouds_of(scenario, points=8000, shift=(0.006, -0.004, 0.0), **TRUTH)
+        found = fit_gauss_newton(Objective(scenario, [episode]), space, GaussNewtonSettings(starts=1))
+        assert found.values["offset_x"] == pytest.approx(0.006, abs=1.5e-3)
+        assert found.values["offset_y"] == pytest.approx(-0.004, abs=1.5e-3)
+
+    def test_the_same_settings_give_the_same_fit(self):
+        settings = GaussNewtonSettings(starts=2, screen=7, iterations=4)
+        one, other = (fit_gauss_newton(lifted(), SPACE, settings) for _ in range(2))
+        assert one.values == other.values
+        assert one.evaluations == other.evaluations
+
+    @pytest.mark.parametrize(("settings", "reason"), [({"threshold": 1.0}, "threshold"), ({"iterations": 1}, "iterations")])
+    def test_other_ends(self, settings, reason):
+        found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=1, screen=0, **settings))
+        assert found.stop_reason == reason
+        assert found.iterations == len(found.history.losses) - 1 == (0 if reason == "threshold" else 1)
+
+    def test_ctrl_c_keeps_the_best_so_far(self):
+        def interrupt(progress):
+            if progress.iteration == 2:
+                raise KeyboardInterrupt
+
+        found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=2, screen=7), progress=interrupt)
+        assert found.stop_reason == "interrupted"
+        assert found.loss == float(found.history.losses[-1].min())
+
+    def test_losses_never_rise(self):
+        found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=3, screen=7))
+        losses = torch.stack(found.history.losses)
+        assert bool((losses.diff(dim=0) <= 0).all())
+
+    def test_when_all_diverge(self, monkeypatch):
+        objective = lifted()
+
+        def diverges(*_, **__):
+            raise DivergedError(3, list(range(1)), "too soft")
+
+        monkeypatch.setattr("diffcloud.fit.residuals.rollout_tangents", diverges)
+        with pytest.raises(DivergedError, match="starts diverged"):
+            fit_gauss_newton(objective, SPACE, GaussNewtonSettings(screen=0, starts=1))
