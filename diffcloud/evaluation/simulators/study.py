@@ -77,9 +77,8 @@ def known_answers() -> Iterator[Answer]:
                 problem, newton.Settings("semi_implicit", step)
             ),
             "Newton, VBD, 1 ms": lambda problem: newton.simulate(problem, newton.Settings(step=1e-3)),
+            "Newton, VBD, 0.1 ms": lambda problem: newton.simulate(problem, newton.Settings(step=1e-4)),
         }
-        if stiff:
-            runs["Newton, VBD, 0.1 ms"] = lambda problem: newton.simulate(problem, newton.Settings(step=1e-4))
         for name, run in runs.items():
             yield Answer(known.problem.name, name, known.measures(run(known.problem)), known.theory)
 
@@ -94,15 +93,16 @@ def motions() -> Iterator[Pair]:
         rough, other = (mujoco.simulate(problem, mujoco.Settings(step=step)) for step in (mujoco.Settings.step, _FINE))
         yield _pair(problem, "MuJoCo, 0.2 ms", THIS, own, rough)
         yield _pair(problem, "MuJoCo, 0.1 ms", THIS, own, other)
+        yield _pair(problem, "MuJoCo, 0.2 ms", "MuJoCo, 0.1 ms", other, rough)
         block = newton.simulate(problem)
         yield _pair(problem, "Newton, VBD", THIS, own, block)
-        yield _pair(problem, "Newton, VBD", "MuJoCo", other, block)
+        yield _pair(problem, "Newton, VBD", "MuJoCo, 0.1 ms", other, block)
         if not problem.self_contact:
             free = _damped(problem, 0.0)
             own, other = ours.simulate(free), mujoco.simulate(free, mujoco.Settings(step=_FINE))
             plain = newton.simulate(free, newton.EXPLICIT)
             yield _pair(problem, "Newton, explicit, no damping", f"{THIS}, no damping", own, plain)
-            yield _pair(problem, "Newton, explicit, no damping", "MuJoCo, no damping", other, plain)
+            yield _pair(problem, "Newton, explicit, no damping", "MuJoCo, 0.1 ms, no damping", other, plain)
 
 
 def opinions() -> Iterator[Pair]:
@@ -158,6 +158,9 @@ def switches() -> Iterator[Pair]:
     def sheet(**fields: float) -> Callable[[Problem], Problem]:
         return lambda problem: replace(problem, sheet=replace(problem.sheet, **fields))
 
+    def rougher(problem: Problem) -> Track:
+        return ours.simulate(replace(problem, friction=1.03 * problem.friction))
+
     def same(problem: Problem) -> Problem:
         return problem
 
@@ -184,6 +187,8 @@ def switches() -> Iterator[Pair]:
         ("thickness: MuJoCo's contacts five times softer", same, ours.simulate, changed(contact_time=0.01)),
         ("mesh: alternate diagonals", lambda p: lift(alternate_diagonals=True), ours.simulate, with_steps(plain)),
         ("mesh: cells halved in both", lambda p: lift(refinement=2), ours.simulate, with_steps(finest)),
+        ("for scale: 3 % more friction in this simulator alone", same, ours.simulate, rougher),
+        ("for scale: the same with alternate diagonals", lambda p: lift(alternate_diagonals=True), ours.simulate, rougher),
     ]
     for problem in (lift(), swing()):
         for what, change, one, two in rows + (table if problem.table is not None else []):
