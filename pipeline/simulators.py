@@ -90,7 +90,7 @@ def _page(
             "block descent, VBD, and the explicit solver that it can differentiate): equal mesh, node masses, material, "
             "prescribed nodes and friction, no air. `diffcloud simulators` makes this page, here with "
             + ", ".join(f"{name} {version}" for name, version in versions.items())
-            + ". Times are wall time on two cores, without building and compiling.",
+            + ". Times are processor time on two cores, without building and compiling.",
             "",
             *_material(),
             *_known(answers),
@@ -133,7 +133,7 @@ def _material() -> list[str]:
 
 def _known(answers: Sequence[Answer]) -> list[str]:
     rows = [
-        [row.test, row.simulator, name, f"{row.theory[name]:.5f}", f"{value:.5f}", _percent(value / row.theory[name] - 1)]
+        [row.test, row.simulator, name, f"{row.theory[name]:.4g}", f"{value:.4g}", _percent(value / row.theory[name] - 1)]
         for row in answers
         for name, value in row.found.items()
     ]

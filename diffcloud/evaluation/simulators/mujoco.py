@@ -58,14 +58,14 @@ def simulate(problem: Problem, settings: Settings | None = None) -> Track:
     data = mujoco.MjData(model)
     mujoco.mj_setConst(model, data)
     start, wanted = problem.mesh.nodes, problem.held_at(np.arange(total + 1) * step)
-    frames, began = [start], time.perf_counter()
+    frames, began = [start], time.process_time()
     for number in range(total):
         data.qpos[places[held]] = wanted[number] - start[held]
         data.qvel[places[held]] = (wanted[number + 1] - wanted[number]) / step
         mujoco.mj_step(model, data)
         if (number + 1) % count == 0:
             frames.append(start + data.qpos[places])
-    return Track(np.array(frames), time.perf_counter() - began)
+    return Track(np.array(frames), time.process_time() - began)
 
 
 def _xml(problem: Problem, chosen: Settings, step: float) -> str:

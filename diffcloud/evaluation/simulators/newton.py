@@ -62,7 +62,7 @@ def simulate(problem: Problem, settings: Settings | None = None) -> Track:
     count = problem.steps_of(chosen.step)
     step, total = 1 / (problem.rate * count), (len(problem.times) - 1) * count
     held, wanted = list(problem.held), problem.held_at(np.arange(total + 1) * step)
-    frames, began = [problem.mesh.nodes], time.perf_counter()
+    frames, began = [problem.mesh.nodes], time.process_time()
     for number in range(1, total + 1):
         now.clear_forces()
         now.particle_q.numpy()[held] = wanted[number]  # on the processor this is the array itself
@@ -72,10 +72,10 @@ def simulate(problem: Problem, settings: Settings | None = None) -> Track:
         solver.step(now, after, control, contacts, step)
         now, after = after, now
         if number == 1:
-            began = time.perf_counter()  # kernels are compiled
+            began = time.process_time()  # kernels are compiled
         if number % count == 0:
             frames.append(now.particle_q.numpy().astype(np.float64))
-    return Track(np.array(frames), time.perf_counter() - began)
+    return Track(np.array(frames), time.process_time() - began)
 
 
 def mean_height(problem: Problem, stretching: float = 1.0) -> tuple[float, float, float, float]:
@@ -88,16 +88,16 @@ def mean_height(problem: Problem, stretching: float = 1.0) -> tuple[float, float
     step, total = 1 / (problem.rate * count), (len(problem.times) - 1) * count
     states, control = [model.state() for _ in range(total + 1)], model.control()
     for number in range(2):  # the first time kernels are compiled
-        began = time.perf_counter()
+        began = time.process_time()
         with warp.Tape() as tape:
             for before, after in pairwise(states):
                 before.clear_forces()
                 solver.step(before, after, control, None, step)
-        forward = time.perf_counter()
+        forward = time.process_time()
         seed = np.zeros((len(problem.mesh.nodes), 3), dtype=np.float32)
         seed[:, 2] = 1 / len(seed)
         tape.backward(grads={states[-1].particle_q: warp.array(seed, dtype=warp.vec3, device="cpu")})
-        done = time.perf_counter()
+        done = time.process_time()
         slopes = model.tri_materials.grad.numpy()[:, :2]
         derivative = float((slopes * model.tri_materials.numpy()[:, :2]).sum())
         if number == 0:

@@ -103,7 +103,7 @@ class Track:
     nodes: NDArray[np.float64]
     """[T, V, 3] at the problem's times [m]."""
     seconds: float
-    """Of wall time, without building and compiling."""
+    """Of processor time, without building and compiling."""
 
 
 def distances(a: Track, b: Track) -> NDArray[np.float64]:

@@ -166,9 +166,14 @@ def switches() -> Iterator[Pair]:
 
     rows: list[tuple[str, Callable[[Problem], Problem], Run, Run]] = [
         ("nothing", same, ours.simulate, with_steps(plain)),
-        ("integrator: ours of first order", same, lambda p: ours.simulate(p, order=1), with_steps(plain)),
-        ("integrator: our steps a quarter", same, lambda p: ours.simulate(p, steps=FINER * ours.STEPS), with_steps(plain)),
-        ("integrator: MuJoCo's steps a quarter", same, ours.simulate, with_steps(finest)),
+        ("integrator: of first order here", same, lambda p: ours.simulate(p, order=1), with_steps(plain)),
+        (
+            "integrator: steps a quarter as long here",
+            same,
+            lambda p: ours.simulate(p, steps=FINER * ours.STEPS),
+            with_steps(plain),
+        ),
+        ("integrator: MuJoCo's steps a quarter as long", same, ours.simulate, with_steps(finest)),
         ("damping: none in both", sheet(damping=0.0), ours.simulate, with_steps(fine)),
         ("damping: four times in both", sheet(damping=0.02), ours.simulate, with_steps(finest)),
         ("Poisson's ratio: 0 in both", sheet(poisson=0.0), ours.simulate, with_steps(plain)),
