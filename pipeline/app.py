@@ -28,6 +28,7 @@ COMMANDS = {
     "gradients": "pipeline.gradients:gradients",
     "materials": "pipeline.materials:materials",
     "discretisation": "pipeline.discretisation:discretisation",
+    "simulators": "pipeline.simulators:simulators",
     "bench": "pipeline.bench:bench",
     "capture": "pipeline.capture:record",
     "calibrate": "pipeline.calibrate:calibrate",

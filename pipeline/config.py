@@ -246,7 +246,7 @@ class EvaluateConfig(Section):
     """Fresh point samples that a loss is averaged over."""
     seed: int = 1000
     rivals: list[Rival] = list(RIVALS)
-    """Methods beside the fits and the networks; searches may simulate as often as a fit from one start."""
+    """Methods beside the fits and the networks; searches may simulate as often as the fit."""
     identifiability: list[str] = ["*"]
     """Patterns of <scenario>/<episode> of which it is measured what they tell: 90 simulations each."""
     landscapes: list[str] = []

@@ -121,16 +121,6 @@ class TestRecovery:
         assert outcome.loss < 0.25 * outcome.loss_start
         assert outcome.values["stretch"] == pytest.approx(0.8, rel=0.1)
 
-    def test_smoothed_gradients_find_the_valley_of_a_rough_loss(self):
-        """A jerky lift has a bumpy loss: the exact gradient stays near its start, the smoothed one arrives."""
-        scenario = small_lift(path=[(0, 0, 0, 0), (0.5, 0, -0.05, 0.3)], points=600)
-        objective = Objective(scenario, [clouds_of(scenario, stretch=0.8, mass=1.5)])
-        space = FitSpace.build(["stretch"], fixed={"mass": 1.5})
-        exact = fit_adam(objective, space, AdamSettings(iterations=40))
-        smoothed = fit_adam(objective, space, AdamSettings(iterations=40, smoothing=0.5))
-        assert smoothed.values["stretch"] == pytest.approx(0.8, rel=0.1)
-        assert smoothed.loss < 0.2 * exact.loss
-
     def test_a_known_mass_in_other_units_fixes_the_scale(self):
         """Halving the given mass halves the fitted stretch: the clouds only know the ratio."""
         scenario = small_lift(**GENTLE, air_density=0.0)
@@ -343,12 +333,21 @@ def test_screened_starts_are_the_best_candidates():
 class Rough:
     """The squared logarithmic distance to a place, in ripples that are a sixth of a unit wide."""
 
-    def __init__(self) -> None:
+    def __init__(self, height: float = 0.05) -> None:
+        self.height = height
         self.system = SimpleNamespace(device=torch.device("cpu"), dtype=torch.float64)
 
     def __call__(self, parameters, offset=None):
         away = torch.stack([(parameters["stretch"] / 0.13).log(), (parameters["mass"] / 7.0).log()])
-        return (away.square() + 0.05 * (1 - (40 * away).cos())).sum(0)
+        return (away.square() + self.height * (1 - (40 * away).cos())).sum(0)
+
+
+def test_smoothed_gradients_find_the_valley_of_a_rough_loss():
+    """Where ripples are as steep as ten valleys, the exact gradient goes nowhere."""
+    space = FitSpace.build(["stretch", "mass"])
+    exact = fit_adam(Rough(1.0), space, AdamSettings(iterations=60))
+    found = [fit_adam(Rough(1.0), space, AdamSettings(iterations=60, smoothing=0.5, seed=seed)) for seed in range(4)]
+    assert max(one.loss for one in found) < 0.1 * exact.loss
 
 
 class TestPatience:

@@ -7,7 +7,8 @@ with F [3, 2] the deformation gradient and a the material-space area. The coeffi
 align_corners = False); with zero padding the resting stiffness would be halved. They are constants in force and stiffness,
 but their dependence on the strain does enter derivatives with respect to the state.
 
-The stiffness takes the geometric term of tension only and drops the shear's (ARCSim), which keeps it positive.
+The stiffness H takes the geometric term of tension only and drops the shear's (ARCSim), which keeps it positive. Of the
+displacement d = (Δt + β) v of a damped step, that term takes Δt v alone: with β v it would damp rotations.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ def force(face: Element) -> Sequence[Vector]:
     """-∂W/∂x - H d on the three corners."""
     xu, xv = _along_material(face, face.positions)
     du, dv = _along_material(face, face.displacement)
+    along_u, along_v = _along_material(face, [face.ahead * velocity for velocity in face.after])
     e00, e11, e01 = 0.5 * (dot(xu, xu) - 1), 0.5 * (dot(xv, xv) - 1), 0.5 * dot(xu, xv)
     k0, k1, k2, k3 = (k * face.parameter("stretching") for k in _coefficients(face, e00, e11, e01))
     # strains after the displacement, to first order
@@ -38,8 +40,8 @@ def force(face: Element) -> Sequence[Vector]:
     stress_u, stress_v, shear = k0 * p00 + k1 * p11, k1 * p00 + k2 * p11, k3 * p01
     stretched_u, stretched_v = maximum(e00, 0.0), maximum(e11, 0.0)
     tension_u, tension_v = k0 * stretched_u + k1 * stretched_v, k1 * stretched_u + k2 * stretched_v
-    row_u = stress_u * xu + shear * xv + tension_u * du
-    row_v = shear * xu + stress_v * xv + tension_v * dv
+    row_u = stress_u * xu + shear * xv + tension_u * along_u
+    row_v = shear * xu + stress_v * xv + tension_v * along_v
     area = face.constant("area")
     pulls = [
         -area * (face.constant("inverse_rest", side, 0) * row_u + face.constant("inverse_rest", side, 1) * row_v)

@@ -54,7 +54,8 @@ def stretching(constants: Numbers, parameters: Numbers, motion: SimpleNamespace)
     axial, shear = stiffness @ after.diagonal(), k3 * after[0, 1]
     stress = torch.stack([torch.stack([axial[0], shear]), torch.stack([shear, axial[1]])])
     tension = stiffness @ strain.diagonal().clamp(min=0)
-    pull = -constants["area"] * (gradient @ stress + moved * tension) @ constants["inverse_rest"].T  # [3, 2] on 1 and 2
+    onward = motion.ahead * along_material(motion.after)
+    pull = -constants["area"] * (gradient @ stress + onward * tension) @ constants["inverse_rest"].T  # [3, 2] on 1 and 2
     return torch.stack([-pull.sum(1), pull[:, 0], pull[:, 1]])
 
 

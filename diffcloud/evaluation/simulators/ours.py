@@ -1,0 +1,83 @@
+"""Problems in this simulator."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import torch
+
+from diffcloud.evaluation.simulators.problem import Problem, Track
+from diffcloud.mesh.shapes import rectangle_surface
+from diffcloud.scene.description import Scene
+from diffcloud.sim.handles import Handle, Handles
+from diffcloud.sim.materials import isotropic
+from diffcloud.sim.simulate import rollout
+from diffcloud.sim.surrounding import Order, Surrounding
+
+STEPS = 16
+"""A frame."""
+_SETTLING_STEP, _SETTLING_STEPS = 0.02, 400
+"""[s] and how many: so long steps of backward Euler bring a cloth to rest by themselves."""
+
+
+def scene(problem: Problem, order: Order = 2) -> Scene:
+    """The problem as a scene with implicit steps."""
+    sheet = problem.sheet
+    table = () if problem.table is None else (rectangle_surface((0.0, 0.0), (10.0, 10.0), problem.table),)
+    return Scene(
+        mesh=problem.mesh,
+        material=isotropic(
+            problem.name,
+            density=sheet.density,
+            stretching=sheet.stretching,
+            bending=sheet.bending,
+            poisson=sheet.poisson,
+            damping=sheet.damping,
+        ),
+        handles=Handles(tuple(Handle(node, motion) for node, motion in problem.held.items()), hard=True),
+        frame_time=1 / problem.rate,
+        frame_steps=STEPS,
+        surrounding=Surrounding(
+            gravity=(0.0, 0.0, -problem.gravity),
+            air_density=0.0,
+            friction_obstacle=problem.friction,
+            friction_cloth=problem.friction,
+            self_contact=problem.self_contact,
+            obstacles=table,
+        ),
+        integrator="implicit",
+        order=order,
+    )
+
+
+def simulate(problem: Problem, *, steps: int = STEPS, order: Order = 2) -> Track:
+    """The motion with so many steps a frame; of a problem that settles, its start and its rest."""
+    described = replace(scene(problem, order), frame_steps=steps)
+    count = (len(problem.times) - 1) * steps
+    if problem.settling:
+        described, count = replace(described, frame_time=_SETTLING_STEP, frame_steps=1, order=1), _SETTLING_STEPS
+    system, _ = described.build()
+    with torch.no_grad():
+        rollout(system, 1)  # kernels are loaded before the motion is timed
+        began = time.process_time()
+        nodes = rollout(system, count).positions[0].numpy()
+    return Track(nodes[:: count if problem.settling else steps], time.process_time() - began)
+
+
+def mean_height(problem: Problem, stretching: float = 1.0, *, steps: int = STEPS) -> tuple[float, float, float, float]:
+    """(mean height of the nodes at the end [m], its derivative by the logarithm of E h [m], seconds forward, backward).
+
+    Args:
+        stretching: a factor on E h.
+    """
+    system, _ = replace(scene(problem), frame_steps=steps).build()
+    factor = torch.tensor(stretching, dtype=torch.float64, requires_grad=True)
+    properties = replace(system.properties, stretching=system.properties.stretching * factor)
+    rollout(system, 1, properties=properties).positions.sum().backward()  # kernels are loaded before they are timed
+    properties = replace(system.properties, stretching=system.properties.stretching * factor)
+    began = time.process_time()
+    height = rollout(system, (len(problem.times) - 1) * steps, properties=properties).positions[0, -1, :, 2].mean()
+    forward = time.process_time()
+    (derivative,) = torch.autograd.grad(height, factor)
+    return height.item(), derivative.item() * stretching, forward - began, time.process_time() - forward

@@ -1,0 +1,140 @@
+"""Motions of an isotropic towel, and two tests whose answers are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from diffcloud.evaluation.simulators.problem import Problem, Sheet, Track
+from diffcloud.mesh.shapes import grid_cloth
+from diffcloud.mesh.topology import ClothMesh
+from diffcloud.sim.motion import Keyframe, Motion
+
+TOWEL = Sheet(density=0.16, stretching=60.0, poisson=0.3, bending=3e-6, damping=0.005)
+"""As light and as soft as the preset `jersey-knit`, but isotropic."""
+_TABLE, _GAP = 0.02, 0.002
+_SIZE = (0.40, 0.30)
+_CELLS = (8, 6)
+
+
+def lift(*, refinement: int = 1, alternate_diagonals: bool = False) -> Problem:
+    """A towel is lifted off a table by a corner, and swings when it hangs: the tutorial's motion.
+
+    Args:
+        refinement: parts into which each cell of the mesh is divided along both sides.
+    """
+    mesh = _towel(_TABLE + _GAP, refinement, alternate_diagonals)
+    path = _path((0.0, 0.0, 0.0, 0.0), (2.5, -0.1, -0.1, 0.45))
+    return Problem("lift", mesh, TOWEL, 2.5, {len(mesh.nodes) - 1: path}, table=_TABLE)
+
+
+def fold() -> Problem:
+    """The towel is folded over its diagonal on the table; the corner opposite to the moved one is held."""
+    mesh = _towel(_TABLE + _GAP)
+    path = _path((0.0, 0.0, 0.0, 0.0), (1.25, 0.16, 0.12, 0.20), (2.5, 0.32, 0.24, 0.03))
+    return Problem("fold", mesh, TOWEL, 2.5, {0: path, len(mesh.nodes) - 1: None}, table=_TABLE, self_contact=True)
+
+
+def swing() -> Problem:
+    """The towel is let go level, held by the two corners of a short side, and swings without a table."""
+    mesh = _towel(0.0)
+    return Problem("swing", mesh, TOWEL, 1.5, {0: None, _CELLS[1] * (_CELLS[0] + 1): None})
+
+
+@dataclass(frozen=True)
+class Known:
+    """A test with a known answer."""
+
+    problem: Problem
+    measures: Callable[[Track], dict[str, float]]
+    """Name -> what a simulator makes of it."""
+    theory: dict[str, float]
+
+
+_LENGTH = 0.5
+_ROWS, _ACROSS = 17, 4
+_CLEAR = 12
+"""Row up to which the held upper end does not show."""
+
+
+def strip() -> Known:
+    """A strip hangs from its upper end: how its lower three quarters stretch, and how it contracts across them."""
+    flat = grid_cloth(_ROWS, _ACROSS, _LENGTH, 0.1)
+    upright = np.column_stack([flat.nodes[:, 0], np.zeros(len(flat.nodes)), flat.nodes[:, 1]])
+    sheet = Sheet(density=0.2, stretching=500.0, poisson=0.3, bending=1e-6, damping=0.0)
+    held: dict[int, Motion | None] = dict.fromkeys(range((_ROWS - 1) * _ACROSS, _ROWS * _ACROSS))
+    problem = Problem("strip", replace(flat, nodes=upright), sheet, 0.5, held, settling=300.0)
+    part = _CLEAR / (_ROWS - 1)
+    clear = _LENGTH * part
+
+    def measures(track: Track) -> dict[str, float]:
+        start, end = (nodes.reshape(_ROWS, _ACROSS, 3)[: _CLEAR + 1] for nodes in (upright, track.nodes[-1]))
+        along = [float(rows[-1, :, 2].mean() - rows[0, :, 2].mean()) for rows in (start, end)]
+        across = [float((rows[:, -1, 0] - rows[:, 0, 0]).mean()) for rows in (start, end)]
+        stretched = along[1] / along[0] - 1
+        return {"elongation": stretched, "contraction across / elongation": (1 - across[1] / across[0]) / stretched}
+
+    weight = sheet.density * problem.gravity * clear
+    return Known(
+        problem,
+        measures,
+        {"elongation": weight / (2 * sheet.stretching), "contraction across / elongation": sheet.poisson},
+    )
+
+
+_GAMMA = 5.0
+_BEAM = 0.1
+
+
+def cantilever(cells: int = 24) -> Known:
+    """A strip clamped level at one end bends far under its weight, the heavy elastica: drop and reach of its free end.
+
+    Args:
+        cells: along the free length, and half a cell more, in whose middle the clamp ends.
+    """
+    side = _BEAM / (cells + 0.5)
+    columns = cells + 2
+    mesh = grid_cloth(3, columns, 2 * side, side * (columns - 1), alternate_diagonals=True)
+    sheet = Sheet(density=0.2, stretching=200.0, poisson=0.0, bending=1e-4, damping=0.0)
+    gravity = _GAMMA * sheet.bending / (sheet.density * _BEAM**3)
+    held: dict[int, Motion | None] = {row * columns + column: None for row in range(3) for column in (0, 1)}
+    problem = Problem("cantilever", mesh, sheet, 1.5, held, gravity=gravity, settling=16.0)
+    root = float(mesh.nodes[1, 0]) - side / 2  # the second held row's hinges bend over half a cell to either side
+
+    def measures(track: Track) -> dict[str, float]:
+        tip = track.nodes[-1].reshape(3, columns, 3)[:, -1].mean(axis=0)
+        return {"drop / length": -float(tip[2]) / _BEAM, "reach / length": (float(tip[0]) - root) / _BEAM}
+
+    drop, reach = elastica(_GAMMA)
+    return Known(problem, measures, {"drop / length": drop, "reach / length": reach})
+
+
+def elastica(gamma: float) -> tuple[float, float]:
+    """(drop, reach) of the free end of a heavy clamped strip, in parts of its length.
+
+    The slope φ below the level obeys φ'' = -Γ (1 - s) cos φ, φ(0) = 0, φ'(1) = 0, with Γ = σ g L³/B and s along the strip.
+    """
+    from scipy.integrate import solve_bvp  # slow to import
+
+    s = np.linspace(0, 1, 401)
+    solved = solve_bvp(
+        lambda s, y: np.stack([y[1], -gamma * (1 - s) * np.cos(y[0])]),
+        lambda start, end: np.array([start[0], end[1]]),
+        s,
+        np.stack([s, 1 - s]),
+        tol=1e-8,
+    )
+    slope = solved.sol(s)[0]
+    return float(np.trapezoid(np.sin(slope), s)), float(np.trapezoid(np.cos(slope), s))
+
+
+def _towel(height: float, refinement: int = 1, alternate_diagonals: bool = False) -> ClothMesh:
+    columns, rows = (refinement * cells + 1 for cells in _CELLS)
+    flat = grid_cloth(rows, columns, _SIZE[1], _SIZE[0], alternate_diagonals=alternate_diagonals)
+    return replace(flat, nodes=flat.nodes + np.array([0.0, 0.0, height]))
+
+
+def _path(*keys: tuple[float, float, float, float]) -> Motion:
+    return Motion(tuple(Keyframe(time, (x, y, z)) for time, x, y, z in keys))
