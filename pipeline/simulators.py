@@ -193,9 +193,8 @@ def _separated(pairs: Sequence[Pair], third: Sequence[Pair], separate: Sequence[
         [what, *cells([row for row in separate if row.what == what])]
         for what in dict.fromkeys(row.what for row in separate)
     ]
-    alone = {
-        row.against: _millimetres(row.at(0.5)) for row in third if (row.problem, row.what) == ("swing", WHOLE_STIFFNESS)
-    }
+    damped = ("swing", WHOLE_STIFFNESS, THIS)
+    alone = next(_millimetres(row.at(0.5)) for row in third if (row.problem, row.what, row.against) == damped)
     itself = ", ".join(
         _millimetres(float(row.apart.max()))
         for row in pairs
@@ -214,9 +213,9 @@ def _separated(pairs: Sequence[Pair], third: Sequence[Pair], separate: Sequence[
         *markdown_table(["third opinion", "against", *head], opinion),
         "",
         "With all choices of this simulator it gives this simulator's motions. Damping that multiplied the whole stiffness "
-        "matrix, as ARCSim's does, would also resist a rotation of the stretched cloth as a whole, by the part of that matrix "
-        "that is due to tension: a sheet of length L that swings from its upper edge would lose energy at a rate of "
-        f"3 β g/(2 L), and half a second into the swing this towel would be {alone[THIS]} mm from where it is. MuJoCo's hinges "
+        "matrix, as ARCSim's does, would also resist a rotation of the stretched cloth as a whole, by the part of that "
+        "matrix that is due to tension: a sheet of length L that swings from its upper edge would lose energy at a rate of "
+        f"3 β g/(2 L), and half a second into the swing this towel would be {alone} mm from where it is. MuJoCo's hinges "
         "by their chord, and Newton's membrane in large strain, explain most of what is left. "
         f"Later in the swing any difference grows: MuJoCo comes to be {itself} mm from itself with half the step. So it is "
         "with alternate diagonals at the end of the lift, where 3 % of friction are worth as much as the simulator.",
