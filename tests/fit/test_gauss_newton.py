@@ -12,6 +12,7 @@ import torch
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.errors import DivergedError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton, residuals
+from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.residuals import Axis, linearise
 from tests.conftest import small_lift
 from tests.fit.test_fit import GENTLE, clouds_of
@@ -137,6 +138,18 @@ class TestFits:
             lifted(), SPACE, GaussNewtonSettings(starts=2, screen=7, init={"stretch": 9.0, "mass": 9.0})
         )
         assert found.start == {"stretch": pytest.approx(9.0), "mass": pytest.approx(9.0)}
+
+    def test_a_single_start_is_the_best_of_the_screen(self):
+        objective = lifted()
+        found = fit_gauss_newton(objective, SPACE, GaussNewtonSettings(starts=1, screen=7, iterations=1))
+        candidates = batch_losses(objective, SPACE, SPACE.starts(8, seed=0)[0].double())
+        assert found.loss_start == pytest.approx(float(candidates.min()), rel=1e-9)
+        assert found.evaluations == 8 + 2
+
+    def test_without_a_screen_starts_are_spread(self):
+        found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=3, screen=0, iterations=1))
+        assert found.evaluations == 6
+        torch.testing.assert_close(found.history.values[0], SPACE.starts(3, seed=0)[0].double())
 
     def test_bounds_hold_and_the_rest_goes_on(self):
         space = FitSpace.build(["stretch", "mass"], bounds={"stretch": (1.5, 10.0)})

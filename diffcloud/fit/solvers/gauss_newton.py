@@ -47,7 +47,7 @@ class GaussNewtonSettings:
     threshold: float = 0.0
     """Stop below this loss; 0: never."""
     screen: int = 24
-    """Candidates that are simulated once, without derivatives."""
+    """Candidates beside the first that are simulated once, without derivatives; 0: the starts are taken unseen."""
     starts: int = 3
     """The best of them, which are followed."""
     seed: int = 0
@@ -103,11 +103,12 @@ def fit_gauss_newton(
             raise
         reason = "interrupted"
     values = axis.bounded(search.places[search.best]).tolist()
+    first = int(torch.isfinite(history.losses[0]).nonzero()[0])
     return FitOutcome(
         values=dict(zip(space.names, values, strict=True)),
         loss=float(search.losses.min()),
-        start=dict(zip(space.names, history.values[0][0].tolist(), strict=True)),
-        loss_start=float(history.losses[0][0]),
+        start=dict(zip(space.names, history.values[0][first].tolist(), strict=True)),
+        loss_start=float(history.losses[0][first]),
         best_start=search.best,
         iterations=len(history.losses) - 1,
         evaluations=evaluations,
@@ -182,17 +183,17 @@ class _Search:
 
 def _starts(objective: Objective, space: FitSpace, settings: GaussNewtonSettings, axis: Axis) -> tuple[Tensor, int]:
     """Places [B, k] to start at, and how many simulations it took to choose them."""
-    values, _ = space.starts(1 + settings.screen, seed=settings.seed, first=settings.init)
-    values = values.double()
-    if settings.screen == 0 or settings.starts == 1:
-        return axis.places(values[:1]), 0
+    count = max(1 + settings.screen, settings.starts)
+    values = space.starts(count, seed=settings.seed, first=settings.init)[0].double()
+    if not settings.screen:
+        return axis.places(values), 0
     losses = batch_losses(objective, space, values)
-    first = torch.zeros(1, dtype=torch.long) if settings.init else losses.argmin()[None]
-    others = [int(index) for index in losses.argsort() if int(index) not in first.tolist()]
     if not math.isfinite(float(losses.min())):
-        raise DivergedError(0, [], f"all {len(values)} candidates diverged")
-    chosen = torch.tensor([*first.tolist(), *others[: settings.starts - 1]])
-    return axis.places(values[chosen]), len(values)
+        raise DivergedError(0, [], f"all {count} candidates diverged")
+    order = losses.argsort()
+    if settings.init:
+        order = torch.cat([torch.zeros(1, dtype=torch.long), order[order > 0]])
+    return axis.places(values[order[: settings.starts]]), count
 
 
 def _remember(history: FitHistory, search: _Search, axis: Axis) -> None:
