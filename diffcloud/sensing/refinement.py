@@ -39,6 +39,9 @@ from diffcloud.sensing.masking import RobotMask, View, joints_at
 Floats = NDArray[np.float64]
 
 _ITERATIONS = 10
+_THICKENED_AT = 4
+"""Before this iteration the arm is cast as described, from it on as thick as it was found to be. A skin is not as thick
+along a ray as along the normal, and on round links the difference grows with the angle between them."""
 _CONVERGED = 2e-5
 """Metres and radians of a step."""
 _COLUMNS = 212
@@ -154,15 +157,19 @@ def refine_extrinsics(
     found = np.zeros(len(prior))
     """Corrections of the poses, of the lag, and the skins."""
     free = np.arange(6, len(prior))  # the first camera stays
-    for _ in range(_ITERATIONS):
+    surface, thickened = arm, np.zeros(links)
+    for iteration in range(_ITERATIONS):
+        if arm is not None and iteration == _THICKENED_AT:
+            thickened = found[poses_end + 1 :].copy()
+            surface = RobotMask(arm.robot, inflation_m=dict(zip(arm.robot.links, thickened.tolist(), strict=True)))
         information, right = np.diag(prior), -prior * found
         groups, of_arm = [], []
         for index, name in enumerate(names):
             own = 6 * index + np.arange(6)
-            if arm is not None and log is not None:
+            if surface is not None and log is not None:
                 view = replace(images[name].view, T_world_camera=poses[name])
-                lag, skin = lag_s + float(found[poses_end]), found[poses_end + 1 :]
-                rows = _arm_rows(log, arm, images[name], view, centre, skin, lag, sigma_per_m)
+                lag, skin = lag_s + float(found[poses_end]), found[poses_end + 1 :] - thickened
+                rows = _arm_rows(log, surface, images[name], view, centre, skin, lag, sigma_per_m)
                 of_arm.append(rows.among(len(prior), np.concatenate([own, np.arange(poses_end, len(prior))])))
             if index:
                 if plane is not None and len(sight.table[name]):
@@ -181,7 +188,7 @@ def refine_extrinsics(
         found += step
         for index, name in enumerate(names):
             poses[name] = _moved(poses[name], step[6 * index : 6 * index + 6], centre)
-        if np.abs(step[:poses_end]).max() < _CONVERGED:
+        if iteration >= _THICKENED_AT and np.abs(step[:poses_end]).max() < _CONVERGED:
             break
     skins = found[poses_end + 1 :]
     skin_m = float(np.median(skins[skins != 0])) if skins.any() else 0.0
@@ -218,7 +225,13 @@ def _thinned(raw: RawEpisode, name: str, view: View, frames: Sequence[int]) -> _
 def _arm_rows(
     log: RobotLog, arm: RobotMask, images: _Images, view: View, centre: Floats, skin: Floats, lag: float, sigma_per_m: float
 ) -> _Rows:
-    """From each measurement near the described arm to its surface on the same ray."""
+    """From each measurement near the arm to its surface on the same ray.
+
+    Args:
+        arm: the surface that is cast.
+        skin: [L] by which the links are thicker than that [m].
+        lag: of the joint log [s].
+    """
     robot = arm.robot
     earlier, now, later = (
         robot.forward_kinematics(robot.configuration(*joints_at(log, images.times, lag_s=lag + value)))
