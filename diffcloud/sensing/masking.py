@@ -13,7 +13,7 @@ times as much a frame.)
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -78,16 +78,16 @@ class RobotMask:
     """A robot's inflated surface, ready to be cast into cameras.
 
     Args:
-        inflation_m: margin around every link [m].
+        inflation_m: margin around every link, or by link; others have none [m].
     """
 
-    def __init__(self, robot: Robot, *, inflation_m: float = 0.01) -> None:
+    def __init__(self, robot: Robot, *, inflation_m: float | Mapping[str, float] = 0.01) -> None:
         self.robot = robot
         self._links: list[tuple[int, Any, Floats]] = []
         """(place among the robot's links, its ray-casting scene, the corners [8, 3] of its box)."""
         open3d = import_open3d()
         for name, mesh in robot.description.meshes.items():
-            solid = inflate(mesh, inflation_m)
+            solid = inflate(mesh, inflation_m.get(name, 0.0) if isinstance(inflation_m, Mapping) else inflation_m)
             scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # threads cost more than they gain on these few rays
             scene.add_triangles(solid.vertices.astype(np.float32), solid.faces.astype(np.uint32))
             ends = np.stack([solid.vertices.min(axis=0), solid.vertices.max(axis=0)])
@@ -218,7 +218,7 @@ def flying_pixels(depth_m: NDArray[np.floating[Any]], step_m: float) -> Mask:
 
 
 def inflate(mesh: LinkMesh, margin_m: float) -> LinkMesh:
-    """The surface with every face moved outwards by `margin_m`, together with the surface itself.
+    """The surface with every face moved outwards by `margin_m`, together with the surface itself; inwards, it alone.
 
     Vertices move along the mean normal of their faces, farther at edges so that the faces move by the whole margin. The
     original is kept because a scanned mesh may have faces that are turned inside out.
@@ -226,7 +226,7 @@ def inflate(mesh: LinkMesh, margin_m: float) -> LinkMesh:
     if margin_m == 0:
         return mesh
     moved = offset(mesh, margin_m)
-    return joined([mesh, moved])
+    return joined([mesh, moved]) if margin_m > 0 else moved
 
 
 def offset(mesh: LinkMesh, margin_m: float) -> LinkMesh:

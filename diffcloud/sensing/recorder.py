@@ -309,11 +309,24 @@ def _off(pose: Floats, millimetres: float, degrees: float, nodes: Floats, rng: n
 
 
 def _write_log(writer: RawEpisodeWriter, robot: Robot, times: Floats, joints: Floats, settings: RecorderSettings) -> None:
-    """The joint log at its own rate: what the arm did `lag_s` before each row's time."""
+    """The joint log at its own rate: what the arm did `lag_s` before each row's time.
+
+    Between the images it moves smoothly, at rest before the first and after the last.
+
+    Args:
+        times: [T] of the images [s].
+        joints: [T, J] at these times [rad].
+    """
     start, end = times[0] - _BEFORE_S, times[-1] + _BEFORE_S
     clock = start + np.arange(int(np.ceil((end - start) * settings.joint_rate_hz)) + 1) / settings.joint_rate_hz
     continuous = np.unwrap(joints, axis=0)
-    logged = np.stack([np.interp(clock - settings.lag_s, times, column) for column in continuous.T], axis=1)
+    true_times = np.clip(clock - settings.lag_s, times[0], times[-1])
+    if len(times) > 1:
+        from scipy.interpolate import CubicSpline  # slow to import
+
+        logged = CubicSpline(times, continuous, bc_type="clamped")(true_times)
+    else:
+        logged = np.repeat(continuous, len(clock), axis=0)
     tool = robot.tool_pose(logged)
     quaternion = np.roll(Rotation.from_matrix(tool[:, :3, :3]).as_quat(), 1, axis=-1)
     for row in range(len(clock)):  # a file is written row by row

@@ -5,13 +5,19 @@ whose place its joints tell, the same table, and in part the same cloth. The pos
 refined by Gauss–Newton on distances along normals, over several frames at once:
 
 - arm: from each measured point to the described surface on its ray. How much thicker each link is than its description
-  (its *skin*) and how late the joint log is are unknown too; the first camera, which stays where it is, helps to find them.
+  (its *skin*), by how much each patch of it differs from that, and how late the joint log is are unknown too; the first
+  camera, which stays where it is, helps to find them.
 - table: from the other camera's points to the first camera's plane.
 - cloth: from the other camera's points to the first camera's points nearby.
 
+An arm is rounder than its description, and cables lie on it. Such errors are the arm's own: the same place of a link is
+off by the same amount in every image of every camera. Taken for noise they become lag, because an arm that goes one way
+shows other places when it is fast than when it is slow. So each patch of a link has an offset of its own, which is
+eliminated, and the lag is read off how the same patches move.
+
 Weights come from the depth's own noise, and fall off for outliers by Tukey's function of the residuals' median deviation.
-Neighbouring points share the errors of a surface's description, so they count as few. The calibration is the prior: what
-nothing in the recording constrains stays as it was.
+Neighbouring points of table and cloth share their surface's errors, so they count as few. The calibration is the prior:
+what nothing in the recording constrains stays as it was.
 """
 
 from __future__ import annotations
@@ -21,6 +27,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -32,6 +39,9 @@ from diffcloud.sensing.masking import RobotMask, View, joints_at
 Floats = NDArray[np.float64]
 
 _ITERATIONS = 10
+_THICKENED_AT = 4
+"""Before this iteration the arm is cast as described, from it on as thick as it was found to be. A skin is not as thick
+along a ray as along the normal, and on round links the difference grows with the angle between them."""
 _CONVERGED = 2e-5
 """Metres and radians of a step."""
 _COLUMNS = 212
@@ -44,7 +54,16 @@ _TUKEY = 4.685
 _SHAPE_M = 0.002
 """By which surfaces differ from their descriptions beyond a common skin, and depth is off beyond its noise."""
 _SHARED = 36
-"""So many thinned pixels lie on one patch of 4 cm at a metre, over which the errors of a description are alike."""
+"""So many thinned pixels lie on one patch of 4 cm at a metre, over which the errors of a surface are alike."""
+_PATCH_M = 0.02
+"""Patches of the arm: cubes of this side in a link's frame, and in each the sides that face along one of its axes."""
+_PRIOR_PATCH_M = 0.003
+"""By which a patch differs from its link's description and skin: rounded edges, screws, cables."""
+_CUBES = 1 << 12
+"""Patches are numbered within this many cubes along each axis."""
+_REWEIGHTED = 3
+_WINDOW = 4
+"""So many thinned pixels share a window of stereo matching, and with it their noise."""
 _PRIOR_M, _PRIOR_RAD = 0.005, np.deg2rad(0.5)
 """How far calibrations tend to be off, along and about each axis."""
 _PRIOR_SKIN_M, _PRIOR_LAG_S = 0.005, 0.1
@@ -82,14 +101,23 @@ class Refinement:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Linearised residuals of one camera."""
+    """Linearised residuals."""
 
     J: Floats
-    """[N, 7 + L] by rotation (3), translation (3), lag, and the skin of each link."""
+    """[N, 6] by a camera's rotation and translation, [N, 7 + L] also by the lag and the skin of each link, or [N, U] by
+    all unknowns."""
     r: Floats
     """[N] [m]."""
     sigma: Floats
     """[N] their deviation [m]."""
+    patch: NDArray[np.int64] | None = None
+    """[N] numbers of the arm's patches; None for what is not of the arm."""
+
+    def among(self, unknowns: int, columns: NDArray[np.int64]) -> _Rows:
+        """The same by all unknowns, of which J's are at these places."""
+        J = np.zeros((len(self.r), unknowns))
+        J[:, columns] = self.J
+        return replace(self, J=J)
 
 
 def refine_extrinsics(
@@ -129,30 +157,38 @@ def refine_extrinsics(
     found = np.zeros(len(prior))
     """Corrections of the poses, of the lag, and the skins."""
     free = np.arange(6, len(prior))  # the first camera stays
-    for _ in range(_ITERATIONS):
+    surface, thickened = arm, np.zeros(links)
+    for iteration in range(_ITERATIONS):
+        if arm is not None and iteration == _THICKENED_AT:
+            thickened = found[poses_end + 1 :].copy()
+            surface = RobotMask(arm.robot, inflation_m=dict(zip(arm.robot.links, thickened.tolist(), strict=True)))
         information, right = np.diag(prior), -prior * found
+        groups, of_arm = [], []
         for index, name in enumerate(names):
-            groups = []
-            if arm is not None and log is not None:
+            own = 6 * index + np.arange(6)
+            if surface is not None and log is not None:
                 view = replace(images[name].view, T_world_camera=poses[name])
-                lag, skin = lag_s + float(found[poses_end]), found[poses_end + 1 :]
-                groups.append(_arm_rows(log, arm, images[name], view, centre, skin, lag, sigma_per_m))
+                lag, skin = lag_s + float(found[poses_end]), found[poses_end + 1 :] - thickened
+                rows = _arm_rows(log, surface, images[name], view, centre, skin, lag, sigma_per_m)
+                of_arm.append(rows.among(len(prior), np.concatenate([own, np.arange(poses_end, len(prior))])))
             if index:
                 if plane is not None and len(sight.table[name]):
-                    groups.append(_table_rows(sight.table[name], poses[name], plane, centre, sigma_per_m))
-                groups.append(_cloth_rows(sight.cloth[name], poses[name], surfaces, centre, sigma_per_m))
-            for rows in groups:
-                width = rows.J.shape[1]
-                columns = np.concatenate([6 * index + np.arange(6), poses_end + np.arange(width - 6)])
-                weighted = rows.J * (_tukey(rows) / rows.sigma**2 / _SHARED)[:, None]
-                information[np.ix_(columns, columns)] += weighted.T @ rows.J
-                right[columns] -= weighted.T @ rows.r
+                    rows = _table_rows(sight.table[name], poses[name], plane, centre, sigma_per_m)
+                    groups.append(rows.among(len(prior), own))
+                rows = _cloth_rows(sight.cloth[name], poses[name], surfaces, centre, sigma_per_m)
+                groups.append(rows.among(len(prior), own))
+        if of_arm:
+            groups.append(_joined(of_arm))  # the cameras see the same patches
+        for rows in groups:
+            added, pulled = _normal_equations(rows)
+            information += added
+            right += pulled
         step = np.zeros(len(prior))
         step[free] = np.linalg.solve(information[np.ix_(free, free)], right[free])
         found += step
         for index, name in enumerate(names):
             poses[name] = _moved(poses[name], step[6 * index : 6 * index + 6], centre)
-        if np.abs(step[:poses_end]).max() < _CONVERGED:
+        if iteration >= _THICKENED_AT and np.abs(step[:poses_end]).max() < _CONVERGED:
             break
     skins = found[poses_end + 1 :]
     skin_m = float(np.median(skins[skins != 0])) if skins.any() else 0.0
@@ -189,31 +225,71 @@ def _thinned(raw: RawEpisode, name: str, view: View, frames: Sequence[int]) -> _
 def _arm_rows(
     log: RobotLog, arm: RobotMask, images: _Images, view: View, centre: Floats, skin: Floats, lag: float, sigma_per_m: float
 ) -> _Rows:
-    """From each measurement near the described arm to its surface on the same ray."""
+    """From each measurement near the arm to its surface on the same ray.
+
+    Args:
+        arm: the surface that is cast.
+        skin: [L] by which the links are thicker than that [m].
+        lag: of the joint log [s].
+    """
     robot = arm.robot
-    places = [
-        robot.forward_kinematics(robot.configuration(*joints_at(log, images.times, lag_s=value)))
-        for value in (lag, lag + _LAG_STEP_S)
-    ]
+    earlier, now, later = (
+        robot.forward_kinematics(robot.configuration(*joints_at(log, images.times, lag_s=lag + value)))
+        for value in (-_LAG_STEP_S, 0.0, _LAG_STEP_S)
+    )
+    rates = (later - earlier) / (2 * _LAG_STEP_S)
     rotation = view.T_world_camera[:3, :3]
     parts = []
-    for index, depth_m in enumerate(images.depth_m):  # a handful of images, each vectorised
-        (surface, link), (later, _) = (arm.first_hits(view, place[index]) for place in places)
+    for poses, rate, depth_m in zip(now, rates, images.depth_m, strict=True):  # a handful of images, each vectorised
+        surface, link = arm.first_hits(view, poses)
         solid = np.isfinite(surface)
-        points = view.directions * np.where(solid, surface, 0.0)[..., None]
-        normal, facing = _image_normals(points, solid, view.directions)
+        described = view.directions * np.where(solid, surface, 0.0)[..., None]
+        normal, facing = _image_normals(described, solid, view.directions)
         off = depth_m - np.where(solid, surface, 0.0)
-        moved = np.where(solid & np.isfinite(later), later, np.inf) - np.where(solid, surface, 0.0)
-        use = solid & (depth_m > 0) & (np.abs(off) < _GATE_M) & (facing > _STEEPEST) & (np.abs(moved) < 0.01)
+        use = solid & (depth_m > 0) & (np.abs(off) < _GATE_M) & (facing > _STEEPEST)
         along = (view.directions[use] * normal[use]).sum(axis=-1)  # negative: normals look at the camera
         world = transform(view.T_world_camera, view.directions[use] * depth_m[use][:, None])
-        n = normal[use] @ rotation.T
+        n, which = normal[use] @ rotation.T, link[use]
+        from_link = transform(view.T_world_camera, described[use]) - poses[which, :3, 3]
+        place, facet = (np.einsum("nji,nj->ni", poses[which, :3, :3], vector) for vector in (from_link, n))
+        motion = np.einsum("nij,nj->ni", rate[which, :3, :3], place) + rate[which, :3, 3]
         J = np.zeros((len(n), 7 + len(skin)))
-        J[:, :3], J[:, 3:6], J[:, 6] = np.cross(world - centre, n), n, -along * moved[use] / _LAG_STEP_S
-        J[np.arange(len(n)), 7 + link[use]] = -1.0
+        J[:, :3], J[:, 3:6], J[:, 6] = np.cross(world - centre, n), n, -(motion * n).sum(axis=-1)
+        J[np.arange(len(n)), 7 + which] = -1.0
         sigma = np.hypot(sigma_per_m * depth_m[use] ** 2 * np.abs(along), _SHAPE_M)
-        parts.append(_Rows(J, off[use] * along - skin[link[use]], sigma))
-    return _Rows(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("J", "r", "sigma")))
+        parts.append(_Rows(J, off[use] * along - skin[which], sigma, _patches(which, place, facet)))
+    return _joined(parts)
+
+
+def _patches(link: NDArray[np.int64], place: Floats, normal: Floats) -> NDArray[np.int64]:
+    """Numbers [N] of the patches of places [N, 3] on links [N] with normals [N, 3], both in the links' frames."""
+    axis = np.abs(normal).argmax(axis=1)
+    side = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0)
+    cube = np.floor(place / _PATCH_M).astype(np.int64) + _CUBES // 2
+    number: NDArray[np.int64] = np.ravel_multi_index((link, side, *cube.T), (1 << 20, 6, _CUBES, _CUBES, _CUBES))
+    return number
+
+
+def _joined(parts: Sequence[_Rows]) -> _Rows:
+    """Rows of the arm together."""
+    return _Rows(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("J", "r", "sigma", "patch")))
+
+
+def _normal_equations(rows: _Rows) -> tuple[Floats, Floats]:
+    """JᵀWJ [U, U] and -JᵀWr [U]; for rows of the arm, of what is left when the patches' offsets are eliminated."""
+    if rows.patch is None:
+        weighted = rows.J * (_tukey(rows.r / rows.sigma) / rows.sigma**2 / _SHARED)[:, None]
+        return weighted.T @ rows.J, -weighted.T @ rows.r
+    numbers, patch = np.unique(rows.patch, return_inverse=True)
+    belongs = csr_array((np.ones(len(patch)), (patch, np.arange(len(patch)))), shape=(len(numbers), len(patch)))
+    offset = np.zeros(len(numbers))
+    for _ in range(_REWEIGHTED):  # outliers are those from their own patch
+        weight = _tukey((rows.r - offset[patch]) / rows.sigma) / rows.sigma**2 / _WINDOW
+        total = belongs @ weight + 1 / _PRIOR_PATCH_M**2
+        offset = belongs @ (weight * rows.r) / total
+    weighted = rows.J * weight[:, None]
+    sums = belongs @ weighted
+    return weighted.T @ rows.J - (sums / total[:, None]).T @ sums, -weighted.T @ rows.r + sums.T @ offset
 
 
 def _table_rows(points: Floats, pose: Floats, plane: tuple[Floats, float], centre: Floats, sigma_per_m: float) -> _Rows:
@@ -250,11 +326,10 @@ def _plane_rows(world: Floats, normal: Floats, r: Floats, points: Floats, centre
     )
 
 
-def _tukey(rows: _Rows) -> Floats:
-    """[N] weights 0..1."""
-    if not len(rows.r):
+def _tukey(u: Floats) -> Floats:
+    """[N] weights 0..1 of residuals over their deviations."""
+    if not len(u):
         return np.zeros(0)
-    u = rows.r / rows.sigma
     scale = 1.4826 * float(np.median(np.abs(u))) + 1e-9
     weight: Floats = np.square(1 - np.minimum(np.abs(u) / (_TUKEY * scale), 1.0) ** 2)
     return weight

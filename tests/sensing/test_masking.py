@@ -79,6 +79,16 @@ def test_inflation_moves_every_face_of_a_box_by_the_margin():
     np.testing.assert_allclose(solid.vertices.max(axis=0), [0.33, 0.23, 0.93], atol=1e-9)
 
 
+def test_a_box_shrinks_by_a_negative_margin_and_each_link_by_its_own():
+    robot = one_box((-0.1, -0.2, 0.5), (0.3, 0.2, 0.9))
+    solid = inflate(robot.description.meshes["base"], -0.03)
+    np.testing.assert_allclose(solid.vertices.min(axis=0), [-0.07, -0.17, 0.53], atol=1e-9)
+    np.testing.assert_allclose(solid.vertices.max(axis=0), [0.27, 0.17, 0.87], atol=1e-9)
+    for margins, expected in (({"base": -0.03}, 0.53), ({"base": 0.03}, 0.47), ({}, 0.5)):
+        depth = RobotMask(robot, inflation_m=margins).surface(AHEAD, poses(robot))
+        np.testing.assert_allclose(depth[15, 20], expected, atol=1e-6)
+
+
 def test_rays_that_pass_within_the_margin_are_masked(rng):
     robot = gen3()
     placed = robot.forward_kinematics(robot.configuration(GEN3_HOME_RAD))
