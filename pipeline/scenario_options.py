@@ -19,7 +19,7 @@ ScenarioName = Annotated[
     str | None,
     typer.Option(
         "--scenario",
-        help="lift, fold, band_stretch, vest_hang, release_lift, release_fold, release_hang, release_band, a YAML file, or "
+        help="lift, fold, band_stretch, vest_hang, shake, release_lift, release_fold, release_hang, release_band, a YAML file, or "
         f"the name of one in {OWN_SCENARIOS}.",
     ),
 ]
