@@ -9,7 +9,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from diffcloud.evaluation.discretisation import FINER, NUDGE, MeshRow, StepRow, mesh_study, step_study
+from diffcloud.evaluation.discretisation import FINER, NUDGE, PUSH, MeshRow, StepRow, mesh_study, step_study
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.io.files import write_text
 from diffcloud.scene.description import Scene
@@ -58,6 +58,7 @@ def _page(own: dict[str, Scene], steps: list[StepRow], meshes: list[MeshRow]) ->
         "median mm",
         "largest mm",
         f"largest mm after {NUDGE:.0e} m",
+        f"after {1e3 * PUSH:g} mm",
         "ms a motion",
     ]
     rows = [
@@ -67,6 +68,7 @@ def _page(own: dict[str, Scene], steps: list[StepRow], meshes: list[MeshRow]) ->
             f"{row.steps_per_frame}{' (default)' if _is_default(own, row) else ''}",
             *_millimetres(row.errors),
             _largest(row.nudged),
+            _largest(row.pushed),
             f"{1e3 * row.seconds:.0f}",
         ]
         for row in steps
@@ -76,9 +78,11 @@ def _page(own: dict[str, Scene], steps: list[StepRow], meshes: list[MeshRow]) ->
         "# Step size and mesh",
         "",
         f"RMS node distance at the loss frame to the same simulation with {FINER} times the steps, over nine pairs of "
-        "stretch and mass: the middles of nine equal parts of their bounds, on the logarithmic scale. The last distance is "
-        f"to a run whose start was changed by {NUDGE:.0e} m at random: where it is large, the motion is chaotic, and no "
-        "step size makes it repeat. Milliseconds are processor time as far as the loss frame, of one core. "
+        "stretch and mass: the middles of nine equal parts of their bounds, on the logarithmic scale. The last two "
+        f"distances are to runs whose start was changed by {NUDGE:.0e} m and by {1e3 * PUSH:g} mm at random. Where the "
+        "first is large, the motion is chaotic, and no step size makes it repeat; where the second is, as in folds that "
+        "may buckle to either side, no recording repeats either. Milliseconds are processor time as far as the loss frame, "
+        "of one core. "
         "`diffcloud discretisation` makes this page; `towel` is the tutorial's cloth ([own-clouds.md](../own-clouds.md)).",
         "",
         *markdown_table(head, rows),

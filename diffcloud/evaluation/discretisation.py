@@ -21,6 +21,8 @@ FINER = 4
 """Times the steps that errors of a step are measured with."""
 NUDGE = 1e-10
 """[m] A random change of the start's coordinates; a chaotic motion turns it into one that can be seen."""
+PUSH = 1e-4
+"""[m] The same, of a size that no hand lays a cloth down to; what a motion turns into centimetres nobody can repeat."""
 _SIDE = 3
 
 
@@ -46,6 +48,8 @@ class StepRow:
     """[9] RMS node distance at the loss frame to four times the steps [m]."""
     nudged: NDArray[np.float64]
     """[9] the same to a start that differs by `NUDGE` [m]."""
+    pushed: NDArray[np.float64]
+    """[9] and by `PUSH` [m]."""
     seconds: float
     """As of `Run`."""
 
@@ -98,7 +102,10 @@ def step_study(scenario: Scenario, scene: Scene, sizes: list[int]) -> list[StepR
     simulate(scenario, replace(scene, frame_steps=1))  # kernels are loaded before the first one is timed
     rows = []
     for steps in sizes:
-        nudged = simulate(scenario, replace(scene, frame_steps=steps), nudge=NUDGE)
+        nudged, pushed = (
+            _distance(at(steps).nodes, simulate(scenario, replace(scene, frame_steps=steps), nudge=size).nodes)
+            for size in (NUDGE, PUSH)
+        )
         rows.append(
             StepRow(
                 scenario.name,
@@ -106,7 +113,8 @@ def step_study(scenario: Scenario, scene: Scene, sizes: list[int]) -> list[StepR
                 scene.order if scene.integrator == "implicit" else 1,
                 steps,
                 _distance(at(steps).nodes, at(FINER * steps).nodes),
-                _distance(at(steps).nodes, nudged.nodes),
+                nudged,
+                pushed,
                 at(steps).seconds,
             )
         )

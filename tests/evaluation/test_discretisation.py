@@ -21,7 +21,8 @@ def test_smaller_steps_are_nearer_to_still_smaller_ones():
     scenario = small_lift(integrator="implicit", gap_m=0.5)
     coarse, fine = step_study(scenario, scenario.scene, [1, 4])
     assert (fine.errors < coarse.errors).all()
-    assert 0 < coarse.nudged.max() < 1e-7
+    assert 0 < coarse.nudged.max() < 1e-7 < coarse.pushed.min()
+    assert coarse.pushed.max() < 3e-3
     assert (coarse.integrator, coarse.order, fine.steps_per_frame) == ("implicit", 2, 4)
 
 

@@ -50,7 +50,6 @@ BAND_STRETCH = BandScenario(
     name="band_stretch",
     path=[(0.0, 0.0, 0.0, 0.0), (1.2, 0.0, -0.2, 0.0)],
     frames=25,
-    steps_per_frame=5,
     loss_frames=(24,),
     points=5500,
     learning_rate=0.4,

@@ -77,6 +77,7 @@ FOLD = GridScenario(
     grasped=("left_bottom",),
     held=("right_top",),
     path=[(0.0, 0.0, 0.0, 0.0), (1.25, 0.0, 0.12, 0.26), (2.5, 0.0, 0.28, 0.08)],
+    steps_per_frame=4,
     loss_frames=(15,),
     loss_surface="grasped_half",
 )
@@ -92,7 +93,7 @@ SHAKE = GridScenario(
         (2.0, 0.0, 0.08, 0.36),
         (2.5, 0.0, 0.0, 0.36),
     ],
-    steps_per_frame=8,
+    steps_per_frame=16,
     recorder="whole_surface",
 )
 

@@ -35,7 +35,7 @@ class ScenarioOptions(Checked):
     """The gripper's displacement."""
     frames: Annotated[int, Field(ge=1)] = 25
     rate_hz: Positive = 10.0
-    steps_per_frame: Annotated[int, Field(ge=1)] = 4
+    steps_per_frame: Annotated[int, Field(ge=1)] = 8
     integrator: Integrator = "implicit"
     """"implicit" has steps of second order and smooth contact; "linearised" are ARCSim's steps, a quarter to a tenth as
     long to compute and less exact (docs/results/discretisation.md)."""

@@ -51,7 +51,6 @@ VEST_HANG = VestScenario(
     name="vest_hang",
     path=[(0.0, 0.0, 0.0, 0.0), (1.2, 0.0, 0.0, -0.117)],
     frames=15,
-    steps_per_frame=5,
     loss_frames=(10,),
     points=3500,
     learning_rate=0.3,
