@@ -12,7 +12,7 @@ from diffcloud.evaluation.identifiability import identify, node_set_note
 from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
-from diffcloud.fit import AdamSettings, FitSpace, Objective
+from diffcloud.fit import AdamSettings, CmaEsSettings, FitSpace, Objective, RandomSearchSettings
 from diffcloud.fit.parameters import NUISANCE
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
@@ -115,7 +115,7 @@ def compare_episode(
         "length_unit_m": scenario.length_unit_m,
         "threshold": success_threshold(scenario),
         "frames": frames,
-        "starts": int(fit["starts"]),
+        "starts": int(fit.get("starts", 1)),  # a search is one
         "start": None if len(sets) in measured.diverged else measured.rows[-1],
         "methods": rows,
         "gaps": [{"method": gap.method, "reason": gap.reason, "expected": gap.expected} for gap in gaps],
@@ -145,9 +145,9 @@ def _run(rival: Rival, objective: Objective, space: FitSpace, summary: Mapping[s
         if rival == "middle":
             return methods.middle(space)
         if rival == "random_search":
-            return methods.random_search(objective, space, simulations=simulations, threshold=threshold, seed=seed)
+            return methods.searched(objective, space, RandomSearchSettings(simulations, threshold, seed))
         if rival == "cma_es":
-            return methods.cma_es(objective, space, simulations=simulations, threshold=threshold, seed=seed)
+            return methods.searched(objective, space, CmaEsSettings(simulations, threshold, seed))
         known = methods.first_start(summary, space)
         if known is not None:
             return known

@@ -1,33 +1,25 @@
 """Methods that name the parameters of an episode, on equal terms.
 
-Each gives one parameter set: a gradient fit, a network's prediction, or a rival without gradients or learning. Rivals that
-search see the objective that the fit sees (frames, points, common random numbers, bounds), may simulate as often as the fit
-(as one start of it, where that was Adam's), and stop below the same threshold.
+Each gives one parameter set: the fit, a network's prediction, or a rival without gradients or learning. Rivals that search
+are the solvers of `fit.solvers`; they see the objective that the fit sees (frames, points, common random numbers, bounds),
+may simulate as often as the fit (as one start of it, where that was Adam's), and stop below the same threshold.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-import numpy as np
-import torch
-
-from diffcloud.errors import DivergedError
-from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
-from diffcloud.fit.batches import batch_losses
+from diffcloud.fit import AdamSettings, CmaEsSettings, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
 from diffcloud.fit.parameters import NUISANCE, Variable
+from diffcloud.fit.solvers import SOLVER_NAMES, SOLVERS, FitOutcome, SearchSettings
 
 Rival = Literal["single_start", "middle", "random_search", "cma_es"]
 """What the comparison can run by itself."""
 Phase = Literal["dataset", "training", "inference", "optimisation"]
 PHASES: tuple[Phase, ...] = ("dataset", "training", "inference", "optimisation")
-_EDGE = 1e-9
-_SPREAD = 0.3
-"""First standard deviation of CMA-ES as a part of each logarithmic range, which its authors advise: 0.2 to 0.5."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +62,12 @@ def space_of(summary: Mapping[str, Any]) -> FitSpace:
 
 
 def fitted(summary: Mapping[str, Any]) -> Estimate:
-    """The gradient fit itself, as `fit.result.read_fit` has it."""
+    """The fit itself, as `fit.result.read_fit` has it."""
     return Estimate(
         "diffcloud",
         {name: float(entry["value"]) for name, entry in summary["parameters"].items()},
         simulations=int(summary["evaluations"]),
-        gradients=True,
+        gradients=not issubclass(SOLVERS[summary["solver"]], SearchSettings),
         seconds={"optimisation": float(summary["seconds"])},
     )
 
@@ -88,15 +80,7 @@ def middle(space: FitSpace) -> Estimate:
 def single_start(objective: Objective, space: FitSpace, settings: AdamSettings) -> Estimate:
     """The paper's own setting: Adam from the middle, plain gradient, one start."""
     found = fit_adam(objective, space, replace(settings, starts=1, smoothing=0.0, init={}))
-    if found.stop_reason == "interrupted":
-        raise KeyboardInterrupt  # half a search is no method; the fit itself keeps its best so far
-    return Estimate(
-        "single_start",
-        found.values,
-        simulations=found.evaluations,
-        gradients=True,
-        seconds={"optimisation": found.seconds},
-    )
+    return _estimate("single_start", found, gradients=True)
 
 
 def first_start(summary: Mapping[str, Any], space: FitSpace) -> Estimate | None:
@@ -119,45 +103,25 @@ def first_start(summary: Mapping[str, Any], space: FitSpace) -> Estimate | None:
     return Estimate("single_start", values, simulations=len(losses), gradients=True)
 
 
-def random_search(
-    objective: Objective, space: FitSpace, *, simulations: int, threshold: float = 0.0, seed: int = 0
-) -> Estimate:
-    """The best of independent draws, log-uniform over the box where the lower bound is positive.
-
-    Raises:
-        DivergedError: every draw diverged.
-    """
-    rng = np.random.default_rng(seed)
-    search = _Search(objective, space, simulations, threshold)
-    while search.goes_on:
-        search.try_(rng.random((min(search.left, 16), len(space.variables))))
-    return search.estimate("random_search")
-
-
-def cma_es(objective: Objective, space: FitSpace, *, simulations: int, threshold: float = 0.0, seed: int = 0) -> Estimate:
-    """Covariance matrix adaptation (Hansen 2016) from the middle, on the logarithmic scale, a generation at a time.
+def searched(objective: Objective, space: FitSpace, settings: CmaEsSettings | RandomSearchSettings) -> Estimate:
+    """A rival without gradients: the solver that a fit can have too, under its name.
 
     Raises:
         DivergedError: every candidate diverged.
     """
-    from cma import CMAEvolutionStrategy  # takes a second to import
+    return _estimate(SOLVER_NAMES[type(settings)], solve(objective, space, settings), gradients=False)
 
-    start = space.unbounded(space.starts(1, seed=0)[0], torch.ones(1, dtype=torch.bool))
-    first = torch.sigmoid(start)[0].tolist()
-    search = _Search(objective, space, simulations, threshold)
-    if len(first) < 2:
-        # the covariance of one variable adapts nothing, and the package refuses it: a second one that changes nothing
-        first = [*first, 0.5]
-    options = {"bounds": [0.0, 1.0], "seed": seed + 1, "verbose": -9, "verb_log": 0}  # a seed of 0 means the clock
-    strategy = CMAEvolutionStrategy(first, _SPREAD, options)
-    while search.goes_on and not strategy.stop():
-        candidates = np.array(strategy.ask())
-        losses = search.try_(candidates[:, : len(space.variables)])
-        if len(losses) < len(candidates):
-            break  # the budget ended within a generation
-        # a diverged candidate is worse than all others, and a number: CMA-ES only ranks
-        strategy.tell(list(candidates), np.nan_to_num(losses, posinf=1e300).tolist())
-    return search.estimate("cma_es")
+
+def _estimate(method: str, found: FitOutcome, *, gradients: bool) -> Estimate:
+    if found.stop_reason == "interrupted":
+        raise KeyboardInterrupt  # half a search is no method; the fit itself keeps its best so far
+    return Estimate(
+        method,
+        found.values,
+        simulations=found.evaluations,
+        gradients=gradients,
+        seconds={"optimisation": found.seconds},
+    )
 
 
 def predicted(method: str, values: Mapping[str, float], seconds: Mapping[str, float]) -> Estimate:
@@ -177,43 +141,3 @@ def clipped(values: Mapping[str, float], space: FitSpace) -> dict[str, float]:
         value = float(values.get(variable.name, found[variable.name]))
         found[variable.name] = min(max(value, variable.low), variable.high)
     return found
-
-
-class _Search:
-    """The best so far of a search in the unit box, and what is left of its budget."""
-
-    def __init__(self, objective: Objective, space: FitSpace, simulations: int, threshold: float) -> None:
-        self._objective, self._space, self._threshold = objective, space, threshold
-        self._budget, self._spent = simulations, 0
-        self._best, self._values = math.inf, torch.empty(0)
-        self._began = time.perf_counter()
-
-    @property
-    def left(self) -> int:
-        return self._budget - self._spent
-
-    @property
-    def goes_on(self) -> bool:
-        return self.left > 0 and not self._best < self._threshold
-
-    def try_(self, fractions: np.ndarray) -> np.ndarray:
-        """Losses of places [b, k] in the unit box, of the first ones if the budget ends within them."""
-        places = torch.as_tensor(fractions[: self.left], dtype=torch.float64).clamp(_EDGE, 1 - _EDGE)
-        logarithmic = torch.ones(len(places), dtype=torch.bool)
-        values = self._space.values(torch.logit(places), logarithmic).double()
-        losses = batch_losses(self._objective, self._space, values)
-        self._spent += len(places)
-        lowest = int(losses.argmin())
-        if float(losses[lowest]) < self._best:
-            self._best, self._values = float(losses[lowest]), values[lowest]
-        return losses.numpy()
-
-    def estimate(self, method: str) -> Estimate:
-        if not math.isfinite(self._best):
-            raise DivergedError(0, [], f"all {self._spent} parameter sets of {method} diverged")
-        return Estimate(
-            method,
-            dict(zip(self._space.names, self._values.tolist(), strict=True)),
-            simulations=self._spent,
-            seconds={"optimisation": time.perf_counter() - self._began},
-        )

@@ -3,18 +3,33 @@
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace, Variable
 from diffcloud.fit.result import FitResult, physical_values, read_fit, write_fit
-from diffcloud.fit.solvers import AdamSettings, GaussNewtonSettings, Progress, fit_adam, fit_gauss_newton, solve
+from diffcloud.fit.solvers import (
+    AdamSettings,
+    CmaEsSettings,
+    GaussNewtonSettings,
+    Progress,
+    RandomSearchSettings,
+    fit_adam,
+    fit_cma_es,
+    fit_gauss_newton,
+    fit_random_search,
+    solve,
+)
 
 __all__ = [
     "AdamSettings",
+    "CmaEsSettings",
     "FitResult",
     "FitSpace",
     "GaussNewtonSettings",
     "Objective",
     "Progress",
+    "RandomSearchSettings",
     "Variable",
     "fit_adam",
+    "fit_cma_es",
     "fit_gauss_newton",
+    "fit_random_search",
     "physical_values",
     "read_fit",
     "solve",

@@ -16,7 +16,7 @@ import diffcloud
 from diffcloud.errors import ConfigError
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import NUISANCE, FitSpace
-from diffcloud.fit.solvers import FitOutcome, GaussNewtonSettings, Settings
+from diffcloud.fit.solvers import SOLVER_NAMES, FitOutcome, Settings
 from diffcloud.io.files import read_json, together, write_json, write_npz
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios import Scenario
@@ -114,7 +114,7 @@ def describe_fit(
         "schema": _SCHEMA,
         "scenario": scenario.name,
         "episodes": episodes,
-        "solver": "gauss_newton" if isinstance(settings, GaussNewtonSettings) else "adam",
+        "solver": SOLVER_NAMES[type(settings)],
         "loss": outcome.loss,
         "loss_start": outcome.loss_start,
         "loss_resampled": float(np.mean(resampled)),

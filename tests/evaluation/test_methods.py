@@ -1,4 +1,4 @@
-"""Rivals: budgets, bounds, repeatability, divergence; what counts as a method's parameters."""
+"""Rivals: the solvers under their names, interruption; what counts as a method's parameters."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ import torch
 from diffcloud.errors import DivergedError
 from diffcloud.evaluation.methods import (
     clipped,
-    cma_es,
     first_start,
+    fitted,
     middle,
     published,
-    random_search,
+    searched,
     single_start,
     space_of,
 )
-from diffcloud.fit import AdamSettings, FitSpace, fit_adam
+from diffcloud.fit import AdamSettings, CmaEsSettings, RandomSearchSettings, fit_adam, solve
 from diffcloud.fit.batches import batch_losses, without_diverged
+from diffcloud.fit.solvers import SOLVER_NAMES
 from tests.evaluation.bowls import SPACE, Bowl
 
 
@@ -40,44 +41,12 @@ def summary_of(outcome):
     }
 
 
-SEARCHES = [random_search, cma_es]
-
-
-@pytest.mark.parametrize("search", SEARCHES)
-class TestSearch:
-    def test_spends_its_budget_and_no_more(self, search):
-        for simulations in (1, 5, 23):
-            assert search(Bowl(), SPACE, simulations=simulations).simulations == simulations
-
-    def test_improves_with_its_budget_and_stays_within_the_bounds(self, search):
-        found = [search(Bowl(), SPACE, simulations=n, seed=3) for n in (6, 120)]
-        assert loss_of(Bowl(), found[1].values) < loss_of(Bowl(), found[0].values)
-        assert loss_of(Bowl(), found[1].values) < 0.2 * loss_of(Bowl(), middle(SPACE).values)
-        assert all(0.1 <= value <= 10 for one in found for value in one.values.values())
-
-    def test_the_same_seed_gives_the_same_values(self, search):
-        first, second, other = (search(Bowl(), SPACE, simulations=12, seed=seed).values for seed in (0, 0, 1))
-        assert first == second != other
-
-    def test_stops_below_the_threshold(self, search):
-        assert search(Bowl(), SPACE, simulations=500, threshold=1e3).simulations <= 16
-
-    def test_goes_on_where_some_diverge_and_fails_where_all_do(self, search):
-        found = search(Bowl(diverges_above=4.0), SPACE, simulations=40)
-        assert max(found.values.values()) <= 4.0
-        with pytest.raises(DivergedError, match=r"all \d parameter sets"):
-            search(Bowl(diverges_above=0.0), SPACE, simulations=8)
-
-    def test_one_variable_with_a_known_other(self, search):
-        space = FitSpace.build(["stretch"], fixed={"mass": 2.0})
-        found = search(Bowl(), space, simulations=60)
-        assert set(found.values) == {"stretch"}
-        assert found.values["stretch"] == pytest.approx(0.7, rel=0.2)
-
-
-def test_cma_es_beats_random_search_in_a_bowl():
-    losses = {search: loss_of(Bowl(), search(Bowl(), SPACE, simulations=100).values) for search in SEARCHES}
-    assert losses[cma_es] < 0.1 * losses[random_search]
+@pytest.mark.parametrize("settings", [RandomSearchSettings(23), CmaEsSettings(23)])
+def test_searches_are_the_solvers_of_fits(settings):
+    told, found = searched(Bowl(), SPACE, settings), solve(Bowl(), SPACE, settings)
+    assert told.method == SOLVER_NAMES[type(settings)]
+    assert (told.values, told.simulations, told.gradients) == (found.values, 23, False)
+    assert set(told.seconds) == {"optimisation"}
 
 
 def test_one_start_is_the_first_of_many():
@@ -98,7 +67,15 @@ def test_one_start_is_the_first_of_many():
     assert first_start(summary_of(elsewhere), SPACE) is None
 
 
-def test_an_interrupted_start_is_no_result(monkeypatch):
+@pytest.mark.parametrize(
+    "rival",
+    [
+        lambda bowl: single_start(bowl, SPACE, AdamSettings(iterations=10)),
+        lambda bowl: searched(bowl, SPACE, RandomSearchSettings()),
+        lambda bowl: searched(bowl, SPACE, CmaEsSettings()),
+    ],
+)
+def test_an_interrupted_rival_is_no_result(rival, monkeypatch):
     def interrupt(self, parameters, offset=None):
         self.calls += 1
         if self.calls == 3:
@@ -108,7 +85,13 @@ def test_an_interrupted_start_is_no_result(monkeypatch):
     real = Bowl.__call__
     monkeypatch.setattr(Bowl, "__call__", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        single_start(Bowl(), SPACE, AdamSettings(iterations=10))
+        rival(Bowl())
+
+
+@pytest.mark.parametrize(("solver", "gradients"), [("gauss_newton", True), ("adam", True), ("random_search", False)])
+def test_a_fit_by_a_search_had_no_gradients(solver, gradients):
+    summary = {"solver": solver, "parameters": {"mass": {"value": 1.0}}, "evaluations": 3, "seconds": 0.5}
+    assert fitted(summary).gradients is gradients
 
 
 def test_batches_without_the_diverged_are_the_single_ones():

@@ -12,7 +12,7 @@ import torch
 from diffcloud.clouds import NeighbourIndex, chamfer
 from diffcloud.evaluation import ComparisonSettings, EpisodeMeter, Estimate, Gap, compare_episode, loss_landscape
 from diffcloud.evaluation.metrics import success_threshold
-from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
+from diffcloud.fit import AdamSettings, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
 from diffcloud.fit.result import describe_fit
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import built_in, make_scenario
@@ -150,6 +150,18 @@ class TestEpisode:
         assert "seconds" not in text
         assert found.record["identifiability"]["parameters"] == ["stretch", "mass"]
         assert np.array(found.record["landscape"]["loss"]).shape == (3, 3)
+
+    def test_a_fit_by_a_search_is_compared_as_others_are(self, scenario, episode):
+        objective, space = Objective(scenario, [episode], seed=1000), FitSpace.build(["stretch", "mass"])
+        settings = RandomSearchSettings(simulations=6, seed=1000)
+        summary = describe_fit(objective, space, settings, solve(objective, space, settings), episodes=["e"]).summary
+        chosen = ComparisonSettings(draws=1, seed=1000, identifiability=False, landscape_size=2)
+        record = compare_episode(scenario, episode, summary, name="e", settings=chosen).record
+        rows = {row["method"]: row for row in record["methods"]}
+        assert [row["simulations"] for row in rows.values()] == [6, 6, 0, 6, 6]
+        assert not rows["diffcloud"]["gradients"]
+        assert rows["diffcloud"]["values"] == rows["random_search"]["values"]  # the same code, points and seed
+        assert len(record["landscape"]["paths"]) == record["starts"] == 1
 
     def test_a_rival_that_fails_leaves_a_gap(self, scenario, episode, summary, monkeypatch):
         real = Objective.__call__

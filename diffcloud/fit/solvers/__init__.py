@@ -1,27 +1,50 @@
-"""Solvers: from an objective and a space of bounded variables to the best place found. One file each."""
+"""Solvers: from an objective and a space of bounded variables to the best place found. One file each.
+
+`gauss_newton` and `adam` descend along derivatives; `cma_es` and `random_search` are searches, which ask for losses alone.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.solvers.adam import AdamSettings, fit_adam
+from diffcloud.fit.solvers.cma_es import CmaEsSettings, fit_cma_es
 from diffcloud.fit.solvers.gauss_newton import GaussNewtonSettings, fit_gauss_newton
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
+from diffcloud.fit.solvers.random_search import RandomSearchSettings, fit_random_search
+from diffcloud.fit.solvers.search import SearchSettings
 
-Settings = AdamSettings | GaussNewtonSettings
+Settings = GaussNewtonSettings | AdamSettings | CmaEsSettings | RandomSearchSettings
+
+SOLVERS: Mapping[str, type[Settings]] = {
+    "gauss_newton": GaussNewtonSettings,
+    "adam": AdamSettings,
+    "cma_es": CmaEsSettings,
+    "random_search": RandomSearchSettings,
+}
+"""Name -> type of the settings."""
+SOLVER_NAMES: Mapping[type[Settings], str] = {kind: name for name, kind in SOLVERS.items()}
+"""Type of the settings -> name."""
 
 __all__ = [
+    "SOLVERS",
+    "SOLVER_NAMES",
     "AdamSettings",
+    "CmaEsSettings",
     "FitHistory",
     "FitOutcome",
     "GaussNewtonSettings",
     "Progress",
+    "RandomSearchSettings",
+    "SearchSettings",
     "Settings",
     "StopReason",
     "fit_adam",
+    "fit_cma_es",
     "fit_gauss_newton",
+    "fit_random_search",
     "solve",
 ]
 
@@ -33,9 +56,18 @@ def solve(
     *,
     progress: Callable[[Progress], None] | None = None,
 ) -> FitOutcome:
-    """Minimise by the solver whose settings these are."""
+    """Minimise by the solver whose settings these are. Ctrl-C ends the fit and keeps the best so far.
+
+    Raises:
+        DivergedError: every start, or every candidate of a search, diverged.
+        KeyboardInterrupt: interrupted before the first loss.
+    """
     match settings:
-        case AdamSettings():
-            return fit_adam(objective, space, settings, progress=progress)
         case GaussNewtonSettings():
             return fit_gauss_newton(objective, space, settings, progress=progress)
+        case AdamSettings():
+            return fit_adam(objective, space, settings, progress=progress)
+        case CmaEsSettings():
+            return fit_cma_es(objective, space, settings, progress=progress)
+        case RandomSearchSettings():
+            return fit_random_search(objective, space, settings, progress=progress)

@@ -8,25 +8,28 @@ from typing import Literal
 
 from torch import Tensor
 
-StopReason = Literal["converged", "rough", "iterations", "threshold", "interrupted"]
-"""`converged`: the best start cannot get lower by more than a thousandth. `rough`: steps along its slope lower the loss no
-more. `threshold`: low enough. `iterations`: none of them yet."""
+StopReason = Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
+"""`converged`: the best start cannot get lower by more than a thousandth, or the candidates of a search lie together.
+`rough`: steps along its slope lower the loss no more. `threshold`: low enough. `iterations`, or `simulations` of a search:
+none of them yet."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """What a progress display gets after each iteration."""
+    """What a progress display gets after each iteration, which is a batch of a search."""
 
     iteration: int
     loss: float
     best: float
     values: Mapping[str, float]
     """Of the best so far."""
+    simulations: int | None = None
+    """So far; of a search, whose budget they are."""
 
 
 @dataclass
 class FitHistory:
-    """What happened; N iterations, B starts, k variables."""
+    """What happened; N iterations, B starts (1 of a search: its lowest so far), k variables."""
 
     names: tuple[str, ...]
     losses: list[Tensor] = field(default_factory=list)
@@ -34,7 +37,7 @@ class FitHistory:
     values: list[Tensor] = field(default_factory=list)
     """N of [B, k]"""
     gradients: list[Tensor] = field(default_factory=list)
-    """N of [B, k], by the unbounded variables."""
+    """N of [B, k], by the unbounded variables; none of a search."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +47,14 @@ class FitOutcome:
     values: dict[str, float]
     loss: float
     start: dict[str, float]
-    """Initial values of the first start that did not diverge at once."""
+    """Initial values of the first start that did not diverge at once, or the best of a search's first batch."""
     loss_start: float
     """Its loss before the first update."""
     best_start: int
     iterations: int
-    """Updates done."""
+    """Updates done, or batches of a search after the first."""
     evaluations: int
-    """Simulations run, with their gradients."""
+    """Simulations run, with their gradients but for searches."""
     stop_reason: StopReason
     seconds: float
     history: FitHistory
