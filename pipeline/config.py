@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -11,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
-from diffcloud.fit import AdamSettings, GaussNewtonSettings
+from diffcloud.fit.solvers import SOLVERS, Settings
 from diffcloud.io.raw_episodes import ScenePlacement
 from diffcloud.regressors.settings import Loss, Profile, Target
 from diffcloud.scene.scenarios import Scenario
@@ -141,7 +142,8 @@ class SimulateConfig(Section):
 
 SMOOTHING = 0.5
 """Default of adam's."""
-_OF_ADAM = ("learning_rate", "patience", "smoothing", "resample")
+_OF_SOLVERS = ("iterations", "starts", "screen", "learning_rate", "patience", "smoothing", "resample", "simulations")
+"""Options that not every solver has: one does if its settings have a field of that name."""
 
 
 class FitConfig(Section):
@@ -150,15 +152,15 @@ class FitConfig(Section):
     parameters: Annotated[list[str], Field(min_length=1)] = ["stretch", "mass"]
     bounds: dict[str, Bounds] = {}
     fixed: dict[str, float] = {}
-    solver: Literal["gauss_newton", "adam"] = "gauss_newton"
-    """`adam` is the paper's."""
+    solver: Literal["gauss_newton", "adam", "cma_es", "random_search"] = "gauss_newton"
+    """`adam` is the paper's; `cma_es` and `random_search` need no derivatives."""
     iterations: Count | None = None
-    """Steps at most; by default 20 of gauss_newton, 50 of adam."""
+    """Of gauss_newton and adam: steps at most; by default 20 and 50."""
     starts: Count | None = None
-    """Descents from as many places; by default 3 of gauss_newton, 1 of adam."""
+    """Of gauss_newton and adam: descents from as many places; by default 3 and 1."""
     screen: Annotated[int, Field(ge=0)] | None = None
-    """Candidates simulated once to choose the starts from; by default 24 of gauss_newton, none of adam, whose further
-    starts are then spread over the box."""
+    """Of gauss_newton and adam: candidates simulated once to choose the starts from; by default 24 of gauss_newton, none of
+    adam, whose further starts are then spread over the box."""
     learning_rate: Positive | None = None
     """Of adam; the scenario's own if not given."""
     patience: Annotated[int, Field(ge=0)] | None = None
@@ -169,6 +171,8 @@ class FitConfig(Section):
     averaged; 0: the plain gradient, as the paper has it; by default 0.5."""
     resample: bool | None = None
     """Of adam: new points in each iteration; by default the same ones."""
+    simulations: Count | None = None
+    """Of cma_es and random_search: as many at most; by default 200."""
     threshold: NonNegative | None = None
     points: Count | None = None
     frames: list[int] | None = None
@@ -182,29 +186,33 @@ class FitConfig(Section):
     @classmethod
     def _is_of_now(cls, data: Any) -> Any:
         if isinstance(data, dict) and "optimizer" in data:
-            raise ValueError("optimizer: now `solver`, gauss_newton or adam")
+            raise ValueError(f"optimizer: now `solver`, one of {', '.join(SOLVERS)}")
         return data
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         for name, pair in self.bounds.items():
             _check_bounds(f"bounds.{name}", pair)
-        others = [name for name in _OF_ADAM if getattr(self, name) is not None]
-        if self.solver != "adam" and others:
-            raise ValueError(f"{', '.join(others)}: of solver adam; leave out, or choose that solver")
+        if foreign := [name for name in self._solver_options() if self.solver not in _solvers_with(name)]:
+            told = "; ".join(f"{name}: of solver {' or '.join(_solvers_with(name))}" for name in foreign)
+            raise ValueError(f"{told}; not of {self.solver}: leave out, or choose that solver")
         return self
 
-    def solver_settings(self, scenario: Scenario) -> AdamSettings | GaussNewtonSettings:
+    def solver_settings(self, scenario: Scenario) -> Settings:
         """Of the solver, with what the scenario says where nothing is given."""
-        shared = {"iterations": self.iterations, "starts": self.starts, "screen": self.screen}
-        given: dict[str, Any] = {name: value for name, value in shared.items() if value is not None}
+        given: dict[str, Any] = {}
+        if self.solver == "adam":
+            given |= {"learning_rate": scenario.learning_rate, "patience": 10, "smoothing": SMOOTHING}
         given |= {"seed": self.seed, "threshold": scenario.threshold if self.threshold is None else self.threshold}
-        if self.solver == "gauss_newton":
-            return GaussNewtonSettings(**given)
-        own = {name: value for name in _OF_ADAM if (value := getattr(self, name)) is not None}
-        return AdamSettings(
-            **{"learning_rate": scenario.learning_rate, "patience": 10, "smoothing": SMOOTHING} | own | given
-        )
+        return SOLVERS[self.solver](**given | self._solver_options())
+
+    def _solver_options(self) -> dict[str, Any]:
+        """Those that were given."""
+        return {name: value for name in _OF_SOLVERS if (value := getattr(self, name)) is not None}
+
+
+def _solvers_with(option: str) -> list[str]:
+    return [name for name, kind in SOLVERS.items() if option in {field.name for field in fields(kind)}]
 
 
 class TrainConfig(Section):

@@ -15,6 +15,7 @@ from rich.table import Table
 from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.fit import FitSpace, Objective, Progress, read_fit, solve, write_fit
 from diffcloud.fit.result import describe_fit
+from diffcloud.fit.solvers import SearchSettings
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
@@ -48,8 +49,14 @@ def fit(
     parameters: Annotated[str | None, typer.Option(help="Comma-separated, e.g. stretch,mass,bending.")] = None,
     fix: Annotated[list[str] | None, typer.Option(help="PARAMETER=VALUE that is known, e.g. mass=1.2.")] = None,
     bound: Annotated[list[str] | None, typer.Option(help="PARAMETER=LOW:HIGH, repeatable.")] = None,
-    solver: Annotated[str | None, typer.Option(help="gauss_newton (default), or adam, the paper's.")] = None,
+    solver: Annotated[
+        str | None,
+        typer.Option(help="gauss_newton (default); adam, the paper's; cma_es or random_search, without derivatives."),
+    ] = None,
     iterations: Annotated[int | None, typer.Option(help="Steps at most. Default: 20 of gauss_newton, 50 of adam.")] = None,
+    simulations: Annotated[
+        int | None, typer.Option(help="Of cma_es and random_search: as many at most. Default: 200.")
+    ] = None,
     starts: Annotated[
         int | None, typer.Option(help="Descents from as many places. Default: 3 of gauss_newton, 1 of adam.")
     ] = None,
@@ -92,6 +99,7 @@ def fit(
         bounds=_bounds(bound) or None,
         solver=solver,
         iterations=iterations,
+        simulations=simulations,
         learning_rate=learning_rate,
         starts=starts,
         screen=screen,
@@ -262,8 +270,11 @@ class FitJob:
         def show_progress(progress: Progress) -> None:
             check_interrupt()
             values = "  ".join(f"{key} {value:.3g}" for key, value in progress.values.items())
-            done = progress.iteration / max(settings.iterations, 1)
-            tell(done, f"{progress.iteration} of at most {settings.iterations}  best {progress.best:.3e}  {values}")
+            if isinstance(settings, SearchSettings):
+                done, most = progress.simulations or 0, settings.simulations
+            else:
+                done, most = progress.iteration, settings.iterations
+            tell(done / max(most, 1), f"{done} of at most {most}  best {progress.best:.3e}  {values}")
 
         objective, space = self.objective(), self.space
         settings = replace(self.settings.solver_settings(self.scenario), init=self.init)

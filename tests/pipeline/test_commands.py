@@ -81,6 +81,26 @@ def test_fit_then_replay_and_measure(work):
         np.testing.assert_allclose(replay["nodes"], fitted["nodes"], atol=1e-12)
 
 
+@pytest.mark.parametrize("solver", ["cma_es", "random_search"])
+def test_a_fit_by_a_search(work, solver):
+    command = ("fit", "--scenario", "small.yaml", "--out", "fits", "--solver", solver, "--simulations", 12)
+    done = run(*command, "--init", "stretch=2,mass=1", "e1.npz", cwd=work)
+    summary = json.loads((work / "fits" / "e1.json").read_text())
+    assert (summary["solver"], summary["evaluations"], summary["stop_reason"]) == (solver, 12, "simulations")
+    assert summary["start"] == {"stretch": 2.0, "mass": 1.0}
+    assert done.result["fits"]["e1"]["loss"] == summary["loss"] <= summary["loss_start"]
+    for options, message in (
+        (
+            ("--starts", 2, "--iterations", 3),
+            "iterations: of solver gauss_newton or adam; starts: of solver gauss_newton or",
+        ),
+        (("--screen", 3), f"screen: of solver gauss_newton or adam; not of {solver}: leave out"),
+        (("--patience", 3), "patience: of solver adam"),
+        (("--simulations", 0), "simulations"),
+    ):
+        assert message in run(*command, *options, "e1.npz", cwd=work, code=1).errors
+
+
 def test_joint_fit_gives_one_result(work):
     write_episode(work / "e2.npz", clouds_of(small_lift(), stretch=1.4, mass=1.0))
     run("fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 1, "--joint", "e1.npz", "e2.npz", cwd=work)
@@ -331,7 +351,8 @@ class TestBadInput:
             ({"fits": {}}, "fits: unknown or unsupported field"),
             ({"fit": {"solver": "lbfgs"}}, "fit.solver"),
             ({"fit": {"optimizer": "adam"}}, "optimizer: now `solver`"),
-            ({"fit": {"smoothing": 0.5}}, "smoothing: of solver adam"),
+            ({"fit": {"smoothing": 0.5}}, "smoothing: of solver adam; not of gauss_newton"),
+            ({"fit": {"simulations": 9}}, "simulations: of solver cma_es or random_search; not of gauss_newton"),
         ],
     )
     def test_parameter_files(self, work, params, message):
