@@ -8,15 +8,19 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.markup import escape
 
 from diffcloud.errors import ConfigError
 from diffcloud.hardware.realsense import play_recordings
 from diffcloud.io.depth_folders import depth_folders
 from diffcloud.io.episodes import write_episode
+from diffcloud.io.files import together
 from diffcloud.io.grippers import named_files
-from diffcloud.io.imports import cloud_folder, release_episodes
+from diffcloud.io.imports import RELEASE_FOLDERS, cloud_folder, release_episodes
+from diffcloud.io.published import RECORDED_START_M, read_trajectories, recorded_episode
 from diffcloud.io.recordings import Recording, read_joint_log, write_recording
 from diffcloud.io.ros.joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
 from diffcloud.io.ros.recording import ros_recording
@@ -30,13 +34,27 @@ app = typer.Typer(no_args_is_help=True, help="Turn recordings of others into epi
 def release(
     folder: Annotated[Path, typer.Argument(help="Holds lift_real_pcls/, fold_real_pcls/, band_sim_pcls/, hang_sim_pcls/.")],
     out: Annotated[Path, typer.Option(help="Folder; episodes go to OUT/release_<lift|fold|band|hang>/.")],
+    trajectories: Annotated[
+        Path | None,
+        typer.Option(
+            help="Holds lift_traj.npy and fold_traj.npy, the gripper's tracks. Adds OUT/recorded_<lift|fold>/: the same "
+            "recordings in metres, with the gripper."
+        ),
+    ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Import the data published with the paper."""
+    tracks = {} if trajectories is None else _tracks(folder, trajectories)
     written: dict[str, list[str]] = {}
-    for scenario, name, episode in release_episodes(folder):
-        write_episode(out / scenario / f"{name}.npz", episode)
-        written.setdefault(scenario, []).append(name)
+    with together():
+        for scenario, name, episode in release_episodes(folder):
+            kind = scenario.removeprefix("release_")
+            made = {scenario: episode}
+            if kind in tracks:
+                made[f"recorded_{kind}"] = recorded_episode(kind, name, episode, tracks[kind])
+            for folder_name, one in made.items():
+                write_episode(out / folder_name / f"{name}.npz", one)
+                written.setdefault(folder_name, []).append(name)
     for scenario, names in written.items():
         errors.print(f"{scenario}: {len(names)} episodes in {out / scenario}")
     finish({"out": str(out), "episodes": written}, json)
@@ -127,6 +145,18 @@ def recording(
     rows = 0 if found.robot is None else len(found.robot.times)
     result = {"out": str(out), "frames": frames, "robot_rows": rows, "source": found.source, "warnings": warnings}
     finish(result, json)
+
+
+def _tracks(folder: Path, trajectories: Path) -> dict[str, NDArray[np.float64]]:
+    """The tracks of those motions whose recordings are there."""
+    folders = {kind: RELEASE_FOLDERS[kind][0] for kind in RECORDED_START_M}
+    kinds = tuple(kind for kind, name in folders.items() if (folder / name).is_dir())
+    if not kinds:
+        raise ConfigError(
+            f"{folder} holds neither {' nor '.join(folders.values())}, to which the trajectories belong; give the folder "
+            "that does, or leave --trajectories out."
+        )
+    return read_trajectories(trajectories, kinds)
 
 
 def _named(sources: list[Path]) -> dict[str, Path]:

@@ -19,8 +19,8 @@ ScenarioName = Annotated[
     str | None,
     typer.Option(
         "--scenario",
-        help="lift, fold, band_stretch, vest_hang, shake, release_lift, release_fold, release_hang, release_band, a YAML "
-        f"file, or the name of one in {OWN_SCENARIOS}.",
+        help="lift, fold, band_stretch, vest_hang, shake, recorded_lift, recorded_fold, release_lift, release_fold, "
+        f"release_hang, release_band, a YAML file, or the name of one in {OWN_SCENARIOS}.",
     ),
 ]
 SceneFile = Annotated[Path | None, typer.Option("--scene", help="ARCSim scene JSON.")]

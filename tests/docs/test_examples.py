@@ -97,6 +97,7 @@ def folder(tmp_path, monkeypatch):
     if RELEASE is not None:
         (tmp_path / "PATH").mkdir()
         (tmp_path / DATA).symlink_to(RELEASE)
+        (tmp_path / "PATH" / "trajs").symlink_to(Path(RELEASE).parent / "trajs")
     return tmp_path
 
 

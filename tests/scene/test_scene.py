@@ -198,7 +198,8 @@ def test_damaged_scene_files(folder):
 class TestScenarios:
     def test_names(self):
         assert SCENARIO_NAMES[:5] == ("lift", "fold", "band_stretch", "vest_hang", "shake")
-        assert SCENARIO_NAMES[5:] == ("release_lift", "release_fold", "release_hang", "release_band")
+        assert SCENARIO_NAMES[5:7] == ("recorded_lift", "recorded_fold")
+        assert SCENARIO_NAMES[7:] == ("release_lift", "release_fold", "release_hang", "release_band")
         with pytest.raises(ConfigError, match=r"Unknown scenario 'lfit'. Did you mean 'lift'.* Allowed: .*lift"):
             load_scenario("lfit")
         with pytest.raises(ConfigError, match="needs --scene"):

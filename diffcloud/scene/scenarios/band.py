@@ -9,10 +9,11 @@ import numpy as np
 from pydantic import Field
 
 from diffcloud.errors import SceneError
+from diffcloud.io.published import RELEASE_UNIT_M
 from diffcloud.mesh.shapes import box_surface, cylinder_surface, loop_cloth
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios.options import ScenarioOptions, assemble
-from diffcloud.scene.scenarios.release import PAPER_THRESHOLD, RELEASE_UNIT_M
+from diffcloud.scene.scenarios.release import PAPER_THRESHOLD
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.scene.schema import NonNegative, Positive
 

@@ -12,6 +12,7 @@ from diffcloud.errors import ConfigError, SceneError, unknown_name
 from diffcloud.scene.load import load_scene
 from diffcloud.scene.scenarios.band import BAND_STRETCH, BandScenario, band_scenario
 from diffcloud.scene.scenarios.grid import FOLD, LIFT, SHAKE, GridScenario, grid_scenario
+from diffcloud.scene.scenarios.recorded import RECORDED
 from diffcloud.scene.scenarios.release import RELEASE, release_scenario
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.scene.scenarios.vest import VEST_HANG, VestScenario, vest_scenario
@@ -19,7 +20,8 @@ from diffcloud.scene.schema import explain
 
 Options = GridScenario | BandScenario | VestScenario
 
-_BUILT_IN: dict[str, Options] = {options.name: options for options in (LIFT, FOLD, BAND_STRETCH, VEST_HANG, SHAKE)}
+_ALL: tuple[Options, ...] = (LIFT, FOLD, BAND_STRETCH, VEST_HANG, SHAKE, *RECORDED)
+_BUILT_IN: dict[str, Options] = {options.name: options for options in _ALL}
 SCENARIO_NAMES = (*_BUILT_IN, *RELEASE)
 
 
@@ -72,7 +74,7 @@ def make_scenario(options: Options) -> Scenario:
 
 
 @overload
-def built_in(name: Literal["lift", "fold", "shake"]) -> GridScenario: ...
+def built_in(name: Literal["lift", "fold", "shake", "recorded_lift", "recorded_fold"]) -> GridScenario: ...
 @overload
 def built_in(name: Literal["band_stretch"]) -> BandScenario: ...
 @overload

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from diffcloud.errors import SceneError
+from diffcloud.io.published import RELEASE_UNIT_M
 from diffcloud.scene.load import load_scene
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.sim.surrounding import ReferenceContact
 
 PAPER_THRESHOLD = 5e-4
 """Stop below this one-sided Chamfer loss, in squared length units of the release (paper, section IV-F)."""
-RELEASE_UNIT_M = 0.35
-"""One length unit of the published recordings [m]."""
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,10 @@ import numpy as np
 from pydantic import Field
 
 from diffcloud.errors import SceneError
+from diffcloud.io.published import RELEASE_UNIT_M
 from diffcloud.mesh.shapes import cylinder_surface, vest_cloth, vest_shoulder
 from diffcloud.scene.scenarios.options import ScenarioOptions, assemble
-from diffcloud.scene.scenarios.release import PAPER_THRESHOLD, RELEASE_UNIT_M
+from diffcloud.scene.scenarios.release import PAPER_THRESHOLD
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.scene.schema import NonNegative, Positive
 

@@ -1,0 +1,110 @@
+"""The gripper's tracks published with the paper, and its real recordings as recordings: metres, seconds, and that track.
+
+The published scenes look at one frame and move their handle along a path of their own. Here a lift or fold is what was
+recorded: clouds in metres, of a 10 Hz motion whose gripper was where the published track says. The track is in the robot's
+frame. The clouds' frame is turned against it by 90° about the vertical; where it lies was found from the clouds' highest
+points, which go along with the track.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import EpisodeError
+from diffcloud.io.episodes import Episode
+from diffcloud.io.pickles import load_npy
+
+RELEASE_UNIT_M = 0.35
+"""One length unit of the published recordings [m]."""
+RECORDED_RATE_HZ = 10.0
+"""Of the robot's commands and of the clouds (paper, section IV-D): row j of a track is where the gripper was in cloud j."""
+RECORDED_START_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(
+    {"lift": (0.0, 0.105, 0.0), "fold": (0.0, -0.30, -0.033)}
+)
+"""Kind of motion -> x and y in the clouds' frame where its gripper starts, and what to add to the robot's z [m]."""
+_FARTHEST_M = 5.0
+"""No arm of one piece reaches farther: such numbers are millimetres."""
+
+
+def read_trajectories(folder: Path, kinds: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:
+    """The published tracks of these kinds of motion: kind -> [T, 3] positions in the robot's frame, z up [m].
+
+    Args:
+        folder: holds `<kind>_traj.npy`, plain arrays [T, 3], one row a frame. They are never unpickled.
+        kinds: keys of `RECORDED_START_M`.
+
+    Raises:
+        EpisodeError: a file that is missing, damaged, of another shape, not finite, or not in metres.
+    """
+    return {kind: _read_track(Path(folder) / f"{kind}_traj.npy") for kind in kinds}
+
+
+def recorded_episode(kind: str, name: str, published: Episode, track: NDArray[np.float64]) -> Episode:
+    """A published recording in metres and seconds, with its gripper.
+
+    Args:
+        kind: key of `RECORDED_START_M`.
+        name: of the recording, for errors.
+        published: T frames in units of the release.
+        track: [T, 3] in the robot's frame [m].
+
+    Returns:
+        Points [m] and the gripper's positions [T, 1, 3] [m] in the clouds' frame, times from 0 [s]. The published
+        predictions are left out: they are multipliers of another scene.
+
+    Raises:
+        EpisodeError: the track has another number of rows than the recording has frames.
+    """
+    if len(track) != published.frame_count:
+        raise EpisodeError(
+            f"{kind}_traj.npy has {len(track)} rows, but {name} has {published.frame_count} clouds; a track has one row a "
+            "cloud."
+        )
+    meta = {name: value for name, value in published.meta.items() if name != "predictions"}
+    return replace(
+        published,
+        points=(RELEASE_UNIT_M * published.points.astype(np.float64)).astype(np.float32),
+        times=np.arange(published.frame_count) / RECORDED_RATE_HZ,
+        gripper=in_clouds_frame(kind, track)[:, None],
+        meta={**meta, "scenario": f"recorded_{kind}"},
+    )
+
+
+def in_clouds_frame(kind: str, track: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A track [T, 3] in the robot's frame [m] as one [T, 3] in the clouds' frame [m], by a rotation and a shift."""
+    way = track - track[0]
+    x, y, lift = RECORDED_START_M[kind]
+    return np.stack([x + way[:, 1], y - way[:, 0], track[:, 2] + lift], axis=1)
+
+
+def _read_track(path: Path) -> NDArray[np.float64]:
+    if not path.is_file():
+        raise EpisodeError(
+            f"No such track: {path}. --trajectories takes the folder of the published data that holds lift_traj.npy and "
+            "fold_traj.npy."
+        )
+    track = load_npy(path)
+    if not isinstance(track, np.ndarray):
+        raise EpisodeError(
+            f"{path} holds a pickled {type(track).__name__}; a track is a plain array [frames, 3] of metres."
+        )
+    if track.dtype.kind not in "fiu":
+        raise EpisodeError(f"{path} holds {track.dtype} values; a track holds numbers.")
+    if track.ndim != 2 or track.shape[1] != 3 or len(track) < 2:
+        raise EpisodeError(f"{path} has shape {list(track.shape)}; a track has shape [frames, 3] with two frames or more.")
+    track = track.astype(np.float64)
+    bad = np.flatnonzero(~np.isfinite(track).all(axis=1))
+    if len(bad):
+        raise EpisodeError(f"{path}: row {bad[0]} is {track[bad[0]].tolist()}; a track holds finite positions in metres.")
+    farthest = float(np.abs(track).max())
+    if farthest > _FARTHEST_M:
+        raise EpisodeError(
+            f"{path} holds a coordinate of {farthest:.4g}; positions are metres, at most {_FARTHEST_M:g} from the base."
+        )
+    return track
