@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
+from diffcloud.fit.pose import parse_priors
 from diffcloud.fit.solvers import SOLVERS, Settings
 from diffcloud.io.raw_episodes import ScenePlacement
 from diffcloud.regressors.settings import Loss, Profile, Target
@@ -177,7 +178,11 @@ class FitConfig(Section):
     points: Count | None = None
     frames: list[int] | None = None
     seed: int = 0
-    offset: bool = False
+    paper: bool = False
+    """The published measure: one-sided, squared, at the scenario's loss frames, without a pose, down to its threshold."""
+    nuisance: str | None = None
+    """What of the pose is fitted along, and how far each may well be off: "x=0.1m,y=0.1m,yaw=30deg" if not given, or
+    "none". Variables: `fit.pose.NUISANCE`."""
     joint: bool = False
     workers: Count = 1
     """Processes, one fit each; they change nothing but the time."""
@@ -187,23 +192,32 @@ class FitConfig(Section):
     def _is_of_now(cls, data: Any) -> Any:
         if isinstance(data, dict) and "optimizer" in data:
             raise ValueError(f"optimizer: now `solver`, one of {', '.join(SOLVERS)}")
+        if isinstance(data, dict) and "offset" in data:
+            raise ValueError("offset: now `nuisance`, such as x=0.1m,y=0.1m,yaw=30deg, or none")
         return data
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         for name, pair in self.bounds.items():
             _check_bounds(f"bounds.{name}", pair)
+        parse_priors(self.nuisance or "none")
         if foreign := [name for name in self._solver_options() if self.solver not in _solvers_with(name)]:
             told = "; ".join(f"{name}: of solver {' or '.join(_solvers_with(name))}" for name in foreign)
             raise ValueError(f"{told}; not of {self.solver}: leave out, or choose that solver")
         return self
+
+    def measure(self) -> dict[str, Any]:
+        """Keyword arguments of `Objective`."""
+        priors = None if self.nuisance is None else parse_priors(self.nuisance)
+        return {"paper": self.paper, "nuisance": priors, "frames": self.frames, "points": self.points, "seed": self.seed}
 
     def solver_settings(self, scenario: Scenario) -> Settings:
         """Of the solver, with what the scenario says where nothing is given."""
         given: dict[str, Any] = {}
         if self.solver == "adam":
             given |= {"learning_rate": scenario.learning_rate, "patience": 10, "smoothing": SMOOTHING}
-        given |= {"seed": self.seed, "threshold": scenario.threshold if self.threshold is None else self.threshold}
+        own = scenario.threshold if self.paper else 0.0
+        given |= {"seed": self.seed, "threshold": own if self.threshold is None else self.threshold}
         return SOLVERS[self.solver](**given | self._solver_options())
 
     def _solver_options(self) -> dict[str, Any]:

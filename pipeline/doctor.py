@@ -57,6 +57,7 @@ def _compile() -> None:
         ("linearised steps", "diffcloud.sim.warm:linearised"),
         ("implicit steps", "diffcloud.sim.warm:implicit"),
         ("nearest neighbours", "diffcloud.clouds.neighbours:compile_neighbours"),
+        ("nearest places", "diffcloud.clouds.surface:compile_surface"),
     ]
     with progress_bar("compiling", len(work)) as update:
         compile_all(update, work, processes=cores())

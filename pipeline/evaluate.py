@@ -18,7 +18,8 @@ from diffcloud.evaluation.markdown import comparison_page
 from diffcloud.evaluation.summary import PREDICTORS, label, sentences, tables
 from diffcloud.evaluation.summary import metrics as summary_metrics
 from diffcloud.fit import Objective, read_fit
-from diffcloud.fit.parameters import NUISANCE
+from diffcloud.fit.pose import parse_priors
+from diffcloud.fit.result import describe_recording
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import claimed, files_in, together, write_json, write_text
 from diffcloud.sim.properties import check_values
@@ -44,23 +45,27 @@ def loss(
     points: Annotated[int | None, typer.Option(help="Sampled per frame.")] = None,
     frame: Annotated[list[int] | None, typer.Option(help="Loss frame, repeatable.")] = None,
     seed: Annotated[int, typer.Option(help="Of the sampled points; fits use 0.")] = 0,
+    paper: Annotated[bool, typer.Option("--paper", help="The published measure: one-sided, one frame, no pose.")] = False,
+    nuisance: Annotated[str | None, typer.Option(help="As of `diffcloud fit`.")] = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
-    """One-sided Chamfer loss of one parameter set on one episode, with the metric and points that a fit uses."""
+    """Loss of one parameter set on one episode, by the measure and with the points of a fit, and the pose found."""
     use_threads(threads)
     chosen = choose_scenario(scenario, scene)
-    objective = Objective(chosen, [read_episode(episode)], points=points, frames=frame, seed=seed)
+    priors = None if nuisance is None else parse_priors(nuisance)
+    recorded = [read_episode(episode)]
+    objective = Objective(chosen, recorded, points=points, frames=frame, seed=seed, paper=paper, nuisance=priors)
     values = assignments(set_, "--set")
-    check_values({name: value for name, value in values.items() if name not in NUISANCE}, "--set")
+    check_values(values, "--set")
     chosen.check_parameters(values)
     tensors = {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
-    nuisance = {name: tensors.pop(name) for name in list(tensors) if name in NUISANCE}
     with torch.no_grad():
-        found = float(objective(tensors, nuisance)[0])
+        found = describe_recording(objective, objective.simulate_to_loss(tensors))
     if not json:
-        output.print(f"{found:.6e}")
-    finish({"loss": found, "parameters": values, "length_unit_m": chosen.length_unit_m}, json)
+        shifts = ", ".join(f"{name} {entry['value']:.4g} {entry['unit']}" for name, entry in found["nuisance"].items())
+        output.print(f"{found['loss']:.6e}  RMS {found['rms_mm']:.2f} mm" + (f"  at {shifts}" if shifts else ""))
+    finish({**found, "parameters": values, "length_unit_m": chosen.length_unit_m}, json)
 
 
 @app.callback(invoke_without_command=True)
@@ -220,8 +225,10 @@ def _metrics(fits: pd.DataFrame, predictions: list[dict[str, Any]]) -> dict[str,
             "loss_start": float(group["loss_start"].mean()),
             "loss": float(group["loss"].mean()),
             "rms_mm": float(group["rms_mm"].mean()),
-            "rms_other_frames_mm": float(group["rms_other_frames_mm"].mean()),
         }
+        others = group["rms_other_frames_mm"].dropna()
+        if len(others):
+            by_scenario[str(name)]["rms_other_frames_mm"] = float(others.mean())
     episodes = {
         f"{row['scenario']}/{row['episode']}": {k: v for k, v in row.items() if isinstance(v, float) and not math.isnan(v)}
         for row in fits.to_dict("records")

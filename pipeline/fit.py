@@ -83,7 +83,16 @@ def fit(
     frame: Annotated[list[int] | None, typer.Option(help="Loss frame, repeatable; default: the scenario's.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of all random numbers.")] = None,
     resample: Annotated[bool | None, typer.Option(help="Of adam: new points in each iteration.")] = None,
-    offset: Annotated[bool | None, typer.Option(help="Fit a rigid offset of the target along.")] = None,
+    paper: Annotated[
+        bool | None, typer.Option("--paper", help="The published measure: one-sided, one frame, no pose.")
+    ] = None,
+    nuisance: Annotated[
+        str | None,
+        typer.Option(
+            help="Pose fitted along, and how far each may well be off: x, y, z, tilt_x, tilt_y, yaw, lag; or none. "
+            "Default: x=0.1m,y=0.1m,yaw=30deg."
+        ),
+    ] = None,
     joint: Annotated[bool | None, typer.Option("--joint", help="One parameter set for all episodes.")] = None,
     workers: Annotated[int | None, typer.Option(help="Fits at once, each in a process with one thread.")] = None,
     threads: Threads = None,
@@ -110,7 +119,8 @@ def fit(
         frames=frame,
         seed=seed,
         resample=resample,
-        offset=offset,
+        paper=paper,
+        nuisance=nuisance,
         joint=joint,
         workers=workers,
     )
@@ -237,8 +247,6 @@ class FitJob:
             settings.parameters,
             bounds={**scenario.bounds, **settings.bounds},
             fixed=settings.fixed,
-            offset=settings.offset,
-            offset_range=(0.02 / scenario.length_unit_m, 0.1),
         )
 
     def objective(self) -> Objective:
@@ -246,9 +254,7 @@ class FitJob:
         Raises:
             ConfigError, EpisodeError: the episodes lack the frames of the loss, or an unknown frame.
         """
-        settings = self.settings
-        recorded = list(self.episodes.values())
-        return Objective(self.scenario, recorded, frames=settings.frames, points=settings.points, seed=settings.seed)
+        return Objective(self.scenario, list(self.episodes.values()), **self.settings.measure())
 
     def known(self) -> dict[str, Any] | None:
         """The summary that this job, or an earlier one of the same inputs and code, has left; maybe interrupted."""

@@ -9,9 +9,8 @@ import torch
 import typer
 
 from diffcloud.errors import ConfigError, DivergedError
-from diffcloud.fit.objective import track_displacement
-from diffcloud.fit.parameters import NUISANCE
-from diffcloud.fit.result import read_fit
+from diffcloud.fit.result import posed, read_fit
+from diffcloud.fit.targets import track_displacement
 from diffcloud.io.clouds import write_ply
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import together, write_npz
@@ -48,9 +47,9 @@ def rollout(
     """Simulate and export a motion."""
     chosen = choose_scenario(scenario, scene)
     values: dict[str, float] = {}
-    if fit is not None:
-        fitted = read_fit(fit)["parameters"]
-        values |= {name: float(entry["value"]) for name, entry in fitted.items() if name not in NUISANCE}
+    fitted = None if fit is None else read_fit(fit)
+    if fitted is not None:
+        values |= {name: float(entry["value"]) for name, entry in fitted["parameters"].items()}
     values |= assignments(set_, "--set")
     check_values(values, "--set")
     chosen.check_parameters(values)
@@ -74,6 +73,10 @@ def rollout(
             raise DivergedError(error.step, error.entries, error.reason, shown) from error
     per_frame = slice(None, None, chosen.scene.frame_steps)
     nodes, times = run.positions[0, per_frame].numpy(), run.times[per_frame].numpy()
+    if fitted is not None and fitted["recordings"]:
+        own = fitted["recordings"].get("" if episode is None else episode.stem)
+        recording = own or next(iter(fitted["recordings"].values()))
+        nodes = posed(recording, run, run.times[per_frame], length_unit_m=chosen.length_unit_m)
     moved, moved_faces = moved_surfaces(system, run)
     moved = moved[0, per_frame]
     bodies = chosen.scene.bodies

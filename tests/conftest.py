@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from diffcloud.fit import Objective
 from diffcloud.io.simulated import SimulatedSet
 from diffcloud.mesh import grid_cloth
 from diffcloud.scene.scenarios import Scenario, built_in, grid_scenario
@@ -56,6 +58,10 @@ def small_lift(**changes: object) -> Scenario:
         "path": [(0.0, 0.0, 0.0, 0.0), (0.5, 0.0, -0.05, 0.15)],
     }
     return grid_scenario(built_in("lift").model_copy(update={**defaults, **changes}))
+
+
+paper_objective = partial(Objective, paper=True)
+"""The published measure: one frame, one direction, no pose."""
 
 
 def shaken(**changes: object) -> Scenario:

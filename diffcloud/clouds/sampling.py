@@ -19,6 +19,32 @@ _TINY = 1e-30
 
 
 @dataclass(frozen=True)
+class SurfacePoints:
+    """Points that stay in their places on the faces of a mesh, however its nodes move."""
+
+    nodes: Tensor
+    """[..., N, 3] the corners of each one's face."""
+    barycentric: Tensor
+    """[..., N, 3] its place among them."""
+
+    def of(self, values: Tensor) -> Tensor:
+        """[..., V, 3] positions of the nodes, or their rates -> [..., N, 3] those of the points. Differentiable."""
+        return (self.barycentric[..., None, :] @ self.corners(values)).squeeze(-2)
+
+    def normals(self, positions: Tensor) -> Tensor:
+        """[..., N, 3] unit normals of the faces at node positions [..., V, 3]; zero on a face without area."""
+        corners = self.corners(positions)
+        normal = torch.linalg.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
+        return normal / normal.norm(dim=-1, keepdim=True).clamp(min=_TINY)
+
+    def corners(self, values: Tensor) -> Tensor:
+        """[..., N, 3, 3] of each one's face, of values [..., V, 3]."""
+        flat = values.reshape(-1, *values.shape[-2:])
+        nodes = self.nodes.reshape(len(flat), -1, 1).expand(-1, -1, 3)
+        return flat.gather(1, nodes).reshape(*self.nodes.shape, 3)
+
+
+@dataclass(frozen=True)
 class SurfaceSampler:
     """Draws N points on the surface of a mesh."""
 
@@ -68,11 +94,17 @@ class SurfaceSampler:
         r1, r2 = torch.rand(2, points, dtype=dtype, generator=generator)
         return SurfaceSampler(faces, weights, choice.to(device), uniform_barycentric(r1, r2).to(device))
 
+    def draw(self, positions: Tensor) -> SurfacePoints:
+        """Points [..., N] on the mesh at node positions [..., V, 3]."""
+        flat = positions.reshape(-1, *positions.shape[-2:])
+        nodes = _choose(flat, self.faces, self.choice, self.weights)
+        return SurfacePoints(
+            nodes.reshape(*positions.shape[:-2], -1, 3), self.barycentric.expand(*positions.shape[:-2], -1, 3)
+        )
+
     def sample(self, positions: Tensor) -> Tensor:
         """[..., V, 3] node positions -> [..., N, 3] points."""
-        flat = positions.reshape(-1, *positions.shape[-2:])
-        points = points_on_faces(flat, self.faces, self.choice, self.barycentric, weights=self.weights)
-        return points.reshape(*positions.shape[:-2], *points.shape[-2:])
+        return self.draw(positions).of(positions)
 
 
 def points_on_faces(
@@ -86,19 +118,23 @@ def points_on_faces(
         barycentric: [N, 3] or [B, N, 3] place on the face.
         weights: [F] or [B, F] on top of the area; None for one.
     """
-    with torch.no_grad():
-        corner = positions[:, faces]
-        area = torch.linalg.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
-        area = area.square().sum(-1).sqrt().clamp(min=_TINY)
-        if weights is not None:
-            area = area * weights
-        cumulative = area.cumsum(-1)
-        face = torch.searchsorted(cumulative, choice * cumulative[:, -1:], right=True)  # [B, N]
-        # rounding may pick the end of the list: the last face that can be picked at all lies where the sum stops growing
-        last = torch.searchsorted(cumulative, cumulative[:, -1:].contiguous())
-        nodes = faces[torch.minimum(face, last)].flatten(1)  # [B, 3N]
-    chosen = positions.gather(1, nodes[..., None].expand(-1, -1, 3)).unflatten(1, (-1, 3))
-    return (barycentric[..., None, :] @ chosen).squeeze(-2)
+    nodes = _choose(positions, faces, choice, weights)
+    return SurfacePoints(nodes, barycentric).of(positions)
+
+
+@torch.no_grad()
+def _choose(positions: Tensor, faces: Tensor, choice: Tensor, weights: Tensor | None) -> Tensor:
+    """[B, N, 3] corners of the faces that are picked."""
+    corner = positions[:, faces]
+    area = torch.linalg.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
+    area = area.square().sum(-1).sqrt().clamp(min=_TINY)
+    if weights is not None:
+        area = area * weights
+    cumulative = area.cumsum(-1)
+    face = torch.searchsorted(cumulative, choice * cumulative[:, -1:], right=True)
+    # rounding may pick the end of the list: the last face that can be picked at all lies where the sum stops growing
+    last = torch.searchsorted(cumulative, cumulative[:, -1:].contiguous())
+    return faces[torch.minimum(face, last)]
 
 
 def uniform_barycentric(first: Tensor, second: Tensor) -> Tensor:

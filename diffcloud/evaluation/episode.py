@@ -13,7 +13,6 @@ from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
 from diffcloud.fit import AdamSettings, CmaEsSettings, FitSpace, Objective, RandomSearchSettings
-from diffcloud.fit.parameters import NUISANCE
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 
@@ -68,15 +67,15 @@ def compare_episode(
     """
     settings = settings or ComparisonSettings()
     fit = summary["settings"]
-    frames, points = list(fit["frames"]), int(fit["points"])
+    measure = {name: fit[name] for name in ("frames", "points", "paper", "nuisance")}
     space = methods.space_of(summary)
-    objective = Objective(scenario, [episode], frames=frames, points=points, seed=int(fit["seed"]))
+    objective = Objective(scenario, [episode], **measure, seed=int(fit["seed"]))
     told: list[Estimate | Gap] = [methods.fitted(summary)]
     told += [_run(rival, objective, space, summary, settings.seed) for rival in settings.rivals]
     told += [*predictions, *methods.published(episode.meta)]
     estimates = [entry for entry in told if isinstance(entry, Estimate)]
     gaps = [entry for entry in told if isinstance(entry, Gap)]
-    meter = EpisodeMeter(scenario, episode, frames=frames, points=points, draws=settings.draws, seed=settings.seed)
+    meter = EpisodeMeter(scenario, episode, **measure, draws=settings.draws, seed=settings.seed)
     sources = dict(transfers or {})
     sets = [methods.clipped(values, space) for values in (*(e.values for e in estimates), *sources.values())]
     measured = meter.measure([*sets, {key: float(value) for key, value in summary["start"].items()}])
@@ -103,7 +102,7 @@ def compare_episode(
         else:
             transferred.append({"source": source, "clipped": sets[index], **measured.rows[index]})
     seconds = {estimate.method: dict(estimate.seconds) for estimate in estimates}
-    best = {key: value for key, value in sets[0].items() if key not in NUISANCE}
+    best = sets[0]
     meta = episode.meta
     record: dict[str, Any] = {
         "scenario": scenario.name,
@@ -114,7 +113,7 @@ def compare_episode(
         "truth": {key: float(value) for key, value in (meta.get("truth") or {}).items()},
         "length_unit_m": scenario.length_unit_m,
         "threshold": success_threshold(scenario),
-        "frames": frames,
+        "frames": list(objective.frames()),
         "starts": int(fit.get("starts", 1)),  # a search is one
         "start": None if len(sets) in measured.diverged else measured.rows[-1],
         "methods": rows,

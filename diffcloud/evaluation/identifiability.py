@@ -31,7 +31,6 @@ from torch import Tensor
 
 from diffcloud.fit import FitSpace, Objective
 from diffcloud.fit.batches import without_diverged
-from diffcloud.fit.parameters import NUISANCE
 from diffcloud.scene.scenarios import Scenario
 
 Verdict = Literal["identified", "only the ratio", "only a combination", "not identified", "too rough to tell"]
@@ -183,23 +182,22 @@ class _Probe:
     def losses(self, places: NDArray[np.float64], *, first: int = 0, draws: int | None = None) -> NDArray[np.float64]:
         """[draws, B] at coordinates [B, k]; infinite where the simulation diverges. `first`: draw to begin with."""
         values = torch.as_tensor(self._coordinates.values(places)).double()
-        return self.losses_of(*self.space.split(values), first=first, draws=draws)
+        return self.losses_of(self.space.parameters(values), first=first, draws=draws)
 
     def losses_of(
-        self, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor], *, first: int = 0, draws: int | None = None
+        self, parameters: Mapping[str, Tensor], *, first: int = 0, draws: int | None = None
     ) -> NDArray[np.float64]:
-        """[draws, B] of parameter sets and rigid offsets of the target."""
+        """[draws, B] of parameter sets."""
         count, draws = len(next(iter(parameters.values()))), draws or self.draws
         seeds = range(self.seed + first, self.seed + first + draws)
 
         def losses(part: Tensor, kept: Tensor) -> Tensor:
             index = part[kept]
             run = self._objective.simulate({name: value[index] for name, value in parameters.items()})
-            shift = {name: value[index] for name, value in offset.items()}
             rows = []
             for seed in seeds:
                 self._objective.reseed(seed)
-                rows.append(self._objective.frame_losses(run, shift).mean(-1))
+                rows.append(self._objective.frame_losses(run).mean(-1))
             return torch.stack(rows)
 
         found = np.full((draws, count), np.inf)
@@ -216,11 +214,10 @@ class _Probe:
         values = torch.as_tensor(self._coordinates.values(places)).double()
         found = []
         with torch.no_grad():
-            parameters, offset = self.space.split(values)
-            run = self._objective.simulate(parameters)
+            run = self._objective.simulate(self.space.parameters(values))
             for seed in range(self.seed, self.seed + self.draws):
                 self._objective.reseed(seed)
-                points = self._objective.points(run, offset)
+                points = self._objective.points(run)
                 for frame, cloud in enumerate(self._objective.clouds()):
                     found.append((points[:, frame] - cloud.nearest(points[:, frame])).norm(dim=-1))
         return torch.cat(found, dim=-1).numpy()
@@ -389,8 +386,7 @@ def _scale(
     base = dict.fromkeys(scaled[1] + scaled[2], 1.0) | dict(values) | dict(space.fixed)
     sets = [base] + [base | {name: factor * base[name] for name in group} for group in scaled for factor in (0.5, 2.0)]
     tensors = {name: torch.tensor([one[name] for one in sets], dtype=torch.float64) for name in base}
-    offset = {name: tensors.pop(name) for name in NUISANCE if name in tensors}
-    losses = probe.losses_of(tensors, offset).mean(axis=0)
+    losses = probe.losses_of(tensors).mean(axis=0)
     change = np.abs(losses[1:] - losses[0]).reshape(3, 2).max(axis=1) / max(noise, 1e-300)
     labels = ("fitted", "with_bending", "everything")
     return {label: float(min(value, 1e9)) for label, value in zip(labels, change, strict=True)}

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from diffcloud.fit import AdamSettings, CmaEsSettings, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
-from diffcloud.fit.parameters import NUISANCE, Variable
+from diffcloud.fit.parameters import Variable
 from diffcloud.fit.solvers import SOLVER_NAMES, SOLVERS, FitOutcome, SearchSettings
 
 Rival = Literal["single_start", "middle", "random_search", "cma_es"]
@@ -48,13 +48,9 @@ class Gap:
 
 
 def space_of(summary: Mapping[str, Any]) -> FitSpace:
-    """The fitted parameters of a fit with their bounds, and those that were given.
-
-    A rigid offset of the target that was fitted along counts as given: it belongs to the recording, and all methods are
-    measured against the same clouds.
-    """
+    """The fitted parameters of a fit with their bounds, and those that were given."""
     entries = summary["parameters"]
-    free = {name: entry["bounds"] for name, entry in entries.items() if not entry["fixed"] and name not in NUISANCE}
+    free = {name: entry["bounds"] for name, entry in entries.items() if not entry["fixed"]}
     return FitSpace(
         tuple(Variable(name, float(low), float(high)) for name, (low, high) in free.items()),
         {name: float(entry["value"]) for name, entry in entries.items() if name not in free},

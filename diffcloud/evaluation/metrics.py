@@ -11,7 +11,6 @@ import torch
 from diffcloud.clouds.losses import chamfer
 from diffcloud.fit import Objective
 from diffcloud.fit.batches import without_diverged
-from diffcloud.fit.parameters import NUISANCE
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import PAPER_THRESHOLD, RELEASE_UNIT_M, Scenario
 
@@ -42,32 +41,34 @@ class EpisodeMeter:
         scenario: Scenario,
         episode: Episode,
         *,
-        frames: Sequence[int],
+        frames: Sequence[int] | None = None,
         points: int | None = None,
+        paper: bool = False,
+        nuisance: Mapping[str, float] | None = None,
         draws: int = 4,
         seed: int = 1000,
     ) -> None:
         """
         Args:
-            frames: those that the fit used; negative ones count from the end.
-            points: sampled per frame; the scenario's if not given.
+            frames, points, paper, nuisance: those of the fit, as of `Objective`.
             draws: of points, over which distances at the fit's frames are averaged.
             seed: of the first draw.
         """
         self.scenario, self.episode = scenario, episode
-        used = [frame % episode.frame_count for frame in frames]
+        measure: dict[str, Any] = {"points": points, "paper": paper, "nuisance": nuisance, "seed": seed}
+        self._own = Objective(scenario, [episode], frames=frames, **measure)
         last = scenario.steps * scenario.scene.time_step + 1e-6
         # frame 0 is before the motion and the same for all parameters
+        used = self._own.frames()
         others = [f for f in range(1, episode.frame_count) if f not in used and episode.times[f] <= last]
-        self._own = Objective(scenario, [episode], frames=used, points=points, seed=seed)
-        self._others = Objective(scenario, [episode], frames=others, points=points, seed=seed) if others else None
+        self._others = Objective(scenario, [episode], frames=others, **measure) if others else None
         self._seeds = range(seed, seed + draws)
 
     def measure(self, sets: Sequence[Mapping[str, float]]) -> Measured:
         """Metrics of parameter sets, each within its bounds.
 
         Returns rows with
-            loss, loss_deviation: one-sided Chamfer at the fit's frames [squared length unit], its mean over the draws and
+            loss, loss_deviation: by the fit's measure at its frames [squared length unit], the mean over the draws and
                 their standard deviation (of one draw);
             rms_mm: its root in millimetres;
             loss_other_frames, rms_other_frames_mm: at the frames that the fit did not use, of one draw; absent without any;
@@ -85,15 +86,14 @@ class EpisodeMeter:
         own = self._own
         names = dict.fromkeys(name for values in sets for name in values)
         tensors = {name: torch.tensor([values.get(name, 0.0) for values in sets], dtype=torch.float64) for name in names}
-        offset = {name: tensors.pop(name) for name in names if name in NUISANCE}
         run = own.simulate(tensors)
         own.reseed(self._seeds[0])
-        points = own.points(run, offset)  # [B, L, N, 3]
+        points = own.points(run)  # [B, L, N, 3]
         both = [chamfer(points[:, frame], [cloud] * len(sets)) for frame, cloud in enumerate(own.clouds())]
         losses = []
         for seed in self._seeds:
             own.reseed(seed)
-            losses.append(own.frame_losses(run, offset).mean(-1))
+            losses.append(own.frame_losses(run).mean(-1))
         every = torch.stack(losses)  # [draws, B]
         to_mm = 1e3 * self.scenario.length_unit_m
         columns = {
@@ -103,7 +103,7 @@ class EpisodeMeter:
             "two_sided": torch.stack(both).mean(0),
         }
         if self._others is not None:
-            others = self._others.frame_losses(run, offset).mean(-1)
+            others = self._others.frame_losses(run).mean(-1)
             columns |= {"loss_other_frames": others, "rms_other_frames_mm": to_mm * others.sqrt()}
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
         return [dict(zip(columns, row, strict=True)) for row in rows]

@@ -42,7 +42,7 @@ def batch_losses(objective: Objective, space: FitSpace, values: Tensor) -> Tenso
     """[B, k] values -> [B] losses; infinite where the simulation diverges."""
     losses = torch.full((len(values),), math.inf, dtype=values.dtype)
     with torch.no_grad():
-        found, kept, _ = without_diverged(len(values), lambda index: objective(*space.split(values[index])))
+        found, kept, _ = without_diverged(len(values), lambda index: objective(space.parameters(values[index])))
     if found is not None:
         losses[kept] = found.to(losses)
     return losses

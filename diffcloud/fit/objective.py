@@ -1,37 +1,62 @@
-"""The loss of parameter sets: simulate, sample, one-sided Chamfer to the recorded clouds."""
+"""The loss of parameter sets: simulate, lay the scene as the recording lies, sample, compare with the recorded clouds.
+
+There are two measures. The default one compares every usable frame in both directions, each distance capped, counts
+simulated points only where the recording could have some, and takes the lowest loss over the pose of the scene
+(`fit.pose`), so that solvers see parameters alone. The paper's is one-sided and squared, at the loss frames, and knows no
+pose.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloud.clouds.losses import one_sided_chamfer
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
-from diffcloud.errors import DivergedError, EpisodeError
+from diffcloud.errors import ConfigError, DivergedError
+from diffcloud.fit.alignment import aligned
+from diffcloud.fit.matching import Pairs, pairs_back, pairs_forth
+from diffcloud.fit.pose import DEFAULT_PRIORS, PoseSpace
+from diffcloud.fit.targets import Target, read_target
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import Rollout, rollout
 
+CAP_M = 0.05
+"""A larger distance counts as this one."""
 _CHUNK = 20
 """Parameter sets whose motions, derivatives and sampled clouds are in memory at the same time."""
+_FEWEST = 200
+"""Points of a frame, however many frames share the scenario's."""
+_FEW = 5
+"""Frames by which a pose is found before all have their say."""
+_FIRST_CAPS = (np.inf, np.inf, 4.0, 4.0, 2.0, 2.0, *[1.0] * 10)
+"""Factors of the cap in the steps from no pose at all: a cloth that lies elsewhere is far from all that was recorded."""
+_CAPS = (2.0, *[1.0] * 8)
+_LAST_CAPS = (1.0, 1.0)
 
 
 @dataclass(frozen=True)
-class _Target:
-    """One episode's clouds in the loss."""
+class Motion:
+    """B simulated motions at the frames of one episode, and how they lie in the recording."""
 
-    times: Tensor
-    """[L] of the loss frames [s]."""
-    clouds: tuple[NeighbourIndex, ...]
-    centre: Tensor
-    """[3] about which the yaw of the offset turns."""
-    track: Tensor | None
-    """[1, S, G, 3] displacement of the grippers."""
+    nodes: Tensor
+    """[B, L, V, 3] of the cloth and of the bodies beside it, in the scene."""
+    velocities: Tensor | None
+    """[B, L, V, 3], where the lag is free."""
+    pose: Tensor
+    """[B, d]"""
+    pairs: tuple[Pairs, ...]
+    """Forth; in the default measure, back too."""
+
+
+Matcher = Callable[[Tensor], tuple[Pairs, ...]]
+"""Poses [B, d] -> pairs."""
 
 
 class Objective:
@@ -42,6 +67,8 @@ class Objective:
         scenario: Scenario,
         episodes: Sequence[Episode],
         *,
+        paper: bool = False,
+        nuisance: Mapping[str, float] | None = None,
         frames: Sequence[int] | None = None,
         points: int | None = None,
         seed: int = 0,
@@ -49,19 +76,39 @@ class Objective:
         """
         Args:
             episodes: one, or several for a joint fit; their losses are averaged.
-            frames: loss frames instead of the scenario's; negative ones count from the end.
-            points: sampled per frame instead of the scenario's.
+            paper: the published measure.
+            nuisance: free variables of the pose, with the standard deviations of their priors [m, rad, s]; by default
+                `DEFAULT_PRIORS`, in the paper's measure none.
+            frames: to compare; negative ones count from the end. By default every usable one, unless the scenario names
+                some.
+            points: sampled per frame; by default the scenario's, which all frames share in the default measure.
             seed: of the common random numbers.
 
         Raises:
-            EpisodeError: a loss frame that an episode lacks, or one after the end of the simulation.
+            EpisodeError: a loss frame that an episode lacks, one after the end of the simulation, or none that is usable.
+            ConfigError: an unknown variable of the pose, or any in the paper's measure.
         """
-        self.scenario = scenario
+        self.scenario, self.paper = scenario, paper
         self.system, _ = scenario.scene.build()
-        self.frames = tuple(scenario.loss_frames if frames is None else frames)
-        self.point_count = points or scenario.points
+        self.nuisance = dict(({} if paper else DEFAULT_PRIORS) if nuisance is None else nuisance)
+        if paper and self.nuisance:
+            raise ConfigError(f"The paper's measure knows no pose; leave out the nuisance {', '.join(self.nuisance)}.")
+        self._unit = scenario.length_unit_m
+        self._cap = torch.inf if paper else CAP_M / self._unit
+        self._first: dict[int, Tensor] = {}
+        self.asked_frames = None if frames is None else tuple(frames)
+        self._asked = points
+        beside = torch.as_tensor(scenario.scene.bodies.faces) + len(self.system.mesh.nodes)
+        self._faces = torch.cat([torch.as_tensor(self.system.mesh.faces), beside])
+        self._bodies = torch.as_tensor(scenario.scene.bodies.nodes, dtype=torch.float64)
+        named = scenario.loss_frames if paper or not scenario.every_frame else None
+        self._targets = [
+            read_target(
+                scenario, self.system, episode, named if frames is None else frames, cut=not paper, nuisance=self.nuisance
+            )
+            for episode in episodes
+        ]
         self.reseed(seed)
-        self._targets = [self._target(episode) for episode in episodes]
         last = max(float(target.times.max()) for target in self._targets)
         self.loss_steps = min(int(np.ceil(last / self.system.time_step - 1e-6)), scenario.steps)
 
@@ -69,23 +116,64 @@ class Objective:
     def episode_count(self) -> int:
         return len(self._targets)
 
+    @property
+    def point_count(self) -> int:
+        """Sampled per frame."""
+        if self._asked is not None:
+            return self._asked
+        share = 1 if self.paper else max(len(target.frames) for target in self._targets)
+        return max(self.scenario.points // share, min(_FEWEST, self.scenario.points))
+
+    def frames(self, episode: int = 0) -> tuple[int, ...]:
+        """The compared frames of an episode, from 0."""
+        return self._targets[episode].frames
+
+    def cut(self, episode: int = 0) -> float | None:
+        """Height below which nothing was recorded; simulated points do not count there."""
+        return self._targets[episode].cut
+
+    def pose_space(self, episode: int = 0) -> PoseSpace:
+        return self._targets[episode].space
+
+    def times(self, episode: int = 0) -> Tensor:
+        """[L] of the compared frames [s]."""
+        return self._targets[episode].times
+
+    def track(self, episode: int = 0) -> Tensor | None:
+        """[1, S, G, 3] displacement of the grippers up to the last compared frame [m]; None: the scene's own motion."""
+        track = self._targets[episode].track
+        return None if track is None else track[:, : self.loss_steps]
+
+    def clouds(self, episode: int = 0) -> tuple[NeighbourIndex, ...]:
+        """The recorded clouds of the L compared frames."""
+        return self._targets[episode].clouds
+
+    @property
+    def residual_count(self) -> int:
+        """M points of all episodes and compared frames."""
+        return sum(len(target.frames) for target in self._targets) * self.point_count
+
     def reseed(self, seed: int) -> None:
         """Draw the common random numbers anew."""
-        subset = self.scenario.loss_faces
+        generator = torch.Generator().manual_seed(seed)
+        cloth = torch.as_tensor(self.system.mesh.faces)
+        subset = self.scenario.loss_faces if self.paper else None
         self.sampler = SurfaceSampler.build(
-            torch.as_tensor(self.system.mesh.faces),
+            cloth,
             self.point_count,
-            generator=torch.Generator().manual_seed(seed),
+            generator=generator,
             subset=None if subset is None else torch.as_tensor(subset),
             dtype=torch.float64,
         )
+        if self.paper:
+            return
+        self._recorded = [self._drawn(target, generator) for target in self._targets]
 
-    def __call__(self, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor] | None = None) -> Tensor:
+    def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Losses [B] in squared length units of the scene, differentiable.
 
         Args:
             parameters: name -> [B].
-            offset: name -> [B] rigid offset of the target (see `parameters.NUISANCE`).
 
         Raises:
             DivergedError: names step and batch entries.
@@ -94,22 +182,19 @@ class Objective:
         losses = []
         for begin in range(0, batch, _CHUNK):  # nothing inside loops over the batch
             part = {name: value[begin : begin + _CHUNK] for name, value in parameters.items()}
-            shift = {name: value[begin : begin + _CHUNK] for name, value in (offset or {}).items()}
             try:
-                terms = [self._loss(index, part, shift) for index in range(len(self._targets))]
+                terms = [
+                    self.frame_losses(self.simulate_to_loss(part, episode=index), episode=index).mean(-1)
+                    for index in range(len(self._targets))
+                ]
             except DivergedError as error:
                 entries = [begin + entry for entry in error.entries]
                 raise DivergedError(error.step, entries, error.reason, error.parameters) from error
             losses.append(torch.stack(terms).mean(0))
         return torch.cat(losses)
 
-    @property
-    def residual_count(self) -> int:
-        """M points of all episodes and loss frames."""
-        return self.episode_count * len(self.frames) * self.point_count
-
     def simulate_to_loss(self, parameters: Mapping[str, Tensor], *, episode: int = 0) -> Rollout:
-        """The rollout up to the last loss frame."""
+        """The rollout up to the last compared frame."""
         return self.simulate(parameters, episode=episode, steps=self.loss_steps)
 
     def simulate(self, parameters: Mapping[str, Tensor], *, episode: int = 0, steps: int | None = None) -> Rollout:
@@ -120,101 +205,160 @@ class Objective:
         track = None if track is None else track[:, :steps]
         return rollout(self.system, steps, properties=properties, track=track)
 
-    def points(self, run: Rollout, offset: Mapping[str, Tensor] | None = None, *, episode: int = 0) -> Tensor:
-        """[B, L, N, 3] points sampled on a rollout's cloth at the times of the loss frames.
+    def frame_losses(self, run: Rollout, *, episode: int = 0) -> Tensor:
+        """[B, L] losses of a rollout at each compared frame, at its pose. Differentiable: at the pose of lowest loss, the
+        loss does not change with the pose."""
+        motion = self.match(run, episode=episode)
+        losses = [pairs.losses(self._moved(motion, pairs, episode), self._cap) for pairs in motion.pairs]
+        return len(self.frames(episode)) * torch.stack(losses).sum(0)
+
+    def points(self, run: Rollout, *, episode: int = 0) -> Tensor:
+        """[B, L, N, 3] points sampled on a rollout's cloth at the compared frames, in the recording's frame."""
+        motion = self.match(run, episode=episode)
+        return self._moved(motion, motion.pairs[0], episode)
+
+    def counted(self, run: Rollout, *, episode: int = 0) -> Tensor:
+        """bool [B, L, N] which of `points` count."""
+        return self.match(run, episode=episode).pairs[0].weights > 0
+
+    def way_losses(self, run: Rollout, *, episode: int = 0) -> list[Tensor]:
+        """The losses [] of a rollout of one motion forth, and in the default measure back."""
+        motion = self.match(run, episode=episode)
+        return [
+            pairs.losses(self._moved(motion, pairs, episode), self._cap).sum() / pairs.weights.sum().clamp(min=1e-300)
+            for pairs in motion.pairs
+        ]
+
+    def shown(self, run: Rollout, *, episode: int = 0) -> NDArray[np.float64]:
+        """[T + 1, V, 3] the cloth's nodes of a rollout of one motion at every frame of the scenario, in the recording's
+        frame."""
+        space, pose = self._targets[episode].space, self.match(run, episode=episode).pose
+        times = run.times[:: self.scenario.scene.frame_steps]
+        lag = space.lag(pose)
+        return space.moved(run.at(times if lag is None else times + lag), pose)[0].numpy()
+
+    def posed_bodies(self, run: Rollout, *, episode: int = 0) -> NDArray[np.float64]:
+        """[V, 3] the nodes of the bodies beside the cloth, there too."""
+        pose = self.match(run, episode=episode).pose
+        return self._targets[episode].space.moved(self._bodies[None], pose)[0].numpy()
+
+    def match(self, run: Rollout, *, episode: int = 0) -> Motion:
+        """A rollout beside an episode, at its pose."""
+        times = self.times(episode)
+        nodes = self.with_bodies(run.at(times))
+        velocities = None
+        if "lag" in self.pose_space(episode).names:
+            step = float(run.times[1])
+            velocities = (self.with_bodies(run.at(times + step)) - self.with_bodies(run.at(times - step))) / (2 * step)
+        with torch.no_grad():
+            still = nodes.detach(), None if velocities is None else velocities.detach()
+            pose = self._pose(*still, episode)
+            return Motion(nodes, velocities, pose, self._matcher(*still, episode, range(nodes.shape[1]))(pose))
+
+    def _pose(self, nodes: Tensor, velocities: Tensor | None, episode: int) -> Tensor:
+        """[B, d] from the pose of the basis material on: on a few frames, then on all."""
+        space = self.pose_space(episode)
+        if not space.names:
+            return torch.zeros(len(nodes), 0, dtype=torch.float64)
+        return self._follow(nodes, velocities, episode, self._first_pose(episode).expand(len(nodes), -1), _CAPS)
+
+    def _first_pose(self, episode: int) -> Tensor:
+        """[1, d] of the basis material, from zero on."""
+        if episode not in self._first:
+            zero = torch.zeros(1, len(self.pose_space(episode).names), dtype=torch.float64)
+            self._first[episode] = zero  # where the steps begin
+            run = self.simulate_to_loss({}, episode=episode)
+            nodes = self.with_bodies(run.at(self.times(episode)))
+            self._first[episode] = self._follow(nodes, torch.zeros_like(nodes), episode, zero, _FIRST_CAPS)
+        return self._first[episode]
+
+    def _follow(
+        self, nodes: Tensor, velocities: Tensor | None, episode: int, start: Tensor, caps: Sequence[float]
+    ) -> Tensor:
+        """[B, d] poses of lowest loss of nodes [B, L, V, 3]."""
+        space, every = self.pose_space(episode), range(nodes.shape[1])
+        few = np.unique(np.linspace(0, len(every) - 1, _FEW).round().astype(int)).tolist()
+        pose = start
+        for frames, factors in ((few, caps), (every, _LAST_CAPS)):
+            matcher = self._matcher(nodes, velocities, episode, frames)
+
+            def terms(
+                poses: Tensor, factor: float, matcher: Matcher = matcher, frames: Sequence[int] = frames
+            ) -> tuple[Tensor, Tensor, Tensor]:
+                moving = None if velocities is None else velocities[:, frames]
+                motion = Motion(nodes[:, frames], moving, poses, matcher(poses))
+                return self.terms(motion, None, episode=episode, factor=factor)
+
+            pose = aligned(space, pose, terms, factors)
+        return pose
+
+    def _matcher(self, nodes: Tensor, velocities: Tensor | None, episode: int, frames: Sequence[int]) -> Matcher:
+        """What finds the pairs of some frames at poses [B, d]."""
+        target, chosen = self._targets[episode], list(frames)
+        here = Motion(nodes[:, chosen], None if velocities is None else velocities[:, chosen], nodes[:0], ())
+        clouds = [target.clouds[frame] for frame in chosen]
+        places = self.sampler.draw(here.nodes)
+        share = 1.0 if self.paper else 0.5
+
+        def pairs_at(pose: Tensor) -> tuple[Pairs, ...]:
+            shown = self._shown(replace(here, pose=pose), target.space)
+            moved = target.space.moved(places.of(shown), pose)
+            forth = pairs_forth(places, moved, clouds, cut=target.cut, share=share)
+            if self.paper:
+                return (forth,)
+            recorded, sure = (part[chosen] for part in self._recorded[episode])
+            back = pairs_back(shown, self._faces, recorded, sure, forth.spacing, space=target.space, pose=pose, share=share)
+            return forth, back
+
+        return pairs_at
+
+    def terms(
+        self, motion: Motion, rates: Tensor | None, *, episode: int = 0, factor: float = 1.0
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Loss [B], half of its slope [B, k + d] and curvature [B, k + d, k + d], without the prior of the pose.
 
         Args:
-            offset: name -> [B] rigid offset of the target, by which the points are displaced.
+            rates: [k, B, L, V, 3] of the cloth's nodes by k variables; None for none.
+            factor: of the cap.
         """
-        return self.points_of(run.at(self.times(episode)), offset, episode=episode)
+        space = self._targets[episode].space
+        sums: tuple[Tensor, Tensor, Tensor] | None = None
+        here = self._shown(motion, space)
+        if rates is not None:  # bodies stand still
+            rates = torch.nn.functional.pad(rates, (0, 0, 0, here.shape[-2] - rates.shape[-2]))
+        for pairs in motion.pairs:
+            points = pairs.places.of(here)
+            velocities = None if motion.velocities is None else pairs.places.of(motion.velocities)
+            columns = [space.rates(points, motion.pose, velocities)]
+            if rates is not None:
+                columns.insert(0, torch.stack([space.turned(pairs.places.of(rate), motion.pose) for rate in rates]))
+            found = pairs.terms(space.moved(points, motion.pose), torch.cat(columns), self._cap * factor)
+            sums = found if sums is None else (sums[0] + found[0], sums[1] + found[1], sums[2] + found[2])
+        assert sums is not None
+        return sums
 
-    def points_of(self, positions: Tensor, offset: Mapping[str, Tensor] | None = None, *, episode: int = 0) -> Tensor:
-        """The same of node positions [B, L, V, 3]."""
-        points = self.sampler.sample(positions)
-        return _displaced(points, self._targets[episode].centre, offset) if offset else points
+    def with_bodies(self, positions: Tensor) -> Tensor:
+        """[..., V, 3] nodes of the cloth -> with those of the bodies beside it, in the default measure."""
+        if self.paper or not len(self._bodies):
+            return positions
+        return torch.cat([positions, self._bodies.expand(*positions.shape[:-2], -1, -1)], dim=-2)
 
-    def times(self, episode: int) -> Tensor:
-        """[L] of the loss frames [s]."""
-        return self._targets[episode].times
+    def _shown(self, motion: Motion, space: PoseSpace) -> Tensor:
+        """[B, L, V, 3] where the nodes are when the recording looks at them."""
+        lag = space.lag(motion.pose)
+        if lag is None or motion.velocities is None:
+            return motion.nodes
+        return motion.nodes + lag[:, None, None, None] * motion.velocities
 
-    def track(self, episode: int) -> Tensor | None:
-        """[1, S, G, 3] displacement of the grippers up to the last loss frame [m]; None: the scene's own motion."""
-        track = self._targets[episode].track
-        return None if track is None else track[:, : self.loss_steps]
+    def _moved(self, motion: Motion, pairs: Pairs, episode: int) -> Tensor:
+        space = self._targets[episode].space
+        return space.moved(pairs.places.of(self._shown(motion, space)), motion.pose)
 
-    def clouds(self, *, episode: int = 0) -> tuple[NeighbourIndex, ...]:
-        """The recorded clouds of the L loss frames."""
-        return self._targets[episode].clouds
-
-    def frame_losses(self, run: Rollout, offset: Mapping[str, Tensor] | None = None, *, episode: int = 0) -> Tensor:
-        """[B, L] one-sided Chamfer loss of a rollout at each loss frame."""
-        points = self.points(run, offset, episode=episode)
-        clouds = self.clouds(episode=episode)
-        return torch.stack([one_sided_chamfer(points[:, index], cloud) for index, cloud in enumerate(clouds)], dim=-1)
-
-    def _loss(self, episode: int, parameters: Mapping[str, Tensor], offset: Mapping[str, Tensor]) -> Tensor:
-        run = self.simulate_to_loss(parameters, episode=episode)
-        return self.frame_losses(run, offset, episode=episode).mean(-1)
-
-    def _target(self, episode: Episode) -> _Target:
-        system = self.system
-        times, clouds = [], []
-        for frame in self.frames:
-            cloud = episode.frame(frame)
-            times.append(episode.times[frame])
-            clouds.append(NeighbourIndex(torch.as_tensor(cloud, dtype=torch.float64)))
-        end = self.scenario.steps * system.time_step
-        if max(times) > end + 0.5 * self.scenario.scene.frame_time:
-            raise EpisodeError(
-                f"A loss frame lies at {max(times):.3f} s, but scenario {self.scenario.name} simulates only {end:.3f} s. "
-                "Use a scenario with more frames, or another loss frame."
-            )
-        track = None
-        if episode.gripper is not None:
-            track = torch.as_tensor(
-                track_displacement(episode, system.handles.grippers, self.scenario.steps, system.time_step),
-                dtype=torch.float64,
-            )[None]
-        centre = torch.cat([cloud.points for cloud in clouds]).mean(0)
-        return _Target(torch.as_tensor(np.array(times), dtype=torch.float64), tuple(clouds), centre, track)
-
-
-def track_displacement(episode: Episode, grippers: Sequence[str], steps: int, time_step: float) -> np.ndarray:
-    """[S, G, 3] displacement of the scene's grippers since time zero at the end of each step [m].
-
-    A cubic spline through the recorded positions, constant after the last. Recorded positions begin with the motion: a
-    track whose first frame is later than time zero is held at its first position until then.
-
-    Raises:
-        EpisodeError: other grippers were recorded than the scene has. (A single one needs no name.)
-    """
-    assert episode.gripper is not None
-    if len(grippers) == len(episode.grippers) == 1:
-        recorded = [0]
-    elif set(grippers) == set(episode.grippers):
-        recorded = [episode.grippers.index(name) for name in grippers]
-    else:
-        raise EpisodeError(
-            f"The scene's grippers are {', '.join(grippers) or 'none'}, the episode's {', '.join(episode.grippers)}; give "
-            "both the same names, in the scenario's `grippers` or in the tracks that are imported."
-        )
-    if len(episode.times) < 2:
-        return np.zeros((steps, len(grippers), 3))
-    times, positions = episode.times, episode.gripper[:, recorded]
-    at = np.clip(np.cumsum(np.full(steps, time_step)), times[0], times[-1])
-    from scipy.interpolate import CubicSpline  # slow to import, and needed for recorded grippers alone
-
-    return np.asarray(CubicSpline(times, positions)(at) - positions[0])
-
-
-def _displaced(points: Tensor, centre: Tensor, offset: Mapping[str, Tensor]) -> Tensor:
-    """Displace the simulated points as the recorded cloud is displaced; so the target's search tree stays as it is.
-
-    Turned by the yaw about the target's centre, then shifted.
-    """
-    zero = torch.zeros_like(next(iter(offset.values())))
-    shift = torch.stack([offset.get(name, zero) for name in ("offset_x", "offset_y", "offset_z")], dim=-1)
-    yaw = offset.get("offset_yaw", zero)
-    cos, sin, one = yaw.cos(), yaw.sin(), torch.ones_like(yaw)
-    turn = torch.stack([cos, sin, zero, -sin, cos, zero, zero, zero, one], dim=-1).unflatten(-1, (3, 3))  # for row vectors
-    return (points - centre) @ turn[:, None] + (centre + shift)[:, None, None]
+    def _drawn(self, target: Target, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """[L, Q, 3] recorded points that look for the cloth, as many as there are sampled ones, and [L, Q] how sure."""
+        points, sure = [], []
+        for cloud, weight in zip(target.clouds, target.sure, strict=True):
+            index = torch.randint(len(cloud.points), (self.point_count,), generator=generator)
+            points.append(cloud.points[index])
+            sure.append(weight[index])
+        return torch.stack(points), torch.stack(sure)

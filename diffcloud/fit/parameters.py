@@ -20,13 +20,6 @@ from torch import Tensor
 from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.sim.properties import PARAMETERS, check_values
 
-NUISANCE = {
-    "offset_x": "m",
-    "offset_y": "m",
-    "offset_z": "m",
-    "offset_yaw": "rad",
-}
-"""Rigid offset of the target cloud, fitted along to absorb calibration error; not a property of the cloth."""
 _EDGE = 1e-6
 
 
@@ -58,15 +51,12 @@ class FitSpace:
         *,
         bounds: Mapping[str, tuple[float, float]] | None = None,
         fixed: Mapping[str, float] | None = None,
-        offset: bool = False,
-        offset_range: tuple[float, float] = (0.02, 0.1),
     ) -> FitSpace:
         """
         Args:
             names: parameters to fit.
             bounds: overrides of each parameter's own bounds.
             fixed: parameters with a known value (a weighed cloth: mass).
-            offset: fit a rigid offset of the target along, within ± offset_range (length unit, rad).
 
         Raises:
             ConfigError: an unknown, repeated or doubly given parameter, or bounds out of order.
@@ -83,9 +73,6 @@ class FitSpace:
             raise ConfigError(f"A parameter is listed twice: {', '.join(names)}.")
         both = sorted(set(names) & set(fixed))
         variables = [Variable(n, *bounds.get(n, PARAMETERS[n].bounds)) for n in names if n not in both]
-        if offset:
-            ranges = dict(zip(NUISANCE, (*[offset_range[0]] * 3, offset_range[1]), strict=True))
-            variables += [Variable(name, -ranges[name], ranges[name]) for name in NUISANCE]
         if not variables:
             raise ConfigError("Nothing is left to fit: every listed parameter is fixed.")
         return FitSpace(tuple(variables), fixed)
@@ -155,8 +142,6 @@ class FitSpace:
             safe = np.where(low > 0, low, 1.0)
             logs = safe * np.where(low > 0, high / safe, 1.0) ** sobol
             values[1:] = np.where(low > 0, logs, low + (high - low) * sobol)
-            nuisance = [index for index, name in enumerate(self.names) if name in NUISANCE]
-            values[1:, nuisance] = 0.0
         return torch.as_tensor(values), torch.arange(count) > 0
 
     def moved(self, values: Tensor, parts: Tensor) -> Tensor:
@@ -166,12 +151,10 @@ class FitSpace:
         moved = torch.where(low > 0, values * parts.exp(), values + (high - low) * parts)
         return torch.minimum(torch.maximum(moved, low), high)
 
-    def split(self, values: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """[B, k] -> (parameters of the simulator incl. the fixed ones, offset of the target), name -> [B]."""
+    def parameters(self, values: Tensor) -> dict[str, Tensor]:
+        """[B, k] -> parameters of the simulator, the fixed ones too, name -> [B]."""
         columns = dict(zip(self.names, values.unbind(-1), strict=True))
-        columns |= {name: torch.full_like(values[:, 0], value) for name, value in self.fixed.items()}
-        offset = {name: columns.pop(name) for name in NUISANCE if name in columns}
-        return columns, offset
+        return columns | {name: torch.full_like(values[:, 0], value) for name, value in self.fixed.items()}
 
     def _bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
         low = [variable.low for variable in self.variables]

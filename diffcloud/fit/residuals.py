@@ -1,18 +1,15 @@
-"""How the loss of simulated points changes with what is fitted, to first and second order.
+"""How the loss changes with what is fitted, to first and second order.
 
 Variables are fitted on an axis of their own: the logarithm of a value whose lower bound is positive, else the part of its
 range. Where the integrator's derivatives hold over finite distances (the implicit one: docs/results/gradients.md), the
 motion is linearised by forward tangents, in one simulation. The linearised integrator's contact is rough: there, motions
 a finite step to both sides give the differences.
 
-With r = x - y of a simulated point x and the recorded point y nearest to it, the loss is the mean of |r|², and half of its
-slope that of r · ∂x. For the curvature, Gauss and Newton would take |∂x|², as if x were bound to the point y. But y is
-a sample of a surface, along which x may slide: with the surface's normal n at y, and r's own direction t along the surface,
+What a motion says at a pose stands in `matching`. The pose is not among the variables: it follows them, to where the loss
+is lowest. Of the whole system over variables p and pose q, what is left when q is solved for is (variable projection;
+Golub and Pereyra 2003)
 
-    curvature = (n · ∂x)² + w (t · ∂x)²,      w = |r_t|² / (|r_t|² + s²),
-
-where s is the distance between recorded points. So w is small inside of the recorded surface and near one where x lies
-beyond its rim. (Chen and Medioni 1992 minimise the first part alone.)
+    slope g_p - H_pq H_qq⁻¹ g_q,      curvature H_pp - H_pq H_qq⁻¹ H_qp.
 """
 
 from __future__ import annotations
@@ -27,7 +24,7 @@ from diffcloud.fit.batches import without_diverged
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.sim.properties import Properties
-from diffcloud.sim.simulate import rollout_tangents
+from diffcloud.sim.simulate import Rollout, rollout_tangents
 
 STEP = 0.05
 """Of the differences, on the axis: 5 % of a value."""
@@ -86,10 +83,13 @@ class Linearisation:
 def linearise(objective: Objective, space: FitSpace, places: Tensor) -> Linearisation:
     """The loss at [B, k] places, by the rule that stands at the head of this module."""
     by_tangents = objective.scenario.scene.integrator == "implicit"
-    rates_of = _by_tangents if by_tangents else _by_differences
+    moved = _by_tangents if by_tangents else _by_differences
 
     def run(index: Tensor) -> list[Tensor]:
-        parts = [_terms(objective, space, places[index], rates_of, episode) for episode in range(objective.episode_count)]
+        parts = []
+        for episode in range(objective.episode_count):
+            motion, rates = moved(objective, space, places[index], episode)
+            parts.append(_over_pose(objective, motion, rates, episode))
         return [torch.stack(part).mean(0) for part in zip(*parts, strict=True)]
 
     with torch.no_grad():
@@ -103,15 +103,12 @@ def linearise(objective: Objective, space: FitSpace, places: Tensor) -> Linearis
     return Linearisation(losses, slope, curvature, each * count * objective.episode_count)
 
 
-Rates = Callable[[Objective, FitSpace, Tensor, int], tuple[Tensor, Tensor]]
-"""Node positions [B, L, V, 3] at the loss frames of an episode, and their rates [k, B, L, V, 3]."""
-
-
-def _by_tangents(objective: Objective, space: FitSpace, places: Tensor, episode: int) -> tuple[Tensor, Tensor]:
+def _by_tangents(objective: Objective, space: FitSpace, places: Tensor, episode: int) -> tuple[Rollout, Tensor]:
+    """Motions of B places, and the rates [k, B, L, V, 3] of their nodes at the compared frames."""
     axis = Axis.of(space)
 
     def properties(at: Tensor) -> tuple[Tensor, ...]:
-        return objective.scenario.properties(objective.system, space.split(axis.values(at))[0]).tensors()
+        return objective.scenario.properties(objective.system, space.parameters(axis.values(at))).tensors()
 
     rates = [_along(properties, places, way) for way in _ways(places)]
     run, moves = rollout_tangents(
@@ -122,54 +119,34 @@ def _by_tangents(objective: Objective, space: FitSpace, places: Tensor, episode:
         track=objective.track(episode),
     )
     times = objective.times(episode)
-    return run.at(times), torch.stack([replace(run, positions=move).at(times) for move in moves])
+    return run, torch.stack([replace(run, positions=move).at(times) for move in moves])
 
 
-def _by_differences(objective: Objective, space: FitSpace, places: Tensor, episode: int) -> tuple[Tensor, Tensor]:
+def _by_differences(objective: Objective, space: FitSpace, places: Tensor, episode: int) -> tuple[Rollout, Tensor]:
+    """The same."""
     axis = Axis.of(space)
     low, high = axis.ends
     ways = _ways(places)
     above, below = (torch.minimum(torch.maximum(places + sign * STEP * ways, low), high) for sign in (1, -1))
     every = torch.cat([places[None], above, below]).flatten(0, 1)
-    run = objective.simulate_to_loss(space.split(axis.values(every))[0], episode=episode)
-    here, *others = run.at(objective.times(episode)).split(len(places))
-    there = torch.stack(others).unflatten(0, (2, -1))
+    run = objective.simulate_to_loss(space.parameters(axis.values(every)), episode=episode)
+    there = run.at(objective.times(episode))[len(places) :].unflatten(0, (2, -1, len(places)))
     width = ((above - below) * ways).sum(-1)  # halved at a bound
-    return here, (there[0] - there[1]) / width[..., None, None, None]
+    return replace(run, positions=run.positions[: len(places)]), (there[0] - there[1]) / width[..., None, None, None]
 
 
-def _terms(
-    objective: Objective, space: FitSpace, places: Tensor, rates_of: Rates, episode: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Loss [B], slope [B, k] and curvature [B, k, k] of one episode."""
-    axis = Axis.of(space)
-    positions, rates = rates_of(objective, space, places, episode)
-
-    def points(nodes: Tensor, at: Tensor) -> tuple[Tensor]:
-        return (objective.points_of(nodes, space.split(axis.values(at))[1], episode=episode),)
-
-    (simulated,) = points(positions, places)
-    moves = torch.stack(
-        [
-            torch.func.jvp(points, (positions, places), (rate, way))[1][0]
-            for rate, way in zip(rates, _ways(places), strict=True)
-        ]
-    )  # [k, B, L, N, 3]
-    parts = []
-    for frame, cloud in enumerate(objective.clouds(episode=episode)):
-        here, along = simulated[:, frame], moves[:, :, frame]
-        nearest = cloud.nearest_index(here)
-        away, normal = here - cloud.points[nearest], cloud.normals[nearest]
-        flat = away - (away * normal).sum(-1, keepdim=True) * normal
-        squared = flat.square().sum(-1)
-        rim = flat / (squared + cloud.spacing**2).sqrt()[..., None]  # sqrt(w) t
-        rows = torch.stack([(along * one).sum(-1) for one in (normal, rim)])  # [2, k, B, N]
-        count = here.shape[1]
-        slope = torch.einsum("kbni,bni->bk", along, away) / count
-        curvature = torch.einsum("rkbn,rlbn->bkl", rows, rows) / count
-        parts.append((away.square().sum(-1).mean(-1), slope, curvature))
-    loss, slope, curvature = (torch.stack(part).mean(0) for part in zip(*parts, strict=True))
-    return loss, slope, curvature
+def _over_pose(objective: Objective, run: Rollout, rates: Tensor, episode: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Loss [B], slope [B, k] and curvature [B, k, k] of one episode, the pose solved for."""
+    motion, count = objective.match(run, episode=episode), len(rates)
+    loss, slope, curvature = objective.terms(motion, rates, episode=episode)
+    if motion.pose.shape[1] == 0:
+        return loss, slope, curvature
+    prior = objective.pose_space(episode).prior_weights
+    of_pose = slope[:, count:] + prior * motion.pose
+    along, mixed = curvature[:, count:, count:] + prior.diag(), curvature[:, :count, count:]
+    solved = torch.linalg.solve(along, torch.cat([of_pose[..., None], mixed.mT], dim=-1))
+    slope = slope[:, :count] - (mixed @ solved[..., :1]).squeeze(-1)
+    return loss, slope, curvature[:, :count, :count] - mixed @ solved[..., 1:]
 
 
 def _ways(places: Tensor) -> Tensor:

@@ -15,14 +15,16 @@ from numpy.typing import NDArray
 import diffcloud
 from diffcloud.errors import ConfigError
 from diffcloud.fit.objective import Objective
-from diffcloud.fit.parameters import NUISANCE, FitSpace
+from diffcloud.fit.parameters import FitSpace
+from diffcloud.fit.pose import PoseSpace
 from diffcloud.fit.solvers import SOLVER_NAMES, FitOutcome, Settings
 from diffcloud.io.files import read_json, together, write_json, write_npz
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS
+from diffcloud.sim.simulate import Rollout
 
-_SCHEMA = 2
+_SCHEMA = 3
 
 
 @dataclass(frozen=True)
@@ -32,24 +34,21 @@ class FitResult:
     summary: dict[str, Any]
     """The JSON file."""
     positions: NDArray[np.float64]
-    """[T + 1, V, 3] fitted nodes at each frame, in the scene's unit."""
+    """[T + 1, V, 3] fitted nodes at each frame, in the scene's unit and the first recording's frame: its pose applied."""
     start_positions: NDArray[np.float64]
-    """[T + 1, V, 3] nodes at the first start's parameters."""
+    """[T + 1, V, 3] nodes at the first start's parameters, at the pose found with these."""
     faces: NDArray[np.int64]
     """[F, 3]"""
     times: NDArray[np.float64]
     """[T + 1] [s]"""
     bodies: SurfaceMesh
-    """Fixed bodies around the cloth, without tables."""
+    """Fixed bodies around the cloth, without tables, in the first recording's frame."""
 
 
 def physical_values(scenario: Scenario, values: Mapping[str, float]) -> dict[str, dict[str, Any]]:
     """Each parameter with what it means: multiplier, physical value and unit (SI if the scene is)."""
     described: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
-        if name in NUISANCE:
-            described[name] = {"value": value, "unit": NUISANCE[name], "physical": value, "physical_unit": NUISANCE[name]}
-            continue
         parameter = PARAMETERS[name]
         basis = parameter.basis
         described[name] = {
@@ -86,40 +85,39 @@ def describe_fit(
             low, high = bounds[name]
             entry["at_bound"] = bool(min(outcome.values[name] - low, high - outcome.values[name]) < 0.01 * (high - low))
 
-    def batch(values: Mapping[str, float]) -> dict[str, torch.Tensor]:
-        return {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
-
-    def split(values: Mapping[str, float]) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
-        tensors = batch(values)
-        return (
-            {name: value for name, value in tensors.items() if name not in NUISANCE},
-            {name: value for name, value in tensors.items() if name in NUISANCE},
-        )
+    def motions(values: Mapping[str, float], episodes: int) -> list[Rollout]:
+        sets = {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
+        return [objective.simulate(sets, episode=index) for index in range(episodes)]
 
     history = outcome.history
     start_values = outcome.start | dict(space.fixed)
+    unit = scenario.length_unit_m
     with torch.no_grad():
-        frame_steps = scenario.scene.frame_steps
-        fitted, offset = split(all_values)
-        runs = [objective.simulate(fitted, episode=index) for index in range(objective.episode_count)]
-        run, start = runs[0], objective.simulate(split(start_values)[0])
+        runs = motions(all_values, objective.episode_count)
+        (start,) = motions(start_values, 1)
+        recordings = {
+            name: describe_recording(objective, run, episode=index)
+            for index, (name, run) in enumerate(zip(episodes, runs, strict=True))
+        }
+        shown, shown_start = objective.shown(runs[0]), objective.shown(start)
         resampled = []
         for seed in range(1, resampled_seeds + 1):
             objective.reseed(settings.seed + 10_000 + seed)
-            losses = [objective.frame_losses(one, offset, episode=index) for index, one in enumerate(runs)]
+            losses = [objective.frame_losses(one, episode=index) for index, one in enumerate(runs)]
             resampled.append(float(torch.stack([loss.mean() for loss in losses]).mean()))
         objective.reseed(settings.seed)
-    unit = scenario.length_unit_m
+    loss = float(np.mean([recording["loss"] for recording in recordings.values()]))  # by itself, not in a solver's batch
     summary = {
         "schema": _SCHEMA,
         "scenario": scenario.name,
         "episodes": episodes,
+        "recordings": recordings,
         "solver": SOLVER_NAMES[type(settings)],
-        "loss": outcome.loss,
+        "loss": loss,
         "loss_start": outcome.loss_start,
         "loss_resampled": float(np.mean(resampled)),
-        "loss_unit": "squared length unit, mean over simulated points",
-        "rms_mm": 1e3 * unit * outcome.loss**0.5,
+        "loss_unit": "squared length unit, mean over points",
+        "rms_mm": 1e3 * unit * loss**0.5,
         "length_unit_m": unit,
         "iterations": outcome.iterations,
         "evaluations": outcome.evaluations,
@@ -130,8 +128,10 @@ def describe_fit(
         "best_start": outcome.best_start,
         "settings": {
             **{name: value for name, value in asdict(settings).items() if name != "init"},
+            "paper": objective.paper,
+            "nuisance": objective.nuisance,
             "points": objective.point_count,
-            "frames": list(objective.frames),
+            "frames": None if objective.asked_frames is None else list(objective.asked_frames),
         },
         "history": {
             "names": list(history.names),
@@ -144,12 +144,55 @@ def describe_fit(
     }
     return FitResult(
         summary=summary,
-        positions=run.positions[0, ::frame_steps].cpu().numpy(),
-        start_positions=start.positions[0, ::frame_steps].cpu().numpy(),
+        positions=shown,
+        start_positions=shown_start,
         faces=objective.system.mesh.faces,
-        times=run.times[::frame_steps].cpu().numpy(),
-        bodies=scenario.scene.bodies,
+        times=runs[0].times[:: scenario.scene.frame_steps].cpu().numpy(),
+        bodies=SurfaceMesh(objective.posed_bodies(runs[0]), scenario.scene.bodies.faces),
     )
+
+
+def describe_recording(objective: Objective, run: Rollout, *, episode: int = 0) -> dict[str, Any]:
+    """One recording beside the motion fitted to it, as plain values in SI.
+
+    Returns:
+        loss [squared length unit]; rms_mm, and in the default measure rms_to_recording_mm and rms_to_cloth_mm: each
+        direction by itself; frames: that were compared; frame_rms_mm: of each; counted: part of the simulated points that
+        count, in each; cut_m: height below which nothing was recorded; nuisance: name -> value, prior, unit; centre: of
+        the recording, about which the scene is turned.
+    """
+    unit, space = objective.scenario.length_unit_m, objective.pose_space(episode)
+    losses = objective.frame_losses(run, episode=episode)[0]
+    ways = objective.way_losses(run, episode=episode)
+    cut = objective.cut(episode)
+    names = ("rms_to_recording_mm", "rms_to_cloth_mm")
+    return {
+        "loss": float(losses.mean()),
+        "rms_mm": 1e3 * unit * float(losses.mean()) ** 0.5,
+        **{name: 1e3 * unit * float(loss) ** 0.5 for name, loss in zip(names, ways, strict=False)},
+        "frames": list(objective.frames(episode)),
+        "frame_rms_mm": (1e3 * unit * losses.sqrt()).tolist(),
+        "counted": objective.counted(run, episode=episode)[0].double().mean(-1).tolist(),
+        "cut_m": None if cut is None else cut * unit,
+        "nuisance": space.described(objective.match(run, episode=episode).pose[0], length_unit_m=unit),
+        "centre": space.centre.tolist(),
+    }
+
+
+def posed(recording: Mapping[str, Any], run: Rollout, times: torch.Tensor, *, length_unit_m: float) -> NDArray[np.float64]:
+    """[T, V, 3] nodes of a rollout of one motion at times [T], where a recording of a fit has them.
+
+    Args:
+        recording: as of `describe_recording`.
+    """
+    described = recording["nuisance"]
+    priors = {name: float(entry["prior"]) for name, entry in described.items()}
+    centre = torch.tensor(recording["centre"], dtype=torch.float64)
+    space = PoseSpace.build(priors, centre, length_unit_m=length_unit_m)
+    pose = space.of(described, length_unit_m=length_unit_m)[None]
+    lag = space.lag(pose)
+    nodes = run.at(times if lag is None else times + lag)
+    return space.moved(nodes, pose)[0].cpu().numpy()
 
 
 def write_fit(folder: Path, name: str, result: FitResult) -> Path:

@@ -214,7 +214,7 @@ def overlay_figure(entries: Sequence[EpisodeEntry]) -> Figure | None:
     shown = [first[name] for name in dict.fromkeys(entry.scenario for entry in entries)]
     canvas, axes = _canvas(2 * len(shown), height=2.9)
     for index, entry in enumerate(shown):
-        frame = entry.fit["settings"]["frames"][0] % entry.episode.frame_count
+        frame = entry.last_frame
         state = int(np.abs(entry.times - entry.episode.times[frame]).argmin())
         cloud = entry.episode.frame(frame).astype(float)
         flat = cloud[:, :2] - cloud[:, :2].mean(axis=0)

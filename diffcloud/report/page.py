@@ -53,6 +53,11 @@ class EpisodeEntry:
     pictures: Mapping[str, bytes] = field(default_factory=dict)
     """Caption -> PNG, of episodes made from raw recordings."""
 
+    @property
+    def last_frame(self) -> int:
+        """The last of the recording that the fit compared."""
+        return int(self.fit["recordings"][self.fit["episodes"][0]]["frames"][-1])
+
 
 def build_page(
     entries: Sequence[EpisodeEntry],
@@ -139,13 +144,12 @@ def _entry_data(entry: EpisodeEntry, overlay_points: int, rng: np.random.Generat
         )
     history = entry.fit["history"]
     best = np.minimum.accumulate([min(v for v in row if v is not None) for row in history["loss"]])
-    count = entry.episode.frame_count
     return {
         "name": f"{entry.scenario} / {entry.name}",
         "frames": frames,
         "faces": entry.faces.T.tolist(),
         "bodies": {"nodes": _axes(entry.bodies.nodes), "faces": entry.bodies.faces.T.tolist()},
-        "lossFrame": min(entry.fit["settings"]["frames"][0] % count, len(frames) - 1),
+        "lossFrame": min(entry.last_frame, len(frames) - 1),
         "loss": [float(f"{value:.4g}") for value in best],
     }
 

@@ -29,7 +29,7 @@ class Bowl:
     def reseed(self, seed: int) -> None:
         pass
 
-    def __call__(self, parameters, offset=None):
+    def __call__(self, parameters):
         self.calls += 1
         stacked = torch.stack(list(parameters.values()))
         bad = (stacked > self.diverges_above).any(0).nonzero().flatten().tolist()
@@ -59,12 +59,12 @@ class KnownResiduals:
     def simulate(self, parameters):
         return torch.stack([(parameters[name] / value).log() for name, value in self.optimum.items()], dim=-1)
 
-    def points(self, run, offset=None):
+    def points(self, run):
         x = 10 + run @ self.rows.T + self.errors
         return torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], dim=-1)[:, None]
 
     def clouds(self):
         return (NeighbourIndex(torch.zeros(1, 3).double()),)
 
-    def frame_losses(self, run, offset=None):
+    def frame_losses(self, run):
         return self.points(run).square().sum(-1).mean(-1)

@@ -103,9 +103,9 @@ class TestCheck:
         """Whatever moves the mass moves all points by a tenth, as when another contact is met: to one side or to both."""
 
         class Jumping(KnownResiduals):
-            def points(self, run, offset=None):
+            def points(self, run):
                 lower = -run[:, 1] if not both else run[:, 1].abs()
-                places = super().points(run, offset)
+                places = super().points(run)
                 places[..., 0] += 0.1 * (lower > 1e-4)[:, None, None]
                 return places
 

@@ -76,11 +76,11 @@ def test_one_start_is_the_first_of_many():
     ],
 )
 def test_an_interrupted_rival_is_no_result(rival, monkeypatch):
-    def interrupt(self, parameters, offset=None):
+    def interrupt(self, parameters):
         self.calls += 1
         if self.calls == 3:
             raise KeyboardInterrupt
-        return real(self, parameters, offset)
+        return real(self, parameters)
 
     real = Bowl.__call__
     monkeypatch.setattr(Bowl, "__call__", interrupt)
@@ -100,7 +100,7 @@ def test_batches_without_the_diverged_are_the_single_ones():
     losses = batch_losses(bowl, SPACE, values)
     assert losses.isinf().tolist() == [False, True, False, True]
     for row in (0, 2):
-        torch.testing.assert_close(losses[row : row + 1], bowl(SPACE.split(values[row : row + 1])[0]))
+        torch.testing.assert_close(losses[row : row + 1], bowl(SPACE.parameters(values[row : row + 1])))
 
 
 def test_every_lost_entry_has_its_own_message():
@@ -121,21 +121,19 @@ class TestValues:
         "parameters": {
             "stretch": {"value": 2.0, "fixed": False, "bounds": [0.5, 4.0]},
             "mass": {"value": 1.2, "fixed": True, "bounds": None},
-            "offset_x": {"value": 0.01, "fixed": False, "bounds": [-0.02, 0.02]},
         }
     }
 
-    def test_what_was_given_and_the_offset_hold_for_all_methods(self):
+    def test_what_was_given_holds_for_all_methods(self):
         space = space_of(self.SUMMARY)
         assert space.names == ("stretch",)
-        parameters, offset = space.split(torch.tensor([[2.0]]).double())
+        parameters = space.parameters(torch.tensor([[2.0]]).double())
         assert {name: float(value) for name, value in parameters.items()} == {"stretch": 2.0, "mass": 1.2}
-        assert {name: float(value) for name, value in offset.items()} == {"offset_x": 0.01}
 
     @pytest.mark.parametrize(("told", "value"), [({"stretch": 9.0}, 4.0), ({"stretch": -3.0}, 0.5), ({}, 2.25)])
     def test_clipped_to_the_bounds(self, told, value):
         found = clipped({**told, "mass": 7.0}, space_of(self.SUMMARY))
-        assert found == {"stretch": value, "mass": 1.2, "offset_x": 0.01}
+        assert found == {"stretch": value, "mass": 1.2}
 
     def test_published_predictions(self):
         told = published({"predictions": {"mlp": {"stretch": -1.0, "mass": 3.0}}})

@@ -16,7 +16,7 @@ from diffcloud.fit import AdamSettings, FitSpace, Objective, RandomSearchSetting
 from diffcloud.fit.result import describe_fit
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import built_in, make_scenario
-from tests.conftest import small_lift
+from tests.conftest import paper_objective, small_lift
 from tests.fit.test_fit import clouds_of
 
 TRUTH = {"stretch": 0.8, "mass": 1.5}
@@ -39,24 +39,24 @@ def batch(*sets):
 
 @pytest.fixture(scope="module")
 def rows(scenario, episode):
-    return EpisodeMeter(scenario, episode, frames=[-1], draws=2, seed=7).measure([TRUTH, OTHER]).rows
+    return EpisodeMeter(scenario, episode, frames=[-1], paper=True, draws=2, seed=7).measure([TRUTH, OTHER]).rows
 
 
 class TestMeter:
     def test_loss_is_the_fits_with_fresh_points(self, scenario, episode, rows):
         with torch.no_grad():
-            found = [Objective(scenario, [episode], seed=seed)(batch(TRUTH, OTHER)) for seed in (7, 8)]
+            found = [paper_objective(scenario, [episode], seed=seed)(batch(TRUTH, OTHER)) for seed in (7, 8)]
         torch.testing.assert_close(torch.tensor([row["loss"] for row in rows]).double(), torch.stack(found).mean(0))
         assert rows[1]["loss_deviation"] == pytest.approx(float(torch.stack(found).std(0)[1]))
         assert rows[1]["rms_mm"] == pytest.approx(1e3 * math.sqrt(rows[1]["loss"]))
 
     def test_other_frames_are_all_but_the_first_and_the_fits(self, scenario, episode, rows):
         with torch.no_grad():
-            found = Objective(scenario, [episode], frames=[1, 2, 3, 4], seed=7)(batch(TRUTH, OTHER))
+            found = paper_objective(scenario, [episode], frames=[1, 2, 3, 4], seed=7)(batch(TRUTH, OTHER))
         torch.testing.assert_close(torch.tensor([row["loss_other_frames"] for row in rows]).double(), found)
 
     def test_two_sided_is_both_directions(self, scenario, episode, rows):
-        objective = Objective(scenario, [episode], seed=7)
+        objective = paper_objective(scenario, [episode], seed=7)
         with torch.no_grad():
             points = objective.points(objective.simulate(batch(OTHER)))[:, 0]
         target = NeighbourIndex(torch.as_tensor(episode.frame(-1)).double())
@@ -72,7 +72,7 @@ class TestMeter:
         assert [row["success"] for row in rows] == [row["loss"] < success_threshold(scenario) for row in rows]
 
     def test_one_that_diverges_costs_only_itself(self, scenario, episode, rows):
-        meter = EpisodeMeter(scenario, episode, frames=[-1], draws=2, seed=7)
+        meter = EpisodeMeter(scenario, episode, frames=[-1], paper=True, draws=2, seed=7)
         found = meter.measure([TRUTH, {"stretch": -1e9, "mass": 1.0}, OTHER])
         assert list(found.diverged) == [1]
         assert "diverged at step" in found.diverged[1]
@@ -81,14 +81,14 @@ class TestMeter:
 
     def test_an_episode_of_the_loss_frame_alone(self, scenario, episode):
         short = Episode.from_frames([episode.frame(0), episode.frame(-1)], episode.times[[0, -1]])
-        row = EpisodeMeter(scenario, short, frames=[-1], draws=1).measure([TRUTH]).rows[0]
+        row = EpisodeMeter(scenario, short, frames=[-1], paper=True, draws=1).measure([TRUTH]).rows[0]
         assert "loss_other_frames" not in row
         assert "success" not in row  # nothing is known of it
         assert row["loss_deviation"] == 0.0
 
 
 def test_landscape_is_the_loss_on_a_grid(scenario, episode):
-    objective, space = Objective(scenario, [episode]), FitSpace.build(["stretch", "mass"])
+    objective, space = paper_objective(scenario, [episode]), FitSpace.build(["stretch", "mass"])
     history = {"names": ["stretch", "mass"], "values": [[[1.0, 2.0], [None, None]], [[1.1, 2.1], [3.0, 3.0]]]}
     found = loss_landscape(objective, space, TRUTH, history, size=3)
     assert found["x"] == pytest.approx([0.1, 1.0, 10.0])
@@ -101,7 +101,7 @@ def test_landscape_is_the_loss_on_a_grid(scenario, episode):
 
 @pytest.fixture(scope="module")
 def summary(scenario, episode):
-    objective, space = Objective(scenario, [episode]), FitSpace.build(["stretch", "mass"])
+    objective, space = paper_objective(scenario, [episode]), FitSpace.build(["stretch", "mass"])
     settings = AdamSettings(iterations=3, starts=2)
     outcome = fit_adam(objective, space, settings)
     return describe_fit(objective, space, settings, outcome, episodes=["e"]).summary
@@ -137,7 +137,7 @@ class TestEpisode:
         assert found.seconds["diffcloud"] == {"optimisation": summary["seconds"]}
 
     def test_the_start_is_measured_as_the_methods_are(self, scenario, episode, found, summary):
-        meter = EpisodeMeter(scenario, episode, frames=summary["settings"]["frames"], draws=2)
+        meter = EpisodeMeter(scenario, episode, paper=True, draws=2)
         assert found.record["start"] == pytest.approx(meter.measure([summary["start"]]).rows[0])
 
     def test_transfer_is_measured_as_the_methods_are(self, found):
@@ -166,8 +166,8 @@ class TestEpisode:
     def test_a_rival_that_fails_leaves_a_gap(self, scenario, episode, summary, monkeypatch):
         real = Objective.__call__
 
-        def fragile(self, parameters, offset=None):
-            return real(self, {**parameters, "stretch": torch.full_like(parameters["stretch"], -1e9)}, offset)
+        def fragile(self, parameters):
+            return real(self, {**parameters, "stretch": torch.full_like(parameters["stretch"], -1e9)})
 
         monkeypatch.setattr(Objective, "__call__", fragile)
         settings = ComparisonSettings(rivals=["random_search"], draws=1, identifiability=False)
@@ -181,6 +181,6 @@ def test_what_has_no_stiffness_of_its_own_leaves_the_motion_alone():
     from diffcloud.evaluation import identify
 
     scenario = make_scenario(built_in("lift").model_copy(update={"nodes": (5, 5), "frames": 8, "points": 500}))
-    objective = Objective(scenario, [clouds_of(scenario, stretch=1.0, mass=1.0)])
+    objective = paper_objective(scenario, [clouds_of(scenario, stretch=1.0, mass=1.0)])
     scale = identify(objective, FitSpace.build(["stretch", "mass"]), {"stretch": 1.0, "mass": 1.0}, draws=2)["scale"]
     assert scale["everything"] < 0.5 * scale["fitted"] or scale["everything"] < 1.0

@@ -13,13 +13,13 @@ from diffcloud.errors import ConfigError, DivergedError, EpisodeError
 from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
 from diffcloud.fit.agreement import Agreement, gradient_agreement, random_parameters
 from diffcloud.fit.benchmark import time_contact
-from diffcloud.fit.objective import track_displacement
 from diffcloud.fit.result import describe_fit, read_fit, write_fit
+from diffcloud.fit.targets import track_displacement
 from diffcloud.fit.visibility import visibility_map
 from diffcloud.io.episodes import Episode
 from diffcloud.scene import load_scenario
 from diffcloud.sim import rollout
-from tests.conftest import small_lift
+from tests.conftest import paper_objective, small_lift
 
 
 def clouds_of(scenario, *, points=800, seed=5, gripper=True, shift=(0, 0, 0), yaw=0.0, **truth):
@@ -69,9 +69,8 @@ class TestSpace:
     def test_fixed_and_first_values(self):
         space = FitSpace.build(["stretch", "mass"], fixed={"mass": 1.2})
         assert space.names == ("stretch",)
-        parameters, offset = space.split(torch.tensor([[3.0]]).double())
+        parameters = space.parameters(torch.tensor([[3.0]]).double())
         assert parameters["mass"].tolist() == [1.2]
-        assert not offset
         assert space.starts(1, seed=0, first={"stretch": 2.0})[0].tolist() == [[2.0]]
 
     @pytest.mark.parametrize(
@@ -117,7 +116,7 @@ class TestRecovery:
         scenario = small_lift(**GENTLE)
         episode = clouds_of(scenario, stretch=0.8, mass=1.5)
         space = FitSpace.build(["stretch"], fixed={"mass": 1.5})
-        outcome = fit_adam(Objective(scenario, [episode]), space, AdamSettings(iterations=40))
+        outcome = fit_adam(paper_objective(scenario, [episode]), space, AdamSettings(iterations=40))
         assert outcome.loss < 0.25 * outcome.loss_start
         assert outcome.values["stretch"] == pytest.approx(0.8, rel=0.1)
 
@@ -129,32 +128,20 @@ class TestRecovery:
         for mass in (1.5, 0.75):
             space = FitSpace.build(["stretch"], fixed={"mass": mass})
             settings = AdamSettings(iterations=25, init={"stretch": mass})
-            found.append(fit_adam(Objective(scenario, [episode]), space, settings).values["stretch"])
+            found.append(fit_adam(paper_objective(scenario, [episode]), space, settings).values["stretch"])
         assert found[0] / found[1] == pytest.approx(2.0, rel=0.15)
-
-    def test_offset_of_the_target_is_found_along(self):
-        scenario = small_lift(points=2000)
-        episode = clouds_of(scenario, points=4000, stretch=1.0, mass=1.0, shift=(0.008, -0.005, 0.0), yaw=0.03)
-        space = FitSpace.build(["stretch"], fixed={"mass": 1.0}, offset=True)
-        outcome = fit_adam(Objective(scenario, [episode]), space, AdamSettings(iterations=60, init={"stretch": 1.0}))
-        assert outcome.values["offset_x"] == pytest.approx(0.008, abs=0.002)
-        assert outcome.values["offset_y"] == pytest.approx(-0.005, abs=0.002)
-        truth = {"offset_x": 0.008, "offset_y": -0.005, "offset_z": 0.0, "offset_yaw": 0.03}
-        one = torch.ones(1, dtype=torch.float64)
-        at_truth = Objective(scenario, [episode])({"stretch": one, "mass": one}, {k: v * one for k, v in truth.items()})
-        assert outcome.loss < 1.1 * float(at_truth)
 
     def test_joint_loss_is_the_mean_of_the_episodes(self):
         scenario = small_lift()
         episodes = [clouds_of(scenario, stretch=s, mass=1.0) for s in (0.5, 2.0)]
         values = {"stretch": torch.tensor([1.0, 3.0]).double()}
-        alone = [Objective(scenario, [episode], frames=[2, 5])(values) for episode in episodes]
-        together = Objective(scenario, episodes, frames=[2, 5])(values)
+        alone = [paper_objective(scenario, [episode], frames=[2, 5])(values) for episode in episodes]
+        together = paper_objective(scenario, episodes, frames=[2, 5])(values)
         torch.testing.assert_close(together, torch.stack(alone).mean(0))
 
     def test_truth_has_the_lowest_loss(self):
         scenario = small_lift(points=4000, path=[(0, 0, 0, 0), (0.5, 0, -0.05, 0.3)])
-        objective = Objective(scenario, [clouds_of(scenario, stretch=1.0, mass=1.0)])
+        objective = paper_objective(scenario, [clouds_of(scenario, stretch=1.0, mass=1.0)])
         stretch = torch.tensor([0.5, 0.8, 1.0, 1.25, 2.0]).double()
         assert int(objective({"stretch": stretch}).argmin()) == 2
 
@@ -166,7 +153,7 @@ class TestRun:
 
     @pytest.fixture
     def objective(self, scenario):
-        return Objective(scenario, [clouds_of(scenario, stretch=0.6, mass=1.0)])
+        return paper_objective(scenario, [clouds_of(scenario, stretch=0.6, mass=1.0)])
 
     def test_same_seed_same_result_and_best_iterate_kept(self, scenario, objective):
         space = FitSpace.build(["stretch", "mass"])
@@ -195,11 +182,11 @@ class TestRun:
     def test_a_start_that_diverges_is_dropped_and_named(self, objective, monkeypatch, tmp_path):
         real = Objective.__call__
 
-        def fragile(self, parameters, offset=None):
+        def fragile(self, parameters):
             bad = (parameters["stretch"] > 5.0).nonzero().flatten().tolist()
             if bad:
                 raise DivergedError(3, bad, "test")
-            return real(self, parameters, offset)
+            return real(self, parameters)
 
         monkeypatch.setattr(Objective, "__call__", fragile)
         space, settings = FitSpace.build(["stretch"]), AdamSettings(starts=4, iterations=3, smoothing=0.3)
@@ -215,11 +202,11 @@ class TestRun:
     def test_a_copy_that_diverges_does_not_cost_its_start(self, objective, monkeypatch):
         real = Objective.__call__
 
-        def fragile(self, parameters, offset=None):
+        def fragile(self, parameters):
             bad = (parameters["stretch"] > 5.5).nonzero().flatten().tolist()
             if bad:
                 raise DivergedError(3, bad, "test")
-            return real(self, parameters, offset)
+            return real(self, parameters)
 
         monkeypatch.setattr(Objective, "__call__", fragile)
         outcome = fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings(iterations=1, smoothing=0.5))
@@ -236,7 +223,7 @@ class TestRun:
     def test_the_loss_with_fresh_points_is_the_objectives_own(self, scenario):
         episodes = [clouds_of(scenario, stretch=stretch, mass=1.0, shift=(0.0, 0.0, 0.002)) for stretch in (0.7, 1.4)]
         objective = Objective(scenario, episodes)
-        space = FitSpace.build(["stretch"], offset=True, offset_range=(0.02, 0.1))
+        space = FitSpace.build(["stretch"])
         settings = AdamSettings(iterations=2, seed=3)
         outcome = fit_adam(objective, space, settings)
         summary = describe_fit(objective, space, settings, outcome, episodes=["a", "b"], resampled_seeds=2).summary
@@ -244,7 +231,7 @@ class TestRun:
         for seed in (10_004, 10_005):
             objective.reseed(seed)
             values = torch.tensor([list(outcome.values.values())], dtype=torch.float64)
-            losses.append(float(objective(*space.split(values))))
+            losses.append(float(objective(space.parameters(values))))
         assert summary["loss_resampled"] == pytest.approx(np.mean(losses), rel=1e-9)
 
     def test_result_files(self, scenario, objective, tmp_path):
@@ -271,20 +258,20 @@ class TestRun:
     def test_frames_that_the_episode_lacks(self, scenario):
         episode = clouds_of(scenario, stretch=1.0)
         with pytest.raises(EpisodeError, match="Frame 24 is missing"):
-            Objective(scenario, [episode], frames=[24])
+            paper_objective(scenario, [episode], frames=[24])
 
     def test_frames_after_the_end_of_the_simulation(self, scenario):
         late = clouds_of(small_lift(frames=9), stretch=1.0)
         with pytest.raises(EpisodeError, match="simulates only"):
-            Objective(scenario, [late])
+            paper_objective(scenario, [late])
 
 
 def test_a_track_drives_the_handle_as_the_scenes_motion_does():
     """With and without the recorded track the same episode gives nearly the same motion."""
     scenario = small_lift()
     values = {"stretch": torch.tensor([0.7]).double()}
-    with_track = Objective(scenario, [clouds_of(scenario, stretch=0.7)]).simulate(values)
-    without = Objective(scenario, [clouds_of(scenario, stretch=0.7, gripper=False)]).simulate(values)
+    with_track = paper_objective(scenario, [clouds_of(scenario, stretch=0.7)]).simulate(values)
+    without = paper_objective(scenario, [clouds_of(scenario, stretch=0.7, gripper=False)]).simulate(values)
     assert (with_track.positions - without.positions).abs().max() < 3e-3
     assert (with_track.positions - without.positions).abs().max() > 0
 
@@ -319,12 +306,12 @@ def test_the_box_of_parameters_is_visible_at_camera_noise(name, linear):
 
 def test_screened_starts_are_the_best_candidates():
     scenario = small_lift()
-    objective = Objective(scenario, [clouds_of(scenario, stretch=0.4, mass=1.5)])
+    objective = paper_objective(scenario, [clouds_of(scenario, stretch=0.4, mass=1.5)])
     space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
     outcome = fit_adam(objective, space, AdamSettings(starts=4, screen=15, iterations=0))
     candidates, _ = space.starts(16, seed=0)
     with torch.no_grad():
-        losses = objective(*space.split(candidates))
+        losses = objective(space.parameters(candidates))
     expected = torch.cat([losses[:1], losses[1:].sort().values[:3]])
     assert torch.allclose(outcome.history.losses[0], expected, rtol=1e-9)
     assert outcome.evaluations == 15 + 4
@@ -337,7 +324,7 @@ class Rough:
         self.height = height
         self.system = SimpleNamespace(device=torch.device("cpu"), dtype=torch.float64)
 
-    def __call__(self, parameters, offset=None):
+    def __call__(self, parameters):
         away = torch.stack([(parameters["stretch"] / 0.13).log(), (parameters["mass"] / 7.0).log()])
         return (away.square() + self.height * (1 - (40 * away).cos())).sum(0)
 

@@ -24,8 +24,8 @@ class Counted(Bowl):
         super().__post_init__()
         self.asked = []
 
-    def __call__(self, parameters, offset=None):
-        losses = super().__call__(parameters, offset)
+    def __call__(self, parameters):
+        losses = super().__call__(parameters)
         self.asked += zip(*(parameters[name].tolist() for name in self.target), strict=True)
         return losses
 
@@ -106,10 +106,10 @@ class TestSearch:
 
     def test_ctrl_c_within_a_simulation_or_before_the_first_loss(self, settings):
         class Stopped(Bowl):
-            def __call__(self, parameters, offset=None):
+            def __call__(self, parameters):
                 if self.calls == stop_at:
                     raise KeyboardInterrupt
-                return super().__call__(parameters, offset)
+                return super().__call__(parameters)
 
         stop_at = 2
         assert solve(Stopped(), SPACE, settings()).stop_reason == "interrupted"
@@ -125,7 +125,7 @@ class TestSearch:
     def test_a_range_from_zero_is_searched_linearly(self, settings):
         """Where a logarithm would never come near the bound."""
 
-        def line(parameters, offset=None):
+        def line(parameters):
             return (10 * parameters["damping"] - 0.2).square() + (parameters["mass"] / 2).log().square()
 
         space = FitSpace.build(["damping", "mass"], bounds={"damping": (0.0, 0.1)})

@@ -15,7 +15,8 @@ def entry(name="tan1", *, scenario="lift", fabric="tan", failures=()):
     fit = {
         "parameters": {"stretch": {"value": 1.5, "physical": 60.0, "physical_unit": "N/m"}},
         "history": {"loss": [[0.2], [0.1]]},
-        "settings": {"frames": [-1]},
+        "episodes": [name],
+        "recordings": {name: {"frames": [1]}},
         "iterations": 2,
         "seconds": 1.5,
         "failures": list(failures),

@@ -95,7 +95,7 @@ def fit_adam(
                 values = space.values(unbounded[owner] + noise, logarithmic[owner])
                 try:
                     evaluations += len(values)
-                    found = objective(*space.split(values))
+                    found = objective(space.parameters(values))
                     share = 1.0 / torch.bincount(owner, minlength=settings.starts)[owner]
                     (share * found).sum().backward()
                     break

@@ -114,6 +114,8 @@ def read_options(path: Path) -> Options:
         data["material"] = str((Path(path).parent / material).resolve())
     options = _BUILT_IN[base]
     given = options.model_dump()
+    if "loss_frames" in data:
+        given["every_frame"] = False
     for own, other in (("grasped", "grippers"), ("grippers", "grasped")):
         if own in data:
             given.pop(other, None)

@@ -43,6 +43,9 @@ class ScenarioOptions(Checked):
     """Whether the cloth is at rest in bending as it starts, not flat."""
     soft_handles: bool = False
     loss_frames: tuple[int, ...] = (-1,)
+    """The frames that the paper's measure compares, and studies of the motion look at."""
+    every_frame: bool = True
+    """Whether fits compare all usable frames; a file that names loss_frames has only those, unless it says true."""
     points: Annotated[int, Field(ge=1)] = 3500
     learning_rate: Positive = 0.2
     threshold_m2: NonNegative = 0.0
@@ -137,6 +140,7 @@ def assemble(
         scene=scene,
         frames=options.frames,
         loss_frames=tuple(options.loss_frames),
+        every_frame=options.every_frame,
         loss_faces=loss_faces,
         points=options.points,
         learning_rate=options.learning_rate,

@@ -30,7 +30,9 @@ class Scenario:
     frames: int
     """Simulated frames after the start."""
     loss_frames: tuple[int, ...]
-    """Frames of an episode that enter the loss; negative ones count from the end."""
+    """Frames of an episode that enter the paper's loss; negative ones count from the end."""
+    every_frame: bool = False
+    """Whether the default measure compares all usable frames, not these."""
     loss_faces: NDArray[np.int64] | None = None
     """Faces whose surface is sampled; None for all."""
     node_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)

@@ -1,0 +1,40 @@
+"""The pose that a simulated motion is compared at: the one of lowest loss, by Gauss and Newton's steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from diffcloud.fit.pose import PoseSpace
+
+Terms = Callable[[Tensor, float], tuple[Tensor, Tensor, Tensor]]
+"""Poses [B, d] and a factor of the cap -> loss [B], half of its slope [B, d] and of its curvature [B, d, d]."""
+_ARRIVED = 1e-2
+"""A step below this part of the priors' deviations; what is left of the way, the loss has to second order."""
+_LARGEST = 1.0
+"""Step, in deviations."""
+_DAMPING = 1e-6
+
+
+def aligned(space: PoseSpace, start: Tensor, terms: Terms, caps: Sequence[float]) -> Tensor:
+    """[B, d] poses that steps from `start` [B, d] lead to, each one on the loss with another factor of the cap.
+
+    Before they are through, an entry ends where the cap is its own and its step is small, whatever the others do.
+    """
+    poses, going = start, torch.ones(len(start), dtype=torch.bool)
+    for cap in caps:
+        _, slope, curvature = terms(poses, cap)
+        slope, curvature = slope + space.prior_weights * poses, curvature + space.prior_weights.diag()
+        scaled = curvature * space.deviations[:, None] * space.deviations
+        damping = _DAMPING * scaled.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1e-300)
+        eye = torch.eye(len(space.names), dtype=torch.float64)
+        step = -torch.linalg.solve(scaled + damping[:, None, None] * eye, slope * space.deviations)
+        step = step * (_LARGEST / step.abs().amax(-1, keepdim=True).clamp(min=_LARGEST))
+        poses = torch.where(going[:, None], poses + step * space.deviations, poses)
+        if cap == 1.0:
+            going &= step.abs().amax(-1) >= _ARRIVED
+            if not bool(going.any()):
+                break
+    return poses

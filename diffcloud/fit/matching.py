@@ -1,0 +1,131 @@
+"""Pairs of a point of the simulated surface and a recorded one, in both directions, and what they say of a motion.
+
+Forth, points sampled on the cloth look for the nearest recorded ones; back, recorded points look for the nearest place on
+the cloth, or on a body beside it. With r = x - y of such a pair, the loss is the weighted mean of |r|², each capped:
+a recorded point of something else, or a part of the cloth that no camera saw, then draws at nothing.
+
+Half of its slope is the mean of r · ∂x. For its curvature, Gauss and Newton would take |∂x|², as if x were bound to y. But
+either is a sample of a surface, along which it may slide: with the surface's normal n, and r's own direction t along it,
+
+    curvature = (n · ∂x)² + w (t · ∂x)²,      w = |r_t|² / (|r_t|² + s²),
+
+where s is the distance between recorded points. So w is small inside of the surface and near one where r leads beyond its
+rim. (Chen and Medioni 1992 minimise the first part alone.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffcloud.clouds.neighbours import NeighbourIndex
+from diffcloud.clouds.sampling import SurfacePoints
+from diffcloud.fit.pose import PoseSpace
+
+_TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """B motions, L frames, N pairs in each."""
+
+    places: SurfacePoints
+    """[B, L, N] on the surface."""
+    partners: Tensor
+    """[B, L, N, 3] recorded points, in the recording's frame."""
+    normals: Tensor
+    """[B, L, N, 3] of what is slid along, there too."""
+    spacing: Tensor
+    """[L] between recorded points."""
+    weights: Tensor
+    """[B, L, N]"""
+
+    def losses(self, moved: Tensor, cap: float) -> Tensor:
+        """[B, L] sums of the weighted squared distances, differentiable.
+
+        Args:
+            moved: [B, L, N, 3] the places in the recording's frame.
+            cap: largest distance that counts as itself.
+        """
+        return (self.weights * (moved - self.partners).square().sum(-1).clamp(max=cap**2)).sum(-1)
+
+    def terms(self, moved: Tensor, rates: Tensor, cap: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Loss [B], half of its slope [B, k] and of its curvature [B, k, k].
+
+        Args:
+            rates: [k, B, L, N, 3] of the places.
+        """
+        away = moved - self.partners
+        squared = away.square().sum(-1)
+        weights = torch.where(squared < cap**2, self.weights, 0.0)
+        flat = away - (away * self.normals).sum(-1, keepdim=True) * self.normals
+        beside = flat.square().sum(-1) + self.spacing[:, None] ** 2
+        rim = flat / beside.sqrt().clamp(min=_TINY)[..., None]  # sqrt(w) t
+        rows = torch.stack([(rates * one).sum(-1) for one in (self.normals, rim)])  # [2, k, B, L, N]
+        slope = torch.einsum("kblni,blni,bln->bk", rates, away, weights)
+        curvature = torch.einsum("rjbln,rkbln,bln->bjk", rows, rows, weights)
+        return self.losses(moved, cap).sum(-1), slope, curvature
+
+
+@torch.no_grad()
+def pairs_forth(
+    places: SurfacePoints, moved: Tensor, clouds: Sequence[NeighbourIndex], *, cut: float | None, share: float
+) -> Pairs:
+    """Each place with the nearest recorded point of its frame.
+
+    Args:
+        moved: [B, L, N, 3] the places in the recording's frame.
+        cut: places below this height do not count: the recording ends there.
+        share: of all weights.
+    """
+    found = [cloud.nearest_index(moved[:, frame]) for frame, cloud in enumerate(clouds)]
+    partners = torch.stack([cloud.points[index] for cloud, index in zip(clouds, found, strict=True)], dim=1)
+    normals = torch.stack([cloud.normals[index] for cloud, index in zip(clouds, found, strict=True)], dim=1)
+    counted = torch.ones_like(moved[..., 0]) if cut is None else (moved[..., 2] >= cut).to(moved)
+    weights = share * counted / counted.sum(-1, keepdim=True).clamp(min=1.0) / len(clouds)
+    return Pairs(places, partners, normals, moved.new_tensor([cloud.spacing for cloud in clouds]), weights)
+
+
+@torch.no_grad()
+def pairs_back(
+    positions: Tensor,
+    faces: Tensor,
+    recorded: Tensor,
+    sure: Tensor,
+    spacing: Tensor,
+    *,
+    space: PoseSpace,
+    pose: Tensor,
+    share: float,
+) -> Pairs:
+    """Each recorded point with the nearest place on the surface.
+
+    Args:
+        positions: [B, L, V, 3] nodes of the surface.
+        faces: [F, 3] of the cloth, and of bodies beside it.
+        recorded: [L, Q, 3].
+        sure: [L, Q] how much each counts.
+        pose: [B, d]
+    """
+    places = nearest_places(positions, faces, space.back(recorded, pose))
+    normals = space.turned(places.normals(positions), pose)
+    weights = share * sure / sure.sum(-1, keepdim=True) / len(recorded)
+    batch = len(positions)
+    return Pairs(places, recorded.expand(batch, -1, -1, -1), normals, spacing, weights.expand(batch, -1, -1))
+
+
+def nearest_places(positions: Tensor, faces: Tensor, queries: Tensor) -> SurfacePoints:
+    """[B, L, Q] the places on faces [F, 3] of meshes at node positions [B, L, V, 3] nearest to queries [B, L, Q, 3].
+
+    Where a position is no number, the place is the first corner.
+    """
+    from diffcloud.clouds.surface import find_on_surface  # numba takes a moment to import
+
+    states = positions.shape[0] * positions.shape[1]
+    nodes, points = (part.detach().reshape(states, -1, 3).contiguous().numpy() for part in (positions, queries))
+    found, places = find_on_surface(points, nodes, faces.numpy())
+    shape = (*queries.shape[:-1], 3)
+    return SurfacePoints(faces[torch.from_numpy(found)].reshape(shape), torch.from_numpy(places).reshape(shape))

@@ -1,0 +1,192 @@
+"""How a recording lies against the scene: what is fitted along for each episode, and is no property of the cloth.
+
+The scene is turned about the recording's centre c by the rotation vector w = (tilt_x, tilt_y, yaw), shifted by
+t = (x, y, z), and looked at later by `lag`, as far as its velocity v tells:
+
+    x' = exp([w]×) (x + lag v - c) + c + t
+
+A level table looks the same from every side: x, y and yaw are exact, and cost no simulation. z and the tilts are those of
+the cameras against the robot.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffcloud.errors import ConfigError, unknown_name
+
+NUISANCE = {"x": "m", "y": "m", "z": "m", "tilt_x": "rad", "tilt_y": "rad", "yaw": "rad", "lag": "s"}
+"""Name -> unit."""
+DEFAULT_PRIORS = {"x": 0.1, "y": 0.1, "yaw": math.radians(30)}
+"""Of a cloth laid down by hand where the scene says [m, rad]."""
+_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180, "s": 1.0, "ms": 1e-3}
+_QUANTITY = {"m": "m", "cm": "m", "mm": "m", "rad": "rad", "deg": "rad", "s": "s", "ms": "s"}
+_NOISE_M = 0.005
+_INDEPENDENT = 100
+"""A prior weighs, for each of its deviations, as one of so many residuals of that size: much less than a recording."""
+_ANGLES = ("tilt_x", "tilt_y", "yaw")
+_SHIFTS = ("x", "y", "z")
+
+
+def parse_priors(text: str) -> dict[str, float]:
+    """What `--nuisance` says -> name -> standard deviation of its prior [m, rad, s].
+
+    Args:
+        text: "none", or names with how far each may well be off zero, as in "x=10cm,y=0.1,yaw=30deg"; without a unit in m,
+            rad or s.
+
+    Raises:
+        ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.
+    """
+    if text.strip() == "none":
+        return {}
+    priors: dict[str, float] = {}
+    for item in text.split(","):
+        name, _, value = (part.strip() for part in item.partition("="))
+        if name not in NUISANCE:
+            raise ConfigError(f"nuisance: {unknown_name('nuisance variable', name, NUISANCE)}")
+        match = re.fullmatch(r"([0-9.eE+-]+?)\s*([a-z]*)", value)
+        number = _number(match[1]) if match else math.nan
+        unit = (match[2] if match else "") or NUISANCE[name]
+        if not (number > 0 and math.isfinite(number)) or _QUANTITY.get(unit) != NUISANCE[name]:
+            allowed = ", ".join(one for one, quantity in _QUANTITY.items() if quantity == NUISANCE[name])
+            raise ConfigError(
+                f"nuisance {item.strip()!r}: {name} takes how far it may well be off, a positive number in one of "
+                f"{allowed}, such as {name}=0.1{NUISANCE[name]}."
+            )
+        if name in priors:
+            raise ConfigError(f"nuisance names {name} twice.")
+        priors[name] = number * _UNITS[unit]
+    return priors
+
+
+@dataclass(frozen=True)
+class PoseSpace:
+    """Which of the variables are free, and how far each may well be off."""
+
+    names: tuple[str, ...]
+    """d of them."""
+    deviations: Tensor
+    """[d] of their priors about zero, in the scene's length unit, rad and s."""
+    prior_weights: Tensor
+    """[d] what the loss gains by the square of each variable."""
+    centre: Tensor
+    """[3] of the recording."""
+
+    @staticmethod
+    def build(priors: Mapping[str, float], centre: Tensor, *, length_unit_m: float) -> PoseSpace:
+        """
+        Args:
+            priors: name -> standard deviation [m, rad, s].
+
+        Raises:
+            ConfigError: an unknown name, or what is no positive number.
+        """
+        for name, value in priors.items():
+            if name not in NUISANCE:
+                raise ConfigError(unknown_name("nuisance variable", name, NUISANCE))
+            if not (value > 0 and math.isfinite(value)):
+                raise ConfigError(f"The prior of {name} must be a positive number of {NUISANCE[name]}, got {value!r}.")
+        names = tuple(name for name in NUISANCE if name in priors)
+        scale = [priors[name] / (length_unit_m if NUISANCE[name] == "m" else 1.0) for name in names]
+        deviations = torch.tensor(scale, dtype=torch.float64)
+        return PoseSpace(names, deviations, (_NOISE_M / length_unit_m / deviations) ** 2 / _INDEPENDENT, centre)
+
+    def described(self, values: Tensor, *, length_unit_m: float) -> dict[str, dict[str, float | str]]:
+        """[d] values as records keep them: name -> value and its prior, in SI."""
+        return {
+            name: {
+                "value": float(value) * (length_unit_m if NUISANCE[name] == "m" else 1.0),
+                "prior": float(prior) * (length_unit_m if NUISANCE[name] == "m" else 1.0),
+                "unit": NUISANCE[name],
+            }
+            for name, value, prior in zip(self.names, values, self.deviations, strict=True)
+        }
+
+    def of(self, described: Mapping[str, Mapping[str, float | str]], *, length_unit_m: float) -> Tensor:
+        """The inverse of `described`; what is missing there is zero."""
+        values = [
+            float(described.get(name, {}).get("value", 0.0)) / (length_unit_m if NUISANCE[name] == "m" else 1.0)
+            for name in self.names
+        ]
+        return torch.tensor(values, dtype=torch.float64)
+
+    def lag(self, values: Tensor) -> Tensor | None:
+        """[B] of values [B, d]; None where it is not free."""
+        return values[:, self.names.index("lag")] if "lag" in self.names else None
+
+    def rotation(self, values: Tensor) -> Tensor:
+        """[B, 3, 3] of values [B, d]."""
+        return torch.linalg.matrix_exp(_cross(self._parts(values, _ANGLES)))
+
+    def moved(self, points: Tensor, values: Tensor) -> Tensor:
+        """[B, ..., 3] points of the scene at values [B, d] -> where the recording has them."""
+        turned = _turned(points - self.centre, self.rotation(values))
+        return turned + _beside(self.centre + self._parts(values, _SHIFTS), turned)
+
+    def turned(self, vectors: Tensor, values: Tensor) -> Tensor:
+        """[B, ..., 3] directions in the scene at values [B, d] -> in the recording."""
+        return _turned(vectors, self.rotation(values))
+
+    def back(self, points: Tensor, values: Tensor) -> Tensor:
+        """[..., 3] points of the recording -> [B, ..., 3] where the scene at values [B, d] has them."""
+        shifted = points - _beside(self.centre + self._parts(values, _SHIFTS), points[None])
+        return _turned(shifted, self.rotation(values).mT) + self.centre
+
+    def rates(self, points: Tensor, values: Tensor, velocities: Tensor | None) -> Tensor:
+        """[d, B, ..., 3] derivatives of `moved` by the values.
+
+        Args:
+            velocities: [B, ..., 3] of the points; needed where `lag` is free.
+        """
+        columns = []
+        angles = self._parts(values, _ANGLES)
+        centred = points - self.centre
+        for name in self.names:
+            if name == "lag":
+                assert velocities is not None
+                columns.append(_turned(velocities, self.rotation(values)))
+            elif name in _SHIFTS:
+                columns.append(torch.zeros_like(points))
+                columns[-1][..., _SHIFTS.index(name)] = 1.0
+            else:
+                way = torch.zeros_like(angles)
+                way[:, _ANGLES.index(name)] = 1.0
+                turning = torch.func.jvp(lambda w: torch.linalg.matrix_exp(_cross(w)), (angles,), (way,))[1]
+                columns.append(_turned(centred, turning))
+        return torch.stack(columns) if columns else points.new_zeros(0, *points.shape)
+
+    def _parts(self, values: Tensor, names: tuple[str, ...]) -> Tensor:
+        """[B, n] of values [B, d]; zero for what is not free."""
+        zero = values.new_zeros(len(values))
+        return torch.stack([values[:, self.names.index(n)] if n in self.names else zero for n in names], dim=-1)
+
+
+def _turned(points: Tensor, rotation: Tensor) -> Tensor:
+    """[B, ..., 3] points by [B, 3, 3]."""
+    return (points.flatten(1, -2) @ rotation.mT).reshape(points.shape)
+
+
+def _beside(vector: Tensor, points: Tensor) -> Tensor:
+    """[B, 3] -> [B, 1, ..., 3] as points [B, ..., 3] have dimensions."""
+    return vector.reshape(len(vector), *[1] * (points.dim() - 2), 3)
+
+
+def _cross(vector: Tensor) -> Tensor:
+    """[B, 3] -> [B, 3, 3] that multiplies like a cross product."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

@@ -1,0 +1,171 @@
+"""One episode as the loss takes it: which frames, which points, and the gripper's track."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffcloud.clouds.neighbours import NeighbourIndex
+from diffcloud.errors import EpisodeError
+from diffcloud.fit.pose import PoseSpace
+from diffcloud.io.episodes import Episode
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.simulate import rollout
+from diffcloud.sim.system import System
+
+_CUT_M = 0.002
+"""A recording whose lowest points lie so far above the cloth's start was cut there."""
+_LOWEST = 0.005
+"""Part of the recorded points that may lie below the cut: noise."""
+_USABLE, _NEARLY, _TOO_LITTLE = 0.5, 0.8, 0.05
+"""Part of the cloth above the cut in a frame that counts; where no frame has it, this part of the most that any has; and
+what is too little in any case."""
+_UNSURE_M = 0.005
+"""A recorded point whose depth is so uncertain counts half."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """One episode in the loss; L frames."""
+
+    frames: tuple[int, ...]
+    """[L] numbers of the episode's frames."""
+    times: Tensor
+    """[L] [s]"""
+    clouds: tuple[NeighbourIndex, ...]
+    sure: tuple[Tensor, ...]
+    """How much each recorded point counts."""
+    cut: float | None
+    """Height below which nothing was recorded."""
+    space: PoseSpace
+    track: Tensor | None
+    """[1, S, G, 3] displacement of the grippers."""
+
+
+def read_target(
+    scenario: Scenario,
+    system: System,
+    episode: Episode,
+    named: Sequence[int] | None,
+    *,
+    cut: bool,
+    nuisance: Mapping[str, float],
+) -> Target:
+    """
+    Args:
+        named: frames to compare, negative ones counted from the end; None for every usable one.
+        cut: whether to look for a height below which nothing was recorded.
+        nuisance: variables of the pose with the deviations of their priors [m, rad, s].
+
+    Raises:
+        EpisodeError: a frame that the episode lacks, one after the end of the simulation, none that is usable, or other
+            grippers than the scene's.
+        ConfigError: an unknown variable of the pose.
+    """
+    unit = scenario.length_unit_m
+    track = None
+    if episode.gripper is not None:
+        moved = track_displacement(episode, system.handles.grippers, scenario.steps, system.time_step)
+        track = torch.as_tensor(moved, dtype=torch.float64)[None]
+    height = _found_cut(system, episode, unit) if cut else None
+    frames = (
+        _usable(scenario, system, episode, track, height)
+        if named is None
+        else [_checked(scenario, episode, frame) for frame in named]
+    )
+    clouds = tuple(NeighbourIndex(torch.as_tensor(episode.frame(frame), dtype=torch.float64)) for frame in frames)
+    centre = torch.cat([cloud.points for cloud in clouds]).mean(0)
+    return Target(
+        tuple(frames),
+        torch.as_tensor(episode.times[frames], dtype=torch.float64),
+        clouds,
+        tuple(_sure(episode, frame) for frame in frames),
+        height,
+        PoseSpace.build(nuisance, centre, length_unit_m=unit),
+        track,
+    )
+
+
+def _end(scenario: Scenario) -> float:
+    """Of what can be compared [s]."""
+    return scenario.steps * scenario.scene.time_step + 0.5 * scenario.scene.frame_time
+
+
+def _checked(scenario: Scenario, episode: Episode, frame: int) -> int:
+    episode.frame(frame)  # raises
+    if episode.times[frame] > _end(scenario):
+        raise EpisodeError(
+            f"A loss frame lies at {episode.times[frame]:.3f} s, but scenario {scenario.name} simulates only "
+            f"{scenario.steps * scenario.scene.time_step:.3f} s. Use a scenario with more frames, or another loss frame."
+        )
+    return frame % episode.frame_count
+
+
+def _usable(scenario: Scenario, system: System, episode: Episode, track: Tensor | None, cut: float | None) -> list[int]:
+    """Frames after the start, within the simulation, with enough of the cloth of the basis above the cut."""
+    end = _end(scenario)
+    frames = [index for index, time in enumerate(episode.times) if 0 < time <= end]
+    if cut is not None and frames:
+        with torch.no_grad():
+            run = rollout(system, scenario.steps, track=track)
+        heights = run.at(torch.as_tensor(episode.times[frames]))[0, ..., 2]
+        above = (heights >= cut).double().mean(-1)
+        enough = max(min(_USABLE, _NEARLY * float(above.max())), _TOO_LITTLE)
+        frames = [frame for frame, part in zip(frames, above.tolist(), strict=True) if part >= enough]
+    if not frames:
+        told = (
+            ""
+            if cut is None
+            else f", and in none is more than {_TOO_LITTLE:.0%} of the cloth above {cut:.3f}, where the recording is cut"
+        )
+        raise EpisodeError(
+            f"No frame of the episode can be compared: they lie at {episode.times[0]:.3f} to {episode.times[-1]:.3f} s, "
+            f"scenario {scenario.name} simulates {end:.3f} s{told}. Name some with --frame, or check times and cropping."
+        )
+    return frames
+
+
+def _found_cut(system: System, episode: Episode, unit: float) -> float | None:
+    low = float(np.quantile(episode.points[:, 2], _LOWEST))
+    return low if low > system.mesh.nodes[:, 2].min() + _CUT_M / unit else None
+
+
+def _sure(episode: Episode, frame: int) -> Tensor:
+    """How much each point of a frame counts, by its `sigma`."""
+    begin, end = episode.offsets[frame], episode.offsets[frame + 1]
+    if episode.sigma is None:
+        return torch.ones(int(end - begin), dtype=torch.float64)
+    sigma = torch.as_tensor(episode.sigma[begin:end], dtype=torch.float64)
+    return 1 / (1 + (sigma / _UNSURE_M) ** 2)
+
+
+def track_displacement(episode: Episode, grippers: Sequence[str], steps: int, time_step: float) -> np.ndarray:
+    """[S, G, 3] displacement of the scene's grippers since time zero at the end of each step [m].
+
+    A cubic spline through the recorded positions, constant after the last. Recorded positions begin with the motion: a
+    track whose first frame is later than time zero is held at its first position until then.
+
+    Raises:
+        EpisodeError: other grippers were recorded than the scene has. (A single one needs no name.)
+    """
+    assert episode.gripper is not None
+    if len(grippers) == len(episode.grippers) == 1:
+        recorded = [0]
+    elif set(grippers) == set(episode.grippers):
+        recorded = [episode.grippers.index(name) for name in grippers]
+    else:
+        raise EpisodeError(
+            f"The scene's grippers are {', '.join(grippers) or 'none'}, the episode's {', '.join(episode.grippers)}; give "
+            "both the same names, in the scenario's `grippers` or in the tracks that are imported."
+        )
+    if len(episode.times) < 2:
+        return np.zeros((steps, len(grippers), 3))
+    times, positions = episode.times, episode.gripper[:, recorded]
+    at = np.clip(np.cumsum(np.full(steps, time_step)), times[0], times[-1])
+    from scipy.interpolate import CubicSpline  # slow to import, and needed for recorded grippers alone
+
+    return np.asarray(CubicSpline(times, positions)(at) - positions[0])

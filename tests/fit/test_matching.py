@@ -1,0 +1,129 @@
+"""Pairs between the simulated surface and recorded points, by brute force; and what they say of a motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from diffcloud.clouds.neighbours import NeighbourIndex
+from diffcloud.clouds.sampling import SurfacePoints, SurfaceSampler
+from diffcloud.fit.matching import Pairs, nearest_places, pairs_forth
+from diffcloud.mesh.shapes import grid_cloth
+
+
+@pytest.fixture
+def sheet(generator):
+    """A wavy 5 x 5 cloth at two frames [1, 2, 25, 3], and its faces."""
+    mesh = grid_cloth(5, 5, 0.4, 0.4)
+    nodes = torch.as_tensor(mesh.nodes, dtype=torch.float64)[None, None].expand(1, 2, -1, -1).clone()
+    nodes[..., 2] += 0.05 * torch.sin(12 * nodes[..., 0])
+    nodes[:, 1] += 0.02 * torch.randn(nodes[:, 1].shape, generator=generator, dtype=torch.float64)
+    return nodes, torch.as_tensor(mesh.faces)
+
+
+def test_the_nearest_place_on_a_surface_is_trimeshs(sheet, generator):
+    nodes, faces = sheet
+    queries = nodes.mean(2, keepdim=True) + 0.2 * torch.randn(1, 2, 200, 3, generator=generator, dtype=torch.float64)
+    found = nearest_places(nodes, faces, queries)
+    assert bool((found.barycentric >= -1e-12).all())
+    torch.testing.assert_close(found.barycentric.sum(-1), torch.ones(1, 2, 200, dtype=torch.float64))
+    for frame in range(2):
+        mesh = trimesh.Trimesh(nodes[0, frame].numpy(), faces.numpy(), process=False)
+        expected, _, _ = trimesh.proximity.closest_point_naive(mesh, queries[0, frame].numpy())
+        np.testing.assert_allclose(found.of(nodes)[0, frame].numpy(), expected, atol=1e-9)
+
+
+def test_faces_without_area_have_a_nearest_place():
+    corners = torch.zeros(1, 1, 3, 3, dtype=torch.float64)
+    corners[..., 1, 0] = corners[..., 2, 0] = 1.0
+    queries = torch.tensor([[[[0.5, 1.0, 0.0], [-1.0, 0.0, 0.0], [3.0, 0.0, 1.0]]]], dtype=torch.float64)
+    found = nearest_places(corners, torch.tensor([[0, 1, 2]]), queries).of(corners)
+    torch.testing.assert_close(found[0, 0, :, 0], torch.tensor([0.5, 0.0, 1.0], dtype=torch.float64))
+
+
+def test_normals_are_those_of_the_faces(sheet, generator):
+    nodes, faces = sheet
+    places = SurfaceSampler.build(faces, 50, generator=generator).draw(nodes)
+    corners = places.corners(nodes)
+    normals = places.normals(nodes)
+    torch.testing.assert_close(normals.norm(dim=-1), torch.ones(1, 2, 50, dtype=torch.float64))
+    for corner in (1, 2):
+        edge = corners[..., corner, :] - corners[..., 0, :]
+        assert float((edge * normals).sum(-1).abs().max()) < 1e-12
+
+
+def at_points(moved):
+    """Places that are points by themselves: each its own node."""
+    nodes = torch.arange(moved.shape[2]).reshape(1, 1, -1, 1).expand(*moved.shape[:3], 3)
+    return SurfacePoints(nodes, torch.full_like(moved, 1 / 3))
+
+
+class TestForth:
+    def test_below_the_cut_nothing_counts(self, generator):
+        moved = torch.rand(2, 1, 40, 3, generator=generator, dtype=torch.float64)
+        clouds = [NeighbourIndex(torch.rand(30, 3, generator=generator, dtype=torch.float64))]
+        pairs = pairs_forth(at_points(moved), moved, clouds, cut=0.4, share=1.0)
+        assert torch.equal(pairs.weights > 0, moved[..., 2] >= 0.4)
+        torch.testing.assert_close(pairs.weights.sum((1, 2)), torch.ones(2, dtype=torch.float64))
+
+    def test_all_below_it_is_no_loss(self, generator):
+        moved = torch.rand(1, 1, 5, 3, generator=generator, dtype=torch.float64)
+        clouds = [NeighbourIndex(torch.rand(30, 3, generator=generator, dtype=torch.float64))]
+        pairs = pairs_forth(at_points(moved), moved, clouds, cut=2.0, share=1.0)
+        assert float(pairs.losses(moved, 1.0).sum()) == 0.0
+
+    def test_the_partner_is_the_nearest(self, generator):
+        moved = torch.rand(2, 2, 40, 3, generator=generator, dtype=torch.float64)
+        clouds = [NeighbourIndex(torch.rand(30, 3, generator=generator, dtype=torch.float64)) for _ in range(2)]
+        pairs = pairs_forth(at_points(moved), moved, clouds, cut=None, share=0.5)
+        for frame, cloud in enumerate(clouds):
+            expected = torch.cdist(moved[:, frame], cloud.points.expand(2, -1, -1)).amin(-1)
+            torch.testing.assert_close((moved[:, frame] - pairs.partners[:, frame]).norm(dim=-1), expected)
+
+
+def some_pairs(generator, *, count=30):
+    moved, partners = torch.rand(2, 2, 3, count, 3, generator=generator, dtype=torch.float64)
+    normals = torch.nn.functional.normalize(torch.randn(moved.shape, generator=generator, dtype=torch.float64), dim=-1)
+    weights = torch.rand(moved.shape[:3], generator=generator, dtype=torch.float64)
+    return moved, Pairs(at_points(moved), partners, normals, torch.full((3,), 0.1, dtype=torch.float64), weights)
+
+
+class TestTerms:
+    @pytest.mark.parametrize("cap", [0.5, torch.inf])
+    def test_the_slope_is_half_of_the_gradient(self, generator, cap):
+        moved, pairs = some_pairs(generator)
+        rates = torch.randn(4, *moved.shape, generator=generator, dtype=torch.float64)
+        loss, slope, _ = pairs.terms(moved, rates, cap)
+        leaf = moved.clone().requires_grad_()
+        found = pairs.losses(leaf, cap).sum(-1)
+        (gradient,) = torch.autograd.grad(found.sum(), leaf)
+        torch.testing.assert_close(loss, found.detach())
+        torch.testing.assert_close(2 * slope, torch.einsum("kblni,blni->bk", rates, gradient))
+
+    def test_the_curvature_is_between_sliding_and_being_bound(self, generator):
+        """A move along the normal counts in full, one along the surface less, and never more than if bound to a point."""
+        moved, pairs = some_pairs(generator)
+        rates = torch.randn(3, *moved.shape, generator=generator, dtype=torch.float64)
+        _, _, curvature = pairs.terms(moved, rates, torch.inf)
+        bound = torch.einsum("jblni,kblni,bln->bjk", rates, rates, pairs.weights)
+        assert bool((torch.linalg.eigvalsh(bound - curvature) > 0).all())
+        assert bool((torch.linalg.eigvalsh(curvature) > 0).all())
+        along = pairs.normals[None]
+        _, _, whole = pairs.terms(moved, along, torch.inf)
+        torch.testing.assert_close(whole[:, 0, 0], pairs.weights.sum((1, 2)))
+
+    def test_what_is_farther_than_the_cap_draws_at_nothing(self, generator):
+        moved, pairs = some_pairs(generator)
+        rates = torch.randn(2, *moved.shape, generator=generator, dtype=torch.float64)
+        loss, slope, curvature = pairs.terms(moved, rates, 1e-6)
+        torch.testing.assert_close(loss, 1e-12 * pairs.weights.sum((1, 2)))
+        assert float(slope.abs().max()) == float(curvature.abs().max()) == 0.0
+
+
+def test_positions_that_are_no_numbers_have_some_place(sheet):
+    nodes, faces = sheet
+    queries = torch.full((1, 2, 3, 3), torch.nan, dtype=torch.float64)
+    found = nearest_places(nodes, faces, queries)
+    torch.testing.assert_close(found.barycentric.sum(-1), torch.ones(1, 2, 3, dtype=torch.float64))

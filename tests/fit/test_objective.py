@@ -1,0 +1,180 @@
+"""The default measure: pose, cut, usable frames, both directions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from diffcloud.errors import ConfigError, EpisodeError
+from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton
+from diffcloud.fit.residuals import Axis, linearise
+from diffcloud.fit.result import describe_recording
+from diffcloud.io.episodes import Episode
+from diffcloud.scene import load_scenario
+from diffcloud.sensing.whole_surface import sample_surface
+from tests.conftest import small_lift
+from tests.fit.test_fit import GENTLE, clouds_of
+
+TRUTH = {"stretch": 0.6, "mass": 1.7}
+SPACE = FitSpace.build(["stretch", "mass"])
+
+
+def scenario_of(**changes):
+    return small_lift(**{**GENTLE, "integrator": "implicit", "points": 2400, **changes})
+
+
+def at(values):
+    return {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
+
+
+def moved(episode, *, shift=(0.0, 0.0, 0.0), yaw=0.0):
+    """The recording turned about the vertical through the origin, and shifted."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    return replace(episode, points=(episode.points @ turn.T + shift).astype(np.float32))
+
+
+def found_at(objective, values):
+    with torch.no_grad():
+        return describe_recording(objective, objective.simulate_to_loss(at(values)))
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return scenario_of()
+
+
+@pytest.fixture(scope="module")
+def episode(scenario):
+    return clouds_of(scenario, points=3000, **TRUTH)
+
+
+class TestPose:
+    def test_the_loss_does_not_know_where_the_recording_lies(self, scenario, episode):
+        """x, y and yaw are symmetries: of a recording turned and shifted, every parameter set has the same loss."""
+        beside = moved(episode, shift=(0.03, -0.02, 0.0), yaw=0.15)
+        values = {"stretch": torch.tensor([0.3, 0.6, 2.0]).double(), "mass": torch.tensor([1.7, 1.7, 0.8]).double()}
+        with torch.no_grad():
+            here, there = (Objective(scenario, [one])(values) for one in (episode, beside))
+        torch.testing.assert_close(there, here, rtol=0.02, atol=1e-7)
+
+    def test_pose_and_parameters_are_found_together(self, scenario, episode):
+        yaw, shift = 0.2, np.array([0.03, -0.04, 0.0])
+        objective = Objective(scenario, [moved(episode, shift=shift, yaw=yaw)])
+        fit = fit_gauss_newton(objective, SPACE, GaussNewtonSettings(starts=2, screen=14))
+        assert fit.values == pytest.approx(TRUTH, rel=0.05)
+        recording = found_at(objective, fit.values)
+        assert recording["nuisance"]["yaw"]["value"] == pytest.approx(yaw, abs=0.01)
+        # told about the centre of the recording, while the test turned it about the origin
+        turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+        centre = np.array(recording["centre"])[:2]
+        told = [recording["nuisance"][name]["value"] for name in ("x", "y")]
+        np.testing.assert_allclose(told, shift[:2] - centre + turn @ centre, atol=4e-3)
+
+    def test_height_tilt_and_lag_are_found_where_they_are_free(self, scenario, episode):
+        late = replace(episode, times=np.append(episode.times[:1], episode.times[1:] - 0.03), gripper=None)
+        objective = Objective(
+            scenario,
+            [moved(late, shift=(0.0, 0.0, 0.02))],
+            nuisance={"x": 0.1, "y": 0.1, "z": 0.1, "yaw": 0.5, "tilt_x": 0.1, "tilt_y": 0.1, "lag": 0.1},
+        )
+        pose = {name: entry["value"] for name, entry in found_at(objective, TRUTH)["nuisance"].items()}
+        assert pose["z"] == pytest.approx(0.02, abs=1e-3)
+        assert pose["lag"] == pytest.approx(0.03, abs=3e-3)
+        assert abs(pose["tilt_x"]) < 0.01
+        assert abs(pose["tilt_y"]) < 0.01
+
+    def test_without_nuisance_the_shift_stays_in_the_loss(self, scenario, episode):
+        beside = moved(episode, shift=(0.03, 0.0, 0.0))
+        fixed, free = (found_at(Objective(scenario, [beside], nuisance=one), TRUTH) for one in ({}, None))
+        assert fixed["nuisance"] == {}
+        assert fixed["rms_mm"] > 3 * free["rms_mm"]
+
+    def test_the_slope_is_that_of_the_loss_at_its_pose(self, scenario, episode):
+        """By differences, with the pose found anew on both sides."""
+        objective = Objective(scenario, [moved(episode, shift=(0.02, 0.01, 0.0), yaw=0.1)])
+        places = Axis.of(SPACE).places(torch.tensor([[0.9, 1.2]], dtype=torch.float64))
+        found = linearise(objective, SPACE, places)
+        for index in range(2):
+            way = torch.zeros_like(places)
+            way[0, index] = 0.02
+            with torch.no_grad():
+                above, below = (
+                    float(objective(SPACE.parameters(Axis.of(SPACE).values(places + s * way)))) for s in (1, -1)
+                )
+            assert 2 * float(found.slope[0, index]) == pytest.approx((above - below) / 0.04, rel=0.15)
+
+    def test_the_papers_measure_has_none(self, scenario, episode):
+        with pytest.raises(ConfigError, match="leave out the nuisance x"):
+            Objective(scenario, [episode], paper=True, nuisance={"x": 0.1})
+
+
+class TestWhatCounts:
+    def test_every_frame_after_the_start(self, scenario, episode):
+        objective = Objective(scenario, [episode])
+        assert objective.frames() == tuple(range(1, 13))
+        assert objective.point_count == 200
+
+    def test_named_frames_are_kept(self, episode):
+        named = replace(scenario_of(), every_frame=False, loss_frames=(3, -1))
+        assert Objective(named, [episode]).frames() == (3, 12)
+        assert Objective(scenario_of(), [episode], frames=[-2]).frames() == (11,)
+        assert Objective(scenario_of(), [episode], paper=True).frames() == (12,)
+
+    def test_below_the_height_where_a_recording_ends_nothing_counts(self, scenario, episode):
+        height = 0.05
+        frames = [frame[frame[:, 2] > height] for frame in map(episode.frame, range(13))]
+        kept = [index for index, frame in enumerate(frames) if len(frame) > 10]
+        cut = Episode.from_frames([frames[index] for index in kept], episode.times[kept])
+        objective = Objective(scenario, [cut])
+        assert objective.cut() == pytest.approx(height, abs=0.01)
+        assert 0 < len(objective.frames()) < len(kept)
+        recording = found_at(objective, TRUTH)
+        assert min(recording["counted"]) > 0.3
+        assert recording["rms_mm"] < 6.0
+
+    def test_a_whole_recording_has_no_cut(self, scenario, episode):
+        assert Objective(scenario, [episode]).cut() is None
+
+    def test_an_episode_without_a_usable_frame(self, scenario, episode):
+        early = Episode.from_frames([episode.frame(0)], np.array([0.0]))
+        with pytest.raises(EpisodeError, match="No frame of the episode can be compared"):
+            Objective(scenario, [early])
+
+    def test_scraps_cost_no_more_than_the_cap(self, scenario, episode, rng):
+        """A tenth of every frame is of something else, half a metre away: the fit stays where it was."""
+        frames = []
+        for frame in map(episode.frame, range(13)):
+            scraps = frame[: len(frame) // 10] + np.float32([0.5, 0.2, 0.3])
+            frames.append(np.concatenate([frame, scraps]))
+        dirty = Episode.from_frames(frames, episode.times, gripper=episode.gripper)
+        space = FitSpace.build(["stretch"], fixed={"mass": TRUTH["mass"]})
+        found = fit_gauss_newton(Objective(scenario, [dirty]), space, GaussNewtonSettings(starts=1, screen=7))
+        assert found.values["stretch"] == pytest.approx(TRUTH["stretch"], rel=0.05)
+
+    def test_points_that_are_sure_count_more(self, scenario, episode):
+        """Half of the recorded points are 2 cm too high; said to be uncertain, they move the loss less."""
+        points = episode.points.copy()
+        points[::2, 2] += 0.02
+        sigma = np.full(len(points), 0.001, np.float32)
+        unsure = sigma.copy()
+        unsure[::2] = 0.05
+        rows = [found_at(Objective(scenario, [replace(episode, points=points, sigma=s)]), TRUTH) for s in (sigma, unsure)]
+        assert rows[1]["rms_to_cloth_mm"] < 0.5 * rows[0]["rms_to_cloth_mm"]
+
+    def test_a_recorded_body_is_no_cloth(self):
+        """The pole that the recording shows lies where the scene has it: the truth still has next to no loss."""
+        band = load_scenario("band_stretch")
+        objective = Objective(band, [clouds_of(band)], nuisance={}, frames=[12])
+        with torch.no_grad():
+            run = objective.simulate_to_loss({"stretch": torch.ones(1, dtype=torch.float64)})
+        nodes = run.at(objective.times())[0].numpy()
+        recorded = sample_surface(
+            nodes, band.scene.mesh.faces, objective.times().numpy(), band.scene.bodies, points=3000, seed=1, meta={}
+        )
+        found = Objective(band, [recorded], nuisance={}, frames=[0])
+        assert describe_recording(found, run)["rms_to_cloth_mm"] < 0.1

@@ -1,0 +1,119 @@
+"""The pose of a recording: its transform, what is read from text and records."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from diffcloud.errors import ConfigError
+from diffcloud.fit.pose import NUISANCE, PoseSpace, parse_priors
+
+CENTRE = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
+EVERY = dict.fromkeys(NUISANCE, 0.1)
+
+
+def space(*names: str, unit: float = 1.0) -> PoseSpace:
+    return PoseSpace.build(dict.fromkeys(names or NUISANCE, 0.1), CENTRE, length_unit_m=unit)
+
+
+@pytest.fixture
+def poses(generator):
+    return 0.3 * torch.randn(4, len(NUISANCE), generator=generator, dtype=torch.float64)
+
+
+@pytest.fixture
+def points(generator):
+    return torch.randn(4, 2, 5, 3, generator=generator, dtype=torch.float64)
+
+
+class TestTransform:
+    def test_a_rotation_vector_about_the_centre_and_a_shift(self, points, poses):
+        found = space().moved(points, poses)
+        x, y, z, tilt_x, tilt_y, yaw = poses[:, :6].T
+        for row in range(len(poses)):
+            turn = Rotation.from_rotvec([tilt_x[row], tilt_y[row], yaw[row]]).as_matrix()
+            shift = np.array([x[row], y[row], z[row]])
+            expected = (points[row].numpy() - CENTRE.numpy()) @ turn.T + CENTRE.numpy() + shift
+            np.testing.assert_allclose(found[row].numpy(), expected, atol=1e-12)
+
+    def test_back_is_its_inverse(self, points, poses):
+        recorded = points[0]
+        there = space().back(recorded, poses)
+        torch.testing.assert_close(space().moved(there, poses), recorded.expand_as(there))
+
+    def test_distances_stay(self, points, poses):
+        moved = space().moved(points, poses)
+        torch.testing.assert_close((moved[:, 0] - moved[:, 1]).norm(dim=-1), (points[:, 0] - points[:, 1]).norm(dim=-1))
+
+    def test_zero_leaves_all_in_place(self, points):
+        torch.testing.assert_close(space().moved(points, torch.zeros(4, len(NUISANCE), dtype=torch.float64)), points)
+
+    def test_rates_are_those_of_differences(self, points, poses, generator):
+        velocities = torch.randn(points.shape, generator=generator, dtype=torch.float64)
+        whole, step = space(), 1e-6
+
+        def at(values):
+            lag = whole.lag(values)
+            return whole.moved(points + lag[:, None, None, None] * velocities, values)
+
+        lag = whole.lag(poses)
+        found = whole.rates(points + lag[:, None, None, None] * velocities, poses, velocities)
+        for index in range(len(NUISANCE)):
+            way = torch.zeros_like(poses)
+            way[:, index] = step
+            expected = (at(poses + way) - at(poses - way)) / (2 * step)
+            torch.testing.assert_close(found[index], expected, rtol=1e-7, atol=1e-8)
+
+    def test_what_is_not_free_is_zero(self, points):
+        values = torch.full((4, 1), 0.2, dtype=torch.float64)
+        found = space("yaw").moved(points, values)
+        torch.testing.assert_close(found[..., 2], points[..., 2])
+        torch.testing.assert_close(found.mean((1, 2))[:, 2], points.mean((1, 2))[:, 2])
+
+
+class TestText:
+    def test_units_are_told_or_si(self):
+        assert parse_priors("x=10cm, y=0.05,yaw=30deg,lag=20ms") == pytest.approx(
+            {"x": 0.1, "y": 0.05, "yaw": math.pi / 6, "lag": 0.02}
+        )
+
+    def test_none(self):
+        assert parse_priors("none") == {}
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("jaw=30deg", "Unknown nuisance variable 'jaw'. Did you mean 'yaw'"),
+            ("x", "x takes how far it may well be off, a positive number in one of m, cm, mm, such as x=0.1m"),
+            ("x=30deg", "one of m, cm, mm"),
+            ("yaw=1m", "one of rad, deg"),
+            ("x=0.1parsec", "one of m, cm, mm"),
+            ("x=-1cm", "positive"),
+            ("x=nan", "positive"),
+            ("x=0", "positive"),
+            ("x=1e999", "positive"),
+            ("x=1,x=2", "names x twice"),
+            ("", "Unknown nuisance variable ''"),
+        ],
+    )
+    def test_typed_wrongly(self, text, message):
+        with pytest.raises(ConfigError, match=message):
+            parse_priors(text)
+
+
+class TestRecords:
+    def test_lengths_are_kept_in_metres(self, poses):
+        scene = space(unit=0.35)
+        kept = scene.described(poses[0], length_unit_m=0.35)
+        assert kept["x"] == {"value": pytest.approx(0.35 * float(poses[0, 0])), "prior": pytest.approx(0.1), "unit": "m"}
+        assert kept["yaw"]["value"] == pytest.approx(float(poses[0, 5]))
+        torch.testing.assert_close(scene.of(kept, length_unit_m=0.35), poses[0])
+
+    @pytest.mark.parametrize("priors", [{"jaw": 0.1}, {"x": 0.0}, {"x": math.inf}])
+    def test_priors_that_are_none(self, priors):
+        with pytest.raises(ConfigError):
+            PoseSpace.build(priors, CENTRE, length_unit_m=1.0)
