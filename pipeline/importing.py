@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import chain
@@ -73,12 +74,19 @@ def clouds(
         ),
     ] = None,
     rate_hz: Annotated[float | None, typer.Option(help="Frame rate, if the CSV has no t_s.")] = None,
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="NAME=X,Y,Z [m], repeatable: where each camera stood. Fits then leave out what none of them could see."
+        ),
+    ] = None,
     scenario: Annotated[str | None, typer.Option(help="Name kept in the episode's metadata.")] = None,
     fabric: Annotated[str | None, typer.Option(help="Fabric kept in the episode's metadata.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Import a folder of clouds and the tracks of grippers."""
-    meta = {name: value for name, value in (("scenario", scenario), ("fabric", fabric)) if value is not None}
+    labels = (("scenario", scenario), ("fabric", fabric), ("viewpoints", _viewpoints(camera)))
+    meta = {name: value for name, value in labels if value}
     episode = cloud_folder(folder, grippers=named_files(gripper) if gripper else None, rate_hz=rate_hz, meta=meta)
     write_episode(out, episode)
     errors.print(f"Wrote {episode.frame_count} frames, {len(episode.points)} points to {out}.")
@@ -197,3 +205,21 @@ def _with_log(found: Recording, path: Path, offset_s: float) -> Recording:
     start = 0.0 if first is None else first.time_s
     log = read_joint_log(path, offset_s=offset_s, recording_start_s=start)
     return replace(found, frames=frames if first is None else chain([first], frames), robot=log)
+
+
+def _viewpoints(items: list[str] | None) -> dict[str, list[float]]:
+    """
+    Raises:
+        ConfigError: what is not NAME=X,Y,Z, or a camera that is named twice.
+    """
+    found: dict[str, list[float]] = {}
+    for item in items or []:
+        name, _, text = item.partition("=")
+        try:
+            place = [float(part) for part in text.split(",")]
+        except ValueError:
+            place = []
+        if not name or name in found or len(place) != 3 or not all(map(math.isfinite, place)):
+            raise ConfigError(f"--camera takes NAME=X,Y,Z in metres, each camera once, as in side=1.2,0,0.5; got {item!r}.")
+        found[name] = place
+    return found

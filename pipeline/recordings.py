@@ -76,7 +76,8 @@ def _fit_all(scenario: Scenario, name: str, episode: Episode, raw: RawEpisode, t
     hidden = episode.meta["truth"]
     held = raw.placement.to_scene(truth.nodes[:, scenario.grasped].mean(axis=1))[:, None]
     clouds = [raw.placement.to_scene(cloud) for cloud in visible_clouds(raw, truth)]
-    noise_free = Episode.from_frames(clouds, episode.times, gripper=held)
+    seen_from = {"viewpoints": episode.meta["viewpoints"]}
+    noise_free = Episode.from_frames(clouds, episode.times, gripper=held, meta=seen_from)
     ratios = [_ratio(scenario, cloud, hidden["mass"], config) for cloud in (episode, noise_free, _of_first_camera(episode))]
     return _Fits(name, hidden["stretch"] / hidden["mass"], *ratios)
 
@@ -94,7 +95,9 @@ def _of_first_camera(episode: Episode) -> Episode:
         episode.frame(index)[episode.camera[episode.offsets[index] : episode.offsets[index + 1]] == 0]
         for index in range(episode.frame_count)
     ]
-    return Episode.from_frames(frames, episode.times, gripper=episode.gripper)
+    first = episode.meta["cameras"][0]
+    seen_from = {"viewpoints": {first: episode.meta["viewpoints"][first]}}
+    return Episode.from_frames(frames, episode.times, gripper=episode.gripper, meta=seen_from)
 
 
 def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: list[_Fits], config: FitConfig) -> str:

@@ -72,7 +72,13 @@ class Pairs:
 
 @torch.no_grad()
 def pairs_forth(
-    places: SurfacePoints, moved: Tensor, clouds: Sequence[NeighbourIndex], *, cut: float | None, share: float
+    places: SurfacePoints,
+    moved: Tensor,
+    clouds: Sequence[NeighbourIndex],
+    *,
+    cut: float | None,
+    share: float,
+    seen: Tensor | None = None,
 ) -> Pairs:
     """Each place with the nearest recorded point of its frame.
 
@@ -80,11 +86,14 @@ def pairs_forth(
         moved: [B, L, N, 3] the places in the recording's frame.
         cut: places below this height do not count: the recording ends there.
         share: of all weights.
+        seen: bool [B, L, N] which places a camera could see; None for all.
     """
     found = [cloud.nearest_index(moved[:, frame]) for frame, cloud in enumerate(clouds)]
     partners = torch.stack([cloud.points[index] for cloud, index in zip(clouds, found, strict=True)], dim=1)
     normals = torch.stack([cloud.normals[index] for cloud, index in zip(clouds, found, strict=True)], dim=1)
     counted = torch.ones_like(moved[..., 0]) if cut is None else (moved[..., 2] >= cut).to(moved)
+    if seen is not None:
+        counted = counted * seen
     weights = share * counted / counted.sum(-1, keepdim=True).clamp(min=1.0) / len(clouds)
     return Pairs(places, partners, normals, moved.new_tensor([cloud.spacing for cloud in clouds]), weights)
 
@@ -115,6 +124,22 @@ def pairs_back(
     weights = share * sure / sure.sum(-1, keepdim=True) / len(recorded)
     batch = len(positions)
     return Pairs(places, recorded.expand(batch, -1, -1, -1), normals, spacing, weights.expand(batch, -1, -1))
+
+
+def seen_places(positions: Tensor, faces: Tensor, points: Tensor, viewpoints: Tensor, *, near: float) -> Tensor:
+    """bool [B, L, N] which points [B, L, N, 3] no face [F, 3] hides from all viewpoints [B, C, 3].
+
+    Args:
+        positions: [B, L, V, 3] nodes of the meshes.
+        near: what is nearer to a point hides nothing.
+    """
+    from diffcloud.clouds.surface import find_hidden  # numba takes a moment to import
+
+    states = positions.shape[0] * positions.shape[1]
+    eyes = viewpoints[:, None].expand(-1, positions.shape[1], -1, -1)
+    nodes, places, eyes = (part.detach().reshape(states, -1, 3).contiguous() for part in (positions, points, eyes))
+    hidden = find_hidden(places.numpy(), eyes.numpy(), nodes.numpy(), faces.numpy(), near)
+    return torch.from_numpy(hidden == 0).reshape(points.shape[:-1])
 
 
 def nearest_places(positions: Tensor, faces: Tensor, queries: Tensor) -> SurfacePoints:

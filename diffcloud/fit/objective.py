@@ -20,7 +20,7 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.alignment import aligned
-from diffcloud.fit.matching import Pairs, pairs_back, pairs_forth
+from diffcloud.fit.matching import Pairs, pairs_back, pairs_forth, seen_places
 from diffcloud.fit.pose import DEFAULT_PRIORS, PoseSpace
 from diffcloud.fit.targets import Target, read_target
 from diffcloud.io.episodes import Episode
@@ -33,6 +33,8 @@ _CHUNK = 20
 """Parameter sets whose motions, derivatives and sampled clouds are in memory at the same time."""
 _FEWEST = 200
 """Points of a frame, however many frames share the scenario's."""
+_NEAR_M = 0.008
+"""A layer of cloth that lies so close over another does not hide it: a camera sees both as one."""
 _FEW = 5
 """Frames by which a pose is found before all have their say."""
 _FIRST_CAPS = (np.inf, np.inf, 4.0, 4.0, 2.0, 2.0, *[1.0] * 10)
@@ -299,11 +301,17 @@ class Objective:
         clouds = [target.clouds[frame] for frame in chosen]
         places = self.sampler.draw(here.nodes)
         share = 1.0 if self.paper else 0.5
+        seen: Tensor | None = None
 
         def pairs_at(pose: Tensor) -> tuple[Pairs, ...]:
+            nonlocal seen
             shown = self._shown(replace(here, pose=pose), target.space)
-            moved = target.space.moved(places.of(shown), pose)
-            forth = pairs_forth(places, moved, clouds, cut=target.cut, share=share)
+            points = places.of(shown)
+            if seen is None and target.viewpoints is not None:  # from where one stands metres away, a step changes nothing
+                eyes = target.space.back(target.viewpoints, pose)
+                seen = seen_places(shown, self._faces, points, eyes, near=_NEAR_M / self._unit)
+            moved = target.space.moved(points, pose)
+            forth = pairs_forth(places, moved, clouds, cut=target.cut, share=share, seen=seen)
             if self.paper:
                 return (forth,)
             recorded, sure = (part[chosen] for part in self._recorded[episode])

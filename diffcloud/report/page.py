@@ -24,6 +24,7 @@ from diffcloud.report.comparison import (
     comparison_pictures,
     comparison_sections,
 )
+from diffcloud.report.poses import poses_table
 from diffcloud.report.recordings import recordings_pictures, recordings_table
 from diffcloud.report.regressors import TrainingEntry, errors_table, predictions_table, training_data
 from diffcloud.report.tables import Cell, Table, number, table
@@ -100,6 +101,7 @@ def build_page(
         pictures=comparison_pictures(comparison) if comparison else [],
         command=comparison.command if comparison else "",
         fits=_fits_table(entries),
+        poses=poses_table([(f"{entry.scenario} / {entry.name}", entry.fit) for entry in entries]),
         predictions=predictions_table(predictions, fitted_mm),
         errors=errors_table(trainings),
         failures=[*missing, *(f"{entry.name}: {text}" for entry in entries for text in entry.fit["failures"])],

@@ -143,8 +143,9 @@ def fuse(
         watch: called with each frame and what is left of each camera's image.
 
     Returns:
-        An episode whose meta holds `quality`, figures for each frame: `points_per_view` and `masked_fraction` by camera,
-        `overlap_m` (median distance of the second view's points to the first's where they overlap; None without any), and
+        An episode whose meta holds `viewpoints` (camera -> its place in the scene) and `quality`, figures for each frame:
+        `points_per_view` and `masked_fraction` by camera, `overlap_m` (median distance of the second view's points to the
+        first's where they overlap; None without any), and
         `refinement`, what was found about the cameras' places, the arm's skin and the log's lag.
 
     Raises:
@@ -186,7 +187,7 @@ def fuse(
         watch(index, parts)
         frames.append(parts)
         tell(index + 1, f"frame {index}")
-    return _episode(raw, frames, mask, quality, settings)
+    return _episode(raw, views, frames, mask, quality, settings)
 
 
 class _Cameras:
@@ -400,6 +401,7 @@ def _overlap(first: Floats, second: Floats) -> float | None:
 
 def _episode(
     raw: RawEpisode,
+    views: Mapping[str, View],
     frames: list[dict[str, Seen]],
     mask: RobotMask | None,
     quality: _Quality,
@@ -422,7 +424,13 @@ def _episode(
         camera=np.concatenate([np.full(len(part.points), index, dtype=np.uint8) for index, part in parts]),
         pixel=np.concatenate([part.pixels for _, part in parts]).astype(np.uint16),
         sigma=np.concatenate([part.depth_m**2 * settings.sigma_per_m for _, part in parts]).astype(np.float32),
-        meta={**labels, "source": "raw episode", "cameras": names, "quality": quality.figures},
+        meta={
+            **labels,
+            "source": "raw episode",
+            "cameras": names,
+            "viewpoints": {name: placement.to_scene(views[name].T_world_camera[:3, 3]).tolist() for name in names},
+            "quality": quality.figures,
+        },
     )
 
 

@@ -9,7 +9,7 @@ import trimesh
 
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfacePoints, SurfaceSampler
-from diffcloud.fit.matching import Pairs, nearest_places, pairs_forth
+from diffcloud.fit.matching import Pairs, nearest_places, pairs_forth, seen_places
 from diffcloud.mesh.shapes import grid_cloth
 
 
@@ -127,3 +127,64 @@ def test_positions_that_are_no_numbers_have_some_place(sheet):
     queries = torch.full((1, 2, 3, 3), torch.nan, dtype=torch.float64)
     found = nearest_places(nodes, faces, queries)
     torch.testing.assert_close(found.barycentric.sum(-1), torch.ones(1, 2, 3, dtype=torch.float64))
+
+
+class TestSeen:
+    """A square screen of 20 cm lies level 10 cm above another."""
+
+    @pytest.fixture
+    def screens(self):
+        corners = torch.tensor([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=torch.float64) * 0.1
+        nodes = torch.cat([corners, corners + torch.tensor([0, 0, 0.1])])[None, None]
+        faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+        return nodes, torch.cat([faces, faces + 4])
+
+    def seen(self, screens, points, eyes, near=0.005):
+        nodes, faces = screens
+        found = seen_places(nodes, faces, torch.tensor([[points]]).double(), torch.tensor([eyes]).double(), near=near)
+        return found[0, 0].tolist()
+
+    def test_from_above_only_the_upper_one(self, screens):
+        points = [[0.02, 0.03, 0.0], [0.02, 0.03, 0.1]]
+        assert self.seen(screens, points, [[0.0, 0.0, 1.0]]) == [False, True]
+
+    def test_from_below_only_the_lower_one(self, screens):
+        points = [[0.02, 0.03, 0.0], [0.02, 0.03, 0.1]]
+        assert self.seen(screens, points, [[0.0, 0.0, -1.0]]) == [True, False]
+
+    def test_two_cameras_see_what_either_does(self, screens):
+        points = [[0.02, 0.03, 0.0], [0.02, 0.03, 0.1], [0.02, 0.03, 0.05]]
+        assert self.seen(screens, points, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) == [True, True, False]
+
+    def test_from_the_side_past_the_rim(self, screens):
+        assert self.seen(screens, [[0.0, 0.0, 0.05]], [[1.0, 0.0, 0.05]]) == [True]
+
+    def test_an_eye_between_is_not_hidden_by_what_lies_behind_it(self, screens):
+        assert self.seen(screens, [[0.0, 0.01, 0.0]], [[0.0, 0.0, 0.05]]) == [True]
+
+    def test_a_layer_that_lies_on_it_does_not_hide_a_point(self, screens):
+        points = [[0.02, 0.03, 0.097]]
+        assert self.seen(screens, points, [[0.0, 0.0, 1.0]], near=0.005) == [True]
+        assert self.seen(screens, points, [[0.0, 0.0, 1.0]], near=0.001) == [False]
+
+    def test_by_brute_force(self, sheet, generator):
+        nodes, faces = sheet
+        points = nodes.mean(2, keepdim=True) + 0.1 * torch.randn(1, 2, 80, 3, generator=generator, dtype=torch.float64)
+        eyes = torch.tensor([[[1.0, 0.2, 0.6], [-0.8, 0.3, 0.5]]], dtype=torch.float64)
+        found = seen_places(nodes, faces, points, eyes, near=0.005)
+        for frame in range(2):
+            mesh = trimesh.Trimesh(nodes[0, frame].numpy(), faces.numpy(), process=False)
+            for index, point in enumerate(points[0, frame].numpy()):
+                assert bool(found[0, frame, index]) == any(not blocked(mesh, point, eye) for eye in eyes[0].numpy())
+
+
+def blocked(mesh, point, eye, *, near=0.005):
+    """Whether a face of the mesh crosses the line of sight, by solving for each plane and place."""
+    for a, b, c in mesh.triangles:
+        try:
+            t, v, w = np.linalg.solve(np.stack([eye - point, a - b, a - c], axis=1), a - point)
+        except np.linalg.LinAlgError:
+            continue
+        if near / np.linalg.norm(eye - point) < t < 1 and v >= 0 and w >= 0 and v + w <= 1:
+            return True
+    return False

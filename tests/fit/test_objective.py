@@ -11,6 +11,7 @@ import torch
 
 from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton
+from diffcloud.fit.matching import seen_places
 from diffcloud.fit.residuals import Axis, linearise
 from diffcloud.fit.result import describe_recording
 from diffcloud.io.episodes import Episode
@@ -155,6 +156,31 @@ class TestWhatCounts:
         space = FitSpace.build(["stretch"], fixed={"mass": TRUTH["mass"]})
         found = fit_gauss_newton(Objective(scenario, [dirty]), space, GaussNewtonSettings(starts=1, screen=7))
         assert found.values["stretch"] == pytest.approx(TRUTH["stretch"], rel=0.05)
+
+    def test_what_no_camera_could_see_does_not_count(self, scenario, episode):
+        """Seen from one side alone, and recorded so: a part of the cloth has no points. The truth is then twice as near to
+        the recording as where the camera's place is not known."""
+        eye = [1.5, 0.3, 0.3]
+        faces = torch.as_tensor(scenario.scene.mesh.faces)
+        with torch.no_grad():
+            run = Objective(scenario, [episode]).simulate_to_loss(at(TRUTH))
+        motion = run.at(torch.as_tensor(episode.times))
+        frames = []
+        for index in range(episode.frame_count):
+            points = torch.as_tensor(episode.frame(index)).double()[None, None]
+            eyes = torch.tensor([[eye]]).double()
+            seen = seen_places(motion[:, index : index + 1], faces, points, eyes, near=0.008)
+            frames.append(episode.frame(index)[seen[0, 0].numpy()])
+        recorded = Episode.from_frames(frames, episode.times, gripper=episode.gripper)
+        known = replace(recorded, meta={"viewpoints": {"side": eye}})
+        without, with_ = (found_at(Objective(scenario, [one], nuisance={}), TRUTH) for one in (recorded, known))
+        assert min(with_["counted"]) < 0.9
+        assert with_["rms_to_recording_mm"] < 0.5 * without["rms_to_recording_mm"]
+
+    @pytest.mark.parametrize("told", [{"a": [0, 1]}, {"a": "here"}, {"a": [0, 1, math.nan]}, [1, 2], {"a": None}])
+    def test_viewpoints_that_are_none(self, scenario, episode, told):
+        with pytest.raises(EpisodeError, match="viewpoints of an episode's meta"):
+            Objective(scenario, [replace(episode, meta={"viewpoints": told})])
 
     def test_points_that_are_sure_count_more(self, scenario, episode):
         """Half of the recorded points are 2 cm too high; said to be uncertain, they move the loss less."""

@@ -179,6 +179,13 @@ def test_ctrl_c_stops_fits_in_processes_and_keeps_their_best(work):
     assert reasons == ["threshold", "interrupted"]
 
 
+@pytest.mark.parametrize("told", ["side=1,2", "side", "=1,2,3", "side=1,2,nan", "side=a,b,c"])
+def test_a_camera_that_stands_nowhere(work, told):
+    refused = run("import", "clouds", "clouds", "--rate-hz", 10, "--camera", told, "--out", "nowhere.npz", cwd=work, code=1)
+    assert "--camera takes NAME=X,Y,Z in metres" in refused.errors
+    assert not (work / "nowhere.npz").exists()
+
+
 def test_import_own_clouds_end_to_end(work):
     (work / "clouds").mkdir()
     episode = read_episode(work / "e1.npz")
@@ -186,7 +193,9 @@ def test_import_own_clouds_end_to_end(work):
         np.savetxt(work / "clouds" / f"frame_{index:03d}.xyz", episode.frame(index))
     rows = np.column_stack([episode.times, episode.gripper[:, 0]])
     np.savetxt(work / "gripper.csv", rows, delimiter=",", header="t_s,x,y,z", comments="")
-    run("import", "clouds", "clouds", "--gripper", "gripper.csv", "--out", "own.npz", cwd=work)
+    where = ("--camera", "side=1.2,0,0.5", "--camera", "top=0,0,2")
+    run("import", "clouds", "clouds", "--gripper", "gripper.csv", *where, "--out", "own.npz", cwd=work)
+    assert read_episode(work / "own.npz").meta["viewpoints"] == {"side": [1.2, 0.0, 0.5], "top": [0.0, 0.0, 2.0]}
     again = read_episode(work / "own.npz")
     np.testing.assert_allclose(again.points, episode.points, atol=1e-6)
     run("fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 1, "own.npz", cwd=work)

@@ -16,7 +16,21 @@ def entry(name="tan1", *, scenario="lift", fabric="tan", failures=()):
         "parameters": {"stretch": {"value": 1.5, "physical": 60.0, "physical_unit": "N/m"}},
         "history": {"loss": [[0.2], [0.1]]},
         "episodes": [name],
-        "recordings": {name: {"frames": [1]}},
+        "recordings": {
+            name: {
+                "rms_mm": 10.0,
+                "rms_to_recording_mm": 12.0,
+                "rms_to_cloth_mm": 7.5,
+                "frames": [1],
+                "frame_rms_mm": [10.0],
+                "counted": [0.8],
+                "cut_m": None,
+                "nuisance": {
+                    "x": {"value": 0.21, "prior": 0.1, "unit": "m"},
+                    "yaw": {"value": 0.1, "prior": 0.5, "unit": "rad"},
+                },
+            }
+        },
         "iterations": 2,
         "seconds": 1.5,
         "failures": list(failures),

@@ -24,7 +24,7 @@ def test_names_are_shown_as_text():
     shown = main_of(page)
     assert "<!--" not in page[: page.index("<script>")]
     assert "<script" not in shown
-    assert shown.count("&lt;!--&lt;script&gt;alert(1)&lt;/script&gt;&amp;amp;") == 6  # title, three cells, a failure twice
+    assert shown.count("&lt;!--&lt;script&gt;alert(1)&lt;/script&gt;&amp;amp;") == 9  # title, six cells, a failure twice
 
 
 def test_data_cannot_end_or_confuse_the_script():

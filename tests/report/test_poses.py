@@ -1,0 +1,26 @@
+"""The table of how recordings lie."""
+
+from __future__ import annotations
+
+from diffcloud.report.poses import poses_table
+from tests.report.pages import entry
+
+
+def test_poses_are_shown_in_millimetres_and_degrees_and_pointed_out_beyond_their_priors():
+    found = poses_table([("lift / tan1", entry().fit)])
+    cells = dict(zip(found.heads, found.rows[0], strict=True))
+    assert [cells[head].text for head in ("fit", "recording", "mm")] == ["lift / tan1", "tan1", "10.0"]
+    assert cells["mm"].note == "10.0 in frame 1"
+    assert (cells["x mm"].text, cells["x mm"].note) == ("210.0", "beyond its prior")
+    assert (cells["yaw °"].text, cells["yaw °"].note) == ("5.7", "")
+    assert cells["points that count"].text == "80 %"
+    assert cells["cut mm"].text == "–"
+
+
+def test_what_a_fit_did_not_free_is_a_dash():
+    one, other = entry("a").fit, entry("b").fit
+    other["recordings"]["b"]["nuisance"] = {}
+    del other["recordings"]["b"]["rms_to_cloth_mm"]  # the paper's measure has one direction
+    found = poses_table([("a", one), ("b", other)])
+    row = dict(zip(found.heads, found.rows[1], strict=True))
+    assert row["x mm"].text == row["cloud to cloth mm"].text == "–"
