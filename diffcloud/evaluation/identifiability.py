@@ -194,10 +194,11 @@ class _Probe:
         def losses(part: Tensor, kept: Tensor) -> Tensor:
             index = part[kept]
             run = self._objective.simulate({name: value[index] for name, value in parameters.items()})
-            rows = []
+            self._objective.reseed(self.seed)
+            pose, rows = self._objective.pose(run), []
             for seed in seeds:
                 self._objective.reseed(seed)
-                rows.append(self._objective.frame_losses(run).mean(-1))
+                rows.append(self._objective.frame_losses(run, pose=pose).mean(-1))
             return torch.stack(rows)
 
         found = np.full((draws, count), np.inf)
@@ -215,9 +216,11 @@ class _Probe:
         found = []
         with torch.no_grad():
             run = self._objective.simulate(self.space.parameters(values))
+            self._objective.reseed(self.seed)
+            pose = self._objective.pose(run)
             for seed in range(self.seed, self.seed + self.draws):
                 self._objective.reseed(seed)
-                points = self._objective.points(run)
+                points = self._objective.points(run, pose=pose)
                 for frame, cloud in enumerate(self._objective.clouds()):
                     found.append((points[:, frame] - cloud.nearest(points[:, frame])).norm(dim=-1))
         return torch.cat(found, dim=-1).numpy()

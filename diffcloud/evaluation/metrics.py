@@ -88,12 +88,13 @@ class EpisodeMeter:
         tensors = {name: torch.tensor([values.get(name, 0.0) for values in sets], dtype=torch.float64) for name in names}
         run = own.simulate(tensors)
         own.reseed(self._seeds[0])
-        points = own.points(run)  # [B, L, N, 3]
+        pose = own.pose(run)
+        points = own.points(run, pose=pose)  # [B, L, N, 3]
         both = [chamfer(points[:, frame], [cloud] * len(sets)) for frame, cloud in enumerate(own.clouds())]
         losses = []
         for seed in self._seeds:
             own.reseed(seed)
-            losses.append(own.frame_losses(run).mean(-1))
+            losses.append(own.frame_losses(run, pose=pose).mean(-1))
         every = torch.stack(losses)  # [draws, B]
         to_mm = 1e3 * self.scenario.length_unit_m
         columns = {
@@ -103,7 +104,7 @@ class EpisodeMeter:
             "two_sided": torch.stack(both).mean(0),
         }
         if self._others is not None:
-            others = self._others.frame_losses(run).mean(-1)
+            others = self._others.frame_losses(run, pose=pose).mean(-1)
             columns |= {"loss_other_frames": others, "rms_other_frames_mm": to_mm * others.sqrt()}
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
         return [dict(zip(columns, row, strict=True)) for row in rows]

@@ -35,6 +35,7 @@ _FEWEST = 200
 """Points of a frame, however many frames share the scenario's."""
 _NEAR_M = 0.008
 """A layer of cloth that lies so close over another does not hide it: a camera sees both as one."""
+_TINY = 1e-300
 _FEW = 5
 """Frames by which a pose is found before all have their say."""
 _FIRST_CAPS = (np.inf, np.inf, 4.0, 4.0, 2.0, 2.0, *[1.0] * 10)
@@ -150,11 +151,6 @@ class Objective:
         """The recorded clouds of the L compared frames."""
         return self._targets[episode].clouds
 
-    @property
-    def residual_count(self) -> int:
-        """M points of all episodes and compared frames."""
-        return sum(len(target.frames) for target in self._targets) * self.point_count
-
     def reseed(self, seed: int) -> None:
         """Draw the common random numbers anew."""
         generator = torch.Generator().manual_seed(seed)
@@ -207,45 +203,48 @@ class Objective:
         track = None if track is None else track[:, :steps]
         return rollout(self.system, steps, properties=properties, track=track)
 
-    def frame_losses(self, run: Rollout, *, episode: int = 0) -> Tensor:
-        """[B, L] losses of a rollout at each compared frame, at its pose. Differentiable: at the pose of lowest loss, the
-        loss does not change with the pose."""
-        motion = self.match(run, episode=episode)
-        losses = [pairs.losses(self._moved(motion, pairs, episode), self._cap) for pairs in motion.pairs]
-        return len(self.frames(episode)) * torch.stack(losses).sum(0)
+    def frame_losses(self, run: Rollout, *, pose: Tensor | None = None, episode: int = 0) -> Tensor:
+        """[B, L] losses of a rollout at each compared frame, at its pose or at poses [B, d]. Differentiable: at the pose of
+        lowest loss, the loss does not change with the pose."""
+        return self.losses(self.match(run, pose=pose, episode=episode), episode=episode)
 
-    def points(self, run: Rollout, *, episode: int = 0) -> Tensor:
-        """[B, L, N, 3] points sampled on a rollout's cloth at the compared frames, in the recording's frame."""
-        motion = self.match(run, episode=episode)
-        return self._moved(motion, motion.pairs[0], episode)
+    def losses(self, motion: Motion, *, episode: int = 0) -> Tensor:
+        """[B, L] losses of a matched motion at each compared frame."""
+        found = [pairs.losses(self._moved(motion, pairs, episode), self._cap) for pairs in motion.pairs]
+        return len(self.frames(episode)) * torch.stack(found).sum(0)
 
-    def counted(self, run: Rollout, *, episode: int = 0) -> Tensor:
-        """bool [B, L, N] which of `points` count."""
-        return self.match(run, episode=episode).pairs[0].weights > 0
-
-    def way_losses(self, run: Rollout, *, episode: int = 0) -> list[Tensor]:
-        """The losses [] of a rollout of one motion forth, and in the default measure back."""
-        motion = self.match(run, episode=episode)
+    def way_losses(self, motion: Motion, *, episode: int = 0) -> list[float]:
+        """The loss of one matched motion forth, and in the default measure back."""
         return [
-            pairs.losses(self._moved(motion, pairs, episode), self._cap).sum() / pairs.weights.sum().clamp(min=1e-300)
+            float(
+                pairs.losses(self._moved(motion, pairs, episode), self._cap).sum() / pairs.weights.sum().clamp(min=1e-300)
+            )
             for pairs in motion.pairs
         ]
 
-    def shown(self, run: Rollout, *, episode: int = 0) -> NDArray[np.float64]:
+    def points(self, run: Rollout, *, pose: Tensor | None = None, episode: int = 0) -> Tensor:
+        """[B, L, N, 3] points sampled on a rollout's cloth at the compared frames, in the recording's frame."""
+        motion = self.match(run, pose=pose, episode=episode)
+        return self._moved(motion, motion.pairs[0], episode)
+
+    def pose(self, run: Rollout, *, episode: int = 0) -> Tensor:
+        """[B, d] the pose of a rollout. It belongs to the motion: where points are drawn anew, it may stay."""
+        return self.match(run, episode=episode).pose
+
+    def shown(self, run: Rollout, pose: Tensor, *, episode: int = 0) -> NDArray[np.float64]:
         """[T + 1, V, 3] the cloth's nodes of a rollout of one motion at every frame of the scenario, in the recording's
         frame."""
-        space, pose = self._targets[episode].space, self.match(run, episode=episode).pose
+        space = self._targets[episode].space
         times = run.times[:: self.scenario.scene.frame_steps]
         lag = space.lag(pose)
         return space.moved(run.at(times if lag is None else times + lag), pose)[0].numpy()
 
-    def posed_bodies(self, run: Rollout, *, episode: int = 0) -> NDArray[np.float64]:
+    def posed_bodies(self, pose: Tensor, *, episode: int = 0) -> NDArray[np.float64]:
         """[V, 3] the nodes of the bodies beside the cloth, there too."""
-        pose = self.match(run, episode=episode).pose
         return self._targets[episode].space.moved(self._bodies[None], pose)[0].numpy()
 
-    def match(self, run: Rollout, *, episode: int = 0) -> Motion:
-        """A rollout beside an episode, at its pose."""
+    def match(self, run: Rollout, *, pose: Tensor | None = None, episode: int = 0) -> Motion:
+        """A rollout beside an episode, at its pose or at poses [B, d]."""
         times = self.times(episode)
         nodes = self.with_bodies(run.at(times))
         velocities = None
@@ -254,7 +253,8 @@ class Objective:
             velocities = (self.with_bodies(run.at(times + step)) - self.with_bodies(run.at(times - step))) / (2 * step)
         with torch.no_grad():
             still = nodes.detach(), None if velocities is None else velocities.detach()
-            pose = self._pose(*still, episode)
+            if pose is None:
+                pose = self._pose(*still, episode)
             return Motion(nodes, velocities, pose, self._matcher(*still, episode, range(nodes.shape[1]))(pose))
 
     def _pose(self, nodes: Tensor, velocities: Tensor | None, episode: int) -> Tensor:

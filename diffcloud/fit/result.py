@@ -99,11 +99,15 @@ def describe_fit(
             name: describe_recording(objective, run, episode=index)
             for index, (name, run) in enumerate(zip(episodes, runs, strict=True))
         }
-        shown, shown_start = objective.shown(runs[0]), objective.shown(start)
+        poses = [objective.pose(run, episode=index) for index, run in enumerate(runs)]
+        shown, shown_start = objective.shown(runs[0], poses[0]), objective.shown(start, objective.pose(start))
         resampled = []
         for seed in range(1, resampled_seeds + 1):
             objective.reseed(settings.seed + 10_000 + seed)
-            losses = [objective.frame_losses(one, episode=index) for index, one in enumerate(runs)]
+            losses = [
+                objective.frame_losses(one, pose=pose, episode=index)
+                for index, (one, pose) in enumerate(zip(runs, poses, strict=True))
+            ]
             resampled.append(float(torch.stack([loss.mean() for loss in losses]).mean()))
         objective.reseed(settings.seed)
     loss = float(np.mean([recording["loss"] for recording in recordings.values()]))  # by itself, not in a solver's batch
@@ -148,7 +152,7 @@ def describe_fit(
         start_positions=shown_start,
         faces=objective.system.mesh.faces,
         times=runs[0].times[:: scenario.scene.frame_steps].cpu().numpy(),
-        bodies=SurfaceMesh(objective.posed_bodies(runs[0]), scenario.scene.bodies.faces),
+        bodies=SurfaceMesh(objective.posed_bodies(poses[0]), scenario.scene.bodies.faces),
     )
 
 
@@ -162,19 +166,19 @@ def describe_recording(objective: Objective, run: Rollout, *, episode: int = 0) 
         the recording, about which the scene is turned.
     """
     unit, space = objective.scenario.length_unit_m, objective.pose_space(episode)
-    losses = objective.frame_losses(run, episode=episode)[0]
-    ways = objective.way_losses(run, episode=episode)
+    motion = objective.match(run, episode=episode)
+    losses, ways = objective.losses(motion, episode=episode)[0], objective.way_losses(motion, episode=episode)
     cut = objective.cut(episode)
     names = ("rms_to_recording_mm", "rms_to_cloth_mm")
     return {
         "loss": float(losses.mean()),
         "rms_mm": 1e3 * unit * float(losses.mean()) ** 0.5,
-        **{name: 1e3 * unit * float(loss) ** 0.5 for name, loss in zip(names, ways, strict=False)},
+        **{name: 1e3 * unit * loss**0.5 for name, loss in zip(names, ways, strict=False)},
         "frames": list(objective.frames(episode)),
         "frame_rms_mm": (1e3 * unit * losses.sqrt()).tolist(),
-        "counted": objective.counted(run, episode=episode)[0].double().mean(-1).tolist(),
+        "counted": (motion.pairs[0].weights[0] > 0).double().mean(-1).tolist(),
         "cut_m": None if cut is None else cut * unit,
-        "nuisance": space.described(objective.match(run, episode=episode).pose[0], length_unit_m=unit),
+        "nuisance": space.described(motion.pose[0], length_unit_m=unit),
         "centre": space.centre.tolist(),
     }
 

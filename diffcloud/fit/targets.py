@@ -80,7 +80,7 @@ def read_target(
         else [_checked(scenario, episode, frame) for frame in named]
     )
     clouds = tuple(NeighbourIndex(torch.as_tensor(episode.frame(frame), dtype=torch.float64)) for frame in frames)
-    centre = torch.cat([cloud.points for cloud in clouds]).mean(0)
+    centre = torch.as_tensor(episode.points.mean(0, dtype=np.float64))  # of all frames, so that a pose holds for others too
     return Target(
         tuple(frames),
         torch.as_tensor(episode.times[frames], dtype=torch.float64),

@@ -59,12 +59,15 @@ class KnownResiduals:
     def simulate(self, parameters):
         return torch.stack([(parameters[name] / value).log() for name, value in self.optimum.items()], dim=-1)
 
-    def points(self, run):
+    def pose(self, run):
+        return None
+
+    def points(self, run, *, pose=None):
         x = 10 + run @ self.rows.T + self.errors
         return torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], dim=-1)[:, None]
 
     def clouds(self):
         return (NeighbourIndex(torch.zeros(1, 3).double()),)
 
-    def frame_losses(self, run):
+    def frame_losses(self, run, *, pose=None):
         return self.points(run).square().sum(-1).mean(-1)

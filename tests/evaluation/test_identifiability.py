@@ -103,7 +103,7 @@ class TestCheck:
         """Whatever moves the mass moves all points by a tenth, as when another contact is met: to one side or to both."""
 
         class Jumping(KnownResiduals):
-            def points(self, run):
+            def points(self, run, *, pose=None):
                 lower = -run[:, 1] if not both else run[:, 1].abs()
                 places = super().points(run)
                 places[..., 0] += 0.1 * (lower > 1e-4)[:, None, None]

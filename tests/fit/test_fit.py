@@ -227,11 +227,13 @@ class TestRun:
         settings = AdamSettings(iterations=2, seed=3)
         outcome = fit_adam(objective, space, settings)
         summary = describe_fit(objective, space, settings, outcome, episodes=["a", "b"], resampled_seeds=2).summary
-        losses = []
+        parameters = space.parameters(torch.tensor([list(outcome.values.values())], dtype=torch.float64))
+        runs = [objective.simulate(parameters, episode=episode) for episode in (0, 1)]
+        objective.reseed(0)  # as it was made; the pose is that of the fit's own points
+        poses, losses = [objective.pose(run, episode=episode) for episode, run in enumerate(runs)], []
         for seed in (10_004, 10_005):
             objective.reseed(seed)
-            values = torch.tensor([list(outcome.values.values())], dtype=torch.float64)
-            losses.append(float(objective(space.parameters(values))))
+            losses += [float(objective.frame_losses(runs[e], pose=poses[e], episode=e).mean()) for e in (0, 1)]
         assert summary["loss_resampled"] == pytest.approx(np.mean(losses), rel=1e-9)
 
     def test_result_files(self, scenario, objective, tmp_path):
