@@ -45,8 +45,11 @@ def loss(
     points: Annotated[int | None, typer.Option(help="Sampled per frame.")] = None,
     frame: Annotated[list[int] | None, typer.Option(help="Loss frame, repeatable.")] = None,
     seed: Annotated[int, typer.Option(help="Of the sampled points; fits use 0.")] = 0,
-    paper: Annotated[bool, typer.Option("--paper", help="The published measure: one-sided, one frame, no pose.")] = False,
-    nuisance: Annotated[str | None, typer.Option(help="As of `diffcloud fit`.")] = None,
+    paper: Annotated[
+        bool,
+        typer.Option("--paper", help="The published measure: from cloth to recording only, at the loss frames, no pose."),
+    ] = False,
+    nuisance: Annotated[str | None, typer.Option(help="As for `diffcloud fit`.")] = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:

@@ -78,18 +78,22 @@ def fit(
     smoothing: Annotated[
         float | None, typer.Option(help="Of adam: perturbation whose gradients are averaged; 0: none.")
     ] = None,
-    threshold: Annotated[float | None, typer.Option(help="Stop below this loss; default: the scenario's.")] = None,
+    threshold: Annotated[
+        float | None, typer.Option(help="Stop below this loss; default: never, with --paper the scenario's.")
+    ] = None,
     points: Annotated[int | None, typer.Option(help="Sampled per frame.")] = None,
-    frame: Annotated[list[int] | None, typer.Option(help="Loss frame, repeatable; default: the scenario's.")] = None,
+    frame: Annotated[list[int] | None, typer.Option(help="Frame to compare, repeatable; default: all usable ones.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of all random numbers.")] = None,
     resample: Annotated[bool | None, typer.Option(help="Of adam: new points in each iteration.")] = None,
     paper: Annotated[
-        bool | None, typer.Option("--paper", help="The published measure: one-sided, one frame, no pose.")
+        bool | None,
+        typer.Option("--paper", help="The published measure: from cloth to recording only, at the loss frames, no pose."),
     ] = None,
     nuisance: Annotated[
         str | None,
         typer.Option(
-            help="Pose fitted along, and how far each may well be off: x, y, z, tilt_x, tilt_y, yaw, lag; or none. "
+            help="What of the recording's pose is found too, each with how far it may be off (a weak prior, no bound), "
+            "such as x=2cm,yaw=5deg,lag=50ms. Of x, y, z, tilt_x, tilt_y, yaw, lag; none keeps the scene's pose. "
             "Default: x=0.1m,y=0.1m,yaw=30deg."
         ),
     ] = None,

@@ -77,7 +77,7 @@ def clouds(
     camera: Annotated[
         list[str] | None,
         typer.Option(
-            help="NAME=X,Y,Z [m], repeatable: where each camera stood. Fits then leave out what none of them could see."
+            help="NAME=X,Y,Z [m] in the frame of the clouds, for every camera: fits leave out what none of them could see."
         ),
     ] = None,
     scenario: Annotated[str | None, typer.Option(help="Name kept in the episode's metadata.")] = None,
@@ -208,7 +208,8 @@ def _with_log(found: Recording, path: Path, offset_s: float) -> Recording:
 
 
 def _viewpoints(items: list[str] | None) -> dict[str, list[float]]:
-    """
+    """NAME=X,Y,Z items as camera -> [x, y, z] [m].
+
     Raises:
         ConfigError: what is not NAME=X,Y,Z, or a camera that is named twice.
     """

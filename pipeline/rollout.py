@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import typer
 
 from diffcloud.errors import ConfigError, DivergedError
-from diffcloud.fit.result import posed, read_fit
+from diffcloud.fit.result import read_fit, recorded_pose
 from diffcloud.fit.targets import track_displacement
 from diffcloud.io.clouds import write_ply
 from diffcloud.io.episodes import read_episode
@@ -35,7 +36,7 @@ def rollout(
     scenario: ScenarioName = None,
     scene: SceneFile = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="PARAMETER=VALUE, repeatable.")] = None,
-    fit: Annotated[Path | None, typer.Option(help="JSON of a fit whose parameters are used.")] = None,
+    fit: Annotated[Path | None, typer.Option(help="JSON of a fit: its parameters, in the frame of its recording.")] = None,
     episode: Annotated[Path | None, typer.Option(help="Episode whose gripper track moves the handles.")] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Frames to simulate.")] = None,
     obj: Annotated[
@@ -73,13 +74,15 @@ def rollout(
             raise DivergedError(error.step, error.entries, error.reason, shown) from error
     per_frame = slice(None, None, chosen.scene.frame_steps)
     nodes, times = run.positions[0, per_frame].numpy(), run.times[per_frame].numpy()
-    if fitted is not None and fitted["recordings"]:
-        own = fitted["recordings"].get("" if episode is None else episode.stem)
-        recording = own or next(iter(fitted["recordings"].values()))
-        nodes = posed(recording, run, run.times[per_frame], length_unit_m=chosen.length_unit_m)
     moved, moved_faces = moved_surfaces(system, run)
     moved = moved[0, per_frame]
     bodies = chosen.scene.bodies
+    recording = None if fitted is None else _recording(fitted["recordings"], episode)
+    if recording is not None:
+        space, pose = recorded_pose(recording, length_unit_m=chosen.length_unit_m)
+        nodes = space.moved_motion(run.at, run.times[per_frame], pose).numpy()
+        moved = space.moved(torch.as_tensor(moved)[None], pose)[0].numpy()
+        bodies = SurfaceMesh(space.moved(torch.as_tensor(bodies.nodes)[None], pose)[0].numpy(), bodies.faces)
     with together():
         for index, frame in enumerate(nodes):
             if obj is not None:
@@ -112,3 +115,17 @@ def rollout(
         },
         json,
     )
+
+
+def _recording(known: Mapping[str, Any], episode: Path | None) -> Mapping[str, Any] | None:
+    """The recording of a fit in whose frame the motion is written; None where the scene's own frame stays."""
+    if episode is None:
+        if len(known) > 1:
+            errors.print(f"The motion lies where {next(iter(known))} has it, the first of the fit's recordings.")
+        return next(iter(known.values()))
+    if episode.stem not in known:
+        errors.print(
+            f"{episode.stem} is not among the fit's recordings ({', '.join(known)}): its pose is not known, and the motion "
+            "stays in the frame of the scene."
+        )
+    return known.get(episode.stem)

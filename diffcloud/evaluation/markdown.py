@@ -21,8 +21,8 @@ def comparison_page(told: Tables, missing: Sequence[str]) -> str:
     parts += [
         "## Loss per episode",
         "",
-        "One-sided Chamfer at the fit's frames, squared length units of the scene, fresh points, parameters clipped to the "
-        "bounds.",
+        "Loss by the fit's measure at its frames, squared length units of the scene, fresh points, parameters clipped to "
+        "the bounds.",
         "",
         *_losses(told["methods"]),
         "",

@@ -12,7 +12,7 @@ from diffcloud.fit.pose import PoseSpace
 Terms = Callable[[Tensor, float], tuple[Tensor, Tensor, Tensor]]
 """Poses [B, d] and a factor of the cap -> loss [B], half of its slope [B, d] and of its curvature [B, d, d]."""
 _ARRIVED = 1e-2
-"""A step below this part of the priors' deviations; what is left of the way, the loss has to second order."""
+"""A step smaller than this part of the priors' deviations is the last one; what is left changes little."""
 _LARGEST = 1.0
 """Step, in deviations."""
 _DAMPING = 1e-6
@@ -21,7 +21,7 @@ _DAMPING = 1e-6
 def aligned(space: PoseSpace, start: Tensor, terms: Terms, caps: Sequence[float]) -> Tensor:
     """[B, d] poses that steps from `start` [B, d] lead to, each one on the loss with another factor of the cap.
 
-    Before they are through, an entry ends where the cap is its own and its step is small, whatever the others do.
+    An entry of the batch stops early once the factor is 1 and its step is small, whatever the others do.
     """
     poses, going = start, torch.ones(len(start), dtype=torch.bool)
     for cap in caps:

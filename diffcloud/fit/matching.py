@@ -42,15 +42,19 @@ class Pairs:
     """[L] between recorded points."""
     weights: Tensor
     """[B, L, N]"""
+    share: float
+    """Of all weights in a frame; where no place counts, they are missing."""
 
     def losses(self, moved: Tensor, cap: float) -> Tensor:
-        """[B, L] sums of the weighted squared distances, differentiable.
+        """[B, L] sums of the weighted squared distances, differentiable. A frame in which no place counts has the largest
+        loss: a motion that hides from the recording explains nothing.
 
         Args:
             moved: [B, L, N, 3] the places in the recording's frame.
             cap: largest distance that counts as itself.
         """
-        return (self.weights * (moved - self.partners).square().sum(-1).clamp(max=cap**2)).sum(-1)
+        found = (self.weights * (moved - self.partners).square().sum(-1).clamp(max=cap**2)).sum(-1)
+        return torch.where(self.weights.sum(-1) > 0, found, self.share * cap**2)
 
     def terms(self, moved: Tensor, rates: Tensor, cap: float) -> tuple[Tensor, Tensor, Tensor]:
         """Loss [B], half of its slope [B, k] and of its curvature [B, k, k].
@@ -94,8 +98,9 @@ def pairs_forth(
     counted = torch.ones_like(moved[..., 0]) if cut is None else (moved[..., 2] >= cut).to(moved)
     if seen is not None:
         counted = counted * seen
-    weights = share * counted / counted.sum(-1, keepdim=True).clamp(min=1.0) / len(clouds)
-    return Pairs(places, partners, normals, moved.new_tensor([cloud.spacing for cloud in clouds]), weights)
+    weights = share / len(clouds) * counted / counted.sum(-1, keepdim=True).clamp(min=1.0)
+    spacing = moved.new_tensor([cloud.spacing for cloud in clouds])
+    return Pairs(places, partners, normals, spacing, weights, share / len(clouds))
 
 
 @torch.no_grad()
@@ -123,7 +128,8 @@ def pairs_back(
     normals = space.turned(places.normals(positions), pose)
     weights = share * sure / sure.sum(-1, keepdim=True) / len(recorded)
     batch = len(positions)
-    return Pairs(places, recorded.expand(batch, -1, -1, -1), normals, spacing, weights.expand(batch, -1, -1))
+    shares = weights.expand(batch, -1, -1)
+    return Pairs(places, recorded.expand(batch, -1, -1, -1), normals, spacing, shares, share / len(recorded))
 
 
 def seen_places(positions: Tensor, faces: Tensor, points: Tensor, viewpoints: Tensor, *, near: float) -> Tensor:

@@ -9,7 +9,8 @@ pose.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -35,7 +36,6 @@ _FEWEST = 200
 """Points of a frame, however many frames share the scenario's."""
 _NEAR_M = 0.008
 """A layer of cloth that lies so close over another does not hide it: a camera sees both as one."""
-_TINY = 1e-300
 _FEW = 5
 """Frames by which a pose is found before all have their say."""
 _FIRST_CAPS = (np.inf, np.inf, 4.0, 4.0, 2.0, 2.0, *[1.0] * 10)
@@ -107,13 +107,14 @@ class Objective:
         named = scenario.loss_frames if paper or not scenario.every_frame else None
         self._targets = [
             read_target(
-                scenario, self.system, episode, named if frames is None else frames, cut=not paper, nuisance=self.nuisance
+                scenario, self.system, episode, named if frames is None else frames, whole=paper, nuisance=self.nuisance
             )
             for episode in episodes
         ]
         self.reseed(seed)
         last = max(float(target.times.max()) for target in self._targets)
-        self.loss_steps = min(int(np.ceil(last / self.system.time_step - 1e-6)), scenario.steps)
+        steps = int(np.ceil(last / self.system.time_step - 1e-6)) + ("lag" in self.nuisance)  # a velocity has two sides
+        self.loss_steps = min(steps, scenario.steps)
 
     @property
     def episode_count(self) -> int:
@@ -204,8 +205,8 @@ class Objective:
         return rollout(self.system, steps, properties=properties, track=track)
 
     def frame_losses(self, run: Rollout, *, pose: Tensor | None = None, episode: int = 0) -> Tensor:
-        """[B, L] losses of a rollout at each compared frame, at its pose or at poses [B, d]. Differentiable: at the pose of
-        lowest loss, the loss does not change with the pose."""
+        """[B, L] losses of a rollout at each compared frame, at its pose or at poses [B, d]. Differentiable, with the pose
+        held fixed: it minimises the loss, a weak prior aside."""
         return self.losses(self.match(run, pose=pose, episode=episode), episode=episode)
 
     def losses(self, motion: Motion, *, episode: int = 0) -> Tensor:
@@ -216,9 +217,7 @@ class Objective:
     def way_losses(self, motion: Motion, *, episode: int = 0) -> list[float]:
         """The loss of one matched motion forth, and in the default measure back."""
         return [
-            float(
-                pairs.losses(self._moved(motion, pairs, episode), self._cap).sum() / pairs.weights.sum().clamp(min=1e-300)
-            )
+            float(pairs.losses(self._moved(motion, pairs, episode), self._cap).mean() / pairs.share)
             for pairs in motion.pairs
         ]
 
@@ -231,13 +230,11 @@ class Objective:
         """[B, d] the pose of a rollout. It belongs to the motion: where points are drawn anew, it may stay."""
         return self.match(run, episode=episode).pose
 
-    def shown(self, run: Rollout, pose: Tensor, *, episode: int = 0) -> NDArray[np.float64]:
+    def posed_nodes(self, run: Rollout, pose: Tensor, *, episode: int = 0) -> NDArray[np.float64]:
         """[T + 1, V, 3] the cloth's nodes of a rollout of one motion at every frame of the scenario, in the recording's
         frame."""
-        space = self._targets[episode].space
         times = run.times[:: self.scenario.scene.frame_steps]
-        lag = space.lag(pose)
-        return space.moved(run.at(times if lag is None else times + lag), pose)[0].numpy()
+        return self._targets[episode].space.moved_motion(run.at, times, pose).numpy()
 
     def posed_bodies(self, pose: Tensor, *, episode: int = 0) -> NDArray[np.float64]:
         """[V, 3] the nodes of the bodies beside the cloth, there too."""
@@ -249,8 +246,9 @@ class Objective:
         nodes = self.with_bodies(run.at(times))
         velocities = None
         if "lag" in self.pose_space(episode).names:
-            step = float(run.times[1])
-            velocities = (self.with_bodies(run.at(times + step)) - self.with_bodies(run.at(times - step))) / (2 * step)
+            before, after = ((times + way * float(run.times[1])).clamp(0.0, float(run.times[-1])) for way in (-1, 1))
+            moved = self.with_bodies(run.at(after)) - self.with_bodies(run.at(before))
+            velocities = moved / (after - before)[:, None, None]
         with torch.no_grad():
             still = nodes.detach(), None if velocities is None else velocities.detach()
             if pose is None:
@@ -267,11 +265,11 @@ class Objective:
     def _first_pose(self, episode: int) -> Tensor:
         """[1, d] of the basis material, from zero on."""
         if episode not in self._first:
-            zero = torch.zeros(1, len(self.pose_space(episode).names), dtype=torch.float64)
-            self._first[episode] = zero  # where the steps begin
-            run = self.simulate_to_loss({}, episode=episode)
-            nodes = self.with_bodies(run.at(self.times(episode)))
-            self._first[episode] = self._follow(nodes, torch.zeros_like(nodes), episode, zero, _FIRST_CAPS)
+            self._first[episode] = torch.zeros(1, len(self.pose_space(episode).names), dtype=torch.float64)
+            with suppress(DivergedError):  # then steps begin at zero, whatever the parameters
+                nodes = self.with_bodies(self.simulate_to_loss({}, episode=episode).at(self.times(episode)))
+                zero = self._first[episode]
+                self._first[episode] = self._follow(nodes, torch.zeros_like(nodes), episode, zero, _FIRST_CAPS)
         return self._first[episode]
 
     def _follow(
@@ -297,15 +295,15 @@ class Objective:
     def _matcher(self, nodes: Tensor, velocities: Tensor | None, episode: int, frames: Sequence[int]) -> Matcher:
         """What finds the pairs of some frames at poses [B, d]."""
         target, chosen = self._targets[episode], list(frames)
-        here = Motion(nodes[:, chosen], None if velocities is None else velocities[:, chosen], nodes[:0], ())
+        still, moving = nodes[:, chosen], None if velocities is None else velocities[:, chosen]
         clouds = [target.clouds[frame] for frame in chosen]
-        places = self.sampler.draw(here.nodes)
+        places = self.sampler.draw(still)
         share = 1.0 if self.paper else 0.5
         seen: Tensor | None = None
 
         def pairs_at(pose: Tensor) -> tuple[Pairs, ...]:
             nonlocal seen
-            shown = self._shown(replace(here, pose=pose), target.space)
+            shown = self._lagged(Motion(still, moving, pose, ()), target.space)
             points = places.of(shown)
             if seen is None and target.viewpoints is not None:  # from where one stands metres away, a step changes nothing
                 eyes = target.space.back(target.viewpoints, pose)
@@ -331,7 +329,7 @@ class Objective:
         """
         space = self._targets[episode].space
         sums: tuple[Tensor, Tensor, Tensor] | None = None
-        here = self._shown(motion, space)
+        here = self._lagged(motion, space)
         if rates is not None:  # bodies stand still
             rates = torch.nn.functional.pad(rates, (0, 0, 0, here.shape[-2] - rates.shape[-2]))
         for pairs in motion.pairs:
@@ -351,7 +349,7 @@ class Objective:
             return positions
         return torch.cat([positions, self._bodies.expand(*positions.shape[:-2], -1, -1)], dim=-2)
 
-    def _shown(self, motion: Motion, space: PoseSpace) -> Tensor:
+    def _lagged(self, motion: Motion, space: PoseSpace) -> Tensor:
         """[B, L, V, 3] where the nodes are when the recording looks at them."""
         lag = space.lag(motion.pose)
         if lag is None or motion.velocities is None:
@@ -360,7 +358,7 @@ class Objective:
 
     def _moved(self, motion: Motion, pairs: Pairs, episode: int) -> Tensor:
         space = self._targets[episode].space
-        return space.moved(pairs.places.of(self._shown(motion, space)), motion.pose)
+        return space.moved(pairs.places.of(self._lagged(motion, space)), motion.pose)
 
     def _drawn(self, target: Target, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """[L, Q, 3] recorded points that look for the cloth, as many as there are sampled ones, and [L, Q] how sure."""

@@ -1,19 +1,20 @@
-"""How a recording lies against the scene: what is fitted along for each episode, and is no property of the cloth.
+"""How a recording lies against the scene: fitted with the parameters, for each episode, and no property of the cloth.
 
 The scene is turned about the recording's centre c by the rotation vector w = (tilt_x, tilt_y, yaw), shifted by
 t = (x, y, z), and looked at later by `lag`, as far as its velocity v tells:
 
     x' = exp([w]×) (x + lag v - c) + c + t
 
-A level table looks the same from every side: x, y and yaw are exact, and cost no simulation. z and the tilts are those of
-the cameras against the robot.
+On a level table, x and y, and yaw of cloth, gripper and bodies together, are symmetries of the motion: they need no new
+simulation. A cloth that lies turned under a gripper which does not turn is another motion; yaw only approximates it. z and
+the tilts are those of the cameras against the robot. A cloud stamped t shows the motion at t + lag.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -29,7 +30,7 @@ _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180, "s
 _QUANTITY = {"m": "m", "cm": "m", "mm": "m", "rad": "rad", "deg": "rad", "s": "s", "ms": "s"}
 _NOISE_M = 0.005
 _INDEPENDENT = 100
-"""A prior weighs, for each of its deviations, as one of so many residuals of that size: much less than a recording."""
+"""A prior at one deviation costs as much as one residual of that size among so many: far less than a recording."""
 _ANGLES = ("tilt_x", "tilt_y", "yaw")
 _SHIFTS = ("x", "y", "z")
 
@@ -129,6 +130,15 @@ class PoseSpace:
         """[B, ..., 3] points of the scene at values [B, d] -> where the recording has them."""
         turned = _turned(points - self.centre, self.rotation(values))
         return turned + _beside(self.centre + self._parts(values, _SHIFTS), turned)
+
+    def moved_motion(self, at: Callable[[Tensor], Tensor], times: Tensor, values: Tensor) -> Tensor:
+        """[T, V, 3] where the recording has the nodes of one motion at times [T] of its own, at values [1, d].
+
+        Args:
+            at: times [T] -> nodes [1, T, V, 3].
+        """
+        lag = self.lag(values)
+        return self.moved(at(times if lag is None else times + lag), values)[0]
 
     def turned(self, vectors: Tensor, values: Tensor) -> Tensor:
         """[B, ..., 3] directions in the scene at values [B, d] -> in the recording."""

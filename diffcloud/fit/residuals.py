@@ -132,7 +132,9 @@ def _by_differences(objective: Objective, space: FitSpace, places: Tensor, episo
     run = objective.simulate_to_loss(space.parameters(axis.values(every)), episode=episode)
     there = run.at(objective.times(episode))[len(places) :].unflatten(0, (2, -1, len(places)))
     width = ((above - below) * ways).sum(-1)  # halved at a bound
-    return replace(run, positions=run.positions[: len(places)]), (there[0] - there[1]) / width[..., None, None, None]
+    return replace(run, positions=run.positions[: len(places)], velocities=run.velocities[: len(places)]), (
+        there[0] - there[1]
+    ) / width[..., None, None, None]
 
 
 def _over_pose(objective: Objective, run: Rollout, rates: Tensor, episode: int) -> tuple[Tensor, Tensor, Tensor]:

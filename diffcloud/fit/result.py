@@ -100,7 +100,7 @@ def describe_fit(
             for index, (name, run) in enumerate(zip(episodes, runs, strict=True))
         }
         poses = [objective.pose(run, episode=index) for index, run in enumerate(runs)]
-        shown, shown_start = objective.shown(runs[0], poses[0]), objective.shown(start, objective.pose(start))
+        shown, shown_start = objective.posed_nodes(runs[0], poses[0]), objective.posed_nodes(start, objective.pose(start))
         resampled = []
         for seed in range(1, resampled_seeds + 1):
             objective.reseed(settings.seed + 10_000 + seed)
@@ -157,7 +157,7 @@ def describe_fit(
 
 
 def describe_recording(objective: Objective, run: Rollout, *, episode: int = 0) -> dict[str, Any]:
-    """One recording beside the motion fitted to it, as plain values in SI.
+    """One recording beside the motion fitted to it, as plain values, in SI but for `loss` and `centre`.
 
     Returns:
         loss [squared length unit]; rms_mm, and in the default measure rms_to_recording_mm and rms_to_cloth_mm: each
@@ -183,8 +183,8 @@ def describe_recording(objective: Objective, run: Rollout, *, episode: int = 0) 
     }
 
 
-def posed(recording: Mapping[str, Any], run: Rollout, times: torch.Tensor, *, length_unit_m: float) -> NDArray[np.float64]:
-    """[T, V, 3] nodes of a rollout of one motion at times [T], where a recording of a fit has them.
+def recorded_pose(recording: Mapping[str, Any], *, length_unit_m: float) -> tuple[PoseSpace, torch.Tensor]:
+    """The pose that a fit found for a recording, and its values [1, d].
 
     Args:
         recording: as of `describe_recording`.
@@ -193,10 +193,7 @@ def posed(recording: Mapping[str, Any], run: Rollout, times: torch.Tensor, *, le
     priors = {name: float(entry["prior"]) for name, entry in described.items()}
     centre = torch.tensor(recording["centre"], dtype=torch.float64)
     space = PoseSpace.build(priors, centre, length_unit_m=length_unit_m)
-    pose = space.of(described, length_unit_m=length_unit_m)[None]
-    lag = space.lag(pose)
-    nodes = run.at(times if lag is None else times + lag)
-    return space.moved(nodes, pose)[0].cpu().numpy()
+    return space, space.of(described, length_unit_m=length_unit_m)[None]
 
 
 def write_fit(folder: Path, name: str, result: FitResult) -> Path:

@@ -18,7 +18,7 @@ from diffcloud.sim.simulate import rollout
 from diffcloud.sim.system import System
 
 _CUT_M = 0.002
-"""A recording whose lowest points lie so far above the cloth's start was cut there."""
+"""If the lowest points lie so far above the lowest node of the cloth at its start, the recording was cut there."""
 _LOWEST = 0.005
 """Part of the recorded points that may lie below the cut: noise."""
 _USABLE, _NEARLY, _TOO_LITTLE = 0.5, 0.8, 0.05
@@ -54,18 +54,19 @@ def read_target(
     episode: Episode,
     named: Sequence[int] | None,
     *,
-    cut: bool,
+    whole: bool,
     nuisance: Mapping[str, float],
 ) -> Target:
     """
     Args:
         named: frames to compare, negative ones counted from the end; None for every usable one.
-        cut: whether to look for a height below which nothing was recorded.
+        whole: whether all of a recording counts; else it is looked for a height below which nothing was recorded, and for
+            where the cameras stood.
         nuisance: variables of the pose with the deviations of their priors [m, rad, s].
 
     Raises:
-        EpisodeError: a frame that the episode lacks, one after the end of the simulation, none that is usable, or other
-            grippers than the scene's.
+        EpisodeError: a frame that the episode lacks, one after the end of the simulation, none that is usable, other
+            grippers than the scene's, or viewpoints that are no positions.
         ConfigError: an unknown variable of the pose.
     """
     unit = scenario.length_unit_m
@@ -73,11 +74,11 @@ def read_target(
     if episode.gripper is not None:
         moved = track_displacement(episode, system.handles.grippers, scenario.steps, system.time_step)
         track = torch.as_tensor(moved, dtype=torch.float64)[None]
-    height = _found_cut(system, episode, unit) if cut else None
+    height = None if whole else _found_cut(system, episode, unit)
     frames = (
         _usable(scenario, system, episode, track, height)
         if named is None
-        else [_checked(scenario, episode, frame) for frame in named]
+        else list(dict.fromkeys(_checked(scenario, episode, frame) for frame in named))
     )
     clouds = tuple(NeighbourIndex(torch.as_tensor(episode.frame(frame), dtype=torch.float64)) for frame in frames)
     centre = torch.as_tensor(episode.points.mean(0, dtype=np.float64))  # of all frames, so that a pose holds for others too
@@ -87,7 +88,7 @@ def read_target(
         clouds,
         tuple(_sure(episode, frame) for frame in frames),
         height,
-        _viewpoints(episode) if cut else None,
+        None if whole else _viewpoints(episode),
         PoseSpace.build(nuisance, centre, length_unit_m=unit),
         track,
     )
@@ -114,20 +115,17 @@ def _usable(scenario: Scenario, system: System, episode: Episode, track: Tensor 
     frames = [index for index, time in enumerate(episode.times) if 0 < time <= end]
     if cut is not None and frames:
         with torch.no_grad():
-            run = rollout(system, scenario.steps, track=track)
+            run = rollout(system, scenario.steps, track=track, drop_diverged=True)
         heights = run.at(torch.as_tensor(episode.times[frames]))[0, ..., 2]
-        above = (heights >= cut).double().mean(-1)
+        above = ((heights >= cut) | heights.isnan()).double().mean(-1)  # of a motion that diverges nothing is known
         enough = max(min(_USABLE, _NEARLY * float(above.max())), _TOO_LITTLE)
         frames = [frame for frame, part in zip(frames, above.tolist(), strict=True) if part >= enough]
     if not frames:
-        told = (
-            ""
-            if cut is None
-            else f", and in none is more than {_TOO_LITTLE:.0%} of the cloth above {cut:.3f}, where the recording is cut"
-        )
+        unit, simulated = scenario.length_unit_m, scenario.steps * scenario.scene.time_step
+        told = "" if cut is None else f", at most {_TOO_LITTLE:.0%} of the cloth is above the cut at {cut * unit:.3f} m"
         raise EpisodeError(
             f"No frame of the episode can be compared: they lie at {episode.times[0]:.3f} to {episode.times[-1]:.3f} s, "
-            f"scenario {scenario.name} simulates {end:.3f} s{told}. Name some with --frame, or check times and cropping."
+            f"scenario {scenario.name} simulates {simulated:.3f} s{told}. Name some with --frame, or check times and cropping."
         )
     return frames
 

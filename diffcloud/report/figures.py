@@ -87,7 +87,7 @@ def _losses(told: Tables) -> Figure | None:
         canvas,
         "losses",
         "Distance per method and fabric category",
-        "One dot per episode, a bar at the mean. One-sided Chamfer at the fit's frames as a root mean square, fresh "
+        "One dot per episode, a bar at the mean. The loss by the fit's measure at its frames, as a root mean square, fresh "
         "points, the same simulator for all.",
         "tables/methods.csv",
     )

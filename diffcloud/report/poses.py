@@ -25,7 +25,16 @@ def poses_table(fits: Sequence[tuple[str, Mapping[str, Any]]]) -> Table:
     rows = [(name, recorded, recording) for name, fit in fits for recorded, recording in fit["recordings"].items()]
     variables = list(dict.fromkeys(key for _, _, recording in rows for key in recording["nuisance"]))
     units = {key: one["nuisance"][key]["unit"] for _, _, one in rows for key in one["nuisance"]}
-    heads = ["fit", "recording", "mm", "cloth to cloud mm", "cloud to cloth mm", "frames", "points that count", "cut mm"]
+    heads = [
+        "fit",
+        "recording",
+        "RMS mm",
+        "cloth to cloud mm",
+        "cloud to cloth mm",
+        "frames",
+        "points that count",
+        "cut mm",
+    ]
     heads += [f"{key} {_SHOWN[units[key]][1]}" for key in variables]
     return table(heads, (_row(name, recorded, recording, variables) for name, recorded, recording in rows))
 

@@ -68,12 +68,6 @@ class TestForth:
         assert torch.equal(pairs.weights > 0, moved[..., 2] >= 0.4)
         torch.testing.assert_close(pairs.weights.sum((1, 2)), torch.ones(2, dtype=torch.float64))
 
-    def test_all_below_it_is_no_loss(self, generator):
-        moved = torch.rand(1, 1, 5, 3, generator=generator, dtype=torch.float64)
-        clouds = [NeighbourIndex(torch.rand(30, 3, generator=generator, dtype=torch.float64))]
-        pairs = pairs_forth(at_points(moved), moved, clouds, cut=2.0, share=1.0)
-        assert float(pairs.losses(moved, 1.0).sum()) == 0.0
-
     def test_the_partner_is_the_nearest(self, generator):
         moved = torch.rand(2, 2, 40, 3, generator=generator, dtype=torch.float64)
         clouds = [NeighbourIndex(torch.rand(30, 3, generator=generator, dtype=torch.float64)) for _ in range(2)]
@@ -87,7 +81,7 @@ def some_pairs(generator, *, count=30):
     moved, partners = torch.rand(2, 2, 3, count, 3, generator=generator, dtype=torch.float64)
     normals = torch.nn.functional.normalize(torch.randn(moved.shape, generator=generator, dtype=torch.float64), dim=-1)
     weights = torch.rand(moved.shape[:3], generator=generator, dtype=torch.float64)
-    return moved, Pairs(at_points(moved), partners, normals, torch.full((3,), 0.1, dtype=torch.float64), weights)
+    return moved, Pairs(at_points(moved), partners, normals, torch.full((3,), 0.1, dtype=torch.float64), weights, 1.0)
 
 
 class TestTerms:

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from diffcloud.errors import ConfigError, EpisodeError
+from diffcloud.clouds.neighbours import NeighbourIndex
+from diffcloud.clouds.sampling import SurfacePoints
+from diffcloud.errors import ConfigError, DivergedError, EpisodeError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton
-from diffcloud.fit.matching import seen_places
+from diffcloud.fit.matching import pairs_forth, seen_places
 from diffcloud.fit.residuals import Axis, linearise
 from diffcloud.fit.result import describe_recording
 from diffcloud.io.episodes import Episode
@@ -204,3 +206,38 @@ class TestWhatCounts:
         )
         found = Objective(band, [recorded], nuisance={}, frames=[0])
         assert describe_recording(found, run)["rms_to_cloth_mm"] < 0.1
+
+    def test_a_motion_that_hides_below_the_cut_has_the_largest_loss(self, generator):
+        moved = torch.rand(1, 2, 5, 3, generator=generator, dtype=torch.float64)
+        moved[:, 1, :, 2] -= 5.0
+        clouds = [NeighbourIndex(torch.rand(30, 3, generator=generator, dtype=torch.float64))] * 2
+        nodes = torch.arange(5).reshape(1, 1, 5, 1).expand(1, 2, 5, 3)
+        places = SurfacePoints(nodes, torch.full_like(moved, 1 / 3))
+        pairs = pairs_forth(places, moved, clouds, cut=0.0, share=0.5)
+        losses = pairs.losses(moved, 0.05)[0]
+        assert float(losses[1]) == pytest.approx(0.25 * 0.05**2)
+        assert float(losses[0]) <= float(losses[1])
+
+
+def test_with_a_lag_the_loss_does_not_depend_on_how_far_is_simulated(scenario, episode):
+    """A velocity at the last compared frame needs what comes after it."""
+    objective = Objective(scenario, [episode], nuisance={"lag": 0.05}, frames=[4, 8])
+    with torch.no_grad():
+        short, whole = objective.simulate_to_loss(at(TRUTH)), objective.simulate(at(TRUTH))
+        assert len(short.times) < len(whole.times)
+        torch.testing.assert_close(objective.frame_losses(short), objective.frame_losses(whole))
+
+
+def test_a_basis_that_diverges_costs_no_parameter_set(scenario, episode, monkeypatch):
+    """The first pose is looked for with the basis material; without its motion, steps begin at zero."""
+    objective = Objective(scenario, [episode])
+    real = Objective.simulate
+
+    def fragile(self, parameters, **options):
+        if not parameters:
+            raise DivergedError(3, [0], "test")
+        return real(self, parameters, **options)
+
+    monkeypatch.setattr(Objective, "simulate", fragile)
+    with torch.no_grad():
+        assert bool(torch.isfinite(objective(at(TRUTH))).all())

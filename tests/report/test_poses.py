@@ -9,8 +9,8 @@ from tests.report.pages import entry
 def test_poses_are_shown_in_millimetres_and_degrees_and_pointed_out_beyond_their_priors():
     found = poses_table([("lift / tan1", entry().fit)])
     cells = dict(zip(found.heads, found.rows[0], strict=True))
-    assert [cells[head].text for head in ("fit", "recording", "mm")] == ["lift / tan1", "tan1", "10.0"]
-    assert cells["mm"].note == "10.0 in frame 1"
+    assert [cells[head].text for head in ("fit", "recording", "RMS mm")] == ["lift / tan1", "tan1", "10.0"]
+    assert cells["RMS mm"].note == "10.0 in frame 1"
     assert (cells["x mm"].text, cells["x mm"].note) == ("210.0", "beyond its prior")
     assert (cells["yaw °"].text, cells["yaw °"].note) == ("5.7", "")
     assert cells["points that count"].text == "80 %"

@@ -43,7 +43,7 @@ def load_scenario(name: str | Path | None, scene: Path | None = None) -> Scenari
             )
         loaded = load_scene(scene)
         frames = loaded.default_frames or 25
-        return Scenario(Path(scene).stem, loaded, frames, loss_frames=(-1,))
+        return Scenario(Path(scene).stem, loaded, frames, loss_frames=(-1,), every_frame=True)
     text = str(name)
     if text in RELEASE:
         if scene is None:

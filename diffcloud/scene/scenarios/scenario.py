@@ -34,7 +34,7 @@ class Scenario:
     every_frame: bool = False
     """Whether the default measure compares all usable frames, not these."""
     loss_faces: NDArray[np.int64] | None = None
-    """Faces whose surface is sampled; None for all."""
+    """Faces whose surface the paper's measure samples; None for all."""
     node_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
     """Parameter name -> nodes it acts on."""
     points: int = 3500
