@@ -122,7 +122,7 @@ def _usable(scenario: Scenario, system: System, episode: Episode, track: Tensor 
         frames = [frame for frame, part in zip(frames, above.tolist(), strict=True) if part >= enough]
     if not frames:
         unit, simulated = scenario.length_unit_m, scenario.steps * scenario.scene.time_step
-        told = "" if cut is None else f", at most {_TOO_LITTLE:.0%} of the cloth is above the cut at {cut * unit:.3f} m"
+        told = "" if cut is None else f", at most {_TOO_LITTLE:.0%} of the cloth lies above the cut, {cut * unit:.3f} m"
         raise EpisodeError(
             f"No frame of the episode can be compared: they lie at {episode.times[0]:.3f} to {episode.times[-1]:.3f} s, "
             f"scenario {scenario.name} simulates {simulated:.3f} s{told}. Name some with --frame, or check times and cropping."
