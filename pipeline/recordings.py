@@ -21,8 +21,6 @@ from pipeline.config import FitConfig, load_config
 from pipeline.console import JsonFlag, ParamsFile, finish, output, progress_bar, writes
 from pipeline.scenario_options import choose_scenario
 
-"""Of stretch to mass: a fit starts from the best of them."""
-
 
 @writes(".md")
 def recordings(

@@ -99,7 +99,7 @@ def describe_fit(
             name: describe_recording(objective, run, episode=index)
             for index, (name, run) in enumerate(zip(episodes, runs, strict=True))
         }
-        poses = [objective.pose(run, episode=index) for index, run in enumerate(runs)]
+        poses = [recorded_pose(recording, length_unit_m=unit)[1] for recording in recordings.values()]
         shown, shown_start = objective.posed_nodes(runs[0], poses[0]), objective.posed_nodes(start, objective.pose(start))
         resampled = []
         for seed in range(1, resampled_seeds + 1):

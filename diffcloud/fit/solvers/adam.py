@@ -140,14 +140,10 @@ def fit_adam(
         if not history.losses:
             raise
         reason = "interrupted"
-    first = int(torch.isfinite(history.losses[0]).nonzero()[0])
     return FitOutcome(
         values=dict(zip(space.names, best.values.tolist(), strict=True)),
         loss=best.loss,
-        start=dict(zip(space.names, history.values[0][first].tolist(), strict=True)),
-        loss_start=float(history.losses[0][first]),
         best_start=best.start,
-        iterations=len(history.losses) - 1,
         evaluations=evaluations,
         stop_reason=reason,
         seconds=time.perf_counter() - began,

@@ -103,19 +103,14 @@ def fit_gauss_newton(
             raise
         reason = "interrupted"
     values = axis.bounded(search.places[search.best]).tolist()
-    first = int(torch.isfinite(history.losses[0]).nonzero()[0])
     return FitOutcome(
         values=dict(zip(space.names, values, strict=True)),
         loss=float(search.losses.min()),
-        start=dict(zip(space.names, history.values[0][first].tolist(), strict=True)),
-        loss_start=float(history.losses[0][first]),
         best_start=search.best,
-        iterations=len(history.losses) - 1,
         evaluations=evaluations,
         stop_reason=reason,
         seconds=time.perf_counter() - began,
         history=history,
-        failures=(),
     )
 
 

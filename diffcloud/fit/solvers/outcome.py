@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 StopReason = Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
@@ -46,17 +47,30 @@ class FitOutcome:
 
     values: dict[str, float]
     loss: float
-    start: dict[str, float]
-    """Initial values of the first start that did not diverge at once, or the best of a search's first batch."""
-    loss_start: float
-    """Its loss before the first update."""
     best_start: int
-    iterations: int
-    """Updates done, or batches of a search after the first."""
     evaluations: int
     """Simulations run, with their gradients but for searches."""
     stop_reason: StopReason
     seconds: float
     history: FitHistory
-    failures: tuple[str, ...]
+    failures: tuple[str, ...] = ()
     """Messages of starts that diverged."""
+
+    @property
+    def iterations(self) -> int:
+        """Updates done, or batches of a search after the first."""
+        return len(self.history.losses) - 1
+
+    @property
+    def start(self) -> dict[str, float]:
+        """Initial values of the first start that did not diverge at once, or the best of a search's first batch."""
+        return dict(zip(self.history.names, self.history.values[0][self._first].tolist(), strict=True))
+
+    @property
+    def loss_start(self) -> float:
+        """Its loss before the first update."""
+        return float(self.history.losses[0][self._first])
+
+    @property
+    def _first(self) -> int:
+        return int(torch.isfinite(self.history.losses[0]).nonzero()[0])

@@ -128,15 +128,11 @@ def search(
     return FitOutcome(
         values=dict(zip(space.names, best.values.tolist(), strict=True)),
         loss=best.loss,
-        start=dict(zip(space.names, history.values[0][0].tolist(), strict=True)),
-        loss_start=float(history.losses[0][0]),
         best_start=0,
-        iterations=len(history.losses) - 1,
         evaluations=simulated,
         stop_reason=reason,
         seconds=time.perf_counter() - began,
         history=history,
-        failures=(),
     )
 
 
