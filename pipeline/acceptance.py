@@ -97,7 +97,7 @@ def _real_fits(release: Path, starts: int) -> str:
         for index, (name, label, episode) in enumerate(episodes):
             update(index, label)
             scenario = choose_scenario(name, _scene(release, name))
-            objective = Objective(scenario, [episode], paper=True)
+            objective = Objective(scenario, episode, paper=True)
             space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
             settings = AdamSettings(learning_rate=scenario.learning_rate, smoothing=SMOOTHING)
             single = fit_adam(objective, space, settings)
@@ -222,7 +222,7 @@ def _simulated_fits(release: Path) -> str:
             scenario = load_scenario(name, _scene(release, name))
             space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
             settings = AdamSettings(learning_rate=scenario.learning_rate, threshold=scenario.threshold)
-            found = fit_adam(Objective(scenario, [episode], paper=True), space, settings)
+            found = fit_adam(Objective(scenario, episode, paper=True), space, settings)
             truth = episode.meta["truth"]
             rows.append(
                 [

@@ -15,13 +15,14 @@ from diffcloud.evaluation import ComparisonSettings, EpisodeRecord, Estimate, Ga
 from diffcloud.evaluation.methods import predicted
 from diffcloud.evaluation.repeats import other_repeats
 from diffcloud.evaluation.summary import PREDICTORS
-from diffcloud.fit import read_fit
+from diffcloud.fit import FitRecord, read_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import files_in, read_json, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.regressors import Regressor, predict_episode
 from diffcloud.scene.scenarios import Scenario
 from pipeline.config import Config
+from pipeline.fit_jobs import joint_fit
 from pipeline.workers import Tell, run_all
 
 _CODE = ("mesh", "io", "sim", "scene", "clouds", "fit", "evaluation")
@@ -39,7 +40,7 @@ class Job:
     fit: str
     """Name of its fit."""
     episode: Episode
-    summary: Mapping[str, Any]
+    fitted: FitRecord
     predictions: Sequence[Estimate | Gap]
     transfers: Mapping[str, Mapping[str, float]]
     settings: ComparisonSettings
@@ -58,7 +59,7 @@ class Job:
         """
         # seconds of predictions differ from run to run, and change nothing in the record
         told = [(entry.method, entry.values if isinstance(entry, Estimate) else entry.reason) for entry in self.predictions]
-        inputs = [self.name, self.fit, self.episode, self.summary, told, self.transfers, self.settings]
+        inputs = [self.name, self.fit, self.episode, self.fitted.plain(), told, self.transfers, self.settings]
         mark = fingerprint([self.scenario, self.group, *inputs], packages=_CODE)
         if self.kept.is_file():
             known = read_json(self.kept)
@@ -67,7 +68,7 @@ class Job:
         found = compare_episode(
             self.scenario,
             self.episode,
-            self.summary,
+            self.fitted,
             name=self.name,
             fit_name=self.fit,
             predictions=self.predictions,
@@ -131,26 +132,29 @@ def comparison_jobs(
     Raises:
         ConfigError, EpisodeError: a damaged fit or episode.
     """
-    summaries = {path: read_fit(path) for path in files_in(fits / group, ".json")}
-    fitted = [(path.stem, name, summary) for path, summary in summaries.items() for name in summary["episodes"]]
+    found = [(path.stem, read_fit(path)) for path in [*files_in(fits / group, ".json"), *joint_fit(fits)]]
+    fitted = [
+        (name, recording.name, fit)
+        for name, fit in found
+        for recording in fit.episodes
+        if recording.scenario == scenario.name
+    ]
     recorded = {name: read_episode(episodes / group / f"{name}.npz") for _, name, _ in fitted}
-    values = {
-        name: {key: float(entry["value"]) for key, entry in summary["parameters"].items()} for _, name, summary in fitted
-    }
+    values = {name: fit.values for _, name, fit in fitted}
     others = other_repeats({name: episode.meta for name, episode in recorded.items()}, values)
     networks = _networks(config, group, regressors, simulated)
     jobs = []
-    for fit, name, summary in fitted:
-        label = name if fit == name else f"{fit}-{name}"  # a joint fit has several episodes
+    for fit_name, name, fit in fitted:
+        label = name if fit_name == name else f"{fit_name}-{name}"  # a joint fit has several episodes
         real = not recorded[name].meta.get("truth")
         jobs.append(
             Job(
                 scenario=scenario,
                 group=group,
                 name=label,
-                fit=fit,
+                fit=fit_name,
                 episode=recorded[name],
-                summary=summary,
+                fitted=fit,
                 predictions=[network.of(recorded[name]) for network in networks],
                 # simulated targets share labels, not parameters
                 transfers=others[name] if real else {},

@@ -183,7 +183,10 @@ class FitConfig(Section):
     nuisance: str | None = None
     """What of the pose is fitted along, and how far each may well be off: "x=0.1m,y=0.1m,yaw=30deg" if not given, or
     "none". Variables: `fit.pose.NUISANCE`."""
+    prior: str | None = None
+    """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""
     joint: bool = False
+    """One parameter set for all episodes, whatever their scenario: they must be of one cloth."""
     workers: Count = 1
     """Processes, one fit each; they change nothing but the time."""
 

@@ -27,6 +27,7 @@ from diffcloud.sim.threads import use_threads
 from pipeline.comparison import Comparison, compare, comparison_jobs, write_tables
 from pipeline.config import Config, load_config
 from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, errors, finish, output, show
+from pipeline.fit_jobs import joint_fit
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 
 app = typer.Typer(help="Measure parameters, and compare methods.")
@@ -57,18 +58,18 @@ def loss(
     use_threads(threads)
     chosen = choose_scenario(scenario, scene)
     priors = None if nuisance is None else parse_priors(nuisance)
-    recorded = [read_episode(episode)]
+    recorded = read_episode(episode)
     objective = Objective(chosen, recorded, points=points, frames=frame, seed=seed, paper=paper, nuisance=priors)
     values = assignments(set_, "--set")
     check_values(values, "--set")
     chosen.check_parameters(values)
     tensors = {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
     with torch.no_grad():
-        found = describe_recording(objective, objective.simulate_to_loss(tensors))
+        found = describe_recording(objective, objective.simulate_to_loss(tensors), episode.stem)
     if not json:
-        shifts = ", ".join(f"{name} {entry['value']:.4g} {entry['unit']}" for name, entry in found["nuisance"].items())
-        output.print(f"{found['loss']:.6e}  RMS {found['rms_mm']:.2f} mm" + (f"  at {shifts}" if shifts else ""))
-    finish({**found, "parameters": values, "length_unit_m": chosen.length_unit_m}, json)
+        shifts = ", ".join(f"{name} {entry.value:.4g} {entry.unit}" for name, entry in found.nuisance.items())
+        output.print(f"{found.loss:.6e}  RMS {found.rms_mm:.2f} mm" + (f"  at {shifts}" if shifts else ""))
+    finish({**found.model_dump(), "parameters": values, "length_unit_m": chosen.length_unit_m}, json)
 
 
 @app.callback(invoke_without_command=True)
@@ -94,7 +95,7 @@ def evaluate(
     if context.invoked_subcommand is not None:
         return
     config = load_config(params)
-    if not any(files_in(fits / name, ".json") for name in config.scenarios):
+    if not joint_fit(fits) and not any(files_in(fits / name, ".json") for name in config.scenarios):
         raise ConfigError(f"{fits} holds no fits of {', '.join(config.scenarios)}; run `diffcloud fit` first.")
     jobs = [
         job
@@ -191,15 +192,15 @@ def _curves(config: Config, fits: Path) -> tuple[list[dict[str, Any]], dict[str,
     """Loss curves of all fits, and their wall times."""
     curves: list[dict[str, Any]] = []
     seconds: dict[str, float] = {}
-    for name in config.scenarios:
-        for path in files_in(fits / name, ".json"):
-            summary = read_fit(path)
-            curves += [
-                {"scenario": name, "episode": path.stem, "iteration": i, "loss": min(filter(None, row))}
-                for i, row in enumerate(summary["history"]["loss"])
-                if any(value is not None for value in row)
-            ]
-            seconds[f"{name}/{path.stem}"] = summary["seconds"]
+    named = [(f"{name}/", path) for name in config.scenarios for path in files_in(fits / name, ".json")]
+    for folder, path in [*named, *(("", path) for path in joint_fit(fits))]:
+        fit = read_fit(path)
+        curves += [
+            {"scenario": fit.scenario, "episode": path.stem, "iteration": i, "loss": min(filter(None, row))}
+            for i, row in enumerate(fit.history.loss)
+            if any(value is not None for value in row)
+        ]
+        seconds[f"{folder}{path.stem}"] = fit.seconds
     return curves, seconds
 
 

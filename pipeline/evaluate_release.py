@@ -19,7 +19,7 @@ from pipeline.comparison import compare, comparison_jobs
 from pipeline.config import Config, load_config, updated
 from pipeline.console import JsonFlag, Threads, errors, finish, writes
 from pipeline.evaluate import AllowMissing, MarkdownFile, app, stop_if_missing, write_evaluation
-from pipeline.fit import FitJob
+from pipeline.fit_jobs import FitJob, Recording
 from pipeline.report import report
 from pipeline.scenario_options import choose_scenario
 from pipeline.workers import run_all
@@ -105,7 +105,10 @@ def _import(chosen: list[tuple[str, str, Episode]], folder: Path) -> None:
 
 def _fit(config: Config, chosen: list[tuple[str, str, Episode]], scenarios: dict[str, Scenario], folder: Path) -> list[str]:
     """Fit what is not fitted yet; messages of those that failed."""
-    jobs = [FitJob(scenarios[name], label, {label: episode}, config.fit, folder / name) for name, label, episode in chosen]
+    jobs = [
+        FitJob(label, [Recording(scenarios[name], label, episode)], config.fit, folder / name)
+        for name, label, episode in chosen
+    ]
     failures = []
     for job, _, error in run_all("fit", jobs, config.evaluate.workers, patient=True):
         errors.print(f"fitted {job.label}" if error is None else f"{job.label}: {error}")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,25 +11,30 @@ from rich.markup import escape
 from rich.table import Table
 
 from diffcloud.errors import ConfigError, DiffCloudError
-from diffcloud.fit import FitSpace, Objective, Progress, read_fit, solve, write_fit
-from diffcloud.fit.result import describe_fit
-from diffcloud.fit.solvers import SearchSettings
-from diffcloud.io.episodes import Episode, read_episode
-from diffcloud.io.fingerprints import fingerprint
-from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
-from diffcloud.scene.scenarios import Scenario
+from diffcloud.fit import FitRecord, FitSpace
+from diffcloud.io.episodes import read_episode
+from diffcloud.io.manifests import read_manifest, write_manifest
 from diffcloud.sim.threads import use_threads
-from pipeline.config import FitConfig, load_config, updated
+from pipeline.config import Config, load_config, updated
 from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, episode_files, errors, finish, show, writes
+from pipeline.fit_jobs import JOINT, FitJob, Recording, first_start, read_recordings, remove_stale, stated_recordings
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
-from pipeline.workers import Tell, check_interrupt, run_all
+from pipeline.workers import run_all
 
 _INTERRUPTED = 130
-_JOINT = "joint"
-"""Name of the fit of one parameter set to all episodes."""
-_SHOWN = ("loss", "loss_start", "loss_resampled", "iterations", "seconds", "stop_reason", "parameters")
-_CODE = ("mesh", "io", "sim", "scene", "clouds", "fit")
-"""Packages whose source decides the numbers of a fit."""
+_SHOWN = {
+    "loss",
+    "loss_start",
+    "loss_resampled",
+    "rms_mm",
+    "iterations",
+    "simulations",
+    "seconds",
+    "stop_reason",
+    "parameters",
+    "nuisance",
+    "solver",
+}
 
 
 @writes()
@@ -39,10 +42,16 @@ def fit(
     episodes: Annotated[
         list[Path],
         typer.Argument(
-            help="Episode files, or folders of them; without a scenario, a folder with <scenario>/<episode>.npz."
+            help="Episode files, or folders of them; without --scenario, a folder with <scenario>/<episode>.npz, "
+            "SCENARIO=EPISODE for each, or a YAML file that lists episodes by scenario."
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder; one JSON and one NPZ per episode, without a scenario in <scenario>/.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Folder; one JSON and one NPZ per fit: <episode>, joint, or without --scenario <scenario>/<episode>."
+        ),
+    ],
     scenario: ScenarioName = None,
     scene: SceneFile = None,
     params: ParamsFile = None,
@@ -97,7 +106,16 @@ def fit(
             "Default: x=0.1m,y=0.1m,yaw=30deg."
         ),
     ] = None,
-    joint: Annotated[bool | None, typer.Option("--joint", help="One parameter set for all episodes.")] = None,
+    prior: Annotated[
+        str | None,
+        typer.Option(
+            help="Within which factor of the basis material each multiplier probably lies, such as bending=3x,mass=2x, or "
+            "none. Default: 10x, which decides only what the recording does not show."
+        ),
+    ] = None,
+    joint: Annotated[
+        bool | None, typer.Option("--joint", help="One parameter set for all episodes, of any scenario: one cloth.")
+    ] = None,
     workers: Annotated[int | None, typer.Option(help="Fits at once, each in a process with one thread.")] = None,
     threads: Threads = None,
     json: JsonFlag = False,
@@ -125,22 +143,18 @@ def fit(
         resample=resample,
         paper=paper,
         nuisance=nuisance,
+        prior=prior,
         joint=joint,
         workers=workers,
     )
-    every = scenario is None and scene is None and _by_scenario(episodes, config.scenarios)
-    if every:
-        folders = {name: (choose_scenario(name), episode_files([episodes[0] / name])) for name in config.scenarios}
-    else:
-        folders = {"": (choose_scenario(scenario, scene), episode_files(episodes))}
-    jobs: list[FitJob] = []
+    every, recordings = _recordings(episodes, scenario, scene, config)
+    groups: dict[tuple[Path, str], list[Recording]] = {}
+    for folder, recording in recordings:
+        key = (out, JOINT) if settings.joint else (out / folder, recording.name)
+        groups.setdefault(key, []).append(recording)
+    jobs = [FitJob(name, members, settings, folder) for (folder, name), members in groups.items()]
+    jobs = [replace(job, init=first_start(init, job)) for job in jobs]
     # everything is read before anything is fitted: a damaged last file must not cost the first ones' time
-    for folder, (chosen, files) in folders.items():
-        recorded = {path.stem: read_episode(path) for path in files}
-        groups = {_JOINT: recorded} if settings.joint else {name: {name: episode} for name, episode in recorded.items()}
-        for name, members in groups.items():
-            job = FitJob(chosen, name, members, settings, out / folder)
-            jobs.append(replace(job, init=_first_start(init, job)))
     for job in jobs:
         job.objective()
     space = jobs[0].space
@@ -149,22 +163,26 @@ def fit(
     failures: list[str] = []
 
     def told_as(job: FitJob) -> str:
-        return job.label if every else job.name
+        return job.label if every and job.name != JOINT else job.name
 
-    def add(job: FitJob, summary: Mapping[str, Any]) -> None:
+    def add(job: FitJob, record: FitRecord) -> None:
         name = told_as(job)
-        results[name] = {key: summary[key] for key in _SHOWN}
-        table.add_row(name, *_row(summary, space))
-        for failure in summary["failures"]:
+        results[name] = {key: value for key, value in record.plain().items() if key in _SHOWN}
+        table.add_row(name, *_row(record, space))
+        for recording in record.episodes if job.name == JOINT else ():
+            left = recording.left_out
+            told = "" if left is None else f", {left.rms_mm:.1f} with the parameters of the others"
+            errors.print(f"{recording.scenario}/{recording.name}: RMS {recording.rms_mm:.1f} mm{told}", markup=False)
+        for failure in record.failures:
             errors.print(f"[yellow]{name}:[/] {escape(failure)}", soft_wrap=True)
 
     if every:  # stated before, so that what an interrupted call leaves is known too
         write_manifest(out, read_manifest(out) | {path.relative_to(out).as_posix() for job in jobs for path in job.files})
     try:
-        for job, summary, error in run_all("fit", jobs, settings.workers, patient=True):
+        for job, record, error in run_all("fit", jobs, settings.workers, patient=True):
             if error is None:
-                errors.print(f"{job.label}: loss {summary['loss_start']:.3e} -> {summary['loss']:.3e}")
-                add(job, summary)
+                errors.print(f"{job.label}: loss {record.loss_start:.3e} -> {record.loss:.3e}")
+                add(job, record)
             else:
                 failures.append(f"{told_as(job)}: {error}")
     except KeyboardInterrupt:
@@ -179,7 +197,7 @@ def fit(
     if failures:
         raise DiffCloudError("\n".join(failures))
     if every:
-        _remove_stale(out, jobs)
+        remove_stale(out, jobs)
 
 
 def _by_scenario(episodes: list[Path], scenarios: list[str]) -> bool:
@@ -187,149 +205,36 @@ def _by_scenario(episodes: list[Path], scenarios: list[str]) -> bool:
     return len(episodes) == 1 and all((episodes[0] / name).is_dir() for name in scenarios)
 
 
-def _remove_stale(out: Path, jobs: Sequence[FitJob]) -> None:
-    """Remove fits that an earlier call left there and that this one's inputs no longer give: of episodes that are gone, or
-    with other settings. Finished single fits stay beside a joint one, and the reverse."""
-    kept = {name for job in jobs for name in job.files}
-    others = [
-        replace(job, name=name, episodes={name: episode})
-        for job in jobs
-        for name, episode in (job.episodes.items() if job.name == _JOINT else ())
-    ]
-    folders = {job.folder: [each for each in jobs if each.folder == job.folder] for job in jobs}
-    others += [
-        replace(members[0], name=_JOINT, episodes={job.name: job.episodes[job.name] for job in members})
-        for members in folders.values()
-        if members[0].name != _JOINT
-    ]
-    kept |= {name for job in others if job.known() is not None for name in job.files}
-    inside = {path.relative_to(out).as_posix() for path in kept}
-    removed = remove_files(out, sorted(read_manifest(out) - inside))
-    write_manifest(out, inside)
-    if removed:
-        told = "Removed fits whose episode is gone or whose settings have changed"
-        errors.print(f"{told}: {', '.join(removed)}.", markup=False, soft_wrap=True)
-
-
-def _readable(path: Path) -> dict[str, Any] | None:
-    try:
-        return read_fit(path)
-    except ConfigError:  # none, or a damaged one
-        return None
-
-
-@dataclass(frozen=True)
-class FitJob:
-    """One parameter set for one or several episodes. A finished fit of the same inputs by the same code is kept."""
-
-    scenario: Scenario
-    name: str
-    episodes: Mapping[str, Episode]
-    settings: FitConfig
-    folder: Path
-    init: Mapping[str, float] = field(default_factory=dict)
-    """Values of the first start; the middle of the range where not given."""
-
-    @property
-    def label(self) -> str:
-        return f"{self.scenario.name}/{self.name}"
-
-    @property
-    def files(self) -> tuple[Path, Path]:
-        """What `run` writes."""
-        return self.folder / f"{self.name}.json", self.folder / f"{self.name}.npz"
-
-    @property
-    def space(self) -> FitSpace:
-        """
-        Raises:
-            ConfigError: bounds or fixed values that do not fit the parameters.
-        """
-        settings, scenario = self.settings, self.scenario
-        scenario.check_parameters([*settings.parameters, *settings.fixed])
-        return FitSpace.build(
-            settings.parameters,
-            bounds={**scenario.bounds, **settings.bounds},
-            fixed=settings.fixed,
-        )
-
-    def objective(self) -> Objective:
-        """
-        Raises:
-            ConfigError, EpisodeError: the episodes lack the frames of the loss, or an unknown frame.
-        """
-        return Objective(self.scenario, list(self.episodes.values()), **self.settings.measure())
-
-    def known(self) -> dict[str, Any] | None:
-        """The summary that this job, or an earlier one of the same inputs and code, has left; maybe interrupted."""
-        summary = _readable(self.files[0])
-        same = summary is not None and summary.get("fingerprint") == self._fingerprint and self.files[1].is_file()
-        return summary if same else None
-
-    def run(self, tell: Tell) -> dict[str, Any]:
-        """Fit, write, and return the summary.
-
-        Raises:
-            DivergedError: every start diverged.
-            KeyboardInterrupt: Ctrl-C; the best so far is written.
-        """
-        known = self.known()
-        if known is not None and known["stop_reason"] != "interrupted":
-            return known
-
-        def show_progress(progress: Progress) -> None:
-            check_interrupt()
-            values = "  ".join(f"{key} {value:.3g}" for key, value in progress.values.items())
-            if isinstance(settings, SearchSettings):
-                done, most = progress.simulations or 0, settings.simulations
-            else:
-                done, most = progress.iteration, settings.iterations
-            tell(done / max(most, 1), f"{done} of at most {most}  best {progress.best:.3e}  {values}")
-
-        objective, space = self.objective(), self.space
-        settings = replace(self.settings.solver_settings(self.scenario), init=self.init)
-        outcome = solve(objective, space, settings, progress=show_progress)
-        result = describe_fit(objective, space, settings, outcome, episodes=list(self.episodes))
-        result.summary["fingerprint"] = self._fingerprint
-        write_fit(self.folder, self.name, result)
-        if outcome.stop_reason == "interrupted":
-            raise KeyboardInterrupt
-        return result.summary
-
-    @cached_property
-    def _fingerprint(self) -> str:
-        settings = self.settings.model_dump(exclude={"workers", "joint"})  # which the name and the episodes tell
-        return fingerprint([self.scenario, self.name, self.episodes, settings, self.init], packages=_CODE)
-
-
-def _first_start(init: str, job: FitJob) -> dict[str, float]:
-    """Values of the first start by name; episodes of a joint fit give the mean of their predictions.
+def _recordings(
+    arguments: list[Path], scenario: str | None, scene: Path | None, config: Config
+) -> tuple[bool, list[tuple[str, Recording]]]:
+    """Whether the arguments stand for a folder of all scenarios, and each recording with the folder of its fit.
 
     Raises:
-        ConfigError: a value of what is not fitted, or outside of its bounds.
+        ConfigError, EpisodeError: what is stated cannot be read.
     """
-    if init == "middle":
-        return {}
-    if "=" in init:
-        stated = assignments(init.split(","), "--init")
-        job.space.check_start(stated)
-        return stated
-    # imported here: the fits of the pipeline start elsewhere, and must not be stale when a regressor changes
-    from pipeline.predict import predicted_start
+    stated = stated_recordings(arguments)
+    if stated is not None:
+        if scenario is not None or scene is not None:
+            raise ConfigError("Each episode names its scenario; leave out --scenario and --scene.")
+        return False, [(one.scenario.name, one) for one in read_recordings(stated)]
+    if scenario is None and scene is None and _by_scenario(arguments, config.scenarios):
+        tree = [(name, path) for name in config.scenarios for path in episode_files([arguments[0] / name])]
+        found = read_recordings(tree)
+        return True, [(name, one) for (name, _), one in zip(tree, found, strict=True)]
+    chosen = choose_scenario(scenario, scene)
+    return False, [("", Recording(chosen, path.stem, read_episode(path))) for path in episode_files(arguments)]
 
-    found = [predicted_start(init, job.scenario.name, episode) for episode in job.episodes.values()]
-    return job.space.nearest({name: sum(values[name] for values in found) / len(found) for name in found[0]})
 
-
-def _row(summary: Mapping[str, Any], space: FitSpace) -> list[str]:
+def _row(record: FitRecord, space: FitSpace) -> list[str]:
     return [
-        f"{summary['loss_start']:.3e}",
-        f"{summary['loss']:.3e}",
-        f"{summary['rms_mm']:.1f}",
-        *(f"{summary['parameters'][name]['value']:.3f}" for name in space.names),
-        str(summary["iterations"]),
-        f"{summary['seconds']:.1f}",
-        summary["stop_reason"],
+        f"{record.loss_start:.3e}",
+        f"{record.loss:.3e}",
+        f"{record.rms_mm:.1f}",
+        *(f"{record.parameters[name].value:.3f}" for name in space.names),
+        str(record.iterations),
+        f"{record.seconds:.1f}",
+        record.stop_reason,
     ]
 
 

@@ -82,7 +82,7 @@ def _fit_all(scenario: Scenario, name: str, episode: Episode, raw: RawEpisode, t
 
 def _ratio(scenario: Scenario, episode: Episode, mass: float, config: FitConfig) -> float:
     """Fitted stretch over the weighed mass. With both free, bending and air hardly tell them apart (docs/concepts.md)."""
-    objective = Objective(scenario, [episode], **config.measure())
+    objective = Objective(scenario, episode, **config.measure())
     space = FitSpace.build(["stretch"], bounds={**scenario.bounds, **config.bounds}, fixed={"mass": mass})
     return solve(objective, space, config.solver_settings(scenario)).values["stretch"] / mass
 

@@ -17,9 +17,9 @@ import diffcloud
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation.summary import tables as comparison_tables
 from diffcloud.fit import read_fit
+from diffcloud.fit.result import read_motion
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import read_json, together, write_bytes, write_text
-from diffcloud.mesh import SurfaceMesh
 from diffcloud.report import (
     ComparisonEntry,
     EpisodeEntry,
@@ -30,6 +30,7 @@ from diffcloud.report import (
 )
 from pipeline.config import load_config
 from pipeline.console import JsonFlag, ParamsFile, errors, finish, writes
+from pipeline.fit_jobs import fit_file
 
 
 @writes(".html")
@@ -52,25 +53,23 @@ def report(
     entries = []
     for known in _rows(table):
         scenario, name = str(known["scenario"]), str(known["episode"])
-        fit = read_fit(fits / scenario / f"{name}.json")
+        path = fit_file(fits, scenario, name)
+        fit = read_fit(path)
         known.setdefault("rms_other_frames_mm", float("nan"))
-        source = fit["episodes"][0]
-        with np.load(fits / scenario / f"{name}.npz", allow_pickle=False) as run:
-            entries.append(
-                EpisodeEntry(
-                    scenario=scenario,
-                    name=name,
-                    row=known,
-                    fit=fit,
-                    episode=read_episode(episodes / scenario / f"{source}.npz"),
-                    nodes=run["nodes"],
-                    start_nodes=run["start_nodes"],
-                    faces=run["faces"],
-                    times=run["times"],
-                    bodies=SurfaceMesh(run["obstacle_nodes"], run["obstacle_faces"]),
-                    pictures=_pictures(episodes / scenario, source),
-                )
+        index = next((i for i, one in enumerate(fit.episodes) if one.scenario == scenario), 0)
+        source = fit.episodes[index].name
+        entries.append(
+            EpisodeEntry(
+                scenario=scenario,
+                name=name,
+                row=known,
+                fit=fit,
+                recording=fit.episodes[index],
+                episode=read_episode(episodes / scenario / f"{source}.npz"),
+                motion=read_motion(path.with_suffix(".npz"), index),
+                pictures=_pictures(episodes / scenario, source),
             )
+        )
     trainings = [
         TrainingEntry.read(path)
         for name in config.scenarios
@@ -124,7 +123,7 @@ def _comparison(folder: Path, entries: list[EpisodeEntry]) -> ComparisonEntry:
             f"{folder} was not written by this version's `diffcloud evaluate` ({error!r}); run it."
         ) from error
     told = comparison_tables(records, seconds, references)
-    histories = {(entry.scenario, entry.name): entry.fit["history"] for entry in entries}
+    histories = {(entry.scenario, entry.name): entry.fit.history for entry in entries}
     figures = comparison_figures(told, records, histories)
     overlays = overlay_figure(entries)
     return ComparisonEntry(told, records, failures, [*figures, *([overlays] if overlays else [])])

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 import typer
 
 from diffcloud.errors import ConfigError, DivergedError
-from diffcloud.fit.result import read_fit, recorded_pose
+from diffcloud.fit.record import RecordingFit, read_fit
+from diffcloud.fit.result import recorded_pose
 from diffcloud.fit.targets import track_displacement
 from diffcloud.io.clouds import write_ply
 from diffcloud.io.episodes import read_episode
@@ -50,7 +51,7 @@ def rollout(
     values: dict[str, float] = {}
     fitted = None if fit is None else read_fit(fit)
     if fitted is not None:
-        values |= {name: float(entry["value"]) for name, entry in fitted["parameters"].items()}
+        values |= fitted.values
     values |= assignments(set_, "--set")
     check_values(values, "--set")
     chosen.check_parameters(values)
@@ -77,7 +78,7 @@ def rollout(
     moved, moved_faces = moved_surfaces(system, run)
     moved = moved[0, per_frame]
     bodies = chosen.scene.bodies
-    recording = None if fitted is None else _recording(fitted["recordings"], episode)
+    recording = None if fitted is None else _recording(fitted.episodes, chosen.name, episode)
     if recording is not None:
         space, pose = recorded_pose(recording, length_unit_m=chosen.length_unit_m)
         nodes = space.moved_motion(run.at, run.times[per_frame], pose).numpy()
@@ -117,15 +118,19 @@ def rollout(
     )
 
 
-def _recording(known: Mapping[str, Any], episode: Path | None) -> Mapping[str, Any] | None:
+def _recording(known: Sequence[RecordingFit], scenario: str, episode: Path | None) -> RecordingFit | None:
     """The recording of a fit in whose frame the motion is written; None where the scene's own frame stays."""
-    if episode is None:
-        if len(known) > 1:
-            errors.print(f"The motion lies where {next(iter(known))} has it, the first of the fit's recordings.")
-        return next(iter(known.values()))
-    if episode.stem not in known:
+    of_scenario = {one.name: one for one in known if one.scenario == scenario}
+    if episode is None and of_scenario:
+        first = next(iter(of_scenario))
+        if len(of_scenario) > 1:
+            errors.print(f"The motion lies where {first} has it, the first of the fit's recordings.")
+        return of_scenario[first]
+    name = scenario if episode is None else episode.stem
+    if name not in of_scenario:
+        told = ", ".join(f"{one.scenario}/{one.name}" for one in known)
         errors.print(
-            f"{episode.stem} is not among the fit's recordings ({', '.join(known)}): its pose is not known, and the motion "
-            "stays in the frame of the scene."
+            f"{name} is not among the fit's recordings ({told}): its pose is not known, and the motion stays in the frame "
+            "of the scene."
         )
-    return known.get(episode.stem)
+    return of_scenario.get(name)

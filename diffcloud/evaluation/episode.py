@@ -12,7 +12,7 @@ from diffcloud.evaluation.identifiability import identify, node_set_note
 from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
-from diffcloud.fit import AdamSettings, CmaEsSettings, FitSpace, Objective, RandomSearchSettings
+from diffcloud.fit import AdamSettings, CmaEsSettings, FitRecord, FitSpace, Objective, RandomSearchSettings
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 
@@ -48,7 +48,7 @@ class EpisodeRecord:
 def compare_episode(
     scenario: Scenario,
     episode: Episode,
-    summary: Mapping[str, Any],
+    fit: FitRecord,
     *,
     name: str,
     fit_name: str | None = None,
@@ -59,26 +59,24 @@ def compare_episode(
     """Compare all methods on one episode.
 
     Args:
-        summary: the fit of the episode (`fit.result.read_fit`); its frames, points, bounds, given parameters and number of
-            iterations hold for every method.
+        fit: of the episode; its measure, bounds, given parameters and number of iterations hold for every method.
         fit_name: of the fit, if it is another than the episode's: a joint fit has several episodes.
         predictions: of networks, and why those that should be there are not.
         transfers: episode -> parameters fitted on it, of other recordings of the same fabric.
     """
     settings = settings or ComparisonSettings()
-    fit = summary["settings"]
-    measure = {name: fit[name] for name in ("frames", "points", "paper", "nuisance")}
-    space = methods.space_of(summary)
-    objective = Objective(scenario, [episode], **measure, seed=int(fit["seed"]))
-    told: list[Estimate | Gap] = [methods.fitted(summary)]
-    told += [_run(rival, objective, space, summary, settings.seed) for rival in settings.rivals]
+    measure = fit.measure.model_dump(exclude={"seed"})
+    space = methods.space_of(fit)
+    objective = Objective(scenario, episode, **measure, seed=fit.measure.seed)
+    told: list[Estimate | Gap] = [methods.fitted(fit)]
+    told += [_run(rival, objective, space, fit, settings.seed) for rival in settings.rivals]
     told += [*predictions, *methods.published(episode.meta)]
     estimates = [entry for entry in told if isinstance(entry, Estimate)]
     gaps = [entry for entry in told if isinstance(entry, Gap)]
     meter = EpisodeMeter(scenario, episode, **measure, draws=settings.draws, seed=settings.seed)
     sources = dict(transfers or {})
     sets = [methods.clipped(values, space) for values in (*(e.values for e in estimates), *sources.values())]
-    measured = meter.measure([*sets, {key: float(value) for key, value in summary["start"].items()}])
+    measured = meter.measure([*sets, fit.start])
     rows, transferred = [], []
     for index, estimate in enumerate(estimates):
         if index in measured.diverged:
@@ -113,12 +111,12 @@ def compare_episode(
         "truth": {key: float(value) for key, value in (meta.get("truth") or {}).items()},
         "length_unit_m": scenario.length_unit_m,
         "threshold": success_threshold(scenario),
-        "frames": list(objective.frames()),
-        "starts": int(fit.get("starts", 1)),  # a search is one
+        "frames": list(objective.frames),
+        "starts": int(fit.settings.get("starts") or 1),  # a search is one
         "start": None if len(sets) in measured.diverged else measured.rows[-1],
         "methods": rows,
         "gaps": [{"method": gap.method, "reason": gap.reason, "expected": gap.expected} for gap in gaps],
-        "failures": list(summary["failures"]),
+        "failures": list(fit.failures),
         "transfers": transferred,
         "identifiability": None,
         "landscape": None,
@@ -128,18 +126,18 @@ def compare_episode(
     if settings.identifiability:
         record["identifiability"] = identify(objective, space, best, draws=settings.draws)
         record["identifiability"]["note"] = node_set_note(scenario)
-    objective.reseed(int(fit["seed"]))
+    objective.reseed(fit.measure.seed)
     if settings.landscape_size:
-        record["landscape"] = loss_landscape(objective, space, best, summary["history"], size=settings.landscape_size)
+        record["landscape"] = loss_landscape(objective, space, best, fit.history, size=settings.landscape_size)
     return EpisodeRecord(record, seconds)
 
 
-def _run(rival: Rival, objective: Objective, space: FitSpace, summary: Mapping[str, Any], seed: int) -> Estimate | Gap:
+def _run(rival: Rival, objective: Objective, space: FitSpace, fit: FitRecord, seed: int) -> Estimate | Gap:
     """One rival with the budget of the fit, or of one start of Adam; a gap if its simulations fail."""
-    fit = summary["settings"]
-    by_adam = summary["solver"] == "adam"
-    simulations, threshold = int(fit["iterations"]) + 1 if by_adam else int(summary["evaluations"]), float(fit["threshold"])
-    objective.reseed(int(fit["seed"]))
+    told, by_adam = fit.settings, fit.solver == "adam"
+    simulations = int(told["iterations"] or 0) + 1 if by_adam else fit.simulations
+    threshold = float(told["threshold"] or 0.0)
+    objective.reseed(fit.measure.seed)
     try:
         if rival == "middle":
             return methods.middle(space)
@@ -147,15 +145,15 @@ def _run(rival: Rival, objective: Objective, space: FitSpace, summary: Mapping[s
             return methods.searched(objective, space, RandomSearchSettings(simulations, threshold, seed))
         if rival == "cma_es":
             return methods.searched(objective, space, CmaEsSettings(simulations, threshold, seed))
-        known = methods.first_start(summary, space)
+        known = methods.first_start(fit, space)
         if known is not None:
             return known
         adam = AdamSettings(
-            learning_rate=float(fit["learning_rate"] if by_adam else objective.scenario.learning_rate),
+            learning_rate=float(told.get("learning_rate") or objective.scenario.learning_rate),
             iterations=simulations - 1,
             threshold=threshold,
-            seed=int(fit["seed"]),
-            resample=bool(fit.get("resample", False)),
+            seed=fit.measure.seed,
+            resample=bool(told.get("resample", False)),
         )
         return methods.single_start(objective, space, adam)
     except DiffCloudError as error:

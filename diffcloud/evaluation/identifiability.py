@@ -221,7 +221,7 @@ class _Probe:
             for seed in range(self.seed, self.seed + self.draws):
                 self._objective.reseed(seed)
                 points = self._objective.points(run, pose=pose)
-                for frame, cloud in enumerate(self._objective.clouds()):
+                for frame, cloud in enumerate(self._objective.clouds):
                     found.append((points[:, frame] - cloud.nearest(points[:, frame])).norm(dim=-1))
         return torch.cat(found, dim=-1).numpy()
 

@@ -10,16 +10,17 @@ import torch
 
 from diffcloud.fit import FitSpace, Objective
 from diffcloud.fit.batches import batch_losses
+from diffcloud.fit.record import History
 
 
 def loss_landscape(
-    objective: Objective, space: FitSpace, values: Mapping[str, float], history: Mapping[str, Any], *, size: int
+    objective: Objective, space: FitSpace, values: Mapping[str, float], history: History, *, size: int
 ) -> dict[str, Any] | None:
     """Losses over the first two fitted parameters, the others as fitted.
 
     Args:
         values: the fitted ones.
-        history: of `fit.result.read_fit`.
+        history: of the fit.
         size: n places along each axis, between the bounds.
 
     Returns:
@@ -34,8 +35,8 @@ def loss_landscape(
     places = np.tile([values[name] for name in space.names], (size * size, 1))
     places[:, 0], places[:, 1] = x.ravel(), y.ravel()
     losses = batch_losses(objective, space, torch.as_tensor(places).double()).reshape(size, size)
-    columns = [list(history["names"]).index(variable.name) for variable in (first, second)]
-    paths = np.array(history["values"], dtype=np.float64)[:, :, columns]  # [N, B, 2]; None is NaN
+    columns = [history.names.index(variable.name) for variable in (first, second)]
+    paths = np.array(history.values, dtype=np.float64)[:, :, columns]  # [N, B, 2]; None is NaN
     return {
         "names": [first.name, second.name],
         "x": axes[0].tolist(),

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from diffcloud.fit import AdamSettings, CmaEsSettings, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
+from diffcloud.fit import AdamSettings, CmaEsSettings, FitRecord, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
 from diffcloud.fit.parameters import Variable
 from diffcloud.fit.solvers import SOLVER_NAMES, SOLVERS, FitOutcome, SearchSettings
 
@@ -47,24 +47,23 @@ class Gap:
     """Whether it should have: then the comparison is incomplete."""
 
 
-def space_of(summary: Mapping[str, Any]) -> FitSpace:
-    """The fitted parameters of a fit with their bounds, and those that were given."""
-    entries = summary["parameters"]
-    free = {name: entry["bounds"] for name, entry in entries.items() if not entry["fixed"]}
+def space_of(fit: FitRecord) -> FitSpace:
+    """The fitted parameters of a fit with their bounds and priors, and those that were given."""
+    free = [(name, entry.bounds, entry.prior) for name, entry in fit.parameters.items() if entry.bounds is not None]
     return FitSpace(
-        tuple(Variable(name, float(low), float(high)) for name, (low, high) in free.items()),
-        {name: float(entry["value"]) for name, entry in entries.items() if name not in free},
+        tuple(Variable(name, low, high, prior) for name, (low, high), prior in free),
+        {name: entry.value for name, entry in fit.parameters.items() if entry.bounds is None},
     )
 
 
-def fitted(summary: Mapping[str, Any]) -> Estimate:
-    """The fit itself, as `fit.result.read_fit` has it."""
+def fitted(fit: FitRecord) -> Estimate:
+    """The fit itself."""
     return Estimate(
         "diffcloud",
-        {name: float(entry["value"]) for name, entry in summary["parameters"].items()},
-        simulations=int(summary["evaluations"]),
-        gradients=not issubclass(SOLVERS[summary["solver"]], SearchSettings),
-        seconds={"optimisation": float(summary["seconds"])},
+        fit.values,
+        simulations=fit.simulations,
+        gradients=not issubclass(SOLVERS[fit.solver], SearchSettings),
+        seconds={"optimisation": fit.seconds},
     )
 
 
@@ -79,23 +78,24 @@ def single_start(objective: Objective, space: FitSpace, settings: AdamSettings) 
     return _estimate("single_start", found, gradients=True)
 
 
-def first_start(summary: Mapping[str, Any], space: FitSpace) -> Estimate | None:
+def first_start(fit: FitRecord, space: FitSpace) -> Estimate | None:
     """What the paper's setting gives, if it is a part of the fit: its first start, from the middle with plain gradients.
 
     Starts do not touch one another, so it need not be run again. Its own wall time is not known then. None if the fit was
     smoothed, began elsewhere, was stopped by another start, or changed its points, or if another solver made it.
     """
-    if summary["solver"] != "adam":
+    if fit.solver != "adam":
         return None
-    settings, history = summary["settings"], summary["history"]
-    losses = [row[0] for row in history["loss"]]
-    begin = dict(zip(history["names"], history["values"][0][0], strict=True))
+    settings, history = fit.settings, fit.history
+    losses = [row[0] for row in history.loss if row[0] is not None]
+    begin = dict(zip(history.names, history.values[0][0], strict=True))
     same = all(math.isclose(begin[name] or math.nan, value, rel_tol=1e-6) for name, value in middle(space).values.items())
-    ended = summary["stop_reason"] == "iterations" and None not in losses
+    ended = fit.stop_reason == "iterations" and len(losses) == len(history.loss)
     if not (same and ended and set(begin) == set(space.names)) or settings["smoothing"] or settings["resample"]:
         return None
     lowest = losses.index(min(losses))
-    values = dict(zip(history["names"], history["values"][lowest][0], strict=True))
+    ended_at = zip(history.names, history.values[lowest][0], strict=True)
+    values = {name: value for name, value in ended_at if value is not None}
     return Estimate("single_start", values, simulations=len(losses), gradients=True)
 
 
@@ -114,7 +114,7 @@ def _estimate(method: str, found: FitOutcome, *, gradients: bool) -> Estimate:
     return Estimate(
         method,
         found.values,
-        simulations=found.evaluations,
+        simulations=found.simulations,
         gradients=gradients,
         seconds={"optimisation": found.seconds},
     )

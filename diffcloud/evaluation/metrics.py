@@ -56,12 +56,12 @@ class EpisodeMeter:
         """
         self.scenario, self.episode = scenario, episode
         measure: dict[str, Any] = {"points": points, "paper": paper, "nuisance": nuisance, "seed": seed}
-        self._own = Objective(scenario, [episode], frames=frames, **measure)
+        self._own = Objective(scenario, episode, frames=frames, **measure)
         last = scenario.steps * scenario.scene.time_step + 1e-6
         # frame 0 is before the motion and the same for all parameters
-        used = self._own.frames()
+        used = self._own.frames
         others = [f for f in range(1, episode.frame_count) if f not in used and episode.times[f] <= last]
-        self._others = Objective(scenario, [episode], frames=others, **measure) if others else None
+        self._others = Objective(scenario, episode, frames=others, **measure) if others else None
         self._seeds = range(seed, seed + draws)
 
     def measure(self, sets: Sequence[Mapping[str, float]]) -> Measured:
@@ -90,7 +90,7 @@ class EpisodeMeter:
         own.reseed(self._seeds[0])
         pose = own.pose(run)
         points = own.points(run, pose=pose)  # [B, L, N, 3]
-        both = [chamfer(points[:, frame], [cloud] * len(sets)) for frame, cloud in enumerate(own.clouds())]
+        both = [chamfer(points[:, frame], [cloud] * len(sets)) for frame, cloud in enumerate(own.clouds)]
         losses = []
         for seed in self._seeds:
             own.reseed(seed)

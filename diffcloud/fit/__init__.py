@@ -1,8 +1,10 @@
 """Fitting simulator parameters to point clouds with the simulator's derivatives."""
 
+from diffcloud.fit.joint import JointObjective
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace, Variable
-from diffcloud.fit.result import FitResult, physical_values, read_fit, write_fit
+from diffcloud.fit.record import FitRecord, read_fit
+from diffcloud.fit.result import FitResult, physical_values, write_fit
 from diffcloud.fit.solvers import (
     AdamSettings,
     CmaEsSettings,
@@ -19,9 +21,11 @@ from diffcloud.fit.solvers import (
 __all__ = [
     "AdamSettings",
     "CmaEsSettings",
+    "FitRecord",
     "FitResult",
     "FitSpace",
     "GaussNewtonSettings",
+    "JointObjective",
     "Objective",
     "Progress",
     "RandomSearchSettings",

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from diffcloud.errors import DivergedError
-from diffcloud.fit.objective import Objective
+from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 
 T = TypeVar("T")
@@ -38,11 +38,20 @@ def without_diverged(count: int, run: Callable[[Tensor], T]) -> tuple[T | None, 
     return None, kept, lost
 
 
-def batch_losses(objective: Objective, space: FitSpace, values: Tensor) -> Tensor:
-    """[B, k] values -> [B] losses; infinite where the simulation diverges."""
+def posterior_losses(objective: AnyObjective, space: FitSpace, values: Tensor) -> Tensor:
+    """[B, k] values -> [B] losses with what the priors add; differentiable.
+
+    Raises:
+        DivergedError: names step and batch entries.
+    """
+    return objective(space.parameters(values)) + space.prior_loss(values, objective.length_unit_m)
+
+
+def batch_losses(objective: AnyObjective, space: FitSpace, values: Tensor) -> Tensor:
+    """The same without a gradient; infinite where the simulation diverges."""
     losses = torch.full((len(values),), math.inf, dtype=values.dtype)
     with torch.no_grad():
-        found, kept, _ = without_diverged(len(values), lambda index: objective(space.parameters(values[index])))
+        found, kept, _ = without_diverged(len(values), lambda index: posterior_losses(objective, space, values[index]))
     if found is not None:
         losses[kept] = found.to(losses)
     return losses

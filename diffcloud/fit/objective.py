@@ -1,4 +1,4 @@
-"""The loss of parameter sets: simulate, lay the scene as the recording lies, sample, compare with the recorded clouds.
+"""The loss of parameter sets on a recording: simulate, lay the scene as it lies, sample, compare with its clouds.
 
 There are two measures. The default one compares every usable frame in both directions, each distance capped, counts
 simulated points only where the recording could have some, and takes the lowest loss over the pose of the scene
@@ -23,7 +23,7 @@ from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.alignment import aligned
 from diffcloud.fit.matching import Pairs, pairs_back, pairs_forth, seen_places
 from diffcloud.fit.pose import DEFAULT_PRIORS, PoseSpace
-from diffcloud.fit.targets import Target, read_target
+from diffcloud.fit.targets import read_target
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import Rollout, rollout
@@ -63,12 +63,12 @@ Matcher = Callable[[Tensor], tuple[Pairs, ...]]
 
 
 class Objective:
-    """Losses of a batch of parameter sets on one or several episodes of one scenario."""
+    """Losses of a batch of parameter sets on one episode."""
 
     def __init__(
         self,
         scenario: Scenario,
-        episodes: Sequence[Episode],
+        episode: Episode,
         *,
         paper: bool = False,
         nuisance: Mapping[str, float] | None = None,
@@ -78,7 +78,6 @@ class Objective:
     ) -> None:
         """
         Args:
-            episodes: one, or several for a joint fit; their losses are averaged.
             paper: the published measure.
             nuisance: free variables of the pose, with the standard deviations of their priors [m, rad, s]; by default
                 `DEFAULT_PRIORS`, in the paper's measure none.
@@ -98,59 +97,67 @@ class Objective:
             raise ConfigError(f"The paper's measure knows no pose; leave out the nuisance {', '.join(self.nuisance)}.")
         self._unit = scenario.length_unit_m
         self._cap = torch.inf if paper else CAP_M / self._unit
-        self._first: dict[int, Tensor] = {}
+        self._first: Tensor | None = None
         self.asked_frames = None if frames is None else tuple(frames)
-        self._asked = points
+        self.asked_points = points
         beside = torch.as_tensor(scenario.scene.bodies.faces) + len(self.system.mesh.nodes)
         self._faces = torch.cat([torch.as_tensor(self.system.mesh.faces), beside])
         self._bodies = torch.as_tensor(scenario.scene.bodies.nodes, dtype=torch.float64)
         named = scenario.loss_frames if paper or not scenario.every_frame else None
-        self._targets = [
-            read_target(
-                scenario, self.system, episode, named if frames is None else frames, whole=paper, nuisance=self.nuisance
-            )
-            for episode in episodes
-        ]
+        self._target = read_target(
+            scenario, self.system, episode, named if frames is None else frames, whole=paper, nuisance=self.nuisance
+        )
         self.reseed(seed)
-        last = max(float(target.times.max()) for target in self._targets)
+        last = float(self._target.times.max())
         steps = int(np.ceil(last / self.system.time_step - 1e-6)) + ("lag" in self.nuisance)  # a velocity has two sides
         self.loss_steps = min(steps, scenario.steps)
 
     @property
-    def episode_count(self) -> int:
-        return len(self._targets)
+    def members(self) -> tuple[Objective, ...]:
+        """This one alone; of a `JointObjective` one for each recording."""
+        return (self,)
+
+    @property
+    def length_unit_m(self) -> float:
+        return self.scenario.length_unit_m
 
     @property
     def point_count(self) -> int:
         """Sampled per frame."""
-        if self._asked is not None:
-            return self._asked
-        share = 1 if self.paper else max(len(target.frames) for target in self._targets)
+        if self.asked_points is not None:
+            return self.asked_points
+        share = 1 if self.paper else len(self._target.frames)
         return max(self.scenario.points // share, min(_FEWEST, self.scenario.points))
 
-    def frames(self, episode: int = 0) -> tuple[int, ...]:
+    @property
+    def frames(self) -> tuple[int, ...]:
         """The compared frames of an episode, from 0."""
-        return self._targets[episode].frames
+        return self._target.frames
 
-    def cut(self, episode: int = 0) -> float | None:
+    @property
+    def cut(self) -> float | None:
         """Height below which nothing was recorded; simulated points do not count there."""
-        return self._targets[episode].cut
+        return self._target.cut
 
-    def pose_space(self, episode: int = 0) -> PoseSpace:
-        return self._targets[episode].space
+    @property
+    def pose_space(self) -> PoseSpace:
+        return self._target.space
 
-    def times(self, episode: int = 0) -> Tensor:
+    @property
+    def times(self) -> Tensor:
         """[L] of the compared frames [s]."""
-        return self._targets[episode].times
+        return self._target.times
 
-    def track(self, episode: int = 0) -> Tensor | None:
+    @property
+    def track(self) -> Tensor | None:
         """[1, S, G, 3] displacement of the grippers up to the last compared frame [m]; None: the scene's own motion."""
-        track = self._targets[episode].track
+        track = self._target.track
         return None if track is None else track[:, : self.loss_steps]
 
-    def clouds(self, episode: int = 0) -> tuple[NeighbourIndex, ...]:
+    @property
+    def clouds(self) -> tuple[NeighbourIndex, ...]:
         """The recorded clouds of the L compared frames."""
-        return self._targets[episode].clouds
+        return self._target.clouds
 
     def reseed(self, seed: int) -> None:
         """Draw the common random numbers anew."""
@@ -166,7 +173,7 @@ class Objective:
         )
         if self.paper:
             return
-        self._recorded = [self._drawn(target, generator) for target in self._targets]
+        self._recorded = self._drawn(generator)
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Losses [B] in squared length units of the scene, differentiable.
@@ -182,119 +189,109 @@ class Objective:
         for begin in range(0, batch, _CHUNK):  # nothing inside loops over the batch
             part = {name: value[begin : begin + _CHUNK] for name, value in parameters.items()}
             try:
-                terms = [
-                    self.frame_losses(self.simulate_to_loss(part, episode=index), episode=index).mean(-1)
-                    for index in range(len(self._targets))
-                ]
+                losses.append(self.frame_losses(self.simulate_to_loss(part)).mean(-1))
             except DivergedError as error:
                 entries = [begin + entry for entry in error.entries]
                 raise DivergedError(error.step, entries, error.reason, error.parameters) from error
-            losses.append(torch.stack(terms).mean(0))
         return torch.cat(losses)
 
-    def simulate_to_loss(self, parameters: Mapping[str, Tensor], *, episode: int = 0) -> Rollout:
+    def simulate_to_loss(self, parameters: Mapping[str, Tensor]) -> Rollout:
         """The rollout up to the last compared frame."""
-        return self.simulate(parameters, episode=episode, steps=self.loss_steps)
+        return self.simulate(parameters, steps=self.loss_steps)
 
-    def simulate(self, parameters: Mapping[str, Tensor], *, episode: int = 0, steps: int | None = None) -> Rollout:
+    def simulate(self, parameters: Mapping[str, Tensor], *, steps: int | None = None) -> Rollout:
         """The rollout of parameter sets with an episode's gripper track, by default over the whole scenario."""
         steps = self.scenario.steps if steps is None else steps
         properties = self.scenario.properties(self.system, parameters)
-        track = self._targets[episode].track
+        track = self._target.track
         track = None if track is None else track[:, :steps]
         return rollout(self.system, steps, properties=properties, track=track)
 
-    def frame_losses(self, run: Rollout, *, pose: Tensor | None = None, episode: int = 0) -> Tensor:
+    def frame_losses(self, run: Rollout, *, pose: Tensor | None = None) -> Tensor:
         """[B, L] losses of a rollout at each compared frame, at its pose or at poses [B, d]. Differentiable, with the pose
         held fixed: it minimises the loss, a weak prior aside."""
-        return self.losses(self.match(run, pose=pose, episode=episode), episode=episode)
+        return self.losses(self.match(run, pose=pose))
 
-    def losses(self, motion: Motion, *, episode: int = 0) -> Tensor:
+    def losses(self, motion: Motion) -> Tensor:
         """[B, L] losses of a matched motion at each compared frame."""
-        found = [pairs.losses(self._moved(motion, pairs, episode), self._cap) for pairs in motion.pairs]
-        return len(self.frames(episode)) * torch.stack(found).sum(0)
+        found = [pairs.losses(self._moved(motion, pairs), self._cap) for pairs in motion.pairs]
+        return len(self.frames) * torch.stack(found).sum(0)
 
-    def way_losses(self, motion: Motion, *, episode: int = 0) -> list[float]:
+    def way_losses(self, motion: Motion) -> list[float]:
         """The loss of one matched motion forth, and in the default measure back."""
-        return [
-            float(pairs.losses(self._moved(motion, pairs, episode), self._cap).mean() / pairs.share)
-            for pairs in motion.pairs
-        ]
+        return [float(pairs.losses(self._moved(motion, pairs), self._cap).mean() / pairs.share) for pairs in motion.pairs]
 
-    def points(self, run: Rollout, *, pose: Tensor | None = None, episode: int = 0) -> Tensor:
+    def points(self, run: Rollout, *, pose: Tensor | None = None) -> Tensor:
         """[B, L, N, 3] points sampled on a rollout's cloth at the compared frames, in the recording's frame."""
-        motion = self.match(run, pose=pose, episode=episode)
-        return self._moved(motion, motion.pairs[0], episode)
+        motion = self.match(run, pose=pose)
+        return self._moved(motion, motion.pairs[0])
 
-    def pose(self, run: Rollout, *, episode: int = 0) -> Tensor:
+    def pose(self, run: Rollout) -> Tensor:
         """[B, d] the pose of a rollout. It belongs to the motion: where points are drawn anew, it may stay."""
-        return self.match(run, episode=episode).pose
+        return self.match(run).pose
 
-    def posed_nodes(self, run: Rollout, pose: Tensor, *, episode: int = 0) -> NDArray[np.float64]:
+    def posed_nodes(self, run: Rollout, pose: Tensor) -> NDArray[np.float64]:
         """[T + 1, V, 3] the cloth's nodes of a rollout of one motion at every frame of the scenario, in the recording's
         frame."""
         times = run.times[:: self.scenario.scene.frame_steps]
-        return self._targets[episode].space.moved_motion(run.at, times, pose).numpy()
+        return self._target.space.moved_motion(run.at, times, pose).numpy()
 
-    def posed_bodies(self, pose: Tensor, *, episode: int = 0) -> NDArray[np.float64]:
+    def posed_bodies(self, pose: Tensor) -> NDArray[np.float64]:
         """[V, 3] the nodes of the bodies beside the cloth, there too."""
-        return self._targets[episode].space.moved(self._bodies[None], pose)[0].numpy()
+        return self._target.space.moved(self._bodies[None], pose)[0].numpy()
 
-    def match(self, run: Rollout, *, pose: Tensor | None = None, episode: int = 0) -> Motion:
+    def match(self, run: Rollout, *, pose: Tensor | None = None) -> Motion:
         """A rollout beside an episode, at its pose or at poses [B, d]."""
-        times = self.times(episode)
+        times = self.times
         nodes = self.with_bodies(run.at(times))
         velocities = None
-        if "lag" in self.pose_space(episode).names:
+        if "lag" in self.pose_space.names:
             before, after = ((times + way * float(run.times[1])).clamp(0.0, float(run.times[-1])) for way in (-1, 1))
             moved = self.with_bodies(run.at(after)) - self.with_bodies(run.at(before))
             velocities = moved / (after - before)[:, None, None]
         with torch.no_grad():
             still = nodes.detach(), None if velocities is None else velocities.detach()
             if pose is None:
-                pose = self._pose(*still, episode)
-            return Motion(nodes, velocities, pose, self._matcher(*still, episode, range(nodes.shape[1]))(pose))
+                pose = self._pose(*still)
+            return Motion(nodes, velocities, pose, self._matcher(*still, range(nodes.shape[1]))(pose))
 
-    def _pose(self, nodes: Tensor, velocities: Tensor | None, episode: int) -> Tensor:
+    def _pose(self, nodes: Tensor, velocities: Tensor | None) -> Tensor:
         """[B, d] from the pose of the basis material on: on a few frames, then on all."""
-        space = self.pose_space(episode)
+        space = self.pose_space
         if not space.names:
             return torch.zeros(len(nodes), 0, dtype=torch.float64)
-        return self._follow(nodes, velocities, episode, self._first_pose(episode).expand(len(nodes), -1), _CAPS)
+        return self._follow(nodes, velocities, self._first_pose().expand(len(nodes), -1), _CAPS)
 
-    def _first_pose(self, episode: int) -> Tensor:
+    def _first_pose(self) -> Tensor:
         """[1, d] of the basis material, from zero on."""
-        if episode not in self._first:
-            self._first[episode] = torch.zeros(1, len(self.pose_space(episode).names), dtype=torch.float64)
+        if self._first is None:
+            self._first = torch.zeros(1, len(self.pose_space.names), dtype=torch.float64)
             with suppress(DivergedError):  # then steps begin at zero, whatever the parameters
-                nodes = self.with_bodies(self.simulate_to_loss({}, episode=episode).at(self.times(episode)))
-                zero = self._first[episode]
-                self._first[episode] = self._follow(nodes, torch.zeros_like(nodes), episode, zero, _FIRST_CAPS)
-        return self._first[episode]
+                nodes = self.with_bodies(self.simulate_to_loss({}).at(self.times))
+                self._first = self._follow(nodes, torch.zeros_like(nodes), self._first, _FIRST_CAPS)
+        return self._first
 
-    def _follow(
-        self, nodes: Tensor, velocities: Tensor | None, episode: int, start: Tensor, caps: Sequence[float]
-    ) -> Tensor:
+    def _follow(self, nodes: Tensor, velocities: Tensor | None, start: Tensor, caps: Sequence[float]) -> Tensor:
         """[B, d] poses of lowest loss of nodes [B, L, V, 3]."""
-        space, every = self.pose_space(episode), range(nodes.shape[1])
+        space, every = self.pose_space, range(nodes.shape[1])
         few = np.unique(np.linspace(0, len(every) - 1, _FEW).round().astype(int)).tolist()
         pose = start
         for frames, factors in ((few, caps), (every, _LAST_CAPS)):
-            matcher = self._matcher(nodes, velocities, episode, frames)
+            matcher = self._matcher(nodes, velocities, frames)
 
             def terms(
                 poses: Tensor, factor: float, matcher: Matcher = matcher, frames: Sequence[int] = frames
             ) -> tuple[Tensor, Tensor, Tensor]:
                 moving = None if velocities is None else velocities[:, frames]
                 motion = Motion(nodes[:, frames], moving, poses, matcher(poses))
-                return self.terms(motion, None, episode=episode, factor=factor)
+                return self.terms(motion, None, factor=factor)
 
             pose = aligned(space, pose, terms, factors)
         return pose
 
-    def _matcher(self, nodes: Tensor, velocities: Tensor | None, episode: int, frames: Sequence[int]) -> Matcher:
+    def _matcher(self, nodes: Tensor, velocities: Tensor | None, frames: Sequence[int]) -> Matcher:
         """What finds the pairs of some frames at poses [B, d]."""
-        target, chosen = self._targets[episode], list(frames)
+        target, chosen = self._target, list(frames)
         still, moving = nodes[:, chosen], None if velocities is None else velocities[:, chosen]
         clouds = [target.clouds[frame] for frame in chosen]
         places = self.sampler.draw(still)
@@ -312,22 +309,20 @@ class Objective:
             forth = pairs_forth(places, moved, clouds, cut=target.cut, share=share, seen=seen)
             if self.paper:
                 return (forth,)
-            recorded, sure = (part[chosen] for part in self._recorded[episode])
+            recorded, sure = (part[chosen] for part in self._recorded)
             back = pairs_back(shown, self._faces, recorded, sure, forth.spacing, space=target.space, pose=pose, share=share)
             return forth, back
 
         return pairs_at
 
-    def terms(
-        self, motion: Motion, rates: Tensor | None, *, episode: int = 0, factor: float = 1.0
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def terms(self, motion: Motion, rates: Tensor | None, *, factor: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
         """Loss [B], half of its slope [B, k + d] and curvature [B, k + d, k + d], without the prior of the pose.
 
         Args:
             rates: [k, B, L, V, 3] of the cloth's nodes by k variables; None for none.
             factor: of the cap.
         """
-        space = self._targets[episode].space
+        space = self._target.space
         sums: tuple[Tensor, Tensor, Tensor] | None = None
         here = self._lagged(motion, space)
         if rates is not None:  # bodies stand still
@@ -356,14 +351,14 @@ class Objective:
             return motion.nodes
         return motion.nodes + lag[:, None, None, None] * motion.velocities
 
-    def _moved(self, motion: Motion, pairs: Pairs, episode: int) -> Tensor:
-        space = self._targets[episode].space
+    def _moved(self, motion: Motion, pairs: Pairs) -> Tensor:
+        space = self._target.space
         return space.moved(pairs.places.of(self._lagged(motion, space)), motion.pose)
 
-    def _drawn(self, target: Target, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def _drawn(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """[L, Q, 3] recorded points that look for the cloth, as many as there are sampled ones, and [L, Q] how sure."""
         points, sure = [], []
-        for cloud, weight in zip(target.clouds, target.sure, strict=True):
+        for cloud, weight in zip(self._target.clouds, self._target.sure, strict=True):
             index = torch.randint(len(cloud.points), (self.point_count,), generator=generator)
             points.append(cloud.points[index])
             sure.append(weight[index])

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from diffcloud.errors import ConfigError, unknown_name
+from diffcloud.fit.priors import prior_cost
 from diffcloud.sim.properties import PARAMETERS, check_values
 
 _EDGE = 1e-6
@@ -30,6 +31,8 @@ class Variable:
     name: str
     low: float
     high: float
+    prior: float | None = None
+    """Factor of one deviation of its log-normal prior about 1, the basis material; None: none."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
@@ -51,12 +54,14 @@ class FitSpace:
         *,
         bounds: Mapping[str, tuple[float, float]] | None = None,
         fixed: Mapping[str, float] | None = None,
+        priors: Mapping[str, float] | None = None,
     ) -> FitSpace:
         """
         Args:
             names: parameters to fit.
             bounds: overrides of each parameter's own bounds.
             fixed: parameters with a known value (a weighed cloth: mass).
+            priors: factors of one deviation (`fit.priors`); none where not given.
 
         Raises:
             ConfigError: an unknown, repeated or doubly given parameter, or bounds out of order.
@@ -72,7 +77,8 @@ class FitSpace:
         if len(set(names)) < len(names):
             raise ConfigError(f"A parameter is listed twice: {', '.join(names)}.")
         both = sorted(set(names) & set(fixed))
-        variables = [Variable(n, *bounds.get(n, PARAMETERS[n].bounds)) for n in names if n not in both]
+        known = priors or {}
+        variables = [Variable(n, *bounds.get(n, PARAMETERS[n].bounds), known.get(n)) for n in names if n not in both]
         if not variables:
             raise ConfigError("Nothing is left to fit: every listed parameter is fixed.")
         return FitSpace(tuple(variables), fixed)
@@ -155,6 +161,17 @@ class FitSpace:
         """[B, k] -> parameters of the simulator, the fixed ones too, name -> [B]."""
         columns = dict(zip(self.names, values.unbind(-1), strict=True))
         return columns | {name: torch.full_like(values[:, 0], value) for name, value in self.fixed.items()}
+
+    def prior_weights(self, length_unit_m: float) -> Tensor:
+        """[k] what the loss gains by the square of each variable's logarithm [squared length unit]."""
+        cost = prior_cost(length_unit_m)
+        weights = [0.0 if v.prior is None else cost / math.log(v.prior) ** 2 for v in self.variables]
+        return torch.tensor(weights, dtype=torch.float64)
+
+    def prior_loss(self, values: Tensor, length_unit_m: float) -> Tensor:
+        """[B] what the priors add to the loss of values [B, k]."""
+        weights = self.prior_weights(length_unit_m)
+        return (weights * torch.where(weights > 0, values, 1.0).log().square()).sum(-1)
 
     def _bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
         low = [variable.low for variable in self.variables]

@@ -16,21 +16,30 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from diffcloud.errors import ConfigError, unknown_name
+from diffcloud.fit.priors import prior_cost
+from diffcloud.fit.record import NuisanceValue
 
-NUISANCE = {"x": "m", "y": "m", "z": "m", "tilt_x": "rad", "tilt_y": "rad", "yaw": "rad", "lag": "s"}
+NUISANCE: dict[str, Literal["m", "rad", "s"]] = {
+    "x": "m",
+    "y": "m",
+    "z": "m",
+    "tilt_x": "rad",
+    "tilt_y": "rad",
+    "yaw": "rad",
+    "lag": "s",
+}
 """Name -> unit."""
 DEFAULT_PRIORS = {"x": 0.1, "y": 0.1, "yaw": math.radians(30)}
 """Of a cloth laid down by hand where the scene says [m, rad]."""
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180, "s": 1.0, "ms": 1e-3}
 _QUANTITY = {"m": "m", "cm": "m", "mm": "m", "rad": "rad", "deg": "rad", "s": "s", "ms": "s"}
-_NOISE_M = 0.005
-_INDEPENDENT = 100
-"""A prior at one deviation costs as much as one residual of that size among so many: far less than a recording."""
+_EXAMPLES = {"m": "2cm", "rad": "5deg", "s": "50ms"}
 _ANGLES = ("tilt_x", "tilt_y", "yaw")
 _SHIFTS = ("x", "y", "z")
 
@@ -39,8 +48,8 @@ def parse_priors(text: str) -> dict[str, float]:
     """What `--nuisance` says -> name -> standard deviation of its prior [m, rad, s].
 
     Args:
-        text: "none", or names with how far each may well be off zero, as in "x=10cm,y=0.1,yaw=30deg"; without a unit in m,
-            rad or s.
+        text: "none", or names with how far each may well be off zero, as in "x=10cm,y=0.1,yaw=30deg"; a length without a
+            unit in m, a time in s. An angle names its unit: 30 may be meant in degrees, and 0.5 in radians.
 
     Raises:
         ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.
@@ -54,12 +63,12 @@ def parse_priors(text: str) -> dict[str, float]:
             raise ConfigError(f"nuisance: {unknown_name('nuisance variable', name, NUISANCE)}")
         match = re.fullmatch(r"([0-9.eE+-]+?)\s*([a-z]*)", value)
         number = _number(match[1]) if match else math.nan
-        unit = (match[2] if match else "") or NUISANCE[name]
+        unit = (match[2] if match else "") or {"rad": ""}.get(NUISANCE[name], NUISANCE[name])
         if not (number > 0 and math.isfinite(number)) or _QUANTITY.get(unit) != NUISANCE[name]:
             allowed = ", ".join(one for one, quantity in _QUANTITY.items() if quantity == NUISANCE[name])
             raise ConfigError(
                 f"nuisance {item.strip()!r}: {name} takes how far it may well be off, a positive number in one of "
-                f"{allowed}, such as {name}=0.1{NUISANCE[name]}."
+                f"{allowed}, such as {name}={_EXAMPLES[NUISANCE[name]]}."
             )
         if name in priors:
             raise ConfigError(f"nuisance names {name} twice.")
@@ -97,23 +106,23 @@ class PoseSpace:
         names = tuple(name for name in NUISANCE if name in priors)
         scale = [priors[name] / (length_unit_m if NUISANCE[name] == "m" else 1.0) for name in names]
         deviations = torch.tensor(scale, dtype=torch.float64)
-        return PoseSpace(names, deviations, (_NOISE_M / length_unit_m / deviations) ** 2 / _INDEPENDENT, centre)
+        return PoseSpace(names, deviations, prior_cost(length_unit_m) / deviations**2, centre)
 
-    def described(self, values: Tensor, *, length_unit_m: float) -> dict[str, dict[str, float | str]]:
+    def described(self, values: Tensor, *, length_unit_m: float) -> dict[str, NuisanceValue]:
         """[d] values as records keep them: name -> value and its prior, in SI."""
         return {
-            name: {
-                "value": float(value) * (length_unit_m if NUISANCE[name] == "m" else 1.0),
-                "prior": float(prior) * (length_unit_m if NUISANCE[name] == "m" else 1.0),
-                "unit": NUISANCE[name],
-            }
+            name: NuisanceValue(
+                value=float(value) * (length_unit_m if NUISANCE[name] == "m" else 1.0),
+                prior=float(prior) * (length_unit_m if NUISANCE[name] == "m" else 1.0),
+                unit=NUISANCE[name],
+            )
             for name, value, prior in zip(self.names, values, self.deviations, strict=True)
         }
 
-    def of(self, described: Mapping[str, Mapping[str, float | str]], *, length_unit_m: float) -> Tensor:
+    def of(self, described: Mapping[str, NuisanceValue], *, length_unit_m: float) -> Tensor:
         """The inverse of `described`; what is missing there is zero."""
         values = [
-            float(described.get(name, {}).get("value", 0.0)) / (length_unit_m if NUISANCE[name] == "m" else 1.0)
+            described[name].value / (length_unit_m if NUISANCE[name] == "m" else 1.0) if name in described else 0.0
             for name in self.names
         ]
         return torch.tensor(values, dtype=torch.float64)

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from diffcloud.fit.batches import without_diverged
+from diffcloud.fit.joint import AnyObjective, mean_terms
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.sim.properties import Properties
@@ -80,17 +81,19 @@ class Linearisation:
     simulations: int
 
 
-def linearise(objective: Objective, space: FitSpace, places: Tensor) -> Linearisation:
-    """The loss at [B, k] places, by the rule that stands at the head of this module."""
-    by_tangents = objective.scenario.scene.integrator == "implicit"
-    moved = _by_tangents if by_tangents else _by_differences
+def linearise(objective: AnyObjective, space: FitSpace, places: Tensor) -> Linearisation:
+    """The loss at [B, k] places, with the prior of the variables, by the rule that stands at the head of this module."""
+    paper = objective.paper
 
-    def run(index: Tensor) -> list[Tensor]:
+    def run(index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         parts = []
-        for episode in range(objective.episode_count):
-            motion, rates = moved(objective, space, places[index], episode)
-            parts.append(_over_pose(objective, motion, rates, episode))
-        return [torch.stack(part).mean(0) for part in zip(*parts, strict=True)]
+        for member in objective.members:
+            moved = _by_tangents if by_tangents(member) else _by_differences
+            parts.append(_over_pose(member, *moved(member, space, places[index])))
+        loss, slope, curvature = mean_terms(parts, paper=paper)
+        weights = space.prior_weights(objective.length_unit_m)
+        off = places[index]  # logarithms of multipliers, where there is a prior
+        return loss + (weights * off.square()).sum(-1), slope + weights * off, curvature + weights.diag()
 
     with torch.no_grad():
         found, kept, _ = without_diverged(len(places), run)
@@ -99,11 +102,16 @@ def linearise(objective: Objective, space: FitSpace, places: Tensor) -> Linearis
     slope, curvature = places.new_zeros(count, variables), places.new_zeros(count, variables, variables)
     if found is not None:
         losses[kept], slope[kept], curvature[kept] = found
-    each = 1 if by_tangents else 1 + 2 * variables
-    return Linearisation(losses, slope, curvature, each * count * objective.episode_count)
+    each = sum(1 if by_tangents(member) else 1 + 2 * variables for member in objective.members)
+    return Linearisation(losses, slope, curvature, each * count)
 
 
-def _by_tangents(objective: Objective, space: FitSpace, places: Tensor, episode: int) -> tuple[Rollout, Tensor]:
+def by_tangents(objective: Objective) -> bool:
+    """Whether the derivatives of its integrator hold over finite distances."""
+    return objective.scenario.scene.integrator == "implicit"
+
+
+def _by_tangents(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rollout, Tensor]:
     """Motions of B places, and the rates [k, B, L, V, 3] of their nodes at the compared frames."""
     axis = Axis.of(space)
 
@@ -116,34 +124,34 @@ def _by_tangents(objective: Objective, space: FitSpace, places: Tensor, episode:
         objective.loss_steps,
         properties=Properties(*properties(places)),
         tangents=Properties(*(torch.cat(parts) for parts in zip(*rates, strict=True))),
-        track=objective.track(episode),
+        track=objective.track,
     )
-    times = objective.times(episode)
+    times = objective.times
     return run, torch.stack([replace(run, positions=move).at(times) for move in moves])
 
 
-def _by_differences(objective: Objective, space: FitSpace, places: Tensor, episode: int) -> tuple[Rollout, Tensor]:
+def _by_differences(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rollout, Tensor]:
     """The same."""
     axis = Axis.of(space)
     low, high = axis.ends
     ways = _ways(places)
     above, below = (torch.minimum(torch.maximum(places + sign * STEP * ways, low), high) for sign in (1, -1))
     every = torch.cat([places[None], above, below]).flatten(0, 1)
-    run = objective.simulate_to_loss(space.parameters(axis.values(every)), episode=episode)
-    there = run.at(objective.times(episode))[len(places) :].unflatten(0, (2, -1, len(places)))
+    run = objective.simulate_to_loss(space.parameters(axis.values(every)))
+    there = run.at(objective.times)[len(places) :].unflatten(0, (2, -1, len(places)))
     width = ((above - below) * ways).sum(-1)  # halved at a bound
     return replace(run, positions=run.positions[: len(places)], velocities=run.velocities[: len(places)]), (
         there[0] - there[1]
     ) / width[..., None, None, None]
 
 
-def _over_pose(objective: Objective, run: Rollout, rates: Tensor, episode: int) -> tuple[Tensor, Tensor, Tensor]:
+def _over_pose(objective: Objective, run: Rollout, rates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Loss [B], slope [B, k] and curvature [B, k, k] of one episode, the pose solved for."""
-    motion, count = objective.match(run, episode=episode), len(rates)
-    loss, slope, curvature = objective.terms(motion, rates, episode=episode)
+    motion, count = objective.match(run), len(rates)
+    loss, slope, curvature = objective.terms(motion, rates)
     if motion.pose.shape[1] == 0:
         return loss, slope, curvature
-    prior = objective.pose_space(episode).prior_weights
+    prior = objective.pose_space.prior_weights
     of_pose = slope[:, count:] + prior * motion.pose
     along, mixed = curvature[:, count:, count:] + prior.diag(), curvature[:, :count, count:]
     solved = torch.linalg.solve(along, torch.cat([of_pose[..., None], mixed.mT], dim=-1))

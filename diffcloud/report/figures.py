@@ -17,6 +17,7 @@ import pandas as pd
 
 from diffcloud.evaluation.methods import PHASES
 from diffcloud.evaluation.summary import Tables, label
+from diffcloud.fit.record import History
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,7 +47,7 @@ class Figure:
 
 
 def comparison_figures(
-    told: Tables, records: Sequence[Mapping[str, Any]], histories: Mapping[tuple[str, str], Mapping[str, Any]]
+    told: Tables, records: Sequence[Mapping[str, Any]], histories: Mapping[tuple[str, str], History]
 ) -> list[Figure]:
     """All figures for which there is data.
 
@@ -182,7 +183,7 @@ def _success(told: Tables) -> Figure | None:
     )
 
 
-def _curves(histories: Mapping[tuple[str, str], Mapping[str, Any]]) -> Figure | None:
+def _curves(histories: Mapping[tuple[str, str], History]) -> Figure | None:
     scenarios = list(dict.fromkeys(scenario for scenario, _ in histories))
     if not scenarios:
         return None
@@ -190,7 +191,7 @@ def _curves(histories: Mapping[tuple[str, str], Mapping[str, Any]]) -> Figure | 
     for axis, scenario in zip(axes, scenarios, strict=True):
         for (owner, _), history in histories.items():
             if owner == scenario:
-                lowest = [min((value for value in row if value is not None), default=np.nan) for row in history["loss"]]
+                lowest = [min((value for value in row if value is not None), default=np.nan) for row in history.loss]
                 axis.plot(np.fmin.accumulate(lowest), color=_COLOURS[0], alpha=0.8, linewidth=1)
         axis.set_yscale("log")
         axis.set_xlabel("iteration")
@@ -215,19 +216,19 @@ def overlay_figure(entries: Sequence[EpisodeEntry]) -> Figure | None:
     canvas, axes = _canvas(2 * len(shown), height=2.9)
     for index, entry in enumerate(shown):
         frame = entry.last_frame
-        state = int(np.abs(entry.times - entry.episode.times[frame]).argmin())
+        state = int(np.abs(entry.motion.times - entry.episode.times[frame]).argmin())
         cloud = entry.episode.frame(frame).astype(float)
         flat = cloud[:, :2] - cloud[:, :2].mean(axis=0)
         wide = np.linalg.svd(flat, full_matrices=False)[2][0]
         for axis, nodes, name, colour in zip(
             axes[2 * index : 2 * index + 2],
-            (entry.start_nodes[state], entry.nodes[state]),
+            (entry.motion.start_nodes[state], entry.motion.nodes[state]),
             ("start of the fit", "fitted"),
             (_COLOURS[6], _COLOURS[0]),
             strict=True,
         ):
             axis.scatter(cloud[::4, :2] @ wide, cloud[::4, 2], s=2, color=_COLOURS[2], linewidths=0, rasterized=True)
-            axis.triplot(nodes[:, :2] @ wide, nodes[:, 2], entry.faces, color=colour, linewidth=0.9)
+            axis.triplot(nodes[:, :2] @ wide, nodes[:, 2], entry.motion.faces, color=colour, linewidth=0.9)
             axis.set_title(f"{entry.scenario} / {entry.name}, {name}")
             axis.set_aspect("equal", adjustable="datalim")
     return _finished(

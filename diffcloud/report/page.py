@@ -15,8 +15,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from diffcloud.fit.record import FitRecord, FittedParameter, RecordingFit
+from diffcloud.fit.result import FittedMotion
 from diffcloud.io.episodes import Episode
-from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.report.comparison import (
     ComparisonEntry,
     comparison_failures,
@@ -40,24 +41,19 @@ class EpisodeEntry:
     name: str
     row: Mapping[str, Any]
     """Of `evaluation.summary.fit_table`."""
-    fit: Mapping[str, Any]
-    """Of `fit.result.read_fit`."""
+    fit: FitRecord
+    recording: RecordingFit
+    """That is shown: of a joint fit, the first of this scenario."""
     episode: Episode
-    nodes: NDArray[np.float64]
-    """[T + 1, V, 3] fitted motion at the scenario's frames."""
-    start_nodes: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    times: NDArray[np.float64]
-    """[T + 1] [s]"""
-    bodies: SurfaceMesh
-    """Fixed bodies around the cloth; may be empty."""
+    """Of that recording."""
+    motion: FittedMotion
     pictures: Mapping[str, bytes] = field(default_factory=dict)
     """Caption -> PNG, of episodes made from raw recordings."""
 
     @property
     def last_frame(self) -> int:
         """The last of the recording that the fit compared."""
-        return int(self.fit["recordings"][self.fit["episodes"][0]]["frames"][-1])
+        return self.recording.frames[-1]
 
 
 def build_page(
@@ -104,7 +100,7 @@ def build_page(
         poses=poses_table([(f"{entry.scenario} / {entry.name}", entry.fit) for entry in entries]),
         predictions=predictions_table(predictions, fitted_mm),
         errors=errors_table(trainings),
-        failures=[*missing, *(f"{entry.name}: {text}" for entry in entries for text in entry.fit["failures"])],
+        failures=[*missing, *(f"{entry.name}: {text}" for entry in entries for text in entry.fit.failures)],
         recordings=recordings_table(entries),
         photographs=recordings_pictures(entries),
         environment=environment,
@@ -130,27 +126,26 @@ class _Summary:
 def _entry_data(entry: EpisodeEntry, overlay_points: int, rng: np.random.Generator) -> dict[str, Any]:
     frames = []
     for index, time in enumerate(entry.episode.times):
-        if time > entry.times[-1] + 1e-6:
+        if time > entry.motion.times[-1] + 1e-6:
             break
         cloud = entry.episode.frame(index)
         if len(cloud) > overlay_points:
             cloud = cloud[np.sort(rng.choice(len(cloud), overlay_points, replace=False))]
-        state = int(np.abs(entry.times - time).argmin())
+        state = int(np.abs(entry.motion.times - time).argmin())
         frames.append(
             {
                 "time": round(float(time), 3),
                 "target": _axes(cloud),
-                "fitted": _axes(entry.nodes[state]),
-                "start": _axes(entry.start_nodes[state]),
+                "fitted": _axes(entry.motion.nodes[state]),
+                "start": _axes(entry.motion.start_nodes[state]),
             }
         )
-    history = entry.fit["history"]
-    best = np.minimum.accumulate([min(v for v in row if v is not None) for row in history["loss"]])
+    best = np.minimum.accumulate([min(v for v in row if v is not None) for row in entry.fit.history.loss])
     return {
         "name": f"{entry.scenario} / {entry.name}",
         "frames": frames,
-        "faces": entry.faces.T.tolist(),
-        "bodies": {"nodes": _axes(entry.bodies.nodes), "faces": entry.bodies.faces.T.tolist()},
+        "faces": entry.motion.faces.T.tolist(),
+        "bodies": {"nodes": _axes(entry.motion.bodies.nodes), "faces": entry.motion.bodies.faces.T.tolist()},
         "lossFrame": min(entry.last_frame, len(frames) - 1),
         "loss": [float(f"{value:.4g}") for value in best],
     }
@@ -160,13 +155,6 @@ def _axes(points: NDArray[Any]) -> list[list[float]]:
     """[N, 3] -> three lists, rounded to a tenth of a millimetre to keep the page small."""
     columns: list[list[float]] = np.round(points.T.astype(np.float64), _DECIMALS).tolist()
     return columns
-
-
-def _parameter_names(entries: Sequence[EpisodeEntry]) -> list[str]:
-    names: dict[str, None] = {}
-    for entry in entries:
-        names |= dict.fromkeys(entry.fit["parameters"])
-    return list(names)
 
 
 def _summary(entries: Sequence[EpisodeEntry]) -> _Summary:
@@ -185,7 +173,7 @@ def _summary(entries: Sequence[EpisodeEntry]) -> _Summary:
 def _fits_table(entries: Sequence[EpisodeEntry]) -> Table:
     names: dict[str, None] = {}
     for entry in entries:
-        names |= dict.fromkeys(entry.fit["parameters"])
+        names |= dict.fromkeys(entry.fit.parameters)
     heads = ("episode", "scenario", "fabric", "start mm", "fitted mm", "other frames mm", *names)
     heads = (*heads, "stretch / mass", "iterations", "seconds")
     return table(heads, (_fit_row(index, entry, list(names)) for index, entry in enumerate(entries)))
@@ -201,18 +189,18 @@ def _fit_row(index: int, entry: EpisodeEntry, names: Sequence[str]) -> list[Cell
         number(row["rms_start_mm"], 1),
         replace(number(row["rms_mm"], 1), strong=True),
         number(row["rms_other_frames_mm"], 1),
-        *(_parameter_cell(fit["parameters"].get(name), row.get(f"true_{name}")) for name in names),
+        *(_parameter_cell(fit.parameters.get(name), row.get(f"true_{name}")) for name in names),
         number(row.get("fitted_ratio"), 2, note="" if true_ratio is None else f"true {true_ratio:.2f}"),
-        number(fit["iterations"], 0),
-        number(fit["seconds"], 1),
+        number(fit.iterations, 0),
+        number(fit.seconds, 1),
     ]
 
 
-def _parameter_cell(fitted: Mapping[str, Any] | None, true: float | None) -> Cell:
+def _parameter_cell(fitted: FittedParameter | None, true: float | None) -> Cell:
     if fitted is None:
         return Cell("")
-    notes = [f"{fitted['physical']:.3g} {fitted['physical_unit']}"]
+    notes = [f"{fitted.physical:.3g} {fitted.physical_unit}"]
     notes += [f"true {true:.2f}"] if true is not None else []
-    notes += ["at its bound"] if fitted.get("at_bound") else []
-    notes += ["given"] if fitted.get("fixed") else []
-    return number(fitted["value"], 2, note=" · ".join(notes))
+    notes += ["at its bound"] if fitted.at_bound else []
+    notes += ["given"] if fitted.fixed else []
+    return number(fitted.value, 2, note=" · ".join(notes))

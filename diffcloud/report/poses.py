@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
+from diffcloud.fit.record import FitRecord, NuisanceValue, RecordingFit
 from diffcloud.report.tables import UNKNOWN, Cell, Table, number, table
 
 _SHOWN = {"m": (1e3, "mm", 1), "rad": (180 / math.pi, "°", 1), "s": (1e3, "ms", 1)}
@@ -16,15 +16,15 @@ _WIDE = 2.0
 """A value so many of its prior's deviations off zero is pointed out."""
 
 
-def poses_table(fits: Sequence[tuple[str, Mapping[str, Any]]]) -> Table:
+def poses_table(fits: Sequence[tuple[str, FitRecord]]) -> Table:
     """A row for each recording of each fit.
 
     Args:
-        fits: name shown, and summary as `fit.result.read_fit` has it.
+        fits: name shown, and record.
     """
-    rows = [(name, recorded, recording) for name, fit in fits for recorded, recording in fit["recordings"].items()]
-    variables = list(dict.fromkeys(key for _, _, recording in rows for key in recording["nuisance"]))
-    units = {key: one["nuisance"][key]["unit"] for _, _, one in rows for key in one["nuisance"]}
+    rows = [(name, recording) for name, fit in fits for recording in fit.episodes]
+    units = {key: entry.unit for _, recording in rows for key, entry in recording.nuisance.items()}
+    variables = list(units)
     heads = [
         "fit",
         "recording",
@@ -36,28 +36,35 @@ def poses_table(fits: Sequence[tuple[str, Mapping[str, Any]]]) -> Table:
         "cut mm",
     ]
     heads += [f"{key} {_SHOWN[units[key]][1]}" for key in variables]
-    return table(heads, (_row(name, recorded, recording, variables) for name, recorded, recording in rows))
+    joint = any(recording.left_out is not None for _, recording in rows)
+    heads += ["RMS mm by the others"] * joint
+    return table(heads, ([*_row(name, one, variables), *[_left_out_cell(one)] * joint] for name, one in rows))
 
 
-def _row(name: str, recorded: str, recording: Mapping[str, Any], variables: Sequence[str]) -> list[Cell]:
-    frames = recording["frames"]
-    worst = int(np.argmax(recording["frame_rms_mm"]))
+def _row(name: str, recording: RecordingFit, variables: Sequence[str]) -> list[Cell]:
+    frames = recording.frames
+    worst = int(np.argmax(recording.frame_rms_mm))
     return [
         Cell(name),
-        Cell(recorded),
-        number(recording["rms_mm"], 1, note=f"{recording['frame_rms_mm'][worst]:.1f} in frame {frames[worst]}"),
-        number(recording.get("rms_to_recording_mm"), 1),
-        number(recording.get("rms_to_cloth_mm"), 1),
+        Cell(recording.name),
+        number(recording.rms_mm, 1, note=f"{recording.frame_rms_mm[worst]:.1f} in frame {frames[worst]}"),
+        number(recording.rms_to_recording_mm, 1),
+        number(recording.rms_to_cloth_mm, 1),
         Cell(f"{len(frames)}", sort=len(frames), note=f"{frames[0]} to {frames[-1]}"),
-        number(float(np.mean(recording["counted"])), 0, factor=100, unit=" %"),
-        number(recording["cut_m"], 0, factor=1e3),
-        *(_pose_cell(recording["nuisance"].get(key)) for key in variables),
+        number(float(np.mean(recording.counted)), 0, factor=100, unit=" %"),
+        number(recording.cut_m, 0, factor=1e3),
+        *(_pose_cell(recording.nuisance.get(key)) for key in variables),
     ]
 
 
-def _pose_cell(entry: Mapping[str, Any] | None) -> Cell:
+def _left_out_cell(recording: RecordingFit) -> Cell:
+    """With the parameters that the other recordings of a joint fit give."""
+    return UNKNOWN if recording.left_out is None else number(recording.left_out.rms_mm, 1)
+
+
+def _pose_cell(entry: NuisanceValue | None) -> Cell:
     if entry is None:
         return UNKNOWN
-    factor, _, digits = _SHOWN[entry["unit"]]
-    far = abs(entry["value"]) > _WIDE * entry["prior"]
-    return number(entry["value"], digits, factor=factor, note="beyond its prior" if far else "")
+    factor, _, digits = _SHOWN[entry.unit]
+    far = abs(entry.value) > _WIDE * entry.prior
+    return number(entry.value, digits, factor=factor, note="beyond its prior" if far else "")

@@ -123,7 +123,7 @@ def test_a_simulated_episode_is_fitted_below_the_papers_threshold(release, kind)
     episode = next(e for s, n, e in release_episodes(release) if s == f"release_{kind}" and n == "1")
     space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
     settings = AdamSettings(learning_rate=scenario.learning_rate, threshold=scenario.threshold)
-    outcome = fit_adam(Objective(scenario, [episode], paper=True), space, settings)
+    outcome = fit_adam(Objective(scenario, episode, paper=True), space, settings)
     assert outcome.loss < scenario.threshold
     assert outcome.iterations > 0
 
@@ -134,7 +134,7 @@ def test_a_single_start_fit_beats_every_published_prediction(release, kind):
     name = f"release_{kind}"
     scenario = scenario_of(release, name)
     label, episode = next((n, e) for s, n, e in release_episodes(release) if s == name)
-    objective = Objective(scenario, [episode], paper=True)
+    objective = Objective(scenario, episode, paper=True)
     space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
     outcome = fit_adam(objective, space, AdamSettings(learning_rate=scenario.learning_rate, smoothing=SMOOTHING))
     pairs = episode.meta["predictions"].values()

@@ -12,8 +12,10 @@ import yaml
 from diffcloud.io.calibrations import Calibration, CameraCalibration, write_calibration
 from diffcloud.io.clouds import write_ply
 from diffcloud.io.episodes import Episode, write_episode
+from diffcloud.scene.scenarios import load_scenario
 from diffcloud.sensing.cameras import inverse
 from tests.docs.examples import Example, examples, read
+from tests.fit.test_fit import clouds_of
 from tests.io.test_recordings import bag
 from tests.pipeline.invoke import invoke
 from tests.sensing.charuco_scene import gripper_poses
@@ -57,6 +59,12 @@ def lift_episode(folder: Path) -> None:
     invoke("rollout", "--scenario", "quick", "--out", "run.npz")
     with np.load("run.npz") as run:
         write_episode(folder / "my_episode.npz", Episode.from_frames(list(run["nodes"]), run["times"]))
+
+
+def motions(folder: Path) -> None:
+    """Two lifts and a fold of one cloth."""
+    for name, scenario, seed in (("a", "lift", 1), ("b", "lift", 2), ("c", "fold", 3)):
+        write_episode(folder / f"{name}.npz", clouds_of(load_scenario(scenario), stretch=0.7, seed=seed))
 
 
 def board(folder: Path) -> None:
@@ -121,6 +129,7 @@ def quick(folder: Path) -> None:
 PREPARED = {
     "README.md": own_clouds,
     "docs/calibration.md": board,
+    "docs/concepts.md": motions,
     "docs/capture.md": lab,
     "docs/evaluation.md": fitted,
     "docs/pipeline.md": quick,

@@ -28,7 +28,7 @@ SMALLER = {
     "visibility": "--size 2",
     "simulate": "--train 4 --test 5",
     "train": "--epochs 1 --points 32",
-    "fit": "--starts 1 --iterations 1 --points 200",
+    "fit": "--starts 1 --screen 0 --iterations 1 --points 200",
     "gradients": "--pairs 1",
     "evaluate loss": "--points 200",
     "evaluate release": "--only release_lift/lift_tan --allow-missing --workers 1",

@@ -21,6 +21,8 @@ class Bowl:
 
     target: dict[str, float] = field(default_factory=lambda: {"stretch": 0.7, "mass": 2.0})
     diverges_above: float = float("inf")
+    length_unit_m: float = 1.0
+    members: tuple[None, ...] = (None,)
     calls: int = 0
 
     def __post_init__(self) -> None:
@@ -66,6 +68,7 @@ class KnownResiduals:
         x = 10 + run @ self.rows.T + self.errors
         return torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], dim=-1)[:, None]
 
+    @property
     def clouds(self):
         return (NeighbourIndex(torch.zeros(1, 3).double()),)
 

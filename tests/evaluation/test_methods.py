@@ -20,8 +20,11 @@ from diffcloud.evaluation.methods import (
 )
 from diffcloud.fit import AdamSettings, CmaEsSettings, RandomSearchSettings, fit_adam, solve
 from diffcloud.fit.batches import batch_losses, without_diverged
+from diffcloud.fit.parameters import Variable
+from diffcloud.fit.record import History
 from diffcloud.fit.solvers import SOLVER_NAMES
 from tests.evaluation.bowls import SPACE, Bowl
+from tests.fit.records import parameter_of, record_of
 
 
 def loss_of(bowl, values):
@@ -31,14 +34,13 @@ def loss_of(bowl, values):
 def summary_of(outcome):
     """The parts of a fit's file that matter here."""
     history = outcome.history
-    told = {"names": list(history.names), "loss": [row.tolist() for row in history.losses]}
-    told["values"] = [row.tolist() for row in history.values]
-    return {
-        "solver": "adam",
-        "settings": {"smoothing": 0.0, "resample": False},
-        "stop_reason": outcome.stop_reason,
-        "history": told,
-    }
+    told = History(
+        names=list(history.names),
+        loss=[row.tolist() for row in history.losses],
+        values=[row.tolist() for row in history.values],
+        gradient_norm=[],
+    )
+    return record_of(stop_reason=outcome.stop_reason, history=told)
 
 
 @pytest.mark.parametrize("settings", [RandomSearchSettings(23), CmaEsSettings(23)])
@@ -59,10 +61,10 @@ def test_one_start_is_the_first_of_many():
     found = first_start(summary, SPACE)
     assert found.values == pytest.approx(alone.values, rel=1e-12)
     assert found.simulations == 13
-    assert first_start({**summary, "solver": "gauss_newton"}, SPACE) is None
+    assert first_start(summary.model_copy(update={"solver": "gauss_newton"}), SPACE) is None
     for change in ({"smoothing": 0.5}, {"resample": True}):
-        assert first_start({**summary, "settings": {**summary["settings"], **change}}, SPACE) is None
-    assert first_start({**summary, "stop_reason": "threshold"}, SPACE) is None
+        assert first_start(summary.model_copy(update={"settings": summary.settings | change}), SPACE) is None
+    assert first_start(summary.model_copy(update={"stop_reason": "threshold"}), SPACE) is None
     elsewhere = fit_adam(Bowl(), SPACE, AdamSettings(iterations=2, init={"mass": 1.0}))
     assert first_start(summary_of(elsewhere), SPACE) is None
 
@@ -90,8 +92,7 @@ def test_an_interrupted_rival_is_no_result(rival, monkeypatch):
 
 @pytest.mark.parametrize(("solver", "gradients"), [("gauss_newton", True), ("adam", True), ("random_search", False)])
 def test_a_fit_by_a_search_had_no_gradients(solver, gradients):
-    summary = {"solver": solver, "parameters": {"mass": {"value": 1.0}}, "evaluations": 3, "seconds": 0.5}
-    assert fitted(summary).gradients is gradients
+    assert fitted(record_of(solver=solver)).gradients is gradients
 
 
 def test_batches_without_the_diverged_are_the_single_ones():
@@ -117,16 +118,16 @@ def test_every_lost_entry_has_its_own_message():
 
 
 class TestValues:
-    SUMMARY = {  # noqa: RUF012 - nothing changes it
-        "parameters": {
-            "stretch": {"value": 2.0, "fixed": False, "bounds": [0.5, 4.0]},
-            "mass": {"value": 1.2, "fixed": True, "bounds": None},
+    SUMMARY = record_of(
+        parameters={
+            "stretch": parameter_of(value=2.0, bounds=(0.5, 4.0), prior=3.0),
+            "mass": parameter_of(value=1.2, fixed=True, bounds=None),
         }
-    }
+    )
 
     def test_what_was_given_holds_for_all_methods(self):
         space = space_of(self.SUMMARY)
-        assert space.names == ("stretch",)
+        assert space.variables == (Variable("stretch", 0.5, 4.0, 3.0),)
         parameters = space.parameters(torch.tensor([[2.0]]).double())
         assert {name: float(value) for name, value in parameters.items()} == {"stretch": 2.0, "mass": 1.2}
 

@@ -13,6 +13,7 @@ from diffcloud.clouds import NeighbourIndex, chamfer
 from diffcloud.evaluation import ComparisonSettings, EpisodeMeter, Estimate, Gap, compare_episode, loss_landscape
 from diffcloud.evaluation.metrics import success_threshold
 from diffcloud.fit import AdamSettings, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
+from diffcloud.fit.record import History
 from diffcloud.fit.result import describe_fit
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import built_in, make_scenario
@@ -45,18 +46,18 @@ def rows(scenario, episode):
 class TestMeter:
     def test_loss_is_the_fits_with_fresh_points(self, scenario, episode, rows):
         with torch.no_grad():
-            found = [paper_objective(scenario, [episode], seed=seed)(batch(TRUTH, OTHER)) for seed in (7, 8)]
+            found = [paper_objective(scenario, episode, seed=seed)(batch(TRUTH, OTHER)) for seed in (7, 8)]
         torch.testing.assert_close(torch.tensor([row["loss"] for row in rows]).double(), torch.stack(found).mean(0))
         assert rows[1]["loss_deviation"] == pytest.approx(float(torch.stack(found).std(0)[1]))
         assert rows[1]["rms_mm"] == pytest.approx(1e3 * math.sqrt(rows[1]["loss"]))
 
     def test_other_frames_are_all_but_the_first_and_the_fits(self, scenario, episode, rows):
         with torch.no_grad():
-            found = paper_objective(scenario, [episode], frames=[1, 2, 3, 4], seed=7)(batch(TRUTH, OTHER))
+            found = paper_objective(scenario, episode, frames=[1, 2, 3, 4], seed=7)(batch(TRUTH, OTHER))
         torch.testing.assert_close(torch.tensor([row["loss_other_frames"] for row in rows]).double(), found)
 
     def test_two_sided_is_both_directions(self, scenario, episode, rows):
-        objective = paper_objective(scenario, [episode], seed=7)
+        objective = paper_objective(scenario, episode, seed=7)
         with torch.no_grad():
             points = objective.points(objective.simulate(batch(OTHER)))[:, 0]
         target = NeighbourIndex(torch.as_tensor(episode.frame(-1)).double())
@@ -88,8 +89,9 @@ class TestMeter:
 
 
 def test_landscape_is_the_loss_on_a_grid(scenario, episode):
-    objective, space = paper_objective(scenario, [episode]), FitSpace.build(["stretch", "mass"])
-    history = {"names": ["stretch", "mass"], "values": [[[1.0, 2.0], [None, None]], [[1.1, 2.1], [3.0, 3.0]]]}
+    objective, space = paper_objective(scenario, episode), FitSpace.build(["stretch", "mass"])
+    values = [[[1.0, 2.0], [None, None]], [[1.1, 2.1], [3.0, 3.0]]]
+    history = History(names=["stretch", "mass"], loss=[], values=values, gradient_norm=[])
     found = loss_landscape(objective, space, TRUTH, history, size=3)
     assert found["x"] == pytest.approx([0.1, 1.0, 10.0])
     with torch.no_grad():
@@ -101,10 +103,10 @@ def test_landscape_is_the_loss_on_a_grid(scenario, episode):
 
 @pytest.fixture(scope="module")
 def summary(scenario, episode):
-    objective, space = paper_objective(scenario, [episode]), FitSpace.build(["stretch", "mass"])
+    objective, space = paper_objective(scenario, episode), FitSpace.build(["stretch", "mass"])
     settings = AdamSettings(iterations=3, starts=2)
     outcome = fit_adam(objective, space, settings)
-    return describe_fit(objective, space, settings, outcome, episodes=["e"]).summary
+    return describe_fit(objective, space, settings, outcome, episodes=["e"]).record
 
 
 @pytest.fixture(scope="module")
@@ -131,14 +133,14 @@ class TestEpisode:
         assert [row["simulations"] for row in rows.values()] == [8, 4, 0, 4, 4, 0]
         assert rows["mlp"]["clipped"] == {"stretch": 10.0, "mass": 1.0}
         assert not rows["mlp"]["inside"]
-        assert rows["diffcloud"]["clipped"] == {name: entry["value"] for name, entry in summary["parameters"].items()}
+        assert rows["diffcloud"]["clipped"] == summary.values
         assert found.record["gaps"] == [{"method": "meteornet", "reason": "lost", "expected": True}]
         assert found.seconds["mlp"] == {"inference": 0.1}
-        assert found.seconds["diffcloud"] == {"optimisation": summary["seconds"]}
+        assert found.seconds["diffcloud"] == {"optimisation": summary.seconds}
 
     def test_the_start_is_measured_as_the_methods_are(self, scenario, episode, found, summary):
         meter = EpisodeMeter(scenario, episode, paper=True, draws=2)
-        assert found.record["start"] == pytest.approx(meter.measure([summary["start"]]).rows[0])
+        assert found.record["start"] == pytest.approx(meter.measure([summary.start]).rows[0])
 
     def test_transfer_is_measured_as_the_methods_are(self, found):
         (row,) = found.record["transfers"]
@@ -152,9 +154,9 @@ class TestEpisode:
         assert np.array(found.record["landscape"]["loss"]).shape == (3, 3)
 
     def test_a_fit_by_a_search_is_compared_as_others_are(self, scenario, episode):
-        objective, space = Objective(scenario, [episode], seed=1000), FitSpace.build(["stretch", "mass"])
+        objective, space = Objective(scenario, episode, seed=1000), FitSpace.build(["stretch", "mass"])
         settings = RandomSearchSettings(simulations=6, seed=1000)
-        summary = describe_fit(objective, space, settings, solve(objective, space, settings), episodes=["e"]).summary
+        summary = describe_fit(objective, space, settings, solve(objective, space, settings), episodes=["e"]).record
         chosen = ComparisonSettings(draws=1, seed=1000, identifiability=False, landscape_size=2)
         record = compare_episode(scenario, episode, summary, name="e", settings=chosen).record
         rows = {row["method"]: row for row in record["methods"]}
@@ -181,6 +183,6 @@ def test_what_has_no_stiffness_of_its_own_leaves_the_motion_alone():
     from diffcloud.evaluation import identify
 
     scenario = make_scenario(built_in("lift").model_copy(update={"nodes": (5, 5), "frames": 8, "points": 500}))
-    objective = paper_objective(scenario, [clouds_of(scenario, stretch=1.0, mass=1.0)])
+    objective = paper_objective(scenario, clouds_of(scenario, stretch=1.0, mass=1.0))
     scale = identify(objective, FitSpace.build(["stretch", "mass"]), {"stretch": 1.0, "mass": 1.0}, draws=2)["scale"]
     assert scale["everything"] < 0.5 * scale["fitted"] or scale["everything"] < 1.0

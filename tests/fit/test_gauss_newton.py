@@ -11,7 +11,7 @@ import torch
 
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.errors import DivergedError
-from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton, residuals
+from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton, residuals
 from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.residuals import Axis, linearise
 from tests.conftest import paper_objective, small_lift
@@ -24,7 +24,7 @@ SPACE = FitSpace.build(["stretch", "mass"])
 def lifted(*, integrator="implicit", **measure):
     """A slow lift, and the objective of a dense recording of the truth, by default with the paper's measure."""
     scenario = small_lift(**{**GENTLE, "integrator": integrator, "points": 500})
-    return Objective(scenario, [clouds_of(scenario, points=8000, **TRUTH)], **(measure or {"paper": True}))
+    return Objective(scenario, clouds_of(scenario, points=8000, **TRUTH), **(measure or {"paper": True}))
 
 
 def at(objective, space, places):
@@ -48,8 +48,9 @@ class TestLinearisation:
         scenario = small_lift(integrator="implicit", points=300)
         episodes = [clouds_of(scenario, seed=seed, **TRUTH) for seed in (1, 2)]
         places = Axis.of(SPACE).places(SPACE.starts(2, seed=1)[0])
-        both = linearise(paper_objective(scenario, episodes), SPACE, places)
-        one, other = (linearise(paper_objective(scenario, [episode]), SPACE, places) for episode in episodes)
+        members = [paper_objective(scenario, episode) for episode in episodes]
+        both = linearise(JointObjective(members), SPACE, places)
+        one, other = (linearise(member, SPACE, places) for member in members)
         for name in ("losses", "slope", "curvature"):
             torch.testing.assert_close(getattr(both, name), (getattr(one, name) + getattr(other, name)) / 2)
         assert both.simulations == 4
@@ -114,7 +115,7 @@ class TestFits:
     def test_the_truth_is_found_in_few_runs(self):
         found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=2, screen=15))
         assert found.stop_reason == "converged"
-        assert found.evaluations <= 60
+        assert found.simulations <= 60
         assert found.values["stretch"] / found.values["mass"] == pytest.approx(TRUTH["stretch"] / TRUTH["mass"], rel=0.05)
         noise = lifted()({name: torch.tensor([value]).double() for name, value in TRUTH.items()})
         assert found.loss <= 1.02 * float(noise)  # the fit's own points, to which it adapts
@@ -141,11 +142,11 @@ class TestFits:
         found = fit_gauss_newton(objective, SPACE, GaussNewtonSettings(starts=1, screen=7, iterations=1))
         candidates = batch_losses(objective, SPACE, SPACE.starts(8, seed=0)[0].double())
         assert found.loss_start == pytest.approx(float(candidates.min()), rel=1e-9)
-        assert found.evaluations == 8 + 2
+        assert found.simulations == 8 + 2
 
     def test_without_a_screen_starts_are_spread(self):
         found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=3, screen=0, iterations=1))
-        assert found.evaluations == 6
+        assert found.simulations == 6
         torch.testing.assert_close(found.history.values[0], SPACE.starts(3, seed=0)[0].double())
 
     def test_bounds_hold_and_the_rest_goes_on(self):
@@ -159,7 +160,7 @@ class TestFits:
         settings = GaussNewtonSettings(starts=2, screen=7, iterations=4)
         one, other = (fit_gauss_newton(lifted(), SPACE, settings) for _ in range(2))
         assert one.values == other.values
-        assert one.evaluations == other.evaluations
+        assert one.simulations == other.simulations
 
     @pytest.mark.parametrize(("settings", "reason"), [({"threshold": 1.0}, "threshold"), ({"iterations": 1}, "iterations")])
     def test_other_ends(self, settings, reason):

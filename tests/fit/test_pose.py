@@ -88,7 +88,8 @@ class TestText:
         ("text", "message"),
         [
             ("jaw=30deg", "Unknown nuisance variable 'jaw'. Did you mean 'yaw'"),
-            ("x", "x takes how far it may well be off, a positive number in one of m, cm, mm, such as x=0.1m"),
+            ("x", "x takes how far it may well be off, a positive number in one of m, cm, mm, such as x=2cm"),
+            ("yaw=30", "one of rad, deg, such as yaw=5deg"),
             ("x=30deg", "one of m, cm, mm"),
             ("yaw=1m", "one of rad, deg"),
             ("x=0.1parsec", "one of m, cm, mm"),
@@ -109,8 +110,9 @@ class TestRecords:
     def test_lengths_are_kept_in_metres(self, poses):
         scene = space(unit=0.35)
         kept = scene.described(poses[0], length_unit_m=0.35)
-        assert kept["x"] == {"value": pytest.approx(0.35 * float(poses[0, 0])), "prior": pytest.approx(0.1), "unit": "m"}
-        assert kept["yaw"]["value"] == pytest.approx(float(poses[0, 5]))
+        assert kept["x"].value == pytest.approx(0.35 * float(poses[0, 0]))
+        assert (kept["x"].prior, kept["x"].unit) == (pytest.approx(0.1), "m")
+        assert kept["yaw"].value == pytest.approx(float(poses[0, 5]))
         torch.testing.assert_close(scene.of(kept, length_unit_m=0.35), poses[0])
 
     @pytest.mark.parametrize("priors", [{"jaw": 0.1}, {"x": 0.0}, {"x": math.inf}])

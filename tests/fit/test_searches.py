@@ -10,7 +10,8 @@ import torch
 
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit import CmaEsSettings, FitSpace, Objective, RandomSearchSettings, solve
-from diffcloud.fit.result import describe_fit, read_fit, write_fit
+from diffcloud.fit.record import read_fit
+from diffcloud.fit.result import describe_fit, write_fit
 from diffcloud.fit.solvers import SOLVER_NAMES, SOLVERS
 from tests.conftest import small_lift
 from tests.evaluation.bowls import SPACE, Bowl
@@ -44,7 +45,7 @@ class TestSearch:
     def test_spends_its_budget_and_no_more(self, settings, simulations):
         bowl = Counted()
         found = solve(bowl, SPACE, settings(simulations=simulations))
-        assert found.evaluations == len(bowl.asked) == simulations
+        assert found.simulations == len(bowl.asked) == simulations
         assert found.stop_reason == "simulations"
 
     def test_begins_in_the_middle_or_where_it_is_told_and_stays_inside(self, settings):
@@ -76,9 +77,9 @@ class TestSearch:
         found = solve(Bowl(), SPACE, settings(simulations=500, threshold=0.5))
         assert found.stop_reason == "threshold"
         assert found.loss < 0.5
-        assert found.evaluations < 500
+        assert found.simulations < 500
         at_once = solve(Bowl(), SPACE, settings(threshold=1e3))
-        assert (at_once.evaluations, at_once.iterations, at_once.stop_reason) == (1, 0, "threshold")
+        assert (at_once.simulations, at_once.iterations, at_once.stop_reason) == (1, 0, "threshold")
 
     def test_goes_on_where_some_diverge_the_first_among_them(self, settings):
         found = solve(Bowl(diverges_above=4.0), SPACE, settings(simulations=120))
@@ -101,7 +102,7 @@ class TestSearch:
 
         found = solve(Bowl(), SPACE, settings(), progress=interrupt)
         assert found.stop_reason == "interrupted"
-        assert found.evaluations == told[-1].simulations
+        assert found.simulations == told[-1].simulations
         assert (found.loss, found.values) == (told[-1].best, told[-1].values)
 
     def test_ctrl_c_within_a_simulation_or_before_the_first_loss(self, settings):
@@ -125,11 +126,12 @@ class TestSearch:
     def test_a_range_from_zero_is_searched_linearly(self, settings):
         """Where a logarithm would never come near the bound."""
 
-        def line(parameters):
-            return (10 * parameters["damping"] - 0.2).square() + (parameters["mass"] / 2).log().square()
+        class Line(Bowl):
+            def __call__(self, parameters):
+                return (10 * parameters["damping"] - 0.2).square() + (parameters["mass"] / 2).log().square()
 
         space = FitSpace.build(["damping", "mass"], bounds={"damping": (0.0, 0.1)})
-        found = solve(line, space, settings(simulations=300))
+        found = solve(Line(), space, settings(simulations=300))
         assert found.values["damping"] == pytest.approx(0.02, abs=0.01)
 
     def test_needs_a_simulation(self, settings):
@@ -138,15 +140,15 @@ class TestSearch:
 
     def test_files_tell_the_solver_and_its_settings(self, settings, tmp_path):
         scenario = small_lift()
-        objective = Objective(scenario, [clouds_of(scenario, stretch=0.6, mass=1.0)])
+        objective = Objective(scenario, clouds_of(scenario, stretch=0.6, mass=1.0))
         chosen = settings(simulations=9, seed=2)
         found = solve(objective, SPACE, chosen)
-        summary = read_fit(write_fit(tmp_path, "e", describe_fit(objective, SPACE, chosen, found, episodes=["e"])))
-        assert SOLVERS[summary["solver"]] is settings
-        assert summary["evaluations"] == summary["settings"]["simulations"] == 9
-        assert summary["settings"]["seed"] == 2
-        assert summary["history"]["gradient_norm"] == []
-        assert "starts" not in summary["settings"]
+        told = read_fit(write_fit(tmp_path, "e", describe_fit(objective, SPACE, chosen, found, episodes=["e"])))
+        assert SOLVERS[told.solver] is settings
+        assert told.simulations == told.settings["simulations"] == 9
+        assert told.settings["seed"] == told.measure.seed == 2
+        assert told.history.gradient_norm == []
+        assert "starts" not in told.settings
 
 
 def test_cma_es_beats_random_search_in_a_bowl():
@@ -157,7 +159,7 @@ def test_cma_es_beats_random_search_in_a_bowl():
 def test_cma_es_says_when_it_has_arrived():
     found = solve(Bowl(), SPACE, CmaEsSettings(simulations=5000))
     assert found.stop_reason == "converged"
-    assert found.evaluations < 5000
+    assert found.simulations < 5000
 
 
 def test_a_larger_budget_begins_with_the_draws_of_a_smaller_one():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import signal
 import subprocess
@@ -18,6 +19,7 @@ import yaml
 from diffcloud.fit import Objective
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.obj import read_cloth, read_surface
+from diffcloud.scene.scenarios import load_scenario
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
 from tests.pipeline.invoke import DIFFCLOUD, ROOT, Invoked, invoke
@@ -86,7 +88,7 @@ def test_a_fit_by_a_search(work, solver):
     command = ("fit", "--scenario", "small.yaml", "--out", "fits", "--solver", solver, "--simulations", 12)
     done = run(*command, "--init", "stretch=2,mass=1", "e1.npz", cwd=work)
     summary = json.loads((work / "fits" / "e1.json").read_text())
-    assert (summary["solver"], summary["evaluations"], summary["stop_reason"]) == (solver, 12, "simulations")
+    assert (summary["solver"], summary["simulations"], summary["stop_reason"]) == (solver, 12, "simulations")
     assert summary["start"] == {"stretch": 2.0, "mass": 1.0}
     assert done.result["fits"]["e1"]["loss"] == summary["loss"] <= summary["loss_start"]
     for options, message in (
@@ -104,8 +106,71 @@ def test_a_fit_by_a_search(work, solver):
 def test_joint_fit_gives_one_result(work):
     write_episode(work / "e2.npz", clouds_of(small_lift(), stretch=1.4, mass=1.0))
     run("fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 1, "--joint", "e1.npz", "e2.npz", cwd=work)
-    assert json.loads((work / "fits" / "joint.json").read_text())["episodes"] == ["e1", "e2"]
+    assert json.loads((work / "fits" / "joint.json").read_text())["episodes"][1]["name"] == "e2"
     assert sorted(path.name for path in (work / "fits").iterdir()) == ["joint.json", "joint.npz"]
+
+
+class TestJointFitOverMotions:
+    """One cloth that is lifted, and pulled to the side."""
+
+    @pytest.fixture
+    def motions(self, work):
+        told = yaml.safe_load((work / "small.yaml").read_text())
+        (work / "side.yaml").write_text(yaml.safe_dump({**told, "path": [[0, 0, 0, 0], [0.5, 0.1, 0, 0.1]]}))
+        write_episode(work / "s1.npz", clouds_of(load_scenario(str(work / "side.yaml")), stretch=1.4, mass=1.0))
+        return work
+
+    def test_each_recording_has_its_own_pose_and_loss(self, motions):
+        pairs = ("small.yaml=e1.npz", "side.yaml=s1.npz")
+        done = run("fit", "--joint", *pairs, "--out", "fits", "--iterations", 2, "--fix", "mass=1", cwd=motions)
+        joint = json.loads((motions / "fits" / "joint.json").read_text())
+        assert [(one["scenario"], one["name"]) for one in joint["episodes"]] == [("small", "e1"), ("side", "s1")]
+        losses = [one["loss"] for one in joint["episodes"]]
+        assert joint["loss"] == pytest.approx(math.sqrt(losses[0] * losses[1]), rel=1e-9)
+        for one in joint["episodes"]:
+            assert {"x", "y", "yaw"} == set(one["nuisance"])
+            assert one["left_out"]["loss"] >= 0.5 * one["loss"]
+        assert "with the parameters of the others" in done.errors
+        assert done.result["fits"]["joint"]["loss"] == joint["loss"]
+        run(
+            "rollout",
+            "--scenario",
+            "side.yaml",
+            "--fit",
+            "fits/joint.json",
+            "--episode",
+            "s1.npz",
+            "--out",
+            "r.npz",
+            cwd=motions,
+        )
+        with np.load(motions / "r.npz") as replay, np.load(motions / "fits" / "joint.npz") as fitted:
+            np.testing.assert_allclose(replay["nodes"], fitted["nodes_1"], atol=1e-12)
+
+    def test_a_list_says_the_same(self, motions):
+        (motions / "cloth.yaml").write_text("small.yaml: e1.npz\nside.yaml: [s1.npz]\n")
+        run("fit", "--joint", "cloth.yaml", "--out", "fits", "--iterations", 1, cwd=motions)
+        assert len(json.loads((motions / "fits" / "joint.json").read_text())["episodes"]) == 2
+        run("fit", "cloth.yaml", "--out", "single", "--iterations", 1, cwd=motions)
+        assert (motions / "single" / "side" / "s1.json").is_file()
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (("small.yaml=e1.npz", "e1.npz"), "Give each episode its scenario, as in lift=a.npz fold=b.npz"),
+            (("small.yaml=e1.npz", "--scenario", "small.yaml"), "leave out --scenario"),
+            (("small.yaml=e1.npz", "small.yaml=e1.npz"), "Two episodes have the same name"),
+            (("small.yaml=e1.npz", "denim.yaml=s1.npz"), "is of one cloth"),
+            (("empty.yaml",), "lists 0 episodes"),
+            (("number.yaml",), "small takes the path of an episode"),
+        ],
+    )
+    def test_what_is_no_list_of_recordings(self, motions, arguments, message):
+        (motions / "denim.yaml").write_text(yaml.safe_dump({**SMALL, "material": "denim"}))
+        (motions / "empty.yaml").write_text("[]")
+        (motions / "number.yaml").write_text("small: 3")
+        assert message in run("fit", "--joint", *arguments, "--out", "fits", cwd=motions, code=1).errors
+        assert not (motions / "fits").exists() or not list((motions / "fits").iterdir())
 
 
 def test_a_process_says_what_is_wrong_without_a_traceback(work):

@@ -85,7 +85,7 @@ def test_tables_hold_methods_repeats_and_transfer(work):
     assert set(tables["repeatability"]["parameter"]) == {"stretch", "mass", "ratio"}
     assert len(tables["identifiability"]) == 4
     metrics = json.loads((work / "reports" / "metrics.json").read_text())
-    budgets = [read_fit(path)["evaluations"] for path in (work / "data" / "fits" / "small").glob("*.json")]
+    budgets = [read_fit(path).simulations for path in (work / "data" / "fits" / "small").glob("*.json")]
     spent = metrics["comparison"]["methods"]["small"]
     assert spent["diffcloud"]["simulations"] == spent["cma_es"]["simulations"] == np.mean(budgets)
 

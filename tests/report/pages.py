@@ -4,37 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.fit.result import FittedMotion
 from diffcloud.io.episodes import Episode
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.report import EpisodeEntry, build_page
+from tests.fit.records import record_of, recording_of
 
 _TRIANGLE = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 2)
 
 
 def entry(name="tan1", *, scenario="lift", fabric="tan", failures=()):
-    fit = {
-        "parameters": {"stretch": {"value": 1.5, "physical": 60.0, "physical_unit": "N/m"}},
-        "history": {"loss": [[0.2], [0.1]]},
-        "episodes": [name],
-        "recordings": {
-            name: {
-                "rms_mm": 10.0,
-                "rms_to_recording_mm": 12.0,
-                "rms_to_cloth_mm": 7.5,
-                "frames": [1],
-                "frame_rms_mm": [10.0],
-                "counted": [0.8],
-                "cut_m": None,
-                "nuisance": {
-                    "x": {"value": 0.21, "prior": 0.1, "unit": "m"},
-                    "yaw": {"value": 0.1, "prior": 0.5, "unit": "rad"},
-                },
-            }
-        },
-        "iterations": 2,
-        "seconds": 1.5,
-        "failures": list(failures),
+    nuisance = {
+        "x": {"value": 0.21, "prior": 0.1, "unit": "m"},
+        "yaw": {"value": 0.1, "prior": 0.5, "unit": "rad"},
     }
+    fit = record_of(recording_of(name, scenario=scenario, nuisance=nuisance), failures=list(failures))
     row = {
         "rms_start_mm": 20.0,
         "rms_mm": 10.0,
@@ -48,12 +32,15 @@ def entry(name="tan1", *, scenario="lift", fabric="tan", failures=()):
         name=name,
         row=row,
         fit=fit,
+        recording=fit.episodes[0],
         episode=recorded,
-        nodes=_TRIANGLE,
-        start_nodes=_TRIANGLE,
-        faces=np.array([[0, 1, 2]]),
-        times=np.array([0.0, 0.1]),
-        bodies=SurfaceMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)),
+        motion=FittedMotion(
+            nodes=_TRIANGLE,
+            start_nodes=_TRIANGLE,
+            faces=np.array([[0, 1, 2]]),
+            times=np.array([0.0, 0.1]),
+            bodies=SurfaceMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)),
+        ),
     )
 
 

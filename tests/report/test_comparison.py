@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import pytest
 
 from diffcloud.evaluation.summary import tables
+from diffcloud.fit.record import History
 from diffcloud.report import ComparisonEntry, comparison_figures
 from diffcloud.report.comparison import comparison_failures, comparison_overview
 from tests.evaluation.records import record, records
@@ -21,7 +22,8 @@ SECONDS = {
         "middle": {},
     }
 }
-HISTORIES = {("lift", "tan1"): {"loss": [[0.1, 0.2], [None, 0.15], [0.05, None]]}}
+_HISTORY = History(names=[], loss=[[0.1, 0.2], [None, 0.15], [0.05, None]], values=[], gradient_norm=[])
+HISTORIES = {("lift", "tan1"): _HISTORY}
 
 
 @pytest.fixture(scope="module")

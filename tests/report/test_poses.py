@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from diffcloud.fit.record import LeftOut
 from diffcloud.report.poses import poses_table
 from tests.report.pages import entry
 
@@ -17,10 +18,19 @@ def test_poses_are_shown_in_millimetres_and_degrees_and_pointed_out_beyond_their
     assert cells["cut mm"].text == "–"
 
 
+def test_a_joint_fit_shows_what_the_others_say_of_each():
+    one, other = entry("a").fit, entry("b").fit
+    assert "RMS mm by the others" not in poses_table([("a", one)]).heads
+    one.episodes[0].left_out = LeftOut(loss=1e-4, rms_mm=11.3, parameters={})
+    found = poses_table([("a", one), ("b", other)])
+    assert found.heads[-1] == "RMS mm by the others"
+    assert [row[-1].text for row in found.rows] == ["11.3", "–"]
+
+
 def test_what_a_fit_did_not_free_is_a_dash():
     one, other = entry("a").fit, entry("b").fit
-    other["recordings"]["b"]["nuisance"] = {}
-    del other["recordings"]["b"]["rms_to_cloth_mm"]  # the paper's measure has one direction
+    other.episodes[0].nuisance = {}
+    other.episodes[0].rms_to_cloth_mm = None  # the paper's measure has one direction
     found = poses_table([("a", one), ("b", other)])
     row = dict(zip(found.heads, found.rows[1], strict=True))
     assert row["x mm"].text == row["cloud to cloth mm"].text == "–"

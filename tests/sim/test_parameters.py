@@ -29,12 +29,12 @@ def test_every_parameter_has_bounds_it_allows_and_a_physical_value(name):
     check_values({name: parameter.bounds[0]}, "the lower bound of")
     check_values({name: parameter.bounds[1]}, "the upper bound of")
     told = physical_values(load_scenario("lift"), {name: 0.5})[name]
-    assert told["physical_unit"] == parameter.unit
-    assert told["meaning"] == parameter.meaning
+    assert told.physical_unit == parameter.unit
+    assert told.meaning == parameter.meaning
     if parameter.basis is None:
-        assert told["physical"] == 0.5
+        assert told.physical == 0.5
     elif name != "body_mass":  # the lift has no bodies
-        assert told["physical"] == 0.5 * load_scenario("lift").scene.basis(parameter.basis) > 0
+        assert told.physical == 0.5 * load_scenario("lift").scene.basis(parameter.basis) > 0
 
 
 @pytest.mark.parametrize("name", PARAMETERS)

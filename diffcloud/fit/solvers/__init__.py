@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from diffcloud.fit.objective import Objective
+from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.solvers.adam import AdamSettings, fit_adam
 from diffcloud.fit.solvers.cma_es import CmaEsSettings, fit_cma_es
@@ -50,7 +50,7 @@ __all__ = [
 
 
 def solve(
-    objective: Objective,
+    objective: AnyObjective,
     space: FitSpace,
     settings: Settings,
     *,

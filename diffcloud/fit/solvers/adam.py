@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from diffcloud.errors import DivergedError
-from diffcloud.fit.batches import batch_losses
-from diffcloud.fit.objective import Objective
+from diffcloud.fit.batches import batch_losses, posterior_losses
+from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
 
@@ -57,7 +57,7 @@ class AdamSettings:
 
 
 def fit_adam(
-    objective: Objective,
+    objective: AnyObjective,
     space: FitSpace,
     settings: AdamSettings,
     *,
@@ -72,7 +72,7 @@ def fit_adam(
         KeyboardInterrupt: interrupted before the first loss.
     """
     began = time.perf_counter()
-    start_values, logarithmic, evaluations = _starts(objective, space, settings)
+    start_values, logarithmic, simulations = _starts(objective, space, settings)
     iterates = [row.clone().requires_grad_(True) for row in space.unbounded(start_values, logarithmic)]
     optimiser = torch.optim.Adam([{"params": [row]} for row in iterates], lr=settings.learning_rate)
     patience = _Patience(settings)
@@ -94,8 +94,8 @@ def fit_adam(
                 owner, noise = owner[alive[owner]], noise[alive[owner]]
                 values = space.values(unbounded[owner] + noise, logarithmic[owner])
                 try:
-                    evaluations += len(values)
-                    found = objective(space.parameters(values))
+                    simulations += len(values) * len(objective.members)
+                    found = posterior_losses(objective, space, values)
                     share = 1.0 / torch.bincount(owner, minlength=settings.starts)[owner]
                     (share * found).sum().backward()
                     break
@@ -144,7 +144,7 @@ def fit_adam(
         values=dict(zip(space.names, best.values.tolist(), strict=True)),
         loss=best.loss,
         best_start=best.start,
-        evaluations=evaluations,
+        simulations=simulations,
         stop_reason=reason,
         seconds=time.perf_counter() - began,
         history=history,
@@ -188,7 +188,7 @@ class _Patience:
         return space.moved(values, noise), scale
 
 
-def _starts(objective: Objective, space: FitSpace, settings: AdamSettings) -> tuple[Tensor, Tensor, int]:
+def _starts(objective: AnyObjective, space: FitSpace, settings: AdamSettings) -> tuple[Tensor, Tensor, int]:
     """Initial values [B, k], which scale each uses [B], and how many simulations it took to choose them."""
     screened = settings.starts > 1 and settings.screen >= settings.starts
     count = 1 + settings.screen if screened else settings.starts
@@ -198,7 +198,7 @@ def _starts(objective: Objective, space: FitSpace, settings: AdamSettings) -> tu
         return values, logarithmic, 0
     order = batch_losses(objective, space, values[1:]).argsort()[: settings.starts - 1] + 1
     chosen = torch.cat([order.new_zeros(1), order])
-    return values[chosen], logarithmic[chosen], settings.screen
+    return values[chosen], logarithmic[chosen], settings.screen * len(objective.members)
 
 
 def _trials(settings: AdamSettings, unbounded: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:

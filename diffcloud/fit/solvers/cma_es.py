@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from diffcloud.fit.objective import Objective
+from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.solvers.outcome import FitOutcome, Progress
 from diffcloud.fit.solvers.search import SearchSettings, search
@@ -28,7 +28,7 @@ class CmaEsSettings(SearchSettings):
 
 
 def fit_cma_es(
-    objective: Objective,
+    objective: AnyObjective,
     space: FitSpace,
     settings: CmaEsSettings,
     *,

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from diffcloud.errors import DivergedError
 from diffcloud.fit.batches import batch_losses
-from diffcloud.fit.objective import Objective
+from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis, Linearisation, linearise
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
@@ -57,7 +57,7 @@ class GaussNewtonSettings:
 
 
 def fit_gauss_newton(
-    objective: Objective,
+    objective: AnyObjective,
     space: FitSpace,
     settings: GaussNewtonSettings,
     *,
@@ -71,12 +71,12 @@ def fit_gauss_newton(
     """
     began = time.perf_counter()
     axis = Axis.of(space)
-    start, evaluations = _starts(objective, space, settings, axis)
+    start, simulations = _starts(objective, space, settings, axis)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
     try:
         at = linearise(objective, space, start)
-        evaluations += at.simulations
+        simulations += at.simulations
         if not bool(torch.isfinite(at.losses).any()):
             raise DivergedError(0, [], f"all {len(start)} starts diverged")
         search = _Search(start, at)
@@ -96,7 +96,7 @@ def fit_gauss_newton(
             if iteration < settings.iterations:
                 tried = search.propose(going, *axis.ends)
                 found = linearise(objective, space, tried)
-                evaluations += found.simulations
+                simulations += found.simulations
                 search.judge(going, tried, found)
     except KeyboardInterrupt:
         if not history.losses:
@@ -107,7 +107,7 @@ def fit_gauss_newton(
         values=dict(zip(space.names, values, strict=True)),
         loss=float(search.losses.min()),
         best_start=search.best,
-        evaluations=evaluations,
+        simulations=simulations,
         stop_reason=reason,
         seconds=time.perf_counter() - began,
         history=history,
@@ -176,7 +176,7 @@ class _Search:
         self.arrived |= beside
 
 
-def _starts(objective: Objective, space: FitSpace, settings: GaussNewtonSettings, axis: Axis) -> tuple[Tensor, int]:
+def _starts(objective: AnyObjective, space: FitSpace, settings: GaussNewtonSettings, axis: Axis) -> tuple[Tensor, int]:
     """Places [B, k] to start at, and how many simulations it took to choose them."""
     count = max(1 + settings.screen, settings.starts)
     values = space.starts(count, seed=settings.seed, first=settings.init)[0].double()
@@ -188,7 +188,7 @@ def _starts(objective: Objective, space: FitSpace, settings: GaussNewtonSettings
     order = losses.argsort()
     if settings.init:
         order = torch.cat([torch.zeros(1, dtype=torch.long), order[order > 0]])
-    return axis.places(values[order[: settings.starts]]), count
+    return axis.places(values[order[: settings.starts]]), count * len(objective.members)
 
 
 def _remember(history: FitHistory, search: _Search, axis: Axis) -> None:

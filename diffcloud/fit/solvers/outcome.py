@@ -48,7 +48,7 @@ class FitOutcome:
     values: dict[str, float]
     loss: float
     best_start: int
-    evaluations: int
+    simulations: int
     """Simulations run, with their gradients but for searches."""
     stop_reason: StopReason
     seconds: float

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from diffcloud.fit.objective import Objective
+from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.solvers.outcome import FitOutcome, Progress
 from diffcloud.fit.solvers.search import SearchSettings, search
@@ -23,7 +23,7 @@ class RandomSearchSettings(SearchSettings):
 
 
 def fit_random_search(
-    objective: Objective,
+    objective: AnyObjective,
     space: FitSpace,
     settings: RandomSearchSettings,
     *,

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.batches import batch_losses
-from diffcloud.fit.objective import Objective
+from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
@@ -34,7 +34,7 @@ class SearchSettings:
     """
 
     simulations: int = 200
-    """Parameter sets simulated at most, the first among them; in a joint fit each counts once for all episodes."""
+    """Runs at most; a parameter set takes one for each recording."""
     threshold: float = 0.0
     """Stop below this loss; 0: never."""
     seed: int = 0
@@ -62,7 +62,7 @@ class Proposals(Protocol):
 
 
 def search(
-    objective: Objective,
+    objective: AnyObjective,
     space: FitSpace,
     settings: SearchSettings,
     propose: Callable[[NDArray[np.float64]], Proposals],
@@ -87,12 +87,12 @@ def search(
     proposals = propose(((axis.places(values[0]) - low) / (high - low)).numpy())
     best = _Best(math.inf, values[0])
     history = FitHistory(space.names)
-    simulated = 0
+    simulated, each = 0, len(objective.members)
 
     def simulate(batch: Tensor) -> NDArray[np.float64]:
         nonlocal best, simulated
         losses = batch_losses(objective, space, batch)
-        simulated += len(batch)
+        simulated += each * len(batch)
         lowest = int(losses.argmin())
         if float(losses[lowest]) < best.loss:
             best = _Best(float(losses[lowest]), batch[lowest])
@@ -108,12 +108,12 @@ def search(
     reason: StopReason = "simulations"
     try:
         simulate(values)
-        while simulated < settings.simulations and not best.loss < settings.threshold:
+        while simulated + each <= settings.simulations and not best.loss < settings.threshold:
             if proposals.converged:
                 reason = "converged"
                 break
             asked = proposals.ask()
-            places = torch.as_tensor(asked[: settings.simulations - simulated])
+            places = torch.as_tensor(asked[: (settings.simulations - simulated) // each])
             losses = simulate(axis.bounded(low + (high - low) * places))
             if len(losses) == len(asked):  # else the budget has ended within the batch
                 proposals.tell(losses)
@@ -124,12 +124,12 @@ def search(
             raise
         reason = "interrupted"
     if not history.losses:
-        raise DivergedError(0, [], f"all {simulated} parameter sets diverged")
+        raise DivergedError(0, [], f"all {simulated // each} parameter sets diverged")
     return FitOutcome(
         values=dict(zip(space.names, best.values.tolist(), strict=True)),
         loss=best.loss,
         best_start=0,
-        evaluations=simulated,
+        simulations=simulated,
         stop_reason=reason,
         seconds=time.perf_counter() - began,
         history=history,

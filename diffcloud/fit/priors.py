@@ -1,0 +1,70 @@
+"""How much a prior says, of the pose and of the parameters, beside a recording; and the priors of parameters.
+
+A multiplier has a log-normal prior about the basis material: one deviation off is a factor. At one deviation a prior adds
+as much to the loss as a residual of 5 mm among a hundred: far less than a recording says of what it shows. It decides
+where nothing is shown.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+
+from diffcloud.errors import ConfigError, unknown_name
+from diffcloud.sim.properties import PARAMETERS
+
+DEFAULT_FACTOR = 10.0
+"""One deviation of a multiplier."""
+_NOISE_M = 0.005
+_INDEPENDENT = 100
+
+
+def prior_cost(length_unit_m: float) -> float:
+    """What a prior adds to the loss at one deviation [squared length unit]."""
+    return (_NOISE_M / length_unit_m) ** 2 / _INDEPENDENT
+
+
+def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """What `--prior` says -> fitted parameter -> factor of one deviation.
+
+    Args:
+        text: None for the default of every fitted multiplier whose bounds hold the basis, 1; "none"; or parameters with a
+            factor, as in "bending=3x,mass=1.5x", the default for the others.
+        names: fitted parameters.
+        bounds: of each.
+
+    Raises:
+        ConfigError: one that is not fitted or is no multiplier, a factor that is none, or bounds that leave the basis out.
+    """
+    if text is not None and text.strip() == "none":
+        return {}
+    inside = {name: bounds[name][0] <= 1.0 <= bounds[name][1] for name in names}
+    found = {name: DEFAULT_FACTOR for name in names if PARAMETERS[name].basis is not None and inside[name]}
+    for item in () if text is None else text.split(","):
+        name, _, value = (part.strip() for part in item.partition("="))
+        if name not in names:
+            raise ConfigError(f"prior: {unknown_name('fitted parameter', name, names)}")
+        if PARAMETERS[name].basis is None:
+            raise ConfigError(f"prior: {name} is no multiplier; what is known of it are its bounds, {list(bounds[name])}.")
+        factor = _factor(value)
+        if not (factor > 1 and math.isfinite(factor)):
+            raise ConfigError(
+                f"prior {item.strip()!r}: {name} takes the factor within which it probably lies, above 1 and with an x, "
+                f"such as {name}=3x; or write none."
+            )
+        if not inside[name]:
+            raise ConfigError(
+                f"prior {item.strip()!r}: it is about 1, the basis material, and the bounds of {name} are "
+                f"{list(bounds[name])}. Widen them with --bound, or change the scenario's material."
+            )
+        found[name] = factor
+    return found
+
+
+def _factor(text: str) -> float:
+    match = re.fullmatch(r"([0-9.eE+-]+)\s*x", text)
+    try:
+        return float(match[1]) if match else math.nan
+    except ValueError:
+        return math.nan

@@ -1,0 +1,247 @@
+"""Fits as jobs: which recordings belong to one, what it writes, and what of an earlier call is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import yaml
+
+from diffcloud.errors import ConfigError, DivergedError
+from diffcloud.fit import FitSpace, JointObjective, Objective, Progress, read_fit, solve, write_fit
+from diffcloud.fit.joint import AnyObjective
+from diffcloud.fit.left_out import leave_each_out
+from diffcloud.fit.priors import parameter_priors
+from diffcloud.fit.record import FitRecord
+from diffcloud.fit.result import describe_fit
+from diffcloud.fit.solvers import SearchSettings
+from diffcloud.io.episodes import Episode, read_episode
+from diffcloud.io.fingerprints import fingerprint
+from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.properties import PARAMETERS
+from pipeline.config import FitConfig
+from pipeline.console import assignments, episode_files, errors
+from pipeline.scenario_options import choose_scenario
+from pipeline.workers import Tell, check_interrupt
+
+JOINT = "joint"
+"""Name of the fit of one parameter set to all recordings."""
+_CODE = ("mesh", "io", "sim", "scene", "clouds", "fit")
+"""Packages whose source decides the numbers of a fit."""
+_MOST_RECORDINGS = 1000
+
+
+@dataclass(frozen=True)
+class Recording:
+    """An episode and the scenario that simulates it."""
+
+    scenario: Scenario
+    name: str
+    episode: Episode
+
+
+def fit_file(fits: Path, scenario: str, name: str) -> Path:
+    """JSON of a fit: a joint one over several scenarios lies beside their folders."""
+    path = fits / scenario / f"{name}.json"
+    return path if path.is_file() or name != JOINT else fits / f"{name}.json"
+
+
+def joint_fit(fits: Path) -> list[Path]:
+    """The JSON of a joint fit over all scenarios, if there is one."""
+    path = fits / f"{JOINT}.json"
+    return [path] if path.is_file() else []
+
+
+def stated_recordings(arguments: Sequence[Path]) -> list[tuple[str, Path]] | None:
+    """(scenario, episode file) of arguments SCENARIO=EPISODE, or of a YAML file that maps scenarios to episodes; None if
+    they are neither.
+
+    Raises:
+        ConfigError: some are and others are not, or the file is no such list.
+    """
+    if len(arguments) == 1 and arguments[0].suffix in (".yaml", ".yml"):
+        return _listed(arguments[0])
+    if all(argument.exists() for argument in arguments):  # an equals sign may be a part of a name
+        return None
+    pairs = [str(argument).partition("=") for argument in arguments]
+    if not any(equals for _, equals, _ in pairs):
+        return None
+    if not all(scenario and equals and path for scenario, equals, path in pairs):
+        raise ConfigError("Give each episode its scenario, as in lift=a.npz fold=b.npz, or none and --scenario.")
+    return [(scenario, Path(path)) for scenario, _, path in pairs]
+
+
+def _listed(path: Path) -> list[tuple[str, Path]]:
+    try:
+        told = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"Cannot read {path}: {error}") from error
+    found = []
+    for scenario, files in told.items() if isinstance(told, dict) else ():
+        for file in files if isinstance(files, list) else [files]:
+            if not isinstance(file, str):
+                raise ConfigError(f"{path}: {scenario} takes the path of an episode, or a list of paths, got {files!r}.")
+            found.append((str(scenario), path.parent / file))
+    if not 0 < len(found) <= _MOST_RECORDINGS:
+        raise ConfigError(
+            f"{path} lists {len(found)} episodes; it takes 1 to {_MOST_RECORDINGS}, by scenario: `lift: [a.npz, b.npz]`."
+        )
+    return found
+
+
+def read_recordings(pairs: Sequence[tuple[str, Path]]) -> list[Recording]:
+    """
+    Raises:
+        ConfigError, EpisodeError: an unknown scenario, a damaged episode, or two of one name in a scenario.
+    """
+    scenarios = {name: choose_scenario(name) for name in dict.fromkeys(name for name, _ in pairs)}
+    for name in scenarios:
+        episode_files([path for one, path in pairs if one == name])
+    return [Recording(scenarios[name], path.stem, read_episode(path)) for name, path in pairs]
+
+
+@dataclass(frozen=True)
+class FitJob:
+    """One parameter set for one or several recordings. A finished fit of the same inputs by the same code is kept."""
+
+    name: str
+    recordings: Sequence[Recording]
+    settings: FitConfig
+    folder: Path
+    init: Mapping[str, float] = field(default_factory=dict)
+    """Values of the first start; the middle of the range where not given."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """Of the first recording."""
+        return self.recordings[0].scenario
+
+    @property
+    def label(self) -> str:
+        several = len({recording.scenario.name for recording in self.recordings}) > 1
+        return self.name if several else f"{self.scenario.name}/{self.name}"
+
+    @property
+    def files(self) -> tuple[Path, Path]:
+        """What `run` writes."""
+        return self.folder / f"{self.name}.json", self.folder / f"{self.name}.npz"
+
+    @property
+    def space(self) -> FitSpace:
+        """
+        Raises:
+            ConfigError: bounds, priors or fixed values that do not fit the parameters.
+        """
+        settings = self.settings
+        for recording in self.recordings:
+            recording.scenario.check_parameters([*settings.parameters, *settings.fixed])
+        bounds = {**self.scenario.bounds, **settings.bounds}
+        free = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed).names
+        ranges = {name: bounds.get(name, PARAMETERS[name].bounds) for name in free}
+        priors = parameter_priors("none" if settings.paper else settings.prior, free, ranges)
+        return FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed, priors=priors)
+
+    def objective(self) -> AnyObjective:
+        """
+        Raises:
+            ConfigError, EpisodeError: the episodes lack the frames of the loss, an unknown frame, or different cloths.
+        """
+        members = [Objective(one.scenario, one.episode, **self.settings.measure()) for one in self.recordings]
+        return members[0] if len(members) == 1 else JointObjective(members)
+
+    def known(self) -> FitRecord | None:
+        """What this job, or an earlier one of the same inputs and code, has left; maybe interrupted."""
+        try:
+            record = read_fit(self.files[0])
+        except ConfigError:  # none, or a damaged one
+            return None
+        return record if record.fingerprint == self._fingerprint and self.files[1].is_file() else None
+
+    def run(self, tell: Tell) -> FitRecord:
+        """Fit, write, and return the record.
+
+        Raises:
+            DivergedError: every start diverged.
+            KeyboardInterrupt: Ctrl-C; the best so far is written.
+        """
+        known = self.known()
+        if known is not None and known.stop_reason != "interrupted":
+            return known
+
+        def show_progress(progress: Progress) -> None:
+            check_interrupt()
+            values = "  ".join(f"{key} {value:.3g}" for key, value in progress.values.items())
+            if isinstance(settings, SearchSettings):
+                done, most = progress.simulations or 0, settings.simulations
+            else:
+                done, most = progress.iteration, settings.iterations
+            tell(done / max(most, 1), f"{done} of at most {most}  best {progress.best:.3e}  {values}")
+
+        objective, space = self.objective(), self.space
+        settings = replace(self.settings.solver_settings(self.scenario), init=self.init)
+        outcome = solve(objective, space, settings, progress=show_progress)
+        result = describe_fit(objective, space, settings, outcome, episodes=[one.name for one in self.recordings])
+        record, interrupted = result.record, outcome.stop_reason == "interrupted"
+        if isinstance(objective, JointObjective) and not interrupted:
+            try:
+                left = leave_each_out(objective, space, outcome.values, progress=lambda progress: check_interrupt())
+                for recording, told in zip(record.episodes, left, strict=True):
+                    recording.left_out = told
+            except DivergedError as error:
+                record.failures.append(f"leaving one recording out: {error}")
+            except KeyboardInterrupt:
+                record.stop_reason, interrupted = "interrupted", True
+        record.fingerprint = self._fingerprint
+        write_fit(self.folder, self.name, result)
+        if interrupted:
+            raise KeyboardInterrupt
+        return record
+
+    @cached_property
+    def _fingerprint(self) -> str:
+        settings = self.settings.model_dump(exclude={"workers", "joint"})  # which the name and the recordings tell
+        return fingerprint([self.name, self.recordings, settings, self.init], packages=_CODE)
+
+
+def first_start(init: str, job: FitJob) -> dict[str, float]:
+    """Values of the first start by name; recordings of a joint fit give the mean of their predictions.
+
+    Raises:
+        ConfigError: a value of what is not fitted, or outside of its bounds.
+    """
+    if init == "middle":
+        return {}
+    if "=" in init:
+        stated = assignments(init.split(","), "--init")
+        job.space.check_start(stated)
+        return stated
+    # imported here: the fits of the pipeline start elsewhere, and must not be stale when a regressor changes
+    from pipeline.predict import predicted_start
+
+    found = [predicted_start(init, one.scenario.name, one.episode) for one in job.recordings]
+    return job.space.nearest({name: sum(values[name] for values in found) / len(found) for name in found[0]})
+
+
+def remove_stale(out: Path, jobs: Sequence[FitJob]) -> None:
+    """Remove fits that an earlier call left there and that this one's inputs no longer give: of episodes that are gone, or
+    with other settings. Finished single fits stay beside a joint one, and the reverse."""
+    if jobs[0].name == JOINT:
+        others = [
+            replace(job, name=one.name, recordings=[one], folder=out / one.scenario.name)
+            for job in jobs
+            for one in job.recordings
+        ]
+    else:
+        every = [one for job in jobs for one in job.recordings]
+        others = [replace(jobs[0], name=JOINT, recordings=every, folder=out)]
+    kept = {path for job in jobs for path in job.files}
+    kept |= {path for job in others if job.known() is not None for path in job.files}
+    inside = {path.relative_to(out).as_posix() for path in kept}
+    removed = remove_files(out, sorted(read_manifest(out) - inside))
+    write_manifest(out, inside)
+    if removed:
+        told = "Removed fits whose episode is gone or whose settings have changed"
+        errors.print(f"{told}: {', '.join(removed)}.", markup=False, soft_wrap=True)

@@ -1,0 +1,122 @@
+"""One set of parameters for several recordings: how losses join, what must be the same, what each says of the others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from diffcloud.errors import ConfigError
+from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton
+from diffcloud.fit.joint import mean_loss, mean_terms
+from diffcloud.fit.left_out import leave_each_out
+from diffcloud.fit.residuals import Axis, linearise
+from tests.conftest import paper_objective, small_lift
+from tests.fit.test_fit import GENTLE, clouds_of
+
+TRUTH = {"stretch": 0.6, "mass": 1.7}
+SPACE = FitSpace.build(["stretch", "mass"])
+SIDEWAYS = [(0.0, 0.0, 0.0, 0.0), (0.6, 0.12, 0.0, 0.1)]
+
+
+def motions(**changes):
+    """Two scenarios of one cloth: a slow lift, and the same corner pulled to the side."""
+    settings = {**GENTLE, "integrator": "implicit", "points": 500, **changes}
+    return small_lift(**settings), small_lift(**{**settings, "path": SIDEWAYS})
+
+
+class TestMean:
+    def test_in_the_papers_measure_losses_are_averaged(self):
+        scenario = small_lift()
+        values = {"stretch": torch.tensor([1.0, 3.0]).double()}
+        members = [paper_objective(scenario, clouds_of(scenario, stretch=s, mass=1.0), frames=[2, 5]) for s in (0.5, 2.0)]
+        alone = torch.stack([member(values) for member in members])
+        torch.testing.assert_close(JointObjective(members)(values), alone.mean(0))
+
+    def test_else_what_each_gains_counts_as_a_part_of_its_own_loss(self, generator):
+        losses = torch.rand(3, 4, generator=generator).double() + 0.1
+        scaled = losses * torch.tensor([[1.0], [100.0], [0.01]])
+        together = mean_loss(losses, paper=False)
+        torch.testing.assert_close(mean_loss(scaled, paper=False), together)  # 100 and 1/100
+        torch.testing.assert_close(together, losses.prod(0) ** (1 / 3))
+
+    @pytest.mark.parametrize("paper", [False, True])
+    def test_slope_and_curvature_are_those_of_the_mean(self, paper, generator):
+        """Of quadratic losses, whose terms are known: l = c + 2 g·s + s·H s at s = 0."""
+        offset = torch.rand(2, 1, generator=generator).double() + 0.5
+        slope = torch.randn(2, 1, 3, generator=generator).double()
+        root = torch.randn(2, 1, 3, 3, generator=generator).double()
+        normal = root @ root.mT
+
+        def losses(step):
+            return offset + 2 * (slope * step).sum(-1) + torch.einsum("ebij,bi,bj->eb", normal, step, step)
+
+        step = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
+        (gradient,) = torch.autograd.grad(mean_loss(losses(step), paper=paper).sum(), step)
+        terms = [(offset[e], slope[e], normal[e]) for e in (0, 1)]
+        loss, half, curvature = mean_terms(terms, paper=paper)
+        torch.testing.assert_close(loss, mean_loss(offset, paper=paper))
+        torch.testing.assert_close(2 * half, gradient)
+        if paper:
+            torch.testing.assert_close(curvature, normal.mean(0))
+
+
+class TestFit:
+    def test_two_motions_of_one_cloth_give_its_parameters(self):
+        members = [Objective(scenario, clouds_of(scenario, points=6000, **TRUTH), nuisance={}) for scenario in motions()]
+        joint = JointObjective(members)
+        found = fit_gauss_newton(joint, SPACE, GaussNewtonSettings(starts=2, screen=7))
+        assert found.values == pytest.approx(TRUTH, rel=0.03)
+        left = leave_each_out(joint, SPACE, found.values)
+        for one, member in zip(left, members, strict=True):
+            assert one.parameters == pytest.approx(TRUTH, rel=0.1)
+            value = {name: torch.tensor([v]).double() for name, v in one.parameters.items()}
+            assert one.loss == pytest.approx(float(member(value)), rel=1e-9)
+
+    def test_what_is_left_out_has_no_say(self):
+        """Recordings of two cloths: each is predicted with the parameters of the other."""
+        first, second = motions()
+        members = [
+            Objective(first, clouds_of(first, points=6000, stretch=0.4, mass=1.0), nuisance={}),
+            Objective(second, clouds_of(second, points=6000, stretch=2.5, mass=1.0), nuisance={}),
+        ]
+        space = FitSpace.build(["stretch"], fixed={"mass": 1.0})
+        one, other = leave_each_out(JointObjective(members), space, {"stretch": 1.0})
+        assert one.parameters["stretch"] == pytest.approx(2.5, rel=0.1)  # stiff cloth hardly stretches
+        assert other.parameters["stretch"] == pytest.approx(0.4, rel=0.05)
+
+    def test_the_slope_is_that_of_the_loss(self):
+        members = [Objective(s, clouds_of(s, points=4000, **TRUTH), nuisance={}) for s in motions()]
+        joint = JointObjective(members)
+        places = Axis.of(SPACE).places(torch.tensor([[0.8, 1.2]]).double()).requires_grad_(True)
+        loss = joint(SPACE.parameters(Axis.of(SPACE).values(places)))
+        (gradient,) = torch.autograd.grad(loss.sum(), places)
+        found = linearise(joint, SPACE, places.detach())
+        torch.testing.assert_close(found.losses, loss.detach())
+        torch.testing.assert_close(2 * found.slope, gradient, rtol=1e-8, atol=1e-14)
+        assert found.simulations == 2
+
+
+class TestOneCloth:
+    def test_scenarios_of_different_materials_are_refused(self):
+        first = small_lift()
+        other = small_lift(material="denim")
+        members = [Objective(s, clouds_of(s, stretch=1.0)) for s in (first, other)]
+        with pytest.raises(ConfigError, match=r"one cloth, whose \w+ = 1 means \S+ N/m in lift and"):
+            JointObjective(members)
+
+    def test_measures_are_not_mixed(self):
+        scenario = small_lift()
+        episode = clouds_of(scenario, stretch=1.0)
+        with pytest.raises(ConfigError, match="one measure"):
+            JointObjective([Objective(scenario, episode), paper_objective(scenario, episode)])
+
+
+def test_a_recording_twice_as_noisy_weighs_a_quarter():
+    """Weights go with the inverse of each recording's own loss."""
+    slopes = [torch.tensor([[1.0]]).double(), torch.tensor([[1.0]]).double()]
+    normal = torch.ones(1, 1, 1).double()
+    losses = [torch.tensor([1e-6]).double(), torch.tensor([4e-6]).double()]
+    _, both, _ = mean_terms(list(zip(losses, slopes, [normal, normal], strict=True)), paper=False)
+    _, first, _ = mean_terms(list(zip(losses, [slopes[0], 0 * slopes[1]], [normal, normal], strict=True)), paper=False)
+    np.testing.assert_allclose(float(first / both), 0.8)

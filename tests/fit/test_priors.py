@@ -1,0 +1,80 @@
+"""Priors of parameters: what they say, when they decide, and what is refused."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from diffcloud.errors import ConfigError
+from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton
+from diffcloud.fit.batches import posterior_losses
+from diffcloud.fit.priors import DEFAULT_FACTOR, parameter_priors, prior_cost
+from diffcloud.fit.residuals import Axis, linearise
+from tests.conftest import small_lift
+from tests.fit.test_fit import GENTLE, clouds_of
+
+BOUNDS = {"stretch": (0.1, 10.0), "mass": (0.1, 10.0), "damping": (0.0, 0.1), "bending": (2.0, 8.0)}
+
+
+class TestOption:
+    def test_by_default_every_multiplier_has_a_weak_one(self):
+        assert parameter_priors(None, ["stretch", "damping", "bending"], BOUNDS) == {"stretch": DEFAULT_FACTOR}
+        assert parameter_priors("none", ["stretch"], BOUNDS) == {}
+
+    def test_factors_are_taken_and_the_others_stay(self):
+        found = parameter_priors("mass=1.5x", ["stretch", "mass"], BOUNDS)
+        assert found == {"stretch": DEFAULT_FACTOR, "mass": 1.5}
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("mass=1.5", "above 1 and with an x, such as mass=3x"),
+            ("mass=1x", "above 1"),
+            ("mass=0.5x", "above 1"),
+            ("mass=infx", "above 1"),
+            ("mass", "above 1"),
+            ("drag=3x", "fitted parameter"),
+            ("damping=3x", "no multiplier"),
+            ("bending=3x", r"bounds of bending are \[2.0, 8.0\]"),
+        ],
+    )
+    def test_what_is_no_prior_is_refused(self, text, message):
+        with pytest.raises(ConfigError, match=message):
+            parameter_priors(text, ["stretch", "mass", "damping", "bending"], BOUNDS)
+
+
+def test_the_prior_adds_its_cost_at_one_deviation():
+    space = FitSpace.build(["stretch", "mass"], priors={"mass": 3.0})
+    added = space.prior_loss(torch.tensor([[7.0, 3.0], [7.0, 1.0], [7.0, 1 / 9]]).double(), 1.0)
+    assert added.tolist() == pytest.approx([prior_cost(1.0), 0.0, 4 * prior_cost(1.0)])
+
+
+@pytest.fixture(scope="module")
+def objective():
+    scenario = small_lift(**{**GENTLE, "integrator": "implicit", "points": 500})
+    return Objective(scenario, clouds_of(scenario, points=8000, stretch=0.6, mass=1.7), nuisance={})
+
+
+def test_the_linearisation_has_it(objective):
+    space = FitSpace.build(["stretch", "mass"], priors={"stretch": 1.2, "mass": 3.0})
+    places = Axis.of(space).places(torch.tensor([[0.8, 1.2]]).double()).requires_grad_(True)
+    loss = posterior_losses(objective, space, Axis.of(space).values(places))
+    (gradient,) = torch.autograd.grad(loss.sum(), places)
+    found, without = (linearise(objective, one, places.detach()) for one in (space, FitSpace.build(["stretch", "mass"])))
+    torch.testing.assert_close(found.losses, loss.detach())
+    torch.testing.assert_close(2 * found.slope, gradient, rtol=1e-8, atol=1e-14)
+    expected = [prior_cost(1.0) / math.log(factor) ** 2 for factor in (1.2, 3.0)]
+    assert (found.curvature - without.curvature)[0].diagonal().tolist() == pytest.approx(expected)
+
+
+def test_it_decides_only_what_the_recording_does_not_show(objective):
+    """The ratio is what a lift shows; the scale of both is the prior's."""
+    settings = GaussNewtonSettings(starts=2, screen=7)
+    wide, narrow = (
+        fit_gauss_newton(objective, FitSpace.build(["stretch", "mass"], priors=priors), settings).values
+        for priors in ({}, {"mass": 1.05})
+    )
+    assert narrow["stretch"] / narrow["mass"] == pytest.approx(wide["stretch"] / wide["mass"], rel=0.03)
+    assert abs(math.log(narrow["mass"])) < 0.5 * abs(math.log(wide["mass"]))
