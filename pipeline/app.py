@@ -35,6 +35,7 @@ COMMANDS = {
     "doctor": "pipeline.doctor:doctor",
     "acceptance": "pipeline.acceptance:acceptance",
     "recordings": "pipeline.recordings:recordings",
+    "coverage": "pipeline.coverage:coverage",
 }
 """Name -> where it lies; it is imported when it is run."""
 

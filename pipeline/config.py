@@ -12,8 +12,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
+from diffcloud.evaluation.intervals import LEVEL, WITHIN
 from diffcloud.fit.pose import parse_priors
 from diffcloud.fit.solvers import SOLVERS, Settings
+from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, check_doubts
 from diffcloud.io.raw_episodes import ScenePlacement
 from diffcloud.regressors.settings import Loss, Profile, Target
 from diffcloud.scene.scenarios import Scenario
@@ -272,14 +274,23 @@ class EvaluateConfig(Section):
     seed: int = 1000
     rivals: list[Rival] = list(RIVALS)
     """Methods beside the fits and the networks; searches may simulate as often as the fit."""
-    identifiability: list[str] = ["*"]
-    """Patterns of <scenario>/<episode> of which it is measured what they tell: 90 simulations each."""
+    level: Annotated[float, Field(gt=0, lt=1)] | None = LEVEL
+    """Of the intervals; null: none."""
+    within: Annotated[float, Field(gt=1)] = WITHIN
+    """A parameter counts as identified if its interval ends within this factor."""
+    doubts: dict[str, Annotated[float, Field(gt=1)]] = dict(MATERIAL_DOUBTS)
+    """Factors within which material that is not fitted is known; {}: exactly."""
     landscapes: list[str] = []
     """Patterns of <scenario>/<episode> whose loss landscape is simulated."""
     landscape_size: Annotated[int, Field(ge=2)] = 7
     """Places along each of its axes."""
     workers: Count = 1
     """Processes, one episode each; they change nothing but the time."""
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        check_doubts(self.doubts)
+        return self
 
     def comparison(self, episode: str) -> ComparisonSettings:
         """For <scenario>/<episode>."""
@@ -291,7 +302,9 @@ class EvaluateConfig(Section):
             rivals=tuple(self.rivals),
             draws=self.draws,
             seed=self.seed,
-            identifiability=chosen(self.identifiability),
+            level=self.level,
+            within=self.within,
+            doubts=self.doubts,
             landscape_size=self.landscape_size if chosen(self.landscapes) else 0,
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +24,7 @@ from diffcloud.sensing.recorder import ClothMotion, record
 from diffcloud.sensing.whole_surface import sample_surface
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import rollout
+from diffcloud.sim.system import System
 from pipeline.config import EpisodesConfig, load_config
 from pipeline.console import JsonFlag, ParamsFile, errors, finish, progress_bar, writes
 from pipeline.scenario_options import choose_scenario
@@ -63,14 +64,13 @@ def _synthetic(
 ) -> list[str]:
     """Simulate cloths of hidden parameters and record them: by depth cameras as raw episodes, or by their whole surface."""
     rng = np.random.default_rng([config.seed, index])
-    hidden = _hidden(scenario, config, rng)
+    hidden = hidden_parameters(scenario, config, rng)
     system, _ = scenario.scene.build()
     properties = scenario.properties(system, {name: torch.as_tensor(values) for name, values in hidden.items()})
     with torch.no_grad():
         run = rollout(system, scenario.steps, properties=properties)
     nodes = run.positions[:, :: scenario.scene.frame_steps].numpy()
     times = run.times[:: scenario.scene.frame_steps].numpy()
-    obstacles, faces = scenario.scene.surrounding.obstacles, system.mesh.faces
     names = []
     for repeat in range(config.per_scenario):
         name, seed = f"{scenario.name}_hidden{repeat + 1}", int(rng.integers(2**31))
@@ -80,26 +80,54 @@ def _synthetic(
             "repeat": 1,
             "truth": {key: float(values[repeat]) for key, values in hidden.items()},
         }
-        if scenario.recorder == "whole_surface":
-            obstacle = obstacles[0] if obstacles else None
-            meta["source"] = "synthetic"
-            episode = sample_surface(nodes[repeat], faces, times, obstacle, points=scenario.points, seed=seed, meta=meta)
-            write_episode(out / f"{name}.npz", episode)
-        else:
-            if len(grippers := system.handles.grippers) > 1:
-                raise ConfigError(
-                    f"Scenario {scenario.name} has the grippers {', '.join(grippers)}, but the recorder by depth cameras "
-                    "has one arm; choose recorder: whole_surface."
-                )
-            _replaceable(out / name, "synthetic")  # refused before it is recorded
-            height = float(obstacles[0].nodes[:, 2].max()) if obstacles else float(nodes[:, 0, :, 2].min())
-            motion = ClothMotion(nodes[repeat], faces, times, scenario.grasped, height)
-            cameras = published_cameras(*config.image_size, noise=DepthNoise(subpixel_px=config.subpixel_px))
-            with staged(out / name) as folder:
-                record(folder, motion, cameras, settings=config.recorder(), seed=seed, meta=meta, tell=tell)
-                _clear(out / name, "synthetic")
+        record_motion(scenario, system, nodes[repeat], times, out, name, config, seed=seed, meta=meta, tell=tell)
         names.append(name)
     return names
+
+
+def record_motion(
+    scenario: Scenario,
+    system: System,
+    nodes: NDArray[np.float64],
+    times: NDArray[np.float64],
+    out: Path,
+    name: str,
+    config: EpisodesConfig,
+    *,
+    seed: int,
+    meta: Mapping[str, Any],
+    tell: Callable[[int, str], None] = lambda done, text: None,
+) -> None:
+    """Record one simulated motion as the scenario says: its whole surface in OUT/NAME.npz, or by depth cameras in the raw
+    episode OUT/NAME.
+
+    Args:
+        nodes: [T, V, 3] of the cloth at times [T].
+        seed: of the recorder's noise.
+        tell: called with (frames done, text).
+
+    Raises:
+        ConfigError: several grippers before depth cameras, or something else is where the raw episode would be.
+    """
+    obstacles, faces = scenario.scene.surrounding.obstacles, system.mesh.faces
+    if scenario.recorder == "whole_surface":
+        obstacle = obstacles[0] if obstacles else None
+        told = {**meta, "source": "synthetic"}
+        episode = sample_surface(nodes, faces, times, obstacle, points=scenario.points, seed=seed, meta=told)
+        write_episode(out / f"{name}.npz", episode)
+        return
+    if len(grippers := system.handles.grippers) > 1:
+        raise ConfigError(
+            f"Scenario {scenario.name} has the grippers {', '.join(grippers)}, but the recorder by depth cameras "
+            "has one arm; choose recorder: whole_surface."
+        )
+    _replaceable(out / name, "synthetic")  # refused before it is recorded
+    height = float(obstacles[0].nodes[:, 2].max()) if obstacles else float(nodes[0, :, 2].min())
+    motion = ClothMotion(nodes, faces, times, scenario.grasped, height)
+    cameras = published_cameras(*config.image_size, noise=DepthNoise(subpixel_px=config.subpixel_px))
+    with staged(out / name) as folder:
+        record(folder, motion, cameras, settings=config.recorder(), seed=seed, meta=meta, tell=tell)
+        _clear(out / name, "synthetic")
 
 
 def _replaceable(folder: Path, source: str) -> list[str]:
@@ -124,7 +152,9 @@ def _clear(folder: Path, source: str) -> None:
         folder.rmdir()
 
 
-def _hidden(scenario: Scenario, config: EpisodesConfig, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
+def hidden_parameters(
+    scenario: Scenario, config: EpisodesConfig, rng: np.random.Generator
+) -> dict[str, NDArray[np.float64]]:
     """Hidden multipliers, name -> [episodes]: as the paper draws them for its simulated targets (uniform over the fit's
     bounds), or log-uniform over the configured range for recordings by cameras."""
     if scenario.recorder == "whole_surface":

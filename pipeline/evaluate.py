@@ -14,12 +14,15 @@ from rich.markup import escape
 from rich.table import Table
 
 from diffcloud.errors import ConfigError
+from diffcloud.evaluation.intervals import LEVEL, WITHIN, Intervals, significant, state_intervals
 from diffcloud.evaluation.markdown import comparison_page
-from diffcloud.evaluation.summary import PREDICTORS, label, sentences, tables
+from diffcloud.evaluation.methods import space_of
+from diffcloud.evaluation.summary import PREDICTORS, label, largest_sources, sentences, tables
 from diffcloud.evaluation.summary import metrics as summary_metrics
-from diffcloud.fit import Objective, read_fit
+from diffcloud.fit import JointObjective, Objective, read_fit
 from diffcloud.fit.pose import parse_priors
 from diffcloud.fit.result import describe_recording
+from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, check_doubts
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import claimed, files_in, together, write_json, write_text
 from diffcloud.sim.properties import check_values
@@ -70,6 +73,68 @@ def loss(
         shifts = ", ".join(f"{name} {entry.value:.4g} {entry.unit}" for name, entry in found.nuisance.items())
         output.print(f"{found.loss:.6e}  RMS {found.rms_mm:.2f} mm" + (f"  at {shifts}" if shifts else ""))
     finish({**found.model_dump(), "parameters": values, "length_unit_m": chosen.length_unit_m}, json)
+
+
+@app.command()
+def intervals(
+    fit: Annotated[Path, typer.Argument(help="JSON of a fit.")],
+    episodes: Annotated[list[Path], typer.Argument(help="Its episode, or all episodes of a joint fit in their order.")],
+    scenario: ScenarioName = None,
+    scene: SceneFile = None,
+    level: Annotated[float, typer.Option(min=0.01, max=0.999, help="Share of intervals that hold the truth.")] = LEVEL,
+    within: Annotated[float, typer.Option(help="Factor within which a parameter counts as identified.")] = WITHIN,
+    doubt: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="PARAMETER=FACTOR within which material that is not fitted is known, repeatable, or none. Default: "
+            + ", ".join(f"{name}={factor:g}" for name, factor in MATERIAL_DOUBTS.items())
+            + "."
+        ),
+    ] = None,
+    threads: Threads = None,
+    json: JsonFlag = False,
+) -> None:
+    """Intervals of a fit's parameters, a verdict for each, and where the uncertainty comes from."""
+    use_threads(threads)
+    record = read_fit(fit)
+    if len(episodes) != len(record.episodes):
+        names = ", ".join(one.name for one in record.episodes)
+        raise ConfigError(f"{fit} is a fit to {len(record.episodes)} episodes ({names}), {len(episodes)} were given.")
+    if within <= 1:
+        raise ConfigError(f"--within takes a factor above 1, got {within:g}.")
+    doubts = dict(MATERIAL_DOUBTS)
+    if doubt:
+        doubts = {} if doubt == ["none"] else doubts | assignments([item.rstrip("x") for item in doubt], "--doubt")
+    check_doubts(doubts)
+    measure = record.measure.model_dump()
+    members = []
+    for path, one in zip(episodes, record.episodes, strict=True):
+        single = len(episodes) == 1 or one.scenario == record.scenario
+        chosen = choose_scenario(scenario if scenario is not None and single else one.scenario, scene)
+        members.append(Objective(chosen, read_episode(path), **measure))
+    objective = members[0] if len(members) == 1 else JointObjective(members)
+    space = space_of(record)
+    found = state_intervals(
+        objective, space, {name: record.values[name] for name in space.names}, level=level, within=within, doubts=doubts
+    )
+    if not json:
+        _show_intervals(found)
+    finish(found.model_dump(mode="json"), json)
+
+
+def _show_intervals(found: Intervals) -> None:
+    table = Table("parameter", "value", "from", "to", "SI", "verdict", "improve first")
+    for name, entry in found.parameters.items():
+        digits = significant(entry.low, entry.high)
+        ends = ("–", "–") if entry.low is None else (digits(entry.low), digits(entry.high))
+        physical = "" if entry.physical_low is None else f"{digits(entry.physical_low)} to {digits(entry.physical_high)} "
+        sources = largest_sources(found.sources, name)
+        table.add_row(name, digits(entry.value), *ends, f"{physical}{entry.physical_unit}", entry.verdict, sources)
+    output.print(table)
+    if found.ratio is not None and found.ratio.factor is not None:
+        output.print(f"stretch / mass {found.ratio.value:.3g}, within a factor of {found.ratio.factor:.3g}", markup=False)
+    if found.reason:
+        output.print(found.reason[0].upper() + found.reason[1:] + ".", markup=False, soft_wrap=True)
 
 
 @app.callback(invoke_without_command=True)

@@ -1,7 +1,7 @@
 """Comparing methods on equal terms, and what can be known of the parameters."""
 
 from diffcloud.evaluation.episode import RIVALS, ComparisonSettings, EpisodeRecord, compare_episode
-from diffcloud.evaluation.identifiability import identify
+from diffcloud.evaluation.intervals import Intervals, state_intervals
 from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter
@@ -13,8 +13,9 @@ __all__ = [
     "EpisodeRecord",
     "Estimate",
     "Gap",
+    "Intervals",
     "Rival",
     "compare_episode",
-    "identify",
     "loss_landscape",
+    "state_intervals",
 ]

@@ -1,18 +1,19 @@
-"""Everything the comparison says of one episode: methods, gaps, transfer, identifiability, landscape."""
+"""Everything the comparison says of one episode: methods, gaps, transfer, intervals, landscape."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from diffcloud.errors import DiffCloudError
 from diffcloud.evaluation import methods
-from diffcloud.evaluation.identifiability import identify, node_set_note
+from diffcloud.evaluation.intervals import LEVEL, WITHIN, node_set_note, state_intervals
 from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
 from diffcloud.fit import AdamSettings, CmaEsSettings, FitRecord, FitSpace, Objective, RandomSearchSettings
+from diffcloud.fit.uncertainty import MATERIAL_DOUBTS
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 
@@ -28,7 +29,12 @@ class ComparisonSettings:
     """Fresh point samples that losses are averaged over."""
     seed: int = 1000
     """Of the first of them; searches use it too."""
-    identifiability: bool = True
+    level: float | None = LEVEL
+    """Of intervals; None: state none."""
+    within: float = WITHIN
+    """Factor within which a parameter counts as identified."""
+    doubts: Mapping[str, float] = field(default_factory=lambda: dict(MATERIAL_DOUBTS))
+    """Of the material that is not fitted, see `fit.uncertainty`."""
     landscape_size: int = 0
     """Places along each axis of the loss landscape; 0: none."""
 
@@ -40,7 +46,7 @@ class EpisodeRecord:
     record: dict[str, Any]
     """Plain values, the same for the same inputs: scenario, episode, its fit, labels, `start` (metrics of the fit's start,
     None if that diverges), `methods` (a row each: values, clipped values, metrics, simulations), `gaps`, `transfers`,
-    `identifiability`, `landscape`."""
+    `intervals`, `landscape`."""
     seconds: dict[str, dict[str, float]]
     """Method -> phase -> wall time."""
 
@@ -118,14 +124,16 @@ def compare_episode(
         "gaps": [{"method": gap.method, "reason": gap.reason, "expected": gap.expected} for gap in gaps],
         "failures": list(fit.failures),
         "transfers": transferred,
-        "identifiability": None,
+        "intervals": None,
         "landscape": None,
     }
     if 0 in measured.diverged:  # the fit itself: there is no optimum to look around
         return EpisodeRecord(record, seconds)
-    if settings.identifiability:
-        record["identifiability"] = identify(objective, space, best, draws=settings.draws)
-        record["identifiability"]["note"] = node_set_note(scenario)
+    if settings.level is not None and len(fit.episodes) == 1:  # those of a joint fit are of all its recordings together
+        told_intervals = state_intervals(
+            objective, space, best, level=settings.level, within=settings.within, doubts=settings.doubts
+        )
+        record["intervals"] = told_intervals.model_dump(mode="json") | {"note": node_set_note(scenario)}
     objective.reseed(fit.measure.seed)
     if settings.landscape_size:
         record["landscape"] = loss_landscape(objective, space, best, fit.history, size=settings.landscape_size)

@@ -11,7 +11,7 @@ from diffcloud.evaluation.summary import Tables, label, sentences
 
 
 def comparison_page(told: Tables, missing: Sequence[str]) -> str:
-    """Sentences first, then tables: losses per episode, means per method, seconds, identifiability, repeats.
+    """Sentences first, then tables: losses per episode, means per method, seconds, intervals, repeats.
 
     Args:
         told: of `summary.tables`.
@@ -39,9 +39,9 @@ def comparison_page(told: Tables, missing: Sequence[str]) -> str:
         "",
         "## What is identified",
         "",
-        "The factor up and down within which the loss does not tell; `ends` are the direct check of the intervals.",
+        "Intervals at the stated level, verdicts, and the largest sources of uncertainty with their parts of the variance.",
         "",
-        *_identified(told["identifiability"]),
+        *_identified(told["intervals"]),
         "",
         "## Repeats of one fabric",
         "",
@@ -114,10 +114,9 @@ def _seconds(table: pd.DataFrame) -> list[str]:
 def _identified(table: pd.DataFrame) -> list[str]:
     if table.empty:
         return ["Not asked for."]
-    shown = table[["scenario", "episode", "parameter", "value", "factor", "ratio_factor", "verdict", "combination"]]
-    shown = shown.assign(ends=[f"{a}/{b}" for a, b in zip(table["ends_agree"], table["ends_checked"], strict=True)])
-    head = ["scenario", "episode", "parameter", "value", "factor", "factor of the ratio", "verdict", "best seen", "ends"]
-    return _table(head, shown)
+    kept = ["scenario", "episode", "parameter", "value", "low", "high", "ratio_factor", "verdict", "sources"]
+    head = ["scenario", "episode", "parameter", "value", "from", "to", "factor of the ratio", "verdict", "improve first"]
+    return _table(head, table[kept])
 
 
 def _table(head: Sequence[str], table: pd.DataFrame) -> list[str]:

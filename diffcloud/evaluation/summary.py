@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from diffcloud.evaluation.intervals import Combination
 from diffcloud.evaluation.methods import PHASES
 from diffcloud.evaluation.repeats import consistency, fit_of, parameter_table, repeatability, transfer
 
@@ -145,27 +146,35 @@ def seconds_table(seconds: Mapping[tuple[str, str], Mapping[str, Mapping[str, fl
     return table.assign(total=table[list(PHASES)].astype(float).sum(axis=1))
 
 
-def identifiability_table(records: Records) -> pd.DataFrame:
-    """One row per episode and parameter: fitted value, the factor within which the loss does not tell, the verdict, and
-    whether the direct check agrees at all ends; `scale` columns in units of the resampling noise."""
+def interval_table(records: Records) -> pd.DataFrame:
+    """One row per episode and parameter: fitted value, interval, verdict, what the ratio is known within, the
+    best-determined combination, and the three largest sources of uncertainty."""
     rows = []
     for record in records:
-        told = record["identifiability"]
-        fit = fit_of(record)
-        if told is None or fit is None:
+        told = record["intervals"]
+        if told is None:
             continue
-        agrees = [entry["agrees"] for entry in told["check"]]
-        for name in told["parameters"]:
+        ratio = told["ratio"] or {}
+        for name, entry in told["parameters"].items():
             row: dict[str, Any] = {"scenario": record["scenario"], "episode": record["episode"], "fabric": record["fabric"]}
-            row |= {"parameter": name, "value": fit["clipped"][name], "factor": _factor(told["half_widths"][name])}
-            row |= {"verdict": told["verdicts"][name], "ratio_factor": _factor(told.get("ratio_half_width"))}
-            row |= {"combination": told["combination"], "ends_checked": len(agrees), "ends_agree": sum(agrees)}
-            row["ends_at_bounds"] = sum(not entry["farther_within_bounds"] for entry in told["check"])
-            row["ends_rough"] = sum(end is None for ends in told["interval"] for end in ends)
-            row["lower_loss_near"] = told["lower"] is not None
-            row |= {f"scale_{key}": value for key, value in (told["scale"] or {}).items()}
+            row |= {"parameter": name, "verdict": entry["verdict"]}
+            row |= {key: entry[key] for key in ("value", "low", "high", "factor")}
+            row |= {key: entry[key] for key in ("physical", "physical_low", "physical_high", "physical_unit")}
+            row |= {"ratio": ratio.get("value"), "ratio_factor": ratio.get("factor")}
+            row |= {"combination": None if told["best"] is None else str(Combination.model_validate(told["best"]))}
+            row |= {"sources": largest_sources(told["sources"], name), "level": told["level"], "reason": told["reason"]}
             rows.append(row)
     return pd.DataFrame(rows)
+
+
+def largest_sources(sources: Mapping[str, Mapping[str, float]], name: str, count: int = 3) -> str:
+    """What to improve first: the largest sources of a parameter's variance, with their parts of it."""
+    variances = {source: deviations[name] ** 2 for source, deviations in sources.items()}
+    total = sum(variances.values()) or 1.0
+    ranked = sorted(variances.items(), key=lambda item: -item[1])[:count]
+    return ", ".join(
+        f"{source.replace('_', ' ')} {100 * part / total:.0f} %" for source, part in ranked if part > 0.01 * total
+    )
 
 
 def tables(
@@ -181,7 +190,7 @@ def tables(
         "methods": methods,
         "means": method_means(methods),
         "categories": category_means(methods),
-        "identifiability": identifiability_table(records),
+        "intervals": interval_table(records),
         "repeatability": repeatability(parameters),
         "transfer": transfer(records),
         "consistency": consistency(parameters),
@@ -244,24 +253,22 @@ def metrics(told: Tables) -> dict[str, Any]:
     reference = against_reference(told["methods"])
     if reference is not None:
         found["against_reference"] = {"within_5_percent": reference[0], "episodes": reference[1]}
-    table = told["identifiability"]
+    table = told["intervals"]
     if not table.empty:
         verdicts: dict[str, Any] = {}
         for (scenario, parameter), group in table.groupby(["scenario", "parameter"], sort=False):
             counts = group["verdict"].value_counts(sort=False)
             verdicts.setdefault(str(scenario), {})[str(parameter)] = {str(key): int(n) for key, n in counts.items()}
-        ends = table.drop_duplicates(["scenario", "episode"])
-        found["identifiability"] = verdicts
-        found["checked_ends"] = {"agree": int(ends["ends_agree"].sum()), "all": int(ends["ends_checked"].sum())}
+        found["verdicts"] = verdicts
     return found
 
 
 def sentences(told: Tables) -> dict[str, list[str]]:
-    """The comparison in plain words, by topic: winners, success, identifiability, repeats, credibility."""
+    """The comparison in plain words, by topic: winners, success, intervals, repeats, credibility."""
     return {
         "winners": _winners(told),
         "success": _success(told),
-        "identifiability": _identified(told["identifiability"]),
+        "intervals": _identified(told["intervals"]),
         "repeats": _repeats(told),
         "credibility": _credibility(told),
     }
@@ -271,7 +278,7 @@ def overview(told: Tables) -> pd.DataFrame:
     """One row per scenario: the methods with the lowest and the next mean loss, the middle of the range, how far
     DiffCloud's mean is below the best predictor's, and the verdict that most episodes give on each parameter."""
     below = {row["scenario"]: row["below"] for row in against_predictors(told["methods"]).to_dict("records")}
-    verdicts = told["identifiability"]
+    verdicts = told["intervals"]
     rows = []
     for scenario, group in told["means"].groupby("scenario", sort=False):
         ranked = group.sort_values("loss", kind="stable").to_dict("records")
@@ -332,43 +339,15 @@ def _identified(table: pd.DataFrame) -> list[str]:
     found = []
     for (scenario, name), group in table.groupby(["scenario", "parameter"], sort=False):
         counts = ", ".join(f"{verdict} in {count}" for verdict, count in group["verdict"].value_counts().items())
-        found.append(
-            f"{scenario}: verdict on {name}: {counts} of {_count(len(group))}; the loss tells it within "
-            f"{_times(group['factor'].median())} (median)."
-        )
-    ends = table.drop_duplicates(["scenario", "episode"])
-    found.append(
-        f"Direct check of the intervals with fresh points: {int(ends['ends_agree'].sum())} of "
-        f"{int(ends['ends_checked'].sum())} ends agree; for {int(ends['ends_at_bounds'].sum())} of all ends three times as "
-        "far lies beyond the bounds."
-    )
-    if ends["ends_rough"].any():
-        found.append(
-            f"{int(ends['ends_rough'].sum())} further ends, in {_count(int(ends['ends_rough'].gt(0).sum()))}, have no "
-            "interval: after contact the loss is so rough there that no length hides in the noise and tells from three "
-            "times as far on."
-        )
-    if ends["lower_loss_near"].any():
-        found.append(
-            f"In {int(ends['lower_loss_near'].sum())} of {len(ends)} episodes a scan along these directions met a clearly "
-            "lower loss than the fit: that fit has not found its minimum, and its intervals are about where it stopped."
-        )
-    if "scale_everything" in ends:
-        for scenario, group in ends[ends["scale_everything"].notna()].groupby("scenario", sort=False):
-            fitted, everything = group["scale_fitted"].median(), group["scale_everything"].median()
-            text = (
-                f"{scenario!s}: doubling or halving stretch and mass together moves the loss by {fitted:.2g} times the "
-                f"resampling noise (median); with bending, air and all masses along, by {everything:.2g} times. "
-            )
-            if everything > 1 and everything > 0.5 * fitted:
-                text += "What seems to identify the scale is an artefact of soft handles and contact stiffness."
-            elif everything > 1:
-                text += "Part of what identifies the scale is an artefact of soft handles and contact stiffness."
-            elif fitted > 1:
-                text += "The scale is tied down by what no multiplier moves: bending, air, other nodes."
-            else:
-                text += "The scale of stretch and mass is not seen at all: only their ratio is."
-            found.append(text)
+        text = f"{scenario}: verdict on {name}: {counts} of {_count(len(group))}"
+        if group["factor"].notna().any():
+            text += f"; {group['level'].iloc[0]:.0%} intervals end within {_times(group['factor'].median())} (median)"
+        found.append(f"{text}.")
+    for scenario, group in table.drop_duplicates(["scenario", "episode"]).groupby("scenario", sort=False):
+        if group["ratio_factor"].notna().any():
+            found.append(f"{scenario!s}: stretch / mass is known within {_times(group['ratio_factor'].median())} (median).")
+    for row in table[table["reason"] != ""].drop_duplicates(["scenario", "episode"]).to_dict("records"):
+        found.append(f"{row['scenario']} / {row['episode']}: {row['reason']}.")
     return found
 
 
@@ -395,12 +374,13 @@ def _repeats(told: Tables) -> list[str]:
 
 def _credibility(told: Tables) -> list[str]:
     """What one recording promises about a parameter beside what repeats and another motion of the same fabric say."""
-    promised, repeats, motions = told["identifiability"], told["repeatability"], told["consistency"]
+    promised, repeats, motions = told["intervals"], told["repeatability"], told["consistency"]
     if promised.empty or repeats.empty:
         return []
     found = []
     for (scenario, name), group in repeats.groupby(["scenario", "parameter"], sort=False):
-        own = promised[(promised["scenario"] == scenario) & (promised["parameter"] == name)]["factor"].median()
+        chosen = promised[(promised["scenario"] == scenario) & (promised["parameter"] == name)]
+        own = chosen["factor"].astype(float).median()
         if math.isnan(own):
             continue
         spreads = {"repeats of a fabric differ by": group["factor"]}
@@ -410,7 +390,7 @@ def _credibility(told: Tables) -> list[str]:
             ]
             if len(other):
                 spreads["another motion of it by"] = other["factor"]
-        text = f"{scenario}: one recording's loss pins {name} to {_times(own)} (median); "
+        text = f"{scenario}: the interval of one recording gives {name} within {_times(own)} (median); "
         text += ", ".join(
             f"{what} {_times(factors.median())}, at most {factors.max():.3g}" for what, factors in spreads.items()
         )
@@ -429,10 +409,6 @@ def _count(episodes: int) -> str:
 
 def _mean(group: pd.DataFrame, name: str) -> float | None:
     return float(group[name].mean()) if name in group and group[name].notna().any() else None
-
-
-def _factor(half_width: float | None) -> float | None:
-    return None if half_width is None else float(np.exp(half_width))
 
 
 def _times(value: float) -> str:

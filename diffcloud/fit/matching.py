@@ -56,6 +56,16 @@ class Pairs:
         found = (self.weights * (moved - self.partners).square().sum(-1).clamp(max=cap**2)).sum(-1)
         return torch.where(self.weights.sum(-1) > 0, found, self.share * cap**2)
 
+    def scores(self, moved: Tensor, rates: Tensor, cap: float) -> Tensor:
+        """[k, B, L, N] what each pair adds to half of the slope.
+
+        Args:
+            rates: [k, B, L, N, 3] of the places.
+        """
+        away = moved - self.partners
+        weights = torch.where(away.square().sum(-1) < cap**2, self.weights, 0.0)
+        return weights * (rates * away).sum(-1)
+
     def terms(self, moved: Tensor, rates: Tensor, cap: float) -> tuple[Tensor, Tensor, Tensor]:
         """Loss [B], half of its slope [B, k] and of its curvature [B, k, k].
 

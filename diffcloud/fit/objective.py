@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -90,13 +91,13 @@ class Objective:
             EpisodeError: a loss frame that an episode lacks, one after the end of the simulation, or none that is usable.
             ConfigError: an unknown variable of the pose, or any in the paper's measure.
         """
-        self.scenario, self.paper = scenario, paper
+        self.scenario, self.episode, self.paper = scenario, episode, paper
         self.system, _ = scenario.scene.build()
         self.nuisance = dict(({} if paper else DEFAULT_PRIORS) if nuisance is None else nuisance)
         if paper and self.nuisance:
             raise ConfigError(f"The paper's measure knows no pose; leave out the nuisance {', '.join(self.nuisance)}.")
         self._unit = scenario.length_unit_m
-        self._cap = torch.inf if paper else CAP_M / self._unit
+        self.cap = torch.inf if paper else CAP_M / self._unit
         self._first: Tensor | None = None
         self.asked_frames = None if frames is None else tuple(frames)
         self.asked_points = points
@@ -214,12 +215,12 @@ class Objective:
 
     def losses(self, motion: Motion) -> Tensor:
         """[B, L] losses of a matched motion at each compared frame."""
-        found = [pairs.losses(self._moved(motion, pairs), self._cap) for pairs in motion.pairs]
+        found = [pairs.losses(self._moved(motion, pairs), self.cap) for pairs in motion.pairs]
         return len(self.frames) * torch.stack(found).sum(0)
 
     def way_losses(self, motion: Motion) -> list[float]:
         """The loss of one matched motion forth, and in the default measure back."""
-        return [float(pairs.losses(self._moved(motion, pairs), self._cap).mean() / pairs.share) for pairs in motion.pairs]
+        return [float(pairs.losses(self._moved(motion, pairs), self.cap).mean() / pairs.share) for pairs in motion.pairs]
 
     def points(self, run: Rollout, *, pose: Tensor | None = None) -> Tensor:
         """[B, L, N, 3] points sampled on a rollout's cloth at the compared frames, in the recording's frame."""
@@ -249,6 +250,10 @@ class Objective:
             before, after = ((times + way * float(run.times[1])).clamp(0.0, float(run.times[-1])) for way in (-1, 1))
             moved = self.with_bodies(run.at(after)) - self.with_bodies(run.at(before))
             velocities = moved / (after - before)[:, None, None]
+        return self.matched(nodes, velocities, pose)
+
+    def matched(self, nodes: Tensor, velocities: Tensor | None, pose: Tensor | None) -> Motion:
+        """The same of nodes and velocities [B, L, V, 3] at the compared frames, those of bodies among them."""
         with torch.no_grad():
             still = nodes.detach(), None if velocities is None else velocities.detach()
             if pose is None:
@@ -322,21 +327,46 @@ class Objective:
             rates: [k, B, L, V, 3] of the cloth's nodes by k variables; None for none.
             factor: of the cap.
         """
+        found = [
+            pairs.terms(moved, columns, self.cap * factor)
+            for pairs, moved, columns in zip(motion.pairs, *self.columns(motion, rates), strict=True)
+        ]
+        loss, slope, curvature = (torch.stack(part).sum(0) for part in zip(*found, strict=True))
+        return loss, slope, curvature
+
+    def columns(self, motion: Motion, rates: Tensor | None) -> tuple[list[Tensor], list[Tensor]]:
+        """For each kind of pairs, where its places lie in the recording [B, L, N, 3], and their rates [k + d, B, L, N, 3].
+
+        Args:
+            rates: as of `terms`.
+        """
         space = self._target.space
-        sums: tuple[Tensor, Tensor, Tensor] | None = None
         here = self._lagged(motion, space)
         if rates is not None:  # bodies stand still
             rates = torch.nn.functional.pad(rates, (0, 0, 0, here.shape[-2] - rates.shape[-2]))
+        moved, every = [], []
         for pairs in motion.pairs:
             points = pairs.places.of(here)
             velocities = None if motion.velocities is None else pairs.places.of(motion.velocities)
             columns = [space.rates(points, motion.pose, velocities)]
             if rates is not None:
                 columns.insert(0, torch.stack([space.turned(pairs.places.of(rate), motion.pose) for rate in rates]))
-            found = pairs.terms(space.moved(points, motion.pose), torch.cat(columns), self._cap * factor)
-            sums = found if sums is None else (sums[0] + found[0], sums[1] + found[1], sums[2] + found[2])
-        assert sums is not None
-        return sums
+            moved.append(space.moved(points, motion.pose))
+            every.append(torch.cat(columns))
+        return moved, every
+
+    def freed(self, nuisance: Mapping[str, float]) -> Objective:
+        """The same with another pose space.
+
+        Args:
+            nuisance: free variables, with the standard deviations of their priors [m, rad, s].
+        """
+        other = copy(self)
+        target = self._target
+        space = PoseSpace.build(nuisance, target.space.centre, length_unit_m=self.length_unit_m)
+        other.nuisance, other._target, other._first = dict(nuisance), replace(target, space=space), None
+        other.loss_steps = min(self.loss_steps + 1, self.scenario.steps)  # a velocity has two sides
+        return other
 
     def with_bodies(self, positions: Tensor) -> Tensor:
         """[..., V, 3] nodes of the cloth -> with those of the bodies beside it, in the default measure."""

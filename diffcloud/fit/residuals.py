@@ -88,8 +88,7 @@ def linearise(objective: AnyObjective, space: FitSpace, places: Tensor) -> Linea
     def run(index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         parts = []
         for member in objective.members:
-            moved = _by_tangents if by_tangents(member) else _by_differences
-            parts.append(_over_pose(member, *moved(member, space, places[index])))
+            parts.append(_over_pose(member, *moved_by(member, space, places[index])))
         loss, slope, curvature = mean_terms(parts, paper=paper)
         weights = space.prior_weights(objective.length_unit_m)
         off = places[index]  # logarithms of multipliers, where there is a prior
@@ -111,8 +110,12 @@ def by_tangents(objective: Objective) -> bool:
     return objective.scenario.scene.integrator == "implicit"
 
 
-def _by_tangents(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rollout, Tensor]:
+def moved_by(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rollout, Tensor]:
     """Motions of B places, and the rates [k, B, L, V, 3] of their nodes at the compared frames."""
+    return (_by_tangents if by_tangents(objective) else _by_differences)(objective, space, places)
+
+
+def _by_tangents(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rollout, Tensor]:
     axis = Axis.of(space)
 
     def properties(at: Tensor) -> tuple[Tensor, ...]:
@@ -131,7 +134,6 @@ def _by_tangents(objective: Objective, space: FitSpace, places: Tensor) -> tuple
 
 
 def _by_differences(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rollout, Tensor]:
-    """The same."""
     axis = Axis.of(space)
     low, high = axis.ends
     ways = _ways(places)

@@ -39,18 +39,21 @@ _MEANS = {
     "median_error_ratio": "ratio error",
     "simulations": "simulations",
 }
-_IDENTIFIED = {
+_INTERVALS = {
     "scenario": "scenario",
     "episode": "episode",
     "parameter": "parameter",
     "verdict": "verdict",
     "value": "fitted",
+    "low": "from",
+    "high": "to",
     "factor": "within a factor of",
+    "physical_low": "SI from",
+    "physical_high": "to",
+    "physical_unit": "unit",
     "ratio_factor": "ratio within",
     "combination": "seen best",
-    "ends_agree": "ends that agree",
-    "scale_fitted": "scale moves",
-    "scale_everything": "artefact",
+    "sources": "improve first",
 }
 _PIXELS_PER_INCH = 92
 """Of the page per inch of a figure."""
@@ -152,7 +155,7 @@ def comparison_overview(entry: ComparisonEntry) -> Overview:
     verdicts = {name: f"verdict on {name.removeprefix('verdict_')}" for name in names if name.startswith("verdict_")}
     told = entry.told
     apart = [told[name]["factor"].max() for name in ("repeatability", "consistency") if len(told[name])]
-    compared = bool(apart) and not told["identifiability"].empty and not told["repeatability"].empty
+    compared = bool(apart) and not told["intervals"].empty and not told["repeatability"].empty
     drawn = _table(rows, {**_OVERVIEW, **verdicts, **_OVERVIEW_END})
     return Overview(drawn, len(comparison_failures(entry)), float(max(apart)) if compared else None)
 
@@ -172,15 +175,14 @@ def comparison_sections(entry: ComparisonEntry) -> list[Section]:
             "means",
         ),
         Section(
-            "identifiability",
+            "intervals",
             "What is identified",
-            "A parameter counts as identified if the loss tells it within a factor of 1.5. “Scale moves” and “artefact” "
-            "are changes of the loss, in units of the resampling noise, when stretch and mass are doubled or halved "
-            "together, and when bending, air and all masses go along: then only soft handles and contact stiffness are "
-            "left to tell.",
-            said["identifiability"],
-            _table(told["identifiability"], _IDENTIFIED),
-            "identifiability",
+            "Intervals hold the truth at the stated level, as far as the named sources of uncertainty go. A parameter "
+            "counts as identified if its interval ends within a factor of 1.5. “Improve first” names the largest sources "
+            "and their parts of the variance: what is known better makes the interval shorter.",
+            said["intervals"],
+            _table(told["intervals"], _INTERVALS),
+            "intervals",
         ),
         Section(
             "repeats",

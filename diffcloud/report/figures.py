@@ -274,22 +274,22 @@ def _landscape(record: Mapping[str, Any]) -> Figure | None:
         canvas,
         name,
         f"Loss landscape of {record['scenario']} / {record['episode']}",
-        f"{len(x)} × {len(y)} simulations on a logarithmic grid, common random points. The ellipse is what the "
-        "Gauss-Newton matrix says one standard deviation of resampling noise cannot tell; where it is small it "
-        "is within the star.",
+        f"{len(x)} × {len(y)} simulations on a logarithmic grid, common random points. The ellipse holds the "
+        "parameters at the level of the intervals; where it is small it is within the star.",
         "tables/comparison.json",
     )
 
 
 def _draw_ellipse(axis: Axes, record: Mapping[str, Any]) -> None:
-    told, names = record["identifiability"], record["landscape"]["names"]
-    if told is None or told["parameters"] != names or None in told["predicted"]:
+    told, names = record["intervals"], record["landscape"]["names"]
+    if told is None or list(told["parameters"]) != names or not told["arrived"]:
         return
     turn = np.linspace(0, 2 * np.pi, 200)
-    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1) * np.array(told["predicted"])
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1) * np.sqrt(-2 * np.log(1 - told["level"]))
+    spread, axes = np.linalg.eigh(np.array(told["covariance"]))
     centre = np.log(np.array(record["landscape"]["fitted"]))
-    places = np.exp(np.clip(centre + circle @ np.array(told["directions"]), -20, 20))
-    axis.plot(places[:, 0], places[:, 1], color=_COLOURS[1], linewidth=1.5, label="Gauss-Newton ellipse")
+    places = np.exp(np.clip(centre + circle * np.sqrt(np.maximum(spread, 0.0)) @ axes.T, -20, 20))
+    axis.plot(places[:, 0], places[:, 1], color=_COLOURS[1], linewidth=1.5, label=f"{told['level']:.0%} region")
 
 
 def _canvas(count: int, *, height: float, width: float | None = None) -> tuple[Canvas, list[Axes]]:

@@ -16,10 +16,10 @@ def record(
     methods: dict[str, float] | None = None,
     truth: dict[str, float] | None = None,
     transfers: dict[str, float] | None = None,
-    identifiability: bool = True,
+    stated: bool = True,
     gaps: list[dict[str, Any]] | None = None,
     landscape: bool = False,
-    ends: tuple[bool, ...] = (True, True, True, True),
+    reason: str = "",
 ) -> dict[str, Any]:
     """One episode; `methods` and `transfers` give losses."""
     losses = methods or {"diffcloud": 0.001, "middle": 0.01}
@@ -42,7 +42,7 @@ def record(
         "gaps": gaps or [],
         "failures": [],
         "transfers": [{"source": source, **_measured(loss)} for source, loss in (transfers or {}).items()],
-        "identifiability": _identifiability(ends) if identifiability else None,
+        "intervals": _intervals(stretch, reason) if stated else None,
         "landscape": _landscape() if landscape else None,
     }
 
@@ -54,8 +54,8 @@ def records() -> list[dict[str, Any]]:
     gap = {"method": "meteornet", "reason": "no checkpoint", "expected": True}
     return [
         record("lift", "tan1", methods=first, transfers={"tan2": 0.004}, gaps=[gap], landscape=True),
-        record("lift", "tan2", stretch=2.0, methods=second, ends=(True, True, False, True)),
-        record("fold", "tan1", stretch=8.0, identifiability=False),
+        record("lift", "tan2", stretch=2.0, methods=second, reason="the misfit is 14.2 mm"),
+        record("fold", "tan1", stretch=8.0, stated=False),
     ]
 
 
@@ -77,24 +77,31 @@ def _measured(loss: float) -> dict[str, float]:
     }
 
 
-def _identifiability(ends: tuple[bool, ...]) -> dict[str, Any]:
-    end = {"direction": 0, "end": 0.1, "rise": 1e-6, "rise_farther": 1e-4, "farther_within_bounds": True}
+def _intervals(stretch: float, reason: str) -> dict[str, Any]:
+    def entry(value: float, scale: float, unit: str) -> dict[str, Any]:
+        low, high = value / 2, value * 2
+        return {
+            "value": value, "low": low, "high": high, "physical": scale * value, "physical_low": scale * low,
+            "physical_high": scale * high, "physical_unit": unit, "factor": 2.0, "at_bounds": [],
+            "verdict": "only the ratio",
+        }  # fmt: skip
+
     return {
-        "parameters": ["stretch", "mass"],
-        "noise": 1e-5,
-        "matrix": [[1.0, -0.9], [-0.9, 1.0]],
-        "eigenvalues": [1.9, 0.1],
-        "directions": [[0.7071, -0.7071], [0.7071, 0.7071]],
-        "predicted": [0.05, 1.0],
-        "interval": [[0.05, 0.05], [1.0, None]],
-        "open": [[False, False], [False, False]],
-        "half_widths": {"stretch": 0.7, "mass": 0.7},
-        "ratio_half_width": 0.07,
-        "combination": "stretch^+1.00 · mass^-1.00",
-        "verdicts": {"stretch": "only the ratio", "mass": "only the ratio"},
-        "check": [{**end, "agrees": agrees} for agrees in ends],
-        "lower": None,
-        "scale": {"fitted": 9.0, "with_bending": 8.0, "everything": 6.0},
+        "level": 0.9,
+        "within": 1.5,
+        "parameters": {"stretch": entry(stretch, 4.0, "N/m"), "mass": entry(1.0, 0.2, "kg/m²")},
+        "ratio": {"value": stretch, "low": stretch / 1.07, "high": stretch * 1.07, "factor": 1.07},
+        "best": {"powers": {"stretch": 1.0, "mass": -1.0}, "factor": 1.07},
+        "worst": {"powers": {"stretch": 1.0, "mass": 1.0}, "factor": 2.0},
+        "sources": {
+            "friction_obstacle": {"stretch": 0.3, "mass": 0.3, "ratio": 0.03},
+            "noise": {"stretch": 0.1, "mass": 0.1, "ratio": 0.02},
+        },
+        "clusters": 16,
+        "covariance": [[0.1, 0.098], [0.098, 0.1]],
+        "arrived": True,
+        "explains": not reason,
+        "reason": reason,
         "note": "",
     }
 

@@ -57,8 +57,7 @@ def test_metrics_are_plain_numbers(told):
     found = metrics(told)
     assert found["methods"]["lift"]["diffcloud"]["episodes"] == 2
     assert not any(isinstance(value, float) and math.isnan(value) for value in found["methods"]["lift"]["mlp"].values())
-    assert found["identifiability"]["lift"]["stretch"] == {"only the ratio": 2}
-    assert found["checked_ends"] == {"agree": 7, "all": 8}
+    assert found["verdicts"]["lift"]["stretch"] == {"only the ratio": 2}
 
 
 def test_a_fit_has_a_row_with_what_its_start_and_its_end_are_worth():
@@ -110,10 +109,10 @@ class TestWords:
     def test_sentences_say_who_wins_and_what_is_known(self, told):
         said = sentences(told)
         assert "DiffCloud has the lowest mean loss over 2 episodes" in said["winners"][0]
-        assert any("verdict on stretch: only the ratio in 2 of 2 episodes" in line for line in said["identifiability"])
-        assert any("7 of 8 ends agree" in line for line in said["identifiability"])
-        assert any("2 further ends, in 2 episodes, have no interval" in line for line in said["identifiability"])
-        assert any("artefact" in line for line in said["identifiability"])
+        told_of = " ".join(said["intervals"])
+        assert "verdict on stretch: only the ratio in 2 of 2 episodes; 90% intervals end within a factor of 2" in told_of
+        assert "lift: stretch / mass is known within a factor of 1.07 (median)." in told_of
+        assert "lift / tan2: the misfit is 14.2 mm." in told_of
         assert any("stretch a factor of 2" in line for line in said["repeats"])
 
     def test_credibility_holds_one_recording_against_repeats_and_another_motion(self, told):
@@ -135,7 +134,7 @@ class TestWords:
         assert "nan" not in page.lower()
 
     def test_nothing_at_all(self):
-        told = tables([record("lift", "e", methods={"diffcloud": 0.1}, identifiability=False)], {})
+        told = tables([record("lift", "e", methods={"diffcloud": 0.1}, stated=False)], {})
         assert sentences(told)["repeats"] == []
         assert isinstance(overview(told), pd.DataFrame)
         assert "None." in comparison_page(told, [])

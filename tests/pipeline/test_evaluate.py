@@ -83,7 +83,7 @@ def test_tables_hold_methods_repeats_and_transfer(work):
     assert set(methods["method"]) == {"diffcloud", "single_start", "middle", "random_search", "cma_es"}
     assert tables["transfer"][["source", "target"]].to_numpy().tolist() == [["tan2", "tan1"], ["tan1", "tan2"]]
     assert set(tables["repeatability"]["parameter"]) == {"stretch", "mass", "ratio"}
-    assert len(tables["identifiability"]) == 4
+    assert len(tables["intervals"]) == 4
     metrics = json.loads((work / "reports" / "metrics.json").read_text())
     budgets = [read_fit(path).simulations for path in (work / "data" / "fits" / "small").glob("*.json")]
     spent = metrics["comparison"]["methods"]["small"]

@@ -58,7 +58,7 @@ def test_the_same_data_gives_the_same_bytes(told, figures):
 
 
 def test_nothing_is_drawn_of_nothing():
-    told = tables([record("lift", "e", methods={"diffcloud": 0.1}, identifiability=False)], {})
+    told = tables([record("lift", "e", methods={"diffcloud": 0.1}, stated=False)], {})
     assert [figure.name for figure in comparison_figures(told, [], {})] == ["losses", "parameters"]
 
 

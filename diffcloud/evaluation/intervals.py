@@ -1,0 +1,306 @@
+"""What a fit says of the parameters: intervals with a level, a verdict for each, and what to improve first.
+
+Variances come from `fit.uncertainty`. An interval lies symmetrically on the axis of the fit (a factor up and down for
+multipliers) and ends at the bounds. Its half-width is the variance's root times the quantile of Student's t with the
+degrees of freedom of Welch and Satterthwaite: the noise is estimated from few clusters, the stated doubts are not.
+
+No interval is stated where a fit has not arrived: Gauss and Newton's next step would leave a good part of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from diffcloud.fit.joint import AnyObjective
+from diffcloud.fit.objective import Objective
+from diffcloud.fit.parameters import FitSpace
+from diffcloud.fit.residuals import Axis
+from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, Uncertainty, uncertainty
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.properties import PARAMETERS
+
+Verdict = Literal[
+    "identified",
+    "only the ratio",
+    "only a combination",
+    "the prior speaks",
+    "not identified",
+    "the model does not explain the recording",
+    "the fit has not arrived",
+]
+WITHIN = 1.5
+"""A parameter counts as identified if its interval ends within this factor of the fitted value."""
+LEVEL = 0.9
+_UNEXPLAINED = 2.0
+"""RMS over what noise and spacing of the points account for, from which the model does not explain the recording."""
+_NOISE_M = 0.002
+"""Of recorded points whose own uncertainty is not stated."""
+_STEP = 0.5
+"""The largest next step of a fit that has arrived, in standard deviations."""
+_PRIOR = 0.5
+"""Part of the variance from which it is the prior that speaks."""
+_SHARE = 1 / 3
+"""A parameter has its part in a combination from this component on."""
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Interval(_Model):
+    """Of one parameter; None where none is stated."""
+
+    value: float
+    low: float | None
+    high: float | None
+    physical: float
+    physical_low: float | None
+    physical_high: float | None
+    physical_unit: str
+    factor: float | None
+    """To its farther end."""
+    at_bounds: list[float]
+    """Bounds at which it ends: it is one-sided there."""
+    verdict: Verdict
+
+
+class RatioInterval(_Model):
+    """Of stretch to mass."""
+
+    value: float
+    low: float | None
+    high: float | None
+    factor: float | None
+
+
+class Combination(_Model):
+    """A product of powers of the parameters, and the factor within which it is known."""
+
+    powers: dict[str, float]
+    factor: float | None
+
+    def __str__(self) -> str:
+        return " · ".join(f"{name}^{power:+.2f}" for name, power in self.powers.items() if abs(power) > 0.05)
+
+
+class Intervals(_Model):
+    """Of one fit."""
+
+    level: float
+    within: float
+    parameters: dict[str, Interval]
+    ratio: RatioInterval | None
+    best: Combination | None
+    """The best-determined combination, of several parameters."""
+    worst: Combination | None
+    sources: dict[str, dict[str, float]]
+    """Where the uncertainty comes from, the largest part first -> parameter (or `ratio`) -> standard deviation, of the
+    logarithm, or of the part of the range where the lower bound is zero."""
+    clusters: int
+    covariance: list[list[float]]
+    arrived: bool
+    explains: bool
+    """Whether the recordings' noise accounts for the misfit."""
+    reason: str
+    """Why there is no interval, or the verdict is not of the parameters; else empty."""
+
+
+def state_intervals(
+    objective: AnyObjective,
+    space: FitSpace,
+    values: Mapping[str, float],
+    *,
+    level: float = LEVEL,
+    within: float = WITHIN,
+    doubts: Mapping[str, float] = MATERIAL_DOUBTS,
+) -> Intervals:
+    """
+    Args:
+        values: the fitted ones.
+        level: of the intervals.
+        within: factor within which a parameter counts as identified.
+        doubts: of what is not fitted, see `fit.uncertainty`.
+
+    Raises:
+        DivergedError: the fitted motion diverges.
+    """
+    found = uncertainty(objective, space, values, doubts=doubts)
+    total = found.covariance
+    deviations = np.sqrt(np.maximum(total.diagonal(), 1e-300))
+    arrived = bool((np.abs(found.step) <= _STEP * deviations).all())
+    misfit = [_misfit(member, space, values) for member in objective.members]
+    worst_fit = max(misfit, key=lambda pair: pair[0] / pair[1])
+    explains = objective.paper or worst_fit[0] <= _UNEXPLAINED * worst_fit[1]
+    reason = ""
+    if not arrived:
+        reason = "the fit has not arrived: its next step is a good part of the interval; fit again with more iterations"
+    elif not explains:
+        reason = (
+            f"the misfit is {worst_fit[0]:.1f} mm RMS, and noise and spacing of the points account for "
+            f"{worst_fit[1]:.1f}: the model does not explain the recording, and intervals say only how far its misfit "
+            "lets the numbers go"
+        )
+    widths = {name: _half_width(found, row, level) for name, row in zip(space.names, np.eye(len(space.names)), strict=True)}
+    ratio_row = _ratio_row(space)
+    ratio_width = None if ratio_row is None else _half_width(found, ratio_row, level)
+    combinations = _combinations(found, space, level)
+    parameters = {}
+    for index, variable in enumerate(space.variables):
+        name = variable.name
+        low, high, bounded = _ends(space, index, values[name], widths[name])
+        factor = _factor(values[name], low, high)
+        prior = found.sources.get("prior")
+        told: Verdict
+        if not arrived:
+            told = "the fit has not arrived"
+        elif not explains:
+            told = "the model does not explain the recording"
+        elif prior is not None and prior[index, index] > _PRIOR * total[index, index]:
+            told = "the prior speaks"
+        elif factor <= within and not bounded:
+            told = "identified"
+        elif name in ("stretch", "mass") and ratio_width is not None and math.exp(ratio_width) <= within:
+            told = "only the ratio"
+        elif any(c.factor <= within and abs(c.powers[name]) > _SHARE for c in combinations if c.factor is not None):
+            told = "only a combination"
+        else:
+            told = "not identified"
+        stated = arrived
+        scale = _physical_scale(objective.members[0].scenario, name)
+        parameters[name] = Interval(
+            value=values[name],
+            low=low if stated else None,
+            high=high if stated else None,
+            physical=values[name] * scale,
+            physical_low=low * scale if stated else None,
+            physical_high=high * scale if stated else None,
+            physical_unit=PARAMETERS[name].unit,
+            factor=factor if stated and math.isfinite(factor) else None,
+            at_bounds=bounded,
+            verdict=told,
+        )
+    ratio = None
+    if ratio_width is not None:
+        value, factor = values["stretch"] / values["mass"], math.exp(min(ratio_width, 700.0))
+        ratio = RatioInterval(
+            value=value,
+            low=value / factor if arrived else None,
+            high=value * factor if arrived else None,
+            factor=factor if arrived else None,
+        )
+    several = len(space.names) > 1
+    return Intervals(
+        level=level,
+        within=within,
+        parameters=parameters,
+        ratio=ratio,
+        best=combinations[0] if several else None,
+        worst=combinations[-1] if several else None,
+        sources=_sources(found, space, ratio_row),
+        clusters=found.clusters,
+        covariance=total.tolist(),
+        arrived=arrived,
+        explains=explains,
+        reason=reason,
+    )
+
+
+def significant(low: float | None, high: float | None) -> Callable[[float | None], str]:
+    """What prints a number with as many digits as its interval bears: two where it is known within some tens of per cent,
+    three within some per cent, and so on; three without an interval."""
+    digits = 3
+    if low is not None and high is not None and 0 < low < high:
+        digits = 2 + min(max(math.floor(-math.log10((high - low) / (high + low))), 0), 4)
+    return lambda value: "–" if value is None else f"{value:.{digits}g}"
+
+
+def node_set_note(scenario: Scenario) -> str:
+    """Why the ratio is not what a motion identifies where the mass multiplier acts on a part of the cloth; else empty."""
+    nodes = scenario.node_sets.get("mass")
+    if nodes is None:
+        return ""
+    return f"mass multiplies {len(nodes)} of {len(scenario.scene.mesh.nodes)} nodes, so stretch / mass is no exact scale"
+
+
+def _half_width(found: Uncertainty, row: NDArray[np.float64], level: float) -> float:
+    """Of the combination row · places."""
+    from scipy.stats import t  # slow to import
+
+    total = float(row @ found.covariance @ row)
+    noise = float(row @ found.sources["noise"] @ row)
+    if total <= 0:
+        return 0.0
+    freedom = max(found.clusters - 1, 1) / max(noise / total, 1e-6) ** 2
+    return float(t.ppf(0.5 + level / 2, freedom) * math.sqrt(total))
+
+
+def _ends(space: FitSpace, index: int, value: float, half_width: float) -> tuple[float, float, list[float]]:
+    """The interval of one parameter, and the bounds at which it ends."""
+    variable, axis = space.variables[index], Axis.of(space)
+    values = torch.tensor([[v.low for v in space.variables]] * 3, dtype=torch.float64)
+    values[:, index] = value
+    places = axis.places(values)
+    places[:, index] += torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64) * min(half_width, 700.0)
+    low, _, high = axis.values(places)[:, index].tolist()
+    bounded = [bound for bound, out in ((variable.low, low <= variable.low), (variable.high, high >= variable.high)) if out]
+    return max(low, variable.low), min(high, variable.high), bounded
+
+
+def _factor(value: float, low: float, high: float) -> float:
+    return max(high / value, value / low) if low > 0 else math.inf
+
+
+def _ratio_row(space: FitSpace) -> NDArray[np.float64] | None:
+    if not {"stretch", "mass"} <= set(space.names):
+        return None
+    row = np.zeros(len(space.names))
+    row[space.names.index("stretch")], row[space.names.index("mass")] = 1.0, -1.0
+    return row
+
+
+def _combinations(found: Uncertainty, space: FitSpace, level: float) -> list[Combination]:
+    """Principal axes of the covariance, the best-determined first."""
+    told = []
+    for direction in np.linalg.eigh(found.covariance)[1].T:
+        powers = direction / direction[np.abs(direction).argmax()]
+        factor = math.exp(min(_half_width(found, powers, level), 700.0))
+        told.append(
+            Combination(
+                powers=dict(zip(space.names, powers.tolist(), strict=True)), factor=factor if factor < 1e100 else None
+            )
+        )
+    return told
+
+
+def _sources(found: Uncertainty, space: FitSpace, ratio: NDArray[np.float64] | None) -> dict[str, dict[str, float]]:
+    rows = dict(zip(space.names, np.eye(len(space.names)), strict=True)) | ({} if ratio is None else {"ratio": ratio})
+    main = rows.get("ratio", rows[space.names[0]])
+    told = {
+        source: {name: math.sqrt(max(float(row @ covariance @ row), 0.0)) for name, row in rows.items()}
+        for source, covariance in sorted(found.sources.items(), key=lambda item: -float(main @ item[1] @ main))
+    }
+    return told
+
+
+def _misfit(objective: Objective, space: FitSpace, values: Mapping[str, float]) -> tuple[float, float]:
+    """RMS of one recording beside the fitted motion, and what noise and spacing of its points account for [mm]."""
+    given = {**values, **space.fixed}
+    with torch.no_grad():
+        loss = float(objective({name: torch.tensor([value], dtype=torch.float64) for name, value in given.items()}))
+    to_mm = 1e3 * objective.length_unit_m
+    spacing = to_mm * float(np.sqrt(np.mean([cloud.spacing**2 for cloud in objective.clouds])))
+    sigma = objective.episode.sigma
+    noise = 1e3 * _NOISE_M if sigma is None else to_mm * float(np.median(sigma))
+    return to_mm * loss**0.5, math.hypot(spacing, noise)
+
+
+def _physical_scale(scenario: Scenario, name: str) -> float:
+    basis = PARAMETERS[name].basis
+    return 1.0 if basis is None else scenario.scene.basis(basis)

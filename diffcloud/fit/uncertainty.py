@@ -1,0 +1,289 @@
+"""How far a fit may be off, and why: one covariance, added up from stated sources.
+
+At the fitted place, let H be half of the loss's curvature over the fitted variables and the free pose, priors included,
+and s_i what pair i adds to half of its slope. A disturbance that adds g to the slope moves the fit by -H⁻¹ g. So
+
+    noise           H⁻¹ (Σ_c s_c s_cᵀ) H⁻¹,   s_c: the sum over a cluster of pairs (sandwich; Huber 1967, White 1980)
+    prior           H⁻¹ P Σ P H⁻¹,            P: what the priors add to H, Σ: their variances
+    a known doubt   b bᵀ,  b = -H⁻¹ h,        h: the slope's change if what is not fitted is one deviation off
+
+Residuals of one place on the cloth have much in common, over both directions and all frames: an edge that curls, a fold in
+the wrong place. So pairs are clustered by place. Doubts are quantities that the fit takes for known: material that is not
+fitted, where the cameras stand, the lag, and the size of the simulator's step, whose h is the distance to the motion with
+four times the steps. A misfit that the recording's own noise does not explain is inside of the residuals, and widens the
+interval with them.
+
+Changes of the slope are differences between motions to both sides, each matched with the recording anew, with nodes moved
+along the derivatives of one simulation: as a surface moves, its points find other partners, which Gauss and Newton's
+curvature of fixed pairs knows only roughly.
+
+The pose is eliminated as in `residuals`; recordings of a joint fit add up with the weights of `joint`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloud.errors import ConfigError, unknown_name
+from diffcloud.fit.joint import AnyObjective
+from diffcloud.fit.objective import Motion, Objective
+from diffcloud.fit.parameters import FitSpace, Variable
+from diffcloud.fit.pose import NUISANCE
+from diffcloud.fit.residuals import Axis, moved_by
+from diffcloud.fit.targets import track_displacement
+from diffcloud.sim.properties import PARAMETERS
+from diffcloud.sim.simulate import Rollout, rollout
+
+POSE_DOUBTS = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.005, "yaw": 0.005, "lag": 0.002}
+"""How far a calibrated set-up may be off where the fit takes it for known [m, rad, s]."""
+MATERIAL_DOUBTS = {"bending": 1.5, "drag": 1.3, "damping": 1.5, "friction_obstacle": 1.3, "friction_cloth": 1.3}
+"""Factors within which what is not fitted is taken to be known."""
+_REFINED = 4
+_STEP = 0.05
+"""On the axis, by which the slope's change is measured."""
+_ROUGH = 4.0
+_CHUNK = 16
+"""Motions matched together."""
+_PATCHES = 16
+_NO_MATERIAL = 1e-9
+
+
+def check_doubts(doubts: Mapping[str, float]) -> None:
+    """
+    Raises:
+        ConfigError: an unknown parameter, or what is no factor above 1.
+    """
+    for name, factor in doubts.items():
+        if name not in PARAMETERS:
+            raise ConfigError(f"doubt: {unknown_name('parameter', name, PARAMETERS)}")
+        if not (1 < factor < np.inf):
+            raise ConfigError(f"doubt: {name} takes the factor within which it is known, above 1, got {factor:g}.")
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Of k fitted variables, on the axis of `residuals.Axis`."""
+
+    names: tuple[str, ...]
+    places: NDArray[np.float64]
+    """[k] fitted."""
+    sources: Mapping[str, NDArray[np.float64]]
+    """Name -> [k, k] covariance."""
+    clusters: int
+    """Of residuals, over all recordings."""
+    step: NDArray[np.float64]
+    """[k] that Gauss and Newton would take next: small against the deviations where the fit has arrived."""
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """[k, k]"""
+        return np.sum(list(self.sources.values()), axis=0)
+
+
+def uncertainty(
+    objective: AnyObjective,
+    space: FitSpace,
+    values: Mapping[str, float],
+    *,
+    doubts: Mapping[str, float] = MATERIAL_DOUBTS,
+) -> Uncertainty:
+    """
+    Args:
+        values: the fitted ones.
+        doubts: of the material that is not fitted: parameter -> factor of one deviation.
+
+    Raises:
+        DivergedError: the motion, or the refined one, diverges.
+    """
+    axis = Axis.of(space)
+    places = axis.places(torch.tensor([[values[name] for name in space.names]], dtype=torch.float64))
+    with torch.no_grad():
+        parts = [_Part.of(member, space, places, doubts) for member in objective.members]
+    losses = np.array([part.loss for part in parts])
+    weights = np.ones(len(parts)) if objective.paper else np.exp(np.log(losses).mean()) / losses
+    weights /= len(parts)
+    prior = space.prior_weights(objective.length_unit_m).numpy()
+    normal = sum(w * part.normal for w, part in zip(weights, parts, strict=True)) + np.diag(prior)
+    slope = sum(w * part.slope for w, part in zip(weights, parts, strict=True)) + prior * places[0].numpy()
+    inverse = np.linalg.pinv(normal, hermitian=True)
+
+    def spread(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[n, k] additions to the slope -> [k, k]."""
+        moved = rows @ inverse
+        return moved.T @ moved
+
+    clusters = np.concatenate([w * part.scores for w, part in zip(weights, parts, strict=True)])
+    clusters = clusters[np.abs(clusters).max(axis=1) > 0]
+    sources = {"noise": spread(clusters) * len(clusters) / max(len(clusters) - 1, 1)}
+    deviations = np.array([0.0 if v.prior is None else np.log(v.prior) for v in space.variables])
+    if prior.any():
+        sources["prior"] = spread(np.diag(prior * deviations))
+    for name in dict.fromkeys(key for part in parts for key in part.doubts):
+        each = [w * part.doubts[name] for w, part in zip(weights, parts, strict=True) if name in part.doubts]
+        together = name in PARAMETERS or name == "step size"  # of the one cloth, and of the one simulator
+        sources[name] = spread(np.sum(each, axis=0)[None] if together else np.stack(each))
+    return Uncertainty(space.names, places[0].numpy(), sources, len(clusters), -inverse @ slope)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One recording's share, the pose eliminated."""
+
+    loss: float
+    slope: NDArray[np.float64]
+    """[k]"""
+    normal: NDArray[np.float64]
+    """[k, k]"""
+    scores: NDArray[np.float64]
+    """[C, k] of the clusters."""
+    doubts: Mapping[str, NDArray[np.float64]]
+    """Name -> [k] the slope's change at one deviation."""
+
+    @staticmethod
+    def of(objective: Objective, space: FitSpace, places: Tensor, doubts: Mapping[str, float]) -> _Part:
+        whole, deviations = _with_doubts(objective, space, doubts)
+        k, m = len(space.names), len(deviations)
+        known = torch.tensor([[(v.low * v.high) ** 0.5 for v in whole.variables[k:]]], dtype=torch.float64).log()
+        run, rates = moved_by(objective, whole, torch.cat([places, known], dim=-1))
+        refined = _refined(objective, whole.parameters(Axis.of(whole).values(torch.cat([places, known], dim=-1))), run)
+        fitted_pose = objective.match(run).pose[0]
+        free = objective.freed({**POSE_DOUBTS, **objective.nuisance})
+        pose_names = free.pose_space.names
+        values = free.pose_space.of(objective.pose_space.described(fitted_pose, length_unit_m=1.0), length_unit_m=1.0)
+        motion = free.match(run, pose=values[None])
+        # what is tried, to both sides: variables and doubtful material move nodes, pose variables the pose
+        scale = torch.cat([torch.full((k,), _STEP, dtype=torch.float64), deviations])
+        ways = torch.cat([rates * scale[:, None, None, None, None], refined[None]])[:, 0]
+        ways = torch.nn.functional.pad(ways, (0, 0, 0, motion.nodes.shape[-2] - ways.shape[-2]))
+        small = torch.tensor(
+            [POSE_DOUBTS[name] / (objective.length_unit_m if NUISANCE[name] == "m" else 1.0) for name in pose_names]
+        )
+        still = torch.zeros(len(pose_names), *ways.shape[1:], dtype=torch.float64)
+        ways, turns = torch.cat([ways, still]), torch.cat([torch.zeros(k + m + 1, len(pose_names)), small.diag()]).double()
+        both = torch.cat([torch.zeros_like(ways[:1]), ways, -ways])
+        poses = values + torch.cat([torch.zeros_like(turns[:1]), turns, -turns])
+        loss, slopes, normal = _slopes(free, motion, rates[:k], motion.nodes + both, poses)
+        change = (slopes[1 : 1 + len(ways)] - slopes[1 + len(ways) :]) / 2
+        names = [*space.names, *whole.names[k:], "step size", *pose_names]
+        own = [*range(k), *(names.index(name) for name in objective.pose_space.names)]
+        felt = [*range(k), *(k + pose_names.index(name) for name in objective.pose_space.names)]
+        steps = np.concatenate([np.full(k, _STEP), small.numpy()[[index - k for index in felt[k:]]]])
+        prior = np.concatenate([np.zeros(k), objective.pose_space.prior_weights.numpy()])
+        measured = change[np.ix_(own, felt)] / steps[:, None]
+        curved = _between(measured, normal[np.ix_(felt, felt)]) + np.diag(prior)
+        slope = slopes[0, felt] + prior * np.concatenate([np.zeros(k), fitted_pose.numpy()])
+        onto = np.eye(k, len(felt))  # of what is added to the slope of all that is fitted, what the parameters feel
+        if len(felt) > k:
+            onto[:, k:] = -np.linalg.solve(curved[k:, k:], curved[k:, :k]).T
+        found = {
+            name: onto @ change[index, felt]
+            for index, name in enumerate(names)
+            if index not in own and not (name in NUISANCE and objective.paper)
+        }
+        scores = _clustered(free, motion, rates[:k])
+        return _Part(loss, onto @ slope, onto @ curved[:, :k], scores[:, felt] @ onto.T, found)
+
+
+def _slopes(
+    objective: Objective, motion: Motion, rates: Tensor, nodes: Tensor, poses: Tensor
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """The loss at the first of B motions, half of its slopes [B, k + d] at all, each matched anew, and half of the
+    curvature [k + d, k + d] at the first.
+
+    Args:
+        rates: [k, 1, L, V, 3] of the nodes, the same for all motions.
+    """
+    slopes, first = [], None
+    for begin in range(0, len(nodes), _CHUNK):
+        part, at = nodes[begin : begin + _CHUNK], poses[begin : begin + _CHUNK]
+        velocities = None if motion.velocities is None else motion.velocities.expand(len(part), -1, -1, -1)
+        every = rates.expand(-1, len(part), -1, -1, -1)
+        loss, slope, normal = objective.terms(objective.matched(part, velocities, at), every)
+        first = first or (float(loss[0]), normal[0].numpy())
+        slopes.append(slope)
+    assert first is not None
+    return first[0], torch.cat(slopes).numpy(), first[1]
+
+
+def _between(measured: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The measured curvature, which knows that pairs change, but no more than a stated factor off Gauss and Newton's along
+    any direction: where a loss is rough, its measured one may be anything."""
+    values, vectors = np.linalg.eigh(normal)
+    root = vectors * np.sqrt(np.maximum(values, 1e-12 * max(values.max(), 1e-300)))
+    inverse = np.linalg.pinv(root)
+    factors, axes = np.linalg.eigh(inverse @ ((measured + measured.T) / 2) @ inverse.T)
+    clipped = np.clip(factors, 1 / _ROUGH, _ROUGH)
+    return np.asarray(root @ (axes * clipped) @ axes.T @ root.T)
+
+
+def _with_doubts(objective: Objective, space: FitSpace, doubts: Mapping[str, float]) -> tuple[FitSpace, Tensor]:
+    """The fitted variables and then the doubtful ones, and the deviations [m] of these on the axis."""
+    properties = objective.system.properties
+    variables, deviations = [], []
+    for name, factor in doubts.items():
+        basis = PARAMETERS[name].basis
+        there = float(getattr(properties, name)[0]) if basis is None else objective.scenario.scene.basis(basis)
+        known = space.fixed.get(name, there if basis is None else 1.0)
+        if name not in space.names and min(there, known) > _NO_MATERIAL:
+            variables.append(Variable(name, known / 10, known * 10))
+            deviations.append(np.log(factor))
+    added = [variable.name for variable in variables]
+    fixed = {name: value for name, value in space.fixed.items() if name not in added}
+    return FitSpace((*space.variables, *variables), fixed), torch.tensor(deviations, dtype=torch.float64)
+
+
+def _refined(objective: Objective, parameters: Mapping[str, Tensor], run: Rollout) -> Tensor:
+    """[1, L, V, 3] from the motion to that with finer steps, at the compared frames."""
+    scenario = objective.scenario
+    scene = replace(scenario.scene, frame_steps=scenario.scene.frame_steps * _REFINED)
+    system, _ = scene.build()
+    steps = objective.loss_steps * _REFINED
+    track = None
+    if objective.episode.gripper is not None:
+        track = torch.as_tensor(track_displacement(objective.episode, system.handles.grippers, steps, system.time_step))[
+            None
+        ]
+    fine = rollout(system, steps, properties=scenario.properties(system, parameters), track=track)
+    return fine.at(objective.times) - run.at(objective.times)
+
+
+def _clustered(objective: Objective, motion: Motion, rates: Tensor) -> NDArray[np.float64]:
+    """[C, n] sums of what pairs add to the slope over each cluster."""
+    patch = torch.from_numpy(patches(objective.system.mesh.nodes, _PATCHES))
+    bodies = motion.nodes.shape[-2] - len(patch)
+    patch = torch.cat([patch, torch.full((bodies,), _PATCHES)])
+    sums = None
+    for pairs, moved, columns in zip(motion.pairs, *objective.columns(motion, rates), strict=True):
+        scores = pairs.scores(moved, columns, objective.cap)[:, 0]  # [n, L, N]
+        where = patch[pairs.places.nodes[0, ..., 0]]  # [L, N]
+        found = scores.new_zeros(len(scores), _PATCHES + 1)
+        found.index_add_(1, where.flatten(), scores.flatten(1))
+        sums = found if sums is None else sums + found
+    assert sums is not None
+    return sums.T.numpy()
+
+
+def patches(nodes: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """[V] which of `count` patches of equal size each node belongs to: halves of halves, each across its longest side.
+
+    Args:
+        count: a power of two.
+    """
+    found = np.zeros(len(nodes), dtype=np.int64)
+    groups: list[NDArray[np.int64]] = [np.arange(len(nodes))]
+    while len(groups) < count:
+        halved = []
+        for group in groups:
+            side = int(np.ptp(nodes[group], axis=0).argmax()) if len(group) else 0
+            order = group[np.argsort(nodes[group, side], kind="stable")]
+            halved += [order[: len(order) // 2], order[len(order) // 2 :]]
+        groups = halved
+    for index, group in enumerate(groups):
+        found[group] = index
+    return found

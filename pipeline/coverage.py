@@ -1,0 +1,306 @@
+"""`diffcloud coverage`: how often intervals hold the truth, over the whole chain from a drawn cloth to its interval."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+from rich.table import Table
+
+from diffcloud.errors import ConfigError, DiffCloudError
+from diffcloud.evaluation.intervals import state_intervals
+from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.fit import FitSpace, Objective, solve
+from diffcloud.fit.priors import parameter_priors
+from diffcloud.io.episodes import Episode, read_episode, write_episode
+from diffcloud.io.files import files_in, read_json, write_json, write_text
+from diffcloud.io.fingerprints import fingerprint
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.properties import PARAMETERS
+from diffcloud.sim.simulate import rollout
+from pipeline.config import Config, load_config
+from pipeline.console import JsonFlag, ParamsFile, errors, finish, show, writes
+from pipeline.episodes import hidden_parameters, record_motion
+from pipeline.preprocess import PreprocessJob
+from pipeline.scenario_options import choose_scenario
+from pipeline.workers import Tell, run_all
+
+_CODE = ("mesh", "io", "sim", "scene", "clouds", "fit", "evaluation", "sensing")
+_REFINED = 4
+HEAD = (
+    "scenario",
+    "known",
+    "parameter",
+    "recordings",
+    "stated",
+    "hold the truth",
+    "RMS error",
+    "median half-width",
+    "identified",
+)
+
+
+@writes()
+def coverage(
+    out: Annotated[
+        Path, typer.Option(help="Folder; <scenario>/<known>/<number>.json, kept by a later call, and episodes.")
+    ],
+    scenario: Annotated[list[str] | None, typer.Option(help="Repeatable; by default those of the parameters file.")] = None,
+    recordings: Annotated[int, typer.Option(min=1, help="Of each scenario.")] = 200,
+    seed: Annotated[int, typer.Option(help="Of truths and noise.")] = 0,
+    fix: Annotated[list[str] | None, typer.Option(help="Parameter that fits are told the truth of, repeatable.")] = None,
+    level: Annotated[float | None, typer.Option(min=0.01, max=0.999, help="Of the intervals. Default: 0.9.")] = None,
+    refined: Annotated[
+        bool, typer.Option("--refined", help="Simulate the truth with four times the steps that fits take.")
+    ] = False,
+    markdown: Annotated[Path | None, typer.Option(help="Write all that the folder holds to this page.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Recordings at once, each in a process with one thread.")] = 1,
+    params: ParamsFile = None,
+    json: JsonFlag = False,
+) -> None:
+    """Draw cloths, record and fit them, and count how often the stated intervals hold the truth.
+
+    Stretch and mass are drawn as `diffcloud episodes` draws them; material that is not fitted is off by the factors of
+    `evaluate.doubts`. A recording whose fit fails or gets no interval counts as a miss.
+    """
+    config = load_config(params)
+    known = tuple(fix or ())
+    for name in known:
+        if name not in config.fit.parameters:
+            raise ConfigError(f"--fix names a fitted parameter, one of {', '.join(config.fit.parameters)}, not {name!r}.")
+    if set(known) >= set(config.fit.parameters):
+        raise ConfigError("Nothing is left to fit: leave out a --fix.")
+    jobs = [
+        CoverageJob(choose_scenario(name), index, seed, known, level or config.evaluate.level or 0.9, refined, config, out)
+        for name in scenario or config.scenarios
+        for index in range(recordings)
+    ]
+    failures = []
+    for job, _, error in run_all("coverage", jobs, workers):
+        if error is not None:
+            failures.append(f"{job.label}: {error}")
+            errors.print(failures[-1], markup=False, soft_wrap=True)
+    rows = summary_rows(out)
+    table = Table(*HEAD)
+    for row in rows:
+        table.add_row(*map(str, row))
+    show(table, json)
+    if markdown is not None:
+        write_text(markdown, coverage_page(rows))
+    asked = {f"{job.scenario.name}/{job.folder.name}": job.folder for job in jobs}
+    counts = {name: counted(folder) for name, folder in asked.items()}
+    result = next(iter(counts.values())) if len(counts) == 1 else {"scenarios": counts}
+    finish({"out": str(out), "level": jobs[0].level, **result, "failures": failures}, json)
+
+
+@dataclass(frozen=True)
+class CoverageJob:
+    """One drawn cloth: recorded, fitted, and its interval held against the truth. A finished one is kept."""
+
+    scenario: Scenario
+    index: int
+    seed: int
+    known: tuple[str, ...]
+    level: float
+    refined: bool
+    config: Config
+    out: Path
+
+    @property
+    def label(self) -> str:
+        return f"{self.scenario.name}/{self.index}"
+
+    @property
+    def folder(self) -> Path:
+        told = "_".join((*self.known, "known")) if self.known else "free"
+        return self.out / self.scenario.name / (f"{told}_refined" if self.refined else told)
+
+    def run(self, tell: Tell) -> dict[str, Any]:
+        """The finished record.
+
+        Raises:
+            DiffCloudError: the cloth cannot be simulated, recorded or fitted; the record says so.
+        """
+        path = self.folder / f"{self.index:04d}.json"
+        plan = [self.scenario, self.index, self.seed, self.known, self.level, self.refined]
+        sections = [self.config.episodes, self.config.preprocess, self.config.fit, self.config.evaluate.doubts]
+        mark = fingerprint([*plan, [str(section) for section in sections]], packages=_CODE)
+        if path.is_file():
+            kept = read_json(path)
+            if isinstance(kept, dict) and kept.get("fingerprint") == mark:
+                return kept
+        record: dict[str, Any] = {"fingerprint": mark, "truth": self.truth()}
+        try:
+            record |= self._measured(record["truth"], tell)
+        except DiffCloudError as error:
+            record["error"] = str(error)
+        write_json(path, record)
+        if "error" in record:
+            raise DiffCloudError(str(record["error"]))
+        return record
+
+    def truth(self) -> dict[str, float]:
+        """All that is drawn, name -> value."""
+        rng = np.random.default_rng([self.seed, self.index])
+        drawn = hidden_parameters(self.scenario, self.config.episodes.model_copy(update={"per_scenario": 1}), rng)
+        found = {name: float(value[0]) for name, value in drawn.items()}
+        system, _ = self.scenario.scene.build()
+        for name, factor in self.config.evaluate.doubts.items():
+            off = math.exp(rng.standard_normal() * math.log(factor))
+            base = 1.0 if PARAMETERS[name].basis else float(getattr(system.properties, name)[0])
+            if name not in found and base > 0:
+                found[name] = base * off
+        return found
+
+    def _measured(self, truth: Mapping[str, float], tell: Tell) -> dict[str, Any]:
+        episode = self._episode(truth, tell)
+        tell(0.5, "fit")
+        fit, scenario = self.config.fit, self.scenario
+        bounds = {**scenario.bounds, **fit.bounds}
+        fixed = {**fit.fixed, **{name: truth[name] for name in self.known}}
+        names = [name for name in fit.parameters if name not in fixed]
+        ranges = {name: bounds.get(name, PARAMETERS[name].bounds) for name in names}
+        priors = parameter_priors("none" if fit.paper else fit.prior, names, ranges)
+        space = FitSpace.build(names, bounds=bounds, fixed=fixed, priors=priors)
+        objective = Objective(scenario, episode, **fit.measure())
+        outcome = solve(objective, space, fit.solver_settings(scenario))
+        if outcome.stop_reason == "interrupted":
+            raise KeyboardInterrupt
+        found = state_intervals(
+            objective,
+            space,
+            outcome.values,
+            level=self.level,
+            within=self.config.evaluate.within,
+            doubts=self.config.evaluate.doubts,
+        )
+        told = {"loss": outcome.loss, "stop_reason": outcome.stop_reason, "simulations": outcome.simulations}
+        return told | {"seconds": outcome.seconds, "intervals": found.model_dump(mode="json")}
+
+    def _episode(self, truth: Mapping[str, float], tell: Tell) -> Episode:
+        """Recorded and preprocessed; fits with other known parameters share it."""
+        place = self.out / self.scenario.name / ("episodes_refined" if self.refined else "episodes")
+        path = place / f"{self.index:04d}.npz"
+        meta = {"scenario": self.scenario.name, "fabric": f"drawn{self.index}", "repeat": 1, "truth": dict(truth)}
+        if path.is_file() and (kept := read_episode(path)).meta.get("truth") == meta["truth"]:
+            return kept
+        tell(0.0, "recording")
+        scene = self.scenario.scene
+        if self.refined:
+            scene = replace(scene, frame_steps=_REFINED * scene.frame_steps)
+        system, _ = scene.build()
+        sets = {name: torch.tensor([value], dtype=torch.float64) for name, value in truth.items()}
+        steps = self.scenario.frames * scene.frame_steps
+        with torch.no_grad():
+            run = rollout(system, steps, properties=self.scenario.properties(system, sets))
+        nodes, times = run.positions[0, :: scene.frame_steps].numpy(), run.times[:: scene.frame_steps].numpy()
+        seed = int(np.random.default_rng([self.seed, self.index, 1]).integers(2**31))
+        with TemporaryDirectory(prefix="diffcloud-") as folder:
+            work = Path(folder)
+            record_motion(self.scenario, system, nodes, times, work, path.stem, self.config.episodes, seed=seed, meta=meta)
+            source = work / path.stem if (work / path.stem).is_dir() else work / path.name
+            tell(0.25, "preprocessing")
+            PreprocessJob("clean", source, work, self.config.preprocess, None).run(lambda done, text: None)
+            episode = read_episode(work / "clean" / path.name)
+        write_episode(path, episode)
+        return episode
+
+
+def counted(folder: Path) -> dict[str, Any]:
+    """What the records of one folder say.
+
+    Returns:
+        parameters: name -> n, stated: with an interval, covered: those that hold the truth, median_factor: of the
+        intervals, rms_error: of the logarithm, verdicts, identified_within: of those called identified, how many are within
+        the factor; ratio: the same of stretch to mass, if both are fitted.
+    """
+    records = [read_json(path) for path in files_in(folder, ".json")]
+    fitted = next((list(one["intervals"]["parameters"]) for one in records if "intervals" in one), [])
+    parameters = {name: _count(records, name) for name in fitted}
+    told: dict[str, Any] = {"parameters": parameters}
+    if {"stretch", "mass"} <= set(fitted):
+        told["ratio"] = _count(records, "ratio")
+    return told
+
+
+def _count(records: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
+    offs, widths, covered, verdicts, right = [], [], 0, dict[str, int](), 0
+    for record in records:
+        if "intervals" not in record:
+            continue
+        truth, told = record["truth"], record["intervals"]
+        entry = told["ratio"] if name == "ratio" else told["parameters"][name]
+        true = truth["stretch"] / truth["mass"] if name == "ratio" else truth[name]
+        off = abs(math.log(entry["value"] / true))
+        offs.append(off)
+        if entry["low"] is not None:
+            covered += entry["low"] <= true <= entry["high"]
+            widths.append(math.log(entry["high"] / entry["low"]) / 2)
+        if (verdict := entry.get("verdict")) is not None:
+            verdicts[verdict] = verdicts.get(verdict, 0) + 1
+            right += verdict == "identified" and off <= math.log(told["within"])
+    return {
+        "n": len(records),
+        "stated": len(widths),
+        "covered": covered,
+        "median_factor": math.exp(float(np.median(widths))) if widths else None,
+        "median_half_width": float(np.median(widths)) if widths else None,
+        "rms_error": float(np.sqrt(np.mean(np.square(offs)))) if offs else None,
+        "median_error": float(np.median(offs)) if offs else None,
+        "verdicts": verdicts,
+        "identified_within": right,
+    }
+
+
+def summary_rows(out: Path) -> list[list[str]]:
+    """A row for each parameter of each folder of records."""
+    rows = []
+    for scenario in sorted(path for path in out.iterdir() if path.is_dir()):
+        for folder in sorted(path for path in scenario.iterdir() if path.is_dir() and files_in(path, ".json")):
+            told = counted(folder)
+            ratio = {"stretch / mass": told["ratio"]} if "ratio" in told else {}
+            for name, count in (told["parameters"] | ratio).items():
+                share = f"{count['covered']} ({100 * count['covered'] / count['n']:.0f} %)"
+                called = count["verdicts"].get("identified", 0)
+                rows.append(
+                    [
+                        scenario.name,
+                        folder.name.replace("_", " "),
+                        name,
+                        str(count["n"]),
+                        str(count["stated"]),
+                        share,
+                        _number(count["rms_error"]),
+                        _number(count["median_half_width"]),
+                        "" if name == "stretch / mass" else f"{count['identified_within']} of {called}",
+                    ]
+                )
+    return rows
+
+
+def coverage_page(rows: Sequence[Sequence[str]]) -> str:
+    lines = [
+        "# How often intervals hold the truth",
+        "",
+        "Cloths of drawn parameters are simulated, recorded (`lift` and `fold` by two depth cameras through `preprocess`, "
+        "the others by their whole surface), fitted, and the 90 % interval is held against the truth. Material that fits "
+        "take for known is off by the factors that the intervals state (`evaluate.doubts`). Errors and half-widths are of "
+        "the natural logarithm: 0.1 is about 10 %. A fit that fails or states no interval is a miss. *Identified*: of the "
+        "recordings with that verdict, how many are within its factor of the truth. *Refined*: the truth has four times "
+        "the steps that fits take. Command: `make coverage`.",
+        "",
+        *markdown_table(HEAD, rows),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"

@@ -1,0 +1,150 @@
+"""Intervals and verdicts from known covariances."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.stats import norm, t
+
+from diffcloud.evaluation import intervals as module
+from diffcloud.evaluation.intervals import significant, state_intervals
+from diffcloud.evaluation.summary import largest_sources
+from diffcloud.fit import FitSpace, Objective
+from diffcloud.fit.uncertainty import Uncertainty
+from tests.conftest import small_lift
+from tests.fit.test_fit import clouds_of
+
+VALUES = {"stretch": 0.7, "mass": 1.0}
+SPACE = FitSpace.build(["stretch", "mass"], priors={"stretch": 10.0, "mass": 10.0})
+
+
+@pytest.fixture(scope="module")
+def objective():
+    scenario = small_lift()
+    return Objective(scenario, clouds_of(scenario, **VALUES))
+
+
+@pytest.fixture
+def told(objective, monkeypatch):
+    """Intervals of stated variances."""
+
+    def tell(sources, *, space=SPACE, values=VALUES, step=0.0, clusters=16, misfit=(3.0, 3.0), **options):
+        k = len(space.names)
+        places = np.log([values[name] for name in space.names])
+        covariances = {name: np.array(value, dtype=float).reshape(k, k) for name, value in sources.items()}
+        found = Uncertainty(space.names, places, covariances, clusters, np.full(k, step))
+        monkeypatch.setattr(module, "uncertainty", lambda *arguments, **given: found)
+        monkeypatch.setattr(module, "_misfit", lambda *arguments: misfit)
+        return state_intervals(objective, space, values, **options)
+
+    return tell
+
+
+def known_ratio(scale, ratio):
+    """Covariance with a deviation of the common factor, and one of stretch / mass."""
+    return scale**2 * np.ones((2, 2)) + ratio**2 / 4 * np.array([[1, -1], [-1, 1]])
+
+
+class TestEnds:
+    def test_of_doubts_alone_the_quantile_is_the_normal_one(self, told):
+        found = told({"noise": np.zeros((2, 2)), "z": np.diag([0.04, 0.01])}, level=0.95)
+        entry = found.parameters["stretch"]
+        assert math.log(entry.high / entry.value) == pytest.approx(0.2 * norm.ppf(0.975), rel=1e-6)
+        assert entry.low * entry.high == pytest.approx(entry.value**2)
+        assert (entry.physical, entry.physical_unit) == (pytest.approx(4.0 * 0.7), "N/m")
+        assert entry.physical_high == pytest.approx(4.0 * entry.high)
+
+    def test_of_noise_alone_it_is_that_of_its_few_clusters(self, told):
+        found = told({"noise": np.diag([0.04, 0.01])}, clusters=5)
+        entry = found.parameters["stretch"]
+        assert math.log(entry.high / entry.value) == pytest.approx(0.2 * t.ppf(0.95, 4), rel=1e-6)
+
+    def test_they_stop_at_the_bounds(self, told):
+        entry = told({"noise": np.diag([25.0, 25.0])}).parameters["stretch"]
+        assert (entry.low, entry.high) == (0.1, 10.0)
+        assert entry.at_bounds == [0.1, 10.0]
+
+    def test_a_linear_axis_has_a_linear_interval(self, told):
+        space = FitSpace.build(["friction_obstacle"])
+        found = told({"noise": [[0.0]], "z": [[0.01]]}, space=space, values={"friction_obstacle": 0.3})
+        entry = found.parameters["friction_obstacle"]
+        assert entry.high - entry.value == pytest.approx(0.1 * norm.ppf(0.95) * 1.5)  # a part of the range
+        assert entry.value - entry.low == pytest.approx(entry.high - entry.value)
+
+    def test_the_ratio_takes_both_along(self, told):
+        found = told({"noise": np.zeros((2, 2)), "z": known_ratio(1.0, 0.1)})
+        assert found.ratio.value == pytest.approx(0.7)
+        assert math.log(found.ratio.factor) == pytest.approx(0.1 * norm.ppf(0.95), rel=1e-6)
+        assert str(found.best) in ("stretch^+1.00 · mass^-1.00", "stretch^-1.00 · mass^+1.00")
+        assert found.worst.factor > found.best.factor
+
+
+class TestVerdicts:
+    @pytest.mark.parametrize(
+        ("sources", "verdict"),
+        [
+            ({"noise": np.diag([0.01, 0.01])}, "identified"),
+            ({"noise": np.zeros((2, 2)), "z": known_ratio(1.0, 0.1)}, "only the ratio"),
+            ({"noise": np.diag([1.0, 1.0])}, "not identified"),
+            ({"noise": np.diag([0.1, 0.1]), "prior": np.diag([1.0, 1.0])}, "the prior speaks"),
+        ],
+    )
+    def test_from_variances(self, told, sources, verdict):
+        assert told(sources).parameters["stretch"].verdict == verdict
+
+    def test_of_other_pairs_only_a_combination_is_known(self, told):
+        space = FitSpace.build(["stretch", "bending"])
+        found = told(
+            {"noise": np.zeros((2, 2)), "z": known_ratio(1.0, 0.1)}, space=space, values={"stretch": 1, "bending": 1}
+        )
+        assert found.parameters["bending"].verdict == "only a combination"
+        assert found.ratio is None
+
+    def test_a_named_factor_decides(self, told):
+        sources = {"noise": np.zeros((2, 2)), "z": np.diag([0.04, 0.04])}
+        assert told(sources, within=1.2).parameters["stretch"].verdict == "not identified"
+        assert told(sources, within=1.5).parameters["stretch"].verdict == "identified"
+
+    def test_a_fit_that_has_not_arrived_has_none(self, told):
+        found = told({"noise": np.diag([0.01, 0.01])}, step=0.06)
+        assert not found.arrived
+        assert found.parameters["stretch"].low is found.ratio.low is None
+        assert found.parameters["stretch"].verdict == "the fit has not arrived"
+        assert "fit again" in found.reason
+
+    def test_a_misfit_far_above_the_noise_is_no_statement_on_the_cloth(self, told):
+        found = told({"noise": np.diag([0.01, 0.01])}, misfit=(9.0, 4.0))
+        assert not found.explains
+        assert found.parameters["stretch"].verdict == "the model does not explain the recording"
+        assert found.parameters["stretch"].low is not None
+        assert "9.0 mm RMS" in found.reason
+
+
+def test_the_misfit_is_the_fits_own(objective):
+    rms, accounted = module._misfit(objective, FitSpace.build(["stretch"], fixed={"mass": 1.0}), {"stretch": 0.7})
+    assert rms < 1.5 * accounted
+    far, _ = module._misfit(objective, FitSpace.build(["stretch"], fixed={"mass": 1.0}), {"stretch": 0.1})
+    assert far > 1.2 * rms
+
+
+def test_what_to_improve_first():
+    sources = {"noise": {"stretch": 0.1}, "friction_obstacle": {"stretch": 0.3}, "z": {"stretch": 0.001}}
+    assert largest_sources(sources, "stretch") == "friction obstacle 90 %, noise 10 %"
+    assert largest_sources({"noise": {"stretch": 0.0}}, "stretch") == ""
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "told"), [(0.5, 2.0, "1.2"), (1.1, 1.3, "1.23"), (1.23, 1.24, "1.235"), (None, None, "1.23")]
+)
+def test_digits_are_those_that_the_interval_bears(low, high, told):
+    assert significant(low, high)(1.2346) == told
+    assert significant(low, high)(None) == "–"
+
+
+def test_a_note_where_mass_multiplies_a_part_of_the_cloth():
+    scene = SimpleNamespace(mesh=SimpleNamespace(nodes=np.zeros((49, 3))))
+    assert module.node_set_note(SimpleNamespace(node_sets={}, scene=scene)) == ""
+    assert "5 of 49 nodes" in module.node_set_note(SimpleNamespace(node_sets={"mass": range(5)}, scene=scene))

@@ -1,0 +1,141 @@
+"""Standard errors: each source against what repeating it does to a fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from diffcloud.errors import ConfigError
+from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton
+from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, POSE_DOUBTS, check_doubts, patches, uncertainty
+from diffcloud.io.episodes import Episode
+from tests.conftest import small_lift
+from tests.fit.test_fit import GENTLE, clouds_of
+
+TRUTH = {"stretch": 0.6, "mass": 1.7}
+SPACE = FitSpace.build(["stretch"], fixed={"mass": TRUTH["mass"]})
+HERE = GaussNewtonSettings(starts=1, screen=0, init={"stretch": TRUTH["stretch"]})
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return small_lift(**{**GENTLE, "integrator": "implicit", "points": 1500})
+
+
+def recorded(scenario, **changes) -> Episode:
+    return clouds_of(scenario, **{"points": 3000, **TRUTH, **changes})
+
+
+def logarithm(objective) -> float:
+    return float(np.log(fit_gauss_newton(objective, SPACE, HERE).values["stretch"]))
+
+
+def deviation(found, source: str) -> float:
+    return float(np.sqrt(found.sources[source][0, 0]))
+
+
+class TestDoubts:
+    @pytest.mark.parametrize("name", ["bending", "friction_obstacle"])
+    def test_unfitted_material_moves_the_fit_as_far_as_it_says(self, scenario, name):
+        """A cloth that is 5 % off in what the fit takes for known: the fit goes where the linearisation has it."""
+        factor = 1.05
+        base = Objective(scenario, recorded(scenario), nuisance={})
+        value = 1.0 if name == "bending" else float(base.system.properties.friction_obstacle[0])
+        other = Objective(scenario, recorded(scenario, **{name: value * factor}), nuisance={})
+        moved = logarithm(other) - logarithm(base)
+        found = uncertainty(base, SPACE, TRUTH, doubts={name: factor})
+        assert deviation(found, name) == pytest.approx(abs(moved), rel=0.25, abs=5e-4)
+
+    def test_a_late_clock_moves_the_fit_as_far_as_it_says(self, scenario):
+        episode = recorded(scenario, gripper=False)
+        late = replace(episode, times=np.append(episode.times[:1], episode.times[1:] - 5 * POSE_DOUBTS["lag"]))
+        one, other = (Objective(scenario, each, nuisance={}) for each in (episode, late))
+        moved = logarithm(other) - logarithm(one)
+        found = uncertainty(one, SPACE, TRUTH, doubts={})
+        assert 5 * deviation(found, "lag") == pytest.approx(abs(moved), rel=0.4)
+
+    def test_finer_steps_move_the_fit_as_far_as_it_says(self, scenario):
+        episode = recorded(scenario)
+        fine = replace(scenario, scene=replace(scenario.scene, frame_steps=4 * scenario.scene.frame_steps))
+        one, other = (Objective(each, episode, nuisance={}) for each in (scenario, fine))
+        moved = logarithm(other) - logarithm(one)
+        found = uncertainty(one, SPACE, TRUTH, doubts={})
+        assert deviation(found, "step size") == pytest.approx(abs(moved), rel=0.3)
+
+    def test_a_free_pose_is_no_doubt(self, scenario):
+        found = uncertainty(Objective(scenario, recorded(scenario)), SPACE, TRUTH, doubts={})
+        assert {"z", "tilt_x", "tilt_y", "lag", "step size", "noise"} <= set(found.sources)
+        assert not {"x", "y", "yaw"} & set(found.sources)
+
+    @pytest.mark.parametrize(("doubts", "message"), [({"bend": 2}, "Unknown parameter 'bend'"), ({"drag": 1}, "above 1")])
+    def test_what_is_no_doubt_is_refused(self, doubts, message):
+        with pytest.raises(ConfigError, match=message):
+            check_doubts(doubts)
+        check_doubts(MATERIAL_DOUBTS)
+
+
+class TestNoise:
+    def test_refits_of_new_noise_scatter_as_it_says(self, scenario):
+        """Each place of the cloth has an error of its own, the same in all frames: 20 recordings."""
+        rng, found, stated = np.random.default_rng(4), [], []
+        clean = recorded(scenario, points=1500)
+        where = patches(clean.frame(0), 16)
+        for _ in range(20):
+            shift = 0.003 * rng.standard_normal((16, 3))[where]
+            frames = [clean.frame(index) + shift for index in range(clean.frame_count)]
+            objective = Objective(scenario, Episode.from_frames(frames, clean.times, gripper=clean.gripper), nuisance={})
+            fit = fit_gauss_newton(objective, SPACE, HERE).values
+            found.append(float(np.log(fit["stretch"])))
+            stated.append(deviation(uncertainty(objective, SPACE, fit, doubts={}), "noise"))
+        assert np.sqrt(np.mean(np.square(stated))) == pytest.approx(np.std(found, ddof=1), rel=0.4)
+
+    def test_two_recordings_say_more_than_one(self, scenario):
+        members = [Objective(scenario, recorded(scenario, seed=seed), nuisance={}) for seed in (1, 2)]
+        one, other, both = (
+            uncertainty(each, SPACE, TRUTH, doubts={"bending": 2.0}) for each in (*members, JointObjective(members))
+        )
+        assert both.clusters == one.clusters + other.clusters
+        lags, bends = ([deviation(each, name) for each in (one, other)] for name in ("lag", "bending"))
+        assert deviation(both, "lag") == pytest.approx(np.hypot(*lags) / 2, rel=0.15)  # each recording has its own
+        assert deviation(both, "bending") == pytest.approx(np.mean(bends), rel=0.15)  # of the one cloth
+
+
+class TestPrior:
+    def test_where_nothing_is_shown_the_prior_is_all_there_is(self, scenario):
+        """No fluid: drag changes nothing."""
+        still = replace(
+            scenario,
+            scene=replace(scenario.scene, surrounding=replace(scenario.scene.surrounding, air_density=0.0, air_drag=0.0)),
+        )
+        space = FitSpace.build(["drag"], fixed=TRUTH, priors={"drag": 3.0})
+        found = uncertainty(Objective(still, recorded(still), nuisance={}), space, {"drag": 1.0}, doubts={})
+        assert np.sqrt(found.covariance[0, 0]) == pytest.approx(np.log(3.0), rel=1e-6)
+
+    def test_where_much_is_shown_it_says_little(self, scenario):
+        space = FitSpace.build(["stretch"], fixed={"mass": 1.7}, priors={"stretch": 10.0})
+        found = uncertainty(Objective(scenario, recorded(scenario)), space, TRUTH)
+        assert deviation(found, "prior") < 0.1 * np.sqrt(found.covariance[0, 0])
+
+
+def test_the_next_step_is_that_of_the_solver(scenario):
+    objective = Objective(scenario, recorded(scenario), nuisance={})
+    away = uncertainty(objective, SPACE, {"stretch": 0.66}, doubts={})
+    assert away.step[0] == pytest.approx(np.log(0.6 / 0.66), rel=0.2)
+    assert away.places[0] == pytest.approx(np.log(0.66))
+
+
+def test_patches_are_of_one_size():
+    nodes = np.stack(np.meshgrid(np.arange(8.0), np.arange(8.0), [0.0]), axis=-1).reshape(-1, 3)
+    found = patches(nodes, 16)
+    assert np.bincount(found).tolist() == [4] * 16
+    for index in range(16):
+        assert np.ptp(nodes[found == index], axis=0).max() == 1.0
+
+
+def test_the_sum_of_the_sources_is_the_covariance(scenario):
+    found = uncertainty(Objective(scenario, recorded(scenario)), SPACE, TRUTH)
+    np.testing.assert_allclose(found.covariance, sum(found.sources.values()))
+    assert torch.isfinite(torch.tensor(found.covariance)).all()

@@ -1,0 +1,142 @@
+"""`diffcloud coverage` and `diffcloud evaluate intervals` as a person runs them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+
+import pytest
+import yaml
+
+from diffcloud.io.episodes import write_episode
+from pipeline.coverage import counted, coverage_page, summary_rows
+from tests.conftest import small_lift
+from tests.fit.test_fit import clouds_of
+from tests.pipeline.invoke import invoke
+
+SMALL = {
+    "base": "lift",
+    "nodes": [5, 5],
+    "frames": 5,
+    "steps_per_frame": 2,
+    "points": 200,
+    "path": [[0, 0, 0, 0], [0.5, 0, -0.05, 0.15]],
+    "recorder": "whole_surface",
+}
+PARAMS = {"fit": {"starts": 1, "screen": 0, "iterations": 4}, "evaluate": {"doubts": {"bending": 1.5}}}
+
+
+@pytest.fixture
+def work(tmp_path):
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(SMALL))
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump(PARAMS))
+    with contextlib.chdir(tmp_path):
+        yield tmp_path
+
+
+COVERAGE = ("coverage", "--scenario", "small.yaml", "--recordings", 2, "--params", "params.yaml", "--out", "out")
+
+
+class TestCoverage:
+    def test_counts_and_records(self, work):
+        done = invoke(*COVERAGE, "--fix", "mass", "--seed", 3, "--markdown", "page.md")
+        told = done.result["parameters"]["stretch"]
+        assert told["n"] == 2
+        assert 0 <= told["covered"] <= told["stated"] <= 2
+        assert done.result["level"] == 0.9
+        record = json.loads((work / "out/small/mass_known/0001.json").read_text())
+        assert set(record["truth"]) == {"stretch", "mass", "bending"}
+        assert record["intervals"]["parameters"].keys() == {"stretch"}
+        assert "| small | mass known | stretch | 2 |" in (work / "page.md").read_text()
+
+    def test_a_later_call_keeps_what_is_finished(self, work):
+        invoke(*COVERAGE, "--fix", "mass")
+        before = {path: path.stat().st_mtime_ns for path in (work / "out").rglob("*.*")}
+        invoke(*COVERAGE, "--fix", "mass", "--recordings", 3)
+        after = {path: path.stat().st_mtime_ns for path in (work / "out").rglob("*.*")}
+        assert before.items() <= after.items()
+        free = invoke(*COVERAGE)
+        assert set(free.result["parameters"]) == {"stretch", "mass"}
+        assert free.result["ratio"]["n"] == 2
+        assert (work / "out/small/free/0000.json").is_file()
+
+    def test_a_refined_truth_has_a_folder_of_its_own(self, work):
+        invoke(*COVERAGE, "--recordings", 1, "--refined")
+        assert (work / "out/small/free_refined/0000.json").is_file()
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            (("--fix", "drag"), "--fix names a fitted parameter"),
+            (("--fix", "mass", "--fix", "stretch"), "Nothing is left to fit"),
+        ],
+    )
+    def test_what_is_asked_for_must_make_sense(self, work, options, message):
+        assert message in invoke(*COVERAGE, *options, code=1).errors
+        assert not list((work / "out").rglob("*.json"))
+
+
+def test_refusals_and_failures_count_as_misses(tmp_path):
+    def record(value, low, high, verdict="identified"):
+        entry = {"value": value, "low": low, "high": high, "verdict": verdict}
+        return {"truth": {"stretch": 1.0, "mass": 1.0}, "intervals": {"parameters": {"stretch": entry}, "within": 1.5}}
+
+    folder = tmp_path / "lift" / "mass_known"
+    folder.mkdir(parents=True)
+    records = [
+        record(1.1, 0.9, 1.4),
+        record(1.2, 1.15, 1.3),
+        record(2.0, 1.5, 2.5),
+        record(1.0, None, None, "the fit has not arrived"),
+        {"truth": {"stretch": 1.0, "mass": 1.0}, "error": "diverged"},
+    ]
+    for index, one in enumerate(records):
+        (folder / f"{index:04d}.json").write_text(json.dumps(one))
+    told = counted(folder)["parameters"]["stretch"]
+    assert (told["n"], told["stated"], told["covered"]) == (5, 3, 1)
+    assert told["verdicts"] == {"identified": 3, "the fit has not arrived": 1}
+    assert told["identified_within"] == 2
+    assert told["rms_error"] == pytest.approx(math.sqrt((math.log(1.1) ** 2 + math.log(1.2) ** 2 + math.log(2) ** 2) / 4))
+    assert "| lift | mass known | stretch | 5 | 3 | 1 (20 %) |" in coverage_page(summary_rows(tmp_path))
+
+
+class TestIntervals:
+    @pytest.fixture
+    def fitted(self, work):
+        for name, seed in (("e1", 1), ("e2", 2)):
+            write_episode(work / f"{name}.npz", clouds_of(small_lift(), seed=seed, stretch=0.7, mass=1.0))
+        fit = ("fit", "--scenario", "small.yaml", "--out", "fits", "--fix", "mass=1", "--screen", 0, "--starts", 1)
+        invoke(*fit, "e1.npz")
+        invoke(*fit, "--joint", "e1.npz", "e2.npz")
+        return work
+
+    def test_they_are_stated_with_a_verdict(self, fitted):
+        done = invoke("evaluate", "intervals", "fits/e1.json", "e1.npz", "--scenario", "small.yaml", "--level", 0.8)
+        entry = done.result["parameters"]["stretch"]
+        assert done.result["level"] == 0.8
+        assert entry["low"] < entry["value"] < entry["high"]
+        assert entry["verdict"]
+        wide = invoke("evaluate", "intervals", "fits/e1.json", "e1.npz", "--scenario", "small.yaml", "--level", 0.99)
+        assert wide.result["parameters"]["stretch"]["high"] > entry["high"]
+
+    def test_of_a_joint_fit_too(self, fitted):
+        command = ("evaluate", "intervals", "fits/joint.json", "e1.npz", "e2.npz", "--scenario", "small.yaml")
+        joint = invoke(*command, "--doubt", "none")
+        assert joint.result["clusters"] > 16
+        assert "bending" not in joint.result["sources"]
+        assert "bending" in invoke(*command, "--doubt", "bending=2x").result["sources"]
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (("fits/joint.json", "e1.npz"), "is a fit to 2 episodes (e1, e2), 1 were given"),
+            (("fits/e1.json", "e1.npz", "--within", 1), "--within takes a factor above 1"),
+            (("fits/e1.json", "e1.npz", "--doubt", "bend=2"), "Unknown parameter 'bend'"),
+            (("fits/e1.json", "e1.npz", "--doubt", "bending=0.5"), "above 1"),
+            (("fits/e1.json", "e1.npz", "--doubt", "bending=two"), "--doubt takes"),
+            (("e1.npz", "e1.npz"), "e1.npz"),
+        ],
+    )
+    def test_bad_input_is_refused(self, fitted, arguments, message):
+        assert message in invoke("evaluate", "intervals", *arguments, "--scenario", "small.yaml", code=1).errors
