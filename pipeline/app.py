@@ -23,6 +23,7 @@ COMMANDS = {
     "train": "pipeline.train:train",
     "predict": "pipeline.predict:predict",
     "report": "pipeline.report:report",
+    "identify": "pipeline.identify:identify",
     "rollout": "pipeline.rollout:rollout",
     "visibility": "pipeline.visibility:visibility",
     "gradients": "pipeline.gradients:gradients",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -19,6 +20,8 @@ from rich.table import Table
 from diffcloud.errors import ConfigError
 from diffcloud.io.files import claimed, files_in
 
+_QUIET_S = 10.0
+"""Between lines of progress where standard error is no terminal."""
 _PLAIN_WIDTH = 140
 """Columns where the output is a file or a log: tables keep their headings."""
 
@@ -60,7 +63,7 @@ def warn(message: str) -> None:
 
 @contextmanager
 def progress_bar(label: str, total: int) -> Iterator[Callable[[float, str], None]]:
-    """A bar on standard error; call with (done, text)."""
+    """A bar on standard error; call with (done, text). Where that is no terminal, a line every ten seconds."""
     columns = (
         TextColumn("[bold]{task.description}"),
         BarColumn(bar_width=24),
@@ -70,9 +73,16 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[float, str], None
     )
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
         task = progress.add_task(label, total=total, text="")
+        began = told = time.monotonic()
 
         def update(done: float, text: str = "") -> None:
+            nonlocal told
             progress.update(task, completed=done, text=text)
+            now = time.monotonic()
+            if progress.disable and now - told >= _QUIET_S:
+                told = now
+                left = f", about {(now - began) * (total - done) / done:.0f} s left" if done > 0 else ""
+                errors.print(f"{label}: {done:.2g} of {total}{left}  {text}", markup=False, soft_wrap=True)
 
         yield update
 

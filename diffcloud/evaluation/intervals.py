@@ -22,7 +22,7 @@ from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis
-from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, Uncertainty, uncertainty
+from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, Uncertainty, noise_mm, uncertainty
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS
 
@@ -40,8 +40,6 @@ WITHIN = 1.5
 LEVEL = 0.9
 _UNEXPLAINED = 2.0
 """RMS over what noise and spacing of the points account for, from which the model does not explain the recording."""
-_NOISE_M = 0.002
-"""Of recorded points whose own uncertainty is not stated."""
 _STEP = 0.5
 """The largest next step of a fit that has arrived, in standard deviations."""
 _PRIOR = 0.5
@@ -139,7 +137,7 @@ def state_intervals(
     worst_fit = max(misfit, key=lambda pair: pair[0] / pair[1])
     explains = objective.paper or worst_fit[0] <= _UNEXPLAINED * worst_fit[1]
     reason = ""
-    if not arrived:
+    if explains and not arrived:
         reason = "the fit has not arrived: its next step is a good part of the interval; fit again with more iterations"
     elif not explains:
         reason = (
@@ -158,10 +156,10 @@ def state_intervals(
         factor = _factor(values[name], low, high)
         prior = found.sources.get("prior")
         told: Verdict
-        if not arrived:
-            told = "the fit has not arrived"
-        elif not explains:
+        if not explains:
             told = "the model does not explain the recording"
+        elif not arrived:
+            told = "the fit has not arrived"
         elif prior is not None and prior[index, index] > _PRIOR * total[index, index]:
             told = "the prior speaks"
         elif factor <= within and not bounded:
@@ -294,11 +292,7 @@ def _misfit(objective: Objective, space: FitSpace, values: Mapping[str, float]) 
     given = {**values, **space.fixed}
     with torch.no_grad():
         loss = float(objective({name: torch.tensor([value], dtype=torch.float64) for name, value in given.items()}))
-    to_mm = 1e3 * objective.length_unit_m
-    spacing = to_mm * float(np.sqrt(np.mean([cloud.spacing**2 for cloud in objective.clouds])))
-    sigma = objective.episode.sigma
-    noise = 1e3 * _NOISE_M if sigma is None else to_mm * float(np.median(sigma))
-    return to_mm * loss**0.5, math.hypot(spacing, noise)
+    return 1e3 * objective.length_unit_m * loss**0.5, noise_mm(objective)
 
 
 def _physical_scale(scenario: Scenario, name: str) -> float:

@@ -24,6 +24,8 @@ _LOWEST = 0.005
 _USABLE, _NEARLY, _TOO_LITTLE = 0.5, 0.8, 0.05
 """Part of the cloth above the cut in a frame that counts; where no frame has it, this part of the most that any has; and
 what is too little in any case."""
+_MOST = 30
+"""Usable frames that are compared where none are named: neighbours in a quick recording say nearly the same."""
 _UNSURE_M = 0.005
 """A recorded point whose depth is so uncertain counts half."""
 
@@ -76,7 +78,7 @@ def read_target(
         track = torch.as_tensor(moved, dtype=torch.float64)[None]
     height = None if whole else _found_cut(system, episode, unit)
     frames = (
-        _usable(scenario, system, episode, track, height)
+        _spread(_usable(scenario, system, episode, track, height))
         if named is None
         else list(dict.fromkeys(_checked(scenario, episode, frame) for frame in named))
     )
@@ -92,6 +94,13 @@ def read_target(
         PoseSpace.build(nuisance, centre, length_unit_m=unit),
         track,
     )
+
+
+def _spread(frames: list[int]) -> list[int]:
+    """As many as are compared, evenly spread, the last among them."""
+    if len(frames) <= _MOST:
+        return frames
+    return [frames[index] for index in np.unique(np.linspace(0, len(frames) - 1, _MOST).round().astype(int))]
 
 
 def _end(scenario: Scenario) -> float:

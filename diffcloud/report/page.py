@@ -15,6 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from diffcloud.evaluation.intervals import Intervals
 from diffcloud.fit.record import FitRecord, FittedParameter, RecordingFit
 from diffcloud.fit.result import FittedMotion
 from diffcloud.io.episodes import Episode
@@ -29,6 +30,7 @@ from diffcloud.report.poses import poses_table
 from diffcloud.report.recordings import recordings_pictures, recordings_table
 from diffcloud.report.regressors import TrainingEntry, errors_table, predictions_table, training_data
 from diffcloud.report.tables import Cell, Table, number, table
+from diffcloud.report.uncertainty import intervals_table
 
 _DECIMALS = 4
 
@@ -65,6 +67,8 @@ def build_page(
     predictions: Sequence[Mapping[str, Any]] = (),
     trainings: Sequence[TrainingEntry] = (),
     comparison: ComparisonEntry | None = None,
+    findings: Sequence[str] = (),
+    intervals: Intervals | None = None,
     seed: int = 0,
 ) -> str:
     """The page as HTML text.
@@ -74,6 +78,8 @@ def build_page(
         environment: name -> value lines for the last section.
         predictions: rows of the table of predictions.
         comparison: of all methods; left out if not given.
+        findings: sentences for the top of the page, in the place of its own.
+        intervals: of a fit to all entries together.
         seed: of the choice of shown points.
     """
     from plotly.offline import get_plotlyjs
@@ -92,6 +98,8 @@ def build_page(
     return engine.get_template("page.html").render(
         title=title,
         summary=_summary(entries),
+        findings=findings,
+        intervals=None if intervals is None else intervals_table(intervals),
         overview=comparison_overview(comparison) if comparison else None,
         sections=comparison_sections(comparison) if comparison else [],
         pictures=comparison_pictures(comparison) if comparison else [],

@@ -41,7 +41,7 @@ def params(folder: Path, name: str = "params.yaml") -> None:
 
 
 def own_clouds(folder: Path) -> None:
-    """my_clouds/ and gripper.csv of the README's towel: its nodes, where a run puts them."""
+    """my_clouds/ with gripper.csv of the README's towel: its nodes, where a run puts them."""
     towel = next(example for example in examples(read("README.md")) if example.words == ("towel.yaml",))
     write(towel, folder)
     invoke("rollout", "--scenario", "towel.yaml", "--out", "true.npz")
@@ -50,7 +50,7 @@ def own_clouds(folder: Path) -> None:
     for index, frame in enumerate(nodes):
         write_ply(folder / "my_clouds" / f"{index:03d}.ply", frame)
     track = np.column_stack([times, nodes[:, -1]])
-    np.savetxt("gripper.csv", track, delimiter=",", header="t_s,x,y,z", comments="")
+    np.savetxt("my_clouds/gripper.csv", track, delimiter=",", header="t_s,x,y,z", comments="")
 
 
 def lift_episode(folder: Path) -> None:

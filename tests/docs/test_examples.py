@@ -30,6 +30,7 @@ SMALLER = {
     "train": "--epochs 1 --points 32",
     "fit": "--starts 1 --screen 0 --iterations 1 --points 200",
     "gradients": "--pairs 1",
+    "identify": "--parameters stretch",
     "evaluate loss": "--points 200",
     "evaluate release": "--only release_lift/lift_tan --allow-missing --workers 1",
     "bench": "--repeats 1",

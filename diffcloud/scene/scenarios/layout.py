@@ -1,0 +1,216 @@
+"""Where a recorded cloth lies, found from the recording's first frame: for scenarios that nobody has written by hand.
+
+The first frame shows the cloth flat on the table. Its height gives the table's; the rectangle around it, of least area over
+all turns, gives centre, yaw and size; the grasped node is the one under the gripper's first position. Every value comes
+with its reason, and what cannot be so is refused by name before anything is simulated.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import EpisodeError
+from diffcloud.io.episodes import Episode
+
+_GAP_M = 0.002
+"""Of the cloth over the table at the start, as scenarios have it."""
+_LARGEST_M = 5.0
+"""Of a cloth: a larger cloud is in another unit."""
+_SMALLEST_M = 0.02
+_LEVEL_DEG = 25.0
+"""Of the first cloud against the horizontal."""
+_FLAT_M = 0.05
+"""Thickness of the first cloud, over most of its points."""
+_RIM = 0.005
+"""Part of the points beyond each side: noise, and scraps."""
+_SIZE_OFF = 0.2
+"""Part by which the found size may differ from the stated one: beyond, it is another cloth, or a part of one."""
+_AT_CORNER_M = 0.03
+_TRAVEL_M = 0.03
+_CELL_M = 0.034
+_NODES = (5, 13)
+_FEW_POINTS = 100
+
+
+@dataclass(frozen=True)
+class Found:
+    """A value and why it is that."""
+
+    value: object
+    reason: str
+
+
+@dataclass(frozen=True)
+class Layout:
+    """One recording, as fields of a grid scenario: name -> value and reason."""
+
+    fields: dict[str, Found]
+    warnings: tuple[str, ...]
+
+
+def found_size(episode: Episode) -> tuple[float, float]:
+    """Sides of the cloth in the first frame, the longer one first [m]."""
+    sides = _rectangle(_flat_cloud(episode))[1]
+    return max(sides), min(sides)
+
+
+def node_counts(size: tuple[float, float]) -> tuple[int, int]:
+    """Nodes along both sides, some 3.4 cm apart: the fewest that buckle and fold about as finer ones do."""
+    columns, rows = (min(max(round(side / _CELL_M) + 1, _NODES[0]), _NODES[1]) for side in size)
+    return columns, rows
+
+
+def find_layout(episode: Episode, size: tuple[float, float]) -> Layout:
+    """
+    Args:
+        episode: in metres, z up, with the track of one gripper.
+        size: of the cloth [m].
+
+    Raises:
+        EpisodeError: no gripper, another unit, a cloud that is not flat and level, a size that is not that of the cloud,
+            or a gripper that is not at the cloth; says what to try.
+    """
+    if episode.gripper is None:
+        raise EpisodeError("The recording has no track of its gripper: put a gripper.csv (t_s, x, y, z) beside the clouds.")
+    if len(episode.grippers) > 1:
+        raise EpisodeError(
+            f"The recording has the grippers {', '.join(episode.grippers)}; this takes one. Write a scenario with "
+            "`grippers` and use `diffcloud fit`."
+        )
+    warnings = _few_points(episode)
+    cloud = _flat_cloud(episode)
+    yaw, sides, centre = _rectangle(cloud)
+    if (sides[0] < sides[1]) != (size[0] < size[1]):  # the longer side is the longer one's
+        yaw, sides = yaw + math.pi / 2, (sides[1], sides[0])
+    off = max(abs(side / stated - 1) for side, stated in zip(sides, size, strict=True))
+    if off > _SIZE_OFF:
+        raise EpisodeError(
+            f"The first frame shows a cloth of {sides[0]:.3f} x {sides[1]:.3f} m, and {size[0]:.3f} x {size[1]:.3f} m was "
+            "stated. Check --size and the unit of the clouds (metres), and that the first frame shows the whole cloth, "
+            "flat on the table: a recording that is cut above the table does not."
+        )
+    if off > _SIZE_OFF / 2:
+        warnings.append(f"the first frame shows {sides[0]:.3f} x {sides[1]:.3f} m, {off:.0%} off the stated size")
+    gripper = episode.gripper[:, 0]
+    turn = _turned(yaw)
+    local = (gripper[0, :2] - centre) @ turn
+    half = np.array(size) / 2
+    beyond = float(np.linalg.norm(np.maximum(np.abs(local) - half, 0.0)))
+    if beyond > 0.5 * max(size):
+        raise EpisodeError(
+            f"The gripper's first position lies {beyond:.2f} m beside the cloth. Clouds and gripper must be in one frame "
+            "(the robot's base, metres, z up), and the track must begin where the cloth is grasped."
+        )
+    columns, rows = node_counts(size)
+    across, along = np.meshgrid(np.linspace(-half[0], half[0], columns), np.linspace(-half[1], half[1], rows))
+    nodes = np.stack([across.ravel(), along.ravel()], axis=-1)
+    # a rectangle looks the same after half a turn: the one that has the grasped corner at its right top is taken
+    if local[0] < 0 and local[1] < 0:
+        yaw, local = yaw + math.pi, -local
+    distances = np.linalg.norm(nodes - local, axis=1)
+    node = int(distances.argmin())
+    if distances[node] > 0.5 * _CELL_M + _AT_CORNER_M:
+        warnings.append(f"the gripper begins {1e3 * distances[node]:.0f} mm beside the nearest node of the cloth")
+    corners = {
+        0: "left_bottom",
+        columns - 1: "right_bottom",
+        rows * columns - columns: "left_top",
+        len(nodes) - 1: "right_top",
+    }
+    travel = float(np.ptp(gripper, axis=0).max())
+    if travel < _TRAVEL_M:
+        warnings.append(f"the gripper moves by {1e3 * travel:.0f} mm: such a motion shows little")
+    table = float(np.median(cloud[:, 2])) - _GAP_M
+    interval = float(np.median(np.diff(episode.times))) if len(episode.times) > 1 else 0.1
+    frames = max(round(float(episode.times[-1]) / interval), 1)
+    found = {
+        "center_m": Found([round(float(part), 4) for part in centre], "middle of the rectangle around the first frame"),
+        "yaw_deg": Found(round(math.degrees(yaw) % 360, 2), "turn at which that rectangle is smallest"),
+        "table_height_m": Found(round(table, 4), f"{1e3 * _GAP_M:.0f} mm below the middle height of the first frame"),
+        "grasped": Found(
+            [corners.get(node, node)], f"node nearest the gripper's first position, {1e3 * distances[node]:.0f} mm away"
+        ),
+        "rate_hz": Found(round(1 / interval, 6), f"frames are {interval:.4f} s apart"),
+        "frames": Found(frames, f"the recording ends at {episode.times[-1]:.3f} s"),
+        "path": Found(
+            [
+                [0.0, 0.0, 0.0, 0.0],
+                [float(episode.times[-1]) or 1.0, *(round(float(x), 4) for x in gripper[-1] - gripper[0])],
+            ],
+            "first and last position of the gripper; fits follow its recorded track",
+        ),
+    }
+    return Layout(found, tuple(warnings))
+
+
+def _few_points(episode: Episode) -> list[str]:
+    counts = np.diff(episode.offsets)
+    thin = np.flatnonzero(counts < _FEW_POINTS)
+    if not len(thin):
+        return []
+    return [f"frames {', '.join(map(str, thin[:5]))} have fewer than {_FEW_POINTS} points ({counts[thin].min()} at least)"]
+
+
+def _flat_cloud(episode: Episode) -> NDArray[np.float64]:
+    """[N, 3] of the first frame, without scraps.
+
+    Raises:
+        EpisodeError: too large or too small, not level, or not flat.
+    """
+    cloud = episode.frame(0).astype(np.float64)
+    middle = np.median(cloud, axis=0)
+    extent = np.quantile(np.abs(cloud - middle), 0.98, axis=0) * 2
+    if extent.max() > _LARGEST_M or extent.max() < _SMALLEST_M:
+        guess = "millimetres" if extent.max() > _LARGEST_M else "kilometres, or hold one point"
+        raise EpisodeError(
+            f"The first frame is {extent.max():.3g} across. Clouds are in metres; these look as if they were in {guess}."
+        )
+    inside = cloud[(np.abs(cloud - middle) <= 2 * extent.max()).all(axis=1)]
+    _, axes = np.linalg.eigh(np.cov((inside - inside.mean(axis=0)).T))
+    tilt = math.degrees(math.acos(min(abs(float(axes[2, 0])), 1.0)))
+    if tilt > _LEVEL_DEG:
+        raise EpisodeError(
+            f"The first frame is tilted by {tilt:.0f} degrees against the horizontal. Clouds are expected in the robot's "
+            "base frame, z up, with the cloth flat on the table; in a camera's frame they are not."
+        )
+    thick = float(np.quantile(inside[:, 2], 0.95) - np.quantile(inside[:, 2], 0.05))
+    if thick > _FLAT_M:
+        raise EpisodeError(
+            f"The first frame is {1e3 * thick:.0f} mm thick: the cloth does not lie flat in it, or something else is in "
+            "the cloud. Begin the recording with the cloth at rest on the table."
+        )
+    height = np.median(inside[:, 2])
+    return inside[np.abs(inside[:, 2] - height) < _FLAT_M]
+
+
+def _rectangle(cloud: NDArray[np.float64]) -> tuple[float, tuple[float, float], NDArray[np.float64]]:
+    """Yaw in [0, 90°), sides [m] and centre [2] of the smallest rectangle around a cloud from above."""
+    points = cloud[:, :2]
+
+    def around(yaw: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        low, high = np.quantile(points @ _turned(yaw), [_RIM, 1 - _RIM], axis=0)
+        return low, high
+
+    def area(yaw: float) -> float:
+        low, high = around(yaw)
+        return float(np.prod(high - low))
+
+    yaws = np.linspace(0, math.pi / 2, 91)[:-1]
+    best = float(yaws[np.argmin([area(yaw) for yaw in yaws])])
+    for width in (math.radians(1.0), math.radians(0.2)):
+        near = best + np.linspace(-width, width, 11)
+        best = float(near[np.argmin([area(yaw) for yaw in near])])
+    low, high = around(best)
+    share = 1 - 2 * _RIM  # of an evenly covered side
+    sides = (high - low) / share
+    return best, (float(sides[0]), float(sides[1])), (low + high) / 2 @ _turned(best).T
+
+
+def _turned(yaw: float) -> NDArray[np.float64]:
+    """[2, 2] rows of points times this are in the axes of a cloth at that yaw."""
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    return np.array([[cosine, -sine], [sine, cosine]])

@@ -1,0 +1,373 @@
+"""`diffcloud identify`: from recordings of a cloth to its parameters, in one command."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+import yaml
+
+from diffcloud.errors import ConfigError, EpisodeError
+from diffcloud.evaluation.intervals import LEVEL, WITHIN, Intervals, significant, state_intervals
+from diffcloud.evaluation.methods import space_of
+from diffcloud.evaluation.summary import largest_sources
+from diffcloud.fit import FitRecord, JointObjective, Objective
+from diffcloud.fit.joint import AnyObjective
+from diffcloud.fit.result import read_motion
+from diffcloud.fit.uncertainty import refined_distance_mm
+from diffcloud.io.episodes import Episode, read_episode, write_episode
+from diffcloud.io.files import claimed, together, write_json, write_text
+from diffcloud.io.imports import cloud_folder
+from diffcloud.report import EpisodeEntry, build_page
+from diffcloud.scene.scenarios import Scenario, load_scenario
+from diffcloud.scene.scenarios.layout import Found, find_layout, found_size, node_counts
+from diffcloud.sim.threads import use_threads
+from pipeline.config import Config, FitConfig
+from pipeline.console import JsonFlag, Threads, errors, finish, progress_bar, warn
+from pipeline.fit_jobs import FitJob, Recording
+from pipeline.preprocess import PreprocessJob
+
+_DENSITY = 0.16
+_MATERIAL = {"stretching_n_m": 60.0, "bending_n_m": 1e-5, "poisson": 0.3}
+_BOUNDS = {"stretch": (0.03, 30.0), "bending": (0.03, 30.0), "mass": (0.2, 5.0)}
+_STEPS = 8
+_MOST_STEPS = 64
+_NOISE_PART = 0.5
+"""Of the misfit that noise accounts for, which the distance to finer steps may be."""
+_TRANSFERS, _GAIN = 1.25, 0.5
+_HEAD = "# Found by diffcloud identify, with the reason beside each value. Edit and run the command again to overrule."
+
+
+def identify(
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(help="Of one cloth: folders of numbered clouds with a gripper.csv, raw episodes, or episode files."),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder: cloth.yaml, recordings.yaml, fit.json, report.html.")],
+    size: Annotated[str | None, typer.Option(help="Sides in metres, such as 0.40x0.30. Default: as seen.")] = None,
+    mass: Annotated[float | None, typer.Option(help="Of the cloth, weighed, in kg per square metre.")] = None,
+    parameters: Annotated[
+        str | None, typer.Option(help="Comma-separated. Default: stretch,bending, and mass if it was not weighed.")
+    ] = None,
+    level: Annotated[float, typer.Option(min=0.01, max=0.999, help="Share of intervals that hold the truth.")] = LEVEL,
+    within: Annotated[float, typer.Option(help="Factor within which a parameter counts as identified.")] = WITHIN,
+    threads: Threads = None,
+    json: JsonFlag = False,
+) -> None:
+    """Find the parameters of a cloth from recordings of it: layout, joint fit, intervals, and a report."""
+    use_threads(threads)
+    if within <= 1:
+        raise ConfigError(f"--within takes a factor above 1, got {within:g}.")
+    if mass is not None and not (0 < mass < math.inf):
+        raise ConfigError(f"--mass is in kg per square metre, above 0, got {mass:g}.")
+    stated = None if size is None else _sides(size)
+    names = _names(recordings)
+    out.mkdir(parents=True, exist_ok=True)
+    with claimed(out):
+        episodes = {name: _read(path, name, out) for name, path in names.items()}
+        cloth = _cloth(out, episodes, stated, mass)
+        layouts = _layouts(out, episodes, names, cloth)
+        chosen = _chosen(parameters, cloth, mass)
+        record, objective, job = _fitted(out, episodes, cloth, layouts, chosen)
+        found = state_intervals(objective, space_of(record), _free(record), level=level, within=within)
+        findings = _findings(record, objective, found)
+        with together():
+            write_text(out / "report.html", _page(record, found, findings, episodes, job))
+            write_json(out / "intervals.json", found.model_dump(mode="json"))
+    for line in findings:
+        errors.print(line, markup=False, soft_wrap=True)
+    errors.print(f"Wrote {out / 'report.html'}, {out / 'fit.json'}.", markup=False)
+    finish(_result(record, found, findings), json)
+
+
+def _sides(text: str) -> tuple[float, float]:
+    parts = text.lower().split("x")
+    try:
+        sides = tuple(float(part) for part in parts)
+    except ValueError:
+        sides = ()
+    if len(sides) != 2 or not all(0 < side < 10 for side in sides):
+        raise ConfigError(f"--size takes two sides in metres, such as 0.40x0.30, got {text!r}.")
+    return sides
+
+
+def _names(recordings: Sequence[Path]) -> dict[str, Path]:
+    named: dict[str, Path] = {}
+    for path in recordings:
+        if not path.exists():
+            raise ConfigError(f"No such recording: {path}.")
+        name = path.stem if path.is_file() else path.resolve().name
+        if name in named:
+            raise ConfigError(f"Two recordings are named {name}; rename one.")
+        named[name] = path
+    return named
+
+
+def _read(path: Path, name: str, out: Path) -> Episode:
+    """A recording as an episode, kept in OUT/episodes/."""
+    kept = out / "episodes" / f"{name}.npz"
+    if path.is_file():
+        episode = read_episode(path)
+    elif (path / "episode.json").is_file():
+        PreprocessJob("episodes", path, out, Config().preprocess, None).run(lambda done, text: None)
+        return read_episode(kept)
+    else:
+        track = path / "gripper.csv"
+        if not track.is_file():
+            raise EpisodeError(f"{path} holds no gripper.csv with the columns t_s, x, y, z [m], one row a frame.")
+        episode = cloud_folder(path, grippers={"gripper": track})
+    write_episode(kept, episode)
+    return episode
+
+
+def _cloth(
+    out: Path, episodes: Mapping[str, Episode], stated: tuple[float, float] | None, mass: float | None
+) -> dict[str, Any]:
+    """The fields of cloth.yaml: read if it is there, else found and written."""
+    path = out / "cloth.yaml"
+    if path.is_file():
+        return _fields(path)
+    size, reason = stated, "as stated"
+    if size is None:
+        sides = np.array([found_size(episode) for episode in episodes.values()])
+        size = tuple(np.round(np.median(sides, axis=0), 3).tolist())
+        reason = "rectangle around the first frames" + (
+            f", {np.ptp(sides, axis=0).max():.3f} m apart" if len(sides) > 1 else ""
+        )
+    told = "as weighed" if mass is not None else "usual for a knit; fitted"
+    material = {"density_kg_m2": mass or _DENSITY, **_MATERIAL}
+    found = {
+        "base": Found("lift", "a rectangular cloth on a table"),
+        "size_m": Found(list(size), reason),
+        "nodes": Found(list(node_counts(size)), "some 3.4 cm apart"),
+        "material": Found(material, f"what multipliers act on; density {told}"),
+        "steps_per_frame": Found(_STEPS, "doubled where finer steps move the cloth by more than the noise"),
+    }
+    write_text(path, _yaml(found))
+    return {name: entry.value for name, entry in found.items()}
+
+
+def _layouts(
+    out: Path, episodes: Mapping[str, Episode], sources: Mapping[str, Path], cloth: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """The fields of each recording in recordings.yaml: read where they are there, else found and written."""
+    path = out / "recordings.yaml"
+    known = _fields(path) if path.is_file() else {}
+    size = (float(cloth["size_m"][0]), float(cloth["size_m"][1]))
+    blocks, layouts = [path.read_text().rstrip()] if known else [_HEAD], {}
+    for name, episode in episodes.items():
+        if isinstance(known.get(name), dict):
+            layouts[name] = dict(known[name])
+            continue
+        try:
+            layout = find_layout(episode, size)
+        except EpisodeError as error:
+            raise EpisodeError(f"{sources[name]}: {error}") from error
+        for message in layout.warnings:
+            warn(f"{name}: {message}.")
+        layouts[name] = {key: entry.value for key, entry in layout.fields.items()}
+        lines = _yaml(layout.fields, head=False).splitlines()
+        blocks.append("\n".join([f"{name}:", *(f"  {line}" for line in lines)]))
+    write_text(path, "\n".join(blocks) + "\n")
+    return layouts
+
+
+def _fields(path: Path) -> dict[str, Any]:
+    try:
+        told = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"Cannot read {path}: {error}") from error
+    if not isinstance(told, dict):
+        raise ConfigError(f"{path} must be a mapping, got {type(told).__name__}. Remove it to have it written anew.")
+    return told
+
+
+def _yaml(found: Mapping[str, Found], *, head: bool = True) -> str:
+    lines = [_HEAD] if head else []
+    for name, entry in found.items():
+        value = yaml.safe_dump(entry.value, default_flow_style=True, width=1000).strip().removesuffix("...").strip()
+        lines.append(f"{name}: {value}  # {entry.reason}")
+    return "\n".join(lines) + "\n"
+
+
+def _chosen(parameters: str | None, cloth: Mapping[str, Any], mass: float | None) -> FitConfig:
+    names = ["stretch", "bending", *(["mass"] if mass is None else [])]
+    if parameters is not None:
+        names = [name.strip() for name in parameters.split(",")]
+    fixed = {}
+    if mass is not None:
+        density = cloth.get("material", {}).get("density_kg_m2") if isinstance(cloth.get("material"), dict) else None
+        if density is None:
+            raise ConfigError("--mass goes with a material of stated density_kg_m2 in cloth.yaml.")
+        fixed = {"mass": mass / float(density)}
+    bounds = {name: list(pair) for name, pair in _BOUNDS.items() if name in names}
+    return FitConfig.model_validate({"parameters": names, "fixed": fixed, "bounds": bounds, "starts": 2, "screen": 14})
+
+
+def _scenarios(
+    out: Path, cloth: Mapping[str, Any], layouts: Mapping[str, Mapping[str, Any]], steps: int
+) -> dict[str, Scenario]:
+    """One a recording, each written to OUT/scenarios/ for other commands."""
+    found = {}
+    for name, fields in layouts.items():
+        path = out / "scenarios" / f"{name}.yaml"
+        write_text(path, yaml.safe_dump({**cloth, **fields, "steps_per_frame": steps}, sort_keys=False))
+        found[name] = load_scenario(path)
+    return found
+
+
+def _fitted(
+    out: Path,
+    episodes: Mapping[str, Episode],
+    cloth: Mapping[str, Any],
+    layouts: Mapping[str, Mapping[str, Any]],
+    settings: FitConfig,
+) -> tuple[FitRecord, AnyObjective, FitJob]:
+    """Fit, with finer and finer steps from the place found, until they no longer matter."""
+    steps, init = int(cloth.get("steps_per_frame", _STEPS)), dict[str, float]()
+    while True:
+        scenarios = _scenarios(out, cloth, layouts, steps)
+        members = [Recording(scenarios[name], name, episode) for name, episode in episodes.items()]
+        job = FitJob("fit", members, settings, out, init)
+        with progress_bar("identify", 1) as update:
+            record = job.run(partial(_tell, update, steps))
+        objective = job.objective()
+        apart, noise = refined_distance_mm(objective, record.values)
+        errors.print(
+            f"{steps} steps a frame: {record.rms_mm:.1f} mm RMS; four times the steps move the cloth by {apart:.1f} mm, "
+            f"the points' noise is {noise:.1f} mm.",
+            markup=False,
+        )
+        if apart <= _NOISE_PART * noise or 2 * steps > _MOST_STEPS:
+            if apart > _NOISE_PART * noise:
+                warn(f"finer steps still move the cloth by {apart:.1f} mm: what is found includes an error of that size.")
+            return record, objective, job
+        steps, init = 2 * steps, _free(record)
+        settings = settings.model_copy(update={"starts": 1, "screen": 0})
+
+
+def _tell(update: Callable[[float, str], None], steps: int, done: float, text: str) -> None:
+    update(done, f"{steps} steps a frame  {text}")
+
+
+def _free(record: FitRecord) -> dict[str, float]:
+    return {name: entry.value for name, entry in record.parameters.items() if not entry.fixed}
+
+
+def _validation(record: FitRecord, objective: AnyObjective) -> str:
+    """Whether parameters found without a recording explain it."""
+    if not isinstance(objective, JointObjective):
+        return "One recording: whether its parameters carry over to another is not known."
+    held, gains = [], []
+    for member, episode in zip(objective.members, record.episodes, strict=True):
+        if episode.left_out is None:
+            return "Leaving one recording out failed: whether parameters carry over is not known."
+        with torch.no_grad():
+            middle = float(member({}))
+        held.append(episode.left_out.rms_mm / episode.rms_mm)
+        gains.append((middle - episode.left_out.loss) / max(middle - episode.loss, 1e-300))
+    told = f"fitted without it, the misfit of each recording is at most {max(held):.2f} times what it is with it"
+    motions = len({_motion_of(member) for member in objective.members})
+    if max(held) <= _TRANSFERS and min(gains) >= _GAIN:
+        return f"Transfers{'' if motions > 1 else ' within this motion'}: {told}."
+    return f"Explains its own recordings only: {told}."
+
+
+def _motion_of(objective: Objective) -> str:
+    """Recordings whose grippers end within a tenth of their way of each other show one motion."""
+    track = objective.track
+    if track is None:
+        return "scene"
+    end = track[0, -1].flatten().numpy()
+    return str(np.round(end / max(float(np.abs(end).max()), 1e-9), 0).tolist())
+
+
+def _findings(record: FitRecord, objective: AnyObjective, found: Intervals) -> list[str]:
+    """The report's first lines: does the model explain the recordings, do parameters carry over, what are they."""
+    if found.explains:
+        lines = [f"The model explains the recordings: misfit {record.rms_mm:.1f} mm RMS."]
+    else:
+        worst = max(record.episodes, key=lambda one: one.rms_mm)
+        frame = int(np.argmax(worst.frame_rms_mm))
+        lines = [
+            f"The model does not explain the recordings: {found.reason}. It is worst in {worst.name}, frame "
+            f"{worst.frames[frame]}, with {worst.frame_rms_mm[frame]:.1f} mm."
+        ]
+    lines.append(_validation(record, objective))
+    if not found.arrived:
+        lines.append(found.reason[0].upper() + found.reason[1:] + ".")
+    for name, entry in found.parameters.items():
+        digits = significant(entry.low, entry.high)
+        ends = (
+            ""
+            if entry.low is None
+            else f", {found.level:.0%} interval {digits(entry.physical_low)} to {digits(entry.physical_high)}"
+        )
+        first = largest_sources(found.sources, name, 2)
+        improve = f" (improve first: {first})" if first and entry.low is not None else ""
+        lines.append(f"{name}: {digits(entry.physical)} {entry.physical_unit}{ends}: {entry.verdict}{improve}.")
+    return lines
+
+
+def _result(record: FitRecord, found: Intervals, findings: Sequence[str]) -> dict[str, Any]:
+    parameters = {
+        name: {
+            "value": entry.value,
+            "physical": entry.physical,
+            "physical_unit": entry.physical_unit,
+            "low": entry.physical_low,
+            "high": entry.physical_high,
+            "verdict": entry.verdict,
+        }
+        for name, entry in found.parameters.items()
+    }
+    return {
+        "parameters": parameters,
+        "rms_mm": record.rms_mm,
+        "explains": found.explains and found.arrived,
+        "reason": found.reason,
+        "findings": list(findings),
+        "episodes": {one.name: one.rms_mm for one in record.episodes},
+    }
+
+
+def _page(
+    record: FitRecord, found: Intervals, findings: Sequence[str], episodes: Mapping[str, Episode], job: FitJob
+) -> str:
+    entries = []
+    for index, recording in enumerate(record.episodes):
+        row = {
+            "rms_start_mm": 1e3 * record.length_unit_m * record.loss_start**0.5,
+            "rms_mm": recording.rms_mm,
+            "rms_other_frames_mm": math.nan,
+        }
+        entries.append(
+            EpisodeEntry(
+                scenario=recording.scenario,
+                name=recording.name,
+                row=row,
+                fit=_with_one(record, index),
+                recording=recording,
+                episode=episodes[recording.name],
+                motion=read_motion(job.files[1], index),
+            )
+        )
+    return build_page(
+        entries,
+        title="A cloth from its recordings",
+        overlay_points=1200,
+        environment={"command": "diffcloud identify", **record.versions},
+        findings=findings,
+        intervals=found,
+    )
+
+
+def _with_one(record: FitRecord, index: int) -> FitRecord:
+    """The record with one of its recordings alone, as a page's row shows it."""
+    return record.model_copy(update={"episodes": [record.episodes[index]]})

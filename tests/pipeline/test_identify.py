@@ -1,0 +1,162 @@
+"""`diffcloud identify` as a new user runs it: folders of clouds in, parameters and a report out."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from diffcloud.clouds import SurfaceSampler
+from diffcloud.fit import read_fit
+from diffcloud.io.clouds import write_ply
+from diffcloud.scene.scenarios import built_in, make_scenario
+from diffcloud.sim.simulate import rollout
+from tests.pipeline.invoke import invoke
+
+SIZE = (0.16, 0.12)
+
+
+@pytest.fixture(scope="module")
+def towel(tmp_path_factory):
+    """Two lifts of one small cloth, laid differently, as folders of clouds with the gripper's track."""
+    root = tmp_path_factory.mktemp("recorded")
+    material = {"density_kg_m2": 0.25, "stretching_n_m": 30.0, "bending_n_m": 1e-5, "poisson": 0.3}
+    for name, yaw, centre in (("first", 10.0, (0.5, 0.0)), ("second", -35.0, (0.45, 0.1))):
+        changes = {
+            "size_m": SIZE, "nodes": (6, 5), "yaw_deg": yaw, "center_m": centre, "table_height_m": 0.02, "frames": 8,
+            "material": material, "path": [(0, 0, 0, 0), (0.8, -0.03, -0.02, 0.15)], "grasped": ("right_top",),
+        }  # fmt: skip
+        options = type(built_in("lift")).model_validate({**built_in("lift").model_dump(), **changes})
+        scenario = make_scenario(options)
+        system, _ = scenario.scene.build()
+        run = rollout(system, scenario.steps, properties=scenario.properties(system, {"mass": torch.ones(1).double()}))
+        nodes = run.positions[0, :: scenario.scene.frame_steps]
+        generator = torch.Generator().manual_seed(1)
+        sampler = SurfaceSampler.build(torch.as_tensor(system.mesh.faces), 1200, generator=generator)
+        rng, folder = np.random.default_rng(2), root / name
+        folder.mkdir()
+        for index, cloud in enumerate(sampler.sample(nodes).numpy()):
+            write_ply(folder / f"{index:03d}.ply", cloud + 0.001 * rng.standard_normal(cloud.shape))
+        track = np.column_stack([np.arange(9) * 0.1, nodes[:, scenario.grasped[0]].numpy()])
+        np.savetxt(folder / "gripper.csv", track, delimiter=",", header="t_s,x,y,z", comments="")
+    return root
+
+
+@pytest.fixture
+def work(towel, tmp_path):
+    shutil.copytree(towel, tmp_path / "recorded")
+    with contextlib.chdir(tmp_path):
+        yield tmp_path
+
+
+COMMAND = ("identify", "recorded/first", "recorded/second", "--size", "0.16x0.12", "--mass", 0.25, "--out", "found")
+
+
+@pytest.fixture(scope="module")
+def found(towel, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("identified")
+    shutil.copytree(towel, folder / "recorded")
+    with contextlib.chdir(folder):
+        done = invoke(*COMMAND, "--parameters", "stretch")
+    return folder, done
+
+
+class TestNewUser:
+    def test_the_stiffness_comes_out_in_newtons_per_metre(self, found):
+        _, done = found
+        told = done.result["parameters"]["stretch"]
+        assert told["physical_unit"] == "N/m"
+        assert told["physical"] == pytest.approx(30.0, rel=0.3)
+        assert told["low"] < told["physical"] < told["high"]
+        assert done.result["explains"]
+        assert done.result["rms_mm"] < 5
+
+    def test_what_was_found_is_written_with_its_reasons(self, found):
+        folder, _ = found
+        text = (folder / "found" / "recordings.yaml").read_text()
+        assert "  # turn at which that rectangle is smallest" in text
+        layouts = yaml.safe_load(text)
+        assert layouts["first"]["center_m"] == pytest.approx([0.5, 0.0], abs=0.003)
+        assert (layouts["second"]["yaw_deg"] + 35) % 180 == pytest.approx(0, abs=2)
+        cloth = yaml.safe_load((folder / "found" / "cloth.yaml").read_text())
+        assert cloth["size_m"] == [0.16, 0.12]
+        assert cloth["material"]["density_kg_m2"] == 0.25
+
+    def test_the_report_begins_with_what_it_means(self, found):
+        folder, done = found
+        page = (folder / "found" / "report.html").read_text()
+        summary = page[page.index('id="summary"') :]
+        assert summary.index("The model explains the recordings") < summary.index("Transfers within this motion")
+        assert summary.index("Transfers within this motion") < summary.index("stretch: ")
+        assert "fetch(" not in page[: page.index("<main>")]
+        assert done.result["findings"][0].startswith("The model explains")
+
+    def test_other_commands_take_what_it_wrote(self, found):
+        folder, _ = found
+        with contextlib.chdir(folder):
+            record = read_fit(folder / "found" / "fit.json")
+            assert [one.name for one in record.episodes] == ["first", "second"]
+            done = invoke(
+                "rollout", "--scenario", "found/scenarios/second.yaml", "--fit", "found/fit.json",
+                "--episode", "found/episodes/second.npz", "--out", "run.npz",
+            )  # fmt: skip
+            assert done.result["parameters"] == record.values
+
+    def test_an_edited_value_overrules_and_a_finished_fit_is_kept(self, found):
+        folder, first = found
+        with contextlib.chdir(folder):
+            before = (folder / "found" / "fit.json").stat().st_mtime_ns
+            again = invoke(*COMMAND, "--parameters", "stretch")
+            assert (folder / "found" / "fit.json").stat().st_mtime_ns == before
+            assert again.result["parameters"] == first.result["parameters"]
+            path = folder / "found" / "recordings.yaml"
+            text = path.read_text()
+            path.write_text(text.replace("grasped: [right_top]", "grasped: [right_bottom]"))
+            other = invoke(*COMMAND, "--parameters", "stretch")
+            path.write_text(text)
+            assert other.result["rms_mm"] > 2 * first.result["rms_mm"]
+            assert not other.result["explains"]
+            assert other.result["findings"][0].startswith("The model does not explain the recordings")
+            assert other.result["parameters"]["stretch"]["verdict"] == "the model does not explain the recording"
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            (("--size", "0.40x0.30"), "was stated. Check --size"),
+            (("--size", "big"), "--size takes two sides in metres"),
+            (("--mass", -1), "--mass is in kg per square metre"),
+            (("--within", 0.5), "--within takes a factor above 1"),
+        ],
+    )
+    def test_of_options(self, work, change, message):
+        assert message in invoke(*COMMAND, *change, code=1).errors
+        assert not (work / "found" / "fit.json").exists()
+
+    def test_of_what_is_not_there(self, work):
+        assert "No such recording: nothing" in invoke("identify", "nothing", "--out", "found", code=1).errors
+        (work / "recorded/first/gripper.csv").unlink()
+        assert "holds no gripper.csv" in invoke("identify", "recorded/first", "--out", "found", code=1).errors
+
+    def test_of_damaged_notes(self, work):
+        (work / "found").mkdir()
+        (work / "found" / "cloth.yaml").write_text("[1, 2]")
+        assert "must be a mapping" in invoke(*COMMAND, code=1).errors
+        (work / "found" / "cloth.yaml").write_text("size_m: [0.16, 0.12]\nmaterial: denim\n")
+        assert "stated density_kg_m2" in invoke(*COMMAND, code=1).errors
+
+    def test_two_of_one_name(self, work):
+        twice = invoke("identify", "recorded/first", "recorded/first", "--out", "found", code=1)
+        assert "Two recordings are named first" in twice.errors
+
+
+def test_results_are_plain_json(found):
+    folder, _ = found
+    told = json.loads((folder / "found" / "intervals.json").read_text())
+    assert told["parameters"]["stretch"]["verdict"]
