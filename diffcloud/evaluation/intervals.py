@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -18,10 +19,12 @@ import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
+from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis
+from diffcloud.fit.scan import scan
 from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, Uncertainty, noise_mm, uncertainty
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS
@@ -40,6 +43,8 @@ WITHIN = 1.5
 LEVEL = 0.9
 _UNEXPLAINED = 2.0
 """RMS over what noise and spacing of the points account for, from which the model does not explain the recording."""
+_LOWER = 0.02
+"""Part by which a loss nearby must be lower to be another minimum."""
 _STEP = 0.5
 """The largest next step of a fit that has arrived, in standard deviations."""
 _PRIOR = 0.5
@@ -129,15 +134,18 @@ def state_intervals(
     Raises:
         DivergedError: the fitted motion diverges.
     """
-    found = uncertainty(objective, space, values, doubts=doubts)
+    found, lower = _with_scan(objective, space, uncertainty(objective, space, values, doubts=doubts))
     total = found.covariance
     deviations = np.sqrt(np.maximum(total.diagonal(), 1e-300))
-    arrived = bool((np.abs(found.step) <= _STEP * deviations).all())
+    arrived = lower is None and bool((np.abs(found.step) <= _STEP * deviations).all())
     misfit = [_misfit(member, space, values) for member in objective.members]
     worst_fit = max(misfit, key=lambda pair: pair[0] / pair[1])
     explains = objective.paper or worst_fit[0] <= _UNEXPLAINED * worst_fit[1]
     reason = ""
-    if explains and not arrived:
+    if explains and lower is not None:
+        near = ", ".join(f"{name} {value:.3g}" for name, value in lower.items())
+        reason = f"the fit has not arrived: the loss is lower at {near}; fit again with --init there"
+    elif explains and not arrived:
         reason = "the fit has not arrived: its next step is a good part of the interval; fit again with more iterations"
     elif not explains:
         reason = (
@@ -208,6 +216,27 @@ def state_intervals(
         explains=explains,
         reason=reason,
     )
+
+
+def _with_scan(objective: AnyObjective, space: FitSpace, found: Uncertainty) -> tuple[Uncertainty, dict[str, float] | None]:
+    """The uncertainty with one more source: how far along its principal axes the loss stays as low as noise of so few
+    clusters may make it. And the values of a clearly lower loss, if the scan meets one."""
+    from scipy.stats import t  # slow to import
+
+    centre = torch.from_numpy(found.places)
+    inverse = torch.from_numpy(np.linalg.pinv(found.covariance, hermitian=True))
+    seen, _ = scan(objective, space, centre, inverse)
+    axis = Axis.of(space)
+    loss = float(batch_losses(objective, space, axis.bounded(centre[None])))
+    place, lowest = seen.place(centre)
+    lower = None
+    if lowest < (1 - _LOWER) * loss:
+        lower = dict(zip(space.names, axis.bounded(place[None])[0].tolist(), strict=True))
+    quantile = float(t.ppf(0.95, max(found.clusters - 1, 1)))
+    hidden = seen.losses <= (1 + quantile**2 / max(found.clusters - len(space.names), 1)) * loss
+    reach = torch.where(hidden, seen.lengths.abs(), 0.0).amax(-1) / quantile
+    spread = (seen.directions.T * reach.square()) @ seen.directions
+    return replace(found, sources={**found.sources, "nearly as low": spread.numpy()}), lower
 
 
 def significant(low: float | None, high: float | None) -> Callable[[float | None], str]:

@@ -31,7 +31,7 @@ def leave_each_out(
         KeyboardInterrupt: Ctrl-C.
     """
     told = []
-    settings = GaussNewtonSettings(iterations=_STEPS, starts=1, screen=0, init=values)
+    settings = GaussNewtonSettings(iterations=_STEPS, starts=1, screen=0, scans=0, init=values)
     for index, member in enumerate(objective.members):
         others = JointObjective([*objective.members[:index], *objective.members[index + 1 :]])
         found = fit_gauss_newton(others, space, settings, progress=progress)

@@ -15,6 +15,7 @@ from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitSpace, Objective
 from diffcloud.fit.uncertainty import Uncertainty
 from tests.conftest import small_lift
+from tests.evaluation.bowls import Bowl
 from tests.fit.test_fit import clouds_of
 
 VALUES = {"stretch": 0.7, "mass": 1.0}
@@ -31,13 +32,14 @@ def objective():
 def told(objective, monkeypatch):
     """Intervals of stated variances."""
 
-    def tell(sources, *, space=SPACE, values=VALUES, step=0.0, clusters=16, misfit=(3.0, 3.0), **options):
+    def tell(sources, *, space=SPACE, values=VALUES, step=0.0, clusters=16, misfit=(3.0, 3.0), lower=None, **options):
         k = len(space.names)
         places = np.log([values[name] for name in space.names])
         covariances = {name: np.array(value, dtype=float).reshape(k, k) for name, value in sources.items()}
         found = Uncertainty(space.names, places, covariances, clusters, np.full(k, step))
         monkeypatch.setattr(module, "uncertainty", lambda *arguments, **given: found)
         monkeypatch.setattr(module, "_misfit", lambda *arguments: misfit)
+        monkeypatch.setattr(module, "_with_scan", lambda objective, space, found: (found, lower))
         return state_intervals(objective, space, values, **options)
 
     return tell
@@ -115,12 +117,51 @@ class TestVerdicts:
         assert found.parameters["stretch"].verdict == "the fit has not arrived"
         assert "fit again" in found.reason
 
+    def test_one_that_a_scan_finds_lower_losses_beside_has_none(self, told):
+        found = told({"noise": np.diag([0.01, 0.01])}, lower={"stretch": 1.3, "mass": 1.0})
+        assert found.parameters["stretch"].verdict == "the fit has not arrived"
+        assert "the loss is lower at stretch 1.3, mass 1" in found.reason
+
     def test_a_misfit_far_above_the_noise_is_no_statement_on_the_cloth(self, told):
         found = told({"noise": np.diag([0.01, 0.01])}, misfit=(9.0, 4.0))
         assert not found.explains
         assert found.parameters["stretch"].verdict == "the model does not explain the recording"
         assert found.parameters["stretch"].low is not None
         assert "9.0 mm RMS" in found.reason
+
+
+class Wells(Bowl):
+    """Losses in stretch alone: 1 + (u / 0.3)², and at u = 0.5 a narrow second minimum as deep as stated."""
+
+    depth = 0.0
+
+    def __call__(self, parameters):
+        away = parameters["stretch"].log()
+        return 1 + (away / 0.3).square() - self.depth * (-(((away - 0.25) / 0.03) ** 2)).exp()
+
+
+class TestScan:
+    SPACE = FitSpace.build(["stretch"])
+
+    def found(self, depth):
+        well = Wells()
+        well.depth = depth
+        flat = Uncertainty(("stretch",), np.zeros(1), {"noise": np.array([[1e-6]])}, 16, np.zeros(1))
+        return module._with_scan(well, self.SPACE, flat)
+
+    def test_what_noise_hides_widens_the_interval(self):
+        """Of 16 clusters a loss 20 % higher: 0.1 is hidden, 0.25 is not; with the second minimum it is."""
+        smooth, lower = self.found(0.0)
+        assert lower is None
+        quantile = t.ppf(0.95, 15)
+        assert math.sqrt(smooth.sources["nearly as low"][0, 0]) * quantile == pytest.approx(0.1)
+        rough, lower = self.found(0.6)
+        assert lower is None
+        assert math.sqrt(rough.sources["nearly as low"][0, 0]) * quantile == pytest.approx(0.25)
+
+    def test_a_lower_loss_is_told(self):
+        _, lower = self.found(1.2)
+        assert lower["stretch"] == pytest.approx(math.exp(0.25))
 
 
 def test_the_misfit_is_the_fits_own(objective):

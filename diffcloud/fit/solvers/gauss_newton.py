@@ -6,7 +6,8 @@ With half of the loss's slope g and of its curvature H on the axis of `residuals
 
 over the variables that no bound holds (Marquardt 1963; Madsen, Nielsen and Tingleff 2004, section 3.2). Each start keeps
 its own λ: it falls by how much of the predicted decrease a step brings, and grows, faster and faster, where it brings
-none. Starts are the best of a screen of candidates spread over the box.
+none. Starts are the best of a screen of candidates spread over the box. Where they have ended, losses along the principal
+axes of the best place tell whether another minimum is lower nearby; from there a start goes on.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis, Linearisation, linearise
+from diffcloud.fit.scan import scan
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
 
 _FIRST_DAMPING = 1e-2
@@ -34,6 +36,8 @@ _SMALLEST_STEP = 1e-3
 _SMALLEST_DECREASE = 1e-3
 _SAME = 0.02
 """A start that comes as close to the best one, on the axis, leaves the rest of the way to it."""
+_LOWER = 0.02
+"""Part by which another minimum must be lower."""
 _GIVE_UP = 6
 """Steps in vain, one after the other: the loss is rougher than its slope."""
 
@@ -46,6 +50,8 @@ class GaussNewtonSettings:
     """Steps of each start at most."""
     threshold: float = 0.0
     """Stop below this loss; 0: never."""
+    scans: int = 2
+    """Times that a lower minimum is looked for around the best place; 0: never."""
     screen: int = 24
     """Candidates beside the first that are simulated once, without derivatives; 0: the starts are taken unseen."""
     starts: int = 3
@@ -74,6 +80,7 @@ def fit_gauss_newton(
     start, simulations = _starts(objective, space, settings, axis)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
+    scans = 0
     try:
         at = linearise(objective, space, start)
         simulations += at.simulations
@@ -92,7 +99,19 @@ def fit_gauss_newton(
             going = search.going
             if not len(going):
                 reason = "converged" if bool(search.arrived[search.best]) else "rough"
-                break
+                if scans == settings.scans or iteration == settings.iterations:
+                    break
+                scans += 1
+                place = search.places[search.best]
+                found_near, spent = scan(objective, space, place, search.normal[search.best])
+                simulations += spent
+                lower, loss = found_near.place(place)
+                if not loss < (1 - _LOWER) * float(search.losses.min()):
+                    break
+                at = linearise(objective, space, lower[None])
+                simulations += at.simulations
+                going = search.restart(lower, at)
+                reason = "iterations"
             if iteration < settings.iterations:
                 tried = search.propose(going, *axis.ends)
                 found = linearise(objective, space, tried)
@@ -135,6 +154,15 @@ class _Search:
     def going(self) -> Tensor:
         """Starts [b] that have neither arrived nor given up."""
         return (~self.arrived & (self._in_vain < _GIVE_UP) & torch.isfinite(self.losses)).nonzero().flatten()
+
+    def restart(self, place: Tensor, found: Linearisation) -> Tensor:
+        """Another place [k] in that of the highest loss, which has ended; its index [1]."""
+        row = int(self.losses.argmax()) if len(self.losses) > 1 else 0
+        self.places[row], self.losses[row] = place, found.losses[0]
+        self.slope[row], self.normal[row] = found.slope[0], found.curvature[0]
+        self._damping[row], self._growth[row], self._in_vain[row] = _FIRST_DAMPING, 2.0, 0
+        self.arrived[row] = False
+        return torch.tensor([row])
 
     def propose(self, going: Tensor, low: Tensor, high: Tensor) -> Tensor:
         """[b, k] the next places of some starts, between the bounds [k]."""

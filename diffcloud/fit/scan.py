@@ -1,0 +1,63 @@
+"""Losses along the principal axes of a fitted place: is another minimum lower, and how far do nearly as low ones reach?
+
+Where a cloth may fold in more than one way, the loss has many minima, side by side. A descent knows the one that it ended
+in, and its curvature only how sharp that one is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffcloud.fit.batches import batch_losses
+from diffcloud.fit.joint import AnyObjective
+from diffcloud.fit.parameters import FitSpace
+from diffcloud.fit.residuals import Axis
+
+LENGTHS = (0.04, 0.1, 0.25, 0.6)
+"""On the axis, to both sides."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Around one place, of k variables."""
+
+    directions: Tensor
+    """[k, k] principal axes, in rows."""
+    lengths: Tensor
+    """[k, n] along each, negative ones first; where a bound cuts one short, its length is what is left."""
+    losses: Tensor
+    """[k, n] with priors; infinite where a motion diverges."""
+
+    def place(self, centre: Tensor) -> tuple[Tensor, float]:
+        """Where the loss is lowest [k], and that loss."""
+        axis, index = divmod(int(self.losses.argmin()), self.losses.shape[1])
+        return centre + self.lengths[axis, index] * self.directions[axis], float(self.losses[axis, index])
+
+
+def scan(objective: AnyObjective, space: FitSpace, place: Tensor, curvature: Tensor) -> tuple[Scan, int]:
+    """
+    Args:
+        place: [k] on the axis.
+        curvature: [k, k] half of the loss's.
+
+    Returns:
+        The scan, and how many simulations it took.
+    """
+    axis = Axis.of(space)
+    low, high = axis.ends
+    directions = torch.linalg.eigh(curvature)[1].T
+    ways = torch.tensor([-length for length in reversed(LENGTHS)] + list(LENGTHS), dtype=torch.float64)
+    lengths = ways.expand(len(directions), -1).clone()
+    for row, direction in enumerate(directions):
+        for sign in (-1, 1):
+            moving = direction.abs() > 1e-9
+            ends = torch.where(sign * direction > 0, high - place, low - place)[moving] / direction[moving]
+            reach = float(ends.abs().min()) if len(ends) else 0.0
+            side = lengths[row] * sign > 0
+            lengths[row, side] = lengths[row, side].clamp(-reach, reach)
+    places = place + lengths[..., None] * directions[:, None]
+    losses = batch_losses(objective, space, axis.bounded(places.flatten(0, 1))).reshape(lengths.shape)
+    return Scan(directions, lengths, losses), losses.numel() * len(objective.members)

@@ -1,0 +1,67 @@
+"""Scans around a fitted place: what they look at, and that a fit goes on where they meet a lower loss."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from diffcloud.fit import FitSpace, GaussNewtonSettings, fit_gauss_newton, residuals
+from diffcloud.fit.residuals import Axis, Linearisation
+from diffcloud.fit.scan import LENGTHS, scan
+from diffcloud.fit.solvers import gauss_newton
+from tests.evaluation.bowls import SPACE, Bowl
+
+
+class TwoWells(Bowl):
+    """Of the logarithm u of stretch: u² + 0.02 around 0, and a lower minimum at 0.6 that is too narrow to be felt there."""
+
+    def __call__(self, parameters):
+        away = parameters["stretch"].log()
+        far = ((away - 0.6) / 0.2).square()
+        return torch.minimum(away.square() + 0.02, 0.01 * far + 0.001)
+
+
+def linearised(objective, space, places):
+    """Loss, half of its slope and of its curvature, by automatic differentiation."""
+    at = places.detach().requires_grad_(True)
+    losses = objective(space.parameters(Axis.of(space).values(at)))
+    (slope,) = torch.autograd.grad(losses.sum(), at, create_graph=True)
+    (curvature,) = torch.autograd.grad(slope.sum(), at)
+    return Linearisation(losses.detach(), slope.detach() / 2, curvature[..., None] / 2, len(places))
+
+
+def test_a_fit_goes_on_where_a_scan_meets_a_lower_loss(monkeypatch):
+    monkeypatch.setattr(gauss_newton, "linearise", linearised)
+    space = FitSpace.build(["stretch"])
+    settings = GaussNewtonSettings(starts=1, screen=0, init={"stretch": 1.1})
+    assert residuals.linearise is not linearised
+    alone = fit_gauss_newton(TwoWells(), space, GaussNewtonSettings(**{**settings.__dict__, "scans": 0}))
+    assert alone.values["stretch"] == pytest.approx(1.0, rel=1e-3)
+    found = fit_gauss_newton(TwoWells(), space, settings)
+    assert found.values["stretch"] == pytest.approx(math.exp(0.6), rel=1e-3)
+    assert found.stop_reason == "converged"
+    assert found.simulations >= alone.simulations + 2 * len(LENGTHS)
+    assert [float(row.min()) for row in found.history.losses] == sorted(
+        (float(row.min()) for row in found.history.losses), reverse=True
+    )
+
+
+def test_it_goes_along_the_principal_axes_within_the_bounds():
+    place = Axis.of(SPACE).places(torch.tensor([9.0, 1.0]).double())
+    curvature = torch.tensor([[2.0, -1.9], [-1.9, 2.0]]).double()
+    found, simulations = scan(Bowl(), SPACE, place, curvature)
+    assert simulations == found.losses.numel() == 2 * 2 * len(LENGTHS)
+    torch.testing.assert_close(found.directions @ found.directions.T, torch.eye(2).double())
+    assert abs(float(found.directions[0] @ torch.tensor([1.0, 1.0]).double())) == pytest.approx(
+        math.sqrt(2)
+    )  # the flat one first
+    places = place + found.lengths[..., None] * found.directions[:, None]
+    low, high = Axis.of(SPACE).ends
+    assert bool((places <= high + 1e-9).all() and (places >= low - 1e-9).all())
+    expected = [Bowl()(SPACE.parameters(Axis.of(SPACE).bounded(row))) for row in places]
+    torch.testing.assert_close(found.losses, torch.stack(expected))
+    where, lowest = found.place(place)
+    assert lowest == float(found.losses.min())
+    assert float(Bowl()(SPACE.parameters(Axis.of(SPACE).bounded(where[None])))) == pytest.approx(lowest)
