@@ -7,7 +7,7 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 # the tests start hundreds of processes; without byte code each would compile the package again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv repro test test-slow lint format bench acceptance comparison simulated recordings docs clean
+.PHONY: venv repro test test-slow lint format bench acceptance comparison simulated recordings coverage docs clean
 
 venv: $(STAMP)
 
@@ -78,6 +78,12 @@ recordings: venv
 	diffcloud preprocess --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/clouds $(RECORDINGS)/raw
 	diffcloud recordings --params $(RECORDINGS_PARAMS) --recorded $(RECORDINGS)/raw --episodes $(RECORDINGS)/clouds \
 	    --out docs/results/raw-recordings.md
+
+# How often intervals hold the truth: drawn cloths, recorded, fitted, and held against what was drawn.
+COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --out build/coverage --seed 20261124 --workers 2
+coverage: venv
+	$(COVERAGE) --scenario lift --scenario fold --fix mass --recordings 24
+	$(COVERAGE) --scenario band_stretch --scenario vest_hang --recordings 20 --markdown docs/results/coverage.md
 
 # The site of docs/, README and all commands, as files that open from disk: build/site/index.html.
 docs: venv

@@ -54,9 +54,8 @@ def test_it_goes_along_the_principal_axes_within_the_bounds():
     found, simulations = scan(Bowl(), SPACE, place, curvature)
     assert simulations == found.losses.numel() == 2 * 2 * len(LENGTHS)
     torch.testing.assert_close(found.directions @ found.directions.T, torch.eye(2).double())
-    assert abs(float(found.directions[0] @ torch.tensor([1.0, 1.0]).double())) == pytest.approx(
-        math.sqrt(2)
-    )  # the flat one first
+    flattest = found.directions[0] @ torch.tensor([1.0, 1.0]).double()
+    assert abs(float(flattest)) == pytest.approx(math.sqrt(2))
     places = place + found.lengths[..., None] * found.directions[:, None]
     low, high = Axis.of(SPACE).ends
     assert bool((places <= high + 1e-9).all() and (places >= low - 1e-9).all())
