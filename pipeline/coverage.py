@@ -50,12 +50,12 @@ HEAD = (
 @writes()
 def coverage(
     out: Annotated[
-        Path, typer.Option(help="Folder; <scenario>/<known>/<number>.json, kept by a later call, and episodes.")
+        Path, typer.Option(help="Folder for episodes and <scenario>/<known>/<number>.json, which a later call reuses.")
     ],
     scenario: Annotated[list[str] | None, typer.Option(help="Repeatable; by default those of the parameters file.")] = None,
     recordings: Annotated[int, typer.Option(min=1, help="Of each scenario.")] = 200,
     seed: Annotated[int, typer.Option(help="Of truths and noise.")] = 0,
-    fix: Annotated[list[str] | None, typer.Option(help="Parameter that fits are told the truth of, repeatable.")] = None,
+    fix: Annotated[list[str] | None, typer.Option(help="Parameter whose true value fits are given, repeatable.")] = None,
     level: Annotated[float | None, typer.Option(min=0.01, max=0.999, help="Of the intervals. Default: 0.9.")] = None,
     refined: Annotated[
         bool, typer.Option("--refined", help="Simulate the truth with four times the steps that fits take.")

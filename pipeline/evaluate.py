@@ -81,14 +81,13 @@ def intervals(
     episodes: Annotated[list[Path], typer.Argument(help="Its episode, or all episodes of a joint fit in their order.")],
     scenario: ScenarioName = None,
     scene: SceneFile = None,
-    level: Annotated[float, typer.Option(min=0.01, max=0.999, help="Share of intervals that hold the truth.")] = LEVEL,
+    level: Annotated[float, typer.Option(min=0.01, max=0.999, help="Share of intervals meant to hold the truth.")] = LEVEL,
     within: Annotated[float, typer.Option(help="Factor within which a parameter counts as identified.")] = WITHIN,
     doubt: Annotated[
         list[str] | None,
         typer.Option(
-            help="PARAMETER=FACTOR within which material that is not fitted is known, repeatable, or none. Default: "
-            + ", ".join(f"{name}={factor:g}" for name, factor in MATERIAL_DOUBTS.items())
-            + "."
+            help="PARAMETER=FACTOR, repeatable: the factor within which material that is not fitted is known. none: "
+            "exactly. Default: " + ", ".join(f"{name}={factor:g}" for name, factor in MATERIAL_DOUBTS.items()) + "."
         ),
     ] = None,
     threads: Threads = None,

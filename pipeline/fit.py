@@ -109,8 +109,8 @@ def fit(
     prior: Annotated[
         str | None,
         typer.Option(
-            help="Within which factor of the basis material each multiplier probably lies, such as bending=3x,mass=2x, or "
-            "none. Default: 10x, which decides only what the recording does not show."
+            help="The factor of the basis material within which each multiplier probably lies, such as "
+            "bending=3x,mass=2x; none for no prior. Default: 10x, which decides only what the recording does not show."
         ),
     ] = None,
     joint: Annotated[

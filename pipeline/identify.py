@@ -55,7 +55,7 @@ def identify(
     parameters: Annotated[
         str | None, typer.Option(help="Comma-separated. Default: stretch,bending, and mass if it was not weighed.")
     ] = None,
-    level: Annotated[float, typer.Option(min=0.01, max=0.999, help="Share of intervals that hold the truth.")] = LEVEL,
+    level: Annotated[float, typer.Option(min=0.01, max=0.999, help="Share of intervals meant to hold the truth.")] = LEVEL,
     within: Annotated[float, typer.Option(help="Factor within which a parameter counts as identified.")] = WITHIN,
     threads: Threads = None,
     json: JsonFlag = False,
@@ -138,16 +138,16 @@ def _cloth(
         sides = np.array([found_size(episode) for episode in episodes.values()])
         size = tuple(np.round(np.median(sides, axis=0), 3).tolist())
         reason = "rectangle around the first frames" + (
-            f", {np.ptp(sides, axis=0).max():.3f} m apart" if len(sides) > 1 else ""
+            f"; recordings differ by up to {np.ptp(sides, axis=0).max():.3f} m" if len(sides) > 1 else ""
         )
     told = "as weighed" if mass is not None else "usual for a knit; fitted"
     material = {"density_kg_m2": mass or _DENSITY, **_MATERIAL}
     found = {
         "base": Found("lift", "a rectangular cloth on a table"),
         "size_m": Found(list(size), reason),
-        "nodes": Found(list(node_counts(size)), "some 3.4 cm apart"),
+        "nodes": Found(list(node_counts(size)), "about 3.4 cm apart, but 5 to 13 along each side"),
         "material": Found(material, f"what multipliers act on; density {told}"),
-        "steps_per_frame": Found(_STEPS, "doubled where finer steps move the cloth by more than the noise"),
+        "steps_per_frame": Found(_STEPS, "doubled while finer steps move the cloth by more than half of the noise"),
     }
     write_text(path, _yaml(found))
     return {name: entry.value for name, entry in found.items()}
@@ -272,7 +272,7 @@ def _validation(record: FitRecord, objective: AnyObjective) -> str:
             middle = float(member({}))
         held.append(episode.left_out.rms_mm / episode.rms_mm)
         gains.append((middle - episode.left_out.loss) / max(middle - episode.loss, 1e-300))
-    told = f"fitted without it, the misfit of each recording is at most {max(held):.2f} times what it is with it"
+    told = f"when a recording is left out of the fit, its misfit is at most {max(held):.2f} times that in the joint fit"
     motions = len({_motion_of(member) for member in objective.members})
     if max(held) <= _TRANSFERS and min(gains) >= _GAIN:
         return f"Transfers{'' if motions > 1 else ' within this motion'}: {told}."
@@ -296,11 +296,11 @@ def _findings(record: FitRecord, objective: AnyObjective, found: Intervals) -> l
         worst = max(record.episodes, key=lambda one: one.rms_mm)
         frame = int(np.argmax(worst.frame_rms_mm))
         lines = [
-            f"The model does not explain the recordings: {found.reason}. It is worst in {worst.name}, frame "
+            f"The model does not explain the recordings: {found.reason}. The misfit is largest in {worst.name}, frame "
             f"{worst.frames[frame]}, with {worst.frame_rms_mm[frame]:.1f} mm."
         ]
     lines.append(_validation(record, objective))
-    if not found.arrived:
+    if found.explains and not found.arrived:
         lines.append(found.reason[0].upper() + found.reason[1:] + ".")
     for name, entry in found.parameters.items():
         digits = significant(entry.low, entry.high)

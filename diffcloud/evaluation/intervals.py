@@ -143,15 +143,15 @@ def state_intervals(
     explains = objective.paper or worst_fit[0] <= _UNEXPLAINED * worst_fit[1]
     reason = ""
     if explains and lower is not None:
-        near = ", ".join(f"{name} {value:.3g}" for name, value in lower.items())
-        reason = f"the fit has not arrived: the loss is lower at {near}; fit again with --init there"
+        near = ",".join(f"{name}={value:.3g}" for name, value in lower.items())
+        reason = f"the fit has not arrived: the loss is lower at {near}; fit again with `diffcloud fit --init {near}`"
     elif explains and not arrived:
         reason = "the fit has not arrived: its next step is a good part of the interval; fit again with more iterations"
     elif not explains:
         reason = (
-            f"the misfit is {worst_fit[0]:.1f} mm RMS, and noise and spacing of the points account for "
-            f"{worst_fit[1]:.1f}: the model does not explain the recording, and intervals say only how far its misfit "
-            "lets the numbers go"
+            f"the misfit is {worst_fit[0]:.1f} mm RMS, but noise and spacing of the points account for only "
+            f"{worst_fit[1]:.1f} mm; any interval says only how far this misfit lets the numbers go, and nothing about "
+            "the cloth"
         )
     widths = {name: _half_width(found, row, level) for name, row in zip(space.names, np.eye(len(space.names)), strict=True)}
     ratio_row = _ratio_row(space)

@@ -268,16 +268,18 @@ def _with_doubts(objective: Objective, space: FitSpace, doubts: Mapping[str, flo
 
 
 def _refined(objective: Objective, parameters: Mapping[str, Tensor], run: Rollout) -> Tensor:
-    """[1, L, V, 3] from the motion to that with finer steps, at the compared frames."""
+    """[1, L, V, 3] from the motion to that with finer steps, at the compared frames; zero for the paper's measure, which
+    takes the published step as it is."""
     scenario = objective.scenario
+    if objective.paper:
+        return torch.zeros_like(run.at(objective.times))
     scene = replace(scenario.scene, frame_steps=scenario.scene.frame_steps * _REFINED)
     system, _ = scene.build()
     steps = objective.loss_steps * _REFINED
     track = None
     if objective.episode.gripper is not None:
-        track = torch.as_tensor(track_displacement(objective.episode, system.handles.grippers, steps, system.time_step))[
-            None
-        ]
+        moved = track_displacement(objective.episode, system.handles.grippers, steps, system.time_step)
+        track = torch.as_tensor(moved)[None]
     fine = rollout(system, steps, properties=scenario.properties(system, parameters), track=track)
     return fine.at(objective.times) - run.at(objective.times)
 

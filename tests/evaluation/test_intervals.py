@@ -120,7 +120,7 @@ class TestVerdicts:
     def test_one_that_a_scan_finds_lower_losses_beside_has_none(self, told):
         found = told({"noise": np.diag([0.01, 0.01])}, lower={"stretch": 1.3, "mass": 1.0})
         assert found.parameters["stretch"].verdict == "the fit has not arrived"
-        assert "the loss is lower at stretch 1.3, mass 1" in found.reason
+        assert "the loss is lower at stretch=1.3,mass=1;" in found.reason
 
     def test_a_misfit_far_above_the_noise_is_no_statement_on_the_cloth(self, told):
         found = told({"noise": np.diag([0.01, 0.01])}, misfit=(9.0, 4.0))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -154,6 +155,41 @@ class TestRefusals:
     def test_two_of_one_name(self, work):
         twice = invoke("identify", "recorded/first", "recorded/first", "--out", "found", code=1)
         assert "Two recordings are named first" in twice.errors
+
+
+@pytest.mark.slow
+def test_a_towel_of_another_simulator_has_its_stiffness(tmp_path):
+    """MuJoCo lifts it twice, laid differently; two millimetres of noise."""
+    pytest.importorskip("mujoco")
+    from diffcloud.evaluation.simulators import mujoco
+    from diffcloud.evaluation.simulators.problem import Problem, Sheet
+    from diffcloud.mesh.shapes import grid_cloth
+    from diffcloud.sim.motion import Keyframe, Motion
+
+    sheet = Sheet(density=0.25, stretching=40.0, poisson=0.3, bending=1e-5, damping=0.005)
+    path = Motion((Keyframe(0.0, (0.0, 0.0, 0.0)), Keyframe(2.5, (-0.1, -0.1, 0.45))))
+    rng = np.random.default_rng(1)
+    for name, yaw, centre in (("one", 0.0, (0.55, 0.0)), ("two", 0.44, (0.57, -0.05))):
+        mesh = grid_cloth(10, 13, 0.30, 0.40)
+        c, s = np.cos(yaw), np.sin(yaw)
+        nodes = mesh.nodes @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + np.array([*centre, 0.022])
+        problem = Problem("lift", replace(mesh, nodes=nodes), sheet, 3.0, {len(nodes) - 1: path}, table=0.02)
+        run = mujoco.simulate(problem)
+        generator = torch.Generator().manual_seed(1)
+        sampler = SurfaceSampler.build(torch.as_tensor(mesh.faces), 3000, generator=generator)
+        clouds = sampler.sample(torch.as_tensor(run.nodes)).numpy()
+        (tmp_path / name).mkdir()
+        for index, cloud in enumerate(clouds):
+            write_ply(tmp_path / name / f"{index:03d}.ply", cloud + 0.002 * rng.standard_normal(cloud.shape))
+        track = np.column_stack([problem.times, run.nodes[:, -1]])
+        np.savetxt(tmp_path / name / "gripper.csv", track, delimiter=",", header="t_s,x,y,z", comments="")
+    with contextlib.chdir(tmp_path):
+        done = invoke("identify", "one", "two", "--size", "0.40x0.30", "--mass", 0.25, "--out", "found")
+    told = done.result["parameters"]["stretch"]
+    assert 40 / 1.5 < told["physical"] < 40 * 1.5
+    assert told["low"] < 40 < told["high"]
+    assert done.result["rms_mm"] < 8
+    assert done.result["findings"][1].startswith("Transfers within this motion")
 
 
 def test_results_are_plain_json(found):

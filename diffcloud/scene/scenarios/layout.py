@@ -91,7 +91,7 @@ def find_layout(episode: Episode, size: tuple[float, float]) -> Layout:
         raise EpisodeError(
             f"The first frame shows a cloth of {sides[0]:.3f} x {sides[1]:.3f} m, and {size[0]:.3f} x {size[1]:.3f} m was "
             "stated. Check --size and the unit of the clouds (metres), and that the first frame shows the whole cloth, "
-            "flat on the table: a recording that is cut above the table does not."
+            "flat on the table; it does not if all points near the table were cut off."
         )
     if off > _SIZE_OFF / 2:
         warnings.append(f"the first frame shows {sides[0]:.3f} x {sides[1]:.3f} m, {off:.0%} off the stated size")
@@ -152,7 +152,7 @@ def _few_points(episode: Episode) -> list[str]:
     thin = np.flatnonzero(counts < _FEW_POINTS)
     if not len(thin):
         return []
-    return [f"frames {', '.join(map(str, thin[:5]))} have fewer than {_FEW_POINTS} points ({counts[thin].min()} at least)"]
+    return [f"frames {', '.join(map(str, thin[:5]))} have fewer than {_FEW_POINTS} points (as few as {counts[thin].min()})"]
 
 
 def _flat_cloud(episode: Episode) -> NDArray[np.float64]:
@@ -175,7 +175,7 @@ def _flat_cloud(episode: Episode) -> NDArray[np.float64]:
     if tilt > _LEVEL_DEG:
         raise EpisodeError(
             f"The first frame is tilted by {tilt:.0f} degrees against the horizontal. Clouds are expected in the robot's "
-            "base frame, z up, with the cloth flat on the table; in a camera's frame they are not."
+            "base frame, z up, with the cloth flat on the table; these may still be in a camera's frame."
         )
     thick = float(np.quantile(inside[:, 2], 0.95) - np.quantile(inside[:, 2], 0.05))
     if thick > _FLAT_M:
