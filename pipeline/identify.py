@@ -55,13 +55,16 @@ def identify(
     parameters: Annotated[
         str | None, typer.Option(help="Comma-separated. Default: stretch,bending, and mass if it was not weighed.")
     ] = None,
-    level: Annotated[float, typer.Option(min=0.01, max=0.999, help="Share of intervals meant to hold the truth.")] = LEVEL,
-    within: Annotated[float, typer.Option(help="Factor within which a parameter counts as identified.")] = WITHIN,
+    level: Annotated[
+        float | None, typer.Option(min=0.01, max=0.999, help="Share of intervals meant to hold the truth. Default: 0.9.")
+    ] = None,
+    within: Annotated[float | None, typer.Option(help="Factor within which a parameter counts as identified: 1.5.")] = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
     """Find the parameters of a cloth from recordings of it: layout, joint fit, intervals, and a report."""
     use_threads(threads)
+    level, within = level or LEVEL, WITHIN if within is None else within
     if within <= 1:
         raise ConfigError(f"--within takes a factor above 1, got {within:g}.")
     if mass is not None and not (0 < mass < math.inf):
