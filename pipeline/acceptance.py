@@ -74,7 +74,7 @@ def acceptance(
         write_text(out / "real_fits.md", _real_fits(release, starts))
     for name in ("trajectories.md", "simulated_clouds.md", "speed.md", "simulated_fits.md", "real_fits.md"):
         if (out / name).is_file():
-            output.print((out / name).read_text(encoding="utf-8"), markup=False)
+            output.print((out / name).read_text(encoding="utf-8"))
     errors.print(f"Tables are in {out}.")
 
 

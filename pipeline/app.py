@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
+import tempfile
+import traceback
+from typing import Annotated
 
 import typer
 
+from diffcloud import __version__
 from diffcloud.errors import DiffCloudError
-from pipeline.console import errors
+from pipeline.console import errors, say
 from pipeline.lazy import lazy_group
 from pipeline.memory import keep_freed_memory
 
+_MOST_TOLD = 300
+"""Characters of an unforeseen error's message."""
 COMMANDS = {
     "import": "pipeline.importing:app",
     "evaluate": "pipeline.evaluate_release:app",
@@ -24,6 +31,7 @@ COMMANDS = {
     "predict": "pipeline.predict:predict",
     "report": "pipeline.report:report",
     "identify": "pipeline.identify:identify",
+    "export": "pipeline.export:export",
     "rollout": "pipeline.rollout:rollout",
     "visibility": "pipeline.visibility:visibility",
     "gradients": "pipeline.gradients:gradients",
@@ -49,12 +57,15 @@ app = typer.Typer(
 
 
 @app.callback()
-def diffcloud() -> None:
+def diffcloud(
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an unexpected error.")] = False,
+) -> None:
     """Find the simulator parameters of a real cloth from the point clouds of its motion."""
+    del debug  # `main` looks for it in the command line, which it must know if this is not reached
 
 
 def main() -> None:
-    """Run, and turn the project's own errors into a message and exit status 1."""
+    """Run, and turn the project's own errors into a message and exit status 1; any other, into where its traceback is."""
     # A step is a chain of small operations: a second thread gains nothing (measured), and beside another busy process its
     # spinning costs tenfold. Said to OpenMP, which reads it when torch is imported, by those commands that need torch.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -62,11 +73,33 @@ def main() -> None:
     try:
         app()
     except DiffCloudError as error:
-        errors.print(f"[bold red]Error:[/] {str(error).replace('[', chr(92) + '[')}", soft_wrap=True)
+        say("Error:", str(error), style="bold red")
         sys.exit(1)
     except KeyboardInterrupt:
         errors.print("Interrupted.")
         sys.exit(130)
+    except Exception as error:
+        if "--debug" in sys.argv[1:2]:
+            raise
+        say("Error:", _unforeseen(error), style="bold red")
+        sys.exit(1)
+
+
+def _unforeseen(error: Exception) -> str:
+    """What to say of an error that is a fault of the program; its traceback is kept."""
+    told = " ".join(f"{type(error).__name__}: {error}".split())[:_MOST_TOLD]
+    if isinstance(error, MemoryError):
+        told = f"Out of memory ({told}). Try fewer or smaller episodes, frames, nodes or points"
+    else:
+        told = f"Unexpected error ({told})"
+    head = f"diffcloud {__version__}, Python {sys.version.split()[0]}"
+    try:
+        with tempfile.NamedTemporaryFile("w", prefix="diffcloud-", suffix=".log", delete=False, encoding="utf-8") as log:
+            log.write("\n".join([head, shlex.join(sys.argv), *traceback.format_exception(error)]))
+        kept = f"The traceback is in {log.name}; please attach that file to a report"
+    except OSError:
+        kept = "Put --debug right after `diffcloud` to see the traceback, and please report it"
+    return f"{told}. {kept}."
 
 
 if __name__ == "__main__":

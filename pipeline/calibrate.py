@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from diffcloud.errors import CalibrationError, EpisodeError
@@ -80,21 +79,21 @@ def calibrate(
         found = _charuco(read_raw_episode(source[0]), board, picture)
     summary, objections = found.summary, list(found.calibration.objections)
     columns_shown = _SHOWN[method]
-    table = Table("camera", *map(escape, ("position [m]", *columns_shown.values())))
+    table = Table("camera", *("position [m]", *columns_shown.values()))
     for name, entry in summary.items():
         position = " ".join(f"{value:.4f}" for value in np.array(entry["T_world_camera"])[:3, 3])
         table.add_row(name, position, *(f"{entry[key]:.4g}" if key in entry else "" for key in columns_shown))
     show(table, json)
     for message in found.warnings:
-        warn(escape(message))
+        warn(message)
     if objections and not force:
         raise CalibrationError(
             "The calibration is not written. " + " ".join(objections) + " To write it all the same: --force."
         )
     for message in objections:
-        warn(escape(message))
+        warn(message)
     write_calibration(out, found.calibration)
-    errors.print(f"Wrote {escape(str(out))}.")
+    errors.print(f"Wrote {out}.")
     finish(
         {
             "out": str(out),

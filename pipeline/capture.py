@@ -10,7 +10,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.markup import escape
 
 from diffcloud.errors import ConfigError
 from diffcloud.hardware import (
@@ -127,13 +126,11 @@ def record(
             meta={key: value for key, value in (("scenario", scenario), ("fabric", fabric)) if value is not None}
             | ({"trajectory": trajectory.name} if trajectory is not None else {}),
             T_world_camera={serial: entry.T_world_camera for serial, entry in calibrated.items()},
-            tell=lambda text: errors.print(escape(text)),
+            tell=errors.print,
         )
     except BaseException:
         if (out / "episode.json").is_file():
-            errors.print(
-                f"What was recorded so far is in {escape(str(out))}; diffcloud episode validate {escape(str(out))}"
-            )
+            errors.print(f"What was recorded so far is in {out!s}; diffcloud episode validate {out!s}")
         raise
     finally:
         if opened is not None:
@@ -141,9 +138,7 @@ def record(
     dropped = {camera.name: camera.dropped for camera in cameras}
     if any(dropped.values()):
         warn(f"Frames that the cameras lost: {dropped}. Use USB 3, a controller for each camera, or a lower --fps.")
-    errors.print(
-        f"{report.frames} frames and {report.robot_rows} robot rows in {report.seconds:.1f} s to {escape(str(out))}."
-    )
+    errors.print(f"{report.frames} frames and {report.robot_rows} robot rows in {report.seconds:.1f} s to {out!s}.")
     result = {"out": str(out), "frames": report.frames, "robot_rows": report.robot_rows, "seconds": report.seconds}
     finish(result | {"largest_error_m": report.largest_error_m, "dropped": dropped}, json)
 
@@ -195,7 +190,6 @@ def _plan(path: ToolTrajectory | None, serials: dict[str, str], arm: str | None,
             f"{np.round(plan['high_m'], 3).tolist()} (box {limits.box_low_m} to {limits.box_high_m}); at most "
             f"{plan['speed_m_s']:.2f} of {limits.speed_m_s:g} m/s, {plan['acceleration_m_s2']:.2f} of "
             f"{limits.acceleration_m_s2:g} m/s²; stopped beyond {limits.force_N:g} N or {limits.torque_Nm:g} N·m.",
-            markup=False,
             soft_wrap=True,
         )
     return plan

@@ -7,7 +7,6 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from diffcloud.errors import ConfigError
@@ -16,6 +15,7 @@ from diffcloud.evaluation.intervals import LEVEL, WITHIN
 from diffcloud.fit.pose import parse_priors
 from diffcloud.fit.solvers import SOLVERS, Settings
 from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, check_doubts
+from diffcloud.io.files import read_yaml
 from diffcloud.io.raw_episodes import ScenePlacement
 from diffcloud.regressors.settings import Loss, Profile, Target
 from diffcloud.scene.scenarios import Scenario
@@ -341,12 +341,7 @@ def load_config(path: Path | None) -> Config:
     """
     if path is None:
         return Config()
-    try:
-        data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"No such parameter file: {path}.") from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path} is not readable YAML: {error}.") from error
+    data = read_yaml(path, error=ConfigError, kind="parameter file")
     try:
         return Config.model_validate({} if data is None else data)
     except ValidationError as error:

@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from diffcloud.errors import ConfigError
 from diffcloud.io.files import claimed, files_in
@@ -27,8 +28,11 @@ _PLAIN_WIDTH = 140
 
 
 def _console(*, stderr: bool) -> Console:
-    console = Console(stderr=stderr, highlight=False)
-    return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=_PLAIN_WIDTH)
+    # names of files and messages hold brackets that are no markup: what has a style is a Text
+    console = Console(stderr=stderr, highlight=False, markup=False)
+    if not console.is_terminal:
+        console.width = _PLAIN_WIDTH
+    return console
 
 
 errors = _console(stderr=True)
@@ -58,18 +62,23 @@ def show(table: Table, as_json: bool) -> None:
 
 
 def warn(message: str) -> None:
-    errors.print(f"[yellow]Warning:[/] {message}", soft_wrap=True)
+    say("Warning:", message, style="yellow")
+
+
+def say(head: str, message: str, *, style: str, console: Console | None = None) -> None:
+    """A line whose beginning has a style, on standard error unless another console is given."""
+    (console or errors).print(Text.assemble((head, style), " ", message), soft_wrap=True)
 
 
 @contextmanager
 def progress_bar(label: str, total: int) -> Iterator[Callable[[float, str], None]]:
     """A bar on standard error; call with (done, text). Where that is no terminal, a line every ten seconds."""
     columns = (
-        TextColumn("[bold]{task.description}"),
+        TextColumn("{task.description}", style="bold", markup=False),
         BarColumn(bar_width=24),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[text]}"),
+        TextColumn("{task.fields[text]}", markup=False),
     )
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
         task = progress.add_task(label, total=total, text="")
@@ -82,7 +91,7 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[float, str], None
             if progress.disable and now - told >= _QUIET_S:
                 told = now
                 left = f", about {(now - began) * (total - done) / done:.0f} s left" if done > 0 else ""
-                errors.print(f"{label}: {done:.2g} of {total}{left}  {text}", markup=False, soft_wrap=True)
+                errors.print(f"{label}: {done:.2g} of {total}{left}  {text}", soft_wrap=True)
 
         yield update
 

@@ -15,10 +15,10 @@ import typer
 from rich.table import Table
 
 from diffcloud.errors import ConfigError, DiffCloudError
-from diffcloud.evaluation.intervals import state_intervals
+from diffcloud.evaluation.intervals import LEVEL, state_intervals
 from diffcloud.evaluation.markdown import markdown_table
-from diffcloud.fit import FitSpace, Objective, solve
-from diffcloud.fit.priors import parameter_priors
+from diffcloud.fit import solve
+from diffcloud.fit.uncertainty import REFINED
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import files_in, read_json, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint
@@ -28,12 +28,14 @@ from diffcloud.sim.simulate import rollout
 from pipeline.config import Config, load_config
 from pipeline.console import JsonFlag, ParamsFile, errors, finish, show, writes
 from pipeline.episodes import hidden_parameters, record_motion
+from pipeline.fit_jobs import FitJob, Recording
 from pipeline.preprocess import PreprocessJob
 from pipeline.scenario_options import choose_scenario
 from pipeline.workers import Tell, run_all
 
-_CODE = ("mesh", "io", "sim", "scene", "clouds", "fit", "evaluation", "sensing")
-_REFINED = 4
+_RECORDS = ("mesh", "io", "sim", "scene", "clouds", "sensing")
+"""Packages whose source decides what is recorded."""
+_CODE = (*_RECORDS, "fit", "evaluation")
 HEAD = (
     "scenario",
     "known",
@@ -54,7 +56,7 @@ def coverage(
     ],
     scenario: Annotated[list[str] | None, typer.Option(help="Repeatable; by default those of the parameters file.")] = None,
     recordings: Annotated[int, typer.Option(min=1, help="Of each scenario.")] = 200,
-    seed: Annotated[int, typer.Option(help="Of truths and noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of truths and noise.")] = 0,
     fix: Annotated[list[str] | None, typer.Option(help="Parameter whose true value fits are given, repeatable.")] = None,
     level: Annotated[float | None, typer.Option(min=0.01, max=0.999, help="Of the intervals. Default: 0.9.")] = None,
     refined: Annotated[
@@ -78,7 +80,9 @@ def coverage(
     if set(known) >= set(config.fit.parameters):
         raise ConfigError("Nothing is left to fit: leave out a --fix.")
     jobs = [
-        CoverageJob(choose_scenario(name), index, seed, known, level or config.evaluate.level or 0.9, refined, config, out)
+        CoverageJob(
+            choose_scenario(name), index, seed, known, level or config.evaluate.level or LEVEL, refined, config, out
+        )
         for name in scenario or config.scenarios
         for index in range(recordings)
     ]
@@ -86,7 +90,7 @@ def coverage(
     for job, _, error in run_all("coverage", jobs, workers):
         if error is not None:
             failures.append(f"{job.label}: {error}")
-            errors.print(failures[-1], markup=False, soft_wrap=True)
+            errors.print(failures[-1], soft_wrap=True)
     rows = summary_rows(out)
     table = Table(*HEAD)
     for row in rows:
@@ -162,15 +166,11 @@ class CoverageJob:
     def _measured(self, truth: Mapping[str, float], tell: Tell) -> dict[str, Any]:
         episode = self._episode(truth, tell)
         tell(0.5, "fit")
-        fit, scenario = self.config.fit, self.scenario
-        bounds = {**scenario.bounds, **fit.bounds}
-        fixed = {**fit.fixed, **{name: truth[name] for name in self.known}}
-        names = [name for name in fit.parameters if name not in fixed]
-        ranges = {name: bounds.get(name, PARAMETERS[name].bounds) for name in names}
-        priors = parameter_priors("none" if fit.paper else fit.prior, names, ranges)
-        space = FitSpace.build(names, bounds=bounds, fixed=fixed, priors=priors)
-        objective = Objective(scenario, episode, **fit.measure())
-        outcome = solve(objective, space, fit.solver_settings(scenario))
+        fit = self.config.fit
+        fit = fit.model_copy(update={"fixed": {**fit.fixed, **{name: truth[name] for name in self.known}}})
+        job = FitJob(self.label, [Recording(self.scenario, self.label, episode)], fit, self.folder)
+        objective, space = job.objective(), job.space
+        outcome = solve(objective, space, fit.solver_settings(self.scenario))
         if outcome.stop_reason == "interrupted":
             raise KeyboardInterrupt
         found = state_intervals(
@@ -188,13 +188,21 @@ class CoverageJob:
         """Recorded and preprocessed; fits with other known parameters share it."""
         place = self.out / self.scenario.name / ("episodes_refined" if self.refined else "episodes")
         path = place / f"{self.index:04d}.npz"
-        meta = {"scenario": self.scenario.name, "fabric": f"drawn{self.index}", "repeat": 1, "truth": dict(truth)}
-        if path.is_file() and (kept := read_episode(path)).meta.get("truth") == meta["truth"]:
+        told = [self.scenario, self.index, self.seed, self.refined, str(self.config.episodes), str(self.config.preprocess)]
+        made = fingerprint([*told, dict(truth)], packages=_RECORDS)
+        if path.is_file() and (kept := read_episode(path)).meta.get("made") == made:
             return kept
+        meta = {
+            "scenario": self.scenario.name,
+            "fabric": f"drawn{self.index}",
+            "repeat": 1,
+            "truth": dict(truth),
+            "made": made,
+        }
         tell(0.0, "recording")
         scene = self.scenario.scene
         if self.refined:
-            scene = replace(scene, frame_steps=_REFINED * scene.frame_steps)
+            scene = replace(scene, frame_steps=REFINED * scene.frame_steps)
         system, _ = scene.build()
         sets = {name: torch.tensor([value], dtype=torch.float64) for name, value in truth.items()}
         steps = self.scenario.frames * scene.frame_steps

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from diffcloud.hardware.installed import check_installation
 from pipeline.console import JsonFlag, finish, progress_bar, show
@@ -31,11 +31,11 @@ def doctor(
     table = Table("", "state", "detail")
     for check in checks:
         color = _COLORS[check.state]
-        table.add_row(check.name, f"[{color}]{check.state}[/]", escape(check.detail))
+        table.add_row(check.name, Text(check.state, color), check.detail)
     show(table, json)
     compiled = _compiled()
     kept = Table("compiled code", "")
-    kept.add_row("folder", escape(compiled["folder"]))
+    kept.add_row("folder", compiled["folder"])
     kept.add_row("size", f"{compiled['bytes'] / 1e6:.1f} MB")
     kept.add_row("built", "yes" if compiled["built"] else "no: at first use, or now by diffcloud doctor --compile")
     show(kept, json)

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import pandas as pd
 import torch
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from diffcloud.errors import ConfigError
@@ -29,9 +28,9 @@ from diffcloud.sim.properties import check_values
 from diffcloud.sim.threads import use_threads
 from pipeline.comparison import Comparison, compare, comparison_jobs, write_tables
 from pipeline.config import Config, load_config
-from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, errors, finish, output, show
+from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, errors, finish, output, say, show, with_suffix
 from pipeline.fit_jobs import joint_fit
-from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
+from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario
 
 app = typer.Typer(help="Measure parameters, and compare methods.")
 AllowMissing = Annotated[
@@ -48,7 +47,7 @@ def loss(
     set_: Annotated[list[str] | None, typer.Option("--set", help="PARAMETER=VALUE, repeatable.")] = None,
     points: Annotated[int | None, typer.Option(help="Sampled per frame.")] = None,
     frame: Annotated[list[int] | None, typer.Option(help="Loss frame, repeatable.")] = None,
-    seed: Annotated[int, typer.Option(help="Of the sampled points; fits use 0.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the sampled points; fits use 0.")] = 0,
     paper: Annotated[
         bool,
         typer.Option("--paper", help="The published measure: from cloth to recording only, at the loss frames, no pose."),
@@ -90,6 +89,7 @@ def intervals(
             "exactly. Default: " + ", ".join(f"{name}={factor:g}" for name, factor in MATERIAL_DOUBTS.items()) + "."
         ),
     ] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON for the result, which `export --samples` draws from.")] = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
@@ -109,13 +109,13 @@ def intervals(
     members = []
     for path, one in zip(episodes, record.episodes, strict=True):
         single = len(episodes) == 1 or one.scenario == record.scenario
-        chosen = choose_scenario(scenario if scenario is not None and single else one.scenario, scene)
+        stated = scenario if scenario is not None and single else None
+        chosen = choose_scenario(stated or fitted_scenario(fit, one.scenario), scene)
         members.append(Objective(chosen, read_episode(path), **measure))
     objective = members[0] if len(members) == 1 else JointObjective(members)
-    space = space_of(record)
-    found = state_intervals(
-        objective, space, {name: record.values[name] for name in space.names}, level=level, within=within, doubts=doubts
-    )
+    found = state_intervals(objective, space_of(record), record.fitted, level=level, within=within, doubts=doubts)
+    if out is not None:
+        write_json(with_suffix(out, ".json"), found.model_dump(mode="json"))
     if not json:
         _show_intervals(found)
     finish(found.model_dump(mode="json"), json)
@@ -131,9 +131,9 @@ def _show_intervals(found: Intervals) -> None:
         table.add_row(name, digits(entry.value), *ends, f"{physical}{entry.physical_unit}", entry.verdict, sources)
     output.print(table)
     if found.ratio is not None and found.ratio.factor is not None:
-        output.print(f"stretch / mass {found.ratio.value:.3g}, within a factor of {found.ratio.factor:.3g}", markup=False)
+        output.print(f"stretch / mass {found.ratio.value:.3g}, within a factor of {found.ratio.factor:.3g}")
     if found.reason:
-        output.print(found.reason[0].upper() + found.reason[1:] + ".", markup=False, soft_wrap=True)
+        output.print(found.reason[0].upper() + found.reason[1:] + ".", soft_wrap=True)
 
 
 @app.callback(invoke_without_command=True)
@@ -221,7 +221,7 @@ def write_evaluation(
     for table in printed(told):
         show(table, as_json)
     for sentence in (line for lines in sentences(told).values() for line in lines):
-        errors.print(sentence, markup=False, soft_wrap=True)
+        errors.print(sentence, soft_wrap=True)
     errors.print(f"Wrote {out / 'metrics.json'} and {out / 'tables'}.")
     return metrics
 
@@ -229,7 +229,7 @@ def write_evaluation(
 def stop_if_missing(comparison: Comparison, allow_missing: bool) -> None:
     """Name what is missing; then exit status 1, unless that is allowed."""
     for line in comparison.missing:
-        errors.print(f"[yellow]Missing:[/] {escape(line)}", soft_wrap=True)
+        say("Missing:", line, style="yellow")
     if comparison.missing and not allow_missing:
         errors.print("The tables have labelled gaps; --allow-missing accepts them.")
         raise typer.Exit(1)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from diffcloud.errors import ConfigError, DiffCloudError
@@ -16,7 +15,7 @@ from diffcloud.io.episodes import read_episode
 from diffcloud.io.manifests import read_manifest, write_manifest
 from diffcloud.sim.threads import use_threads
 from pipeline.config import Config, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, episode_files, errors, finish, show, writes
+from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, episode_files, errors, finish, say, show, writes
 from pipeline.fit_jobs import JOINT, FitJob, Recording, first_start, read_recordings, remove_stale, stated_recordings
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 from pipeline.workers import run_all
@@ -92,7 +91,7 @@ def fit(
     ] = None,
     points: Annotated[int | None, typer.Option(help="Sampled per frame.")] = None,
     frame: Annotated[list[int] | None, typer.Option(help="Frame to compare, repeatable; default: all usable ones.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of all random numbers.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of all random numbers.")] = None,
     resample: Annotated[bool | None, typer.Option(help="Of adam: new points in each iteration.")] = None,
     paper: Annotated[
         bool | None,
@@ -172,9 +171,9 @@ def fit(
         for recording in record.episodes if job.name == JOINT else ():
             left = recording.left_out
             told = "" if left is None else f", {left.rms_mm:.1f} with the parameters of the others"
-            errors.print(f"{recording.scenario}/{recording.name}: RMS {recording.rms_mm:.1f} mm{told}", markup=False)
+            errors.print(f"{recording.scenario}/{recording.name}: RMS {recording.rms_mm:.1f} mm{told}")
         for failure in record.failures:
-            errors.print(f"[yellow]{name}:[/] {escape(failure)}", soft_wrap=True)
+            say(f"{name}:", failure, style="yellow")
 
     if every:  # stated before, so that what an interrupted call leaves is known too
         write_manifest(out, read_manifest(out) | {path.relative_to(out).as_posix() for job in jobs for path in job.files})

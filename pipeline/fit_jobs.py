@@ -7,8 +7,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
-import yaml
-
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit import FitSpace, JointObjective, Objective, Progress, read_fit, solve, write_fit
 from diffcloud.fit.joint import AnyObjective
@@ -18,10 +16,10 @@ from diffcloud.fit.record import FitRecord
 from diffcloud.fit.result import describe_fit
 from diffcloud.fit.solvers import SearchSettings
 from diffcloud.io.episodes import Episode, read_episode
+from diffcloud.io.files import read_yaml
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim.properties import PARAMETERS
 from pipeline.config import FitConfig
 from pipeline.console import assignments, episode_files, errors
 from pipeline.scenario_options import choose_scenario
@@ -75,11 +73,7 @@ def stated_recordings(arguments: Sequence[Path]) -> list[tuple[str, Path]] | Non
 
 
 def _listed(path: Path) -> list[tuple[str, Path]]:
-    try:
-        told = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"Cannot read {path}: {error}") from error
-    found = []
+    told, found = read_yaml(path, error=ConfigError), []
     for scenario, files in told.items() if isinstance(told, dict) else ():
         for file in files if isinstance(files, list) else [files]:
             if not isinstance(file, str):
@@ -139,9 +133,9 @@ class FitJob:
         for recording in self.recordings:
             recording.scenario.check_parameters([*settings.parameters, *settings.fixed])
         bounds = {**self.scenario.bounds, **settings.bounds}
-        free = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed).names
-        ranges = {name: bounds.get(name, PARAMETERS[name].bounds) for name in free}
-        priors = parameter_priors("none" if settings.paper else settings.prior, free, ranges)
+        space = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed)
+        ranges = {variable.name: (variable.low, variable.high) for variable in space.variables}
+        priors = parameter_priors("none" if settings.paper else settings.prior, space.names, ranges)
         return FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed, priors=priors)
 
     def objective(self) -> AnyObjective:
@@ -244,4 +238,4 @@ def remove_stale(out: Path, jobs: Sequence[FitJob]) -> None:
     write_manifest(out, inside)
     if removed:
         told = "Removed fits whose episode is gone or whose settings have changed"
-        errors.print(f"{told}: {', '.join(removed)}.", markup=False, soft_wrap=True)
+        errors.print(f"{told}: {', '.join(removed)}.", soft_wrap=True)

@@ -22,7 +22,7 @@ from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.result import read_motion
 from diffcloud.fit.uncertainty import refined_distance_mm
 from diffcloud.io.episodes import Episode, read_episode, write_episode
-from diffcloud.io.files import claimed, together, write_json, write_text
+from diffcloud.io.files import claimed, read_yaml, together, write_json, write_text
 from diffcloud.io.imports import cloud_folder
 from diffcloud.report import EpisodeEntry, build_page
 from diffcloud.scene.scenarios import Scenario, load_scenario
@@ -78,14 +78,14 @@ def identify(
         layouts = _layouts(out, episodes, names, cloth)
         chosen = _chosen(parameters, cloth, mass)
         record, objective, job = _fitted(out, episodes, cloth, layouts, chosen)
-        found = state_intervals(objective, space_of(record), _free(record), level=level, within=within)
+        found = state_intervals(objective, space_of(record), record.fitted, level=level, within=within)
         findings = _findings(record, objective, found)
         with together():
             write_text(out / "report.html", _page(record, found, findings, episodes, job))
             write_json(out / "intervals.json", found.model_dump(mode="json"))
     for line in findings:
-        errors.print(line, markup=False, soft_wrap=True)
-    errors.print(f"Wrote {out / 'report.html'}, {out / 'fit.json'}.", markup=False)
+        errors.print(line, soft_wrap=True)
+    errors.print(f"Wrote {out / 'report.html'}, {out / 'fit.json'}.")
     finish(_result(record, found, findings), json)
 
 
@@ -182,10 +182,7 @@ def _layouts(
 
 
 def _fields(path: Path) -> dict[str, Any]:
-    try:
-        told = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"Cannot read {path}: {error}") from error
+    told = read_yaml(path, error=ConfigError)
     if not isinstance(told, dict):
         raise ConfigError(f"{path} must be a mapping, got {type(told).__name__}. Remove it to have it written anew.")
     return told
@@ -245,22 +242,17 @@ def _fitted(
         errors.print(
             f"{steps} steps a frame: {record.rms_mm:.1f} mm RMS; four times the steps move the cloth by {apart:.1f} mm, "
             f"the points' noise is {noise:.1f} mm.",
-            markup=False,
         )
         if apart <= _NOISE_PART * noise or 2 * steps > _MOST_STEPS:
             if apart > _NOISE_PART * noise:
                 warn(f"finer steps still move the cloth by {apart:.1f} mm: what is found includes an error of that size.")
             return record, objective, job
-        steps, init = 2 * steps, _free(record)
+        steps, init = 2 * steps, record.fitted
         settings = settings.model_copy(update={"starts": 1, "screen": 0})
 
 
 def _tell(update: Callable[[float, str], None], steps: int, done: float, text: str) -> None:
     update(done, f"{steps} steps a frame  {text}")
-
-
-def _free(record: FitRecord) -> dict[str, float]:
-    return {name: entry.value for name, entry in record.parameters.items() if not entry.fixed}
 
 
 def _validation(record: FitRecord, objective: AnyObjective) -> str:

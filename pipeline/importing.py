@@ -12,7 +12,6 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.markup import escape
 
 from diffcloud.errors import ConfigError
 from diffcloud.hardware.realsense import play_recordings
@@ -27,6 +26,8 @@ from diffcloud.io.ros.joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
 from diffcloud.io.ros.recording import ros_recording
 from pipeline.console import JsonFlag, errors, finish, warn, writes
 
+_FARTHEST_M = 50.0
+"""From the robot's base: no cloth hangs there."""
 app = typer.Typer(no_args_is_help=True, help="Turn recordings of others into episodes.")
 
 
@@ -88,6 +89,12 @@ def clouds(
     labels = (("scenario", scenario), ("fabric", fabric), ("viewpoints", _viewpoints(camera)))
     meta = {name: value for name, value in labels if value}
     episode = cloud_folder(folder, grippers=named_files(gripper) if gripper else None, rate_hz=rate_hz, meta=meta)
+    far = float(np.abs(episode.points).max())
+    if far > _FARTHEST_M:
+        raise ConfigError(
+            f"{folder}: points lie up to {far:.0f} m from the origin. Clouds are in metres, in the robot's frame; divide "
+            "millimetres by 1000."
+        )
     write_episode(out, episode)
     errors.print(f"Wrote {episode.frame_count} frames, {len(episode.points)} points to {out}.")
     finish({"out": str(out), "frames": episode.frame_count, "points": len(episode.points)}, json)
@@ -146,10 +153,10 @@ def recording(
         if found.robot is None:
             warnings.append("No joint log: the robot cannot be masked later. Give --joint-log if there is one.")
         for message in warnings:
-            warn(escape(message))
+            warn(message)
         meta = {key: value for key, value in (("scenario", scenario), ("fabric", fabric)) if value is not None}
         frames = write_recording(out, found, rate_hz=rate_hz, meta=meta)
-    errors.print(f"Wrote {frames} frames to {out}.", markup=False)
+    errors.print(f"Wrote {frames} frames to {out}.")
     rows = 0 if found.robot is None else len(found.robot.times)
     result = {"out": str(out), "frames": frames, "robot_rows": rows, "source": found.source, "warnings": warnings}
     finish(result, json)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.table import Table
 
 from diffcloud.sim.materials import preset, presets
-from pipeline.console import JsonFlag, finish, output, show
+from pipeline.console import JsonFlag, finish, output, say, show
 
 
 def materials(json: JsonFlag = False) -> None:
@@ -30,5 +30,5 @@ def materials(json: JsonFlag = False) -> None:
     show(table, json)
     if not json:
         for name in presets():
-            output.print(f"[bold]{name}[/]: {preset(name).source}.", highlight=False)
+            say(f"{name}:", f"{preset(name).source}.", style="bold", console=output)
     finish(found, json)

@@ -22,7 +22,7 @@ def predict(
     episodes: Annotated[list[Path], typer.Argument(help="Episode files, or folders of them.")],
     checkpoint: Annotated[Path, typer.Option(help="Written by `diffcloud train`.")],
     level: Annotated[float, typer.Option(min=0.01, max=0.99, help="Probability of the intervals shown.")] = 0.9,
-    seed: Annotated[int, typer.Option(help="Of the choice of points.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the choice of points.")] = 0,
     json: JsonFlag = False,
 ) -> None:
     """Predict the parameters of episodes. Values outside the bounds are shown as they are, and said to be outside."""
@@ -53,7 +53,7 @@ def predict(
     show(table, json)
     if outside:
         bounds = ", ".join(f"{n} {list(b)}" for n, b in zip(names, regressor.description.bounds, strict=True))
-        errors.print(f"Outside the bounds ({bounds}), clipped only for a simulation: {'; '.join(outside)}.", markup=False)
+        errors.print(f"Outside the bounds ({bounds}), clipped only for a simulation: {'; '.join(outside)}.")
     if not json:
         errors.print(f"{1e3 * sorted(seconds)[len(seconds) // 2]:.0f} ms an episode.")
     finish(found, json)

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from diffcloud.sensing.validation.episode import validate_raw_episode
-from pipeline.console import JsonFlag, errors, finish, output
+from pipeline.console import JsonFlag, errors, finish, output, say
 
 app = typer.Typer(no_args_is_help=True, help="Raw episodes: what cameras and arm recorded.")
 
@@ -32,12 +31,10 @@ def validate(
     screen = errors if json else output
     for finding in findings:
         color = "red" if finding.severity == "fault" else "yellow"
-        place = escape(finding.place)
-        screen.print(
-            f"[bold {color}]{finding.severity}[/] {finding.code} in {place}: {escape(finding.message)}", soft_wrap=True
-        )
+        told = f"{finding.code} in {finding.place}: {finding.message}"
+        say(finding.severity, told, style=f"bold {color}", console=screen)
     if not findings:
-        screen.print(f"{escape(str(folder))}: nothing wrong.")
+        screen.print(f"{folder!s}: nothing wrong.")
     finish({"episode": str(folder), "valid": not faults, "findings": [asdict(finding) for finding in findings]}, json)
     if faults:
         raise typer.Exit(1)

@@ -55,7 +55,7 @@ def recordings(
     page = _page(measured, fitted, config.fit)
     write_text(out, page)
     if not json:
-        output.print(page, markup=False)
+        output.print(page)
     finish({"out": str(out), "episodes": len(measured), **_summary(measured, fitted)}, json)
 
 

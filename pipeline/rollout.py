@@ -22,7 +22,7 @@ from diffcloud.sim.moved import moved_surfaces
 from diffcloud.sim.properties import check_values
 from diffcloud.sim.simulate import rollout as simulate
 from pipeline.console import JsonFlag, assignments, errors, finish, progress_bar, writes
-from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, limits
+from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario, limits
 
 
 @writes(".npz")
@@ -39,7 +39,7 @@ def rollout(
     set_: Annotated[list[str] | None, typer.Option("--set", help="PARAMETER=VALUE, repeatable.")] = None,
     fit: Annotated[Path | None, typer.Option(help="JSON of a fit: its parameters, in the frame of its recording.")] = None,
     episode: Annotated[Path | None, typer.Option(help="Episode whose gripper track moves the handles.")] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Frames to simulate.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, max=100_000, help="Frames to simulate.")] = None,
     obj: Annotated[
         Path | None, typer.Option(help="Folder for one OBJ a frame, 000.obj, ...; what moves beside is in 000_moving.obj.")
     ] = None,
@@ -47,9 +47,11 @@ def rollout(
     json: JsonFlag = False,
 ) -> None:
     """Simulate and export a motion."""
+    fitted = None if fit is None else read_fit(fit)
+    if fit is not None and fitted is not None and scenario is None and scene is None:
+        scenario = fitted_scenario(fit, fitted.scenario)
     chosen = choose_scenario(scenario, scene)
     values: dict[str, float] = {}
-    fitted = None if fit is None else read_fit(fit)
     if fitted is not None:
         values |= fitted.values
     values |= assignments(set_, "--set")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from diffcloud.errors import ConfigError
 from pipeline.console import warn
 
 if TYPE_CHECKING:
@@ -30,12 +31,38 @@ def choose_scenario(name: str | None, scene: Path | None = None) -> Scenario:
     """Load a scenario and say what of its scene is not simulated."""
     from diffcloud.scene.scenarios import SCENARIO_NAMES, load_scenario  # takes seconds, which help does without
 
-    if name is not None and name not in SCENARIO_NAMES and (OWN_SCENARIOS / f"{name}.yaml").is_file():
-        name = str(OWN_SCENARIOS / f"{name}.yaml")
+    if name is not None and name not in SCENARIO_NAMES and _own(name).is_file():
+        name = str(_own(name))
     scenario = load_scenario(name, scene)
     for message in limits(scenario):
         warn(message)
     return scenario
+
+
+def fitted_scenario(fit: Path, name: str) -> str:
+    """The scenario of a fit, by the name that the fit gives: the file that `diffcloud identify` wrote beside the fit, a
+    built-in or the person's own one of that name, or a file in the current folder.
+
+    Args:
+        fit: the JSON file.
+
+    Raises:
+        ConfigError: none of these.
+    """
+    from diffcloud.scene.scenarios import SCENARIO_NAMES
+
+    beside, here = fit.parent / "scenarios" / f"{name}.yaml", Path(f"{name}.yaml")
+    if beside.is_file():
+        return str(beside)
+    if name in SCENARIO_NAMES or _own(name).is_file():
+        return name
+    if here.is_file():
+        return str(here)
+    raise ConfigError(f"{fit} is a fit in the scenario {name}, which is not known here; give its YAML file by --scenario.")
+
+
+def _own(name: str) -> Path:
+    return OWN_SCENARIOS / f"{name}.yaml"
 
 
 def limits(scenario: Scenario) -> list[str]:

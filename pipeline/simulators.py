@@ -11,9 +11,10 @@ import typer
 
 from diffcloud import __version__
 from diffcloud.evaluation.markdown import markdown_table
-from diffcloud.evaluation.simulators.problem import installed
-from diffcloud.evaluation.simulators.problems import TOWEL
-from diffcloud.evaluation.simulators.study import (
+from diffcloud.io.files import write_text
+from diffcloud.simulators.problem import installed
+from diffcloud.simulators.problems import TOWEL
+from diffcloud.simulators.study import (
     THIS,
     WHOLE_STIFFNESS,
     Answer,
@@ -25,7 +26,6 @@ from diffcloud.evaluation.simulators.study import (
     opinions,
     switches,
 )
-from diffcloud.io.files import write_text
 from pipeline.console import JsonFlag, errors, finish, progress_bar, writes
 
 _TIMES = {"lift": (0.5, 1.0, 1.5, 2.0, 2.4), "fold": (0.5, 1.0, 1.5, 2.0, 2.4), "swing": (0.25, 0.5, 0.75, 1.0, 1.5)}

@@ -57,7 +57,7 @@ def train(
         bool | None, typer.Option("--heteroscedastic", help="Learn a width of each prediction along.")
     ] = None,
     patience: Annotated[int | None, typer.Option(help="Stop after so many epochs without a better validation.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of all random numbers.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of all random numbers.")] = None,
     device: Annotated[str | None, typer.Option(help="auto, cpu or gpu (mixed precision).")] = None,
     loaders: Annotated[int | None, typer.Option(help="Processes that sample clouds.")] = None,
     workers: Annotated[int | None, typer.Option(help="Trainings at once, each in a process with one thread.")] = None,

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 from rich.table import Table
+from rich.text import Text
 
 from diffcloud.fit.visibility import visibility_map
 from pipeline.console import JsonFlag, finish, output, show
@@ -27,7 +28,7 @@ def visibility(
         rows, columns = (found.grid[1:], found.grid) if name == "stretch" else (found.grid, found.grid[1:])
         table = Table(f"step in {name}; stretch \\ mass", *(f"{value:.3g}" for value in columns))
         for value, row in zip(rows, distances, strict=True):
-            table.add_row(f"{value:.3g}", *(f"{d:.1f}" if d > noise_mm else f"[dim]{d:.1f}[/]" for d in row))
+            table.add_row(f"{value:.3g}", *(Text(f"{d:.1f}", "" if d > noise_mm else "dim") for d in row))
         show(table, json)
     fraction = found.visible_fraction(noise_mm)
     if not json:

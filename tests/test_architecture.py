@@ -19,6 +19,7 @@ ALLOWED = {
     "fit": {"mesh", "io", "sim", "scene", "clouds"},
     "regressors": {"mesh", "io", "clouds"},
     "evaluation": {"mesh", "io", "sim", "scene", "clouds", "fit"},
+    "simulators": {"mesh", "io", "sim", "scene", "fit"},
     "sensing": {"mesh", "io", "clouds"},
     "hardware": {"mesh", "io", "clouds", "sensing"},
     "report": {"mesh", "io", "sim", "scene", "clouds", "fit", "regressors", "sensing", "evaluation"},

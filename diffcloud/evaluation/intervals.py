@@ -12,22 +12,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 
-from diffcloud.fit.batches import batch_losses
-from diffcloud.fit.joint import AnyObjective
+from diffcloud.errors import ConfigError
+from diffcloud.fit.joint import AnyObjective, mean_loss
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis
+from diffcloud.fit.result import physical_values
 from diffcloud.fit.scan import scan
 from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, Uncertainty, noise_mm, uncertainty
+from diffcloud.io.files import read_json
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim.properties import PARAMETERS
 
 Verdict = Literal[
     "identified",
@@ -43,8 +45,6 @@ WITHIN = 1.5
 LEVEL = 0.9
 _UNEXPLAINED = 2.0
 """RMS over what noise and spacing of the points account for, from which the model does not explain the recording."""
-_LOWER = 0.02
-"""Part by which a loss nearby must be lower to be another minimum."""
 _STEP = 0.5
 """The largest next step of a fit that has arrived, in standard deviations."""
 _PRIOR = 0.5
@@ -138,7 +138,7 @@ def state_intervals(
     total = found.covariance
     deviations = np.sqrt(np.maximum(total.diagonal(), 1e-300))
     arrived = lower is None and bool((np.abs(found.step) <= _STEP * deviations).all())
-    misfit = [_misfit(member, space, values) for member in objective.members]
+    misfit = [_misfit(member, loss) for member, loss in zip(objective.members, found.losses.tolist(), strict=True)]
     worst_fit = max(misfit, key=lambda pair: pair[0] / pair[1])
     explains = objective.paper or worst_fit[0] <= _UNEXPLAINED * worst_fit[1]
     reason = ""
@@ -179,15 +179,15 @@ def state_intervals(
         else:
             told = "not identified"
         stated = arrived
-        scale = _physical_scale(objective.members[0].scenario, name)
+        one = physical_values(objective.members[0].scenario, {name: 1.0})[name]
         parameters[name] = Interval(
             value=values[name],
             low=low if stated else None,
             high=high if stated else None,
-            physical=values[name] * scale,
-            physical_low=low * scale if stated else None,
-            physical_high=high * scale if stated else None,
-            physical_unit=PARAMETERS[name].unit,
+            physical=values[name] * one.physical,
+            physical_low=low * one.physical if stated else None,
+            physical_high=high * one.physical if stated else None,
+            physical_unit=one.physical_unit,
             factor=factor if stated and math.isfinite(factor) else None,
             at_bounds=bounded,
             verdict=told,
@@ -227,16 +227,52 @@ def _with_scan(objective: AnyObjective, space: FitSpace, found: Uncertainty) -> 
     inverse = torch.from_numpy(np.linalg.pinv(found.covariance, hermitian=True))
     seen, _ = scan(objective, space, centre, inverse)
     axis = Axis.of(space)
-    loss = float(batch_losses(objective, space, axis.bounded(centre[None])))
-    place, lowest = seen.place(centre)
-    lower = None
-    if lowest < (1 - _LOWER) * loss:
-        lower = dict(zip(space.names, axis.bounded(place[None])[0].tolist(), strict=True))
+    of_data = mean_loss(torch.from_numpy(found.losses)[:, None], paper=objective.paper)
+    loss = float(of_data + space.prior_loss(axis.values(centre[None]), objective.length_unit_m))
+    place = seen.lower(centre, loss)
+    lower = None if place is None else dict(zip(space.names, axis.bounded(place[None])[0].tolist(), strict=True))
     quantile = float(t.ppf(0.95, max(found.clusters - 1, 1)))
     hidden = seen.losses <= (1 + quantile**2 / max(found.clusters - len(space.names), 1)) * loss
     reach = torch.where(hidden, seen.lengths.abs(), 0.0).amax(-1) / quantile
     spread = (seen.directions.T * reach.square()) @ seen.directions
     return replace(found, sources={**found.sources, "nearly as low": spread.numpy()}), lower
+
+
+def read_intervals(path: Path, space: FitSpace) -> Intervals:
+    """
+    Args:
+        space: of the fit whose intervals they are.
+
+    Raises:
+        ConfigError: missing, damaged, not intervals, or those of a fit of other parameters.
+    """
+    try:
+        found = Intervals.model_validate(read_json(path, error=ConfigError))
+    except ValidationError as error:
+        raise ConfigError(
+            f"{path} holds no intervals; take intervals.json of `diffcloud identify`, or what `diffcloud evaluate "
+            "intervals --json` prints."
+        ) from error
+    shape, count = np.shape(np.array(found.covariance, dtype=object)), len(space.names)
+    if tuple(found.parameters) != space.names or shape != (count, count) or not np.isfinite(found.covariance).all():
+        told = ", ".join(found.parameters)
+        raise ConfigError(f"{path} holds intervals of {told}; the fit is of {', '.join(space.names)}.")
+    return found
+
+
+def draws(found: Intervals, space: FitSpace, count: int, seed: int) -> list[dict[str, float]]:
+    """Parameter sets as probable as the data leave them: normal on the axis of the fit, none beyond its bounds.
+
+    Raises:
+        ConfigError: the fit has not arrived, or does not explain its recording; then its covariance says nothing.
+    """
+    if found.reason:
+        raise ConfigError(f"Nothing can be drawn from these intervals: {found.reason}.")
+    axis = Axis.of(space)
+    values = torch.tensor([[entry.value for entry in found.parameters.values()]], dtype=torch.float64)
+    spread = np.random.default_rng(seed).multivariate_normal(np.zeros(len(space.names)), found.covariance, count)
+    drawn = axis.bounded(axis.places(values) + torch.from_numpy(spread))
+    return [dict(zip(space.names, row, strict=True)) for row in drawn.tolist()]
 
 
 def significant(low: float | None, high: float | None) -> Callable[[float | None], str]:
@@ -316,14 +352,6 @@ def _sources(found: Uncertainty, space: FitSpace, ratio: NDArray[np.float64] | N
     return told
 
 
-def _misfit(objective: Objective, space: FitSpace, values: Mapping[str, float]) -> tuple[float, float]:
+def _misfit(objective: Objective, loss: float) -> tuple[float, float]:
     """RMS of one recording beside the fitted motion, and what noise and spacing of its points account for [mm]."""
-    given = {**values, **space.fixed}
-    with torch.no_grad():
-        loss = float(objective({name: torch.tensor([value], dtype=torch.float64) for name, value in given.items()}))
     return 1e3 * objective.length_unit_m * loss**0.5, noise_mm(objective)
-
-
-def _physical_scale(scenario: Scenario, name: str) -> float:
-    basis = PARAMETERS[name].basis
-    return 1.0 if basis is None else scenario.scene.basis(basis)

@@ -67,10 +67,16 @@ def mean_loss(losses: Tensor, *, paper: bool) -> Tensor:
 def mean_terms(terms: Sequence[tuple[Tensor, Tensor, Tensor]], *, paper: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Loss [B], half of its slope [B, k] and curvature [B, k, k] from those of each recording."""
     losses, slopes, curvatures = (torch.stack(part) for part in zip(*terms, strict=True))
-    loss = mean_loss(losses, paper=paper)
-    weights = torch.ones_like(losses) if paper or len(terms) == 1 else loss / losses.clamp(min=_TINY)
-    slope, curvature = (weights[..., None] * slopes).mean(0), (weights[..., None, None] * curvatures).mean(0)
-    return loss, slope, curvature
+    weights = loss_weights(losses, paper=paper)
+    slope, curvature = (weights[..., None] * slopes).sum(0), (weights[..., None, None] * curvatures).sum(0)
+    return mean_loss(losses, paper=paper), slope, curvature
+
+
+def loss_weights(losses: Tensor, *, paper: bool) -> Tensor:
+    """[n, B] derivatives of the mean loss by those of n recordings."""
+    if paper or len(losses) == 1:
+        return torch.full_like(losses, 1 / len(losses))
+    return mean_loss(losses, paper=paper) / losses.clamp(min=_TINY) / len(losses)
 
 
 def check_same_cloth(first: Scenario, other: Scenario) -> None:

@@ -231,10 +231,10 @@ class Objective:
         """[B, d] the pose of a rollout. It belongs to the motion: where points are drawn anew, it may stay."""
         return self.match(run).pose
 
-    def posed_nodes(self, run: Rollout, pose: Tensor) -> NDArray[np.float64]:
-        """[T + 1, V, 3] the cloth's nodes of a rollout of one motion at every frame of the scenario, in the recording's
-        frame."""
-        times = run.times[:: self.scenario.scene.frame_steps]
+    def posed_nodes(self, run: Rollout, pose: Tensor, *, steps: bool = False) -> NDArray[np.float64]:
+        """[T + 1, V, 3] the cloth's nodes of a rollout of one motion at every frame of the scenario, or at every step, in
+        the recording's frame."""
+        times = run.times[:: 1 if steps else self.scenario.scene.frame_steps]
         return self._target.space.moved_motion(run.at, times, pose).numpy()
 
     def posed_bodies(self, pose: Tensor) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from diffcloud.errors import ConfigError
 from diffcloud.io.files import read_json
 
-SCHEMA = 4
+SCHEMA = 5
 """Of the file. Another one is refused, by name."""
 
 
@@ -81,6 +81,27 @@ class FittedParameter(_Model):
     at_bound: bool = False
 
 
+class WholeMaterial(_Model):
+    """All that the cloth was simulated with, fitted or not, in the scene's units, which are SI unless `length_unit_m` says
+    otherwise; stiffness at rest."""
+
+    density: float
+    """[kg/m²] Mean over the cloth."""
+    stretching: float
+    """[N/m] Force per width per strain of a strip whose sides are free."""
+    poisson: float
+    shear: float
+    """[N/m] Force per width per shear angle."""
+    bending: float
+    """[N·m] Bending stiffness per width."""
+    damping: float
+    """[s] Proportional to the stiffness."""
+    friction_obstacle: float
+    friction_cloth: float
+    air_density: float
+    """[kg/m³]"""
+
+
 class Measure(_Model):
     """What recording and motion were compared by: keyword arguments of `Objective`."""
 
@@ -119,6 +140,7 @@ class FitRecord(_Model):
     solver: str
     """Of `SOLVERS`."""
     parameters: dict[str, FittedParameter] = Field(min_length=1)
+    material: WholeMaterial
     loss: float
     """[squared length unit, mean over points], by the fit's own random points, without priors; of a joint fit the geometric
     mean over its recordings, with `paper` the plain one."""
@@ -150,6 +172,11 @@ class FitRecord(_Model):
     def values(self) -> dict[str, float]:
         """Parameter -> value, the given ones too."""
         return {name: parameter.value for name, parameter in self.parameters.items()}
+
+    @property
+    def fitted(self) -> dict[str, float]:
+        """Parameter -> value, of those that were not given."""
+        return {name: parameter.value for name, parameter in self.parameters.items() if not parameter.fixed}
 
     def plain(self) -> dict[str, Any]:
         """As the file has it."""

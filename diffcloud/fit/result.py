@@ -21,7 +21,7 @@ from diffcloud.fit.joint import AnyObjective, mean_loss
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.pose import PoseSpace
-from diffcloud.fit.record import FitRecord, FittedParameter, History, Measure, RecordingFit
+from diffcloud.fit.record import FitRecord, FittedParameter, History, Measure, RecordingFit, WholeMaterial
 from diffcloud.fit.solvers import SOLVER_NAMES, FitOutcome, Settings
 from diffcloud.io.files import together, write_json, write_npz
 from diffcloud.mesh.topology import SurfaceMesh
@@ -47,6 +47,12 @@ class FittedMotion:
     """[T + 1] [s]"""
     bodies: SurfaceMesh
     """Fixed bodies around the cloth, without tables."""
+    held: NDArray[np.int64]
+    """[K] nodes that something holds."""
+    held_times: NDArray[np.float64]
+    """[S + 1] of every step [s]"""
+    held_nodes: NDArray[np.float64]
+    """[S + 1, K, 3] where they are then."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +79,27 @@ def physical_values(scenario: Scenario, values: Mapping[str, float]) -> dict[str
             meaning=parameter.meaning,
         )
     return described
+
+
+def whole_material(scenario: Scenario, values: Mapping[str, float]) -> WholeMaterial:
+    """The material of the scenario with parameters of these values; what they leave out is the basis material's."""
+    material = scenario.scene.material
+    system, _ = scenario.scene.build()
+    changed = scenario.properties(
+        system, {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
+    )
+    stretching, bending = float(changed.stretching.mean()), float(changed.bending.mean())
+    return WholeMaterial(
+        density=float(changed.node_mass.sum()) / float(scenario.scene.mesh.face_area.sum()),
+        stretching=stretching * material.resting_stretching_stiffness,
+        poisson=material.resting_poisson_ratio,
+        shear=stretching * material.resting_shear_stiffness,
+        bending=bending * material.resting_bending_stiffness,
+        damping=float(changed.damping),
+        friction_obstacle=float(changed.friction_obstacle),
+        friction_cloth=float(changed.friction_cloth),
+        air_density=float(changed.air_density),
+    )
 
 
 def describe_fit(
@@ -119,6 +146,7 @@ def describe_fit(
         nuisance=recordings[0].nuisance if len(recordings) == 1 else {},
         solver=SOLVER_NAMES[type(settings)],
         parameters=_parameters(first.scenario, space, outcome, values),
+        material=whole_material(first.scenario, values),
         loss=loss,
         loss_start=outcome.loss_start,
         loss_resampled=float(np.mean(resampled)),
@@ -181,8 +209,8 @@ def recorded_pose(recording: RecordingFit, *, length_unit_m: float) -> tuple[Pos
 
 
 def write_fit(folder: Path, name: str, result: FitResult) -> Path:
-    """Write `<name>.npz` (nodes, start_nodes, faces, times, obstacle_nodes, obstacle_faces; of a second recording nodes_1
-    and so on) and `<name>.json` together; returns the latter."""
+    """Write `<name>.npz` (nodes, start_nodes, faces, times, obstacle_nodes, obstacle_faces, held, held_times, held_nodes;
+    of a second recording nodes_1 and so on) and `<name>.json` together; returns the latter."""
     path = Path(folder) / f"{name}.json"
     arrays: dict[str, Any] = {}
     for index, motion in enumerate(result.motions):
@@ -193,6 +221,9 @@ def write_fit(folder: Path, name: str, result: FitResult) -> Path:
             "times": motion.times,
             "obstacle_nodes": motion.bodies.nodes,
             "obstacle_faces": motion.bodies.faces,
+            "held": motion.held,
+            "held_times": motion.held_times,
+            "held_nodes": motion.held_nodes,
         }
         arrays |= {_key(key, index): array for key, array in told.items()}
     with together():
@@ -210,7 +241,9 @@ def read_motion(path: Path, index: int = 0) -> FittedMotion:
     Raises:
         ConfigError: missing, damaged, or another file.
     """
-    keys = ("nodes", "start_nodes", "faces", "times", "obstacle_nodes", "obstacle_faces")
+    keys = (
+        "nodes", "start_nodes", "faces", "times", "obstacle_nodes", "obstacle_faces", "held", "held_times", "held_nodes",
+    )  # fmt: skip
     try:
         with np.load(path, allow_pickle=False) as told:
             found = {key: told[_key(key, index)] for key in keys}
@@ -226,12 +259,16 @@ def _key(name: str, index: int) -> str:
 
 def _fitted_motion(objective: Objective, run: Rollout, pose: Tensor, start_values: Mapping[str, float]) -> FittedMotion:
     scene, start = objective.scenario.scene, _motion(objective, start_values)
+    held = np.unique(scene.handles.nodes).astype(np.int64)
     return FittedMotion(
         nodes=objective.posed_nodes(run, pose),
         start_nodes=objective.posed_nodes(start, objective.pose(start)),
         faces=objective.system.mesh.faces,
         times=run.times[:: scene.frame_steps].cpu().numpy(),
         bodies=SurfaceMesh(objective.posed_bodies(pose), scene.bodies.faces),
+        held=held,
+        held_times=run.times.cpu().numpy(),
+        held_nodes=objective.posed_nodes(run, pose, steps=True)[:, held],
     )
 
 

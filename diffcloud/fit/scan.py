@@ -16,6 +16,8 @@ from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis
 
+LOWER = 0.02
+"""Part by which a loss nearby must be lower to be another minimum."""
 LENGTHS = (0.04, 0.1, 0.25, 0.6)
 """On the axis, to both sides."""
 
@@ -35,6 +37,11 @@ class Scan:
         """Where the loss is lowest [k], and that loss."""
         axis, index = divmod(int(self.losses.argmin()), self.losses.shape[1])
         return centre + self.lengths[axis, index] * self.directions[axis], float(self.losses[axis, index])
+
+    def lower(self, centre: Tensor, loss: float) -> Tensor | None:
+        """A place [k] of another minimum, lower than the centre's loss; None if the scan has met none."""
+        place, lowest = self.place(centre)
+        return place if lowest < (1 - LOWER) * loss else None
 
 
 def scan(objective: AnyObjective, space: FitSpace, place: Tensor, curvature: Tensor) -> tuple[Scan, int]:

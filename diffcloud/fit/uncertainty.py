@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloud.errors import ConfigError, unknown_name
-from diffcloud.fit.joint import AnyObjective
+from diffcloud.fit.joint import AnyObjective, loss_weights
 from diffcloud.fit.objective import Motion, Objective
 from diffcloud.fit.parameters import FitSpace, Variable
 from diffcloud.fit.pose import NUISANCE
@@ -44,10 +44,12 @@ POSE_DOUBTS = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.
 """How far a calibrated set-up may be off where the fit takes it for known [m, rad, s]."""
 MATERIAL_DOUBTS = {"bending": 1.5, "drag": 1.3, "damping": 1.5, "friction_obstacle": 1.3, "friction_cloth": 1.3}
 """Factors within which what is not fitted is taken to be known."""
-_REFINED = 4
+REFINED = 4
+"""Times as many steps show what the step size does."""
 _STEP = 0.05
 """On the axis, by which the slope's change is measured."""
 _ROUGH = 4.0
+"""The largest factor between measured and Gauss and Newton's curvature that is believed."""
 _CHUNK = 16
 """Motions matched together."""
 _PATCHES = 16
@@ -75,6 +77,8 @@ class Uncertainty:
     names: tuple[str, ...]
     places: NDArray[np.float64]
     """[k] fitted."""
+    losses: NDArray[np.float64]
+    """[n] of the recordings, without priors."""
     sources: Mapping[str, NDArray[np.float64]]
     """Name -> [k, k] covariance."""
     clusters: int
@@ -107,9 +111,8 @@ def uncertainty(
     places = axis.places(torch.tensor([[values[name] for name in space.names]], dtype=torch.float64))
     with torch.no_grad():
         parts = [_Part.of(member, space, places, doubts) for member in objective.members]
-    losses = np.array([part.loss for part in parts])
-    weights = np.ones(len(parts)) if objective.paper else np.exp(np.log(losses).mean()) / losses
-    weights /= len(parts)
+    losses = torch.tensor([part.loss for part in parts], dtype=torch.float64)
+    weights = loss_weights(losses[:, None], paper=objective.paper)[:, 0].numpy()
     prior = space.prior_weights(objective.length_unit_m).numpy()
     normal = sum(w * part.normal for w, part in zip(weights, parts, strict=True)) + np.diag(prior)
     slope = sum(w * part.slope for w, part in zip(weights, parts, strict=True)) + prior * places[0].numpy()
@@ -130,7 +133,7 @@ def uncertainty(
         each = [w * part.doubts[name] for w, part in zip(weights, parts, strict=True) if name in part.doubts]
         together = name in PARAMETERS or name == "step size"  # of the one cloth, and of the one simulator
         sources[name] = spread(np.sum(each, axis=0)[None] if together else np.stack(each))
-    return Uncertainty(space.names, places[0].numpy(), sources, len(clusters), -inverse @ slope)
+    return Uncertainty(space.names, places[0].numpy(), losses.numpy(), sources, len(clusters), -inverse @ slope)
 
 
 def refined_distance_mm(objective: AnyObjective, values: Mapping[str, float]) -> tuple[float, float]:
@@ -176,11 +179,10 @@ class _Part:
 
     @staticmethod
     def of(objective: Objective, space: FitSpace, places: Tensor, doubts: Mapping[str, float]) -> _Part:
-        whole, deviations = _with_doubts(objective, space, doubts)
+        whole, known, deviations = _with_doubts(objective, space, doubts)
         k, m = len(space.names), len(deviations)
-        known = torch.tensor([[(v.low * v.high) ** 0.5 for v in whole.variables[k:]]], dtype=torch.float64).log()
-        run, rates = moved_by(objective, whole, torch.cat([places, known], dim=-1))
-        refined = _refined(objective, whole.parameters(Axis.of(whole).values(torch.cat([places, known], dim=-1))), run)
+        run, rates = moved_by(objective, whole, torch.cat([places, known.log()[None]], dim=-1))
+        refined = _refined(objective, space.parameters(Axis.of(space).values(places)), run)
         fitted_pose = objective.match(run).pose[0]
         free = objective.freed({**POSE_DOUBTS, **objective.nuisance})
         pose_names = free.pose_space.names
@@ -251,20 +253,23 @@ def _between(measured: NDArray[np.float64], normal: NDArray[np.float64]) -> NDAr
     return np.asarray(root @ (axes * clipped) @ axes.T @ root.T)
 
 
-def _with_doubts(objective: Objective, space: FitSpace, doubts: Mapping[str, float]) -> tuple[FitSpace, Tensor]:
-    """The fitted variables and then the doubtful ones, and the deviations [m] of these on the axis."""
+def _with_doubts(objective: Objective, space: FitSpace, doubts: Mapping[str, float]) -> tuple[FitSpace, Tensor, Tensor]:
+    """The fitted variables and then the doubtful ones; what is known of these, values [m] and deviations [m] of the
+    logarithm."""
     properties = objective.system.properties
-    variables, deviations = [], []
+    variables, values, deviations = [], [], []
     for name, factor in doubts.items():
         basis = PARAMETERS[name].basis
         there = float(getattr(properties, name)[0]) if basis is None else objective.scenario.scene.basis(basis)
         known = space.fixed.get(name, there if basis is None else 1.0)
         if name not in space.names and min(there, known) > _NO_MATERIAL:
             variables.append(Variable(name, known / 10, known * 10))
+            values.append(known)
             deviations.append(np.log(factor))
     added = [variable.name for variable in variables]
     fixed = {name: value for name, value in space.fixed.items() if name not in added}
-    return FitSpace((*space.variables, *variables), fixed), torch.tensor(deviations, dtype=torch.float64)
+    whole = FitSpace((*space.variables, *variables), fixed)
+    return whole, torch.tensor(values, dtype=torch.float64), torch.tensor(deviations, dtype=torch.float64)
 
 
 def _refined(objective: Objective, parameters: Mapping[str, Tensor], run: Rollout) -> Tensor:
@@ -273,9 +278,9 @@ def _refined(objective: Objective, parameters: Mapping[str, Tensor], run: Rollou
     scenario = objective.scenario
     if objective.paper:
         return torch.zeros_like(run.at(objective.times))
-    scene = replace(scenario.scene, frame_steps=scenario.scene.frame_steps * _REFINED)
+    scene = replace(scenario.scene, frame_steps=scenario.scene.frame_steps * REFINED)
     system, _ = scene.build()
-    steps = objective.loss_steps * _REFINED
+    steps = objective.loss_steps * REFINED
     track = None
     if objective.episode.gripper is not None:
         moved = track_displacement(objective.episode, system.handles.grippers, steps, system.time_step)

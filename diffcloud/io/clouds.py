@@ -17,6 +17,8 @@ from diffcloud.io.libusb import load_libusb
 from diffcloud.io.pickles import load_npy
 
 FORMATS = (".npy", ".ply", ".xyz", ".pcd")
+_PCD_HEADER = 65_536
+"""[B] A longer one is none."""
 
 
 def read_cloud(path: Path) -> NDArray[np.float32]:
@@ -72,9 +74,45 @@ def _read_xyz(path: Path) -> NDArray[Any]:
 
 
 def _read_pcd(path: Path) -> NDArray[Any]:
+    _check_pcd(path)
     open3d = import_open3d()
     cloud = open3d.io.read_point_cloud(str(path), remove_nan_points=False, remove_infinite_points=False)
     return np.asarray(cloud.points)
+
+
+def _check_pcd(path: Path) -> None:
+    """Refuse what open3d reads in silence: rows of text as points at zero, and points that the file cannot hold, for which
+    it takes memory.
+
+    Raises:
+        EpisodeError: these, or no header.
+    """
+    with path.open("rb") as stream:
+        head: dict[str, list[str]] = {}
+        while "DATA" not in head and stream.tell() < _PCD_HEADER and (line := stream.readline(_PCD_HEADER)):
+            name, *words = [*line.decode("ascii", errors="replace").split(), ""]
+            head[name.upper()] = words[:-1]
+        try:
+            points, kind, sizes = int(head["POINTS"][0]), head["DATA"][0].lower(), [int(size) for size in head["SIZE"]]
+            counts = [int(count) for count in head.get("COUNT", ["1"] * len(sizes))]
+            row = max(sum(size * count for size, count in zip(sizes, counts, strict=True)), 1)
+        except (KeyError, IndexError, ValueError) as error:
+            raise EpisodeError(
+                f"{path} is not a readable PCD file: its header lacks or garbles a field ({error})."
+            ) from error
+        left = path.stat().st_size - stream.tell()
+        # LZF, which compressed files have, gains at most a factor of 88
+        most = {"ascii": left // 2, "binary": left // row, "binary_compressed": 88 * left // row}.get(kind, 0)
+        if not 0 <= points <= most:
+            raise EpisodeError(f"{path} states {points} points, but what follows its header can hold {most} at most.")
+        if kind != "ascii":
+            return
+        try:
+            rows = np.loadtxt(stream, ndmin=2)
+        except (ValueError, UnicodeDecodeError) as error:
+            raise EpisodeError(f"{path} is not a readable PCD file (numbers, as many in each line): {error}.") from error
+    if len(rows) != points:
+        raise EpisodeError(f"{path} states {points} points and holds {len(rows)}.")
 
 
 def import_open3d() -> Any:

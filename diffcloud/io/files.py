@@ -25,9 +25,12 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+import yaml
 
 from diffcloud.errors import DiffCloudError
 
+_MOST_YAML = 100_000
+"""Values that a YAML file may stand for."""
 TEMPORARY, LOCK = ".diffcloud-tmp", ".diffcloud-lock"
 """Suffixes of a file that is being written, and of the lock file beside an output that a command holds."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EINVAL}
@@ -182,6 +185,39 @@ def read_json(path: Path, *, error: type[DiffCloudError] = DiffCloudError) -> An
         raise error(f"No such file: {path}.") from missing
     except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as damage:
         raise error(f"{path} is not readable JSON: {damage}.") from damage
+
+
+def read_yaml(path: Path, *, error: type[DiffCloudError] = DiffCloudError, kind: str = "file") -> Any:
+    """Read a YAML file of plain values.
+
+    Args:
+        kind: what it is, for the message if it is missing.
+
+    Raises:
+        error: the file is missing, is not YAML, or its anchors stand for too much; the message names file and place.
+    """
+    try:
+        loader = yaml.SafeLoader(Path(path).read_text(encoding="utf-8"))
+        try:
+            node = loader.get_single_node()
+            if _yaml_size(node, {}) > _MOST_YAML:
+                raise error(f"{path} stands for more than {_MOST_YAML} values; write out what its anchors (&, *) repeat.")
+            return None if node is None else loader.construct_document(node)
+        finally:
+            loader.dispose()
+    except FileNotFoundError as missing:
+        raise error(f"No such {kind}: {path}.") from missing
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as damage:
+        raise error(f"{path} is not readable YAML: {damage}.") from damage
+
+
+def _yaml_size(node: yaml.Node | None, known: dict[int, int]) -> int:
+    """How many values a node stands for, its aliases written out."""
+    if isinstance(node, yaml.CollectionNode) and id(node) not in known:
+        known[id(node)] = 1  # of an alias to what surrounds it
+        parts = [part for pair in node.value for part in (pair if isinstance(pair, tuple) else (pair,))]
+        known[id(node)] = 1 + sum(_yaml_size(part, known) for part in parts)
+    return known.get(id(node), 1)
 
 
 def files_in(folder: Path, *suffixes: str) -> list[Path]:

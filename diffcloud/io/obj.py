@@ -11,6 +11,8 @@ from diffcloud.errors import MeshError
 from diffcloud.io.files import write_text
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 
+_MOST_CORNERS = 100
+"""Of a face: triangulating looks at each of its fans."""
 _IGNORED = {"#", "mtllib", "usemtl", "o", "g", "s", "vn", "l"}
 
 
@@ -125,6 +127,8 @@ def _parse(path: Path) -> _ObjFile:
                 obj.polygons.append([_corner(word) for word in words[1:]])
                 if len(obj.polygons[-1]) < 3:
                     raise ValueError("a face has at least three corners")
+                if len(obj.polygons[-1]) > _MOST_CORNERS:
+                    raise ValueError(f"a face has at most {_MOST_CORNERS} corners here; triangulate it")
             else:
                 raise ValueError(f"unsupported keyword {words[0]!r}")
         except ValueError as error:

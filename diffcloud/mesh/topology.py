@@ -6,6 +6,7 @@ A *node* is a world-space point, a *vert* a material-space point; a node on a se
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -44,6 +45,17 @@ class SurfaceMesh:
     """[V, 3] positions [m]."""
     faces: IntArray
     """[F, 3] node indices, counter-clockwise seen from outside."""
+
+    @staticmethod
+    def joined(parts: Sequence[SurfaceMesh]) -> SurfaceMesh:
+        """Several as one; of none, no nodes and no faces."""
+        first = np.cumsum([0, *(len(part.nodes) for part in parts)])
+        return SurfaceMesh(
+            np.concatenate([np.zeros((0, 3)), *(part.nodes for part in parts)]),
+            np.concatenate(
+                [np.zeros((0, 3), np.int64), *(part.faces + n for part, n in zip(parts, first[:-1], strict=True))]
+            ),
+        )
 
     def plane(self) -> tuple[FloatArray, float] | None:
         """(unit normal [3], offset) if all nodes lie in one plane normal . x = offset, else None."""
@@ -105,6 +117,13 @@ class ClothMesh:
     def face_area(self) -> FloatArray:
         """[F] material-space area [m²]."""
         return 0.5 * np.linalg.det(self.material_edges)
+
+    @cached_property
+    def smallest_height(self) -> float:
+        """Of all triangles, in material space [m]."""
+        corner = self.verts[self.face_verts]
+        longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=-1).max(axis=1)
+        return float((2 * self.face_area / longest).min())
 
     @cached_property
     def node_area(self) -> FloatArray:

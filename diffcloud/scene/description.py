@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.sim.build import build_system
 from diffcloud.sim.handles import Handles
@@ -54,14 +52,7 @@ class Scene:
     @property
     def bodies(self) -> SurfaceMesh:
         """All static obstacles but the planar ones (tables), as one mesh to draw; without any, no nodes and no faces."""
-        bodies = [obstacle for obstacle in self.surrounding.obstacles if obstacle.plane() is None]
-        first = np.cumsum([0, *(len(body.nodes) for body in bodies)])
-        return SurfaceMesh(
-            np.concatenate([np.zeros((0, 3)), *(body.nodes for body in bodies)]),
-            np.concatenate(
-                [np.zeros((0, 3), np.int64), *(body.faces + n for body, n in zip(bodies, first[:-1], strict=True))]
-            ),
-        )
+        return SurfaceMesh.joined([obstacle for obstacle in self.surrounding.obstacles if obstacle.plane() is None])
 
     def basis(self, name: Basis) -> float:
         """What multipliers act on, in the scene's units: stiffness at rest in stretching [N/m] or in bending [N·m], density

@@ -58,6 +58,11 @@ class Material:
                     f"Material {self.name!r}: the {name} table must hold {shape[0]} x {shape[1]} finite numbers, "
                     f"got shape {table.shape}."
                 )
+        if (self.stretching[:, [0, 2]] < 0).any() or (self.bending < 0).any():
+            raise SceneError(
+                f"Material {self.name!r}: k0 and k2 of the stretching table and the bending table must not be negative; "
+                f"the lowest are {self.stretching[:, [0, 2]].min():g} N/m and {self.bending.min():g} N·m."
+            )
         if not self.density > 0 or not self.damping >= 0:
             raise SceneError(
                 f"Material {self.name!r}: density must be positive and damping not negative, "

@@ -71,10 +71,16 @@ class Motion:
 
 
 def axis_angle_quaternion(degrees: float, axis: tuple[float, float, float]) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z) of a rotation about an axis; a zero angle or axis gives the identity."""
-    length = float(np.linalg.norm(axis))
-    if degrees == 0 or length == 0:
+    """Unit quaternion (w, x, y, z) of a rotation about an axis; a zero angle gives the identity, whatever the axis.
+
+    Raises:
+        SceneError: a rotation about no axis.
+    """
+    if degrees == 0:
         return _IDENTITY_QUATERNION
+    length = float(np.linalg.norm(axis))
+    if length == 0:
+        raise SceneError(f"A rotation by {degrees:g}° about the axis {list(axis)}: give an axis that is not zero.")
     half = np.deg2rad(degrees) / 2
     x, y, z = np.asarray(axis) / length * np.sin(half)
     return float(np.cos(half)), float(x), float(y), float(z)

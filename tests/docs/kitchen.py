@@ -114,6 +114,15 @@ def fitted(folder: Path) -> None:
     params(folder, "pipeline/profiles/release.yaml")
 
 
+def towel(folder: Path) -> None:
+    """towel.npz and its fit, of a lift that takes a moment."""
+    (folder / "towel.yaml").write_text(yaml.safe_dump(QUICK))
+    invoke("rollout", "--scenario", "towel.yaml", "--set", "stretch=0.7", "--out", "run.npz")
+    with np.load("run.npz") as run:
+        write_episode(folder / "towel.npz", Episode.from_frames(list(run["nodes"]), run["times"]))
+    invoke("fit", "--scenario", "towel.yaml", "--parameters", "stretch", "--out", "fits", "towel.npz")
+
+
 def write(example: Example, folder: Path) -> None:
     """The file that a page shows, a towel with fewer nodes and steps."""
     (folder / example.words[0]).write_text(example.text.replace("nodes: [9, 7]", "nodes: [4, 3]\nsteps_per_frame: 2"))
@@ -132,6 +141,7 @@ PREPARED = {
     "docs/concepts.md": motions,
     "docs/capture.md": lab,
     "docs/evaluation.md": fitted,
+    "docs/export.md": towel,
     "docs/pipeline.md": quick,
     "docs/regressors.md": lift_episode,
 }

@@ -34,6 +34,7 @@ SMALLER = {
     "evaluate loss": "--points 200",
     "evaluate release": "--only release_lift/lift_tan --allow-missing --workers 1",
     "bench": "--repeats 1",
+    "export fits/towel.json --to mujoco --samples": "--samples 2",
 }
 """Command -> options that are added to it; the last of two counts."""
 

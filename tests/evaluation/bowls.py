@@ -23,6 +23,7 @@ class Bowl:
     diverges_above: float = float("inf")
     length_unit_m: float = 1.0
     members: tuple[None, ...] = (None,)
+    paper: bool = False
     calls: int = 0
 
     def __post_init__(self) -> None:

@@ -13,7 +13,7 @@ from diffcloud.evaluation import intervals as module
 from diffcloud.evaluation.intervals import significant, state_intervals
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitSpace, Objective
-from diffcloud.fit.uncertainty import Uncertainty
+from diffcloud.fit.uncertainty import Uncertainty, uncertainty
 from tests.conftest import small_lift
 from tests.evaluation.bowls import Bowl
 from tests.fit.test_fit import clouds_of
@@ -36,7 +36,7 @@ def told(objective, monkeypatch):
         k = len(space.names)
         places = np.log([values[name] for name in space.names])
         covariances = {name: np.array(value, dtype=float).reshape(k, k) for name, value in sources.items()}
-        found = Uncertainty(space.names, places, covariances, clusters, np.full(k, step))
+        found = Uncertainty(space.names, places, np.ones(1), covariances, clusters, np.full(k, step))
         monkeypatch.setattr(module, "uncertainty", lambda *arguments, **given: found)
         monkeypatch.setattr(module, "_misfit", lambda *arguments: misfit)
         monkeypatch.setattr(module, "_with_scan", lambda objective, space, found: (found, lower))
@@ -146,7 +146,7 @@ class TestScan:
     def found(self, depth):
         well = Wells()
         well.depth = depth
-        flat = Uncertainty(("stretch",), np.zeros(1), {"noise": np.array([[1e-6]])}, 16, np.zeros(1))
+        flat = Uncertainty(("stretch",), np.zeros(1), np.ones(1), {"noise": np.array([[1e-6]])}, 16, np.zeros(1))
         return module._with_scan(well, self.SPACE, flat)
 
     def test_what_noise_hides_widens_the_interval(self):
@@ -165,9 +165,13 @@ class TestScan:
 
 
 def test_the_misfit_is_the_fits_own(objective):
-    rms, accounted = module._misfit(objective, FitSpace.build(["stretch"], fixed={"mass": 1.0}), {"stretch": 0.7})
+    def loss_at(stretch):
+        space = FitSpace.build(["stretch"], fixed={"mass": 1.0})
+        return float(uncertainty(objective, space, {"stretch": stretch}, doubts={}).losses[0])
+
+    rms, accounted = module._misfit(objective, loss_at(0.7))
     assert rms < 1.5 * accounted
-    far, _ = module._misfit(objective, FitSpace.build(["stretch"], fixed={"mass": 1.0}), {"stretch": 0.1})
+    far, _ = module._misfit(objective, loss_at(0.1))
     assert far > 1.2 * rms
 
 

@@ -37,6 +37,10 @@ def record_of(*recordings: RecordingFit, **changes: Any) -> FitRecord:
         "nuisance": {},
         "solver": "adam",
         "parameters": {"stretch": parameter_of()},
+        "material": {
+            "density": 0.2, "stretching": 6.0, "poisson": 0.0, "shear": 1.5, "bending": 4e-6, "damping": 0.005,
+            "friction_obstacle": 0.3, "friction_cloth": 0.6, "air_density": 1.2,
+        },
         "loss": 1e-4,
         "loss_start": 2e-4,
         "loss_resampled": 1e-4,
@@ -53,5 +57,5 @@ def record_of(*recordings: RecordingFit, **changes: Any) -> FitRecord:
         "history": History(names=["stretch"], loss=[[0.2], [0.1]], values=[[[1.0]], [[1.5]]], gradient_norm=[]),
         "failures": [],
         "versions": {},
-    }
+    }  # fmt: skip
     return FitRecord.model_validate(told | changes)

@@ -135,6 +135,13 @@ def test_patches_are_of_one_size():
         assert np.ptp(nodes[found == index], axis=0).max() == 1.0
 
 
+def test_the_losses_are_those_of_the_recordings(scenario):
+    members = [Objective(scenario, recorded(scenario, seed=seed)) for seed in (1, 2)]
+    found = uncertainty(JointObjective(members), SPACE, TRUTH, doubts={})
+    values = {name: torch.tensor([value]).double() for name, value in TRUTH.items()}
+    assert found.losses.tolist() == pytest.approx([float(member(values)) for member in members], rel=1e-3)
+
+
 def test_the_sum_of_the_sources_is_the_covariance(scenario):
     found = uncertainty(Objective(scenario, recorded(scenario)), SPACE, TRUTH)
     np.testing.assert_allclose(found.covariance, sum(found.sources.values()))

@@ -9,21 +9,14 @@ import math
 import pytest
 import yaml
 
-from diffcloud.io.episodes import write_episode
+from diffcloud.io.episodes import read_episode, write_episode
 from pipeline.coverage import counted, coverage_page, summary_rows
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
 from tests.pipeline.invoke import invoke
+from tests.pipeline.test_commands import SMALL as LIFT
 
-SMALL = {
-    "base": "lift",
-    "nodes": [5, 5],
-    "frames": 5,
-    "steps_per_frame": 2,
-    "points": 200,
-    "path": [[0, 0, 0, 0], [0.5, 0, -0.05, 0.15]],
-    "recorder": "whole_surface",
-}
+SMALL = {**LIFT, "recorder": "whole_surface"}
 PARAMS = {"fit": {"starts": 1, "screen": 0, "iterations": 4}, "evaluate": {"doubts": {"bending": 1.5}}}
 
 
@@ -60,6 +53,17 @@ class TestCoverage:
         assert set(free.result["parameters"]) == {"stretch", "mass"}
         assert free.result["ratio"]["n"] == 2
         assert (work / "out/small/free/0000.json").is_file()
+
+    def test_other_recordings_are_made_anew(self, work):
+        invoke(*COVERAGE, "--recordings", 1)
+        episode = work / "out/small/episodes/0000.npz"
+        first, written = read_episode(episode), episode.stat().st_mtime_ns
+        (work / "params.yaml").write_text(yaml.safe_dump({**PARAMS, "preprocess": {"points": 40}}))
+        invoke(*COVERAGE, "--recordings", 1)
+        second = read_episode(episode)
+        assert first.meta["truth"] == second.meta["truth"]
+        assert first.meta["made"] != second.meta["made"]
+        assert episode.stat().st_mtime_ns != written
 
     def test_a_refined_truth_has_a_folder_of_its_own(self, work):
         invoke(*COVERAGE, "--recordings", 1, "--refined")

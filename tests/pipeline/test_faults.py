@@ -187,7 +187,8 @@ class TestTwoAtOnce:
             [*DIFFCLOUD, *map(str, command)], cwd=work, env=env, stderr=subprocess.PIPE, text=True
         ) as first:
             deadline = time.monotonic() + 60
-            while not (work / ".out.diffcloud-lock").exists() and time.monotonic() < deadline:
+            lock = work / ".out.diffcloud-lock"
+            while not (lock.exists() and lock.stat().st_size) and time.monotonic() < deadline:
                 time.sleep(0.005)
             # held still, so that the second comes in the middle however slow the machine is
             first.send_signal(signal.SIGSTOP)

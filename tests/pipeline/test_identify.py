@@ -161,10 +161,10 @@ class TestRefusals:
 def test_a_towel_of_another_simulator_has_its_stiffness(tmp_path):
     """MuJoCo lifts it twice, laid differently; two millimetres of noise."""
     pytest.importorskip("mujoco")
-    from diffcloud.evaluation.simulators import mujoco
-    from diffcloud.evaluation.simulators.problem import Problem, Sheet
     from diffcloud.mesh.shapes import grid_cloth
     from diffcloud.sim.motion import Keyframe, Motion
+    from diffcloud.simulators import mujoco
+    from diffcloud.simulators.problem import Problem, Sheet
 
     sheet = Sheet(density=0.25, stretching=40.0, poisson=0.3, bending=1e-5, damping=0.005)
     path = Motion((Keyframe(0.0, (0.0, 0.0, 0.0)), Keyframe(2.5, (-0.1, -0.1, 0.45))))

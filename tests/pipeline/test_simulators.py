@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.evaluation.simulators.study import THIS, WHOLE_STIFFNESS, Answer, Derivative, Pair
+from diffcloud.simulators.study import THIS, WHOLE_STIFFNESS, Answer, Derivative, Pair
 from pipeline.simulators import _page
 
 

@@ -40,6 +40,9 @@ def entry(name="tan1", *, scenario="lift", fabric="tan", failures=()):
             faces=np.array([[0, 1, 2]]),
             times=np.array([0.0, 0.1]),
             bodies=SurfaceMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)),
+            held=np.array([0]),
+            held_times=np.array([0.0, 0.1]),
+            held_nodes=_TRIANGLE[:, :1],
         ),
     )
 

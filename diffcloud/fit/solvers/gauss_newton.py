@@ -36,8 +36,6 @@ _SMALLEST_STEP = 1e-3
 _SMALLEST_DECREASE = 1e-3
 _SAME = 0.02
 """A start that comes as close to the best one, on the axis, leaves the rest of the way to it."""
-_LOWER = 0.02
-"""Part by which another minimum must be lower."""
 _GIVE_UP = 6
 """Steps in vain, one after the other: the loss is rougher than its slope."""
 
@@ -105,8 +103,8 @@ def fit_gauss_newton(
                 place = search.places[search.best]
                 found_near, spent = scan(objective, space, place, search.normal[search.best])
                 simulations += spent
-                lower, loss = found_near.place(place)
-                if not loss < (1 - _LOWER) * float(search.losses.min()):
+                lower = found_near.lower(place, float(search.losses.min()))
+                if lower is None:
                     break
                 at = linearise(objective, space, lower[None])
                 simulations += at.simulations

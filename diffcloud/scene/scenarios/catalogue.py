@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal, overload
 
-import yaml
 from pydantic import ValidationError
 
 from diffcloud.errors import ConfigError, SceneError, unknown_name
+from diffcloud.io.files import read_yaml
 from diffcloud.scene.load import load_scene
 from diffcloud.scene.scenarios.band import BAND_STRETCH, BandScenario, band_scenario
 from diffcloud.scene.scenarios.grid import FOLD, LIFT, SHAKE, GridScenario, grid_scenario
@@ -98,17 +98,12 @@ def read_options(path: Path) -> Options:
     Raises:
         SceneError: an unreadable file, an unknown field, or a value out of range.
     """
-    try:
-        data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise SceneError(f"No such scenario file: {path}.") from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise SceneError(f"{path} is not readable YAML: {error}.") from error
+    data = read_yaml(path, error=SceneError, kind="scenario file")
     if not isinstance(data, dict):
         raise SceneError(f"{path}: a scenario is a mapping of fields, got {type(data).__name__}.")
     base = data.pop("base", "lift")
-    if base not in _BUILT_IN:
-        raise SceneError(f"{path}: " + unknown_name("base", base, _BUILT_IN))
+    if not isinstance(base, str) or base not in _BUILT_IN:
+        raise SceneError(f"{path}: " + unknown_name("base", str(base), _BUILT_IN))
     material = data.get("material")
     if isinstance(material, str) and material.endswith(".json"):
         data["material"] = str((Path(path).parent / material).resolve())

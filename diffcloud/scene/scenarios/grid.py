@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from diffcloud.errors import SceneError, unknown_name
 from diffcloud.mesh.shapes import grid_cloth, rectangle_surface
 from diffcloud.mesh.topology import ClothMesh
-from diffcloud.scene.scenarios.options import Keyframes, ScenarioOptions, assemble
+from diffcloud.scene.scenarios.options import Coordinate, Keyframes, ScenarioOptions, assemble
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.scene.schema import Checked, NonNegative, Positive
 
@@ -35,13 +35,13 @@ class GridScenario(ScenarioOptions):
 
     size_m: tuple[Positive, Positive]
     """Extent along the cloth's own x and y."""
-    nodes: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]] = (7, 7)
+    nodes: tuple[Annotated[int, Field(ge=2, le=500)], Annotated[int, Field(ge=2, le=500)]] = (7, 7)
     """Node counts along x and y."""
-    center_m: tuple[float, float] = (0.0, 0.0)
+    center_m: tuple[Coordinate, Coordinate] = (0.0, 0.0)
     """Where the cloth's centre lies on the table."""
     yaw_deg: float = 45.0
     """Rotation about the vertical; 45 lays a square cloth as a diamond."""
-    table_height_m: float = 0.0
+    table_height_m: Coordinate = 0.0
     gap_m: NonNegative = 0.002
     """Height of the cloth over the table at the start."""
     grasped: Names = ()

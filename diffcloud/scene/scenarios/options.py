@@ -21,7 +21,10 @@ from diffcloud.sim.materials import Material, preset, read_material
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.surrounding import ContactSettings, Integrator, ReferenceContact, Surrounding
 
-Keyframes = Annotated[list[tuple[float, float, float, float]], Field(min_length=2)]
+Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
+"""[m] Whatever lies farther off is a mistake."""
+_Time = Annotated[float, Field(ge=-1e6, le=1e6)]
+Keyframes = Annotated[list[tuple[_Time, Coordinate, Coordinate, Coordinate]], Field(min_length=2)]
 """Keyframes (time s, dx, dy, dz m) of a displacement, in the world's axes."""
 
 
@@ -33,9 +36,9 @@ class ScenarioOptions(Checked):
     """A preset, the path of an ARCSim material JSON, or an isotropic sheet in SI units."""
     path: Keyframes
     """The gripper's displacement."""
-    frames: Annotated[int, Field(ge=1)] = 25
+    frames: Annotated[int, Field(ge=1, le=100_000)] = 25
     rate_hz: Positive = 10.0
-    steps_per_frame: Annotated[int, Field(ge=1)] = 8
+    steps_per_frame: Annotated[int, Field(ge=1, le=10_000)] = 8
     integrator: Integrator = "implicit"
     """"implicit" has steps of second order and smooth contact; "linearised" are ARCSim's steps, a quarter to a tenth as
     long to compute and less exact (docs/results/discretisation.md)."""
@@ -46,7 +49,7 @@ class ScenarioOptions(Checked):
     """The frames that the paper's measure compares, and studies of the motion look at."""
     every_frame: bool = True
     """Whether fits compare all usable frames; a file that names loss_frames has only those, unless it says true."""
-    points: Annotated[int, Field(ge=1)] = 3500
+    points: Annotated[int, Field(ge=1, le=1_000_000)] = 3500
     learning_rate: Positive = 0.2
     threshold_m2: NonNegative = 0.0
     """A fit stops when its loss is below; 0: never."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffcloud.errors import ConfigError
 from diffcloud.scene.description import Scene
-from diffcloud.sim.properties import Properties, scaled_properties
+from diffcloud.sim.properties import Properties, check_values, scaled_properties
 from diffcloud.sim.system import System
 
 Recorder = Literal["depth_cameras", "whole_surface"]
@@ -66,6 +66,45 @@ class Scenario:
         """
         if "body_mass" in names and not self.scene.surrounding.bodies:
             raise ConfigError(f"body_mass has no effect in {self.name}, whose scene has no rigid bodies; leave it out.")
+
+    def fitted_scene(self, values: Mapping[str, float]) -> Scene:
+        """The scene with parameters written into its material, its air, its friction and its bodies.
+
+        Raises:
+            ConfigError: an unknown parameter, or one that acts on a part of the nodes, which no material can say.
+        """
+        check_values(values, self.name)
+        self.check_parameters(values)
+        parts = sorted(values.keys() & self.node_sets.keys())
+        if parts:
+            raise ConfigError(
+                f"In {self.name}, {', '.join(parts)} acts on a part of the nodes, which no material can say; fit a "
+                "scenario without node sets."
+            )
+        scene, around = self.scene, self.scene.surrounding
+        weight, air = values.get("mass", 1.0) * values.get("density", 1.0), values.get("drag", 1.0)
+        material = scene.material.scaled(
+            density=weight, stretching=values.get("stretch", 1.0), bending=values.get("bending", 1.0)
+        )
+        heavy = values.get("body_mass", 1.0)
+        bodies = tuple(
+            replace(body, density=body.density * heavy, mass=None if body.mass is None else body.mass * heavy)
+            for body in around.bodies
+        )
+        around = replace(
+            around,
+            air_density=around.air_density * air,
+            air_drag=around.air_drag * air,
+            friction_obstacle=values.get("friction_obstacle", around.friction_obstacle),
+            friction_cloth=values.get("friction_cloth", around.friction_cloth),
+            bodies=bodies,
+        )
+        return replace(
+            scene,
+            material=replace(material, damping=values.get("damping", material.damping)),
+            mass_material=None if scene.mass_material is None else scene.mass_material.scaled(density=weight),
+            surrounding=around,
+        )
 
     def properties(self, system: System, values: Mapping[str, Tensor]) -> Properties:
         """Physical quantities of parameter sets, name -> [B], with the scenario's node sets applied.

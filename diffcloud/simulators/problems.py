@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diffcloud.evaluation.simulators.problem import Problem, Sheet, Track
 from diffcloud.mesh.shapes import grid_cloth
 from diffcloud.mesh.topology import ClothMesh
 from diffcloud.sim.motion import Keyframe, Motion
+from diffcloud.simulators.problem import Problem, Sheet, Track
 
 TOWEL = Sheet(density=0.16, stretching=60.0, poisson=0.3, bending=3e-6, damping=0.005)
 """As light and as soft as the preset `jersey-knit`, but isotropic."""
@@ -53,21 +54,40 @@ class Known:
     theory: dict[str, float]
 
 
+_STRIP = Sheet(density=0.2, stretching=500.0, poisson=0.3, bending=1e-6, damping=0.0)
 _LENGTH = 0.5
 _ROWS, _ACROSS = 17, 4
 _CLEAR = 12
 """Row up to which the held upper end does not show."""
+_ELONGATION = 0.00073575
+"""Mean strain of the clear part: that of `_STRIP` on Earth, small enough for linear theory."""
+_LITTLE = 0.01
+"""Poisson's ratio below which the contraction is not looked at."""
 
 
-def strip() -> Known:
-    """A strip hangs from its upper end: how its lower three quarters stretch, and how it contracts across them."""
+def strip(sheet: Sheet = _STRIP) -> Known:
+    """A strip hangs from its upper end: how its lower three quarters stretch, and how it contracts across them.
+
+    Args:
+        sheet: hangs under a gravity that stretches it by so little as theory allows; its damping is left out.
+    """
+    sheet = replace(sheet, damping=0.0)
     flat = grid_cloth(_ROWS, _ACROSS, _LENGTH, 0.1)
     upright = np.column_stack([flat.nodes[:, 0], np.zeros(len(flat.nodes)), flat.nodes[:, 1]])
-    sheet = Sheet(density=0.2, stretching=500.0, poisson=0.3, bending=1e-6, damping=0.0)
     held: dict[int, Motion | None] = dict.fromkeys(range((_ROWS - 1) * _ACROSS, _ROWS * _ACROSS))
-    problem = Problem("strip", replace(flat, nodes=upright), sheet, 0.5, held, settling=300.0)
-    part = _CLEAR / (_ROWS - 1)
-    clear = _LENGTH * part
+    clear = _LENGTH * _CLEAR / (_ROWS - 1)
+    gravity = _ELONGATION * 2 * sheet.stretching / (sheet.density * clear)
+    passage = _LENGTH / math.sqrt(sheet.stretching / sheet.density)  # of a wave along the strip
+    problem = Problem(
+        "strip",
+        replace(flat, nodes=upright),
+        sheet,
+        50 * passage,
+        held,
+        gravity=gravity,
+        settling=3 / passage,
+        rate=0.2 / passage,
+    )
 
     def measures(track: Track) -> dict[str, float]:
         start, end = (nodes.reshape(_ROWS, _ACROSS, 3)[: _CLEAR + 1] for nodes in (upright, track.nodes[-1]))
@@ -76,36 +96,39 @@ def strip() -> Known:
         stretched = along[1] / along[0] - 1
         return {"elongation": stretched, "contraction across / elongation": (1 - across[1] / across[0]) / stretched}
 
-    weight = sheet.density * problem.gravity * clear
-    return Known(
-        problem,
-        measures,
-        {"elongation": weight / (2 * sheet.stretching), "contraction across / elongation": sheet.poisson},
-    )
+    theory = {"elongation": _ELONGATION}
+    if sheet.poisson > _LITTLE:
+        theory["contraction across / elongation"] = sheet.poisson
+    return Known(problem, measures, theory)
 
 
+_BEAM = Sheet(density=0.2, stretching=200.0, poisson=0.0, bending=1e-4, damping=0.0)
 _GAMMA = 5.0
-_BEAM = 0.1
+_SLENDER = 2e4
+"""E h L²/B: so long a strip that it bends and does not stretch."""
 
 
-def cantilever(cells: int = 24) -> Known:
+def cantilever(sheet: Sheet = _BEAM, cells: int = 24) -> Known:
     """A strip clamped level at one end bends far under its weight, the heavy elastica: drop and reach of its free end.
 
     Args:
+        sheet: whose stiffnesses decide how long the strip is, and how heavy; its damping is left out.
         cells: along the free length, and half a cell more, in whose middle the clamp ends.
     """
-    side = _BEAM / (cells + 0.5)
+    sheet = replace(sheet, damping=0.0)
+    length = math.sqrt(_SLENDER * sheet.bending / sheet.stretching)
+    side = length / (cells + 0.5)
     columns = cells + 2
     mesh = grid_cloth(3, columns, 2 * side, side * (columns - 1), alternate_diagonals=True)
-    sheet = Sheet(density=0.2, stretching=200.0, poisson=0.0, bending=1e-4, damping=0.0)
-    gravity = _GAMMA * sheet.bending / (sheet.density * _BEAM**3)
+    gravity = _GAMMA * sheet.bending / (sheet.density * length**3)
+    sway = length**2 * math.sqrt(sheet.density / sheet.bending)  # by which bending vibrations are measured
     held: dict[int, Motion | None] = {row * columns + column: None for row in range(3) for column in (0, 1)}
-    problem = Problem("cantilever", mesh, sheet, 1.5, held, gravity=gravity, settling=16.0)
+    problem = Problem("cantilever", mesh, sheet, 3.4 * sway, held, gravity=gravity, settling=7 / sway, rate=9 / sway)
     root = float(mesh.nodes[1, 0]) - side / 2  # the second held row's hinges bend over half a cell to either side
 
     def measures(track: Track) -> dict[str, float]:
         tip = track.nodes[-1].reshape(3, columns, 3)[:, -1].mean(axis=0)
-        return {"drop / length": -float(tip[2]) / _BEAM, "reach / length": (float(tip[0]) - root) / _BEAM}
+        return {"drop / length": -float(tip[2]) / length, "reach / length": (float(tip[0]) - root) / length}
 
     drop, reach = elastica(_GAMMA)
     return Known(problem, measures, {"drop / length": drop, "reach / length": reach})

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from diffcloud.evaluation.simulators.problem import Problem, Track
 from diffcloud.sim.surrounding import ContactSettings
+from diffcloud.simulators.problem import Problem, Track
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from diffcloud.evaluation.simulators import explicit, mujoco, newton, ours
-from diffcloud.evaluation.simulators.problem import Problem, Track, distances
-from diffcloud.evaluation.simulators.problems import cantilever, fold, lift, strip, swing
+from diffcloud.simulators import explicit, mujoco, newton, ours
+from diffcloud.simulators.problem import Problem, Track, distances
+from diffcloud.simulators.problems import cantilever, fold, lift, strip, swing
 
 THIS = "this simulator"
 WHOLE_STIFFNESS = "damping of the whole stiffness, as in ARCSim"

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import ConfigError
-from diffcloud.mesh.topology import ClothMesh
+from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.sim.materials import TABLE_ENTRY_TO_BENDING
 from diffcloud.sim.motion import Motion
 
 REST_HEIGHT = 0.0021
 """Of nodes that lie on a table [m]: where this simulator's contact bears a light cloth. The others get it as a radius."""
+
+_MOTION_RATE = 480
+"""[1/s] At which motions of held nodes are sampled for scripts, which interpolate linearly."""
 
 
 @dataclass(frozen=True)
@@ -57,14 +62,25 @@ class Problem:
     table: float | None = None
     """Its height [m]."""
     friction: float = 0.3
-    """Of the cloth with the table and itself."""
+    """Of the cloth with the table and what else it meets."""
+    self_friction: float | None = None
+    """Of the cloth with itself; None: the same."""
     self_contact: bool = False
+    bodies: tuple[SurfaceMesh, ...] = ()
+    """What the cloth meets beside the table, standing still."""
+    shaped: bool = False
+    """Whether its hinges are at rest as the mesh stands, not flat."""
     gravity: float = 9.81
     """Downwards [m/s²]."""
     settling: float = 0.0
     """Drag that brings a cloth to rest, where only its rest is looked at: force per momentum [1/s]."""
     rate: float = 20.0
     """Frames a second that are compared."""
+
+    @property
+    def frictions(self) -> tuple[float, float]:
+        """(with the table and bodies, of the cloth with itself)"""
+        return self.friction, self.friction if self.self_friction is None else self.self_friction
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -94,6 +110,36 @@ class Problem:
             start = np.broadcast_to(self.mesh.nodes[node], (len(times), 3))
             places.append(start if motion is None else start + motion.at(times.astype(np.float64))[1])
         return np.stack(places, axis=1)
+
+    def arrays(self) -> dict[str, Any]:
+        """All of it as numbers, for the scripts that run it without this package."""
+        mesh, sheet, hinges = self.mesh, self.sheet, self.mesh.hinges
+        bodies = SurfaceMesh.joined(self.bodies)
+        motion_times = np.linspace(0.0, self.times[-1], math.ceil(self.times[-1] * _MOTION_RATE) + 1)
+        return {
+            "nodes": mesh.nodes,
+            "faces": mesh.faces,
+            "times": self.times,
+            "held": np.array(list(self.held), dtype=np.int64),
+            "motion_times": motion_times,
+            "motion": self.held_at(motion_times),
+            "density": sheet.density,
+            "shear": sheet.shear,
+            "lateral": sheet.lateral,
+            "damping": sheet.damping,
+            "hinge_edges": hinges.nodes[:, :2],
+            "hinge_stiffness": self.hinge_stiffness,
+            "hinge_length": hinges.length,
+            "hinge_area": mesh.face_area[hinges.faces].sum(axis=1),
+            "table": np.nan if self.table is None else self.table,
+            "friction": self.friction,
+            "self_contact": self.self_contact,
+            "body_nodes": bodies.nodes,
+            "body_faces": bodies.faces,
+            "gravity": self.gravity,
+            "settling": self.settling,
+            "radius": REST_HEIGHT,
+        }
 
 
 @dataclass(frozen=True)

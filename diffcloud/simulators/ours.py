@@ -7,18 +7,18 @@ from dataclasses import replace
 
 import torch
 
-from diffcloud.evaluation.simulators.problem import Problem, Track
 from diffcloud.mesh.shapes import rectangle_surface
 from diffcloud.scene.description import Scene
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import isotropic
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.surrounding import Order, Surrounding
+from diffcloud.simulators.problem import Problem, Track
 
 STEPS = 16
 """A frame."""
-_SETTLING_STEP, _SETTLING_STEPS = 0.02, 400
-"""[s] and how many: so long steps of backward Euler bring a cloth to rest by themselves."""
+_SETTLING_PART, _SETTLING_STEPS = 1 / 25, 400
+"""Of the time that others need, and how many: so long steps of backward Euler bring a cloth to rest by themselves."""
 
 
 def scene(problem: Problem, order: Order = 2) -> Scene:
@@ -41,11 +41,12 @@ def scene(problem: Problem, order: Order = 2) -> Scene:
         surrounding=Surrounding(
             gravity=(0.0, 0.0, -problem.gravity),
             air_density=0.0,
-            friction_obstacle=problem.friction,
-            friction_cloth=problem.friction,
+            friction_obstacle=problem.frictions[0],
+            friction_cloth=problem.frictions[1],
             self_contact=problem.self_contact,
-            obstacles=table,
+            obstacles=(*table, *problem.bodies),
         ),
+        shaped=problem.shaped,
         integrator="implicit",
         order=order,
     )
@@ -56,7 +57,10 @@ def simulate(problem: Problem, *, steps: int = STEPS, order: Order = 2) -> Track
     described = replace(scene(problem, order), frame_steps=steps)
     count = (len(problem.times) - 1) * steps
     if problem.settling:
-        described, count = replace(described, frame_time=_SETTLING_STEP, frame_steps=1, order=1), _SETTLING_STEPS
+        described, count = (
+            replace(described, frame_time=_SETTLING_PART * problem.seconds, frame_steps=1, order=1),
+            _SETTLING_STEPS,
+        )
     system, _ = described.build()
     with torch.no_grad():
         rollout(system, 1)  # kernels are loaded before the motion is timed

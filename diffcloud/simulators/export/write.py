@@ -1,0 +1,168 @@
+"""The files of each target."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from diffcloud import __version__
+from diffcloud.io.files import together, write_json, write_npz, write_text
+from diffcloud.io.obj import write_cloth, write_surface
+from diffcloud.scene.write import write_scene
+from diffcloud.simulators import mujoco
+from diffcloud.simulators.export.cloth import ExportedCloth
+from diffcloud.simulators.export.isaac import layer
+from diffcloud.simulators.problem import Problem
+
+Target = Literal["mujoco", "newton", "isaac", "arcsim", "obj"]
+TARGETS: tuple[Target, ...] = get_args(Target)
+WRITTEN_FOR: dict[Target, str] = {
+    "mujoco": "MuJoCo 4.0.0",
+    "newton": "Newton 1.8.0 with Warp 1.19.0",
+    "isaac": "Isaac Sim 5 (Omni Physics 107 or later)",
+    "arcsim": "ARCSim 0.2 and DiffSim",
+    "obj": "Wavefront OBJ and CSV",
+}
+
+
+def write_export(
+    cloth: ExportedCloth, target: Target, folder: Path, about: Mapping[str, Any]
+) -> tuple[list[str], list[str]]:
+    """Write the target's files, and `cloth.json`, which says what they are.
+
+    Args:
+        about: what else `cloth.json` shall hold.
+
+    Returns:
+        Names of the files, and what of the cloth they leave out.
+
+    Raises:
+        SceneError: what ARCSim's files cannot say.
+    """
+    left_out = [*cloth.left_out, *(cloth.simplified if target in ("mujoco", "newton", "isaac") else ())]
+    problem = cloth.problem
+    with together():
+        names, more = _WRITERS[target](cloth, folder, left_out)
+        left_out += more
+        told = {
+            "made_by": f"diffcloud {__version__}",
+            "written_for": WRITTEN_FOR[target],
+            "units": "m, kg, s; z points up",
+            **about,
+            "isotropic_sheet": {
+                "density_kg_m2": problem.sheet.density,
+                "stretching_n_m": problem.sheet.stretching,
+                "poisson": problem.sheet.poisson,
+                "bending_n_m": problem.sheet.bending,
+                "damping_s": problem.sheet.damping,
+            },
+            "table_m": problem.table,
+            "gravity_m_s2": problem.gravity,
+            "held_nodes": [int(node) for node in problem.held],
+            "files": names,
+            "left_out": left_out,
+        }
+        write_json(folder / "cloth.json", told)
+    return [*names, "cloth.json"], left_out
+
+
+def for_mujoco(problem: Problem) -> tuple[Problem, mujoco.Settings]:
+    """The problem as MuJoCo's explicit steps bear it, and their settings."""
+    settings, sheet = mujoco.stable(problem)
+    return replace(problem, sheet=sheet), settings
+
+
+def _mujoco(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
+    problem, settings = for_mujoco(cloth.problem)
+    more = []
+    if problem.sheet.damping < 0.99 * cloth.problem.sheet.damping:
+        more.append(
+            f"The damping is {problem.sheet.damping:.2g} s; the fit's {cloth.problem.sheet.damping:.2g} s would need "
+            "steps below 20 µs."
+        )
+    if problem.bodies:
+        more.append("MuJoCo replaces each body that the cloth meets by its convex hull.")
+    more += _flat_hinges(problem)
+    remark = f"{_head(cloth, 'mujoco')} {' '.join([*left_out, *more])}".replace("--", "-")
+    write_text(folder / "cloth.xml", mujoco.model_file(problem, settings, remark=remark))
+    return ["cloth.xml", *_script("run_mujoco.py", problem, folder)], more
+
+
+def _newton(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
+    more = [
+        "Newton's membrane is neo-Hookean; it agrees with the fit's at small strains.",
+        *_one_friction(cloth.problem),
+        *_flat_hinges(cloth.problem),
+    ]
+    return _script("run_newton.py", cloth.problem, folder), more
+
+
+def _one_friction(problem: Problem) -> list[str]:
+    among, itself = problem.frictions
+    if itself == among or not problem.self_contact:
+        return []
+    return [f"There is one coefficient of friction, {among:.3g}; in the fit, the cloth has {itself:.3g} with itself."]
+
+
+def _flat_hinges(problem: Problem) -> list[str]:
+    told = "The exported hinges are flat at rest; in the fit, they rest in the shape in which the cloth starts."
+    return [told] if problem.shaped else []
+
+
+def _script(name: str, problem: Problem, folder: Path) -> list[str]:
+    arrays: dict[str, Any] = {key: np.asarray(value) for key, value in problem.arrays().items()}
+    write_npz(folder / "cloth.npz", **arrays)
+    write_text(folder / name, (files("diffcloud.simulators.scripts") / name).read_text(encoding="utf-8"))
+    return ["cloth.npz", name]
+
+
+def _isaac(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
+    more = [
+        *_one_friction(cloth.problem),
+        "This file has not been run in Isaac Sim: attributes and units are those of its published schema. That PhysX "
+        "multiplies the bending stiffness by the cube of the thickness is taken from its documentation.",
+    ]
+    write_text(folder / "cloth.usda", layer(cloth.problem, _head(cloth, "isaac"), [*left_out, *more]))
+    return ["cloth.usda"], more
+
+
+def _arcsim(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
+    path = write_scene(cloth.scene, folder, "cloth")
+    obstacles = [f"meshes/cloth/obstacle{number}.obj" for number in range(len(cloth.scene.surrounding.obstacles))]
+    more = ["Firmly held nodes, smooth contact and second-order steps are diffcloud's own; ARCSim uses its own methods."]
+    return [path.relative_to(folder).as_posix(), "meshes/cloth/cloth.obj", "materials/cloth.json", *obstacles], more
+
+
+def _obj(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
+    problem = cloth.problem
+    write_cloth(folder / "cloth.obj", problem.mesh, problem.mesh.nodes)
+    names = ["cloth.obj"]
+    for number, body in enumerate(problem.bodies):
+        write_surface(folder / f"body{number}.obj", body)
+        names.append(f"body{number}.obj")
+    header = ["t_s", *(f"node{node}_{axis}" for node in problem.held for axis in "xyz")]
+    places = problem.held_at(problem.times).reshape(len(problem.times), -1)
+    rows = [[f"{number:.9g}" for number in row] for row in np.column_stack([problem.times, places]).tolist()]
+    write_text(folder / "held.csv", "\n".join(",".join(row) for row in [header, *rows]) + "\n")
+    return [*names, "held.csv"], []
+
+
+_WRITERS: dict[Target, Callable[[ExportedCloth, Path, list[str]], tuple[list[str], list[str]]]] = {
+    "mujoco": _mujoco,
+    "newton": _newton,
+    "isaac": _isaac,
+    "arcsim": _arcsim,
+    "obj": _obj,
+}
+
+
+def _head(cloth: ExportedCloth, target: Target) -> str:
+    return (
+        f"{cloth.problem.name}: a cloth fitted to a recording, written by diffcloud {__version__} for "
+        f"{WRITTEN_FOR[target]}. Units: m, kg, s; z points up."
+    )

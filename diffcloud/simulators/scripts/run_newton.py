@@ -1,0 +1,154 @@
+"""Run the cloth of cloth.npz in Newton by vertex block descent (VBD), its held nodes moved as they were recorded.
+
+    pip install newton==1.8.0 warp-lang==1.19.0 numpy
+    python run_newton.py              writes nodes.npz: nodes [T, V, 3] [m] at times [T] [s]
+
+To put the cloth into a model of your own, call `add_cloth` with your builder before anything else that has
+particles, then its `color(include_bending=True)`, `finish_cloth` with the finalized model, and move the held nodes in every
+step as `frames` does.
+"""
+
+import argparse
+from pathlib import Path
+
+import newton
+import numpy as np
+import warp
+
+CONTACT_STIFFNESS = 100.0
+"""[N/m] A node of a light towel sinks in by 0.03 mm."""
+CONTACT_DAMPING = 0.02
+"""[N·s/m] Of the explicit solver, whose nodes bounce without."""
+FRICTION_GAIN = 10.0
+"""[N·s/m] Of the explicit solver: a node that sticks creeps by less than 0.1 mm/s."""
+STICKING_SPEED = 1e-3
+"""[m/s] Of VBD."""
+
+
+def add_cloth(builder, cloth, explicit=False):
+    """The cloth, its table, and the bodies that it meets.
+
+    Args:
+        cloth: what cloth.npz holds.
+        explicit: for the explicit solver, whose elasticity has other constants than that of VBD.
+    """
+    shear, lateral, damping = (float(cloth[name]) for name in ("shear", "lateral", "damping"))
+    builder.add_cloth_mesh(
+        pos=warp.vec3(0.0),
+        rot=warp.quat_identity(),
+        scale=1.0,
+        vel=warp.vec3(0.0),
+        vertices=[warp.vec3(*map(float, node)) for node in cloth["nodes"]],
+        indices=cloth["faces"].ravel().tolist(),
+        density=float(cloth["density"]),
+        tri_ke=shear,
+        # the explicit solver's λ is that of its energy, VBD's that of small strains
+        tri_ka=lateral + (shear if explicit else 0.0),
+        # VBD multiplies rates of FᵀF = 2 E + 1; the explicit solver those of F, which resists rigid rotation too
+        tri_kd=shear * damping * (2.0 if explicit else 0.5),
+        tri_drag=0.0,
+        tri_lift=0.0,
+        edge_ke=1.0,
+        edge_kd=0.0,
+        particle_radius=float(cloth["radius"]),
+    )
+    for node in cloth["held"].tolist():
+        builder.particle_mass[node] = 0.0
+        builder.particle_flags[node] = int(builder.particle_flags[node]) & ~int(newton.ParticleFlags.ACTIVE)
+    surface = newton.ModelBuilder.ShapeConfig(
+        mu=float(cloth["friction"]), ke=CONTACT_STIFFNESS, kd=CONTACT_DAMPING if explicit else 0.0, kf=FRICTION_GAIN
+    )
+    if np.isfinite(cloth["table"]):
+        builder.add_ground_plane(height=float(cloth["table"]), cfg=surface)
+    if len(cloth["body_faces"]):
+        mesh = newton.Mesh(cloth["body_nodes"], cloth["body_faces"].ravel(), compute_inertia=False)
+        builder.add_shape_mesh(-1, mesh=mesh, cfg=surface)
+
+
+def finish_cloth(model, cloth, explicit=False):
+    """What a builder does not take: friction of the cloth, and the bending stiffness of each edge.
+
+    An edge's energy is K θ²/2: VBD has k l θ²/2, so k = K/l; the explicit solver pushes with k l² θ where the gradient of θ
+    asks for K θ/height, so k = K/(l (a0 + a1)) where both faces have one size.
+    """
+    model.particle_grid = None  # nodes do not repel each other as balls
+    model.soft_contact_mu, model.soft_contact_ke = float(cloth["friction"]), CONTACT_STIFFNESS
+    model.soft_contact_kd, model.soft_contact_kf = CONTACT_DAMPING if explicit else 0.0, FRICTION_GAIN
+    stiffness = cloth["hinge_stiffness"] / (cloth["hinge_length"] * (cloth["hinge_area"] if explicit else 1.0))
+    rows = {frozenset(pair): row for row, pair in enumerate(cloth["hinge_edges"].tolist())}
+    bending = np.zeros((model.edge_count, 2), dtype=np.float32)
+    for edge, pair in enumerate(model.edge_indices.numpy()[:, 2:].tolist()):
+        if frozenset(pair) in rows:  # else at the boundary
+            bending[edge] = stiffness[rows[frozenset(pair)]] * np.array([1.0, cloth["damping"]])
+    model.edge_bending_properties.assign(bending)
+
+
+def build(cloth, explicit=False, gradient=False):
+    """The cloth alone as a model, on the CPU."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -float(cloth["gravity"])))
+    add_cloth(builder, cloth, explicit)
+    if not explicit:
+        builder.color(include_bending=True)
+    model = builder.finalize(device="cpu", requires_grad=gradient)
+    finish_cloth(model, cloth, explicit)
+    return model
+
+
+def solver_of(model, cloth, explicit=False, iterations=10):
+    if explicit:
+        return newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False)
+    return newton.solvers.SolverVBD(
+        model,
+        iterations=iterations,
+        friction_epsilon=STICKING_SPEED,
+        particle_enable_self_contact=bool(cloth["self_contact"]),
+        particle_self_contact_radius=2 * float(cloth["radius"]),
+        particle_self_contact_margin=2.5 * float(cloth["radius"]),
+    )
+
+
+def frames(model, solver, cloth, wanted, step, every):
+    """Yields [V, 3] nodes [m] at the start and after every so many steps.
+
+    Args:
+        wanted: [S + 1, K, 3] where the held nodes are before and after each step [m].
+        step: [s]
+    """
+    now, after, control = model.state(), model.state(), model.control()
+    touches = np.isfinite(cloth["table"]) or len(cloth["body_faces"])
+    contacts = model.contacts() if touches else None
+    held, slowed = cloth["held"], 1 - float(cloth["settling"]) * step
+    yield np.array(cloth["nodes"])
+    for number in range(1, len(wanted)):
+        now.clear_forces()
+        now.particle_q.numpy()[held] = wanted[number]  # on the CPU this is the array itself
+        now.particle_qd.numpy()[:] *= slowed
+        if contacts is not None:
+            model.collide(now, contacts)
+        solver.step(now, after, control, contacts, step)
+        now, after = after, now
+        if number % every == 0:
+            yield now.particle_q.numpy().astype(np.float64)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--step", type=float, default=1 / 1200, help="[s]; the shorter, the better VBD converges")
+    parser.add_argument("--iterations", type=int, default=10, help="VBD sweeps per step")
+    parser.add_argument("--out", type=Path, default=Path("nodes.npz"), help="where to write the nodes")
+    chosen = parser.parse_args()
+    with np.load(Path(__file__).resolve().parent / "cloth.npz") as told:
+        cloth = dict(told)
+    times, keys, motion = cloth["times"], cloth["motion_times"], cloth["motion"]
+    every = max(1, round((times[1] - times[0]) / chosen.step))
+    step = (times[1] - times[0]) / every
+    steps = np.arange(every * (len(times) - 1) + 1) * step
+    wanted = [[np.interp(steps, keys, motion[:, k, axis]) for axis in range(3)] for k in range(motion.shape[1])]
+    model = build(cloth)
+    solver = solver_of(model, cloth, iterations=chosen.iterations)
+    nodes = list(frames(model, solver, cloth, np.array(wanted).transpose(2, 0, 1), step, every))
+    np.savez(chosen.out, nodes=np.array(nodes), times=times)
+
+
+if __name__ == "__main__":
+    main()
