@@ -68,7 +68,7 @@ class FakeArm:
         self._velocity, self._wanted = np.zeros(3), np.zeros(3)
         self._turning, self._wanted_turning = np.zeros(7), np.zeros(7)
         self._time = time.monotonic()
-        self._lock = threading.RLock()
+        self._lock, self._linking = threading.RLock(), threading.Lock()
         self._tcp = socket.create_server(("127.0.0.1", 0))
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._udp.bind(("127.0.0.1", 0))
@@ -88,7 +88,8 @@ class FakeArm:
 
     def cut(self) -> None:
         """End all links: the other side is told, and no answer comes from now on."""
-        self._open = False
+        with self._linking:
+            self._open = False
         for link in [*self._links, self._tcp]:
             with suppress(OSError):
                 link.shutdown(socket.SHUT_RDWR)
@@ -167,7 +168,11 @@ class FakeArm:
                 link, _ = self._tcp.accept()
             except OSError:
                 return
-            self._links.append(link)
+            with self._linking:  # a link that comes while `cut` ends the others would be nobody's to close
+                if not self._open:
+                    link.close()
+                    return
+                self._links.append(link)
             threading.Thread(target=self._serve, args=(link,), daemon=True).start()
 
     def _serve(self, link: socket.socket) -> None:
