@@ -10,10 +10,26 @@ distance backwards, or `_AHEAD_S` forwards, go unnoticed.
 
 from __future__ import annotations
 
+import time
+
 from diffcloud.errors import HardwareError
 
 _AHEAD_S = 0.05
 """A stamp may lie this far after the frame's arrival: drivers estimate the camera's clock, and the estimate wavers."""
+
+
+def monotonic_of_day(readings: int = 5) -> float:
+    """What is added to the time of day to make it `time.monotonic()` [s], now.
+
+    Of several pairs of readings the closest counts: a thread that is suspended between both clocks, by another one or by
+    the system, would put milliseconds between the camera's times and the arm's.
+    """
+
+    def one() -> tuple[float, float]:
+        before, day, after = time.monotonic(), time.time(), time.monotonic()
+        return after - before, (before + after) / 2 - day
+
+    return min(one() for _ in range(readings))[1]
 
 
 class FrameTimes:

@@ -19,7 +19,7 @@ import numpy as np
 
 from diffcloud.errors import HardwareError
 from diffcloud.hardware.devices import CameraFrame
-from diffcloud.hardware.frame_times import FrameTimes
+from diffcloud.hardware.frame_times import FrameTimes, monotonic_of_day
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.libusb import load_libusb
 from diffcloud.io.raw_episodes import CameraInfo
@@ -174,7 +174,7 @@ class RealSenseCamera:
                 f"{self.name} ({self.serial})", 1 / self._fps, longest_s=_QUEUED_PAIRS / self._fps + _LONGEST_WAY_S
             )
             if depth.get_frame_timestamp_domain() != import_realsense().timestamp_domain.hardware_clock:
-                self._times.tie(time.monotonic() - time.time())
+                self._times.tie(monotonic_of_day())
         t = self._times.monotonic(depth.get_frame_number(), frame.time_s, arrival_s)
         return CameraFrame(t, frame.depth, frame.color)
 

@@ -7,6 +7,8 @@ import time
 
 import numpy as np
 
+from diffcloud.hardware.frame_times import monotonic_of_day
+
 WIDTH, HEIGHT, FPS = 424, 240, 60
 FX, FY, CX, CY = 256.0, 256.0, 212.0, 120.0
 _LEAD_S = 0.25
@@ -121,7 +123,7 @@ class Cameras:
                 number = self.pushed + 1
                 self._ending.wait(max(start + number * self._interval - time.monotonic(), 0.001))
                 # what the driver's clock says at that moment, which is the time of day
-                stamp = start + number * self._interval - time.monotonic() + time.time()
+                stamp = start + number * self._interval - monotonic_of_day()
                 for index, camera in enumerate(self.cameras):
                     if index == 0 or dies_after is None or number <= dies_after:
                         camera.push_numbered(number, 1000 * stamp)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from diffcloud.errors import HardwareError
-from diffcloud.hardware.frame_times import FrameTimes
+from diffcloud.hardware.frame_times import FrameTimes, monotonic_of_day
 
 PERIOD = 1 / 30
 WAY = 0.03
@@ -27,6 +27,19 @@ def regular(count=60):
 
 def true(frames):
     return np.array([t for _, t in frames])
+
+
+def test_a_suspension_between_both_clocks_moves_nothing(monkeypatch):
+    """Time passes only where it is read, and once, for 4 ms, between the readings of the two clocks."""
+    now, naps = [100.0], iter([0.0, 0.004, 0.0, 0.0, 0.0])
+
+    def day():
+        now[0] += next(naps)
+        return now[0] + 1e9
+
+    monkeypatch.setattr("diffcloud.hardware.frame_times.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("diffcloud.hardware.frame_times.time.time", day)
+    assert monotonic_of_day() == pytest.approx(-1e9, abs=1e-6)
 
 
 def test_a_clock_that_nobody_sets_is_believed():
