@@ -32,6 +32,7 @@ COMMANDS = {
     "report": "pipeline.report:report",
     "identify": "pipeline.identify:identify",
     "export": "pipeline.export:export",
+    "view": "pipeline.view:view",
     "rollout": "pipeline.rollout:rollout",
     "visibility": "pipeline.visibility:visibility",
     "gradients": "pipeline.gradients:gradients",

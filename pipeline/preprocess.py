@@ -50,7 +50,7 @@ def preprocess(
     sources = _sources(recorded, config.scenarios)
     calibrated = None if calibration is None else read_calibration(calibration)
     if any(path.is_dir() for _, path in sources):
-        _mask(settings.raw)  # a robot that cannot be read must not cost an episode's time
+        robot_mask(settings.raw)  # a robot that cannot be read must not cost an episode's time
     jobs = [PreprocessJob(scenario, path, out, settings, calibrated) for scenario, path in sources]
     kept: dict[str, Any] = {}
     failures: list[str] = []
@@ -96,7 +96,7 @@ class PreprocessJob:
                 pictures = _Pictures(read_raw_episode(self.path))
                 episode = fuse(
                     pictures.raw,
-                    _mask(self.settings.raw),
+                    robot_mask(self.settings.raw),
                     self.settings.raw.fusion(),
                     calibration=self.calibration,
                     tell=lambda _, text: tell(0.0, text),
@@ -152,7 +152,8 @@ def _stem(path: Path) -> str:
 
 
 @cache
-def _mask(raw: RawConfig) -> RobotMask | None:
+def robot_mask(raw: RawConfig) -> RobotMask | None:
+    """Of the robot that the settings name; None where they name none."""
     if raw.robot is None:
         return None
     robot = gen3() if raw.robot == "gen3" else Robot.from_urdf(Path(raw.robot))

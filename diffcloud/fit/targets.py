@@ -90,7 +90,7 @@ def read_target(
         clouds,
         tuple(_sure(episode, frame) for frame in frames),
         height,
-        None if whole else _viewpoints(episode),
+        None if whole or not episode.viewpoints else torch.from_numpy(np.stack(list(episode.viewpoints.values()))),
         PoseSpace.build(nuisance, centre, length_unit_m=unit),
         track,
     )
@@ -142,23 +142,6 @@ def _usable(scenario: Scenario, system: System, episode: Episode, track: Tensor 
 def _found_cut(system: System, episode: Episode, unit: float) -> float | None:
     low = float(np.quantile(episode.points[:, 2], _LOWEST))
     return low if low > system.mesh.nodes[:, 2].min() + _CUT_M / unit else None
-
-
-def _viewpoints(episode: Episode) -> Tensor | None:
-    """
-    Raises:
-        EpisodeError: `viewpoints` of the meta are no finite positions.
-    """
-    told = episode.meta.get("viewpoints")
-    if not told:
-        return None
-    try:
-        found = np.array(list(told.values()), dtype=np.float64)
-    except (AttributeError, TypeError, ValueError):
-        found = np.empty(0)
-    if found.ndim != 2 or found.shape[1] != 3 or not np.isfinite(found).all():
-        raise EpisodeError(f"viewpoints of an episode's meta are camera -> [x, y, z], finite, got {told!r}.")
-    return torch.from_numpy(found)
 
 
 def _sure(episode: Episode, frame: int) -> Tensor:

@@ -91,6 +91,22 @@ class Episode:
     def frame_count(self) -> int:
         return len(self.times)
 
+    @property
+    def viewpoints(self) -> dict[str, NDArray[np.float64]]:
+        """Camera -> [3] where it stood; empty where that is not known.
+
+        Raises:
+            EpisodeError: `viewpoints` of the meta are no finite positions.
+        """
+        told = self.meta.get("viewpoints") or {}
+        try:
+            found = {str(name): np.array(place, dtype=np.float64) for name, place in told.items()}
+        except (AttributeError, TypeError, ValueError):
+            found = {"": np.empty(0)}
+        if not all(place.shape == (3,) and np.isfinite(place).all() for place in found.values()):
+            raise EpisodeError(f"viewpoints of an episode's meta are camera -> [x, y, z], finite, got {told!r}.")
+        return found
+
     def frame(self, index: int) -> NDArray[np.float32]:
         """[N, 3] points of one frame; negative indices count from the end.
 

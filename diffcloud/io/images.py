@@ -132,6 +132,17 @@ def check_png(data: bytes, name: str) -> None:
     raise EpisodeError(f"{name} is truncated ({len(data)} bytes); its end is missing. Drop the frame or copy it again.")
 
 
+def encode_jpeg(color: NDArray[np.uint8], *, width: int) -> bytes:
+    """Colour [H, W, 3] (red, green, blue) as a JPEG at most so wide, for a page to show."""
+    import cv2
+
+    if color.shape[1] > width:
+        height = round(color.shape[0] * width / color.shape[1])
+        color = np.asarray(cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(color[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 75])
+    return data.tobytes()
+
+
 def _bytes(path: Path) -> bytes:
     try:
         return Path(path).read_bytes()

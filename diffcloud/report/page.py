@@ -1,8 +1,4 @@
-"""Build the report page. All data and scripts are inside it: no request leaves the page.
-
-Texts are escaped by the templates, whatever an episode is called; data for the scripts are JSON that cannot end or confuse
-the script element it stands in.
-"""
+"""Build the report page."""
 
 from __future__ import annotations
 
@@ -11,9 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
-from numpy.typing import NDArray
 
 from diffcloud.evaluation.intervals import Intervals
 from diffcloud.fit.record import FitRecord, FittedParameter, RecordingFit
@@ -26,13 +19,13 @@ from diffcloud.report.comparison import (
     comparison_pictures,
     comparison_sections,
 )
+from diffcloud.report.overlay import Overlay, fitted_layers, recorded_layers
 from diffcloud.report.poses import poses_table
 from diffcloud.report.recordings import recordings_pictures, recordings_table
 from diffcloud.report.regressors import TrainingEntry, errors_table, predictions_table, training_data
+from diffcloud.report.rendering import render
 from diffcloud.report.tables import Cell, Table, number, table
 from diffcloud.report.uncertainty import intervals_table
-
-_DECIMALS = 4
 
 
 @dataclass(frozen=True)
@@ -82,20 +75,11 @@ def build_page(
         intervals: of a fit to all entries together.
         seed: of the choice of shown points.
     """
-    from plotly.offline import get_plotlyjs
-
     rng = np.random.default_rng(seed)
     fitted_mm = {(entry.scenario, entry.name): entry.row["rms_mm"] for entry in entries}
     missing = comparison_failures(comparison) if comparison else []
-    engine = Environment(
-        loader=PackageLoader("diffcloud.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    engine.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
-    return engine.get_template("page.html").render(
+    return render(
+        "page.html",
         title=title,
         summary=_summary(entries),
         findings=findings,
@@ -112,9 +96,9 @@ def build_page(
         recordings=recordings_table(entries),
         photographs=recordings_pictures(entries),
         environment=environment,
-        episodes=[_entry_data(entry, overlay_points, rng) for entry in entries],
+        overlays=[_overlay(entry, overlay_points, rng).data() for entry in entries],
+        episodes=[_losses(entry) for entry in entries],
         trainings=training_data(trainings),
-        plotly=Markup(get_plotlyjs()),
     )
 
 
@@ -131,38 +115,18 @@ class _Summary:
     """Median factor by which the fits miss it, less one."""
 
 
-def _entry_data(entry: EpisodeEntry, overlay_points: int, rng: np.random.Generator) -> dict[str, Any]:
-    frames = []
-    for index, time in enumerate(entry.episode.times):
-        if time > entry.motion.times[-1] + 1e-6:
-            break
-        cloud = entry.episode.frame(index)
-        if len(cloud) > overlay_points:
-            cloud = cloud[np.sort(rng.choice(len(cloud), overlay_points, replace=False))]
-        state = int(np.abs(entry.motion.times - time).argmin())
-        frames.append(
-            {
-                "time": round(float(time), 3),
-                "target": _axes(cloud),
-                "fitted": _axes(entry.motion.nodes[state]),
-                "start": _axes(entry.motion.start_nodes[state]),
-            }
-        )
+def _overlay(entry: EpisodeEntry, points: int, rng: np.random.Generator) -> Overlay:
+    """The frames that were simulated."""
+    end = entry.motion.times[-1] + 1e-6
+    frames = [frame for frame, time in enumerate(entry.episode.times) if time <= end]
+    times = entry.episode.times[frames]
+    layers = recorded_layers(entry.episode, frames, points=points, rng=rng) + fitted_layers(entry.motion, times)
+    return Overlay(f"{entry.scenario} / {entry.name}", frames, times, layers, min(entry.last_frame, len(frames) - 1))
+
+
+def _losses(entry: EpisodeEntry) -> dict[str, Any]:
     best = np.minimum.accumulate([min(v for v in row if v is not None) for row in entry.fit.history.loss])
-    return {
-        "name": f"{entry.scenario} / {entry.name}",
-        "frames": frames,
-        "faces": entry.motion.faces.T.tolist(),
-        "bodies": {"nodes": _axes(entry.motion.bodies.nodes), "faces": entry.motion.bodies.faces.T.tolist()},
-        "lossFrame": min(entry.last_frame, len(frames) - 1),
-        "loss": [float(f"{value:.4g}") for value in best],
-    }
-
-
-def _axes(points: NDArray[Any]) -> list[list[float]]:
-    """[N, 3] -> three lists, rounded to a tenth of a millimetre to keep the page small."""
-    columns: list[list[float]] = np.round(points.T.astype(np.float64), _DECIMALS).tolist()
-    return columns
+    return {"name": f"{entry.scenario} / {entry.name}", "loss": [float(f"{value:.4g}") for value in best]}
 
 
 def _summary(entries: Sequence[EpisodeEntry]) -> _Summary:

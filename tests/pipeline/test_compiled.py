@@ -35,7 +35,7 @@ def run(tmp_path):
 
 @pytest.mark.slow  # starts a process for each kind of kernel
 def test_doctor_compiles_what_is_missing(run, tmp_path):
-    """In a cache that holds all but a part of the nearest neighbours: where the tests have not run before, this compiles everything."""
+    """In a cache without a part of the nearest neighbours. Where the tests have not run before, everything is compiled."""
 
     def doctor(*options):
         done = run(*DIFFCLOUD, "doctor", "--json", *options)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +82,34 @@ def test_measured_against_the_truth_and_reported(work):
     page = (work / "reports" / "index.html").read_text(encoding="utf-8")
     assert page.count("<figure><figcaption>small_hidden1") == 2
     assert "overhead" in page
+
+
+def test_a_look_at_the_raw_recording_its_clouds_and_a_fit(work):
+    raw, episode = "recorded/small/small_hidden1", "episodes/small/small_hidden1.npz"
+    done = invoke("view", raw, "--params", "params.yaml", "--out", "raw.html", "--scenario", "small")
+    assert done.result["episodes"] == 1
+    page = (work / "raw.html").read_text(encoding="utf-8")
+    assert page.count('"name":"recorded, overhead"') == page.count('"name":"cloth, basis material"') == 1
+    assert len(re.findall(r'"/9j/[A-Za-z0-9+/=]{1000,}"', page)) == 4  # a JPEG a frame
+    invoke("fit", episode, "--scenario", "small", "--params", "params.yaml", "--out", "seen")
+    invoke("view", episode, "--fit", "seen/small_hidden1.json", "--out", "fitted")
+    page = (work / "fitted.html").read_text(encoding="utf-8")
+    for name in ("fitted", "start of the fit", "fitted, where the scene has it", "table", "cameras", "gripper"):
+        assert f'"name":"{name}"' in page
+    invoke("view", episode, "--frames", 2, "--points", 7, "--out", "few.html")
+    assert '"numbers":[0,3]' in (work / "few.html").read_text(encoding="utf-8")
+
+
+def test_a_look_with_what_does_not_belong_to_it(work):
+    raw, episode = work / "recorded" / "small" / "small_hidden1", work / "episodes" / "small" / "small_hidden1.npz"
+    invoke("fit", episode, "--scenario", "small", "--params", "params.yaml", "--out", "seen")
+    shutil.copy(episode, work / "other.npz")
+    told = invoke("view", "other.npz", "--fit", "seen/small_hidden1.json", "--out", "o.html", code=1).errors
+    assert "other is not among the recordings" in told
+    assert "small_hidden1" in told
+    assert "No such episode" in invoke("view", "nothing.npz", "--out", "o.html", code=1).errors
+    assert "episode.json" in invoke("view", raw.parent, "--out", "o.html", code=1).errors
+    assert not (work / "o.html").exists()
 
 
 def test_again_replaces_only_what_is_synthetic(work):

@@ -1,0 +1,149 @@
+"""What the pages draw in three dimensions: recorded clouds, simulated cloth and what stands around it, over time."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.fit.result import FittedMotion
+from diffcloud.io.episodes import ONLY_GRIPPER, Episode
+from diffcloud.mesh.topology import SurfaceMesh
+
+_DECIMALS = 4
+"""A tenth of a millimetre, to keep the page small."""
+_COLOURS = ("target", "second", "third", "fourth")
+"""Of the cameras: variables of the page's style."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One thing that is drawn, with a box to hide it. Layers of one name share the box."""
+
+    name: str
+    kind: Literal["points", "mesh", "line", "marks"]
+    frames: Sequence[NDArray[Any]] | NDArray[Any]
+    """[N, 3] in each frame; a single one stands still."""
+    color: str
+    """Variable of the page's style."""
+    faces: NDArray[np.int64] | None = None
+    """[F, 3] of a mesh."""
+    opacity: float = 0.75
+    """Of a mesh."""
+    labels: tuple[str, ...] = ()
+    """Of marks."""
+    shown: bool = True
+    """Whether it is, before anybody chooses."""
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """One episode as it is drawn."""
+
+    name: str
+    numbers: Sequence[int]
+    """[T] of the frames in the recording."""
+    times: NDArray[np.float64]
+    """[T] [s]"""
+    layers: Sequence[Layer]
+    opens: int = 0
+    """Frame that is shown first."""
+    photographs: Sequence[bytes] = ()
+    """A JPEG for each frame; none where there are no images."""
+
+    def data(self) -> dict[str, Any]:
+        """As the page's script takes it."""
+        return {
+            "name": self.name,
+            "numbers": [int(number) for number in self.numbers],
+            "times": [round(float(time), 3) for time in self.times],
+            "opens": self.opens,
+            "layers": [
+                {
+                    "name": layer.name,
+                    "kind": layer.kind,
+                    "color": layer.color,
+                    "opacity": layer.opacity,
+                    "labels": list(layer.labels),
+                    "shown": layer.shown,
+                    "faces": None if layer.faces is None else layer.faces.T.tolist(),
+                    "frames": [_axes(frame) for frame in layer.frames],
+                }
+                for layer in self.layers
+            ],
+            "photographs": [base64.b64encode(jpeg).decode() for jpeg in self.photographs],
+        }
+
+
+def recorded_layers(episode: Episode, frames: Sequence[int], *, points: int, rng: np.random.Generator) -> list[Layer]:
+    """Clouds, one layer for each camera where points name theirs; the grippers, their paths, and the cameras' places.
+
+    Args:
+        frames: that are drawn.
+        points: of a cloud, at most.
+        rng: of their choice.
+    """
+    kept = [_few(int(size), points, rng) for size in np.diff(episode.offsets)[list(frames)]]
+    chosen = [index + episode.offsets[frame] for index, frame in zip(kept, frames, strict=True)]
+    names = episode.meta.get("cameras")
+    if episode.camera is None or not isinstance(names, list) or len(names) <= int(episode.camera.max()):
+        layers = [Layer("recorded", "points", [episode.points[index] for index in chosen], _COLOURS[0])]
+    else:
+        seen = [(episode.points[index], episode.camera[index]) for index in chosen]
+        layers = [
+            Layer(
+                f"recorded, {name}",
+                "points",
+                [cloud[camera == number] for cloud, camera in seen],
+                _COLOURS[number % len(_COLOURS)],
+            )
+            for number, name in enumerate(names)
+        ]
+    if episode.gripper is not None:
+        alone = episode.grippers == ONLY_GRIPPER
+        places = [episode.gripper[frame] for frame in frames]
+        layers.append(Layer("gripper", "marks", places, "held", labels=("",) if alone else episode.grippers))
+        layers += [Layer("gripper", "line", [track], "held") for track in np.moveaxis(episode.gripper, 1, 0)]
+    if viewpoints := episode.viewpoints:
+        standing = np.stack(list(viewpoints.values()))
+        layers.append(Layer("cameras", "marks", [standing], "soft", labels=tuple(viewpoints), shown=False))
+    return layers
+
+
+def fitted_layers(motion: FittedMotion, times: NDArray[np.float64]) -> list[Layer]:
+    """The fitted cloth, the one that the fit started from, and the bodies around it.
+
+    Args:
+        times: [T] of the frames that are drawn [s].
+    """
+    states = states_at(motion.times, times)
+    layers = [
+        Layer("fitted", "mesh", motion.nodes[states], "fitted", motion.faces),
+        Layer("start of the fit", "mesh", motion.start_nodes[states], "start", motion.faces, 0.45, shown=False),
+    ]
+    return [*layers, *body_layers(motion.bodies)]
+
+
+def body_layers(bodies: SurfaceMesh) -> list[Layer]:
+    """What stands around the cloth, if anything does."""
+    return [Layer("around", "mesh", [bodies.nodes], "soft", bodies.faces, 0.5)] if len(bodies.faces) else []
+
+
+def states_at(times: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.int64]:
+    """[W] indices of the simulated times [T] that are nearest to the wanted ones."""
+    return np.abs(times - np.asarray(wanted)[:, None]).argmin(axis=1)
+
+
+def _few(count: int, most: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Sorted indices of at most so many of `count` points."""
+    return np.arange(count) if count <= most else np.sort(rng.choice(count, most, replace=False))
+
+
+def _axes(points: NDArray[Any]) -> list[list[float]]:
+    """[N, 3] -> three lists."""
+    columns: list[list[float]] = np.round(points.T.astype(np.float64), _DECIMALS).tolist()
+    return columns

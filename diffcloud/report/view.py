@@ -1,0 +1,82 @@
+"""A page to look at episodes before and after a fit: clouds, cloth, gripper, table and cameras over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from diffcloud.fit.record import RecordingFit
+from diffcloud.fit.result import FittedMotion, recorded_pose
+from diffcloud.fit.targets import track_displacement
+from diffcloud.io.episodes import Episode
+from diffcloud.mesh.topology import SurfaceMesh
+from diffcloud.report.overlay import Layer, Overlay, body_layers, states_at
+from diffcloud.report.rendering import render
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.simulate import rollout
+
+_BESIDE = 0.25
+"""The table is drawn beyond the cloth by this part of its size: it has no end."""
+
+
+def build_view(overlays: Sequence[Overlay], *, title: str, note: str, facts: Sequence[tuple[str, str]]) -> str:
+    """The page as HTML text.
+
+    Args:
+        note: a sentence or two on what is shown.
+        facts: lines of the table below, name and value.
+    """
+    return render("view.html", title=title, note=note, facts=facts, overlays=[one.data() for one in overlays])
+
+
+def scene_layers(scenario: Scenario, episode: Episode, times: NDArray[np.float64]) -> list[Layer]:
+    """The cloth of a scenario with its basis material, moved by the recording's gripper, and what stands around it.
+
+    Args:
+        times: [T] of the frames that are drawn [s]; after the end of the scenario the cloth stays as it is then.
+
+    Raises:
+        EpisodeError: other grippers were recorded than the scene has.
+    """
+    system, _ = scenario.scene.build()
+    track = None
+    if episode.gripper is not None:
+        moved = track_displacement(episode, system.handles.grippers, scenario.steps, system.time_step)
+        track = torch.as_tensor(moved)[None]
+    with torch.no_grad():
+        run = rollout(system, scenario.steps, track=track, drop_diverged=True)
+    states = states_at(run.times.numpy(), times)
+    nodes = run.positions[0].numpy()[states]
+    known = np.isfinite(nodes).all(axis=(1, 2))
+    shown = [frame if fine else scenario.scene.mesh.nodes for frame, fine in zip(nodes, known, strict=True)]
+    cloth = Layer("cloth, basis material", "mesh", shown, "fitted", system.mesh.faces)
+    return [cloth, *table_layers(scenario, np.concatenate(shown)), *body_layers(scenario.scene.bodies)]
+
+
+def unposed_layer(scenario: Scenario, recording: RecordingFit, motion: FittedMotion, times: NDArray[np.float64]) -> Layer:
+    """The fitted cloth where the scenario has it, before the pose of the recording was found."""
+    space, pose = recorded_pose(recording, length_unit_m=scenario.length_unit_m)
+    nodes = space.back(torch.as_tensor(motion.nodes[states_at(motion.times, times)]), pose)[0].numpy()
+    return Layer("fitted, where the scene has it", "mesh", nodes, "third", motion.faces, 0.35, shown=False)
+
+
+def table_layers(scenario: Scenario, near: NDArray[np.float64]) -> list[Layer]:
+    """The level planes of a scene, as squares around points [N, 3]."""
+    low, high = near[:, :2].min(axis=0), near[:, :2].max(axis=0)
+    margin = _BESIDE * float((high - low).max())
+    (x0, y0), (x1, y1) = low - margin, high + margin
+    layers = []
+    for obstacle in scenario.scene.surrounding.obstacles:
+        plane = obstacle.plane()
+        if plane is None or abs(plane[0][2]) < 1 - 1e-6:
+            continue
+        height = plane[1] * plane[0][2]
+        square = SurfaceMesh(
+            np.array([[x0, y0, height], [x1, y0, height], [x1, y1, height], [x0, y1, height]]),
+            np.array([[0, 1, 2], [0, 2, 3]]),
+        )
+        layers.append(Layer("table", "mesh", [square.nodes], "soft", square.faces, 0.25))
+    return layers
