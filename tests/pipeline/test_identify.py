@@ -6,6 +6,7 @@ import contextlib
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -68,6 +69,14 @@ def found(towel, tmp_path_factory):
 
 
 class TestNewUser:
+    def test_what_was_found_can_be_looked_at(self, found):
+        folder, _ = found
+        with contextlib.chdir(folder):
+            episodes = sorted(Path("found/episodes").glob("*.npz"))
+            done = invoke("view", *episodes, "--fit", "found/fit.json", "--out", "look.html")
+        assert done.result["episodes"] == len(episodes) == 2
+        assert (folder / "look.html").read_text(encoding="utf-8").count('"name":"fitted, where the scene has it"') == 2
+
     def test_the_stiffness_comes_out_in_newtons_per_metre(self, found):
         _, done = found
         told = done.result["parameters"]["stretch"]
