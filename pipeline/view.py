@@ -16,7 +16,7 @@ from diffcloud.fit.record import FitRecord, read_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import write_text
 from pipeline.config import load_config
-from pipeline.console import JsonFlag, ParamsFile, errors, finish, progress_bar, writes
+from pipeline.console import JsonFlag, ParamsFile, episode_files, errors, finish, progress_bar, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ _PHOTOGRAPH_PX = 900
 
 @writes(".html")
 def view(
-    episodes: Annotated[list[Path], typer.Argument(help="Episode files (.npz), or raw episodes.")],
+    episodes: Annotated[list[Path], typer.Argument(help="Episode files (.npz), folders of them, or raw episodes.")],
     out: Annotated[Path, typer.Option(help="HTML file.")] = Path("view.html"),
     scenario: ScenarioName = None,
     scene: SceneFile = None,
@@ -42,21 +42,23 @@ def view(
 ) -> None:
     """Look at episodes: clouds, cloth, gripper, table and cameras over time, on one page that needs no network.
 
-    A scenario, given or named by the episode, adds its cloth under the recorded gripper. A fit adds the fitted cloth,
-    before and after its pose was found. Raw episodes are made into clouds, and their images show what was masked.
+    A scenario, given or named by the episode, adds its cloth under the recorded gripper.
+    A fit adds the fitted cloth, before and after its pose was found.
+    Raw episodes are made into clouds, and their images show what was masked.
     """
     from diffcloud.report.view import build_view
 
     record = None if fit is None else read_fit(fit)
     overlays, facts = [], []
-    for path in episodes:
-        seen = _raw(path, params) if path.is_dir() else _Shown(read_episode(path), {})
+    paths = [path for given in episodes for path in ([given] if _is_raw(given) else episode_files([given]))]
+    for path in paths:
+        seen = _raw(path, params) if _is_raw(path) else _Shown(read_episode(path), {})
         chosen = _spread(seen.episode.frame_count, frames)
         layers, told = _layers(path, seen.episode, chosen, points, (scenario, scene), fit, record)
         overlays.append(_overlay(path.stem, seen, chosen, layers))
         facts += [(path.stem, line) for line in (_about(seen.episode), *told)]
     note = "Masked pixels are red, what was kept as cloth is green." if any(one.photographs for one in overlays) else ""
-    title = episodes[0].stem if len(episodes) == 1 else f"{len(episodes)} episodes"
+    title = paths[0].stem if len(paths) == 1 else f"{len(paths)} episodes"
     page = build_view(overlays, title=title, note=note, facts=facts)
     write_text(out, page)
     errors.print(f"Wrote {out} ({len(page) / 1e6:.1f} MB).", soft_wrap=True)
@@ -127,6 +129,10 @@ def _about(episode: Episode) -> str:
         f"{episode.frame_count} frames over {episode.times[-1] - episode.times[0]:.2f} s, {sizes.min()} to {sizes.max()} "
         f"points a frame, {grippers}, cameras: {cameras}"
     )
+
+
+def _is_raw(path: Path) -> bool:
+    return (path / "episode.json").is_file()
 
 
 def _raw(path: Path, params: Path | None) -> _Shown:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
-from diffcloud.io.episodes import read_episode
+from diffcloud.io.episodes import read_episode, write_episode
 from diffcloud.io.images import png_size, write_depth
 from diffcloud.sensing.recorder import read_truth
 from tests.pipeline.invoke import invoke
@@ -96,7 +97,7 @@ def test_a_look_at_the_raw_recording_its_clouds_and_a_fit(work):
     page = (work / "fitted.html").read_text(encoding="utf-8")
     for name in ("fitted", "start of the fit", "fitted, where the scene has it", "table", "cameras", "gripper"):
         assert f'"name":"{name}"' in page
-    invoke("view", episode, "--frames", 2, "--points", 7, "--out", "few.html")
+    invoke("view", "episodes/small", "--frames", 2, "--points", 7, "--out", "few.html")
     assert '"numbers":[0,3]' in (work / "few.html").read_text(encoding="utf-8")
 
 
@@ -108,8 +109,29 @@ def test_a_look_with_what_does_not_belong_to_it(work):
     assert "other is not among the recordings" in told
     assert "small_hidden1" in told
     assert "No such episode" in invoke("view", "nothing.npz", "--out", "o.html", code=1).errors
-    assert "episode.json" in invoke("view", raw.parent, "--out", "o.html", code=1).errors
+    assert "holds no episodes" in invoke("view", raw.parent, "--out", "o.html", code=1).errors
     assert not (work / "o.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("meta", "says"),
+    [
+        ({"viewpoints": {"side": [1, 2]}}, "viewpoints of an episode's meta"),
+        ({"viewpoints": "side"}, "viewpoints of an episode's meta"),
+        ({"scenario": ["lift"], "cameras": {"side": 1}}, None),
+        ({"scenario": "../../small", "cameras": [3]}, None),
+    ],
+)
+def test_a_look_at_an_episode_whose_meta_is_damaged(work, meta, says):
+    """What only names something is left out; positions that are none are refused."""
+    write_episode(work / "damaged.npz", replace(read_episode(work / "episodes" / "small" / "small_hidden1.npz"), meta=meta))
+    done = invoke("view", "damaged.npz", "--out", "damaged.html", code=0 if says is None else 1)
+    if says is None:
+        page = (work / "damaged.html").read_text(encoding="utf-8")
+        assert '"name":"recorded"' in page
+        assert "no scenario: the recording alone" in page
+    else:
+        assert says in done.errors
 
 
 def test_again_replaces_only_what_is_synthetic(work):
