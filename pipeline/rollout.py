@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -14,14 +15,14 @@ from diffcloud.fit.record import RecordingFit, read_fit
 from diffcloud.fit.result import recorded_pose
 from diffcloud.fit.targets import track_displacement
 from diffcloud.io.clouds import write_ply
-from diffcloud.io.episodes import read_episode
+from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import together, write_npz
 from diffcloud.io.obj import write_cloth, write_surface
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.sim.moved import moved_surfaces
 from diffcloud.sim.properties import check_values
 from diffcloud.sim.simulate import rollout as simulate
-from pipeline.console import JsonFlag, assignments, errors, finish, progress_bar, writes
+from pipeline.console import JsonFlag, assignments, errors, finish, progress_bar, warn, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario, limits
 
 
@@ -63,11 +64,12 @@ def rollout(
     properties = chosen.properties(
         system, {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
     )
-    track = None
+    track, warnings = None, limits(chosen)
     if episode is not None:
         recorded = read_episode(episode)
         if recorded.gripper is None:
             raise ConfigError(f"{episode} has no gripper track; leave --episode out to use the scene's own motion.")
+        warnings += _not_simulated(recorded, steps * system.time_step, chosen.scene.frame_time)
         track = torch.as_tensor(track_displacement(recorded, system.handles.grippers, steps, system.time_step))[None]
     with progress_bar("simulating", steps) as update, torch.no_grad():
         try:
@@ -114,10 +116,23 @@ def rollout(
             "nodes": nodes.shape[1],
             "parameters": values,
             "length_unit_m": chosen.length_unit_m,
-            "warnings": limits(chosen),
+            "warnings": warnings,
         },
         json,
     )
+
+
+def _not_simulated(recorded: Episode, end_s: float, frame_s: float) -> list[str]:
+    """Warn of what a recording shows after the end of the simulation."""
+    within = int((recorded.times <= end_s + 0.5 * frame_s).sum())
+    if within == recorded.frame_count:
+        return []
+    message = (
+        f"{within} of the recording's {recorded.frame_count} frames lie within the {end_s:.3g} s that are simulated; "
+        f"--frames {math.ceil(recorded.times[-1] / frame_s - 1e-6)} covers all."
+    )
+    warn(message)
+    return [message]
 
 
 def _recording(known: Sequence[RecordingFit], scenario: str, episode: Path | None) -> RecordingFit | None:

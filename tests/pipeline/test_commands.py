@@ -322,6 +322,12 @@ def test_two_grippers_from_csv_to_report(work):
     with np.load(work / "again.npz") as again:
         np.testing.assert_allclose(again["nodes"][:, [20, 24]], nodes[:, [20, 24]], atol=1e-6)
         np.testing.assert_allclose(again["nodes"], nodes, atol=5e-3)
+    short = ("rollout", "--scenario", "still", "--episode", episode, "--frames", 2, "--out", "short.npz")
+    done = run(*short, cwd=work)
+    assert f"3 of the recording's {len(times)} frames lie within the" in done.errors
+    assert done.result["warnings"]
+    assert f"--frames {len(times) - 1} covers all" in done.errors
+    assert "of the recording's" not in run(*short, "--frames", len(times) - 1, cwd=work).errors
     (work / "params.yaml").write_text(
         yaml.safe_dump({"scenarios": ["still"], "fit": {"iterations": 2}, "evaluate": {"draws": 1}})
     )
