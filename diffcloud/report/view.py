@@ -12,7 +12,7 @@ from diffcloud.fit.record import RecordingFit
 from diffcloud.fit.result import FittedMotion, recorded_pose
 from diffcloud.fit.targets import track_displacement
 from diffcloud.io.episodes import Episode
-from diffcloud.mesh.topology import SurfaceMesh
+from diffcloud.mesh.shapes import rectangle_surface
 from diffcloud.report.overlay import Layer, Overlay, body_layers, states_at
 from diffcloud.report.rendering import render
 from diffcloud.scene.scenarios import Scenario
@@ -64,19 +64,14 @@ def unposed_layer(scenario: Scenario, recording: RecordingFit, motion: FittedMot
 
 
 def table_layers(scenario: Scenario, near: NDArray[np.float64]) -> list[Layer]:
-    """The level planes of a scene, as squares around points [N, 3]."""
+    """The level planes of a scene, as rectangles around points [N, 3]."""
     low, high = near[:, :2].min(axis=0), near[:, :2].max(axis=0)
     margin = _BESIDE * float((high - low).max())
-    (x0, y0), (x1, y1) = low - margin, high + margin
     layers = []
     for obstacle in scenario.scene.surrounding.obstacles:
         plane = obstacle.plane()
         if plane is None or abs(plane[0][2]) < 1 - 1e-6:
             continue
-        height = plane[1] * plane[0][2]
-        square = SurfaceMesh(
-            np.array([[x0, y0, height], [x1, y0, height], [x1, y1, height], [x0, y1, height]]),
-            np.array([[0, 1, 2], [0, 2, 3]]),
-        )
+        square = rectangle_surface(0.5 * (low + high), 0.5 * (high - low) + margin, plane[1] * plane[0][2])
         layers.append(Layer("table", "mesh", [square.nodes], "soft", square.faces, 0.25))
     return layers

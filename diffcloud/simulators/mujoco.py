@@ -19,9 +19,9 @@ from diffcloud.simulators.problem import REST_HEIGHT, Problem, Sheet, Track
 
 _HOLDING_MASS = 1e3
 """[kg] Of a held node: what is prescribed to it stays so within a step."""
-
 _SHORTEST, _LONGEST = 2e-5, 5e-4
-"""[s] Steps of an exported cloth: damping that would need shorter ones is reduced; longer ones are bad for\ncontact."""
+"""[s] Steps of an exported cloth: damping that would need shorter ones is reduced; longer ones are bad for
+contact."""
 
 
 @dataclass(frozen=True)
