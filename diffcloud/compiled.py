@@ -20,6 +20,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -34,6 +35,7 @@ from numba.core import event
 from platformdirs import user_cache_path
 
 from diffcloud.errors import DiffCloudError
+from diffcloud.linked import LinkedKernel
 
 UNCOMPILED = os.environ.get("DIFFCLOUD_UNCOMPILED", "") not in ("", "0")
 _PACKAGE = Path(__file__).parent
@@ -52,18 +54,15 @@ def kernel_sources(package: Path = _PACKAGE) -> Iterator[Path]:
     """The files whose change compiles again: those that hold kernels, and those that kernels are generated from."""
     for source in sorted(package.rglob("*.py")):
         text = b"\n" + source.read_bytes()
-        if (
-            b"\n@kernel\n" in text
-            or b"\n@inlined\n" in text
-            or b"sim.compiled" in text
-            or source.parent == package / "sim" / "compiled"
-        ):
+        if b"\n@kernel\n" in text or b"sim.compiled" in text or source.parent == package / "sim" / "compiled":
             yield source
 
 
 def fingerprint(package: Path = _PACKAGE) -> str:
-    """16 hexadecimal digits of the compiler's versions, this file, and the kernels' sources."""
-    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode() + Path(__file__).read_bytes())
+    """16 hexadecimal digits of the compiler's versions, what drives it, and the kernels' sources."""
+    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
+    for driver in ("compiled.py", "linked.py"):
+        digest.update((_PACKAGE / driver).read_bytes())
     for source in kernel_sources(package):
         digest.update(source.relative_to(package).as_posix().encode())
         digest.update(source.read_bytes())
@@ -116,53 +115,58 @@ def kernel(function: F) -> F:
     config: Any = numba.config
     given, config.CACHE_DIR = config.CACHE_DIR, str(cache_folder())  # of other people's functions, and of this
     try:
-        return cast(F, numba.njit(cache=True, **_OPTIONS)(function))
+        return cast(F, LinkedKernel(function, **_OPTIONS))
     finally:
         config.CACHE_DIR = given
-
-
-def inlined(function: F) -> F:
-    """A kernel whose code is put where it is called. Of kernels that call large ones: each kernel is compiled with all
-    that it calls, so that deep calls are compiled again on every level."""
-    if UNCOMPILED:
-        return function
-    return cast(F, numba.njit(inline="always", **_OPTIONS)(function))
 
 
 Work = Sequence[tuple[str, str]]
 """Names, and functions as "module:function" that call each kernel once with arguments of the types it is used with."""
 
 
-def compile_all(progress: Callable[[int, str], None], work: Work, *, processes: int) -> None:
+def compile_all(progress: Callable[[int, str], None], work: Sequence[Work]) -> None:
     """Compile everything that is not in the cache folder, and remember that it is complete.
 
     Args:
         progress: called with how many pieces of work are done, and the name of one that is not.
-        work: what compiles, each in a process of its own.
-        processes: at once.
+        work: what compiles; each list one piece after the other, all lists at once, in processes of their own.
 
     Raises:
         DiffCloudError: a piece failed.
     """
-    left = [name for name, _ in work]
+    left = [name for pieces in work for name, _ in pieces]
+    count = len(left)
     progress(0, left[0])
-    with ThreadPoolExecutor(processes) as pool:
-        jobs = {pool.submit(_run, place): name for name, place in work}
-        for job in as_completed(jobs):
+
+    def done(name: str) -> None:
+        left.remove(name)
+        progress(count - len(left), left[0] if left else "")
+
+    with ThreadPoolExecutor(len(work)) as pool:
+        for job in as_completed([pool.submit(_run, pieces, done) for pieces in work]):
             job.result()
-            left.remove(jobs[job])
-            progress(len(work) - len(left), left[0] if left else "")
     mark_built()
 
 
-def _run(place: str) -> None:
-    module, function = place.split(":")
-    code = (
-        f"from diffcloud.compiled import announcement; announcement.silent = True; import {module}; {module}.{function}()"
+def _run(pieces: Work, done: Callable[[str], None]) -> None:
+    code = "from diffcloud.compiled import announcement; announcement.silent = True; import importlib\n" + "".join(
+        f"importlib.import_module({module!r}).{function}(); print(flush=True)\n"
+        for module, function in (place.split(":") for _, place in pieces)
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise DiffCloudError(f"Compiling {place} failed: {done.stderr.strip().splitlines()[-1:]}")
+    # colours of error messages, of which numba makes thousands that nobody sees, take a twentieth of the time
+    plain = os.environ | {"NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
+    command = [sys.executable, "-c", code]
+    with (
+        tempfile.TemporaryFile("w+") as errors,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, env=plain) as process,
+    ):
+        assert process.stdout is not None
+        left = iter(pieces)
+        for _ in process.stdout:
+            done(next(left)[0])
+        if process.wait() != 0:
+            errors.seek(0)
+            raise DiffCloudError(f"Compiling {next(left)[0]} failed: {errors.read().strip().splitlines()[-1:]}")
 
 
 class _Announcement(event.Listener):
@@ -183,7 +187,7 @@ class _Announcement(event.Listener):
         if not self.silent and (function.__module__ or "").startswith("diffcloud"):
             self.silent = True
             _log.warning(
-                "Compiling kernels, once for this version and computer (a minute or two); kept in %s.", cache_folder()
+                "Compiling kernels, once for this version and computer (about a minute); kept in %s.", cache_folder()
             )
 
     def on_end(self, compiling: Any) -> None:

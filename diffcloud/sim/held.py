@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffcloud.compiled import inlined, kernel
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Parameters
 
 
@@ -110,7 +110,7 @@ def take_anchors_reverse(held: Held, step: int, anchors: Floats, positions: Floa
             anchors[h] = 0.0
 
 
-@inlined
+@kernel
 def first_anchors_reverse(held: Held, anchors: Floats, positions: Floats) -> None:
     """Adds the gradients by the anchors that no step took to those by the first positions [V, 3]."""
     for h in range(len(held.node)):

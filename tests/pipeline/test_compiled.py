@@ -66,15 +66,15 @@ def test_compile_all_tells_its_progress(monkeypatch, tmp_path):
     monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path / "made")
     told = []
     assert not compiled.is_built()
-    compile_all(lambda *now: told.append(now), [("a", "gc:collect"), ("b", "gc:enable")], processes=1)
+    compile_all(lambda *now: told.append(now), [[("a", "gc:collect"), ("b", "gc:enable")]])
     assert told == [(0, "a"), (1, "b"), (2, "")]
     assert compiled.is_built()
 
 
 def test_what_fails_to_compile_is_named_and_not_marked(monkeypatch, tmp_path):
     monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path / "made")
-    with pytest.raises(DiffCloudError, match=r"Compiling gc:nothing failed.*has no attribute"):
-        compile_all(lambda *now: None, [("a", "gc:nothing")], processes=2)
+    with pytest.raises(DiffCloudError, match=r"Compiling b failed.*has no attribute"):
+        compile_all(lambda *now: None, [[("a", "gc:collect"), ("b", "gc:nothing")]])
     assert not compiled.is_built()
 
 

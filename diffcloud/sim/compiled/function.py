@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from diffcloud.sim.compiled.derivatives import directional, gradient
-from diffcloud.sim.compiled.source import Code
+from diffcloud.sim.compiled.source import Code, straight_kernel
 from diffcloud.sim.compiled.trace import Graph, Scalar
 
 
@@ -48,5 +48,4 @@ class Function:
         lines = code.lines + [store + code.name(value) for store, value in zip(stores, values, strict=True)]
         if loop:
             lines = ["for k in range(len(rates)):", *(f"    {line}" for line in lines)]
-        head = f"@kernel\ndef {self.name}_{kind}(inputs, constants, {more}):"
-        return "\n".join([head, *(f"    {line}" for line in lines)])
+        return straight_kernel(f"{self.name}_{kind}", f"inputs, constants, {more}", lines)

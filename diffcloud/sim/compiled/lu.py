@@ -13,6 +13,7 @@ import numpy as np
 
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.box import Box, BoxType, define
+from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats
 from diffcloud.sim.compiled.dense import lu, lu_solve, lu_solve_transposed
 from diffcloud.sim.compiled.sparse import Pattern, _await_next, _take_off
@@ -52,8 +53,8 @@ def factorised(of: Pattern, lower: Floats, upper: Floats) -> General:
     following = np.empty(count, np.int64)
     for j in range(count):
         for p in range(of.starts[j], of.starts[j + 1]):
-            work[of.rows[p]] = lower[p]
-            other[of.rows[p]] = upper[p]
+            copy_to(work[of.rows[p]], lower[p])
+            copy_to(other[of.rows[p]], upper[p])
         k = waiting[j]
         while k >= 0:
             after = following[k]

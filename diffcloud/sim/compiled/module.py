@@ -20,7 +20,7 @@ from diffcloud.io.files import write_text
 from diffcloud.sim.compiled.data import Motion
 from diffcloud.sim.compiled.derivatives import directional, gradient
 from diffcloud.sim.compiled.function import Function
-from diffcloud.sim.compiled.source import Code
+from diffcloud.sim.compiled.source import Code, straight_kernel
 from diffcloud.sim.compiled.trace import Graph, Scalar, Vector, ordered
 from diffcloud.sim.terms.term import Element, Term, parameter_source
 
@@ -31,8 +31,9 @@ from math import atan2, cos, floor, log, sin, sqrt
 
 import numpy as np
 
-from diffcloud.compiled import inlined, kernel
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.sparse import add_assemble, add_jacobian
+from diffcloud.sim.compiled.straight import straight
 '''
 
 _ARGUMENTS = {
@@ -105,7 +106,7 @@ def _all(kind: str, terms: Sequence[Term], stiff: set[str]) -> str:
     given = arguments if target is None else arguments.replace("blocks", target)
     if target is not None:
         lines.insert(0, "blocks = np.empty((0, 0, 9))")
-    return "\n".join([f"@inlined\ndef {kind}(terms, {given}):", *(f"    {line}" for line in lines)])
+    return "\n".join([f"@kernel\ndef {kind}(terms, {given}):", *(f"    {line}" for line in lines)])
 
 
 def _force(term: Term) -> str:
@@ -159,7 +160,7 @@ def _jacobian(term: Term) -> str:
     shared = len(code.lines)
     code.compute(changes)
     size = 3 * term.corners
-    inner = ["column, place = c // 3, c % 3", *code.lines[shared:]]
+    inner = ["column = c // 3", "place = c % 3", *code.lines[shared:]]
     for k, change in enumerate(changes):
         inner.append(f"blocks[e, {k // 3 * term.corners} + column, {3 * (k % 3)} + place] = {code.name(change)}")
     lines = [*code.lines[:shared], f"for c in range({size}):", *(f"    {line}" for line in inner)]
@@ -263,5 +264,4 @@ def _independent(outputs: Sequence[Scalar], of: set[int]) -> list[Scalar]:
 def _loop(term: Term, kind: str, lines: Sequence[str]) -> str:
     corners = [f"i{corner} = term.nodes[e, {corner}]" for corner in range(term.corners)]
     body = ["for e in range(len(term.nodes)):", *(f"    {line}" for line in [*corners, *lines])]
-    head = f"@kernel\ndef {term.name}_{kind}(term, {_ARGUMENTS[kind]}):"
-    return "\n".join([head, *(f"    {line}" for line in body)])
+    return straight_kernel(f"{term.name}_{kind}", f"term, {_ARGUMENTS[kind]}", body)

@@ -70,3 +70,10 @@ class Code:
                 before, after = cast(tuple[str, str], node.payload)  # of `terms.term.Element`
                 return f"{before}int({names[0]}){after}"
         raise ValueError(f"No code for {operation}.")
+
+
+def straight_kernel(name: str, arguments: str, body: Iterable[str]) -> str:
+    """The text of a kernel whose body is straight code (`compiled.straight`)."""
+    head = f"@straight\ndef _{name}({arguments}):"
+    call = f"@kernel\ndef {name}({arguments}):\n    _{name}({arguments})"
+    return "\n".join([head, *(f"    {line}" for line in body), "", call])

@@ -22,6 +22,7 @@ from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
 from diffcloud.compiled import kernel
+from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.sorting import sort_part
 
@@ -256,7 +257,7 @@ def cholesky(of: Pattern, matrix: Floats, factor: Floats) -> bool:
     following = np.empty(count, np.int64)
     for j in range(count):
         for p in range(of.starts[j], of.starts[j + 1]):
-            work[of.rows[p]] = matrix[p]
+            copy_to(work[of.rows[p]], matrix[p])
         k = waiting[j]
         while k >= 0:
             after = following[k]
@@ -333,7 +334,7 @@ def solve(of: Pattern, factor: Floats, right: Floats, solution: Floats) -> None:
     starts, rows = of.factor_starts, of.factor_rows
     work = np.empty((count, 3))
     for node in range(count):
-        work[of.place[node]] = right[node]
+        copy_to(work[of.place[node]], right[node])
     for j in range(count):
         d = factor[starts[j]]
         a = work[j, 0] * d[0]
@@ -357,4 +358,4 @@ def solve(of: Pattern, factor: Floats, right: Floats, solution: Floats) -> None:
         b = (b - d[7] * c) * d[4]
         work[j, 0], work[j, 1], work[j, 2] = (a - d[3] * b - d[6] * c) * d[0], b, c
     for node in range(count):
-        solution[node] = work[of.place[node]]
+        copy_to(solution[node], work[of.place[node]])

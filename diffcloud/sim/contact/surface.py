@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffcloud.compiled import inlined
+from diffcloud.compiled import kernel
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh, directed_edges
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints
@@ -70,7 +70,7 @@ class SurfaceBox(Box):  # type: ignore[misc]
 define(SurfaceBox, SurfaceBoxType, Surface._fields)
 
 
-@inlined
+@kernel
 def boxed(surface: Surface) -> SurfaceBox:
     """The surface as kernels pass it on."""
     return SurfaceBox(

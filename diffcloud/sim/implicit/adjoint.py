@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.compiled import inlined, kernel
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Motion, Parameters, Timing
 from diffcloud.sim.compiled.lu import solve_general
 from diffcloud.sim.held import Held, aim, aim_reverse, first_anchors_reverse, holders, take_anchors_reverse
@@ -94,7 +94,7 @@ def reverse(
     parameter_gradients.hold[:] = 0.0
 
 
-@inlined
+@kernel
 def _part(
     work: Work,
     solved: Solved,
@@ -151,7 +151,7 @@ def _part(
         _bodies(work, solved, slopes, y, own, gradients)
 
 
-@inlined
+@kernel
 def _forces(work: Work, solved: Solved, y: Floats, gradients: Parameters, slopes: Motion) -> None:
     """Gradients of Δt y · f, of forces on cloth nodes and on bodies."""
     first_body_point, time_step, terms, parameters = work.first_body_point, work.time_step, work.terms, work.parameters
@@ -181,7 +181,7 @@ def _forces(work: Work, solved: Solved, y: Floats, gradients: Parameters, slopes
     _plane(touching.plane, parameters, motion, timing, adjoint, gradients, slopes)
 
 
-@inlined
+@kernel
 def _bodies(work: Work, solved: Solved, slopes: Motion, y: Floats, own: Floats, gradients: Parameters) -> None:
     """The rigid bodies' part of `_part`."""
     time_step, first_body_point, start_positions, rigid = (

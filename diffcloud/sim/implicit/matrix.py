@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.compiled import inlined, kernel
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Parameters, Timing
 from diffcloud.sim.compiled.lu import General, factorised
 from diffcloud.sim.compiled.sparse import Pattern, find_slot, widened
@@ -20,7 +20,7 @@ _pf_jacobian, _ee_jacobian = kernels.barrier_point_face_jacobian, kernels.barrie
 _plane_jacobian = kernels.barrier_plane_jacobian
 
 
-@inlined
+@kernel
 def widen(work: Work, listed: Ints) -> None:
     """Let the pattern couple the places that touch, listed [E, 5], too; what it couples already stays."""
     wide, moved, freedom = work.wide, work.moved, work.freedom
@@ -156,7 +156,7 @@ def _add_inertia(work: Work, velocity: Floats, swing: Floats, lower: Floats) -> 
                     swing[p, 3 * row + column] = part / time_step
 
 
-@inlined
+@kernel
 def _add_contact(
     work: Work,
     turned: Floats,
@@ -232,7 +232,7 @@ def _add_cross(x: float, y: float, z: float, right: Floats, factor: float, block
         block[6 + c] += factor * (x * right[3 + c] - y * right[c])
 
 
-@inlined
+@kernel
 def _nodes_of(touching: Touching, kind: int) -> Ints:
     if kind == 0:
         return touching.point_point.nodes
@@ -245,7 +245,7 @@ def _nodes_of(touching: Touching, kind: int) -> Ints:
     return touching.plane.nodes
 
 
-@inlined
+@kernel
 def _exact(work: Work, touching: Touching, kind: int, blocks: Floats) -> None:
     """Blocks [E, n², 9] of -Δt d force / d velocity."""
     time_step, parameters, motion = work.time_step, work.parameters, work.motion

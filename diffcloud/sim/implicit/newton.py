@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.compiled import inlined, kernel
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.lu import solve_general
@@ -58,7 +58,7 @@ class Place(Box):  # type: ignore[misc]
 define(Place, PlaceType, ["velocity", "scenery", "points", "turned", "distances", "listed", "numbers", "touching"])
 
 
-@inlined
+@kernel
 def _place(work: Work, room: Room, velocity: Floats, scenery: Floats, points: Floats, turned: Floats) -> Place:
     """The place with what touches there."""
     surface, planes, law = work.surface, work.planes, work.law
@@ -68,7 +68,7 @@ def _place(work: Work, room: Room, velocity: Floats, scenery: Floats, points: Fl
     return Place(velocity, scenery, points, turned, distances, listed, numbers, touching)
 
 
-@inlined
+@kernel
 def converge(work: Work) -> tuple[bool, Place, Room, float]:
     """Solve one part of a step: (whether it converged, where, the room, the last relative change)."""
     work.wide, work.moved = work.pattern, np.arange(len(work.pattern.rows))
@@ -137,7 +137,7 @@ def _arrived(scenery: Floats, final: Floats) -> bool:
     return True
 
 
-@inlined
+@kernel
 def _pushed(work: Work, here: Place, left_over: Floats, found: Floats) -> None:
     """The residual, and how it changes as moving obstacles go the rest of their way, to first order.
 
@@ -160,7 +160,7 @@ def _pushed(work: Work, here: Place, left_over: Floats, found: Floats) -> None:
             found[i, axis] += (ahead[i, axis] - left_over[i, axis]) / _PROBE
 
 
-@inlined
+@kernel
 def _search(
     work: Work, here: Place, direction: Floats, downhill: float, room: Room, rough: bool, found: Floats
 ) -> tuple[Place, bool]:

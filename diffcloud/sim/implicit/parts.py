@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.compiled import inlined, kernel
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats
 from diffcloud.sim.contact.places import as_elements
@@ -33,7 +33,7 @@ class Solved(Box):  # type: ignore[misc]
 define(Solved, SolvedType, ["velocity", "turned", "touching", "matrix", "gone"])
 
 
-@inlined
+@kernel
 def solved_part(
     work: Work,
     scene: Scene,

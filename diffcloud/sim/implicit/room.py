@@ -6,7 +6,7 @@ from math import sqrt
 
 import numpy as np
 
-from diffcloud.compiled import inlined, kernel
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.contact.additive_ccd import safe_fraction
@@ -44,7 +44,7 @@ class Room(Box):  # type: ignore[misc]
 define(Room, RoomType, ["begin", "predicted", "size", "longest", "pairs", "distances"])
 
 
-@inlined
+@kernel
 def room_around(work: Work, begin: Floats, predicted: Floats) -> Room:
     """The room of a path between points [N, 3]."""
     law = work.law
@@ -60,7 +60,7 @@ def room_around(work: Work, begin: Floats, predicted: Floats) -> Room:
     return room
 
 
-@inlined
+@kernel
 def cover(work: Work, room: Room, distance: float) -> None:
     """Let points be so far from the path [m]."""
     room.size = min(2 * distance, room.longest)

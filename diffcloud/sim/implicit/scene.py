@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffcloud.compiled import inlined, kernel
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters
 from diffcloud.sim.compiled.sparse import Pattern
@@ -113,7 +113,7 @@ define(
 )
 
 
-@inlined
+@kernel
 def new_work(scene: Scene, parameters: Parameters, nodes: int, bodies: int) -> Work:
     """Room to work on a scene."""
     count, others = scene.surface.point_count, scene.obstacle_points

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from diffcloud.compiled import kernel
+from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints, Parameters
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.contact.places import gap_of
@@ -54,7 +55,7 @@ def simulate(
     steps, nodes = len(positions) - 1, positions.shape[1]
     kept = nothing_kept(steps if keep >= 0 else 0, 6 * nodes + BODY * bodies.shape[1])
     parts = 0
-    anchors[:] = first_anchors(held, positions[0])
+    copy_to(anchors, first_anchors(held, positions[0]))
     work, past = new_work(scene, parameters, nodes, bodies.shape[1]), no_past(nodes)
     for step in range(steps):
         if control[1] != 0:

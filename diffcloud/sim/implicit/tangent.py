@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.compiled import inlined, kernel
+from diffcloud.compiled import kernel
+from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
 from diffcloud.sim.compiled.lu import solve_general
 from diffcloud.sim.held import Held, aim, aim_tangent, first_anchors, holders, take_anchors_tangent
@@ -57,7 +58,7 @@ def tangents(
     )
     anchor_rates, target = np.empty((directions, len(held.node), 3)), np.empty((directions, len(held.node), 3))
     for d in range(directions):
-        anchor_rates[d] = first_anchors(held, position_rates[0, d])
+        copy_to(anchor_rates[d], first_anchors(held, position_rates[0, d]))
     early_x, early_v = np.zeros((directions, nodes, 3)), np.zeros((directions, nodes, 3))  # before the part before
     for step in range(steps):
         take_anchors_tangent(held, track_rates, step, position_rates[step], anchor_rates)
@@ -96,7 +97,7 @@ def _aimed(holder: Ints, gone: float, first: Floats, wanted: Floats, target: Flo
                     target[d, h, axis] = first[d, i, axis] + gone * (wanted[d, h, axis] - first[d, i, axis])
 
 
-@inlined
+@kernel
 def _part(
     work: Work,
     parameter_rates: Parameters,
@@ -204,7 +205,7 @@ def _body_points(work: Work, own: Floats, turned: Floats, rates: Motion) -> None
                 rates.before[d, first + p, axis] = rates.after[d, first + p, axis] = (new - old) / dt
 
 
-@inlined
+@kernel
 def _body_rows(
     work: Work,
     parameter_rates: Parameters,
@@ -243,7 +244,7 @@ def _body_rows(
             right[row + 1, axis] += dt * (arm[j] * pushed[k] - arm[k] * pushed[j] + lever[j] * push[k] - lever[k] * push[j])
 
 
-@inlined
+@kernel
 def _forces(work: Work, solved: Solved, parameter_rates: Parameters, rates: Motion, change: Floats) -> None:
     """Rates [K, N, 3] of all forces."""
     terms, parameters, motion, time_step = work.terms, work.parameters, work.motion, work.time_step

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.compiled import inlined, kernel
+from diffcloud.compiled import kernel
+from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
 from diffcloud.sim.compiled.sparse import cholesky, solve
 from diffcloud.sim.held import Held, aim, aim_reverse, first_anchors_reverse, holders, take_anchors_reverse
@@ -129,19 +130,19 @@ def reverse(
         gradients.node_mass[i] -= parameters.inverse_mass[i] ** 2 * gradients.inverse_mass[i]
 
 
-@inlined
+@kernel
 def restore(
     scene: Scene, parameters: Parameters, positions: Floats, velocities: Floats, solved: Floats, motion: Motion
 ) -> None:
     """The motion at a step's solution."""
     nodes = len(positions)
-    motion.positions[:nodes] = positions
-    motion.before[:nodes] = velocities
-    motion.after[:nodes] = solved
+    copy_to(motion.positions[:nodes], positions)
+    copy_to(motion.before[:nodes], velocities)
+    copy_to(motion.after[:nodes], solved)
     displace(scene, parameters, nodes, motion)
 
 
-@inlined
+@kernel
 def candidates(scene: Scene, motion: Motion):  # type: ignore[no-untyped-def]
     """([N, 3] points before the impacts of a step, [P, V] whether each plane left each node where it was)."""
     nodes = len(scene.pattern.place)
@@ -155,7 +156,7 @@ def candidates(scene: Scene, motion: Motion):  # type: ignore[no-untyped-def]
     return points, above
 
 
-@inlined
+@kernel
 def project_reverse(scene: Scene, above, places: Floats) -> None:  # type: ignore[no-untyped-def]
     """What planes stop does not move along their normals."""
     for p in range(len(above) - 1, -1, -1):
@@ -167,7 +168,7 @@ def project_reverse(scene: Scene, above, places: Floats) -> None:  # type: ignor
                     places[i, axis] -= along * normal[axis]
 
 
-@inlined
+@kernel
 def factor_of(  # type: ignore[no-untyped-def]
     scene: Scene,
     parameters: Parameters,
@@ -190,7 +191,7 @@ def factor_of(  # type: ignore[no-untyped-def]
     return pattern, factor
 
 
-@inlined
+@kernel
 def clear(motion: Motion) -> None:
     motion.positions[:] = 0.0
     motion.before[:] = 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.compiled import inlined, kernel
+from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
 from diffcloud.sim.compiled.sparse import Pattern, add_assemble, find_slot, hold, widened
 from diffcloud.sim.linearised.scene import Scene
@@ -87,7 +87,7 @@ def pattern_with(base: Pattern, corners: Ints) -> tuple[Pattern, Ints]:
     return widened(base, first[:count], second[:count])
 
 
-@inlined
+@kernel
 def linear_system(  # type: ignore[no-untyped-def]
     scene: Scene,
     parameters: Parameters,

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffcloud.compiled import inlined
+from diffcloud.compiled import kernel
+from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.reference.impact_zones import Impacts, no_impacts
@@ -29,7 +30,7 @@ class Kept(NamedTuple):
     """[., 9]"""
 
 
-@inlined
+@kernel
 def nothing_kept(steps: int, nodes: int) -> Kept:
     """An empty record."""
     corners, constants, factors = np.empty((16, 5), np.int64), np.empty((16, 4)), np.empty((16, 9))
@@ -37,28 +38,28 @@ def nothing_kept(steps: int, nodes: int) -> Kept:
     return Kept(np.empty((steps, nodes, 3)), begins, corners, constants, no_impacts(), factors)
 
 
-@inlined
+@kernel
 def remember(kept: Kept, step: int, solved: Floats, corners: Ints, constants: Floats, factor: Floats, limit: int) -> Kept:
     """What a step adds to the record, but for its impacts."""
-    kept.solved[step] = solved
+    copy_to(kept.solved[step], solved)
     begins = kept.begins
     pairs, rows = begins[step, 0], begins[step, 4]
     more = with_room(kept.corners, pairs, len(corners))
     numbers = with_room(kept.constants, pairs, len(corners))
-    more[pairs : pairs + len(corners)] = corners
-    numbers[pairs : pairs + len(corners)] = constants
+    copy_to(more[pairs : pairs + len(corners)], corners)
+    copy_to(numbers[pairs : pairs + len(corners)], constants)
     begins[step + 1, 0] = pairs + len(corners)
     factors = kept.factors
     if rows + len(factor) <= limit:
         factors = with_room(factors, rows, len(factor))
-        factors[rows : rows + len(factor)] = factor
+        copy_to(factors[rows : rows + len(factor)], factor)
         begins[step + 1, 4] = rows + len(factor)
     else:
         begins[step + 1, 4] = rows
     return Kept(kept.solved, begins, more, numbers, kept.impacts, factors)
 
 
-@inlined
+@kernel
 def with_impacts(kept: Kept, impacts: Impacts, step: int, keep: int) -> Kept:
     """The record with the impacts of a step; without derivatives its room is used again."""
     if keep >= 0:

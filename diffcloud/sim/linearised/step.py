@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.compiled import inlined, kernel
+from diffcloud.compiled import kernel
+from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters
 from diffcloud.sim.compiled.sparse import cholesky, solve
 from diffcloud.sim.contact.neighbours import no_neighbours
@@ -50,7 +51,7 @@ def simulate(
     kept = nothing_kept(steps if keep >= 0 else 0, nodes)
     surface = boxed(scene.surface)
     near = no_neighbours(surface, max(scene.repulsion.thickness, TOUCH))
-    anchors[:] = first_anchors(held, positions[0])
+    copy_to(anchors, first_anchors(held, positions[0]))
     points, motion = with_obstacles(scene, positions[0]), still(scene, nodes)
     force, above = np.empty((len(points), 3)), np.empty((len(scene.plane_offsets), nodes), np.bool_)
     for step in range(steps):
@@ -103,25 +104,25 @@ def simulate(
     return DONE, steps, kept
 
 
-@inlined
+@kernel
 def with_obstacles(scene: Scene, cloth: Floats) -> Floats:
     """[N, 3] all points, of the cloth's [V, 3]."""
     points = np.empty((len(cloth) + len(scene.obstacles), 3))
-    points[: len(cloth)] = cloth
-    points[len(cloth) :] = scene.obstacles
+    copy_to(points[: len(cloth)], cloth)
+    copy_to(points[len(cloth) :], scene.obstacles)
     return points
 
 
-@inlined
+@kernel
 def still(scene: Scene, nodes: int) -> Motion:
     """Room for the motion of all points; obstacles rest."""
     count = nodes + len(scene.obstacles)
     motion = Motion(np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3)))
-    motion.positions[nodes:] = scene.obstacles
+    copy_to(motion.positions[nodes:], scene.obstacles)
     return motion
 
 
-@inlined
+@kernel
 def begin_motion(
     scene: Scene, held: Held, parameters: Parameters, step: int, positions: Floats, velocities: Floats, motion: Motion
 ) -> None:
@@ -140,7 +141,7 @@ def begin_motion(
     displace(scene, parameters, len(positions), motion)
 
 
-@inlined
+@kernel
 def displace(scene: Scene, parameters: Parameters, nodes: int, motion: Motion) -> None:
     """The displacement in which elastic forces are linear: (Δt + β) v."""
     reach = scene.time_step + parameters.damping[0]
@@ -149,7 +150,7 @@ def displace(scene: Scene, parameters: Parameters, nodes: int, motion: Motion) -
             motion.displacement[i, axis] = reach * motion.after[i, axis]
 
 
-@inlined
+@kernel
 def project(scene: Scene, points: Floats, above) -> None:  # type: ignore[no-untyped-def]
     """Put nodes that are behind a plane back above it; `above` bool [P, V] takes which of them were not."""
     for p in range(len(scene.plane_offsets)):
@@ -162,7 +163,7 @@ def project(scene: Scene, points: Floats, above) -> None:  # type: ignore[no-unt
                     points[i, axis] += (scene.projection.thickness - gap) * normal[axis]
 
 
-@inlined
+@kernel
 def mobility(parameters: Parameters, holder: Ints) -> Floats:
     """[N] inverse masses of the impact stage: prescribed nodes do not give way."""
     found = parameters.inverse_mass.copy()

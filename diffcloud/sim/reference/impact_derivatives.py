@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from diffcloud.compiled import kernel
+from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.dense import lu, lu_solve
 from diffcloud.sim.reference.dual import gram
@@ -170,10 +171,10 @@ def _replayed(
 ) -> Floats:
     """[P + 1, N, 3] places before each pass, and after the last."""
     history = np.empty((passes + 1, len(candidate), 3))
-    history[0] = candidate
+    copy_to(history[0], candidate)
     first, force_row = begin[1], begin[3]
     for p in range(passes):
-        history[p + 1] = history[p]
+        copy_to(history[p + 1], history[p])
         count, fresh = record.passes[begin[2] + p, 0], record.passes[begin[2] + p, 1]
         zone = zones(record.met[first : first + count], inverse_mass)
         for j in range(count - fresh, count):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from diffcloud.compiled import kernel
+from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.contact.neighbours import Neighbours, meeting, neighbours_of, no_neighbours
@@ -64,7 +65,7 @@ def nearest_pairs(surface: SurfaceBox, near: Neighbours, repulsion: Repulsion, p
         wins = (1 if first[pairs[c, 7]] == c else 0) + (1 if first[pairs[c, 8]] == c else 0)
         if wins == 0:
             continue
-        corners[kept] = pairs[c, :5]
+        copy_to(corners[kept], pairs[c, :5])
         constants[kept, 0] = found[c, 1]
         constants[kept, 1] = 1.0 if repulsion.count_once else wins
         constants[kept, 2] = repulsion.stiffness * found[c, 2]

@@ -1,0 +1,124 @@
+"""Kernels that are compiled once, to be linked into whatever calls them.
+
+numba makes every function that it compiles ready to run: with machine code of it and of all that it calls, and with a
+wrapper that takes Python's arguments apart. Almost all kernels are called by kernels only and need neither; and what is
+linked has been optimised already. Leaving all that out halves the time of compilation, and motions take as long as before.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from numba import njit
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import PassManager, register_pass
+from numba.core.registry import CPUDispatcher
+from numba.core.typed_passes import NativeLowering
+
+_LARGE = 16
+"""A kernel with more kernels below it is not optimised together with them: they are, each with what it calls."""
+
+
+class LinkedKernel(CPUDispatcher):
+    """What kernels call. Python calls it too, through an entry of its own that numba keeps in its cache."""
+
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+        super().__init__(
+            py_func=function,
+            targetoptions=options | {"nopython": True, "no_cpython_wrapper": True},
+            pipeline_class=_LinkedCompiler,
+        )
+        self._entry = njit(cache=True, pipeline_class=_EntryCompiler, **options)(_calling(self, function))
+
+    def __call__(self, *given: Any, **named: Any) -> Any:
+        return self._entry(*given, **named)
+
+    def add_overload(self, compiled: Any) -> None:
+        """Without telling numba's table of what Python can call."""
+        self.overloads[tuple(compiled.signature.args)] = compiled
+
+
+def _calling(linked: LinkedKernel, function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that does nothing but call a kernel, and that stands, for numba's cache, where the kernel's stands."""
+    name, parameters = function.__name__, inspect.signature(function).parameters.values()
+    taken = ", ".join(one.name if one.default is one.empty else f"{one.name}={one.default!r}" for one in parameters)
+    source = f"def {name}({taken}):\n    return linked({', '.join(one.name for one in parameters)})"
+    scope: dict[str, Any] = {"linked": linked, "__name__": function.__module__}
+    exec(compile(source, function.__code__.co_filename, "exec"), scope)
+    scope[name].__qualname__ = function.__qualname__
+    found: Callable[..., Any] = scope[name]
+    return found
+
+
+class _Library(JITCodeLibrary):
+    """The code of a kernel and of all that it calls."""
+
+    def _optimize_final_module(self) -> None:
+        if len(_below(self)) <= _LARGE:
+            super()._optimize_final_module()
+            return
+        manager, builder = self._codegen._module_pass_manager(
+            loop_vectorize=False, slp_vectorize=False, opt=0, cost="cheap"
+        )
+        manager.run(self._final_module, builder)
+
+
+class _LinkedLibrary(_Library):
+    """That never runs by itself."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+def _below(library: JITCodeLibrary) -> set[JITCodeLibrary]:
+    """The kernels that are linked into a library."""
+    found: set[JITCodeLibrary] = set()
+    for one in library._linking_libraries:
+        if isinstance(one, _LinkedLibrary) and one not in found:
+            found |= {one, *_below(one)}
+    return found
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _LinkedLowering(NativeLowering):
+    _name = "linked_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        state.library = _LinkedLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.flags.no_compile = True
+        super().run_pass(state)
+        state.cr = state.cr._replace(cfunc=object())  # by which numba finds it for callers
+        state.targetctx.insert_user_function(state.cr.cfunc, state.cr.fndesc, [state.library])
+        return True
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _EntryLowering(NativeLowering):
+    _name = "entry_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        state.library = _Library(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library.enable_object_caching()
+        return bool(super().run_pass(state))
+
+
+class _LinkedCompiler(CompilerBase):
+    def define_pipelines(self) -> list[PassManager]:
+        return [_pipeline(self.state, _LinkedLowering)]
+
+
+class _EntryCompiler(CompilerBase):
+    def define_pipelines(self) -> list[PassManager]:
+        return [_pipeline(self.state, _EntryLowering)]
+
+
+def _pipeline(state: Any, lowering: type[NativeLowering]) -> PassManager:
+    """numba's, with other libraries."""
+    manager = DefaultPassBuilder.define_nopython_pipeline(state)
+    manager.passes = [(lowering if one is NativeLowering else one, why) for one, why in manager.passes]
+    manager.finalize()
+    return manager
