@@ -20,6 +20,7 @@ from diffcloud.evaluation.summary import PREDICTORS, label, largest_sources, sen
 from diffcloud.evaluation.summary import metrics as summary_metrics
 from diffcloud.fit import JointObjective, Objective, read_fit
 from diffcloud.fit.pose import parse_priors
+from diffcloud.fit.record import FitRecord
 from diffcloud.fit.result import describe_recording
 from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, check_doubts
 from diffcloud.io.episodes import read_episode
@@ -44,10 +45,11 @@ def loss(
     episode: Annotated[Path, typer.Argument(help="Episode file.")],
     scenario: ScenarioName = None,
     scene: SceneFile = None,
+    fit: Annotated[Path | None, typer.Option(help="JSON of a fit: its parameters and measure, other options win.")] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="PARAMETER=VALUE, repeatable.")] = None,
     points: Annotated[int | None, typer.Option(help="Sampled per frame.")] = None,
     frame: Annotated[list[int] | None, typer.Option(help="Loss frame, repeatable.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the sampled points; fits use 0.")] = 0,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the sampled points; 0 if no fit says.")] = None,
     paper: Annotated[
         bool,
         typer.Option("--paper", help="The published measure: from cloth to recording only, at the loss frames, no pose."),
@@ -58,11 +60,21 @@ def loss(
 ) -> None:
     """Loss of one parameter set on one episode, by the measure and with the points of a fit, and the pose found."""
     use_threads(threads)
+    measure: dict[str, Any] = {}
+    values: dict[str, float] = {}
+    if fit is not None:
+        record = read_fit(fit)
+        if scenario is None and scene is None:
+            scenario = fitted_scenario(fit, _scenario_of(record, episode.stem))
+        measure, values = record.measure.model_dump(), dict(record.values)
     chosen = choose_scenario(scenario, scene)
-    priors = None if nuisance is None else parse_priors(nuisance)
+    given = {"points": points, "frames": frame, "seed": seed, "paper": paper or None}
+    measure |= {name: value for name, value in given.items() if value is not None}
+    if nuisance is not None:
+        measure["nuisance"] = parse_priors(nuisance)
     recorded = read_episode(episode)
-    objective = Objective(chosen, recorded, points=points, frames=frame, seed=seed, paper=paper, nuisance=priors)
-    values = assignments(set_, "--set")
+    objective = Objective(chosen, recorded, **measure)
+    values |= assignments(set_, "--set")
     check_values(values, "--set")
     chosen.check_parameters(values)
     tensors = {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
@@ -72,6 +84,14 @@ def loss(
         shifts = ", ".join(f"{name} {entry.value:.4g} {entry.unit}" for name, entry in found.nuisance.items())
         output.print(f"{found.loss:.6e}  RMS {found.rms_mm:.2f} mm" + (f"  at {shifts}" if shifts else ""))
     finish({**found.model_dump(), "parameters": values, "length_unit_m": chosen.length_unit_m}, json)
+
+
+def _scenario_of(record: FitRecord, name: str) -> str:
+    """In which a fit simulates a recording; that of its first one, if the recording is new to it."""
+    known = sorted({one.scenario for one in record.episodes if one.name == name})
+    if len(known) > 1:
+        raise ConfigError(f"The fit knows {name} in {' and '.join(known)}; choose one by --scenario.")
+    return known[0] if known else record.scenario
 
 
 @app.command()

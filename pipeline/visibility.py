@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -9,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from diffcloud.fit.visibility import visibility_map
+from diffcloud.io.episodes import read_episode
 from pipeline.console import JsonFlag, finish, output, show
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 
@@ -16,14 +18,16 @@ from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 def visibility(
     scenario: ScenarioName = None,
     scene: SceneFile = None,
+    episode: Annotated[Path | None, typer.Option(help="Test the motion of its gripper track, over all frames.")] = None,
     noise_mm: Annotated[float, typer.Option(help="Differences above this count as visible.")] = 4.0,
     size: Annotated[int, typer.Option(min=2, help="Grid points per parameter.")] = 5,
     linear: Annotated[bool, typer.Option(help="Linear instead of logarithmic spacing.")] = False,
     json: JsonFlag = False,
 ) -> None:
-    """Map of stretch x mass: RMS node distance [mm] between neighbours at the loss frame."""
+    """Map of stretch x mass: RMS node distance [mm] between neighbours at the loss frame, or over a recorded motion."""
     chosen = choose_scenario(scenario, scene)
-    found = visibility_map(chosen, size=size, linear=linear)
+    recorded = None if episode is None else read_episode(episode)
+    found = visibility_map(chosen, episode=recorded, size=size, linear=linear)
     for name, distances in (("stretch", found.along_stretch_mm), ("mass", found.along_mass_mm)):
         rows, columns = (found.grid[1:], found.grid) if name == "stretch" else (found.grid, found.grid[1:])
         table = Table(f"step in {name}; stretch \\ mass", *(f"{value:.3g}" for value in columns))

@@ -115,6 +115,7 @@ def follow(page: str, folder: Path, *, slow: bool) -> None:
             raise AssertionError(f"{page}: {example.text}\n{error or type(error).__name__}") from error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_EXAMPLES)
 def test_what_a_page_shows_works(page, folder):
     follow(page, folder, slow=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -298,6 +299,23 @@ def test_the_box_of_parameters_is_visible_at_camera_noise(name, linear):
     """At least 80 % of neighbouring pairs of a 5 x 5 grid differ by more than 4 mm RMS at the loss frame."""
     found = visibility_map(load_scenario(name), size=5, linear=linear)
     assert found.visible_fraction(4.0) >= 0.8
+
+
+def test_what_shows_is_that_of_the_recorded_motion():
+    """Under the track of its own motion a scenario shows what it does by itself; under a gripper that rests, how deep
+    the cloth sinks into the repulsion of the table."""
+    scenario = small_lift(frames=20, rate_hz=40.0, steps_per_frame=1)
+    episode = clouds_of(scenario, stretch=1.0, mass=1.0)
+    own, moved = (visibility_map(scenario, episode=one, size=3) for one in (None, episode))
+    assert 0.2 < np.median(moved.along_stretch_mm / own.along_stretch_mm) < 1  # over all frames, not at the last alone
+    still = replace(episode, gripper=np.repeat(episode.gripper[:1], len(episode.times), axis=0))
+    assert visibility_map(scenario, episode=still, size=3).visible_fraction(2.0) == 0 < moved.visible_fraction(2.0)
+    first = [episode.frame(index) for index in range(3)]
+    short = Episode.from_frames(first, episode.times[:3], gripper=episode.gripper[:3])
+    early = visibility_map(scenario, episode=short, size=3)
+    assert early.along_mass_mm.max() < moved.along_mass_mm.max()
+    with pytest.raises(EpisodeError, match="no gripper track"):
+        visibility_map(scenario, episode=clouds_of(scenario, gripper=False, stretch=1.0, mass=1.0), size=2)
 
 
 def test_screened_starts_are_the_best_candidates():

@@ -78,6 +78,7 @@ class TestDoubts:
 
 
 class TestNoise:
+    @pytest.mark.slow
     def test_refits_of_new_noise_scatter_as_it_says(self, scenario):
         """Each place of the cloth has an error of its own, the same in all frames: 20 recordings."""
         rng, found, stated = np.random.default_rng(4), [], []

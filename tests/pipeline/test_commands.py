@@ -78,6 +78,13 @@ def test_fit_then_replay_and_measure(work):
         "e1.npz", cwd=work,
     )  # fmt: skip
     assert measured.result["loss"] == pytest.approx(summary["loss"], rel=1e-9)  # same metric, same points
+    told = run("evaluate", "loss", "--fit", "fits/e1.json", "e1.npz", cwd=work)  # the scenario's file lies here
+    assert told.result["loss"] == measured.result["loss"]
+    assert told.result["parameters"] == {"stretch": value, "mass": 1.0}
+    assert told.result["rms_mm"] > 0
+    other = run("evaluate", "loss", "--fit", "fits/e1.json", "--set", "mass=2", "--seed", 3, "e1.npz", cwd=work)
+    assert other.result["parameters"]["mass"] == 2.0
+    assert other.result["loss"] > told.result["loss"]
     run("rollout", "--scenario", "small.yaml", "--fit", "fits/e1.json", "--episode", "e1.npz", "--out", "r.npz", cwd=work)
     with np.load(work / "r.npz") as replay, np.load(work / "fits" / "e1.npz") as fitted:
         np.testing.assert_allclose(replay["nodes"], fitted["nodes"], atol=1e-12)
@@ -209,6 +216,7 @@ def test_interrupted_fit_leaves_the_best_so_far_and_goes_on(work, monkeypatch):
     assert len(calls) > begun
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_fits(work):
     write_episode(work / "e2.npz", clouds_of(small_lift(), stretch=1.7, mass=1.0))
     found = {}
@@ -222,6 +230,7 @@ def test_processes_give_the_same_fits(work):
     assert found[1] == found[2]
 
 
+@pytest.mark.slow
 def test_ctrl_c_stops_fits_in_processes_and_keeps_their_best(work):
     write_episode(work / "easy.npz", clouds_of(small_lift(), stretch=5.05, mass=5.05))  # below the threshold at once
     moved = clouds_of(small_lift(), stretch=1.7, mass=1.0)
@@ -291,6 +300,7 @@ def test_stages_run_in_a_row_and_the_page_is_whole(work):
     assert (work / "reports" / "metrics.json").read_bytes() == first
 
 
+@pytest.mark.slow
 def test_two_grippers_from_csv_to_report(work):
     """Their tracks come as one CSV, drive the fit, the rollout, and what the page is made of."""
     (work / "raw" / "scenes").mkdir(parents=True)

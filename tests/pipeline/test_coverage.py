@@ -43,6 +43,7 @@ class TestCoverage:
         assert record["intervals"]["parameters"].keys() == {"stretch"}
         assert "| small | mass known | stretch | 2 |" in (work / "page.md").read_text()
 
+    @pytest.mark.slow
     def test_a_later_call_keeps_what_is_finished(self, work):
         invoke(*COVERAGE, "--fix", "mass")
         before = {path: path.stat().st_mtime_ns for path in (work / "out").rglob("*.*")}

@@ -146,6 +146,7 @@ class TestKilledWhileWriting:
 
 
 class TestFullDisk:
+    @pytest.mark.slow
     @pytest.mark.parametrize("limit", [300, 30_000])
     def test_a_training_leaves_all_or_nothing(self, work, limit):
         sets = {"train": sagging_sheet(24, scenario="small"), "test": sagging_sheet(10, seed=1, scenario="small")}
@@ -163,6 +164,7 @@ class TestFullDisk:
         invoke(*TRAIN)
         assert contents(work / "networks") == again
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("command", [FIT, (*SET, "--workers", 0, "--out", "set")], ids=["fit", "simulate"])
     def test_others_say_so_and_go_on_later(self, work, command):
         done = run_code(FULL, 1000, *command, cwd=work)
@@ -203,6 +205,7 @@ class TestTwoAtOnce:
 
 
 class TestLostWorkers:
+    @pytest.mark.slow
     def test_dask_workers_that_are_killed_are_an_error_with_a_name(self, work):
         invoke(*SET, "--workers", 0, "--out", "out")
         undisturbed = contents(work / "out")

@@ -117,6 +117,7 @@ class TestNewUser:
             )  # fmt: skip
             assert done.result["parameters"] == record.values
 
+    @pytest.mark.slow
     def test_an_edited_value_overrules_and_a_finished_fit_is_kept(self, found):
         folder, first = found
         with contextlib.chdir(folder):

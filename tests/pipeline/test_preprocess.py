@@ -44,6 +44,7 @@ def test_raw_episode_to_episode(tmp_path, params):
     assert same == (tmp_path / "episodes" / "lift" / "blue1.npz").read_bytes()
 
 
+@pytest.mark.slow
 def test_workers_change_nothing_and_a_damaged_episode_stops_no_other(tmp_path, params):
     for name in ("blue1", "blue2", "blue3"):
         write_cloth_episode(tmp_path / "raw" / "lift" / name, frames=1)

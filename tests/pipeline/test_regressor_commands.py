@@ -96,6 +96,7 @@ def test_values_outside_the_bounds_are_shown_and_told(work):
     assert "Outside the bounds" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_fit_starts_from_a_prediction_and_the_report_shows_both(work):
     episodes = "data/episodes/small"
     predicted = result(run("predict", "--checkpoint", CHECKPOINT, "--json", episodes))

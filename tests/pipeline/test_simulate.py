@@ -67,6 +67,7 @@ def test_sets_are_read_back(whole):
     assert json.loads((whole / "set.json").read_text())["draws"] == "uniform"
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_bytes(whole, work):
     run_process(*SET, "--workers", 2, "--out", "processes", cwd=work)
     assert contents(work / "processes") == contents(whole)

@@ -174,6 +174,7 @@ class TestHandEye:
         assert millimetres < 1.0
         assert degrees < 0.1
 
+    @pytest.mark.slow
     def test_the_covariance_tells_how_far_off_it_is(self, rng):
         """With an arm that is off by half a millimetre at each pose, over repeated calibrations."""
         squared = []

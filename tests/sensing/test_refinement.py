@@ -26,6 +26,7 @@ def found_lag(folder: Path, mask: RobotMask) -> float:
     return float(fuse(read_raw_episode(folder), mask, FusionSettings(flying_m=0.03)).meta["quality"]["refinement"]["lag_s"])
 
 
+@pytest.mark.slow
 def test_an_arm_that_is_shaped_otherwise_does_not_look_late(tmp_path, mask):
     """Arms of four shapes fold: with their edges and growth taken for noise, the log seems 2.7 ms later than it is."""
     off = []
