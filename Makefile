@@ -11,11 +11,13 @@ unexport PYTHONDONTWRITEBYTECODE
 
 venv: $(STAMP)
 
-# torch first and pinned: an unpinned one brings gigabytes of CUDA builds
+# torch first and pinned: an unpinned one brings gigabytes of CUDA builds; kernels last, which otherwise every process that
+# needs one would compile for itself
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+	$(BIN)/diffcloud doctor --compile --json > /dev/null
 	touch $@
 
 # PROFILE: a file of parameters that takes the place of params.yaml, such as pipeline/profiles/paper.yaml
