@@ -3,7 +3,8 @@ arithmetic take most of a minute, and none of them is needed.
 
 The code is Python that also runs as Python (`DIFFCLOUD_UNCOMPILED`), of assignments to numbers, additions to array
 elements, and loops. It computes what numba's own compilation of it would, bit for bit: the same operations in the same
-order.
+order. The outer loop goes through four elements at once, each in a lane of the processor's vectors; what they write is
+written one element after the other. So an element may not read what another one writes.
 """
 
 from __future__ import annotations
@@ -12,8 +13,10 @@ import ast
 import inspect
 import math
 import textwrap
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from itertools import groupby
+from typing import Any, NamedTuple, TypeVar, cast
 
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
@@ -24,11 +27,15 @@ from diffcloud.compiled import UNCOMPILED
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+_LANES = 4
+"""Elements at once. Where a processor's vectors are shorter, LLVM makes several of one."""
 _REAL = {ast.Add: "fadd", ast.Sub: "fsub", ast.Mult: "fmul", ast.Div: "fdiv"}
 _WHOLE = {ast.Add: "add", ast.FloorDiv: "sdiv", ast.Mod: "srem"}  # of indices, which are not negative
 _COMPARE = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.Eq: "=="}
-_MATH = {name: getattr(math, name) for name in ("sqrt", "log", "sin", "cos", "floor", "atan2")}
-_CALLED = {"len", "int", "abs", "min", *_MATH}
+_OF_LLVM = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor"}
+_OF_NUMBA = {name: getattr(math, name) for name in ("log", "sin", "cos", "atan2")}
+_CALLED = {"len", "int", "min", *_OF_LLVM, *_OF_NUMBA}
+_INTEGER, _DOUBLE = ir.IntType(64), ir.DoubleType()
 
 
 def straight(function: F) -> F:
@@ -57,32 +64,73 @@ def straight(function: F) -> F:
     return cast(F, intrinsic(typed))
 
 
+class _Array(NamedTuple):
+    """An array, taken apart."""
+
+    kind: Any
+    data: Any
+    shape: list[Any]
+    strides: list[Any]
+
+
 class _Emitter:
-    """Emits statements with a builder. A value is its numba type and its LLVM value."""
+    """Emits statements with a builder. A value is its numba type and its LLVM value: a number, or a vector with one for
+    each lane."""
 
     def __init__(self, context: Any, builder: Any, scope: dict[str, tuple[Any, Any]]) -> None:
         self.context, self.builder, self.scope = context, builder, scope
+        self.arrays: dict[str, _Array] = {}
+        """Those that are in use, by their code."""
+        self.filled: list[Any] = []
+        """Which lanes have an element; nothing outside of the outer loop."""
 
-    def statements(self, body: list[ast.stmt]) -> None:
-        for statement in body:
-            match statement:
-                case ast.Assign(targets=[ast.Name(id=name)], value=value):
-                    self.scope[name] = self.value(value)
-                case ast.Assign(targets=[ast.Subscript() as place], value=value):
-                    self.builder.store(self._number(value), self._pointer(place)[1])
-                case ast.AugAssign(target=ast.Subscript() as place, op=ast.Add(), value=value):
-                    pointer = self._pointer(place)[1]
-                    self.builder.store(self.builder.fadd(self.builder.load(pointer), self._number(value)), pointer)
-                case ast.For(target=ast.Name(id=name), iter=ast.Call(func=ast.Name(id="range"), args=[count])):
-                    with cgutils.for_range(self.builder, self.value(count)[1]) as loop:
-                        outside = dict(self.scope)
-                        self.scope[name] = (types.intp, loop.index)
-                        self.statements(statement.body)
-                        self.scope = outside
-                case ast.Pass():
-                    pass
-                case _:
-                    raise NotImplementedError(f"Straight code has no {ast.unparse(statement)!r}.")
+    def statements(self, body: Sequence[ast.stmt]) -> None:
+        for writes, group in groupby(body, _writes):
+            if writes:
+                self._write(list(group))
+                continue
+            for statement in group:
+                match statement:
+                    case ast.Assign(targets=[ast.Name(id=name)], value=value):
+                        self.scope[name] = self.value(value)
+                    case ast.For(target=ast.Name(id=name), iter=ast.Call(func=ast.Name(id="range"), args=[count])):
+                        outside = dict(self.scope), dict(self.arrays)
+                        self._loop(name, self.value(count)[1], statement.body)
+                        self.scope, self.arrays = outside
+                    case ast.Pass():
+                        pass
+                    case _:
+                        raise NotImplementedError(f"Straight code has no {ast.unparse(statement)!r}.")
+
+    def _loop(self, name: str, count: Any, body: Sequence[ast.stmt]) -> None:
+        builder = self.builder
+        if self.filled:
+            with cgutils.for_range(builder, count) as loop:
+                self.scope[name] = (types.intp, loop.index)
+                self.statements(body)
+            return
+        with cgutils.for_range(builder, builder.sdiv(builder.add(count, _INTEGER(_LANES - 1)), _INTEGER(_LANES))) as loop:
+            first = self._wide(builder.mul(loop.index, _INTEGER(_LANES)))
+            places = builder.add(first, ir.Constant(first.type, list(range(_LANES))))
+            within = builder.icmp_signed("<", places, self._wide(count))
+            # lanes beyond the last element compute it again, and write nothing
+            places = builder.select(within, places, self._wide(builder.sub(count, _INTEGER(1))))
+            self.filled = [_lane(builder, within, lane) for lane in range(_LANES)]
+            self.scope[name] = (types.intp, places)
+            self.statements(body)
+            self.filled = []
+
+    def _write(self, body: Sequence[ast.stmt]) -> None:
+        """Stores, and additions to array elements, of one lane after the other."""
+        builder = self.builder
+        writes = [(self._place(_target(one)), self._number(one.value), one) for one in body]  # type: ignore[attr-defined]
+        for lane, filled in enumerate(self.filled or [None]):
+            with builder.if_then(filled, likely=True) if lane > 0 else nullcontext():
+                for place, number, statement in writes:
+                    pointer, new = self._pointer(place, lane), _lane(builder, number, lane)
+                    if isinstance(statement, ast.AugAssign):
+                        new = builder.fadd(builder.load(pointer), new)
+                    builder.store(new, pointer)
 
     def value(self, node: ast.expr) -> tuple[Any, Any]:
         builder = self.builder
@@ -92,34 +140,33 @@ class _Emitter:
             case ast.Constant(value=bool() | str()):
                 pass
             case ast.Constant(value=int(value)):
-                return types.intp, self.context.get_constant(types.intp, value)
+                return types.intp, _INTEGER(value)
             case ast.Constant(value=float(value)):
-                return types.float64, self.context.get_constant(types.float64, value)
+                return types.float64, _DOUBLE(value)
             case ast.Attribute(value=owner, attr=name):
                 kind, value = self.value(owner)
                 place = kind.fields.index(name)
                 return kind.types[place], builder.extract_value(value, place)
             case ast.Subscript():
-                kind, pointer = self._pointer(node)
-                return kind.dtype, builder.load(pointer)
+                place = self._place(node)
+                lanes = range(_LANES if any(map(_is_wide, place[1])) else 1)
+                return place[0].kind.dtype, self._joined([builder.load(self._pointer(place, lane)) for lane in lanes])
             case ast.UnaryOp(op=ast.USub(), operand=operand):
                 return types.float64, builder.fneg(self._number(operand))
             case ast.BinOp(op=ast.BitAnd(), left=left, right=right):
-                return types.boolean, builder.and_(self.value(left)[1], self.value(right)[1])
+                a, b = self._alike(self.value(left)[1], self.value(right)[1])
+                return types.boolean, builder.and_(a, b)
             case ast.BinOp(op=operator, left=left, right=right) if type(operator) in _REAL | _WHOLE:
-                a, b = self.value(left), self.value(right)
-                if a[0] == b[0] == types.intp and type(operator) in _WHOLE:
-                    return types.intp, getattr(builder, _WHOLE[type(operator)])(a[1], b[1])
-                return types.float64, getattr(builder, _REAL[type(operator)])(self._real(a), self._real(b))
+                kind, a, b = self._both(left, right, whole=type(operator) in _WHOLE)
+                names = _WHOLE if kind == types.intp else _REAL
+                return kind, getattr(builder, names[type(operator)])(a, b)
             case ast.Compare(left=left, ops=[operator], comparators=[right]) if type(operator) in _COMPARE:
-                a, b = self.value(left), self.value(right)
-                sign = _COMPARE[type(operator)]
-                if a[0] == b[0] == types.intp:
-                    return types.boolean, builder.icmp_signed(sign, a[1], b[1])
-                return types.boolean, builder.fcmp_ordered(sign, self._real(a), self._real(b))
+                kind, a, b = self._both(left, right, whole=True)
+                compare = builder.icmp_signed if kind == types.intp else builder.fcmp_ordered
+                return types.boolean, compare(_COMPARE[type(operator)], a, b)
             case ast.IfExp(test=test, body=then, orelse=otherwise):
-                condition = self.value(test)[1]
-                return types.float64, builder.select(condition, self._number(then), self._number(otherwise))
+                condition, a, b = self._alike(self.value(test)[1], self._number(then), self._number(otherwise))
+                return types.float64, builder.select(condition, a, b)
             case ast.Call(func=ast.Name(id=name), args=arguments) if name in _CALLED:
                 return self._call(name, arguments)
         raise NotImplementedError(f"Straight code has no {ast.unparse(node)!r}.")
@@ -130,30 +177,95 @@ class _Emitter:
             kind, value = self.value(arguments[0])
             array = self.context.make_array(kind)(self.context, builder, value)
             return types.intp, builder.extract_value(array.shape, 0)
-        numbers = [self._number(argument) for argument in arguments]
+        numbers = self._alike(*(self._number(argument) for argument in arguments))
+        kind = numbers[0].type
         if name == "int":
-            return types.intp, builder.fptosi(numbers[0], ir.IntType(64))
-        if name == "abs":
-            return types.float64, builder.call(builder.module.declare_intrinsic("llvm.fabs", [ir.DoubleType()]), numbers)
+            return types.intp, builder.fptosi(numbers[0], ir.VectorType(_INTEGER, _LANES) if kind != _DOUBLE else _INTEGER)
         if name == "min":
             return types.float64, builder.select(builder.fcmp_ordered("<", numbers[1], numbers[0]), numbers[1], numbers[0])
-        given = [types.float64] * len(numbers)
-        returned = types.intp if name == "floor" else types.float64
-        called = self.context.get_function(_MATH[name], returned(*given))
-        return returned, called(builder, numbers)
+        if name in _OF_LLVM:
+            width = "f64" if kind == _DOUBLE else f"v{_LANES}f64"
+            of = cgutils.get_or_insert_function(
+                builder.module, ir.FunctionType(kind, [kind]), f"llvm.{_OF_LLVM[name]}.{width}"
+            )
+            return types.float64, builder.call(of, numbers)
+        called = self.context.get_function(_OF_NUMBA[name], types.float64(*[types.float64] * len(numbers)))
+        lanes = range(_LANES if kind != _DOUBLE else 1)
+        return types.float64, self._joined([called(builder, [_lane(builder, n, lane) for n in numbers]) for lane in lanes])
 
     def _number(self, node: ast.expr) -> Any:
-        return self._real(self.value(node))
+        """A value as a double."""
+        return self._real(*self.value(node))
 
-    def _real(self, value: tuple[Any, Any]) -> Any:
-        kind, number = value
-        return number if kind == types.float64 else self.context.cast(self.builder, number, kind, types.float64)
+    def _real(self, kind: Any, number: Any) -> Any:
+        if kind == types.float64:
+            return number
+        return self.builder.sitofp(number, ir.VectorType(_DOUBLE, _LANES) if _is_wide(number) else _DOUBLE)
 
-    def _pointer(self, place: ast.Subscript) -> tuple[Any, Any]:
-        """An array's type, and where one of its elements lies."""
-        kind, value = self.value(place.value)
-        indices = place.slice.elts if isinstance(place.slice, ast.Tuple) else [place.slice]
-        numbers = [self.value(index)[1] for index in indices]
-        return kind, cgutils.get_item_pointer(
-            self.context, self.builder, kind, self.context.make_array(kind)(self.context, self.builder, value), numbers
+    def _both(self, left: ast.expr, right: ast.expr, *, whole: bool) -> tuple[Any, Any, Any]:
+        """Two values of one type: whole numbers where both are and the operation knows them, else doubles."""
+        a, b = self.value(left), self.value(right)
+        if whole and a[0] == b[0] == types.intp:
+            return types.intp, *self._alike(a[1], b[1])
+        return types.float64, *self._alike(self._real(*a), self._real(*b))
+
+    def _place(self, node: ast.Subscript) -> tuple[_Array, list[Any]]:
+        """An array and the indices of an element."""
+        indices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        name = ast.unparse(node.value)
+        if name not in self.arrays:
+            kind, value = self.value(node.value)
+            array = self.context.make_array(kind)(self.context, self.builder, value)
+            shape, strides = (cgutils.unpack_tuple(self.builder, one, kind.ndim) for one in (array.shape, array.strides))
+            self.arrays[name] = _Array(kind, array.data, shape, strides)
+        return self.arrays[name], [self.value(index)[1] for index in indices]
+
+    def _pointer(self, place: tuple[_Array, list[Any]], lane: int) -> Any:
+        """Where one lane's element lies."""
+        array, indices = place
+        return cgutils.get_item_pointer2(
+            self.context,
+            self.builder,
+            array.data,
+            array.shape,
+            array.strides,
+            array.kind.layout,
+            [_lane(self.builder, index, lane) for index in indices],
         )
+
+    def _alike(self, *numbers: Any) -> list[Any]:
+        """All as vectors if one is."""
+        return [self._wide(number) for number in numbers] if any(map(_is_wide, numbers)) else list(numbers)
+
+    def _wide(self, number: Any) -> Any:
+        """A number in every lane."""
+        return number if _is_wide(number) else self._joined([number] * _LANES)
+
+    def _joined(self, numbers: Sequence[Any]) -> Any:
+        """A vector of one number for each lane; one number stays itself."""
+        if len(numbers) == 1:
+            return numbers[0]
+        found = ir.Constant(ir.VectorType(numbers[0].type, _LANES), ir.Undefined)
+        for lane, number in enumerate(numbers):
+            found = self.builder.insert_element(found, number, ir.IntType(32)(lane))
+        return found
+
+
+def _writes(statement: ast.stmt) -> bool:
+    match statement:
+        case ast.Assign(targets=[ast.Subscript()]) | ast.AugAssign(target=ast.Subscript(), op=ast.Add()):
+            return True
+    return False
+
+
+def _target(statement: ast.stmt) -> ast.Subscript:
+    """What a writing statement writes."""
+    return cast(ast.Subscript, statement.target if isinstance(statement, ast.AugAssign) else statement.targets[0])  # type: ignore[attr-defined]
+
+
+def _is_wide(number: Any) -> bool:
+    return isinstance(number.type, ir.VectorType)
+
+
+def _lane(builder: Any, number: Any, lane: int) -> Any:
+    return builder.extract_element(number, ir.IntType(32)(lane)) if _is_wide(number) else number
