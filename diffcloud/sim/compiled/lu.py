@@ -3,8 +3,8 @@
     A = L U,   L_jj = I,   U_jj = D_j
 
 Both halves are kept in the pattern of the lower factor: L as it is, with D_j⁻¹ in the place of its diagonal, and U
-transposed. No rows are exchanged beyond the blocks, which is fine where the diagonal is strong; the residual of each
-solution is looked at, and where it is large the system is solved again by dense LU with pivots.
+transposed. No rows are exchanged beyond the blocks, which is fine where the diagonal is strong; the residual of the first
+solution is looked at, and where it is large all systems of the matrix are solved by dense LU with pivots.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.box import Box, BoxType, define
-from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats
 from diffcloud.sim.compiled.dense import lu, lu_solve, lu_solve_transposed
 from diffcloud.sim.compiled.sparse import Pattern, _await_next, _take_off
@@ -35,10 +34,11 @@ class General(Box):  # type: ignore[misc]
         upper: [A + 1, 9] blocks of the upper half, transposed; its diagonal counts for nothing.
         below: [L, 9] L, with the inverse of D in the place of its diagonal.
         above: [L, 9] U transposed, without its diagonal.
+        sound: 1 once a solution by the factors has been looked at and is right; -1 where it is not; 0 before.
     """
 
 
-define(General, GeneralType, ["pattern", "lower", "upper", "below", "above"])
+define(General, GeneralType, ["pattern", "lower", "upper", "below", "above", "sound"])
 
 
 @kernel
@@ -53,8 +53,8 @@ def factorised(of: Pattern, lower: Floats, upper: Floats) -> General:
     following = np.empty(count, np.int64)
     for j in range(count):
         for p in range(of.starts[j], of.starts[j + 1]):
-            copy_to(work[of.rows[p]], lower[p])
-            copy_to(other[of.rows[p]], upper[p])
+            for k9 in range(9):
+                work[of.rows[p], k9], other[of.rows[p], k9] = lower[p, k9], upper[p, k9]
         k = waiting[j]
         while k >= 0:
             after = following[k]
@@ -63,32 +63,38 @@ def factorised(of: Pattern, lower: Floats, upper: Floats) -> General:
             _await_next(k, reached, waiting, following, rows, starts)
             k = after
         begin = starts[j]
-        d = below[begin]
-        _invert(work[j], d)
-        work[j] = 0.0
-        other[j] = 0.0
-        above[begin] = 0.0
+        _invert(work, j, below, begin)
+        for k9 in range(9):
+            work[j, k9] = other[j, k9] = above[begin, k9] = 0.0
+        d0, d1, d2 = below[begin, 0], below[begin, 1], below[begin, 2]
+        d3, d4, d5 = below[begin, 3], below[begin, 4], below[begin, 5]
+        d6, d7, d8 = below[begin, 6], below[begin, 7], below[begin, 8]
         for p in range(begin + 1, starts[j + 1]):
-            w, u, l, a = work[rows[p]], other[rows[p]], below[p], above[p]
+            i = rows[p]
             for r in range(0, 9, 3):
-                for c in range(3):
-                    l[r + c] = w[r] * d[c] + w[r + 1] * d[3 + c] + w[r + 2] * d[6 + c]
+                a, b, c = work[i, r], work[i, r + 1], work[i, r + 2]
+                below[p, r] = a * d0 + b * d3 + c * d6
+                below[p, r + 1] = a * d1 + b * d4 + c * d7
+                below[p, r + 2] = a * d2 + b * d5 + c * d8
             for k9 in range(9):
-                a[k9] = u[k9]
-                w[k9] = u[k9] = 0.0
+                above[p, k9] = other[i, k9]
+                work[i, k9] = other[i, k9] = 0.0
         reached[j] = begin
         _await_next(j, reached, waiting, following, rows, starts)
-    return General(of, lower, upper, below, above)
+    return General(of, lower, upper, below, above, 0)
 
 
 @kernel
-def _invert(m: Floats, found: Floats) -> None:
-    """The inverse of a block [9]."""
-    a, b, c = m[4] * m[8] - m[5] * m[7], m[5] * m[6] - m[3] * m[8], m[3] * m[7] - m[4] * m[6]
-    scale = 1.0 / (m[0] * a + m[1] * b + m[2] * c)
-    found[0], found[1], found[2] = a * scale, (m[2] * m[7] - m[1] * m[8]) * scale, (m[1] * m[5] - m[2] * m[4]) * scale
-    found[3], found[4], found[5] = b * scale, (m[0] * m[8] - m[2] * m[6]) * scale, (m[2] * m[3] - m[0] * m[5]) * scale
-    found[6], found[7], found[8] = c * scale, (m[1] * m[6] - m[0] * m[7]) * scale, (m[0] * m[4] - m[1] * m[3]) * scale
+def _invert(blocks: Floats, given: int, inverses: Floats, taken: int) -> None:
+    """The inverse of one of the blocks [., 9], into one of others."""
+    m, n, o = blocks[given, 0], blocks[given, 1], blocks[given, 2]
+    p, q, r = blocks[given, 3], blocks[given, 4], blocks[given, 5]
+    s, t, u = blocks[given, 6], blocks[given, 7], blocks[given, 8]
+    a, b, c = q * u - r * t, r * s - p * u, p * t - q * s
+    scale = 1.0 / (m * a + n * b + o * c)
+    found = (a, o * t - n * u, n * r - o * q, b, m * u - o * s, o * p - m * r, c, n * s - m * t, m * q - n * p)
+    for k in range(9):
+        inverses[taken, k] = found[k] * scale
 
 
 @kernel
@@ -98,9 +104,9 @@ def solve_general(of: General, right: Floats, transposed: int, solution: Floats)
         _substitute(of.pattern, of.below, of.above, of.below, right, 1, solution)
     else:
         _substitute(of.pattern, of.below, of.below, of.above, right, 0, solution)
-    if _good(of, right, transposed, solution):
-        return True
-    return _dense(of, right, transposed, solution)
+    if of.sound == 0:
+        of.sound = 1 if _good(of, right, transposed, solution) else -1
+    return True if of.sound > 0 else _dense(of, right, transposed, solution)
 
 
 @kernel

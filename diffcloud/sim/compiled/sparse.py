@@ -124,44 +124,40 @@ def add_assemble(slots: Ints, blocks: Floats, matrix: Floats) -> None:
     """Add the symmetric blocks [E, pairs, 9] of elements to a matrix, each to the half that is stored."""
     for e in range(len(slots)):
         for p in range(slots.shape[1]):
-            slot, block = slots[e, p], blocks[e, p]
-            if slot >= 0:
-                _add(matrix[slot], block)
-            else:
-                _add_transposed(matrix[~slot], block)
+            _add_block(slots[e, p], blocks, e, p, matrix, matrix)
 
 
 @kernel
 def add_jacobian(slots: Ints, blocks: Floats, lower: Floats, upper: Floats) -> None:
     """The same for blocks [E, n², 9] without symmetry: the upper half is stored transposed, apart."""
-    count = blocks.shape[1]
-    corners = int(sqrt(count))
+    corners = int(sqrt(blocks.shape[1]))
     for e in range(len(slots)):
         p = 0
         for a in range(corners):
             for b in range(a, corners):
-                slot, block, mirrored = slots[e, p], blocks[e, a * corners + b], blocks[e, b * corners + a]
+                slot = slots[e, p]
+                _add_block(slot, blocks, e, a * corners + b, lower, upper)
+                if b > a:
+                    _add_block(~slot, blocks, e, b * corners + a, lower, upper)
                 p += 1
-                if slot >= 0:
-                    _add(lower[slot], block)
-                    if b > a:
-                        _add_transposed(upper[slot], mirrored)
-                else:
-                    _add_transposed(upper[~slot], block)
-                    _add(lower[~slot], mirrored)
 
 
 @kernel
-def _add(target, block):  # type: ignore[no-untyped-def]
-    for k in range(9):
-        target[k] += block[k]
-
-
-@kernel
-def _add_transposed(target, block):  # type: ignore[no-untyped-def]
-    for row in range(3):
-        for column in range(3):
-            target[3 * row + column] += block[3 * column + row]
+def _add_block(slot, blocks, e, p, lower, upper):  # type: ignore[no-untyped-def]
+    """Add block p of element e to its half."""
+    b0, b1, b2 = blocks[e, p, 0], blocks[e, p, 1], blocks[e, p, 2]
+    b3, b4, b5 = blocks[e, p, 3], blocks[e, p, 4], blocks[e, p, 5]
+    b6, b7, b8 = blocks[e, p, 6], blocks[e, p, 7], blocks[e, p, 8]
+    half, place = lower, slot
+    if slot < 0:
+        half, place = upper, ~slot
+        b1, b2, b3, b5, b6, b7 = b3, b6, b1, b7, b2, b5
+    a0, a1, a2 = half[place, 0], half[place, 1], half[place, 2]
+    a3, a4, a5 = half[place, 3], half[place, 4], half[place, 5]
+    a6, a7, a8 = half[place, 6], half[place, 7], half[place, 8]
+    half[place, 0], half[place, 1], half[place, 2] = a0 + b0, a1 + b1, a2 + b2
+    half[place, 3], half[place, 4], half[place, 5] = a3 + b3, a4 + b4, a5 + b5
+    half[place, 6], half[place, 7], half[place, 8] = a6 + b6, a7 + b7, a8 + b8
 
 
 @kernel
@@ -309,22 +305,30 @@ def _await_next(column, reached, waiting, following, rows, starts):  # type: ign
 @kernel
 def _take_off(work, left, right, rows, begin, end):  # type: ignore[no-untyped-def]
     """work[i] -= left[i, k] right[j, k]ᵀ for the rows i of column k from j = rows[begin] on."""
-    t = right[begin]
-    t0, t1, t2, t3, t4, t5, t6, t7, t8 = t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7], t[8]
+    t0, t1, t2 = right[begin, 0], right[begin, 1], right[begin, 2]
+    t3, t4, t5 = right[begin, 3], right[begin, 4], right[begin, 5]
+    t6, t7, t8 = right[begin, 6], right[begin, 7], right[begin, 8]
     for p in range(begin, end):
-        w, f = work[rows[p]], left[p]
-        a, b, c = f[0], f[1], f[2]
-        w[0] -= a * t0 + b * t1 + c * t2
-        w[1] -= a * t3 + b * t4 + c * t5
-        w[2] -= a * t6 + b * t7 + c * t8
-        a, b, c = f[3], f[4], f[5]
-        w[3] -= a * t0 + b * t1 + c * t2
-        w[4] -= a * t3 + b * t4 + c * t5
-        w[5] -= a * t6 + b * t7 + c * t8
-        a, b, c = f[6], f[7], f[8]
-        w[6] -= a * t0 + b * t1 + c * t2
-        w[7] -= a * t3 + b * t4 + c * t5
-        w[8] -= a * t6 + b * t7 + c * t8
+        i = rows[p]
+        a0, a1, a2 = left[p, 0], left[p, 1], left[p, 2]
+        b0, b1, b2 = left[p, 3], left[p, 4], left[p, 5]
+        c0, c1, c2 = left[p, 6], left[p, 7], left[p, 8]
+        w0, w1, w2 = work[i, 0], work[i, 1], work[i, 2]
+        w3, w4, w5 = work[i, 3], work[i, 4], work[i, 5]
+        w6, w7, w8 = work[i, 6], work[i, 7], work[i, 8]
+        # everything is read before anything is written, so that the compiler may use vectors
+        w0 -= a0 * t0 + a1 * t1 + a2 * t2
+        w1 -= a0 * t3 + a1 * t4 + a2 * t5
+        w2 -= a0 * t6 + a1 * t7 + a2 * t8
+        w3 -= b0 * t0 + b1 * t1 + b2 * t2
+        w4 -= b0 * t3 + b1 * t4 + b2 * t5
+        w5 -= b0 * t6 + b1 * t7 + b2 * t8
+        w6 -= c0 * t0 + c1 * t1 + c2 * t2
+        w7 -= c0 * t3 + c1 * t4 + c2 * t5
+        w8 -= c0 * t6 + c1 * t7 + c2 * t8
+        work[i, 0], work[i, 1], work[i, 2] = w0, w1, w2
+        work[i, 3], work[i, 4], work[i, 5] = w3, w4, w5
+        work[i, 6], work[i, 7], work[i, 8] = w6, w7, w8
 
 
 @kernel

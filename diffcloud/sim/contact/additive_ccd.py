@@ -34,7 +34,11 @@ def safe_fraction(pairs: Ints, distances: Floats, start: Floats, end: Floats, li
         floor: pairs as close as this may not come closer at all: below, rounding could put them on the wrong side [m].
     """
     x, motion, at, found = np.empty((4, 3)), np.empty((4, 3)), np.empty((4, 3)), np.empty(6)
+    ways = path_lengths(start, end)
     for c in range(len(pairs)):
+        # most pairs move so little that they need no look, not even at what their points have in common
+        if reach(pairs, c, ways) * limit <= (1 - _LEFT) * distances[c]:
+            continue
         bound = _bound(pairs, c, start, end, x, motion)
         # a pair that moves so little that it cannot touch needs no look
         if not bound * limit > (1 - _LEFT) * distances[c]:
@@ -54,6 +58,27 @@ def safe_fraction(pairs: Ints, distances: Floats, start: Floats, end: Floats, li
             fraction += 0.9 * (left - goal) / bound
         limit = min(limit, fraction)
     return limit
+
+
+@kernel
+def path_lengths(start: Floats, end: Floats) -> Floats:
+    """[N] how far each point goes from start to end [N, 3] [m]."""
+    found = np.empty(len(start))
+    for i in range(len(start)):
+        square = 0.0
+        for axis in range(3):
+            square += (end[i, axis] - start[i, axis]) ** 2
+        found[i] = sqrt(square)
+    return found
+
+
+@kernel
+def reach(pairs: Ints, c: int, lengths: Floats) -> float:
+    """How much closer pair c [kind, points] can have come when its points have gone so far [m]."""
+    i, j, k, l = pairs[c, 1], pairs[c, 2], pairs[c, 3], pairs[c, 4]
+    if pairs[c, 0] > 0:
+        return max(lengths[i], lengths[j]) + max(lengths[k], lengths[l])
+    return lengths[i] + max(lengths[j], lengths[k], lengths[l])
 
 
 @kernel

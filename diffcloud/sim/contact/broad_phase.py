@@ -37,25 +37,39 @@ def candidates(surface: SurfaceBox, places: Floats, others: Floats, margin: floa
         Indices into the surface's points and faces, and into its edges (twice): first one that can move.
     """
     points, faces, edges = boxes_of(surface, places, others, margin)
-    points_move, faces_move = _moving(surface, surface.points), _moving(surface, surface.faces[:, 0])
-    edges_move = _moving(surface, surface.edges[:, 0])
-    kind = np.arange(2)  # not literally 0 and 1, for which numba would compile everything twice
-    if len(faces) < _FEW:
-        point_face = _swept_between(surface, points, faces, points_move, faces_move, kind[0])
-    else:
-        point_face = _in_cells(surface, points, faces, points_move, faces_move, kind[0])
+    between = _pool(surface, surface.points.reshape(-1, 1), surface.faces)
+    among = _pool(surface, surface.edges, surface.edges)
+    point_face = _swept_between(between, points, faces) if len(faces) < _FEW else _in_cells(between, points, faces)
     if len(edges) < _FEW:
-        return point_face, _swept_among(surface, edges, edges_move, kind[1])
-    return point_face, _in_cells(surface, edges, edges, edges_move, edges_move, kind[1])
+        return point_face, _swept_among(among, edges)
+    return point_face, _in_cells(among, edges, edges)
+
+
+class _Pool(NamedTuple):
+    """What pairs are made of."""
+
+    first: Ints
+    """[M, n] points of each primitive that may come first."""
+    second: Ints
+    """[N, m]"""
+    first_moves: Flags
+    """[M] whether contact can move it."""
+    second_moves: Flags
+    """[N]"""
+    owner: Ints
+    """[points]"""
+    movable: Flags
+    """[owners]"""
+    touches_itself: bool
+    """The cloth."""
 
 
 @kernel
-def _moving(surface: SurfaceBox, points: Ints) -> Flags:
-    """Whether contact can move the owner of each point."""
-    found = np.empty(len(points), np.bool_)
-    for k in range(len(points)):
-        found[k] = surface.movable[surface.owner[points[k]]]
-    return found
+def _pool(surface: SurfaceBox, first: Ints, second: Ints) -> _Pool:
+    owner, movable = surface.owner, surface.movable
+    return _Pool(
+        first, second, movable[owner[first[:, 0]]], movable[owner[second[:, 0]]], owner, movable, surface.touches_itself
+    )
 
 
 @kernel
@@ -83,13 +97,11 @@ def _boxes(places: Floats, others: Floats, primitives: Ints, margin: float) -> F
 
 
 @kernel
-def _swept_between(
-    surface: SurfaceBox, first: Floats, second: Floats, first_moves: Flags, second_moves: Flags, edges: int
-) -> Ints:
+def _swept_between(pool: _Pool, first: Floats, second: Floats) -> Ints:
     """[C, 2] by sweeping along the axis on which boxes spread most: one of each pair begins within the other."""
     axis = _widest(second)
     order_a, order_b = ascending(first[:, axis]), ascending(second[:, axis])
-    a, b, a_moves, b_moves = first[order_a], second[order_b], first_moves[order_a], second_moves[order_b]
+    a, b, a_moves, b_moves = first[order_a], second[order_b], pool.first_moves[order_a], pool.second_moves[order_b]
     found = np.empty((4 * len(first) + 64, 2), np.int64)
     count = begin = 0
     for i in range(len(a)):
@@ -100,7 +112,7 @@ def _swept_between(
             if b[j, axis] > a[i, 3 + axis]:
                 break
             if (a_moves[i] | b_moves[j]) & meet(a, i, b, j):
-                count = _note(surface, found, count, order_a[i], order_b[j], edges)
+                count = _note(pool, found, count, order_a[i], order_b[j])
     begin = 0
     for j in range(len(b)):
         found = with_room(found, count, len(a))
@@ -110,16 +122,16 @@ def _swept_between(
             if a[i, axis] > b[j, 3 + axis]:
                 break
             if (a_moves[i] | b_moves[j]) & meet(a, i, b, j):
-                count = _note(surface, found, count, order_a[i], order_b[j], edges)
+                count = _note(pool, found, count, order_a[i], order_b[j])
     return found[:count]
 
 
 @kernel
-def _swept_among(surface: SurfaceBox, boxes: Floats, moves: Flags, edges: int) -> Ints:
+def _swept_among(pool: _Pool, boxes: Floats) -> Ints:
     """[C, 2] of one list of boxes in the same way."""
     axis = _widest(boxes)
     order = ascending(boxes[:, axis])
-    a, a_moves = boxes[order], moves[order]
+    a, a_moves = boxes[order], pool.first_moves[order]
     found = np.empty((4 * len(boxes) + 64, 2), np.int64)
     count = 0
     for i in range(len(a)):
@@ -128,7 +140,7 @@ def _swept_among(surface: SurfaceBox, boxes: Floats, moves: Flags, edges: int) -
             if a[j, axis] > a[i, 3 + axis]:
                 break
             if (a_moves[i] | a_moves[j]) & meet(a, i, a, j):
-                count = _note(surface, found, count, order[i], order[j], edges)
+                count = _note(pool, found, count, order[i], order[j])
     return found[:count]
 
 
@@ -146,11 +158,10 @@ def _widest(boxes: Floats) -> int:
 
 
 @kernel
-def _in_cells(
-    surface: SurfaceBox, first: Floats, second: Floats, first_moves: Flags, second_moves: Flags, edges: int
-) -> Ints:
+def _in_cells(pool: _Pool, first: Floats, second: Floats) -> Ints:
     """[C, 2] by grids, one for all second boxes up to the usual size and one for each doubling of it: boxes lie in the cell
     of their low corner, and another box meets those in the cells from which they can reach it."""
+    same = pool.first.shape[1] == pool.second.shape[1]  # both lists are of edges: each pair once
     level, levels = np.full(len(second), -1, np.int64), 1  # what is not finite meets nothing
     total, finite = 0.0, 0
     for m in range(len(second)):
@@ -181,8 +192,8 @@ def _in_cells(
                     for p in range(cells.starts[row + begin[2]], cells.starts[row + end[2]]):  # one by one along z
                         if meet(first, i, boxes, p):
                             j = cells.order[p]
-                            if (edges == 0 or i < j) and (first_moves[i] or second_moves[j]):
-                                count = _note(surface, found, count, i, j, edges)
+                            if (not same or i < j) and (pool.first_moves[i] or pool.second_moves[j]):
+                                count = _note(pool, found, count, i, j)
     return found[:count]
 
 
@@ -263,23 +274,18 @@ def meet(a: Floats, i: int, b: Floats, j: int) -> bool:
 
 
 @kernel
-def _note(surface: SurfaceBox, found: Ints, count: int, a: int, b: int, edges: int) -> int:
+def _note(pool: _Pool, found: Ints, count: int, a: int, b: int) -> int:
     """Add a pair whose boxes meet to a list with room, if contact can bring its primitives together; its length then."""
-    second = surface.edges[b, 0] if edges else surface.faces[b, 0]
-    first = surface.edges[a, 0] if edges else surface.points[a]
-    owner_a, owner_b = surface.owner[first], surface.owner[second]
-    if owner_a == owner_b and (owner_a > 0 or not surface.touches_itself):
+    first, second, owner = pool.first, pool.second, pool.owner
+    owner_a, owner_b = owner[first[a, 0]], owner[second[b, 0]]
+    if owner_a == owner_b and (owner_a > 0 or not pool.touches_itself):
         return count
-    if edges:
-        for k in range(2):
-            for l in range(2):
-                if surface.edges[a, k] == surface.edges[b, l]:
-                    return count
-        moves_a, moves_b = surface.movable[owner_a], surface.movable[owner_b]
-        if not moves_a or (moves_b and b < a):
-            a, b = b, a
-    elif surface.faces[b, 0] == first or surface.faces[b, 1] == first or surface.faces[b, 2] == first:
-        return count
+    for k in range(first.shape[1]):
+        for l in range(second.shape[1]):
+            if first[a, k] == second[b, l]:
+                return count
+    if first.shape[1] > 1 and (not pool.movable[owner_a] or (pool.movable[owner_b] and b < a)):
+        a, b = b, a
     found[count, 0], found[count, 1] = a, b
     return count + 1
 

@@ -7,11 +7,11 @@ import numpy as np
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Parameters, Timing
 from diffcloud.sim.compiled.lu import General, factorised
-from diffcloud.sim.compiled.sparse import Pattern, find_slot, widened
+from diffcloud.sim.compiled.sparse import find_slot, widened
 from diffcloud.sim.contact.places import Touching, corners
 from diffcloud.sim.contact.resistance import resistance
 from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
-from diffcloud.sim.implicit.scene import Rigid, Work
+from diffcloud.sim.implicit.scene import Work
 from diffcloud.sim.terms import kernels
 
 _assemble, _jacobian, _spin_tangent = kernels.assemble, kernels.jacobian, kernels.spin_tangent
@@ -179,28 +179,20 @@ def _add_contact(
             blocks = np.zeros((len(nodes), nodes.shape[1] * nodes.shape[1], 9))
             _exact(work, touching, kind, blocks)
             for e in range(len(nodes)):
-                _couple(
-                    work.freedom,
-                    work.wide,
-                    work.rigid,
-                    work.first_body_point,
-                    turned,
-                    swing,
-                    nodes[e],
-                    blocks[e],
-                    1 - caution,
-                    lower,
-                    upper,
-                )
+                _couple(work, turned, swing, nodes, e, 0, nodes.shape[1], blocks[e], 1 - caution, lower, upper)
     rigid = work.rigid
     if len(rigid.body) == 0:
         return
     wide, freedom, first, dt = work.wide, work.freedom, work.first_body_point, work.time_step
-    force = np.zeros((len(freedom), 3))
+    force, part = np.zeros((len(freedom), 3)), np.empty(9)
     contact_force(work, touching, force)
     for p in range(len(swing)):  # -Δt d arm × f = Δt f × d arm
-        row, f = freedom[first + p, 1], force[first + p]
-        _add_cross(f[0], f[1], f[2], swing[p], dt * dt, lower[wide.starts[wide.place[row]]])
+        for k in range(9):
+            part[k] = swing[p, k]
+        _turn_rows(force[first + p, 0], force[first + p, 1], force[first + p, 2], part)
+        diagonal = wide.starts[wide.place[freedom[first + p, 1]]]
+        for k in range(9):
+            lower[diagonal, k] += dt * dt * part[k]
 
 
 @kernel
@@ -211,7 +203,6 @@ def _add_resistance(
     parameters, motion, planes, law, dt = work.parameters, work.motion, work.planes, work.law, work.time_step
     friction = (parameters.friction_obstacle[0], parameters.friction_cloth[0])
     x, weights, local, blocks = np.empty((4, 3)), np.empty(6), np.empty(18), np.empty((16, 9))
-    freedom, wide, rigid, first = work.freedom, work.wide, work.rigid, work.first_body_point
     for e in range(len(listed)):
         if resistance(planes, law, friction, motion.positions, motion.after, listed, numbers, e, x, weights, local):
             width = corners(listed, e)
@@ -220,16 +211,7 @@ def _add_resistance(
                     factor = weights[a] * weights[b]
                     for k in range(9):
                         blocks[a * width + b, k] = factor * (dt * dt * local[k] + dt * local[9 + k])
-            _couple(freedom, wide, rigid, first, turned, swing, listed[e, 1 : 1 + width], blocks, caution, lower, upper)
-
-
-@kernel
-def _add_cross(x: float, y: float, z: float, right: Floats, factor: float, block: Floats) -> None:
-    """block += factor [x, y, z]× right."""
-    for c in range(3):
-        block[c] += factor * (y * right[6 + c] - z * right[3 + c])
-        block[3 + c] += factor * (z * right[c] - x * right[6 + c])
-        block[6 + c] += factor * (x * right[3 + c] - y * right[c])
+            _couple(work, turned, swing, listed, e, 1, width, blocks, caution, lower, upper)
 
 
 @kernel
@@ -264,54 +246,59 @@ def _exact(work: Work, touching: Touching, kind: int, blocks: Floats) -> None:
 
 @kernel
 def _couple(
-    freedom: Ints,
-    wide: Pattern,
-    rigid: Rigid,
-    first: int,
+    work: Work,
     turned: Floats,
     swing: Floats,
-    nodes: Ints,
+    points: Ints,
+    e: int,
+    begin: int,
+    width: int,
     blocks: Floats,
     factor: float,
     lower: Floats,
     upper: Floats,
 ) -> None:
-    """Add the blocks [n², 9] between points, times a factor, to those between rows of the matrix: of nodes, or of
-    bodies' centres and rotations. `first` is the first point of a body."""
-    width = len(nodes)
-    right, both = np.empty(9), np.empty(9)
+    """Add the blocks [width², 9] between points [e, begin:], times a factor, to those between rows of the matrix: of nodes,
+    or of bodies' centres and rotations."""
+    freedom, wide, rigid, first = work.freedom, work.wide, work.rigid, work.first_body_point
+    part = np.empty(9)
     for a in range(width):
+        i = points[e, begin + a]
         for b in range(width):
-            block = blocks[a * width + b]
+            j = points[e, begin + b]
             for k in range(4):
-                row, column = freedom[nodes[a], k // 2], freedom[nodes[b], k % 2]
+                row, column = freedom[i, k // 2], freedom[j, k % 2]
                 if row < 0 or column < 0:
                     continue
-                part = block
+                for k9 in range(9):
+                    part[k9] = blocks[a * width + b, k9]
                 if k % 2 > 0:
-                    own = swing[nodes[b] - first]
+                    _turn_columns(swing, j - first, part)
+                if k // 2 > 0:
+                    x, y, z = arm_of(rigid, turned, i - first)
+                    _turn_rows(x, y, z, part)
+                slot = find_slot(wide, row, column)
+                if slot >= 0:
+                    for k9 in range(9):
+                        lower[slot, k9] += factor * part[k9]
+                else:
                     for r in range(3):
                         for c in range(3):
-                            right[3 * r + c] = (
-                                block[3 * r] * own[c] + block[3 * r + 1] * own[3 + c] + block[3 * r + 2] * own[6 + c]
-                            )
-                    part = right
-                if k // 2 > 0:
-                    x, y, z = arm_of(rigid, turned, nodes[a] - first)
-                    both[:] = 0.0
-                    _add_cross(x, y, z, part, 1.0, both)
-                    part = both
-                _add_at(wide, row, column, part, factor, lower, upper)
+                            upper[~slot, 3 * c + r] += factor * part[3 * r + c]
 
 
 @kernel
-def _add_at(of: Pattern, row: int, column: int, block: Floats, factor: float, lower: Floats, upper: Floats) -> None:
-    """Add the block (row, column), times a factor."""
-    slot = find_slot(of, row, column)
-    if slot >= 0:
-        for k in range(9):
-            lower[slot, k] += factor * block[k]
-    else:
-        for r in range(3):
-            for c in range(3):
-                upper[~slot, 3 * c + r] += factor * block[3 * r + c]
+def _turn_columns(swing: Floats, p: int, block: Floats) -> None:
+    """block = block swing[p]."""
+    for r in range(0, 9, 3):
+        x, y, z = block[r], block[r + 1], block[r + 2]
+        for c in range(3):
+            block[r + c] = x * swing[p, c] + y * swing[p, 3 + c] + z * swing[p, 6 + c]
+
+
+@kernel
+def _turn_rows(x: float, y: float, z: float, block: Floats) -> None:
+    """block = [x, y, z]× block."""
+    for c in range(3):
+        a, b, d = block[c], block[3 + c], block[6 + c]
+        block[c], block[3 + c], block[6 + c] = y * d - z * b, z * a - x * d, x * b - y * a

@@ -14,7 +14,7 @@ from diffcloud.sim.implicit.matrix import newton_matrix
 from diffcloud.sim.implicit.room import Room, away, cover, distances_at, free_way, room_around
 from diffcloud.sim.implicit.scene import Work
 
-_TOLERANCE = 1e-8
+_TOLERANCE = 1e-10
 """Expected next change of velocity, relative to the largest, at which Newton's method has converged.
 
 It is overestimated: convergence is quadratic in the end, so what is left is far smaller."""
@@ -28,9 +28,10 @@ _LEAST_CAUTION = 0.05
 """Of the step after one that the exact matrix led astray."""
 _ROUGH = 1e-4
 """Relative changes above this are checked, and shortened where they lead astray."""
-_REUSE = 1e-3
-"""After a relative change below this the matrix serves once more, and then as long as changes shrink tenfold."""
-_SHRINKING = 0.1
+_REUSE = 1e-1
+"""Below this relative change a matrix serves once more, be it that of the part before, and then as long as changes shrink:
+a new one costs as much as five to ten steps with an old one."""
+_SHRINKING = 0.3
 _WHOLE = 1 - 1e-9
 """A way that is free so far is free: where it has been shortened before, only rounding keeps it from being whole."""
 _PROBE = 1e-4
@@ -82,7 +83,9 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
     here = _towards(work, _place(work, room, still, work.start_scenery, begin, turned), first - still, 1.0, room)
     left_over, trial_left = np.empty((len(first), 3)), np.empty((len(first), 3))
     residual(work, here.velocity, here.points, here.turned, here.touching, left_over)
-    stale, change, caution = True, np.inf, 1.0
+    matrix, change, stale, trouble = work.last, np.inf, work.serves != work.time_step, False
+    caution, reused = 1.0 if stale else 0.0, not stale
+    work.serves = 0.0
     right, direction = np.empty((len(first), 3)), np.empty((len(first), 3))
     for _ in range(_ITERATIONS):
         fresh = stale
@@ -94,21 +97,26 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
             return False, here, room, change
         downhill, size = _judge(work.holder, left_over, direction, here.velocity)
         rough = size > _ROUGH
-        bad = rough and downhill <= 0 and caution < 1
+        bad = (rough and downhill <= 0 and caution < 1) or (reused and size > _REUSE)
         if not bad:
             here, short = _search(work, here, direction, downhill, room, rough, trial_left)
             left_over, trial_left = trial_left, left_over
             before, change = change, size
             expected = change * min(change / before, 1.0) if np.isfinite(before) else change
-            settled = expected < _TOLERANCE or (change < _ROUNDING and change > 0.3 * before)
+            settled = expected < _TOLERANCE or (fresh and change < _ROUNDING and change > 0.3 * before)
             if settled and _arrived(here.scenery, work.final_scenery):
+                work.last = matrix
+                if not trouble:
+                    work.serves = work.time_step
                 return True, here, room, change
             bad = short
             stale = bad or caution > 0 or change > _REUSE or not (fresh or change < _SHRINKING * before)
             if not stale:
                 continue
+        trouble = trouble or bad
         stale = True
-        caution = min(max(4 * caution, _LEAST_CAUTION), 1.0) if bad else 0.0
+        caution = (1.0 if reused else min(max(4 * caution, _LEAST_CAUTION), 1.0)) if bad else 0.0
+        reused = False
     return False, here, room, change
 
 

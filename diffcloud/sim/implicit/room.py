@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from math import sqrt
-
 import numpy as np
 
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints
-from diffcloud.sim.contact.additive_ccd import safe_fraction
+from diffcloud.sim.contact.additive_ccd import path_lengths, reach, safe_fraction
 from diffcloud.sim.contact.broad_phase import candidates, corners_of
 from diffcloud.sim.contact.distance import closest
 from diffcloud.sim.contact.places import gap_of
@@ -137,21 +135,11 @@ def distances_at(work: Work, room: Room, points: Floats) -> Floats:
     distances = np.empty(len(pairs))
     if len(distances) == 0:
         return distances
-    moved = np.empty(len(points))
-    for i in range(len(points)):
-        square = 0.0
-        for axis in range(3):
-            square += (points[i, axis] - begin[i, axis]) ** 2
-        moved[i] = sqrt(square)
+    moved = path_lengths(begin, points)
     x, found = np.empty((4, 3)), np.empty(6)
     for c in range(len(distances)):
         # a pair cannot have come closer than its points have moved: most need no look at their geometry
-        i, j, k, l = pairs[c, 1], pairs[c, 2], pairs[c, 3], pairs[c, 4]
-        if pairs[c, 0] > 0:
-            reach = max(moved[i], moved[j]) + max(moved[k], moved[l])
-        else:
-            reach = moved[i] + max(moved[j], moved[k], moved[l])
-        distances[c] = old[c] - reach
+        distances[c] = old[c] - reach(pairs, c, moved)
         if distances[c] < thickness:
             distances[c] = distance_of(pairs, c, points, x, found)
     return distances

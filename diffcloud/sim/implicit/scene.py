@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters
+from diffcloud.sim.compiled.lu import General
 from diffcloud.sim.compiled.sparse import Pattern
 from diffcloud.sim.contact.places import Planes
 from diffcloud.sim.contact.surface import Surface, boxed
@@ -76,6 +77,8 @@ class Work(Box):  # type: ignore[misc]
         holder: [V] the handle that prescribes each node; -1: none.
         target: [H, 3] where prescribed nodes go [m].
         wide, moved: the pattern that also couples what touches, and where the blocks of the scene's own lie in it.
+        last: the factorised matrix with which the part before ended.
+        serves: the `time_step` of that part [s]; 0: its matrix is of no use for this one.
     """
 
 
@@ -109,6 +112,8 @@ define(
         "target",
         "wide",
         "moved",
+        "last",
+        "serves",
     ],
 )
 
@@ -148,10 +153,12 @@ def new_work(scene: Scene, parameters: Parameters, nodes: int, bodies: int) -> W
         np.empty((others, 3)),
         np.empty((others, 3)),
         np.empty((count, 3)),
-        np.empty(nodes, np.int64),
+        np.full(nodes, -1, np.int64),
         np.empty((len(parameters.target), 3)),
         scene.pattern,
         np.arange(len(scene.pattern.rows)),
+        General(scene.pattern, np.empty((0, 9)), np.empty((0, 9)), np.empty((0, 9)), np.empty((0, 9)), 0),
+        0.0,
     )
 
 

@@ -62,7 +62,11 @@ def simulate(
             return INTERRUPTED, step, kept
         take_anchors(held, track, step, positions[step], anchors)
         aim(held, track, step, anchors, parameters)
-        work.holder = holders(held, step, nodes)
+        holder = holders(held, step, nodes)
+        for i in range(nodes):
+            if holder[i] != work.holder[i]:
+                work.serves = 0.0
+        work.holder = holder
         for i in range(nodes):
             for axis in range(3):
                 positions[step + 1, i, axis], velocities[step + 1, i, axis] = (
