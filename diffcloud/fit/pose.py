@@ -177,14 +177,21 @@ class PoseSpace:
             else:
                 way = torch.zeros_like(angles)
                 way[:, _ANGLES.index(name)] = 1.0
-                turning = torch.func.jvp(lambda w: torch.linalg.matrix_exp(_cross(w)), (angles,), (way,))[1]
-                columns.append(_turned(centred, turning))
+                columns.append(_turned(centred, _turning(angles, way)))
         return torch.stack(columns) if columns else points.new_zeros(0, *points.shape)
 
     def _parts(self, values: Tensor, names: tuple[str, ...]) -> Tensor:
         """[B, n] of values [B, d]; zero for what is not free."""
         zero = values.new_zeros(len(values))
         return torch.stack([values[:, self.names.index(n)] if n in self.names else zero for n in names], dim=-1)
+
+
+def _turning(angles: Tensor, way: Tensor) -> Tensor:
+    """[B, 3, 3] the derivative of the rotation exp([w]×) along a way [B, 3]: a corner of the exponential of twice the size
+    (Van Loan 1978)."""
+    along, cross = _cross(way), _cross(angles)
+    both = torch.cat([torch.cat([cross, along], dim=-1), torch.cat([torch.zeros_like(cross), cross], dim=-1)], dim=-2)
+    return torch.linalg.matrix_exp(both)[:, :3, 3:]
 
 
 def _turned(points: Tensor, rotation: Tensor) -> Tensor:
