@@ -60,6 +60,8 @@ class EpisodesConfig(Section):
     """How late the joint log is."""
     extrinsic_error: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """(millimetres, degrees) by which the stated place of each camera but the first is off."""
+    workers: Count = 1
+    """Scenarios at once."""
 
     def recorder(self) -> RecorderSettings:
         return RecorderSettings(lag_s=self.lag_s, extrinsic_error=self.extrinsic_error)

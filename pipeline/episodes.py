@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +14,7 @@ import torch
 import typer
 from numpy.typing import NDArray
 
-from diffcloud.errors import ConfigError
+from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.io.episodes import read_episode, write_episode
 from diffcloud.io.files import files_in, folders_in, staged
 from diffcloud.io.manifests import remove_files
@@ -25,9 +26,10 @@ from diffcloud.sensing.whole_surface import sample_surface
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.system import System
-from pipeline.config import EpisodesConfig, load_config
-from pipeline.console import JsonFlag, ParamsFile, errors, finish, progress_bar, writes
+from pipeline.config import EpisodesConfig, load_config, updated
+from pipeline.console import JsonFlag, ParamsFile, errors, finish, writes
 from pipeline.scenario_options import choose_scenario
+from pipeline.workers import Tell, run_all
 
 _HIDDEN = ("stretch", "mass")
 
@@ -36,27 +38,42 @@ _HIDDEN = ("stretch", "mass")
 def episodes(
     out: Annotated[Path, typer.Option(help="Folder; episodes go to OUT/<scenario>/<episode>, raw or .npz.")],
     params: ParamsFile = None,
+    workers: Annotated[int | None, typer.Option(help="Scenarios at once, each in a process with one thread.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Make or collect the recorded episodes of every scenario."""
     config = load_config(params)
-    written: dict[str, list[str]] = {}
-    with progress_bar("episodes", len(config.scenarios)) as update:
-        for index, name in enumerate(config.scenarios):
-            scenario = choose_scenario(name)
-            if config.episodes.source == "synthetic":
-                tell = _teller(update, index, name)
-                written[name] = _synthetic(scenario, config.episodes, index, out / name, tell)
-            else:
-                written[name] = _own(Path(config.episodes.source) / name, out / name)
-            update(index + 1, name)
-    for name, names in written.items():
-        errors.print(f"{name}: {', '.join(names)}")
+    settings = updated(config.episodes, workers=workers)
+    jobs = [EpisodesJob(name, index, settings, out / name) for index, name in enumerate(config.scenarios)]
+    written = {}
+    for job, names, error in run_all("episodes", jobs, settings.workers):
+        if error is not None:
+            raise DiffCloudError(error)
+        written[job.scenario] = names
+        errors.print(f"{job.scenario}: {', '.join(names)}")
     finish({"out": str(out), "episodes": written}, json)
 
 
-def _teller(update: Callable[[int, str], None], done: int, name: str) -> Callable[[int, str], None]:
-    return lambda _, text: update(done, f"{name}, {text}")
+@dataclass(frozen=True)
+class EpisodesJob:
+    """The recordings of one scenario."""
+
+    scenario: str
+    index: int
+    """Of the scenario among all; its random numbers depend on it."""
+    settings: EpisodesConfig
+    out: Path
+
+    @property
+    def label(self) -> str:
+        return self.scenario
+
+    def run(self, tell: Tell) -> list[str]:
+        """Make or copy them; their names."""
+        scenario = choose_scenario(self.scenario)
+        if self.settings.source != "synthetic":
+            return _own(Path(self.settings.source) / self.scenario, self.out)
+        return _synthetic(scenario, self.settings, self.index, self.out, lambda _, text: tell(0.0, text))
 
 
 def _synthetic(
