@@ -1,30 +1,37 @@
 """The place on a triangle mesh nearest to a point, and whether a mesh hides a point, exactly, in kernels.
 
-A face is looked at only where the sphere around it comes near enough: nearer than the nearest place found so far, which
-begins with the face of the query before; or as near to the line of sight as its radius.
+Faces are taken in groups of eight neighbours. Those of a group are looked at only where the sphere around them comes near
+enough: nearer than the nearest place found so far, which begins with a guess or the face of the query before; or as near to
+the line of sight as its radius. Of those, a face whose plane, or a line through an edge of it, is farther away is left out.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.clouds.curve import Floats, Ints
+from diffcloud.clouds.curve import Floats, Ints, curve_order
 from diffcloud.compiled import kernel
+
+NO_GUESS: Ints = np.empty((0, 0), np.int64)
+_GROUP = 8
+_SAFE = 1 - 1e-12
+"""Part of a computed bound that rounding leaves."""
 
 
 @kernel
-def nearest_on_triangle(point: Floats, a: Floats, b: Floats, c: Floats, place: Floats) -> float:
-    """Squared distance [m²]; writes the barycentric place [3]. (Ericson 2005, section 5.1.5.)"""
-    d1 = d2 = d3 = d4 = d5 = d6 = 0.0
-    for axis in range(3):
-        ab, ac = b[axis] - a[axis], c[axis] - a[axis]
-        ap, bp, cp = point[axis] - a[axis], point[axis] - b[axis], point[axis] - c[axis]
-        d1 += ab * ap
-        d2 += ac * ap
-        d3 += ab * bp
-        d4 += ac * bp
-        d5 += ab * cp
-        d6 += ac * cp
+def nearest_on_triangle(x: float, y: float, z: float, nodes: Floats, i: int, j: int, k: int, place: Floats) -> float:
+    """Squared distance of a point from the triangle of three nodes [V, 3] [m²]; writes the barycentric place [3]. (Ericson
+    2005, section 5.1.5.)"""
+    a0, a1, a2 = nodes[i, 0], nodes[i, 1], nodes[i, 2]
+    b0, b1, b2 = nodes[j, 0], nodes[j, 1], nodes[j, 2]
+    c0, c1, c2 = nodes[k, 0], nodes[k, 1], nodes[k, 2]
+    e0, e1, e2, f0, f1, f2 = b0 - a0, b1 - a1, b2 - a2, c0 - a0, c1 - a1, c2 - a2
+    d1 = e0 * (x - a0) + e1 * (y - a1) + e2 * (z - a2)
+    d2 = f0 * (x - a0) + f1 * (y - a1) + f2 * (z - a2)
+    d3 = e0 * (x - b0) + e1 * (y - b1) + e2 * (z - b2)
+    d4 = f0 * (x - b0) + f1 * (y - b1) + f2 * (z - b2)
+    d5 = e0 * (x - c0) + e1 * (y - c1) + e2 * (z - c2)
+    d6 = f0 * (x - c0) + f1 * (y - c1) + f2 * (z - c2)
     vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
     if d1 <= 0.0 and d2 <= 0.0:
         v, w = 0.0, 0.0
@@ -41,73 +48,152 @@ def nearest_on_triangle(point: Floats, a: Floats, b: Floats, c: Floats, place: F
         v = 1.0 - w
     else:
         v, w = vb / (va + vb + vc), vc / (va + vb + vc)
-    place[0], place[1], place[2] = 1.0 - v - w, v, w
-    squared = 0.0
-    for axis in range(3):
-        gap = point[axis] - (place[0] * a[axis] + v * b[axis] + w * c[axis])
-        squared += gap * gap
-    return squared
+    u = 1.0 - v - w
+    place[0], place[1], place[2] = u, v, w
+    g0, g1, g2 = x - (u * a0 + v * b0 + w * c0), y - (u * a1 + v * b1 + w * c1), z - (u * a2 + v * b2 + w * c2)
+    return g0 * g0 + g1 * g1 + g2 * g2
 
 
 @kernel
-def bounding_spheres(corners: Floats, faces: Ints, spheres: Floats) -> None:
-    """[V, 3] node positions -> spheres [F, 4]: centre and radius around each face [m]."""
+def grouped(nodes: Floats, faces: Ints) -> Ints:
+    """[G, 8] faces that lie close together, by nodes [V, 3] of the mesh; the last group is filled with its last face."""
+    centres = np.empty((len(faces), 3))
     for face in range(len(faces)):
-        reach = 0.0
         for axis in range(3):
-            spheres[face, axis] = 0.0
-            for corner in range(3):
-                spheres[face, axis] += corners[faces[face, corner], axis] / 3.0
-        for corner in range(3):
-            away = 0.0
-            for axis in range(3):
-                away += (corners[faces[face, corner], axis] - spheres[face, axis]) ** 2
-            reach = max(reach, away)
-        spheres[face, 3] = np.sqrt(reach)
+            first, second, third = nodes[faces[face, 0], axis], nodes[faces[face, 1], axis], nodes[faces[face, 2], axis]
+            centres[face, axis] = first + second + third
+    order = curve_order(centres)
+    found = np.zeros(((len(faces) + _GROUP - 1) // _GROUP, _GROUP), np.int64)
+    if len(order) < len(faces):  # nodes that are no numbers: any groups will do
+        order = np.arange(len(faces))
+    for place in range(len(found) * _GROUP):
+        found[place // _GROUP, place % _GROUP] = order[min(place, len(faces) - 1)]
+    return found
 
 
 @kernel
-def find_on_surface(queries: Floats, nodes: Floats, faces: Ints) -> tuple[Ints, Floats]:
-    """[M, Q, 3] queries at M states of a mesh, [M, V, 3] its nodes, [F, 3] faces, at least one -> [M, Q] the nearest face
-    of each, [M, Q, 3] the barycentric place on it; the first corner of the first face where a position is no number."""
+def _spheres(nodes: Floats, faces: Ints, groups: Ints, spheres: Floats) -> None:
+    """spheres [G, 4]: centre and radius around all faces of each of the groups [G, n] [m]."""
+    for g in range(len(groups)):
+        count = 3 * groups.shape[1]
+        x = y = z = 0.0
+        for k in range(count):
+            i = faces[groups[g, k // 3], k % 3]
+            x, y, z = x + nodes[i, 0], y + nodes[i, 1], z + nodes[i, 2]
+        x, y, z = x / count, y / count, z / count
+        reach = 0.0
+        for k in range(count):
+            i = faces[groups[g, k // 3], k % 3]
+            reach = max(reach, (nodes[i, 0] - x) ** 2 + (nodes[i, 1] - y) ** 2 + (nodes[i, 2] - z) ** 2)
+        spheres[g, 0], spheres[g, 1], spheres[g, 2], spheres[g, 3] = x, y, z, np.sqrt(reach)
+
+
+@kernel
+def _sides(nodes: Floats, faces: Ints, groups: Ints, sides: Floats) -> None:
+    """sides [G, 16, 8]: of each face the unit normal, and those of its edges within its plane, outwards, each with its
+    offset. Where a face has no area, zero."""
+    sides[:] = 0.0
+    for g in range(len(groups)):
+        for lane in range(_GROUP):
+            face = groups[g, lane]
+            i, j, k = faces[face, 0], faces[face, 1], faces[face, 2]
+            e0, e1, e2 = nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1], nodes[j, 2] - nodes[i, 2]
+            f0, f1, f2 = nodes[k, 0] - nodes[i, 0], nodes[k, 1] - nodes[i, 1], nodes[k, 2] - nodes[i, 2]
+            n0, n1, n2 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
+            area = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+            if not area > 0.0:
+                continue
+            n0, n1, n2 = n0 / area, n1 / area, n2 / area
+            sides[g, 0, lane], sides[g, 1, lane], sides[g, 2, lane] = n0, n1, n2
+            sides[g, 3, lane] = n0 * nodes[i, 0] + n1 * nodes[i, 1] + n2 * nodes[i, 2]
+            for corner in range(3):
+                a, b = faces[face, corner], faces[face, (corner + 1) % 3]
+                d0, d1, d2 = nodes[b, 0] - nodes[a, 0], nodes[b, 1] - nodes[a, 1], nodes[b, 2] - nodes[a, 2]
+                length = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+                o0, o1, o2 = (d1 * n2 - d2 * n1) / length, (d2 * n0 - d0 * n2) / length, (d0 * n1 - d1 * n0) / length
+                row = 4 * (corner + 1)
+                sides[g, row, lane], sides[g, row + 1, lane], sides[g, row + 2, lane] = o0, o1, o2
+                sides[g, row + 3, lane] = o0 * nodes[a, 0] + o1 * nodes[a, 1] + o2 * nodes[a, 2]
+
+
+@kernel
+def _bounds(x: float, y: float, z: float, sides: Floats, begin: int, bounds: Floats) -> None:
+    """bounds [8]: the squared distances of a point from the faces of the group whose sides begin there are no smaller [m²]:
+    from their planes, and from the farthest of their edges' lines in them that it lies beyond."""
+    for lane in range(begin, begin + _GROUP):
+        above = sides[lane] * x + sides[lane + 8] * y + sides[lane + 16] * z - sides[lane + 24]
+        first = sides[lane + 32] * x + sides[lane + 40] * y + sides[lane + 48] * z - sides[lane + 56]
+        second = sides[lane + 64] * x + sides[lane + 72] * y + sides[lane + 80] * z - sides[lane + 88]
+        third = sides[lane + 96] * x + sides[lane + 104] * y + sides[lane + 112] * z - sides[lane + 120]
+        beside = first if first > 0.0 else 0.0
+        beside = second if second > beside else beside
+        beside = third if third > beside else beside
+        bounds[lane - begin] = _SAFE * (above * above + beside * beside)
+
+
+@kernel
+def find_on_surface(queries: Floats, guesses: Ints, nodes: Floats, faces: Ints) -> tuple[Ints, Floats]:
+    """The nearest places on M states of a mesh.
+
+    Args:
+        queries: [M, Q, 3] [m].
+        guesses: [M, Q] faces that may be near; [0, 0]: none.
+        nodes: [M, V, 3] [m].
+        faces: [F, 3], at least one.
+
+    Returns:
+        ([M, Q] the nearest face of each, [M, Q, 3] the barycentric place on it); the first corner of the first face where a
+        position is no number.
+    """
     states, count = queries.shape[0], queries.shape[1]
     found, places = np.zeros((states, count), np.int64), np.zeros((states, count, 3))
-    places[:, :, 0] = 1.0
-    spheres, place = np.empty((len(faces), 4)), np.empty(3)
+    groups = grouped(nodes[0], faces)
+    spheres, sides, bounds = np.empty((len(groups), 4)), np.empty((len(groups), 16, _GROUP)), np.empty(_GROUP)
+    flat, place = sides.reshape(-1), np.empty(3)
     for state in range(states):
         corners = nodes[state]
-        bounding_spheres(corners, faces, spheres)
+        _spheres(corners, faces, groups, spheres)
+        _sides(corners, faces, groups, sides)
         last = 0
         for query in range(count):
-            point = queries[state, query]
-            best, bound = np.inf, np.inf
-            for turn in range(len(faces) + 1):
-                face = last if turn == 0 else turn - 1
-                away = 0.0
-                for axis in range(3):
-                    away += (point[axis] - spheres[face, axis]) ** 2
-                if away > (bound + spheres[face, 3]) ** 2:
+            x, y, z = queries[state, query, 0], queries[state, query, 1], queries[state, query, 2]
+            face = guesses[state, query] if len(guesses) > 0 else last
+            best = nearest_on_triangle(x, y, z, corners, faces[face, 0], faces[face, 1], faces[face, 2], place)
+            if not best < np.inf:
+                best, face, place[0], place[1], place[2] = np.inf, 0, 1.0, 0.0, 0.0
+            bound = np.sqrt(best)
+            places[state, query, 0], places[state, query, 1], places[state, query, 2] = place[0], place[1], place[2]
+            for g in range(len(groups)):
+                dx, dy, dz = x - spheres[g, 0], y - spheres[g, 1], z - spheres[g, 2]
+                if dx * dx + dy * dy + dz * dz > (bound + spheres[g, 3]) ** 2:
                     continue
-                squared = nearest_on_triangle(
-                    point, corners[faces[face, 0]], corners[faces[face, 1]], corners[faces[face, 2]], place
-                )
-                if squared < best:
-                    best, bound, found[state, query] = squared, np.sqrt(squared), face
-                    places[state, query] = place
-            last = found[state, query]
+                _bounds(x, y, z, flat, 16 * _GROUP * g, bounds)
+                for lane in range(_GROUP):
+                    if bounds[lane] >= best:
+                        continue
+                    other = groups[g, lane]
+                    i, j, k = faces[other, 0], faces[other, 1], faces[other, 2]
+                    squared = nearest_on_triangle(x, y, z, corners, i, j, k, place)
+                    if squared < best:
+                        best, bound, face = squared, np.sqrt(squared), other
+                        for axis in range(3):
+                            places[state, query, axis] = place[axis]
+            found[state, query] = last = face
     return found, places
 
 
 @kernel
-def meets_triangle(start: Floats, way: Floats, a: Floats, b: Floats, c: Floats) -> float:
-    """How far along a unit way [3] a ray meets a triangle [m]; negative where it does not. (Möller and Trumbore 1997.)"""
-    e1x, e1y, e1z = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    e2x, e2y, e2z = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+def meets_triangle(start: Floats, way: Floats, nodes: Floats, i: int, j: int, k: int) -> float:
+    """How far along a unit way [3] a ray meets the triangle of three nodes [V, 3] [m]; negative where it does not. (Möller
+    and Trumbore 1997.)"""
+    a0, a1, a2 = nodes[i, 0], nodes[i, 1], nodes[i, 2]
+    e1x, e1y, e1z = nodes[j, 0] - a0, nodes[j, 1] - a1, nodes[j, 2] - a2
+    e2x, e2y, e2z = nodes[k, 0] - a0, nodes[k, 1] - a1, nodes[k, 2] - a2
     px, py, pz = way[1] * e2z - way[2] * e2y, way[2] * e2x - way[0] * e2z, way[0] * e2y - way[1] * e2x
     determinant = e1x * px + e1y * py + e1z * pz
     if abs(determinant) < 1e-300:
         return -1.0
-    sx, sy, sz = start[0] - a[0], start[1] - a[1], start[2] - a[2]
+    sx, sy, sz = start[0] - a0, start[1] - a1, start[2] - a2
     u = (sx * px + sy * py + sz * pz) / determinant
     if u < 0.0 or u > 1.0:
         return -1.0
@@ -125,10 +211,13 @@ def find_hidden(points: Floats, eyes: Floats, nodes: Floats, faces: Ints, near: 
     that it lies on."""
     states, count = points.shape[0], points.shape[1]
     found = np.ones((states, count), np.int64)
-    spheres, way = np.empty((len(faces), 4)), np.empty(3)
+    groups = grouped(nodes[0], faces)
+    single = groups.reshape(-1, 1)
+    around, spheres, way = np.empty((len(groups), 4)), np.empty((len(single), 4)), np.empty(3)
     for state in range(states):
         corners = nodes[state]
-        bounding_spheres(corners, faces, spheres)
+        _spheres(corners, faces, groups, around)
+        _spheres(corners, faces, single, spheres)
         for index in range(count):
             point = points[state, index]
             for eye in range(eyes.shape[1]):
@@ -139,28 +228,49 @@ def find_hidden(points: Floats, eyes: Floats, nodes: Floats, faces: Ints, near: 
                 length = np.sqrt(length)
                 for axis in range(3):
                     way[axis] /= length
-                free = True
-                for face in range(len(faces)):
-                    along, away = 0.0, 0.0
-                    for axis in range(3):
-                        gap = spheres[face, axis] - point[axis]
-                        along += gap * way[axis]
-                        away += gap * gap
-                    reach = spheres[face, 3]
-                    if along < near - reach or along > length + reach or away - along * along > reach * reach:
-                        continue
-                    a, b, c = corners[faces[face, 0]], corners[faces[face, 1]], corners[faces[face, 2]]
-                    if near < meets_triangle(point, way, a, b, c) < length:
-                        free = False
-                        break
-                if free:
+                if not _is_hidden(point, way, length, near, corners, faces, single, around, spheres):
                     found[state, index] = 0
                     break
     return found
 
 
+@kernel
+def _is_hidden(
+    point: Floats,
+    way: Floats,
+    length: float,
+    near: float,
+    nodes: Floats,
+    faces: Ints,
+    listed: Ints,
+    around: Floats,
+    spheres: Floats,
+) -> bool:
+    """Whether a face stands in the unit way [3] from a point to an eye at a distance."""
+    for g in range(len(around)):
+        if _is_beside(point, way, length, near, around, g):
+            continue
+        for place in range(_GROUP * g, _GROUP * (g + 1)):
+            if _is_beside(point, way, length, near, spheres, place):
+                continue
+            face = listed[place, 0]
+            if near < meets_triangle(point, way, nodes, faces[face, 0], faces[face, 1], faces[face, 2]) < length:
+                return True
+    return False
+
+
+@kernel
+def _is_beside(point: Floats, way: Floats, length: float, near: float, spheres: Floats, index: int) -> bool:
+    """Whether nothing of a sphere is in the way from a point on, between `near` and `length` [m]."""
+    x, y, z = spheres[index, 0] - point[0], spheres[index, 1] - point[1], spheres[index, 2] - point[2]
+    along, reach = x * way[0] + y * way[1] + z * way[2], spheres[index, 3]
+    if along < near - reach or along > length + reach:
+        return True
+    return x * x + y * y + z * z - along * along > reach * reach
+
+
 def compile_surface() -> None:
     """Compile what queries need."""
     points, nodes, faces = np.zeros((1, 1, 3)), np.zeros((1, 3, 3)), np.array([[0, 1, 2]])
-    find_on_surface(points, nodes, faces)
+    find_on_surface(points, NO_GUESS, nodes, faces)
     find_hidden(points, points + 1.0, nodes, faces, 0.01)

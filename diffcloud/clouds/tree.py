@@ -2,9 +2,9 @@
 
 Points lie along a Hilbert curve, eight to a leaf; sixteen consecutive nodes make a node of the level above. Sixteen
 queries that follow each other on their own curve go through the tree together: a node is opened where its box comes as
-near to the box of the queries as the farthest of the neighbours found so far. The leaf in which the last queries found
-theirs is looked at first. Rounding is monotone, so the computed distance to a box never exceeds that to a point in it:
-the result is exact, and of equally near points the one of lowest number.
+near to the box of the queries as the farthest of the neighbours found so far. Guesses, and the leaf in which the last
+queries found theirs, are looked at first. Rounding is monotone, so the computed distance to a box never exceeds that to a
+point in it: the result is exact, and of equally near points the one of lowest number.
 
 Loops over sixteen become vector instructions: their length is a constant, too long to be unrolled, and without branches.
 """
@@ -29,8 +29,10 @@ _STACK = 16 * _FAN
 class Tree(NamedTuple):
     """A cloud of P points."""
 
+    points: Floats
+    """[P, 3] [m]"""
     order: Ints
-    """[P] numbers of the points, along the curve."""
+    """[P] their numbers along the curve."""
     leaves: Floats
     """[L * 32] for each leaf 8 x, 8 y, 8 z [m], 8 numbers; infinite, with number P, where the last has fewer points."""
     boxes: Floats
@@ -81,7 +83,7 @@ def build_tree(points: Floats) -> Tree:
                 for k in range(side * _FAN, (side + 1) * _FAN):
                     boxes[low] = smaller(boxes[low], boxes[below + k])
                     boxes[high] = larger(boxes[high], boxes[below + 3 * _FAN + k])
-    return Tree(order, leaves, boxes, starts[:levels], counts[:levels])
+    return Tree(points, order, leaves, boxes, starts[:levels], counts[:levels])
 
 
 @kernel
@@ -122,8 +124,8 @@ def _gaps(boxes: Floats, group: int, box: Floats, gaps: Floats) -> None:
 
 
 @kernel
-def _gather(queries: Floats, order: Ints, begin: int, missing: int, lanes: Floats, box: Floats) -> None:
-    """Load the next queries, the last of all as often as lanes are left, and their box."""
+def _gather(queries: Floats, order: Ints, guesses: Ints, begin: int, points: Floats, lanes: Floats, box: Floats) -> None:
+    """Load the next queries with their guesses, the last of all as often as lanes are left, and their box."""
     for axis in range(3):
         low, high = np.inf, -np.inf
         for lane in range(_LANES):
@@ -132,18 +134,27 @@ def _gather(queries: Floats, order: Ints, begin: int, missing: int, lanes: Float
             low, high = smaller(value, low), larger(value, high)
         box[axis], box[3 + axis] = low, high
     for lane in range(_LANES):
-        lanes[_NEAREST + lane], lanes[_FOUND + lane] = np.inf, missing
+        lanes[_NEAREST + lane], lanes[_FOUND + lane] = np.inf, len(points)
+        guess = guesses[order[min(begin + lane, len(order) - 1)]] if len(guesses) > 0 else -1
+        if guess >= 0:
+            dx, dy = lanes[_X + lane] - points[guess, 0], lanes[_Y + lane] - points[guess, 1]
+            dz = lanes[_Z + lane] - points[guess, 2]
+            lanes[_NEAREST + lane], lanes[_FOUND + lane] = dx * dx + dy * dy + dz * dz, guess
 
 
 @kernel
-def find_nearest(queries: Floats, order: Ints, tree: Tree) -> Ints:
-    """[Q, 3] queries, the numbers of those to answer along a curve -> [Q] number of the nearest point; 0 for the others."""
+def find_nearest(queries: Floats, order: Ints, guesses: Ints, tree: Tree) -> Ints:
+    """[Q, 3] queries, the numbers of those to answer along a curve -> [Q] number of the nearest point; 0 for the others.
+
+    Args:
+        guesses: [Q] points that may be near; below zero, or [0]: none.
+    """
     result = np.zeros(len(queries), np.int64)
     lanes, box, gaps = np.empty(5 * _LANES), np.empty(6), np.empty(_FAN)
     nodes, levels, bounds = np.empty(_STACK, np.int64), np.empty(_STACK, np.int64), np.empty(_STACK)
     leaf = 0  # in which the last queries found theirs
     for begin in range(0, len(order), _LANES):
-        _gather(queries, order, begin, len(tree.order), lanes, box)
+        _gather(queries, order, guesses, begin, tree.points, lanes, box)
         _scan(tree.leaves, leaf, lanes)
         reach, first = _reach(lanes), leaf
         nodes[0], levels[0], bounds[0] = 0, len(tree.starts) - 1, 0.0

@@ -93,16 +93,19 @@ def pairs_forth(
     cut: float | None,
     share: float,
     seen: Tensor | None = None,
-) -> Pairs:
-    """Each place with the nearest recorded point of its frame.
+    guesses: Tensor | None = None,
+) -> tuple[Pairs, Tensor]:
+    """Each place with the nearest recorded point of its frame, and the numbers of these points [B, L, N].
 
     Args:
         moved: [B, L, N, 3] the places in the recording's frame.
         cut: places below this height do not count: the recording ends there.
         share: of all weights.
         seen: bool [B, L, N] which places a camera could see; None for all.
+        guesses: [B, L, N] points that may be near; they save time.
     """
-    found = [cloud.nearest_index(moved[:, frame]) for frame, cloud in enumerate(clouds)]
+    near = [None] * len(clouds) if guesses is None else guesses.unbind(1)
+    found = [cloud.nearest_index(moved[:, frame], near[frame]) for frame, cloud in enumerate(clouds)]
     partners = torch.stack([cloud.points[index] for cloud, index in zip(clouds, found, strict=True)], dim=1)
     normals = torch.stack([cloud.normals[index] for cloud, index in zip(clouds, found, strict=True)], dim=1)
     counted = torch.ones_like(moved[..., 0]) if cut is None else (moved[..., 2] >= cut).to(moved)
@@ -110,7 +113,7 @@ def pairs_forth(
         counted = counted * seen
     weights = share / len(clouds) * counted / counted.sum(-1, keepdim=True).clamp(min=1.0)
     spacing = moved.new_tensor([cloud.spacing for cloud in clouds])
-    return Pairs(places, partners, normals, spacing, weights, share / len(clouds))
+    return Pairs(places, partners, normals, spacing, weights, share / len(clouds)), torch.stack(found, dim=1)
 
 
 @torch.no_grad()
@@ -124,8 +127,9 @@ def pairs_back(
     space: PoseSpace,
     pose: Tensor,
     share: float,
-) -> Pairs:
-    """Each recorded point with the nearest place on the surface.
+    guesses: Tensor | None = None,
+) -> tuple[Pairs, Tensor]:
+    """Each recorded point with the nearest place on the surface, and the numbers of the faces there [B, L, Q].
 
     Args:
         positions: [B, L, V, 3] nodes of the surface.
@@ -133,13 +137,14 @@ def pairs_back(
         recorded: [L, Q, 3].
         sure: [L, Q] how much each counts.
         pose: [B, d]
+        guesses: [B, L, Q] faces that may be near; they save time.
     """
-    places = nearest_places(positions, faces, space.back(recorded, pose))
+    places, found = nearest_places(positions, faces, space.back(recorded, pose), guesses)
     normals = space.turned(places.normals(positions), pose)
     weights = share * sure / sure.sum(-1, keepdim=True) / len(recorded)
     batch = len(positions)
     shares = weights.expand(batch, -1, -1)
-    return Pairs(places, recorded.expand(batch, -1, -1, -1), normals, spacing, shares, share / len(recorded))
+    return Pairs(places, recorded.expand(batch, -1, -1, -1), normals, spacing, shares, share / len(recorded)), found
 
 
 def seen_places(positions: Tensor, faces: Tensor, points: Tensor, viewpoints: Tensor, *, near: float) -> Tensor:
@@ -158,15 +163,22 @@ def seen_places(positions: Tensor, faces: Tensor, points: Tensor, viewpoints: Te
     return torch.from_numpy(hidden == 0).reshape(points.shape[:-1])
 
 
-def nearest_places(positions: Tensor, faces: Tensor, queries: Tensor) -> SurfacePoints:
-    """[B, L, Q] the places on faces [F, 3] of meshes at node positions [B, L, V, 3] nearest to queries [B, L, Q, 3].
+def nearest_places(
+    positions: Tensor, faces: Tensor, queries: Tensor, guesses: Tensor | None = None
+) -> tuple[SurfacePoints, Tensor]:
+    """The places on faces [F, 3] of meshes at node positions [B, L, V, 3] nearest to queries [B, L, Q, 3], and the numbers
+    of their faces [B, L, Q].
 
     Where a position is no number, the place is the first corner.
-    """
-    from diffcloud.clouds.surface import find_on_surface  # numba takes a moment to import
 
-    states = positions.shape[0] * positions.shape[1]
+    Args:
+        guesses: [B, L, Q] faces that may be near; they save time.
+    """
+    from diffcloud.clouds.surface import NO_GUESS, find_on_surface  # numba takes a moment to import
+
+    states, shape = positions.shape[0] * positions.shape[1], queries.shape[:-1]
     nodes, points = (part.detach().reshape(states, -1, 3).contiguous().numpy() for part in (positions, queries))
-    found, places = find_on_surface(points, nodes, faces.numpy())
-    shape = (*queries.shape[:-1], 3)
-    return SurfacePoints(faces[torch.from_numpy(found)].reshape(shape), torch.from_numpy(places).reshape(shape))
+    near = NO_GUESS if guesses is None else guesses.reshape(states, -1).contiguous().numpy()
+    found, places = (torch.from_numpy(part) for part in find_on_surface(points, near, nodes, faces.numpy()))
+    found = found.reshape(shape)
+    return SurfacePoints(faces[found], places.reshape(*shape, 3)), found

@@ -302,20 +302,32 @@ class Objective:
         places = self.sampler.draw(still)
         share = 1.0 if self.paper else 0.5
         seen: Tensor | None = None
+        near: Tensor | None = None  # what was found last: poses of one motion differ little
+        there: Tensor | None = None
 
         def pairs_at(pose: Tensor) -> tuple[Pairs, ...]:
-            nonlocal seen
+            nonlocal seen, near, there
             shown = self._lagged(Motion(still, moving, pose, ()), target.space)
             points = places.of(shown)
             if seen is None and target.viewpoints is not None:  # from where one stands metres away, a step changes nothing
                 eyes = target.space.back(target.viewpoints, pose)
                 seen = seen_places(shown, self._faces, points, eyes, near=_NEAR_M / self._unit)
             moved = target.space.moved(points, pose)
-            forth = pairs_forth(places, moved, clouds, cut=target.cut, share=share, seen=seen)
+            forth, near = pairs_forth(places, moved, clouds, cut=target.cut, share=share, seen=seen, guesses=near)
             if self.paper:
                 return (forth,)
             recorded, sure = (part[chosen] for part in self._recorded)
-            back = pairs_back(shown, self._faces, recorded, sure, forth.spacing, space=target.space, pose=pose, share=share)
+            back, there = pairs_back(
+                shown,
+                self._faces,
+                recorded,
+                sure,
+                forth.spacing,
+                space=target.space,
+                pose=pose,
+                share=share,
+                guesses=there,
+            )
             return forth, back
 
         return pairs_at

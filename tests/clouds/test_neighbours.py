@@ -46,8 +46,10 @@ def test_exactly_brute_force(rng, kind, size):
     target = CLOUDS[kind](rng, size)
     own = CLOUDS[kind](rng, 150)
     for queries in (own, own + np.array([0, 0, 0.3]), 100 * own, target[:50], target.mean(0, keepdims=True)):
-        found = NeighbourIndex(torch.as_tensor(target)).nearest_index(torch.as_tensor(queries))
-        assert np.array_equal(found.numpy(), brute_force(queries, target))
+        index, expected = NeighbourIndex(torch.as_tensor(target)), brute_force(queries, target)
+        assert np.array_equal(index.nearest_index(torch.as_tensor(queries)).numpy(), expected)
+        for guesses in (rng.integers(-1, size, len(queries)), expected):  # whatever is guessed, the answer is the same
+            assert np.array_equal(index.nearest_index(torch.as_tensor(queries), torch.as_tensor(guesses)).numpy(), expected)
 
 
 @pytest.mark.parametrize("kind", CLOUDS)

@@ -26,7 +26,7 @@ def sheet(generator):
 def test_the_nearest_place_on_a_surface_is_trimeshs(sheet, generator):
     nodes, faces = sheet
     queries = nodes.mean(2, keepdim=True) + 0.2 * torch.randn(1, 2, 200, 3, generator=generator, dtype=torch.float64)
-    found = nearest_places(nodes, faces, queries)
+    found, _ = nearest_places(nodes, faces, queries)
     assert bool((found.barycentric >= -1e-12).all())
     torch.testing.assert_close(found.barycentric.sum(-1), torch.ones(1, 2, 200, dtype=torch.float64))
     for frame in range(2):
@@ -35,11 +35,20 @@ def test_the_nearest_place_on_a_surface_is_trimeshs(sheet, generator):
         np.testing.assert_allclose(found.of(nodes)[0, frame].numpy(), expected, atol=1e-9)
 
 
+def test_a_guess_changes_no_nearest_place(sheet, generator):
+    nodes, faces = sheet
+    queries = nodes.mean(2, keepdim=True) + 0.2 * torch.randn(1, 2, 200, 3, generator=generator, dtype=torch.float64)
+    found, there = nearest_places(nodes, faces, queries)
+    for guesses in (there, torch.randint(len(faces), there.shape, generator=generator), torch.zeros_like(there)):
+        again, _ = nearest_places(nodes, faces, queries, guesses)
+        torch.testing.assert_close(again.of(nodes), found.of(nodes), rtol=0.0, atol=1e-15)
+
+
 def test_faces_without_area_have_a_nearest_place():
     corners = torch.zeros(1, 1, 3, 3, dtype=torch.float64)
     corners[..., 1, 0] = corners[..., 2, 0] = 1.0
     queries = torch.tensor([[[[0.5, 1.0, 0.0], [-1.0, 0.0, 0.0], [3.0, 0.0, 1.0]]]], dtype=torch.float64)
-    found = nearest_places(corners, torch.tensor([[0, 1, 2]]), queries).of(corners)
+    found = nearest_places(corners, torch.tensor([[0, 1, 2]]), queries)[0].of(corners)
     torch.testing.assert_close(found[0, 0, :, 0], torch.tensor([0.5, 0.0, 1.0], dtype=torch.float64))
 
 
@@ -64,14 +73,14 @@ class TestForth:
     def test_below_the_cut_nothing_counts(self, generator):
         moved = torch.rand(2, 1, 40, 3, generator=generator, dtype=torch.float64)
         clouds = [NeighbourIndex(torch.rand(30, 3, generator=generator, dtype=torch.float64))]
-        pairs = pairs_forth(at_points(moved), moved, clouds, cut=0.4, share=1.0)
+        pairs, _ = pairs_forth(at_points(moved), moved, clouds, cut=0.4, share=1.0)
         assert torch.equal(pairs.weights > 0, moved[..., 2] >= 0.4)
         torch.testing.assert_close(pairs.weights.sum((1, 2)), torch.ones(2, dtype=torch.float64))
 
     def test_the_partner_is_the_nearest(self, generator):
         moved = torch.rand(2, 2, 40, 3, generator=generator, dtype=torch.float64)
         clouds = [NeighbourIndex(torch.rand(30, 3, generator=generator, dtype=torch.float64)) for _ in range(2)]
-        pairs = pairs_forth(at_points(moved), moved, clouds, cut=None, share=0.5)
+        pairs, _ = pairs_forth(at_points(moved), moved, clouds, cut=None, share=0.5)
         for frame, cloud in enumerate(clouds):
             expected = torch.cdist(moved[:, frame], cloud.points.expand(2, -1, -1)).amin(-1)
             torch.testing.assert_close((moved[:, frame] - pairs.partners[:, frame]).norm(dim=-1), expected)
@@ -119,7 +128,7 @@ class TestTerms:
 def test_positions_that_are_no_numbers_have_some_place(sheet):
     nodes, faces = sheet
     queries = torch.full((1, 2, 3, 3), torch.nan, dtype=torch.float64)
-    found = nearest_places(nodes, faces, queries)
+    found, _ = nearest_places(nodes, faces, queries)
     torch.testing.assert_close(found.barycentric.sum(-1), torch.ones(1, 2, 3, dtype=torch.float64))
 
 
