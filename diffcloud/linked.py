@@ -22,7 +22,7 @@ from numba.core.lowering import Lower
 from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import NativeLowering
 
-_LARGE = 16
+_LARGE = 8
 """A kernel with more kernels below it is not optimised together with them: they are, each with what it calls."""
 
 
@@ -61,12 +61,9 @@ class _Library(JITCodeLibrary):
     """The code of a kernel and of all that it calls."""
 
     def _optimize_final_module(self) -> None:
-        if len(_below(self)) <= _LARGE:
-            super()._optimize_final_module()
-            return
-        manager, builder = self._codegen._module_pass_manager(
-            loop_vectorize=False, slp_vectorize=False, opt=0, cost="cheap"
-        )
+        large = len(_below(self)) > _LARGE
+        options = {"loop_vectorize": False, "slp_vectorize": False, "opt": 0} if large else {}
+        manager, builder = self._codegen._module_pass_manager(cost="cheap", **options)
         manager.run(self._final_module, builder)
 
 
