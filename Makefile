@@ -7,7 +7,7 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 # the tests start hundreds of processes; without byte code each would compile the package again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv repro test test-slow lint format bench acceptance comparison simulated recordings coverage docs clean
+.PHONY: venv repro test tests test-slow lint format bench acceptance comparison simulated recordings coverage docs clean
 
 venv: $(STAMP)
 
@@ -28,7 +28,11 @@ repro: venv
 # one process per core and one more (tests/conftest.py), each with one thread: a step gains nothing from a second one
 TESTS := python -m pytest -n auto --maxprocesses 8 --dist worksteal
 
-test: lint
+# linters beside the tests: mypy takes a minute the first time
+test: venv
+	$(MAKE) --no-print-directory --jobs=2 lint tests
+
+tests: venv
 	$(TESTS)
 
 test-slow: venv

@@ -408,6 +408,7 @@ class TestGradientAgreement:
         assert (random_parameters(scenario, 5, seed=1)[:3] == random_parameters(scenario, 3, seed=1)).all()
 
 
+@pytest.mark.slow
 def test_contacts_of_a_cloth_on_a_sphere_are_counted_and_timed():
     timing = time_contact(8, steps=12, repeats=1)
     assert timing.contacts > 0

@@ -138,6 +138,7 @@ def test_an_interrupted_training_goes_on(work):
     assert not (work / CHECKPOINT).exists()
 
 
+@pytest.mark.slow
 def test_several_networks_at_once_are_those_of_one_after_another(work):
     both = (*TRAIN, "--model", "pointnet2", "--json")
     alone = result(run(*both))
