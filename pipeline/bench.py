@@ -1,4 +1,4 @@
-"""`diffcloud bench`: milliseconds per episode, over batch sizes and mesh sizes, in one run."""
+"""`diffcloud bench`: milliseconds per episode, over batch sizes and mesh sizes, and per comparison with a recording."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from diffcloud.fit.benchmark import time_contact, time_episode
+from diffcloud.fit.benchmark import time_contact, time_episode, time_matching
 from diffcloud.scene.scenarios import GridScenario, Scenario, built_in, grid_scenario
 from diffcloud.sim.threads import thread_count, use_threads
 from pipeline.console import JsonFlag, Threads, finish, progress_bar, show
@@ -21,6 +21,9 @@ _BATCHES = (1, 16, 64)
 _SIDES = (16, 32, 64)
 _CONTACT_SIDES = (10, 14, 20, 28, 40)
 HEAD = ("scenario", "nodes", "steps", "batch", "forward ms", "forward + backward ms", "forward + 10 tangents ms")
+MATCHING_HEAD = ("frames", "points of a frame, each way", "ms", "ms where a pose beside it is known")
+_POINTS = (200, 3500)
+"""Of a frame: what 25 frames have in a fit, and what one frame has."""
 CONTACT_HEAD = ("nodes", "contacts", "free ms per step", "on a sphere ms per step", "µs per contact")
 
 
@@ -31,7 +34,7 @@ def bench(
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
-    """Time lift episodes; with --scene the published lift too (25 steps)."""
+    """Time motions of the built-in scenarios, with --scene the published lift too, and comparisons with a recording."""
     use_threads(threads)
     if contact:
         costs = contact_benchmarks(repeats=repeats)
@@ -39,9 +42,13 @@ def bench(
         finish({"threads": thread_count(), "timings": costs}, json)
         return
     published = {} if scene is None else {"release_lift": scene}
-    timings = run_benchmarks(published, repeats=repeats)
+    timings, matchings = run_benchmarks(published, repeats=repeats), matching_benchmarks(repeats=repeats)
     show(benchmark_table(timings), json)
-    finish({"threads": thread_count(), "timings": timings}, json)
+    table = Table(*MATCHING_HEAD, title="Finding who is nearest to whom")
+    for row in matching_rows(matchings):
+        table.add_row(*row)
+    show(table, json)
+    finish({"threads": thread_count(), "timings": timings, "matchings": matchings}, json)
 
 
 def run_benchmarks(published: Mapping[str, Path], *, repeats: int) -> list[dict[str, Any]]:
@@ -68,6 +75,19 @@ def run_benchmarks(published: Mapping[str, Path], *, repeats: int) -> list[dict[
             update(index, f"{name}, batch {batch}")
             timings.append({"scenario": name, **asdict(time_episode(scenario, batch=batch, repeats=repeats))})
     return timings
+
+
+def matching_benchmarks(*, repeats: int) -> list[dict[str, Any]]:
+    """What it costs to compare a motion with a recording, in one run."""
+    return [asdict(time_matching(choose_scenario("lift"), points, repeats=repeats)) for points in _POINTS]
+
+
+def matching_rows(timings: list[dict[str, Any]]) -> list[list[str]]:
+    """The cells under `MATCHING_HEAD`, one row a timing."""
+    return [
+        [str(entry["frames"]), str(entry["points"]), *(f"{1e3 * entry[key]:.1f}" for key in ("first", "again"))]
+        for entry in timings
+    ]
 
 
 def contact_benchmarks(*, repeats: int) -> list[dict[str, Any]]:

@@ -91,7 +91,7 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[float, str], None
             if progress.disable and now - told >= _QUIET_S:
                 told = now
                 left = f", about {(now - began) * (total - done) / done:.0f} s left" if done > 0 else ""
-                errors.print(f"{label}: {done:.2g} of {total}{left}  {text}", soft_wrap=True)
+                errors.print(f"{label}: {done:.4g} of {total}{left}  {text}", soft_wrap=True)
 
         yield update
 

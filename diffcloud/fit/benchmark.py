@@ -1,4 +1,4 @@
-"""Timing one episode, forward and with gradient, over batch sizes and mesh sizes."""
+"""Timing one episode, forward and with gradient, over batch sizes and mesh sizes; and its comparison with a recording."""
 
 from __future__ import annotations
 
@@ -7,7 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from diffcloud.clouds.neighbours import NeighbourIndex
+from diffcloud.clouds.sampling import SurfaceSampler
+from diffcloud.fit.matching import nearest_places, pairs_forth
 from diffcloud.mesh import grid_cloth, sphere_surface
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.build import build_system
@@ -72,6 +76,47 @@ def time_episode(scenario: Scenario, *, batch: int, repeats: int = 3) -> Timing:
         forward=min(once(False) for _ in range(repeats)),
         forward_backward=min(once(True) for _ in range(repeats)),
         forward_tangents=min(along() for _ in range(repeats)),
+    )
+
+
+@dataclass(frozen=True)
+class MatchingTiming:
+    """Seconds in which simulated points of all frames find their recorded partners, and recorded ones their places on the
+    cloth."""
+
+    frames: int
+    points: int
+    """Of a frame, each way."""
+    first: float
+    again: float
+    """Where partners of a pose a millimetre away are known."""
+
+
+def time_matching(scenario: Scenario, points: int, *, repeats: int = 5) -> MatchingTiming:
+    """Time one comparison of a motion with clouds of 3,500 points a frame, which another cloth made, with 2 mm of noise."""
+    system, _ = scenario.scene.build()
+    faces, generator = torch.as_tensor(system.mesh.faces), torch.Generator().manual_seed(0)
+    values = {"stretch": torch.tensor([1.0, 1.3], dtype=torch.float64)}
+    nodes = rollout(system, scenario.steps, properties=scenario.properties(system, values)).positions
+    nodes = nodes[:, scenario.scene.frame_steps :: scenario.scene.frame_steps]
+    recorded = SurfaceSampler.build(faces, 3500, generator=generator, dtype=torch.float64).sample(nodes[:1])[0]
+    recorded = recorded + 0.002 * torch.randn(recorded.shape, generator=generator, dtype=torch.float64)
+    clouds = [NeighbourIndex(cloud) for cloud in recorded]
+    places = SurfaceSampler.build(faces, points, generator=generator, dtype=torch.float64).draw(nodes[1:])
+    moved, queries = places.of(nodes[1:]), recorded[None, :, :points]
+
+    def once(known: tuple[Tensor, Tensor] | tuple[None, None], shift: float) -> tuple[float, tuple[Tensor, Tensor]]:
+        begin = time.perf_counter()
+        _, forth = pairs_forth(places, moved + shift, clouds, cut=None, share=0.5, guesses=known[0])
+        _, back = nearest_places(nodes[1:], faces, queries - shift, known[1])
+        return time.perf_counter() - begin, (forth, back)
+
+    _, known = once((None, None), 0.0)  # builds the trees
+    return MatchingTiming(
+        frames=len(clouds),
+        points=points,
+        first=min(once((None, None), 0.001)[0] for _ in range(repeats)),
+        again=min(once(known, 0.001)[0] for _ in range(repeats)),
     )
 
 
