@@ -50,7 +50,16 @@ def depth_points(
 
 def transform(matrix: Floats, points: Floats) -> Floats:
     """Rigid transforms [..., 4, 4] of points [..., P, 3]."""
-    return points @ np.swapaxes(matrix[..., :3, :3], -1, -2) + matrix[..., None, :3, 3]
+    moved = rotate(matrix, points)
+    for axis in range(3):  # numpy is slow where the last axis is short
+        moved[..., axis] += matrix[..., None, axis, 3]
+    return moved
+
+
+def rotate(matrix: Floats, vectors: Floats) -> Floats:
+    """Directions [..., P, 3] turned by rigid transforms [..., 4, 4]."""
+    rotated: Floats = vectors @ np.ascontiguousarray(np.swapaxes(matrix[..., :3, :3], -1, -2))  # else not by BLAS
+    return rotated
 
 
 def looking_at(position: ArrayLike, target: ArrayLike) -> Floats:

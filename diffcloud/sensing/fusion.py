@@ -310,8 +310,9 @@ def _cloud(
             "Leave the frame out."
         )
     world = transform(view.T_world_camera, (view.directions * depth_m[..., None]).reshape(-1, 3)).reshape(*depth_m.shape, 3)
-    low, high = settings.workspace_m
-    within = (depth_m > 0) & ((world >= low) & (world <= high)).all(axis=-1)
+    within = depth_m > 0
+    for axis, (low, high) in enumerate(zip(*settings.workspace_m, strict=True)):
+        within &= (world[..., axis] >= low) & (world[..., axis] <= high)
     spoilt = spoilt_pixels(
         depth_m,
         view,

@@ -26,7 +26,7 @@ from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.clouds import import_open3d
 from diffcloud.io.raw_episodes import RobotLog
 from diffcloud.io.urdf import LinkMesh, joined
-from diffcloud.sensing.cameras import inverse, rays, transform
+from diffcloud.sensing.cameras import inverse, rays, rotate, transform
 from diffcloud.sensing.robot import Robot
 
 Floats = NDArray[np.float64]
@@ -278,9 +278,8 @@ def joints_at(log: RobotLog, times: Floats, *, lag_s: float = 0.0) -> tuple[Floa
 
 def _cast(scene: Any, T_link_camera: Floats, eye: Floats, directions: Floats) -> NDArray[np.float32]:
     """[...] of the first hit in lengths of `directions` [..., 3], which start at `eye` in the camera's frame."""
-    rotated = directions @ T_link_camera[:3, :3].T
     bundle = np.empty((*directions.shape[:-1], 6), dtype=np.float32)
     bundle[..., :3] = T_link_camera[:3, :3] @ eye + T_link_camera[:3, 3]
-    bundle[..., 3:] = rotated
+    bundle[..., 3:] = rotate(T_link_camera, directions)
     hit: NDArray[np.float32] = scene.cast_rays(bundle, nthreads=1)["t_hit"].numpy()
     return hit

@@ -29,7 +29,7 @@ from diffcloud.io.images import read_depth, write_depth
 from diffcloud.io.raw_episodes import RawEpisodeWriter, RobotSample, ScenePlacement
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.sensing.arm_body import cable, lookalike
-from diffcloud.sensing.cameras import transform
+from diffcloud.sensing.cameras import rotate, transform
 from diffcloud.sensing.depth_camera import DepthCamera
 from diffcloud.sensing.masking import RobotMask, View
 from diffcloud.sensing.robot import Robot, gen3
@@ -284,7 +284,7 @@ def _cast(scene: Any, view: View, eye: Floats, directions: Floats) -> tuple[Floa
     pose = view.T_world_camera
     bundle = np.empty((*directions.shape[:-1], 6), dtype=np.float32)
     bundle[..., :3] = transform(pose, eye[None])[0]
-    bundle[..., 3:] = directions @ pose[:3, :3].T
+    bundle[..., 3:] = rotate(pose, directions)
     hit = scene.cast_rays(bundle, nthreads=1)
     return hit["t_hit"].numpy().astype(np.float64), hit["geometry_ids"].numpy(), hit["primitive_normals"].numpy()
 
