@@ -16,11 +16,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol, TypeVar
 
-import torch
-
 from diffcloud.errors import DiffCloudError
 from diffcloud.sim.threads import use_threads
 from pipeline.console import progress_bar
+from pipeline.lazy import imports
 from pipeline.memory import keep_freed_memory
 
 Tell = Callable[[float, str], None]
@@ -115,7 +114,8 @@ def _stored(job: Job, path: Path) -> Path:
 
 
 def _attempt_stored(path: Path) -> tuple[Any, str | None]:
-    job: Job = pickle.loads(path.read_bytes())  # which this program has just written
+    with imports():
+        job: Job = pickle.loads(path.read_bytes())  # which this program has just written
     path.unlink()
     return _attempt(job)
 
@@ -129,6 +129,8 @@ def _begin(stop: Event, patient: bool) -> None:
     global _stop
     _stop = stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with imports():
+        import torch  # here, not as this module is imported: by now the collector waits
     torch.set_num_threads(1)
     use_threads(1)
     keep_freed_memory()
