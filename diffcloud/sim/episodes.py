@@ -21,7 +21,7 @@ from diffcloud.sim.plausibility import implausible
 from diffcloud.sim.reference.impact_zones import PASSES
 from diffcloud.sim.scenery import Scenery
 from diffcloud.sim.system import System
-from diffcloud.sim.terms import kernels
+from diffcloud.sim.terms import TERMS, kernels
 from diffcloud.sim.threads import run_all
 
 FACTOR_MEMORY = 256 * 2**20
@@ -260,6 +260,7 @@ class Batch:
             wind=float(np.linalg.norm(system.setup.surrounding.wind)),
             velocities=self.velocities[entry, 0],
             others=np.concatenate([moving, bodies], axis=1),
+            push=sum(term.push(system.setup) for term in TERMS),
         )
 
     def _stored(self, entry: int, step: int) -> float:

@@ -1,10 +1,11 @@
 """Whether a motion is physically possible: an unstable simulation does not always end in NaN or infinity.
 
-What moves a held cloth is its weight, its handles and the wind. With the mass M, the size l, the distance s that the
-handles have moved and their greatest speed v (the wind's, where that is greater), the kinetic and elastic energies E
-and U (E₀ and U₀ at the start), and the work P of gravity since the start, a possible motion satisfies
+What moves a held cloth is its weight, its handles, the wind, and what other forces say that they push with. With the
+mass M, the size l, the distance s that the handles have moved and their greatest speed v (the wind's, where that is
+greater), the weight G = M |g| with those pushes, the kinetic and elastic energies E and U (E₀ and U₀ at the start), and
+the work P of gravity since the start, a possible motion satisfies
 
-    E ≤ 3 (K + W) + P,      K = E₀ + M |g| (l + s) + ½ M v²,
+    E ≤ 3 (K + W) + P,      K = E₀ + G (l + s) + ½ M v²,
 
 where W is the largest elastic energy that was stored at any earlier step, and 3 is a factor of safety: K is a rule of thumb
 for what handles and wind can do. Where a node is farther than three times the cloth's size from every place where a handle
@@ -58,6 +59,13 @@ class Motion:
     """[V, 3] at the start."""
     others: Floats
     """[S + 1, P, 3] points of moving obstacles and rigid bodies."""
+    push: float
+    """[N] of further forces that bring energy in, in whatever direction."""
+
+    @property
+    def pull(self) -> float:
+        """[N] the weight, and what may push as it pulls."""
+        return float(self.mass.sum()) * float(np.linalg.norm(self.gravity)) + self.push
 
 
 def implausible(motion: Motion, stored: Callable[[int], float]) -> tuple[int, str] | None:
@@ -83,8 +91,7 @@ def _energies(motion: Motion) -> tuple[Floats, Floats, Floats]:
     speed = np.maximum(np.maximum.accumulate(moved) / step, motion.wind)
     rounding = _ROUNDING * float(np.abs(motion.positions).max(initial=0.0)) / step
     start = 0.5 * float(motion.mass @ (motion.velocities**2).sum(axis=-1)) + 0.5 * mass * rounding**2
-    weight = mass * float(np.linalg.norm(motion.gravity))
-    given = start + weight * (motion.size + np.cumsum(moved) + _fallen(motion)) + 0.5 * mass * speed**2
+    given = start + motion.pull * (motion.size + np.cumsum(moved) + _fallen(motion)) + 0.5 * mass * speed**2
     work = np.einsum("svi,i,v->s", motion.positions[1:] - motion.positions[0], motion.gravity, motion.mass)
     return given, work, kinetic
 
@@ -118,7 +125,7 @@ def _fallen(motion: Motion) -> Floats:
     free = (np.arange(1, count + 1) - last) * motion.time_step
     speed = np.linalg.norm(np.diff(motion.positions, axis=0), axis=-1).max(axis=1) / motion.time_step
     begin = np.concatenate([[np.linalg.norm(motion.velocities, axis=-1).max()], speed])[last]
-    return np.asarray(0.5 * np.linalg.norm(motion.gravity) * free**2 + (begin + motion.wind) * free)
+    return np.asarray(0.5 * motion.pull / motion.mass.sum() * free**2 + (begin + motion.wind) * free)
 
 
 def _too_quick(given: Floats, work: Floats, kinetic: Floats, stored: Callable[[int], float]) -> tuple[int, str] | None:

@@ -33,6 +33,7 @@ def motion(displacement, **changes):
         wind=0.0,
         velocities=np.zeros((16, 3)),
         others=np.zeros((STEPS + 1, 0, 3)),
+        push=0.0,
     )
     return replace(made, **changes)
 
@@ -95,6 +96,16 @@ def test_a_quick_handle_explains_a_quick_cloth():
     shaken = along(0.2 * np.sin(40 * T))
     made = motion(shaken)
     assert implausible(replace(made, places=made.positions[:, :1]), nothing_stored) is None
+
+
+def test_a_force_explains_what_it_pushes():
+    """A cloth that nothing holds is driven sideways at 3 g; and not at twice that."""
+    driven = 0.5 * 3 * 9.81 * np.stack([T**2, 0 * T, 0 * T], axis=1)
+    made = motion(driven, **free(gravity=np.zeros(3)))
+    pushed = replace(made, push=3 * 9.81 * 16 * 0.01)
+    assert implausible(made, nothing_stored) is not None
+    assert implausible(pushed, nothing_stored) is None
+    assert implausible(replace(pushed, positions=made.positions[:1] + 2 * driven[:, None]), nothing_stored) is not None
 
 
 def test_the_last_digits_of_a_cloth_at_rest_are_no_motion():

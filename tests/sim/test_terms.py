@@ -17,7 +17,7 @@ from diffcloud.sim.surrounding import ContactSettings, Surrounding
 from diffcloud.sim.terms import TERMS
 from diffcloud.sim.terms.stretching import _sampled
 from tests.sim.twins import terms as twins
-from tests.sim.twins.forces import Forces, twin_force
+from tests.sim.twins.forces import Forces, term_of, twin_force
 from tests.sim.twins.terms import coefficients, sampled
 
 # ARCSim's camel-ponte-roma (Wang et al. 2011), whose sampled values are known
@@ -142,6 +142,18 @@ def test_kernels_are_as_their_twins_say(name, state, around, mesh, rng):
 
 
 @pytest.mark.parametrize("name", [term.name for term in TERMS])
+def test_a_force_pushes_no_more_than_it_says(name, mesh, rng):
+    """A force with settings of its own; the check of plausible motions knows what the others can do."""
+    forces = Forces(mesh, CAMEL, AROUND["damped"], rng=rng)
+    most = term_of(name).push(forces.system.setup)
+    if name in AROUND["damped"].forces and term_of(name).energy is None:
+        found = forces.force(name, forces.motion(mesh.nodes))
+        assert np.linalg.norm(found, axis=1).sum() <= most * (1 + 1e-12), "Give the Term a `push` that is no less."
+    else:
+        assert most == 0
+
+
+@pytest.mark.parametrize("name", [term.name for term in TERMS])
 def test_matrices_are_the_derivatives_of_the_forces(name, mesh, rng):
     """`assemble` by displacement and velocity, `jacobian` by positions too: against reverse mode, row by row."""
     forces = Forces(mesh, CAMEL, AROUND["damped"], rng=rng)
@@ -167,8 +179,8 @@ def test_a_formula_that_asks_for_the_truth_of_a_number_is_refused():
 
 
 def test_settings_of_an_unknown_force_are_refused(mesh):
-    with pytest.raises(SceneError, match="wind_box"):
-        Forces(mesh, CAMEL, Surrounding(forces={"wind_box": {}}))
+    with pytest.raises(SceneError, match="no_such_force"):
+        Forces(mesh, CAMEL, Surrounding(forces={"no_such_force": {}}))
 
 
 KINDS = pytest.mark.parametrize("name", ["stretching", "bending"])

@@ -73,6 +73,9 @@ class Term:
     """What it can be differentiated by: fields of `Parameters`."""
     energy: Callable[[Element], Scalar] | None = None
     """[J] that an element stores, where it does; tells explosions from motions."""
+    push: Callable[[Setup], float] = lambda _: 0.0
+    """[N] that it pushes the whole cloth with at most, where it brings energy in; tells motions from explosions. Weight,
+    wind and handles are known without."""
 
     @property
     def class_name(self) -> str:
