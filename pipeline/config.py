@@ -169,8 +169,8 @@ class FitConfig(Section):
     learning_rate: Positive | None = None
     """Of adam; the scenario's own if not given."""
     patience: Annotated[int, Field(ge=0)] | None = None
-    """Of adam: iterations without a lower loss after which a further start goes on beside the best place of all; 0:
-    never; by default 10."""
+    """Of adam: iterations without a lower loss after which a further start restarts near the best point found; 0: never;
+    by default 10."""
     smoothing: NonNegative | None = None
     """Of adam: standard deviation, on the sigmoid's axis, of the first start's perturbed copies, whose gradients are
     averaged; 0: the plain gradient, as the paper has it; by default 0.5."""
@@ -185,7 +185,7 @@ class FitConfig(Section):
     paper: bool = False
     """The published measure: one-sided, squared, at the scenario's loss frames, without a pose, down to its threshold."""
     nuisance: str | None = None
-    """What of the pose is fitted along, and how far each may well be off: "x=0.1m,y=0.1m,yaw=30deg" if not given, or
+    """Which parts of the pose are fitted too, and how far off each may well be: "x=0.1m,y=0.1m,yaw=30deg" if not given, or
     "none". Variables: `fit.pose.NUISANCE`."""
     prior: str | None = None
     """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""

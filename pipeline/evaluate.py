@@ -219,12 +219,13 @@ def write_evaluation(
         markdown: a page of the tables, if wanted.
         references: see `summary.method_table`.
     """
-    curves, seconds = _curves(config, fits)
+    curves, residuals, seconds = _curves(config, fits)
     predictions = _predictions(comparison.records)
     told = tables(comparison.records, comparison.seconds, references)
     metrics = _metrics(told["fits"], predictions) | {"comparison": summary_metrics(told)}
     frames = {
         "losses": pd.DataFrame(curves),
+        "residuals": pd.DataFrame(residuals),
         "predictions": pd.DataFrame(predictions, columns=_columns(predictions)),
         **told,
     }
@@ -272,9 +273,10 @@ def printed(told: Mapping[str, pd.DataFrame]) -> list[Table]:
     return [losses, means]
 
 
-def _curves(config: Config, fits: Path) -> tuple[list[dict[str, Any]], dict[str, float]]:
-    """Loss curves of all fits, and their wall times."""
+def _curves(config: Config, fits: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, float]]:
+    """Of all fits: losses of each iteration, RMS of each frame, wall times."""
     curves: list[dict[str, Any]] = []
+    residuals: list[dict[str, Any]] = []
     seconds: dict[str, float] = {}
     named = [(f"{name}/", path) for name in config.scenarios for path in files_in(fits / name, ".json")]
     for folder, path in [*named, *(("", path) for path in joint_fit(fits))]:
@@ -284,8 +286,13 @@ def _curves(config: Config, fits: Path) -> tuple[list[dict[str, Any]], dict[str,
             for i, row in enumerate(fit.history.loss)
             if any(value is not None for value in row)
         ]
+        residuals += [
+            {"scenario": one.scenario, "episode": one.name, "frame": frame, "rms_mm": rms}
+            for one in fit.episodes
+            for frame, rms in zip(one.frames, one.frame_rms_mm, strict=True)
+        ]
         seconds[f"{folder}{path.stem}"] = fit.seconds
-    return curves, seconds
+    return curves, residuals, seconds
 
 
 def _predictions(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -31,7 +31,7 @@ def gradients(
     ] = None,
     pairs: Annotated[int, typer.Option(min=1, help="Random (stretch, mass), uniform over their bounds.")] = 50,
     seed: Annotated[int, typer.Option(min=0, help="Of the pairs.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="CSV of all pairs; one that is there is gone on with.")] = None,
+    out: Annotated[Path | None, typer.Option(help="CSV of all pairs; an existing one is continued.")] = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:

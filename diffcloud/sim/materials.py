@@ -159,8 +159,8 @@ _BASIS_SOURCE = (
     "an isotropic sheet's, as a knit's is lower"
 )
 _FOAM_SOURCE = (
-    "chosen, not measured: so soft in its plane and so stiff across it that weight, stretching and bending are of one size "
-    "over half a metre, as in a thick sheet of foam; then both multipliers show in the shape (docs/scenarios.md)"
+    "chosen, not measured: so soft in its plane and so stiff across it that weight, stretching and bending are of similar "
+    "magnitude over half a metre, as in a thick sheet of foam; then both multipliers show in the shape (docs/scenarios.md)"
 )
 _STIFFENING_FOAM_SOURCE = (
     f"{_FOAM_SOURCE}; it stiffens as it stretches and is damped, because a cloth that its own weight draws out to many "

@@ -6,7 +6,9 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -21,6 +23,7 @@ from tests.fit.test_fit import clouds_of
 from tests.pipeline.invoke import invoke
 from tests.pipeline.test_commands import SMALL
 
+ROOT = Path(__file__).parents[2]
 PARAMS = {
     "scenarios": ["small"],
     "train": {"scenarios": ["other"], "models": ["mlp"]},
@@ -73,6 +76,25 @@ def test_twice_gives_the_same_but_for_wall_times(work):
     assert set(first) == set(second)
     differing = {name for name in first if first[name] != second[name]}
     assert all("seconds" in name or "timings" in name or name.startswith("reports/episodes/") for name in differing)
+
+
+def test_dvc_draws_loss_traces_and_residuals(work):
+    """Each plot of dvc.yaml finds its columns and has one line an episode."""
+    shutil.copytree(ROOT / ".dvc" / "plots", work / ".dvc" / "plots")
+    shutil.copy(ROOT / ".dvc" / "config", work / ".dvc" / "config")
+    plots = yaml.safe_load((ROOT / "dvc.yaml").read_text())["plots"]
+    assert len(plots) == 2
+    (work / "dvc.yaml").write_text(yaml.safe_dump({"plots": plots}))
+    subprocess.run(["git", "init", "--quiet"], cwd=work, check=True)
+    for name in (name for plot in plots for name in plot):
+        told = subprocess.run(
+            [sys.executable, "-m", "dvc", "plots", "show", "--show-vega", name], cwd=work, check=True, capture_output=True
+        )
+        drawn = json.loads(told.stdout)
+        rows = drawn["data"]["values"]
+        assert {row["episode"] for row in rows} == {"tan1", "tan2"}
+        for axis in ("x", "y"):
+            assert all(float(row[drawn["encoding"][axis]["field"]]) >= 0 for row in rows)
 
 
 def test_tables_hold_methods_repeats_and_transfer(work):
