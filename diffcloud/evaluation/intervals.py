@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
+from scipy.special import stdtrit
 
 from diffcloud.errors import ConfigError
 from diffcloud.fit.joint import AnyObjective, mean_loss
@@ -221,8 +222,6 @@ def state_intervals(
 def _with_scan(objective: AnyObjective, space: FitSpace, found: Uncertainty) -> tuple[Uncertainty, dict[str, float] | None]:
     """The uncertainty with one more source: how far along its principal axes the loss stays as low as noise of so few
     clusters may make it. And the values of a clearly lower loss, if the scan meets one."""
-    from scipy.stats import t  # slow to import
-
     centre = torch.from_numpy(found.places)
     inverse = torch.from_numpy(np.linalg.pinv(found.covariance, hermitian=True))
     seen, _ = scan(objective, space, centre, inverse)
@@ -231,7 +230,7 @@ def _with_scan(objective: AnyObjective, space: FitSpace, found: Uncertainty) -> 
     loss = float(of_data + space.prior_loss(axis.values(centre[None]), objective.length_unit_m))
     place = seen.lower(centre, loss)
     lower = None if place is None else dict(zip(space.names, axis.bounded(place[None])[0].tolist(), strict=True))
-    quantile = float(t.ppf(0.95, max(found.clusters - 1, 1)))
+    quantile = float(stdtrit(max(found.clusters - 1, 1), 0.95))
     hidden = seen.losses <= (1 + quantile**2 / max(found.clusters - len(space.names), 1)) * loss
     reach = torch.where(hidden, seen.lengths.abs(), 0.0).amax(-1) / quantile
     spread = (seen.directions.T * reach.square()) @ seen.directions
@@ -294,14 +293,12 @@ def node_set_note(scenario: Scenario) -> str:
 
 def _half_width(found: Uncertainty, row: NDArray[np.float64], level: float) -> float:
     """Of the combination row · places."""
-    from scipy.stats import t  # slow to import
-
     total = float(row @ found.covariance @ row)
     noise = float(row @ found.sources["noise"] @ row)
     if total <= 0:
         return 0.0
     freedom = max(found.clusters - 1, 1) / max(noise / total, 1e-6) ** 2
-    return float(t.ppf(0.5 + level / 2, freedom) * math.sqrt(total))
+    return float(stdtrit(freedom, 0.5 + level / 2) * math.sqrt(total))
 
 
 def _ends(space: FitSpace, index: int, value: float, half_width: float) -> tuple[float, float, list[float]]:
