@@ -70,7 +70,9 @@ def fit(
     ] = None,
     screen: Annotated[
         int | None,
-        typer.Option(help="Simulate this many candidates and start from the best. Default: 24 of gauss_newton."),
+        typer.Option(
+            help="Simulate this many candidates, start from the best. Default of gauss_newton: 24; 96 if linearised."
+        ),
     ] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Of adam. Default: the scenario's.")] = None,
     patience: Annotated[

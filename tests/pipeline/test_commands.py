@@ -90,6 +90,20 @@ def test_fit_then_replay_and_measure(work):
         np.testing.assert_allclose(replay["nodes"], fitted["nodes"], atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("integrator", "options", "screen"),
+    [("implicit", (), 24), ("linearised", (), 96), ("linearised", ("--screen", 5), 5)],
+)
+def test_a_rough_loss_is_searched_with_more_candidates(work, integrator, options, screen):
+    """The linearised integrator's, unless the user says how many; the record says it, and as many are simulated."""
+    one = {**yaml.safe_load((work / "small.yaml").read_text()), "integrator": integrator}
+    (work / "one.yaml").write_text(yaml.safe_dump(one))
+    run("fit", "--scenario", "one.yaml", "--out", "fits", "--starts", 1, "--iterations", 1, *options, "e1.npz", cwd=work)
+    summary = json.loads((work / "fits" / "e1.json").read_text())
+    assert summary["settings"]["screen"] == screen
+    assert summary["simulations"] > screen
+
+
 @pytest.mark.parametrize("solver", ["cma_es", "random_search"])
 def test_a_fit_by_a_search(work, solver):
     command = ("fit", "--scenario", "small.yaml", "--out", "fits", "--solver", solver, "--simulations", 12)

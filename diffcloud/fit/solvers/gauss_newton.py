@@ -28,6 +28,8 @@ from diffcloud.fit.residuals import Axis, Linearisation, linearise
 from diffcloud.fit.scan import scan
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
 
+ROUGH_SCREEN = 96
+"""Candidates where the loss is too rough for derivatives: more minima, and their simulations cost a tenth."""
 _FIRST_DAMPING = 1e-2
 _LARGEST_STEP = 1.0
 """On the axis: a factor e, or the whole range."""
