@@ -21,6 +21,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.fit.objective import Objective
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS
+from diffcloud.sim.threads import map_threads
 
 _TINY = 1e-300
 _SAME = 1e-6
@@ -47,7 +48,7 @@ class JointObjective:
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Losses [B], as of `Objective`."""
-        return mean_loss(torch.stack([one(parameters) for one in self.members]), paper=self.paper)
+        return mean_loss(torch.stack(map_threads(lambda one: one(parameters), self.members)), paper=self.paper)
 
     def reseed(self, seed: int) -> None:
         """Draw the common random numbers anew."""

@@ -26,6 +26,7 @@ from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.simulate import Rollout, rollout_tangents
+from diffcloud.sim.threads import map_threads
 
 STEP = 0.05
 """Of the differences, on the axis: 5 % of a value."""
@@ -86,9 +87,7 @@ def linearise(objective: AnyObjective, space: FitSpace, places: Tensor) -> Linea
     paper = objective.paper
 
     def run(index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        parts = []
-        for member in objective.members:
-            parts.append(_over_pose(member, *moved_by(member, space, places[index])))
+        parts = map_threads(lambda one: _over_pose(one, *moved_by(one, space, places[index])), objective.members)
         loss, slope, curvature = mean_terms(parts, paper=paper)
         weights = space.prior_weights(objective.length_unit_m)
         off = places[index]  # logarithms of multipliers, where there is a prior

@@ -6,8 +6,9 @@ One thread has one cloth at a time, so that results are the same for any number 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from typing import TypeVar
 
 from diffcloud.errors import ConfigError
 
@@ -57,3 +58,23 @@ def run_all(jobs: Sequence[Callable[[], None]], *, look: Callable[[], None], sto
             for one in open_jobs:
                 one.cancel()
             raise
+
+
+Given = TypeVar("Given")
+Found = TypeVar("Found")
+
+
+def map_threads(function: Callable[[Given], Found], given: Iterable[Given]) -> list[Found]:
+    """The function's results, in order; torch's gradients are recorded where they are here."""
+    import torch  # here: commands that only choose a number of threads start without it
+
+    items, recording = list(given), torch.is_grad_enabled()
+    if min(len(items), thread_count()) < 2:
+        return [function(item) for item in items]
+
+    def run(item: Given) -> Found:
+        with torch.set_grad_enabled(recording):
+            return function(item)
+
+    with ThreadPoolExecutor(min(thread_count(), len(items))) as pool:
+        return list(pool.map(run, items))

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from diffcloud.errors import ConfigError
+from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton
 from diffcloud.fit.joint import mean_loss, mean_terms
 from diffcloud.fit.left_out import leave_each_out
 from diffcloud.fit.residuals import Axis, linearise
+from diffcloud.sim.threads import map_threads, use_threads
 from tests.conftest import paper_objective, small_lift
 from tests.fit.test_fit import GENTLE, clouds_of
 
@@ -95,6 +96,41 @@ class TestFit:
         torch.testing.assert_close(found.losses, loss.detach())
         torch.testing.assert_close(2 * found.slope, gradient, rtol=1e-8, atol=1e-14)
         assert found.simulations == 2
+
+    def test_threads_change_nothing(self):
+        """To the last bit; and in threads, too, gradients are recorded where they are wanted, and only there."""
+        objectives = [Objective(s, clouds_of(s, points=500, **TRUTH)) for s in motions()]
+        places = Axis.of(SPACE).places(torch.tensor([[0.8, 1.2], [0.5, 2.0], [0.6, 1.7]]).double())
+        found = {}
+        try:
+            for threads in (1, 2, 3):
+                use_threads(threads)
+                joint = JointObjective(objectives)
+                wanted = {name: value.requires_grad_() for name, value in SPACE.parameters(places.exp()).items()}
+                loss = joint(wanted)
+                slope = torch.autograd.grad(loss.sum(), wanted["stretch"])[0]
+                with torch.no_grad():
+                    assert not joint(wanted).requires_grad
+                terms = linearise(joint, SPACE, places)
+                found[threads] = [loss.detach(), slope, terms.losses, terms.slope, terms.curvature]
+        finally:
+            use_threads(None)
+        for threads in (2, 3):
+            assert all(torch.equal(one, other) for one, other in zip(found[threads], found[1], strict=True))
+
+    def test_results_of_threads_come_in_order_and_errors_come_through(self):
+        def diverging(one: int) -> int:
+            if one == 2:
+                raise DivergedError(3, [0], "as it should")
+            return one
+
+        try:
+            use_threads(2)
+            assert map_threads(diverging, [1, 3, 5]) == [1, 3, 5]
+            with pytest.raises(DivergedError, match="as it should"):
+                map_threads(diverging, [1, 2, 3])
+        finally:
+            use_threads(None)
 
 
 class TestOneCloth:
