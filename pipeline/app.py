@@ -31,6 +31,7 @@ COMMANDS = {
     "predict": "pipeline.predict:predict",
     "report": "pipeline.report:report",
     "identify": "pipeline.identify:identify",
+    "init": "pipeline.init:init",
     "export": "pipeline.export:export",
     "view": "pipeline.view:view",
     "rollout": "pipeline.rollout:rollout",

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -206,3 +209,94 @@ def test_results_are_plain_json(found):
     folder, _ = found
     told = json.loads((folder / "found" / "intervals.json").read_text())
     assert told["parameters"]["stretch"]["verdict"]
+
+
+@pytest.fixture
+def project(found, tmp_path):
+    """A copy of what was identified, where `diffcloud init` has been."""
+    shutil.copytree(found[0] / "found", tmp_path / "found")
+    for page in ("params.yaml", "dvc.yaml"):
+        (tmp_path / "found" / page).unlink(missing_ok=True)
+    invoke("init", tmp_path / "found")
+    return tmp_path / "found"
+
+
+def dvc(folder, *words):
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        [sys.executable, "-m", "dvc", *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+class TestProject:
+    """`diffcloud init` where `diffcloud identify` has been."""
+
+    @pytest.mark.slow
+    def test_the_pipeline_comes_to_the_same_fit_and_runs_again_only_for_what_changed(self, project):
+        before = read_fit(project / "fit.json")
+        assert (
+            yaml.safe_load((project / "params.yaml").read_text())["identify"]["options"]
+            == "--parameters stretch --mass 0.25"
+        )
+        dvc(project, "repro", "identify")
+        assert read_fit(project / "fit.json").fingerprint == before.fingerprint  # the finished fit was kept
+        assert "up to date" in dvc(project, "status", "identify")
+        assert "stretch" in dvc(project, "metrics", "show")
+        (project / "episodes" / "second.npz").rename(project / "elsewhere.npz")
+        assert "episodes" in dvc(project, "status", "identify")
+        dvc(project, "repro", "identify")
+        assert [one.name for one in read_fit(project / "fit.json").episodes] == ["first"]
+        assert "up to date" in dvc(project, "status", "identify")
+
+    def test_its_stages_are_commands_that_exist(self, project):
+        from typer.main import get_command
+
+        from pipeline.app import app
+
+        commands = get_command(app).commands
+        for stage in yaml.safe_load((project / "dvc.yaml").read_text())["stages"].values():
+            words = stage["cmd"].split()
+            options = {option for parameter in commands[words[1]].params for option in parameter.opts}
+            assert {word for word in words if word.startswith("--")} <= options
+
+    def test_dvc_knows_it_inside_of_a_repository_and_outside(self, project):
+        told = dvc(project, "status")
+        assert "identify" in told
+        inner = project / "inner"
+        shutil.copytree(project, inner, ignore=shutil.ignore_patterns(".dvc*", "*.yaml", "inner"))
+        for name in ("cloth.yaml", "recordings.yaml"):
+            shutil.copy(project / name, inner / name)
+        invoke("init", inner)
+        assert not (inner / ".dvc").exists()  # the outer project's
+
+    def test_nothing_is_written_over(self, project):
+        (project / "params.yaml").write_text("mine: 1\n")
+        told = invoke("init", project, code=1).errors
+        assert "params.yaml is there already" in told
+        assert (project / "params.yaml").read_text() == "mine: 1\n"
+
+    def test_a_folder_where_identify_did_not_finish_is_refused(self, project, tmp_path):
+        told = invoke("init", tmp_path, code=1).errors
+        assert "lacks cloth.yaml, recordings.yaml, fit.json" in told
+        for name in ("params.yaml", "dvc.yaml", "episodes/first.npz"):
+            (project / name).unlink()
+        assert "lacks first" in invoke("init", project, code=1).errors
+        assert not (project / "dvc.yaml").exists()
+
+    @pytest.mark.parametrize(
+        ("name", "text", "told"),
+        [
+            ("cloth.yaml", "material: denim\n", "no material.density_kg_m2"),
+            ("cloth.yaml", "[1, 2", "cloth.yaml"),
+            ("intervals.json", "[]", "holds no intervals"),
+            ("fit.json", "{}", "fit.json"),
+        ],
+    )
+    def test_damaged_files_are_named_and_nothing_is_written(self, project, name, text, told):
+        for page in ("params.yaml", "dvc.yaml"):
+            (project / page).unlink()
+        (project / name).write_text(text)
+        assert told in invoke("init", project, code=1).errors
+        assert not (project / "dvc.yaml").exists()
