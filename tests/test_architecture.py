@@ -110,12 +110,17 @@ def test_stage_parameters_are_sections_of_the_configuration():
 
 
 def test_every_stage_command_exists():
+    check_commands(stages())
+
+
+def check_commands(stages: dict) -> None:
+    """What stages run are commands and options of this package."""
     from typer.main import get_command
 
     from pipeline.app import app
 
     commands = get_command(app).commands
-    for stage in stages().values():
+    for stage in stages.values():
         words = stage["cmd"].split()
         assert words[0] == "diffcloud"
         assert words[1] in commands

@@ -22,6 +22,7 @@ from diffcloud.io.clouds import write_ply
 from diffcloud.scene.scenarios import built_in, make_scenario
 from diffcloud.sim.simulate import rollout
 from tests.pipeline.invoke import invoke
+from tests.test_architecture import check_commands
 
 SIZE = (0.16, 0.12)
 
@@ -250,15 +251,7 @@ class TestProject:
         assert "up to date" in dvc(project, "status", "identify")
 
     def test_its_stages_are_commands_that_exist(self, project):
-        from typer.main import get_command
-
-        from pipeline.app import app
-
-        commands = get_command(app).commands
-        for stage in yaml.safe_load((project / "dvc.yaml").read_text())["stages"].values():
-            words = stage["cmd"].split()
-            options = {option for parameter in commands[words[1]].params for option in parameter.opts}
-            assert {word for word in words if word.startswith("--")} <= options
+        check_commands(yaml.safe_load((project / "dvc.yaml").read_text())["stages"])
 
     def test_dvc_knows_it_inside_of_a_repository_and_outside(self, project):
         told = dvc(project, "status")
