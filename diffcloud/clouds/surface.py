@@ -3,6 +3,9 @@
 Faces are taken in groups of eight neighbours. Those of a group are looked at only where the sphere around them comes near
 enough: nearer than the nearest place found so far, which begins with a guess or the face of the query before; or as near to
 the line of sight as its radius. Of those, a face whose plane, or a line through an edge of it, is farther away is left out.
+
+A place on an edge or in a corner lies on several faces. It is given to the first of them, not to the one that rounding
+favours: their normals differ, and what a query finds must depend neither on its guess nor on other queries.
 """
 
 from __future__ import annotations
@@ -16,6 +19,8 @@ NO_GUESS: Ints = np.empty((0, 0), np.int64)
 _GROUP = 8
 _SAFE = 1 - 1e-12
 """Part of a computed bound that rounding leaves."""
+_EQUAL, _TOGETHER = 1e-9, 1e-24
+"""Part of a squared distance, and the squared distance [m²], by which equally near faces may differ."""
 
 
 @kernel
@@ -142,8 +147,8 @@ def find_on_surface(queries: Floats, guesses: Ints, nodes: Floats, faces: Ints) 
         faces: [F, 3], at least one.
 
     Returns:
-        ([M, Q] the nearest face of each, [M, Q, 3] the barycentric place on it); the first corner of the first face where a
-        position is no number.
+        ([M, Q] the nearest face of each, the first of equally near ones, [M, Q, 3] the barycentric place on it); the first
+        corner of the first face where a position is no number.
     """
     states, count = queries.shape[0], queries.shape[1]
     found, places = np.zeros((states, count), np.int64), np.zeros((states, count, 3))
@@ -161,7 +166,8 @@ def find_on_surface(queries: Floats, guesses: Ints, nodes: Floats, faces: Ints) 
             best = nearest_on_triangle(x, y, z, corners, faces[face, 0], faces[face, 1], faces[face, 2], place)
             if not best < np.inf:
                 best, face, place[0], place[1], place[2] = np.inf, 0, 1.0, 0.0, 0.0
-            bound = np.sqrt(best)
+            equal = best * (1.0 + _EQUAL) + _TOGETHER
+            bound = np.sqrt(equal)
             places[state, query, 0], places[state, query, 1], places[state, query, 2] = place[0], place[1], place[2]
             for g in range(len(groups)):
                 dx, dy, dz = x - spheres[g, 0], y - spheres[g, 1], z - spheres[g, 2]
@@ -169,13 +175,15 @@ def find_on_surface(queries: Floats, guesses: Ints, nodes: Floats, faces: Ints) 
                     continue
                 _bounds(x, y, z, flat, 16 * _GROUP * g, bounds)
                 for lane in range(_GROUP):
-                    if bounds[lane] >= best:
-                        continue
                     other = groups[g, lane]
+                    if bounds[lane] > equal or other == face:
+                        continue
                     i, j, k = faces[other, 0], faces[other, 1], faces[other, 2]
                     squared = nearest_on_triangle(x, y, z, corners, i, j, k, place)
-                    if squared < best:
-                        best, bound, face = squared, np.sqrt(squared), other
+                    if (squared < best and best - squared > equal - best) or (squared <= equal and other < face):
+                        best, face = squared, other
+                        equal = best * (1.0 + _EQUAL) + _TOGETHER
+                        bound = np.sqrt(equal)
                         for axis in range(3):
                             places[state, query, axis] = place[axis]
             found[state, query] = last = face

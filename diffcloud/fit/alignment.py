@@ -9,8 +9,9 @@ from torch import Tensor
 
 from diffcloud.fit.pose import PoseSpace
 
-Terms = Callable[[Tensor, float], tuple[Tensor, Tensor, Tensor]]
-"""Poses [B, d] and a factor of the cap -> loss [B], half of its slope [B, d] and of its curvature [B, d, d]."""
+Terms = Callable[[Tensor, float, Tensor | None], tuple[Tensor, Tensor, Tensor]]
+"""Poses [b, d], a factor of the cap, and which entries [b] of the batch they belong to (None: all) -> loss [b], half of its
+slope [b, d] and of its curvature [b, d, d]."""
 _ARRIVED = 1e-2
 """A step smaller than this part of the priors' deviations is the last one; what is left changes little."""
 _LARGEST = 1.0
@@ -23,18 +24,18 @@ def aligned(space: PoseSpace, start: Tensor, terms: Terms, caps: Sequence[float]
 
     An entry of the batch stops early once the factor is 1 and its step is small, whatever the others do.
     """
-    poses, going = start, torch.ones(len(start), dtype=torch.bool)
+    poses, going = start.clone(), torch.arange(len(start))
+    eye = torch.eye(len(space.names), dtype=torch.float64)
     for cap in caps:
-        _, slope, curvature = terms(poses, cap)
-        slope, curvature = slope + space.prior_weights * poses, curvature + space.prior_weights.diag()
+        _, slope, curvature = terms(poses[going], cap, None if len(going) == len(start) else going)
+        slope, curvature = slope + space.prior_weights * poses[going], curvature + space.prior_weights.diag()
         scaled = curvature * space.deviations[:, None] * space.deviations
         damping = _DAMPING * scaled.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1e-300)
-        eye = torch.eye(len(space.names), dtype=torch.float64)
         step = -torch.linalg.solve(scaled + damping[:, None, None] * eye, slope * space.deviations)
         step = step * (_LARGEST / step.abs().amax(-1, keepdim=True).clamp(min=_LARGEST))
-        poses = torch.where(going[:, None], poses + step * space.deviations, poses)
+        poses[going] += step * space.deviations
         if cap == 1.0:
-            going &= step.abs().amax(-1) >= _ARRIVED
-            if not bool(going.any()):
+            going = going[step.abs().amax(-1) >= _ARRIVED]
+            if not len(going):
                 break
     return poses

@@ -24,6 +24,7 @@ from torch import Tensor
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfacePoints
 from diffcloud.fit.pose import PoseSpace
+from diffcloud.fit.targets import Target
 
 _TINY = 1e-300
 
@@ -82,6 +83,115 @@ class Pairs:
         slope = torch.einsum("kblni,blni,bln->bk", rates, away, weights)
         curvature = torch.einsum("rjbln,rkbln,bln->bjk", rows, rows, weights)
         return self.losses(moved, cap).sum(-1), slope, curvature
+
+
+@dataclass(frozen=True)
+class Motion:
+    """B simulated motions at L frames, and how they lie in the recording."""
+
+    nodes: Tensor
+    """[B, L, V, 3] of the cloth and of the bodies beside it, in the scene."""
+    velocities: Tensor | None
+    """[B, L, V, 3], where the lag is free."""
+    pose: Tensor
+    """[B, d]"""
+    pairs: tuple[Pairs, ...]
+    """Forth; in the default measure, back too."""
+
+    def shown(self, space: PoseSpace) -> Tensor:
+        """[B, L, V, 3] where the nodes are when the recording looks at them."""
+        return _shown(self.nodes, self.velocities, self.pose, space)
+
+
+class Matcher:
+    """Finds the pairs of B motions at one pose after the other: what was found last helps to find what is next."""
+
+    def __init__(
+        self,
+        target: Target,
+        nodes: Tensor,
+        velocities: Tensor | None,
+        places: SurfacePoints,
+        faces: Tensor,
+        recorded: tuple[Tensor, Tensor] | None,
+        *,
+        near: float,
+    ) -> None:
+        """
+        Args:
+            target: of L frames.
+            nodes: [B, L, V, 3]; velocities likewise, where the lag is free.
+            places: [B, L, N] sampled on the cloth.
+            faces: [F, 3] of the cloth, and of bodies beside it.
+            recorded: [L, Q, 3] points that look for the cloth, and [L, Q] how much each counts; None where none do.
+            near: what is nearer to a point hides nothing.
+        """
+        self._target, self._faces, self._near = target, faces, near
+        self._nodes, self._velocities, self._places = nodes, velocities, places
+        self._recorded = recorded
+        self._seen: Tensor | None = None
+        self._found: list[Tensor | None] = [None, None]
+
+    def __call__(self, pose: Tensor, entries: Tensor | None = None) -> Motion:
+        """The motions at poses [b, d], with their pairs.
+
+        Args:
+            entries: [b] of the motions; None for all, as the first time.
+        """
+        target = self._target
+        nodes, places = self._nodes, self._places
+        if entries is not None:
+            nodes = nodes[entries]
+            places = SurfacePoints(places.nodes[entries], places.barycentric[entries])
+        velocities = self._of(self._velocities, entries)
+        shown = _shown(nodes, velocities, pose, target.space)
+        points = places.of(shown)
+        if self._seen is None and target.viewpoints is not None:
+            eyes = target.space.back(target.viewpoints, pose)
+            self._seen = seen_places(shown, self._faces, points, eyes, near=self._near)
+        share = 1.0 if self._recorded is None else 0.5
+        moved, seen = target.space.moved(points, pose), self._of(self._seen, entries)
+        last = [self._of(found, entries) for found in self._found]
+        forth, found = pairs_forth(places, moved, target.clouds, cut=target.cut, share=share, seen=seen, guesses=last[0])
+        self._keep(0, found, entries)
+        pairs = [forth]
+        if self._recorded is not None:
+            back, found = pairs_back(
+                shown,
+                self._faces,
+                *self._recorded,
+                forth.spacing,
+                space=target.space,
+                pose=pose,
+                share=share,
+                guesses=last[1],
+            )
+            self._keep(1, found, entries)
+            pairs.append(back)
+        return Motion(nodes, velocities, pose, tuple(pairs))
+
+    def look_anew(self) -> None:
+        """Forget what the cameras saw at the first pose: so far away that the steps of a search change nothing of it, but a
+        loss at its end is that of its own pose."""
+        self._seen = None
+
+    def _keep(self, way: int, found: Tensor, entries: Tensor | None) -> None:
+        kept = self._found[way]
+        if kept is None or entries is None:
+            self._found[way] = found
+        else:
+            kept[entries] = found
+
+    @staticmethod
+    def _of(whole: Tensor | None, entries: Tensor | None) -> Tensor | None:
+        return whole if whole is None or entries is None else whole[entries]
+
+
+def _shown(nodes: Tensor, velocities: Tensor | None, pose: Tensor, space: PoseSpace) -> Tensor:
+    lag = space.lag(pose)
+    if lag is None or velocities is None:
+        return nodes
+    return nodes + lag[:, None, None, None] * velocities
 
 
 @torch.no_grad()

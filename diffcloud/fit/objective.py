@@ -8,10 +8,10 @@ pose.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.alignment import aligned
-from diffcloud.fit.matching import Pairs, pairs_back, pairs_forth, seen_places
+from diffcloud.fit.matching import Matcher, Motion, Pairs
 from diffcloud.fit.pose import DEFAULT_PRIORS, PoseSpace
 from diffcloud.fit.targets import read_target
 from diffcloud.io.episodes import Episode
@@ -43,24 +43,6 @@ _FIRST_CAPS = (np.inf, np.inf, 4.0, 4.0, 2.0, 2.0, *[1.0] * 10)
 """Factors of the cap in the steps from no pose at all: a cloth that lies elsewhere is far from all that was recorded."""
 _CAPS = (2.0, *[1.0] * 8)
 _LAST_CAPS = (1.0, 1.0)
-
-
-@dataclass(frozen=True)
-class Motion:
-    """B simulated motions at the frames of one episode, and how they lie in the recording."""
-
-    nodes: Tensor
-    """[B, L, V, 3] of the cloth and of the bodies beside it, in the scene."""
-    velocities: Tensor | None
-    """[B, L, V, 3], where the lag is free."""
-    pose: Tensor
-    """[B, d]"""
-    pairs: tuple[Pairs, ...]
-    """Forth; in the default measure, back too."""
-
-
-Matcher = Callable[[Tensor], tuple[Pairs, ...]]
-"""Poses [B, d] -> pairs."""
 
 
 class Objective:
@@ -256,16 +238,13 @@ class Objective:
         """The same of nodes and velocities [B, L, V, 3] at the compared frames, those of bodies among them."""
         with torch.no_grad():
             still = nodes.detach(), None if velocities is None else velocities.detach()
-            if pose is None:
-                pose = self._pose(*still)
-            return Motion(nodes, velocities, pose, self._matcher(*still, range(nodes.shape[1]))(pose))
-
-    def _pose(self, nodes: Tensor, velocities: Tensor | None) -> Tensor:
-        """[B, d] from the pose of the basis material on: on a few frames, then on all."""
-        space = self.pose_space
-        if not space.names:
-            return torch.zeros(len(nodes), 0, dtype=torch.float64)
-        return self._follow(nodes, velocities, self._first_pose().expand(len(nodes), -1), _CAPS)
+            if pose is None and self.pose_space.names:
+                start = self._first_pose().expand(len(nodes), -1)
+                pose, matcher = self._follow(*still, start, _CAPS)
+            else:
+                pose = torch.zeros(len(nodes), 0, dtype=torch.float64) if pose is None else pose
+                matcher = self._matcher(*still, range(nodes.shape[1]))
+            return replace(matcher(pose), nodes=nodes, velocities=velocities)
 
     def _first_pose(self) -> Tensor:
         """[1, d] of the basis material, from zero on."""
@@ -273,11 +252,14 @@ class Objective:
             self._first = torch.zeros(1, len(self.pose_space.names), dtype=torch.float64)
             with suppress(DivergedError):  # then steps begin at zero, whatever the parameters
                 nodes = self.with_bodies(self.simulate_to_loss({}).at(self.times))
-                self._first = self._follow(nodes, torch.zeros_like(nodes), self._first, _FIRST_CAPS)
+                self._first, _ = self._follow(nodes, torch.zeros_like(nodes), self._first, _FIRST_CAPS)
         return self._first
 
-    def _follow(self, nodes: Tensor, velocities: Tensor | None, start: Tensor, caps: Sequence[float]) -> Tensor:
-        """[B, d] poses of lowest loss of nodes [B, L, V, 3]."""
+    def _follow(
+        self, nodes: Tensor, velocities: Tensor | None, start: Tensor, caps: Sequence[float]
+    ) -> tuple[Tensor, Matcher]:
+        """[B, d] poses of lowest loss of nodes [B, L, V, 3], from a start on, on a few frames and then on all; and what
+        matches all of them there."""
         space, every = self.pose_space, range(nodes.shape[1])
         few = np.unique(np.linspace(0, len(every) - 1, _FEW).round().astype(int)).tolist()
         pose = start
@@ -285,52 +267,27 @@ class Objective:
             matcher = self._matcher(nodes, velocities, frames)
 
             def terms(
-                poses: Tensor, factor: float, matcher: Matcher = matcher, frames: Sequence[int] = frames
+                poses: Tensor, factor: float, entries: Tensor | None, matcher: Matcher = matcher
             ) -> tuple[Tensor, Tensor, Tensor]:
-                moving = None if velocities is None else velocities[:, frames]
-                motion = Motion(nodes[:, frames], moving, poses, matcher(poses))
-                return self.terms(motion, None, factor=factor)
+                return self.terms(matcher(poses, entries), None, factor=factor)
 
             pose = aligned(space, pose, terms, factors)
-        return pose
+        matcher.look_anew()
+        return pose, matcher
 
     def _matcher(self, nodes: Tensor, velocities: Tensor | None, frames: Sequence[int]) -> Matcher:
-        """What finds the pairs of some frames at poses [B, d]."""
-        target, chosen = self._target, list(frames)
+        """Of motions [B, L, V, 3] at some of the compared frames."""
+        chosen = list(frames)
         still, moving = nodes[:, chosen], None if velocities is None else velocities[:, chosen]
-        clouds = [target.clouds[frame] for frame in chosen]
-        places = self.sampler.draw(still)
-        share = 1.0 if self.paper else 0.5
-        seen: Tensor | None = None
-        near: Tensor | None = None  # what was found last: poses of one motion differ little
-        there: Tensor | None = None
-
-        def pairs_at(pose: Tensor) -> tuple[Pairs, ...]:
-            nonlocal seen, near, there
-            shown = self._lagged(Motion(still, moving, pose, ()), target.space)
-            points = places.of(shown)
-            if seen is None and target.viewpoints is not None:  # from where one stands metres away, a step changes nothing
-                eyes = target.space.back(target.viewpoints, pose)
-                seen = seen_places(shown, self._faces, points, eyes, near=_NEAR_M / self._unit)
-            moved = target.space.moved(points, pose)
-            forth, near = pairs_forth(places, moved, clouds, cut=target.cut, share=share, seen=seen, guesses=near)
-            if self.paper:
-                return (forth,)
-            recorded, sure = (part[chosen] for part in self._recorded)
-            back, there = pairs_back(
-                shown,
-                self._faces,
-                recorded,
-                sure,
-                forth.spacing,
-                space=target.space,
-                pose=pose,
-                share=share,
-                guesses=there,
-            )
-            return forth, back
-
-        return pairs_at
+        return Matcher(
+            self._target.at(chosen),
+            still,
+            moving,
+            self.sampler.draw(still),
+            self._faces,
+            None if self.paper else (self._recorded[0][chosen], self._recorded[1][chosen]),
+            near=_NEAR_M / self._unit,
+        )
 
     def terms(self, motion: Motion, rates: Tensor | None, *, factor: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
         """Loss [B], half of its slope [B, k + d] and curvature [B, k + d, k + d], without the prior of the pose.
@@ -353,7 +310,7 @@ class Objective:
             rates: as of `terms`.
         """
         space = self._target.space
-        here = self._lagged(motion, space)
+        here = motion.shown(space)
         if rates is not None:  # bodies stand still
             rates = torch.nn.functional.pad(rates, (0, 0, 0, here.shape[-2] - rates.shape[-2]))
         moved, every = [], []
@@ -386,16 +343,9 @@ class Objective:
             return positions
         return torch.cat([positions, self._bodies.expand(*positions.shape[:-2], -1, -1)], dim=-2)
 
-    def _lagged(self, motion: Motion, space: PoseSpace) -> Tensor:
-        """[B, L, V, 3] where the nodes are when the recording looks at them."""
-        lag = space.lag(motion.pose)
-        if lag is None or motion.velocities is None:
-            return motion.nodes
-        return motion.nodes + lag[:, None, None, None] * motion.velocities
-
     def _moved(self, motion: Motion, pairs: Pairs) -> Tensor:
         space = self._target.space
-        return space.moved(pairs.places.of(self._lagged(motion, space)), motion.pose)
+        return space.moved(pairs.places.of(motion.shown(space)), motion.pose)
 
     def _drawn(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """[L, Q, 3] recorded points that look for the cloth, as many as there are sampled ones, and [L, Q] how sure."""

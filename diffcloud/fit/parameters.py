@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.quasirandom import SobolEngine
 
 from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.fit.priors import prior_cost
@@ -142,9 +143,7 @@ class FitSpace:
                 middle[index] = first[name]
         values = np.repeat(middle[None], count, axis=0)
         if count > 1:
-            from scipy.stats import qmc  # takes as long to import as all of scipy else
-
-            sobol = qmc.Sobol(len(low), seed=seed).random_base2(math.ceil(math.log2(count)))[: count - 1]
+            sobol = SobolEngine(len(low), scramble=True, seed=seed).draw(count - 1, dtype=torch.float64).numpy()
             safe = np.where(low > 0, low, 1.0)
             logs = safe * np.where(low > 0, high / safe, 1.0) ** sobol
             values[1:] = np.where(low > 0, logs, low + (high - low) * sobol)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -48,6 +48,16 @@ class Target:
     space: PoseSpace
     track: Tensor | None
     """[1, S, G, 3] displacement of the grippers."""
+
+    def at(self, chosen: Sequence[int]) -> Target:
+        """The same with some of its frames, by their places among these."""
+        return replace(
+            self,
+            frames=tuple(self.frames[index] for index in chosen),
+            times=self.times[list(chosen)],
+            clouds=tuple(self.clouds[index] for index in chosen),
+            sure=tuple(self.sure[index] for index in chosen),
+        )
 
 
 def read_target(

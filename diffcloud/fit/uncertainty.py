@@ -32,13 +32,15 @@ from torch import Tensor
 
 from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.fit.joint import AnyObjective, loss_weights
-from diffcloud.fit.objective import Motion, Objective
+from diffcloud.fit.matching import Motion
+from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace, Variable
 from diffcloud.fit.pose import NUISANCE
 from diffcloud.fit.residuals import Axis, moved_by
 from diffcloud.fit.targets import track_displacement
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import Rollout, rollout
+from diffcloud.sim.threads import map_threads
 
 POSE_DOUBTS = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.005, "yaw": 0.005, "lag": 0.002}
 """How far a calibrated set-up may be off where the fit takes it for known [m, rad, s]."""
@@ -110,7 +112,7 @@ def uncertainty(
     axis = Axis.of(space)
     places = axis.places(torch.tensor([[values[name] for name in space.names]], dtype=torch.float64))
     with torch.no_grad():
-        parts = [_Part.of(member, space, places, doubts) for member in objective.members]
+        parts = map_threads(lambda member: _Part.of(member, space, places, doubts), objective.members)
     losses = torch.tensor([part.loss for part in parts], dtype=torch.float64)
     weights = loss_weights(losses[:, None], paper=objective.paper)[:, 0].numpy()
     prior = space.prior_weights(objective.length_unit_m).numpy()
@@ -147,12 +149,13 @@ def refined_distance_mm(objective: AnyObjective, values: Mapping[str, float]) ->
         DivergedError: a motion diverges.
     """
     parameters = {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
-    told = []
+
+    def told(member: Objective) -> tuple[float, float]:
+        apart = _refined(member, parameters, member.simulate_to_loss(parameters)).square().sum(-1).mean().sqrt()
+        return 1e3 * member.length_unit_m * float(apart), noise_mm(member)
+
     with torch.no_grad():
-        for member in objective.members:
-            apart = _refined(member, parameters, member.simulate_to_loss(parameters)).square().sum(-1).mean().sqrt()
-            told.append((1e3 * member.length_unit_m * float(apart), noise_mm(member)))
-    return max(told, key=lambda pair: pair[0] / pair[1])
+        return max(map_threads(told, objective.members), key=lambda pair: pair[0] / pair[1])
 
 
 def noise_mm(objective: Objective) -> float:

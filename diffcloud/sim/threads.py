@@ -1,13 +1,16 @@
-"""How many threads simulate a batch, and how they are waited for.
+"""How many threads simulate, and how they are waited for.
 
-One thread has one cloth at a time, so that results are the same for any number of threads and any batch.
+One thread has one cloth at a time, so that results are the same for any number of threads and any batch. All simulations
+of a process share one pool: where several recordings are compared side by side, no more threads simulate than were asked
+for.
 """
 
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import TypeVar
 
 from diffcloud.errors import ConfigError
@@ -15,6 +18,8 @@ from diffcloud.errors import ConfigError
 _LOOK = 0.1
 """[s] between two looks at progress and Ctrl-C."""
 _chosen: list[int] = []
+_simulating: list[tuple[int, ThreadPoolExecutor]] = []
+_here = threading.local()
 
 
 def cores() -> int:
@@ -44,20 +49,18 @@ def run_all(jobs: Sequence[Callable[[], None]], *, look: Callable[[], None], sto
     Args:
         look: called now and then meanwhile.
         stop: called when something interrupts; lets the jobs end soon.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C, in the main thread or, within `map_threads`, in the one that waits there.
     """
-    with ThreadPoolExecutor(min(thread_count(), max(len(jobs), 1))) as pool:
-        open_jobs = {pool.submit(job) for job in jobs}
-        try:
-            while open_jobs:
-                done, open_jobs = wait(open_jobs, timeout=_LOOK, return_when=FIRST_EXCEPTION)
-                for one in done:
-                    one.result()
-                look()
-        except BaseException:
-            stop()
-            for one in open_jobs:
-                one.cancel()
-            raise
+    interrupted: threading.Event | None = getattr(_here, "interrupted", None)
+
+    def look_up() -> None:
+        if interrupted is not None and interrupted.is_set():
+            raise KeyboardInterrupt
+        look()
+
+    _finish([_pool().submit(job) for job in jobs], look_up, stop)
 
 
 Given = TypeVar("Given")
@@ -65,16 +68,44 @@ Found = TypeVar("Found")
 
 
 def map_threads(function: Callable[[Given], Found], given: Iterable[Given]) -> list[Found]:
-    """The function's results, in order; torch's gradients are recorded where they are here."""
+    """The function's results, in order; torch's gradients are recorded where they are here. What it simulates ends soon
+    after Ctrl-C."""
     import torch  # here: commands that only choose a number of threads start without it
 
     items, recording = list(given), torch.is_grad_enabled()
     if min(len(items), thread_count()) < 2:
         return [function(item) for item in items]
+    interrupted = threading.Event()
 
     def run(item: Given) -> Found:
+        _here.interrupted = interrupted
         with torch.set_grad_enabled(recording):
             return function(item)
 
     with ThreadPoolExecutor(min(thread_count(), len(items))) as pool:
-        return list(pool.map(run, items))
+        return _finish([pool.submit(run, item) for item in items], lambda: None, interrupted.set)
+
+
+def _pool() -> ThreadPoolExecutor:
+    """What simulates, with as many threads as are asked for now."""
+    count = thread_count()
+    if not _simulating or _simulating[-1][0] != count:
+        _simulating[:] = [(count, ThreadPoolExecutor(count, thread_name_prefix="diffcloud"))]
+    return _simulating[-1][1]
+
+
+def _finish(futures: Sequence[Future[Found]], look: Callable[[], None], stop: Callable[[], None]) -> list[Found]:
+    """Wait for all, and give what they found; the first error in order is raised. Ctrl-C, or an error of `look`, stops
+    them, and is raised once they have ended."""
+    open_jobs = set(futures)
+    try:
+        while open_jobs:
+            open_jobs = wait(open_jobs, timeout=_LOOK).not_done
+            look()
+    except BaseException:
+        stop()
+        for one in open_jobs:
+            one.cancel()
+        wait(open_jobs)
+        raise
+    return [future.result() for future in futures]

@@ -357,17 +357,17 @@ def test_smoothed_gradients_find_the_valley_of_a_rough_loss():
 class TestPatience:
     SPACE = FitSpace.build(["stretch", "mass"])
 
-    def fits(self, **options):
+    def fits(self, seeds=4, **options):
         return [
             fit_adam(Rough(), self.SPACE, AdamSettings(starts=9, iterations=50, seed=seed, patience=patience, **options))
-            for seed in range(4)
+            for seed in range(seeds)
             for patience in (0, 5)
         ]
 
     def test_starts_beside_the_best_find_lower_losses_of_a_rough_landscape(self):
-        found = self.fits()
+        found = self.fits(24)  # geometric means of 64: 0.16, within a factor of 1.4
         without, with_ = found[::2], found[1::2]
-        assert sum(b.loss for b in with_) < 0.5 * sum(a.loss for a in without)
+        assert np.mean([np.log(b.loss / a.loss) for a, b in zip(without, with_, strict=True)]) < np.log(0.5)
         assert [a.simulations for a in without] == [b.simulations for b in with_]
 
     @pytest.mark.parametrize("smoothing", [0.0, 0.3])

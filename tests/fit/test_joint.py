@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
+import time
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +16,7 @@ from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objecti
 from diffcloud.fit.joint import mean_loss, mean_terms
 from diffcloud.fit.left_out import leave_each_out
 from diffcloud.fit.residuals import Axis, linearise
+from diffcloud.sim.simulate import rollout
 from diffcloud.sim.threads import map_threads, use_threads
 from tests.conftest import paper_objective, small_lift
 from tests.fit.test_fit import GENTLE, clouds_of
@@ -131,6 +137,20 @@ class TestFit:
                 map_threads(diverging, [1, 2, 3])
         finally:
             use_threads(None)
+
+    def test_ctrl_c_ends_what_threads_simulate(self):
+        """They would take minutes."""
+        system, _ = small_lift().scene.build()
+        rollout(system, 1)  # compiled
+        began = time.monotonic()
+        threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+        try:
+            use_threads(2)
+            with pytest.raises(KeyboardInterrupt):
+                map_threads(lambda steps: rollout(system, steps), [100_000, 100_000, 100_000])
+        finally:
+            use_threads(None)
+        assert time.monotonic() - began < 10  # on a busy machine
 
 
 class TestOneCloth:

@@ -44,6 +44,24 @@ def test_a_guess_changes_no_nearest_place(sheet, generator):
         torch.testing.assert_close(again.of(nodes), found.of(nodes), rtol=0.0, atol=1e-15)
 
 
+def test_a_place_on_several_faces_belongs_to_the_first_of_them(sheet, generator):
+    """Whatever the guess, the other meshes, and the last digit of the query."""
+    nodes, faces = sheet
+    corners = nodes + 0.0
+    corners[..., 2] -= 0.1 * (corners[..., :2] - corners[..., :2].mean(2, keepdim=True)).square().sum(-1)  # a dome's rim
+    queries = torch.cat([corners + torch.tensor([0.3, 0.1, 0.2]), corners], dim=2)  # beside its rim, and on its corners
+    found, there = nearest_places(corners, faces, queries)
+    on_corner = (found.barycentric.amax(-1) > 1 - 1e-9) & (torch.arange(50) >= 25)
+    assert int(on_corner.sum()) == 50
+    first = torch.stack([(faces == node).any(-1).nonzero()[0, 0] for node in range(25)])
+    assert bool((there[:, :, 25:] == first).all())
+    for _ in range(5):
+        guesses = torch.randint(len(faces), there.shape, generator=generator)
+        near = queries + 1e-15 * torch.randn(queries.shape, generator=generator, dtype=torch.float64)
+        assert torch.equal(nearest_places(corners, faces, near, guesses)[1], there)
+        assert torch.equal(nearest_places(corners[:, 1:], faces, near[:, 1:])[1], there[:, 1:])
+
+
 def test_faces_without_area_have_a_nearest_place():
     corners = torch.zeros(1, 1, 3, 3, dtype=torch.float64)
     corners[..., 1, 0] = corners[..., 2, 0] = 1.0

@@ -111,6 +111,14 @@ class TestPose:
                 )
             assert 2 * float(found.slope[0, index]) == pytest.approx((above - below) / 0.04, rel=0.15)
 
+    def test_a_pose_is_found_without_a_look_at_other_motions(self, scenario, episode):
+        values = SPACE.starts(6, seed=3)[0]
+        objective = Objective(scenario, episode)
+        with torch.no_grad():
+            together = objective(SPACE.parameters(values))
+            alone = torch.cat([objective(SPACE.parameters(value[None])) for value in values])
+        torch.testing.assert_close(together, alone, rtol=1e-8, atol=0.0)
+
     def test_the_papers_measure_has_none(self, scenario, episode):
         with pytest.raises(ConfigError, match="leave out the nuisance x"):
             Objective(scenario, episode, paper=True, nuisance={"x": 0.1})
