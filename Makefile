@@ -7,7 +7,7 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 # the tests start hundreds of processes; without byte code each would compile the package again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv repro test tests test-slow lint format bench acceptance comparison simulated recordings coverage docs clean
+.PHONY: venv repro test tests test-slow lint format bench acceptance comparison simulated recordings coverage robustness docs clean
 
 venv: $(STAMP)
 
@@ -90,6 +90,10 @@ COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --out build/c
 coverage: venv
 	$(COVERAGE) --scenario lift --scenario fold --fix mass --recordings 24
 	$(COVERAGE) --scenario band_stretch --scenario vest_hang --recordings 20 --markdown docs/results/coverage.md
+
+# Every damaged file and every fault; a sample of both is part of test-slow.
+robustness: venv
+	python -m tests.robustness --out docs/results/robustness.md
 
 # The site of docs/, README and all commands, as files that open from disk: build/site/index.html.
 docs: venv

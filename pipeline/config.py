@@ -18,17 +18,28 @@ from diffcloud.fit.solvers.gauss_newton import ROUGH_SCREEN
 from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, check_doubts
 from diffcloud.io.files import read_yaml
 from diffcloud.io.raw_episodes import ScenePlacement
+from diffcloud.io.schema import Component, NonNegative, Positive, Vector, explain
 from diffcloud.regressors.settings import Loss, Profile, Target
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.scene.schema import NonNegative, Positive, explain
 from diffcloud.sensing.depth_camera import DepthNoise
 from diffcloud.sensing.filters import Thinning
 from diffcloud.sensing.fusion import FusionSettings
 from diffcloud.sensing.recorder import RecorderSettings
 
-Count = Annotated[int, Field(ge=1)]
-Bounds = tuple[float, float]
-Point = tuple[float, float, float]
+_MOST, _FACTOR = 10_000_000, 1e6
+Count = Annotated[int, Field(ge=1, le=_MOST)]
+CountOrNone = Annotated[int, Field(ge=0, le=_MOST)]
+"""Zero: there is none, or it is left out."""
+Workers = Annotated[int, Field(ge=1, le=1024)]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Factor = Annotated[float, Field(gt=1, le=_FACTOR)]
+"""Within which something is known."""
+Name = Annotated[str, Field(max_length=1000)]
+"""Of a thing, a file or a folder."""
+Pixels = Annotated[int, Field(ge=1, le=10_000)]
+Names = Annotated[list[Name], Field(min_length=1, max_length=10_000)]
+Bounds = tuple[Component, Component]
+Point = Vector
 
 
 def _check_bounds(name: str, bounds: Bounds) -> None:
@@ -45,15 +56,15 @@ class Section(BaseModel):
 class EpisodesConfig(Section):
     """Where episodes come from."""
 
-    source: str = "synthetic"
+    source: Name = "synthetic"
     """`synthetic`, or a folder with <scenario>/<episode>.npz or raw <scenario>/<episode>/ (see `diffcloud import`)."""
     per_scenario: Count = 2
     """Synthetic episodes of each scenario."""
-    seed: int = 0
+    seed: Seed = 0
     hidden_range: Bounds = (0.3, 3.0)
     """Hidden multipliers of camera recordings are drawn log-uniformly from it; fully observed scenarios (`recorder:
     whole_surface`) draw uniformly over the bounds of a fit, as the paper does."""
-    image_size: tuple[Count, Count] = (424, 240)
+    image_size: tuple[Pixels, Pixels] = (424, 240)
     """Columns and rows of camera recordings; a D435 offers 424 x 240, 640 x 480, 848 x 480 and more."""
     subpixel_px: NonNegative = DepthNoise.subpixel_px
     """Deviation of the cameras' disparity [px of their imagers]."""
@@ -61,7 +72,7 @@ class EpisodesConfig(Section):
     """How late the joint log is."""
     extrinsic_error: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """(millimetres, degrees) by which the stated place of each camera but the first is off."""
-    workers: Count = 1
+    workers: Workers = 1
     """Scenarios at once."""
 
     def recorder(self) -> RecorderSettings:
@@ -78,19 +89,19 @@ class EpisodesConfig(Section):
 class RawConfig(Section):
     """From raw episodes to clouds (`diffcloud.sensing.fusion.FusionSettings` says what each means)."""
 
-    robot: str | None = "gen3"
+    robot: Name | None = "gen3"
     """Whose pixels are masked: `gen3`, the package's own description, or the path of a URDF; null: nobody's."""
     inflation_m: NonNegative = 0.007
     """Margin around the robot."""
     workspace_m: tuple[Point, Point] = FusionSettings.workspace_m
-    eyes_m: tuple[float, ...] = FusionSettings.eyes_m
+    eyes_m: Annotated[tuple[Annotated[float, Field(ge=-1, le=1)], ...], Field(max_length=10)] = FusionSettings.eyes_m
     flying_m: NonNegative = FusionSettings.flying_m
     refine: bool = FusionSettings.refine
-    lag_s: float = FusionSettings.lag_s
+    lag_s: Annotated[float, Field(ge=-10, le=10)] = FusionSettings.lag_s
     table: bool = FusionSettings.table
     clearance_m: Positive = FusionSettings.clearance_m
     color_difference: Positive = FusionSettings.color_difference
-    smoothing_px: Annotated[int, Field(ge=0)] = FusionSettings.smoothing_px
+    smoothing_px: CountOrNone = FusionSettings.smoothing_px
     cluster_gap_m: NonNegative = FusionSettings.cluster_gap_m
     least_cluster: Annotated[float, Field(ge=0, le=1)] = FusionSettings.least_cluster
     subpixel_px: Positive = FusionSettings.subpixel_px
@@ -98,7 +109,7 @@ class RawConfig(Section):
     baseline_m: Positive = FusionSettings.baseline_m
     origin_m: Point | None = None
     """The scene's origin in the base frame; with `yaw_rad` and `length_unit_m` in place of what episode.json says."""
-    yaw_rad: float = 0.0
+    yaw_rad: Component = 0.0
     length_unit_m: Positive = 1.0
 
     def fusion(self) -> FusionSettings:
@@ -119,7 +130,7 @@ class PreprocessConfig(Section):
     raw: RawConfig = RawConfig()
     crop_m: tuple[Point, Point] | None = None
     """Lowest and highest corner of a box in the scene's frame."""
-    outlier_neighbours: Annotated[int, Field(ge=0)] = 20
+    outlier_neighbours: CountOrNone = 20
     outlier_deviations: Positive = 2.5
     radius_m: Positive | None = None
     """Points with fewer than `radius_neighbours` others within it are outliers too; in the scene's unit."""
@@ -127,23 +138,23 @@ class PreprocessConfig(Section):
     points: Count | None = 3500
     """Kept per frame at most."""
     thinning: Thinning = "random"
-    seed: int = 0
-    workers: Count = 1
+    seed: Seed = 0
+    workers: Workers = 1
     """Processes, one episode each; they change nothing but the time."""
 
 
 class SimulateConfig(Section):
     """Simulated sets for the regressors."""
 
-    scenarios: Annotated[list[str], Field(min_length=1)] = ["lift", "fold"]
+    scenarios: Names = ["lift", "fold"]
     """Those that the pipeline makes sets of."""
-    parameters: Annotated[list[str], Field(min_length=1)] = ["stretch", "mass"]
+    parameters: Names = ["stretch", "mass"]
     draws: Literal["uniform", "sobol", "logarithmic", "modes"] = "uniform"
     """Over the bounds: `uniform`, `sobol`, or `logarithmic` (uniform in the logarithms where the lower bound is
     positive); or `modes`: the published code's mixture of soft, medium and stiff cloths."""
-    train: Annotated[int, Field(ge=0)] = 1500
-    test: Annotated[int, Field(ge=0)] = 375
-    seed: Annotated[int, Field(ge=0)] = 0
+    train: CountOrNone = 1500
+    test: CountOrNone = 375
+    seed: Seed = 0
 
 
 SMOOTHING = 0.5
@@ -155,21 +166,21 @@ _OF_SOLVERS = ("iterations", "starts", "screen", "learning_rate", "patience", "s
 class FitConfig(Section):
     """Fits."""
 
-    parameters: Annotated[list[str], Field(min_length=1)] = ["stretch", "mass"]
+    parameters: Names = ["stretch", "mass"]
     bounds: dict[str, Bounds] = {}
-    fixed: dict[str, float] = {}
+    fixed: dict[str, Component] = {}
     solver: Literal["gauss_newton", "adam", "cma_es", "random_search"] = "gauss_newton"
     """`adam` is the paper's; `cma_es` and `random_search` need no derivatives."""
     iterations: Count | None = None
     """Of gauss_newton and adam: steps at most; by default 20 and 50."""
     starts: Count | None = None
     """Of gauss_newton and adam: descents from as many places; by default 3 and 1."""
-    screen: Annotated[int, Field(ge=0)] | None = None
+    screen: CountOrNone | None = None
     """Of gauss_newton and adam: candidates simulated once to choose the starts from; by default 24 of gauss_newton (96 with
     the linearised integrator), none of adam, whose further starts are then spread over the box."""
     learning_rate: Positive | None = None
     """Of adam; the scenario's own if not given."""
-    patience: Annotated[int, Field(ge=0)] | None = None
+    patience: CountOrNone | None = None
     """Of adam: iterations without a lower loss after which a further start restarts near the best point found; 0: never;
     by default 10."""
     smoothing: NonNegative | None = None
@@ -182,17 +193,17 @@ class FitConfig(Section):
     threshold: NonNegative | None = None
     points: Count | None = None
     frames: list[int] | None = None
-    seed: int = 0
+    seed: Seed = 0
     paper: bool = False
     """The published measure: one-sided, squared, at the scenario's loss frames, without a pose, down to its threshold."""
-    nuisance: str | None = None
+    nuisance: Name | None = None
     """Which parts of the pose are fitted too, and how far off each may well be: "x=0.1m,y=0.1m,yaw=30deg" if not given, or
     "none". Variables: `fit.pose.NUISANCE`."""
-    prior: str | None = None
+    prior: Name | None = None
     """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""
     joint: bool = False
     """One parameter set for all episodes, whatever their scenario: they must be of one cloth."""
-    workers: Count = 1
+    workers: Workers = 1
     """Processes, one fit each; they change nothing but the time."""
 
     @model_validator(mode="before")
@@ -242,9 +253,9 @@ def _solvers_with(option: str) -> list[str]:
 class TrainConfig(Section):
     """Regressors. What is not given (null) is the profile's (`diffcloud.regressors.settings`)."""
 
-    scenarios: Annotated[list[str], Field(min_length=1)] = ["lift", "fold"]
+    scenarios: Names = ["lift", "fold"]
     """Those that the pipeline trains for."""
-    models: Annotated[list[str], Field(min_length=1)] = ["mlp", "pointnet2", "meteornet"]
+    models: Names = ["mlp", "pointnet2", "meteornet"]
     profile: Profile = "reduced"
     epochs: Count | None = None
     draws: Count | None = None
@@ -257,11 +268,11 @@ class TrainConfig(Section):
     subtract_background: bool | None = None
     heteroscedastic: bool | None = None
     patience: Count | None = None
-    seed: int | None = None
+    seed: Seed | None = None
     device: Literal["auto", "cpu", "gpu"] = "auto"
-    loaders: Annotated[int, Field(ge=0)] = 0
+    loaders: CountOrNone = 0
     """Processes that sample clouds; they change nothing but the time."""
-    workers: Count = 1
+    workers: Workers = 1
     """Trainings at once, each in a process with one thread."""
 
     def changes(self) -> dict[str, object]:
@@ -276,20 +287,20 @@ class EvaluateConfig(Section):
 
     draws: Count = 4
     """Fresh point samples that a loss is averaged over."""
-    seed: int = 1000
-    rivals: list[Rival] = list(RIVALS)
+    seed: Seed = 1000
+    rivals: Annotated[list[Rival], Field(max_length=len(RIVALS) + 10)] = list(RIVALS)
     """Methods beside the fits and the networks; searches may simulate as often as the fit."""
     level: Annotated[float, Field(gt=0, lt=1)] | None = LEVEL
     """Of the intervals; null: none."""
-    within: Annotated[float, Field(gt=1)] = WITHIN
+    within: Factor = WITHIN
     """A parameter counts as identified if its interval ends within this factor."""
-    doubts: dict[str, Annotated[float, Field(gt=1)]] = dict(MATERIAL_DOUBTS)
+    doubts: dict[str, Factor] = dict(MATERIAL_DOUBTS)
     """Factors within which material that is not fitted is known; {}: exactly."""
-    landscapes: list[str] = []
+    landscapes: Annotated[list[Name], Field(max_length=10_000)] = []
     """Patterns of <scenario>/<episode> whose loss landscape is simulated."""
-    landscape_size: Annotated[int, Field(ge=2)] = 7
+    landscape_size: Annotated[int, Field(ge=2, le=1000)] = 7
     """Places along each of its axes."""
-    workers: Count = 1
+    workers: Workers = 1
     """Processes, one episode each; they change nothing but the time."""
 
     @model_validator(mode="after")
@@ -317,7 +328,7 @@ class EvaluateConfig(Section):
 class ReportConfig(Section):
     """The page."""
 
-    title: str = "DiffCloud report"
+    title: Name = "DiffCloud report"
     overlay_points: Count = 1200
     """Shown per cloud and frame."""
 
@@ -325,7 +336,7 @@ class ReportConfig(Section):
 class Config(Section):
     """All of params.yaml."""
 
-    scenarios: Annotated[list[str], Field(min_length=1)] = ["lift", "fold", "band_stretch", "vest_hang"]
+    scenarios: Names = ["lift", "fold", "band_stretch", "vest_hang"]
     episodes: EpisodesConfig = EpisodesConfig()
     preprocess: PreprocessConfig = PreprocessConfig()
     simulate: SimulateConfig = SimulateConfig()

@@ -9,17 +9,18 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import pandas as pd
 import torch
 import typer
 
 import diffcloud
 from diffcloud.errors import ConfigError
+from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, TimingsFile, check_file, check_rows
 from diffcloud.evaluation.summary import tables as comparison_tables
 from diffcloud.fit import read_fit
 from diffcloud.fit.result import read_motion
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import read_json, together, write_bytes, write_text
+from diffcloud.io.tables import read_csv
 from diffcloud.report import (
     ComparisonEntry,
     EpisodeEntry,
@@ -51,7 +52,9 @@ def report(
     if not table.is_file():
         raise ConfigError(f"No such table: {table}; run `diffcloud evaluate` first.")
     entries = []
-    for known in _rows(table):
+    rows = table_rows(table)
+    check_rows(FitRow, table, rows)
+    for known in rows:
         scenario, name = str(known["scenario"]), str(known["episode"])
         path = fit_file(fits, scenario, name)
         fit = read_fit(path)
@@ -88,12 +91,14 @@ def report(
         "machine": f"{platform.machine()}, {os.cpu_count()} processors",
     }
     comparison = _comparison(tables, entries)
+    predictions = table_rows(tables / "predictions.csv")
+    check_rows(PredictionRow, tables / "predictions.csv", predictions)
     page = build_page(
         entries,
         title=config.report.title,
         overlay_points=config.report.overlay_points,
         environment=environment,
-        predictions=_rows(tables / "predictions.csv"),
+        predictions=predictions,
         trainings=trainings,
         comparison=comparison,
     )
@@ -113,15 +118,12 @@ def _comparison(folder: Path, entries: list[EpisodeEntry]) -> ComparisonEntry:
         ConfigError: it has left nothing, or something else.
     """
     whole = read_json(folder / "comparison.json", error=ConfigError)
+    check_file(ComparisonFile, folder / "comparison.json", whole)
     timings = read_json(folder.parent / "timings.json", error=ConfigError)
-    try:
-        records, failures = whole["records"], whole["failures"]
-        references = {(str(scenario), str(name)): float(loss) for scenario, name, loss in whole["references"]}
-        seconds = {(key.split("/")[0], key.split("/", 1)[1]): told for key, told in timings["methods"].items()}
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise ConfigError(
-            f"{folder} was not written by this version's `diffcloud evaluate` ({error!r}); run it."
-        ) from error
+    check_file(TimingsFile, folder.parent / "timings.json", timings)
+    records, failures = whole["records"], whole["failures"]
+    references = {(scenario, name): float(loss) for scenario, name, loss in whole["references"]}
+    seconds = {(key.split("/")[0], key.split("/", 1)[1]): told for key, told in timings["methods"].items()}
     told = comparison_tables(records, seconds, references)
     histories = {(entry.scenario, entry.name): entry.fit.history for entry in entries}
     figures = comparison_figures(told, records, histories)
@@ -145,11 +147,11 @@ def _pictures(folder: Path, name: str) -> dict[str, bytes]:
     return {caption: path.read_bytes() for caption, path in files.items() if path.is_file()}
 
 
-def _rows(table: Path) -> list[dict[str, Any]]:
+def table_rows(table: Path) -> list[dict[str, Any]]:
     """Rows of a table as column -> value, without what is not known; none if there is no such table."""
     if not table.is_file():
         return []
     return [
         {str(key): value for key, value in row.items() if not (isinstance(value, float) and np.isnan(value))}
-        for row in pd.read_csv(table).to_dict("records")
+        for row in read_csv(table, kind="table", error=ConfigError).to_dict("records")
     ]

@@ -7,7 +7,6 @@ including this package's source, says whether its chunks may be used. It lists i
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict
@@ -18,6 +17,7 @@ import numpy as np
 
 from diffcloud.datasets.chunks import Chunk, Replaced, SimulatedChunk
 from diffcloud.errors import ConfigError, DatasetError
+from diffcloud.io.arrays import read_npz
 from diffcloud.io.files import files_in, read_json, together, write_json, write_npz
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.manifests import remove_files
@@ -25,6 +25,7 @@ from diffcloud.io.simulated import simulated_files
 
 _CODE = ("mesh", "sim", "scene", "datasets")
 """Packages whose source decides the numbers."""
+_ARRAYS = ("parameters", "nodes", "replaced")
 _PLAN = "plan.json"
 
 
@@ -65,14 +66,14 @@ class WorkFolder:
     def read(self, chunk: Chunk) -> SimulatedChunk | None:
         """A finished chunk, None if it is missing or damaged."""
         try:
-            with self._file(chunk).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                replaced = json.loads(str(archive["replaced"]))
-                return SimulatedChunk(
-                    archive["parameters"],
-                    archive["nodes"],
-                    tuple(Replaced(**{**entry, "parameters": tuple(entry["parameters"])}) for entry in replaced),
-                )
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+            told = read_npz(self._file(chunk), kind="chunk of runs", error=DatasetError, names=_ARRAYS)
+            replaced = json.loads(str(told["replaced"]))
+            return SimulatedChunk(
+                told["parameters"],
+                told["nodes"],
+                tuple(Replaced(**{**entry, "parameters": tuple(entry["parameters"])}) for entry in replaced),
+            )
+        except (DatasetError, ValueError, KeyError, TypeError):
             return None
 
     def publish(self, write: Callable[[Path], list[str]]) -> None:

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from diffcloud.errors import ConfigError
 from diffcloud.io.files import read_json
 
 SCHEMA = 5
 """Of the file. Another one is refused, by name."""
+
+
+NonNegative = Annotated[float, Field(ge=0, le=1e12)]
+Positive = Annotated[float, Field(gt=0, le=1e12)]
+Count = Annotated[int, Field(ge=0, le=1_000_000_000)]
+Text = Annotated[str, Field(max_length=1000)]
+Friction = Annotated[float, Field(ge=0, le=100)]
+Pose = Annotated[float, Field(ge=-1e3, le=1e3)]
 
 
 class _Model(BaseModel):
@@ -21,8 +29,8 @@ class _Model(BaseModel):
 class NuisanceValue(_Model):
     """One variable of a recording's pose."""
 
-    value: float
-    prior: float
+    value: Pose
+    prior: Annotated[float, Field(gt=0, le=1e3)]
     """Standard deviation of its prior about zero."""
     unit: Literal["m", "rad", "s"]
     """Of both."""
@@ -31,52 +39,58 @@ class NuisanceValue(_Model):
 class LeftOut(_Model):
     """What the other recordings of a joint fit say of one: fitted to them alone, measured on it."""
 
-    loss: float
-    rms_mm: float
-    parameters: dict[str, float]
+    loss: NonNegative
+    rms_mm: NonNegative
+    parameters: dict[str, NonNegative]
 
 
 class RecordingFit(_Model):
     """One recording beside the motion fitted to it, in SI but for `loss` and `centre`."""
 
-    name: str
-    scenario: str
-    loss: float
+    name: Text
+    scenario: Text
+    loss: NonNegative
     """[squared length unit of the scenario]"""
-    rms_mm: float
-    rms_to_recording_mm: float
+    rms_mm: NonNegative
+    rms_to_recording_mm: NonNegative
     """From cloth to recording."""
-    rms_to_cloth_mm: float | None
+    rms_to_cloth_mm: NonNegative | None
     """From recording to cloth; the paper's measure does not look that way."""
-    frames: list[int]
+    frames: list[Count]
     """That were compared."""
-    frame_rms_mm: list[float]
+    frame_rms_mm: list[NonNegative]
     """Of each."""
-    counted: list[float]
+    counted: list[Annotated[float, Field(ge=0, le=1)]]
     """Part of the simulated points that count, in each."""
-    cut_m: float | None
+    cut_m: Pose | None
     """Height below which nothing was recorded."""
     nuisance: dict[str, NuisanceValue]
     """How the recording lies."""
-    centre: list[float]
+    centre: tuple[Pose, Pose, Pose]
     """[3] of the recording, about which the scene is turned [length unit]."""
     left_out: LeftOut | None = None
     """In a joint fit of several recordings."""
+
+    @model_validator(mode="after")
+    def _of_each_frame(self) -> Self:
+        if not len(self.frames) == len(self.frame_rms_mm) == len(self.counted):
+            raise ValueError("frames, frame_rms_mm and counted must be as long as each other")
+        return self
 
 
 class FittedParameter(_Model):
     """One parameter, fitted or given, and what it means."""
 
-    value: float
-    unit: str
+    value: NonNegative
+    unit: Text
     """"x basis" of a multiplier."""
-    physical: float
-    physical_unit: str
-    meaning: str
+    physical: NonNegative
+    physical_unit: Text
+    meaning: Text
     fixed: bool = False
-    bounds: tuple[float, float] | None = None
+    bounds: tuple[NonNegative, NonNegative] | None = None
     """Of a fitted one."""
-    prior: float | None = None
+    prior: Annotated[float, Field(gt=1, le=1e6)] | None = None
     """Factor of one deviation of its log-normal prior about the basis material; None: none."""
     at_bound: bool = False
 
@@ -85,20 +99,20 @@ class WholeMaterial(_Model):
     """All that the cloth was simulated with, fitted or not, in the scene's units, which are SI unless `length_unit_m` says
     otherwise; stiffness at rest."""
 
-    density: float
+    density: Positive
     """[kg/m²] Mean over the cloth."""
-    stretching: float
+    stretching: Positive
     """[N/m] Force per width per strain of a strip whose sides are free."""
-    poisson: float
-    shear: float
+    poisson: Annotated[float, Field(gt=-1, lt=1)]
+    shear: Positive
     """[N/m] Force per width per shear angle."""
-    bending: float
+    bending: NonNegative
     """[N·m] Bending stiffness per width."""
-    damping: float
+    damping: NonNegative
     """[s] Proportional to the stiffness."""
-    friction_obstacle: float
-    friction_cloth: float
-    air_density: float
+    friction_obstacle: Friction
+    friction_cloth: Friction
+    air_density: NonNegative
     """[kg/m³]"""
 
 
@@ -106,66 +120,75 @@ class Measure(_Model):
     """What recording and motion were compared by: keyword arguments of `Objective`."""
 
     paper: bool
-    nuisance: dict[str, float]
+    nuisance: dict[str, Annotated[float, Field(gt=0, le=1e3)]]
     """Free variables of the pose -> standard deviation of the prior [m, rad, s]."""
     frames: list[int] | None
     """Asked for; None: the scenario's, or every usable one."""
-    points: int | None
+    points: Annotated[int, Field(ge=1, le=10_000_000)] | None
     """Asked for; None: the scenario's."""
-    seed: int
+    seed: Annotated[int, Field(ge=0)]
 
 
 class History(_Model):
     """N iterations of B starts; k parameters. What diverged is None."""
 
-    names: list[str]
+    names: list[Text]
     """[k]"""
-    loss: list[list[float | None]]
+    loss: list[list[NonNegative | None]]
     """[N][B]"""
-    values: list[list[list[float | None]]]
+    values: list[list[list[NonNegative | None]]]
     """[N][B][k]"""
-    gradient_norm: list[list[float | None]]
+    gradient_norm: list[list[NonNegative | None]]
     """[N][B]; empty of a search."""
+
+    @model_validator(mode="after")
+    def _has_one_shape(self) -> Self:
+        starts = [len(row) for row in self.loss]
+        if self.values and [len(row) for row in self.values] != starts:
+            raise ValueError("values must be [N][B][k] for loss [N][B], or empty")
+        if self.gradient_norm and [len(row) for row in self.gradient_norm] != starts:
+            raise ValueError("gradient_norm must be [N][B] as loss is, or empty")
+        return self
 
 
 class FitRecord(_Model):
     """One fit."""
 
     schema_version: int = Field(default=SCHEMA, alias="schema")
-    scenario: str
+    scenario: Text
     """Of the first recording."""
     episodes: list[RecordingFit] = Field(min_length=1)
     nuisance: dict[str, NuisanceValue]
     """How the only recording lies; empty in a joint fit, where each episode has its own."""
-    solver: str
+    solver: Text
     """Of `SOLVERS`."""
     parameters: dict[str, FittedParameter] = Field(min_length=1)
     material: WholeMaterial
-    loss: float
+    loss: NonNegative
     """[squared length unit, mean over points], by the fit's own random points, without priors; of a joint fit the geometric
     mean over its recordings, with `paper` the plain one."""
-    loss_start: float
+    loss_start: NonNegative
     """At `start`."""
-    loss_resampled: float
+    loss_resampled: NonNegative
     """Mean over fresh points, which the fit could not adapt to."""
-    rms_mm: float
-    length_unit_m: float
-    iterations: int
-    simulations: int
+    rms_mm: NonNegative
+    length_unit_m: Annotated[float, Field(gt=0, le=1e3)]
+    iterations: Count
+    simulations: Annotated[int, Field(ge=1, le=1_000_000_000)]
     """Runs of the simulator; one with derivatives counts once."""
-    seconds: float
+    seconds: NonNegative
     stop_reason: Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
-    start: dict[str, float]
+    start: dict[str, NonNegative]
     """Parameters of the first start, the given ones too."""
-    best_start: int
+    best_start: Annotated[int, Field(ge=0, le=1_000_000)]
     measure: Measure
-    settings: dict[str, float | int | bool | None]
+    settings: dict[str, Annotated[int, Field(ge=0)] | bool | NonNegative | None]
     """Of the solver."""
     history: History
     failures: list[str]
     """Of starts that diverged."""
     versions: dict[str, str]
-    fingerprint: str = ""
+    fingerprint: Text = ""
     """Of inputs and code, by which a later call knows a finished fit."""
 
     @property

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import platform
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -23,6 +21,7 @@ from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.pose import PoseSpace
 from diffcloud.fit.record import FitRecord, FittedParameter, History, Measure, RecordingFit, WholeMaterial
 from diffcloud.fit.solvers import SOLVER_NAMES, FitOutcome, Settings
+from diffcloud.io.arrays import read_npz
 from diffcloud.io.files import together, write_json, write_npz
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios import Scenario
@@ -31,6 +30,10 @@ from diffcloud.sim.simulate import Rollout
 
 _AT_BOUND = 0.01
 """Part of the range from an end within which a value counts as there."""
+
+
+_FARTHEST = 1e6
+"""Of a place or time in a motion."""
 
 
 @dataclass(frozen=True)
@@ -196,7 +199,7 @@ def describe_recording(objective: Objective, run: Rollout, name: str) -> Recordi
         counted=(motion.pairs[0].weights[0] > 0).double().mean(-1).tolist(),
         cut_m=None if cut is None else cut * unit,
         nuisance=space.described(motion.pose[0], length_unit_m=unit),
-        centre=space.centre.tolist(),
+        centre=cast(tuple[float, float, float], tuple(space.centre.tolist())),
     )
 
 
@@ -244,13 +247,47 @@ def read_motion(path: Path, index: int = 0) -> FittedMotion:
     keys = (
         "nodes", "start_nodes", "faces", "times", "obstacle_nodes", "obstacle_faces", "held", "held_times", "held_nodes",
     )  # fmt: skip
-    try:
-        with np.load(path, allow_pickle=False) as told:
-            found = {key: told[_key(key, index)] for key in keys}
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ConfigError(f"{path} is no motion written by `diffcloud fit` ({error}); fit again.") from error
+    named = {key: _key(key, index) for key in keys}
+    told = read_npz(path, kind="motion of a fit", error=ConfigError, names=named.values())
+    found = {key: told[name] for key, name in named.items()}
+    _check_motion(path, found)
     bodies = SurfaceMesh(found.pop("obstacle_nodes"), found.pop("obstacle_faces"))
     return FittedMotion(**found, bodies=bodies)
+
+
+def _check_motion(path: Path, found: Mapping[str, NDArray[Any]]) -> None:
+    """
+    Raises:
+        ConfigError: an array of another shape or kind than `FittedMotion` has, or numbers that none of it can be.
+    """
+    frames, nodes, held, steps = (
+        len(found[key]) if found[key].ndim else 0 for key in ("times", "nodes", "held", "held_times")
+    )
+    cloth = found["nodes"].shape[1] if found["nodes"].ndim == 3 else 0
+    shapes = {
+        "nodes": (frames, cloth, 3), "start_nodes": (frames, cloth, 3), "faces": (-1, 3), "times": (frames,),
+        "obstacle_nodes": (-1, 3), "obstacle_faces": (-1, 3), "held": (held,), "held_times": (steps,),
+        "held_nodes": (steps, held, 3),
+    }  # fmt: skip
+    for key, shape in shapes.items():
+        array, indices = found[key], key in ("faces", "obstacle_faces", "held")
+        least = {"faces": 1, "times": 2, "held_times": 2}.get(key, 0)
+        points = len(found["obstacle_nodes"]) if key == "obstacle_faces" else cloth
+        right = array.ndim == len(shape) and all(want in (-1, got) for want, got in zip(shape, array.shape, strict=True))
+        right = right and len(array) >= least and array.dtype.kind in ("iu" if indices else "f") and nodes > 0
+        if right and indices:
+            right = not array.size or (array.min() >= 0 and array.max() < points)
+        elif right:
+            right = bool(np.isfinite(array).all()) and (not array.size or float(np.abs(array).max()) < _FARTHEST)
+        if right and key.endswith("times"):
+            right = bool((np.diff(array) > 0).all())
+        if not right:
+            raise ConfigError(
+                f"{path} is no motion of a fit: its {key} {list(array.shape)} {array.dtype} are not as `diffcloud fit` "
+                "writes them; fit again."
+            )
+    if len(np.unique(found["held"])) < held:
+        raise ConfigError(f"{path} is no motion of a fit: it holds a node twice; fit again.")
 
 
 def _key(name: str, index: int) -> str:

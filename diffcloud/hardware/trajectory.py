@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError, HardwareError, LimitError
 from diffcloud.io.pickles import load_npy
+from diffcloud.io.tables import read_csv
 
 Floats = NDArray[np.float64]
 
@@ -212,17 +212,17 @@ def read_trajectory(path: Path, *, rate_hz: float = 10.0, stretch_time: float = 
         if path.suffix.lower() == ".npy":
             positions = np.asarray(load_npy(path), dtype=np.float64)
         else:
-            table = pd.read_csv(path).astype(float)
+            table = read_csv(path, kind="trajectory", error=EpisodeError).astype(float)
             missing = [name for name in ("x", "y", "z") if name not in table.columns]
             if missing:
                 raise HardwareError(f"{path}: columns {missing} are missing; it has {list(table.columns)}.")
             positions = table[["x", "y", "z"]].to_numpy(np.float64)
             times = table["t_s"].to_numpy(np.float64) if "t_s" in table.columns else None
             gripper = table["gripper"].to_numpy(np.float64) if "gripper" in table.columns else None
-    except FileNotFoundError as error:
-        raise HardwareError(f"No such trajectory: {path}.") from error
-    except (EpisodeError, OSError, ValueError, TypeError) as error:
-        raise HardwareError(f"{path} is not a readable trajectory: {error}") from error
+    except EpisodeError as error:
+        raise HardwareError(str(error)) from error
+    except (OSError, ValueError, TypeError) as error:
+        raise HardwareError(f"{path} is not a readable trajectory: {error}.") from error
     if times is None:
         times = np.arange(len(positions)) / rate_hz
     try:

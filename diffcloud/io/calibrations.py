@@ -11,16 +11,19 @@ import datetime
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, ValidationError
 
 from diffcloud.errors import CalibrationError
-from diffcloud.io.camera_models import Intrinsics, read_transform
+from diffcloud.io.camera_models import Intrinsics, IntrinsicsFile, RigidTransform, square
 from diffcloud.io.files import read_json, write_json
+from diffcloud.io.schema import Checked, Component, NonNegative, Positive, explain
 
 _VERSION = 1
+Text = Annotated[str, Field(max_length=10_000)]
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,41 @@ class Calibration:
         return self.cameras[serial]
 
 
+def _covariance(rows: list[list[float]]) -> list[list[float]]:
+    """
+    Raises:
+        ValueError: not 6 x 6, not symmetric, or with negative variances.
+    """
+    matrix = square(rows, 6)
+    scale = float(np.abs(matrix).max())
+    if np.abs(matrix - matrix.T).max() > 1e-6 * scale or np.linalg.eigvalsh(matrix)[0] < -1e-6 * scale:
+        raise ValueError("it is no covariance: not symmetric, or with a negative variance")
+    return rows
+
+
+class CameraFile(Checked):
+    """One camera of a calibration file."""
+
+    name: Text = ""
+    intrinsics: IntrinsicsFile
+    T_world_camera: RigidTransform
+    covariance: Annotated[list[list[Component]], AfterValidator(_covariance)] | None = None
+    residuals: dict[str, NonNegative] = Field({})
+
+
+class CalibrationFile(Checked):
+    """A calibration file."""
+
+    schema_version: Literal[1]
+    method: Text
+    date: Text = ""
+    units: dict[str, Text] = Field({"length": "m", "angle": "rad"})
+    board: dict[str, Positive | Text | list[list[Component]]] = Field({})
+    forced: bool = False
+    objections: list[Text] = Field([])
+    cameras: Annotated[dict[str, CameraFile], Field(min_length=1, max_length=64)]
+
+
 def write_calibration(path: Path, calibration: Calibration) -> None:
     """Write atomically, as JSON."""
     cameras = {
@@ -103,29 +141,19 @@ def read_calibration(path: Path) -> Calibration:
     Raises:
         CalibrationError: missing, damaged, of another version, or with a matrix that is no rigid transform.
     """
-    data = read_json(Path(path), error=CalibrationError)
-    if not isinstance(data, dict) or data.get("schema_version") != _VERSION:
-        raise CalibrationError(f"{path} is not a calibration of schema_version {_VERSION}.")
     try:
-        cameras = {str(serial): _camera(str(serial), entry, path) for serial, entry in data["cameras"].items()}
-        objections = tuple(str(text) for text in data.get("objections", ()))
-        return Calibration(cameras, str(data["method"]), data.get("board", {}), str(data.get("date", "")), objections)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise CalibrationError(f"{path}: a field is missing or wrong: {error!r}.") from error
-
-
-def _camera(serial: str, entry: Mapping[str, Any], path: Path) -> CameraCalibration:
-    where = f"{path}: camera {serial}"
-    covariance = entry.get("covariance")
-    if covariance is not None:
-        covariance = np.asarray(covariance, dtype=np.float64)
-        if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
-            raise CalibrationError(f"{where}: covariance must be 6 x 6 finite numbers.")
-    return CameraCalibration(
-        serial,
-        Intrinsics.from_json(entry["intrinsics"], where, CalibrationError),
-        read_transform(entry["T_world_camera"], f"{where}: T_world_camera", CalibrationError),
-        covariance,
-        str(entry.get("name", "")),
-        {str(key): float(value) for key, value in entry.get("residuals", {}).items()},
-    )
+        told = CalibrationFile.model_validate(read_json(Path(path), error=CalibrationError))
+    except ValidationError as error:
+        raise explain(path, error, CalibrationError) from error
+    cameras = {
+        serial: CameraCalibration(
+            serial,
+            camera.intrinsics.intrinsics(),
+            np.array(camera.T_world_camera),
+            None if camera.covariance is None else np.array(camera.covariance),
+            camera.name,
+            camera.residuals,
+        )
+        for serial, camera in told.cameras.items()
+    }
+    return Calibration(cameras, told.method, told.board, told.date, tuple(told.objections))

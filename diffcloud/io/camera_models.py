@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError, model_validator
 
 from diffcloud.errors import DiffCloudError, EpisodeError, unknown_name
+from diffcloud.io.schema import Checked, Component, explain
+
+Pixels = Annotated[int, Field(ge=1, le=20_000)]
 
 Distortion = Literal["none", "brown_conrady", "inverse_brown_conrady"]
 """`brown_conrady`: OpenCV's, from rays to pixels. `inverse_brown_conrady`: the same polynomial from pixels to rays, which
@@ -72,51 +75,80 @@ class Intrinsics:
     def to_json(self) -> dict[str, Any]:
         return {**asdict(self), "coefficients": list(self.coefficients)}
 
-    @staticmethod
-    def from_json(value: Any, where: str, error: type[DiffCloudError] = EpisodeError) -> Intrinsics:
-        """From the JSON of a camera or calibration file.
 
-        Raises:
-            error: a field is missing, unknown or wrong; the message starts with `where`.
-        """
-        names = ("width", "height", "fx", "fy", "cx", "cy", "distortion", "coefficients")
-        if not isinstance(value, Mapping):
-            raise error(f"{where}: intrinsics must be an object with {', '.join(names)}.")
-        unknown, missing = sorted(set(value) - set(names)), sorted(set(names[:6]) - set(value))
-        if unknown or missing:
-            raise error(f"{where}: intrinsics lack {missing} and have unknown {unknown}; allowed are {', '.join(names)}.")
+class IntrinsicsFile(Checked):
+    """`Intrinsics` as files state them."""
+
+    width: Pixels
+    height: Pixels
+    fx: Component
+    fy: Component
+    cx: Component
+    cy: Component
+    distortion: Distortion = "none"
+    coefficients: list[Component] = Field([], max_length=5)
+
+    @model_validator(mode="after")
+    def _is_a_camera(self) -> Self:
+        self.intrinsics()
+        return self
+
+    def intrinsics(self) -> Intrinsics:
         try:
-            numbers = {name: float(value[name]) for name in names[2:6]}
-            coefficients = tuple(float(number) for number in value.get("coefficients", ()))
-            return Intrinsics(
-                int(value["width"]),
-                int(value["height"]),
-                **numbers,
-                distortion=value.get("distortion", "none"),
-                coefficients=coefficients,
-            )
-        except (TypeError, ValueError) as damage:
-            raise error(f"{where}: intrinsics are not numbers: {damage}.") from damage
-        except EpisodeError as damage:
-            raise error(f"{where}: {damage}") from damage
+            return Intrinsics(**{**self.model_dump(), "coefficients": tuple(self.coefficients)})
+        except EpisodeError as error:
+            raise ValueError(str(error)) from error
+
+
+def read_intrinsics(value: Any, where: str, error: type[DiffCloudError] = EpisodeError) -> Intrinsics:
+    """From the JSON of a file that is not this project's own.
+
+    Raises:
+        error: a field is missing, unknown or wrong; the message starts with `where`.
+    """
+    try:
+        return IntrinsicsFile.model_validate(value).intrinsics()
+    except ValidationError as damage:
+        raise explain(f"{where}: intrinsics", damage, error) from damage
+
+
+def square(rows: list[list[float]], size: int) -> NDArray[np.float64]:
+    """[n, n] of rows.
+
+    Raises:
+        ValueError: another shape.
+    """
+    if len(rows) != size or any(len(row) != size for row in rows):
+        raise ValueError(f"it must be {size} x {size} numbers")
+    return np.array(rows, dtype=np.float64)
+
+
+def _rigid(rows: list[list[float]]) -> list[list[float]]:
+    """
+    Raises:
+        ValueError: not 4 x 4, not a rotation, or a translation of more than 20 m (millimetres).
+    """
+    matrix = square(rows, 4)
+    rotation = matrix[:3, :3]
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if off > 1e-4 or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
+        raise ValueError(f"it is no rigid transform (its rotation is off by {off:.2g}); give [R t; 0 0 0 1], right-handed")
+    if np.abs(matrix[:3, 3]).max() > 20:
+        raise ValueError(f"it puts the camera {np.abs(matrix[:3, 3]).max():.0f} m away; translations are metres")
+    return rows
+
+
+RigidTransform = Annotated[list[list[Component]], AfterValidator(_rigid)]
+"""[4, 4], from camera to world [m]."""
 
 
 def read_transform(value: Any, where: str, error: type[DiffCloudError] = EpisodeError) -> NDArray[np.float64]:
     """[4, 4] rigid transform from JSON.
 
     Raises:
-        error: not 4 x 4, not a rotation, or a translation of more than 20 m (millimetres).
+        error: not 4 x 4 finite numbers, not a rotation, or a translation of more than 20 m (millimetres).
     """
     try:
-        matrix = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as damage:
-        raise error(f"{where} must be 4 x 4 numbers: {damage}.") from damage
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise error(f"{where} must be 4 x 4 finite numbers, got shape {list(matrix.shape)}.")
-    rotation = matrix[:3, :3]
-    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if off > 1e-4 or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
-        raise error(f"{where} is no rigid transform (its rotation is off by {off:.2g}); give [R t; 0 0 0 1], right-handed.")
-    if np.abs(matrix[:3, 3]).max() > 20:
-        raise error(f"{where} puts the camera {np.abs(matrix[:3, 3]).max():.0f} m away; translations are metres.")
-    return matrix
+        return np.array(TypeAdapter(RigidTransform).validate_python(value))
+    except ValidationError as damage:
+        raise explain(where, damage, error) from damage

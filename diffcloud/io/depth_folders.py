@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from diffcloud.errors import EpisodeError
-from diffcloud.io.camera_models import Intrinsics, read_transform
+from diffcloud.io.camera_models import read_intrinsics, read_transform
 from diffcloud.io.files import files_in, read_json
 from diffcloud.io.images import decode_color, read_depth
 from diffcloud.io.raw_episodes import CameraInfo, first_backwards, read_timestamps
@@ -61,10 +61,10 @@ def _camera(folder: Path, name: str) -> CameraInfo:
         if "intrinsic_matrix" in data:
             matrix = np.asarray(data["intrinsic_matrix"], dtype=np.float64).reshape(3, 3).T
             held = {"width": data["width"], "height": data["height"], "fx": matrix[0, 0], "fy": matrix[1, 1]}
-            intrinsics = Intrinsics.from_json({**held, "cx": matrix[0, 2], "cy": matrix[1, 2]}, str(path))
+            intrinsics = read_intrinsics({**held, "cx": matrix[0, 2], "cy": matrix[1, 2]}, str(path))
             scale = 1 / float(data.get("depth_scale", 1000.0))  # Open3D: units per metre
         else:
-            intrinsics = Intrinsics.from_json(data["intrinsics"], str(path))
+            intrinsics = read_intrinsics(data["intrinsics"], str(path))
             scale = float(data["depth_scale_m"])
     except (KeyError, TypeError, ValueError) as error:
         raise EpisodeError(f"{path}: a field is missing or wrong: {error!r}.") from error

@@ -8,7 +8,6 @@ float32 [P] [m], and `meta`, a JSON string. All in the frame and length unit of 
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,12 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
+from diffcloud.io.arrays import read_npz
 from diffcloud.io.files import write_npz
 
 _OPTIONAL = {"gripper", "grippers", "camera", "pixel", "sigma"}
 _REQUIRED = {"points", "offsets", "times", "meta"}
 ONLY_GRIPPER = ("gripper",)
 """The name of a single one."""
+_FARTHEST = 1e6
+"""[m, s] Of a point, and of a time."""
 _LARGEST_BYTES = 4 * 2**30
 
 
@@ -58,6 +60,8 @@ class Episode:
         points, offsets, times = self.points, self.offsets, self.times
         if points.ndim != 2 or points.shape[1] != 3:
             raise EpisodeError(f"points must have shape [points, 3], got {list(points.shape)}.")
+        if times.ndim != 1:
+            raise EpisodeError(f"times must have shape [frames], got {list(times.shape)}.")
         count = len(times)
         if count < 1 or offsets.shape != (count + 1,) or offsets[0] != 0 or offsets[-1] != len(points):
             raise EpisodeError(
@@ -77,6 +81,10 @@ class Episode:
             value = getattr(self, name)
             if value is not None and value.shape != (len(points), *width):
                 raise EpisodeError(f"{name} must have shape {[len(points), *width]}, got {list(value.shape)}.")
+        if self.sigma is not None and not ((self.sigma >= 0) & (self.sigma < _FARTHEST)).all():
+            raise EpisodeError("sigma must be standard deviations [m], finite and not negative.")
+        if max(float(np.abs(points).max()), float(times[-1])) > _FARTHEST:
+            raise EpisodeError(f"Points or times lie beyond {_FARTHEST:g} m or s; they are in the wrong unit, or damaged.")
         if self.gripper is not None:
             names = self.grippers
             if len(set(names)) < len(names) or not all(names):
@@ -164,32 +172,24 @@ def read_episode(path: Path) -> Episode:
         EpisodeError: missing, damaged, not an episode, or wrong inside; names the file and the field.
     """
     path = Path(path)
-    if not path.is_file():
-        raise EpisodeError(f"No such episode: {path}.")
+    arrays = read_npz(path, kind="episode", error=EpisodeError, most_bytes=_LARGEST_BYTES)
+    names = set(arrays)
+    if not names >= _REQUIRED or not names <= _REQUIRED | _OPTIONAL:
+        raise EpisodeError(
+            f"{path} has the fields {sorted(names)}; an episode has {sorted(_REQUIRED)} and may have {sorted(_OPTIONAL)}."
+        )
     try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(info.file_size for info in archive.infolist())
-        if size > _LARGEST_BYTES:
-            raise EpisodeError(f"{path} unpacks to {size} bytes; at most {_LARGEST_BYTES} are read.")
-        with np.load(path, allow_pickle=False) as archive:
-            names = set(archive.files)
-            if not names >= _REQUIRED or not names <= _REQUIRED | _OPTIONAL:
-                raise EpisodeError(
-                    f"{path} has the fields {sorted(names)}; an episode has {sorted(_REQUIRED)} and may have "
-                    f"{sorted(_OPTIONAL)}."
-                )
-            arrays = {name: archive[name] for name in names}
         meta = json.loads(str(arrays.pop("meta")))
-    except EpisodeError:
-        raise
-    except (zipfile.BadZipFile, ValueError, OSError, KeyError, EOFError) as error:
-        raise EpisodeError(f"{path} is not a readable episode: {error}.") from error
+    except (ValueError, RecursionError) as error:
+        raise EpisodeError(f"{path}: meta is not readable JSON: {error}.") from error
     kinds = {"points": np.float32, "offsets": np.int64, "times": np.float64, "gripper": np.float64}
     kinds |= {"grippers": np.str_, "camera": np.uint8, "pixel": np.uint16, "sigma": np.float32}
     try:
         converted = {name: array.astype(kinds[name], casting="same_kind") for name, array in arrays.items()}
         if not isinstance(meta, dict):
             raise EpisodeError(f"meta must be a JSON object, got {type(meta).__name__}.")
+        if converted.get("grippers", np.zeros(1)).ndim != 1:
+            raise EpisodeError("grippers must be a list of names.")
         gripper, grippers = converted.pop("gripper", None), converted.pop("grippers", np.array(ONLY_GRIPPER))
         if gripper is not None and gripper.ndim == 2:
             gripper = gripper[:, None]

@@ -12,15 +12,18 @@ from __future__ import annotations
 import errno
 import fcntl
 import json
+import math
 import os
 import shlex
 import shutil
 import socket
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -29,8 +32,10 @@ import yaml
 
 from diffcloud.errors import DiffCloudError
 
-_MOST_YAML = 100_000
+_MOST_VALUES = 100_000
 """Values that a YAML file may stand for."""
+_MOST_JSON, _MOST_YAML = 50_000_000, 1_000_000
+"""Bytes of a file of text that is read as a whole: JSON; YAML, whose reader is slow."""
 TEMPORARY, LOCK = ".diffcloud-tmp", ".diffcloud-lock"
 """Suffixes of a file that is being written, and of the lock file beside an output that a command holds."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EINVAL}
@@ -177,13 +182,19 @@ def read_json(path: Path, *, error: type[DiffCloudError] = DiffCloudError) -> An
     """Read a JSON file.
 
     Raises:
-        error: the file is missing or is not JSON; the message names the file and the place.
+        error: the file is missing or is not JSON, too large, or names a field twice; the message names the file and the
+            place.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        return json.loads(
+            _read_text(Path(path), _MOST_JSON, error),
+            object_pairs_hook=partial(_object, Path(path), error),
+            parse_constant=_refuse_constant,
+            parse_float=_finite,
+        )
     except FileNotFoundError as missing:
         raise error(f"No such file: {path}.") from missing
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as damage:
+    except (OSError, ValueError, RecursionError) as damage:  # of UTF-8, JSON and numbers
         raise error(f"{path} is not readable JSON: {damage}.") from damage
 
 
@@ -194,14 +205,16 @@ def read_yaml(path: Path, *, error: type[DiffCloudError] = DiffCloudError, kind:
         kind: what it is, for the message if it is missing.
 
     Raises:
-        error: the file is missing, is not YAML, or its anchors stand for too much; the message names file and place.
+        error: the file is missing, is not YAML, too large, names a field twice, or its anchors stand for too much; the
+            message names file and place.
     """
     try:
-        loader = yaml.SafeLoader(Path(path).read_text(encoding="utf-8"))
+        loader = yaml.SafeLoader(_read_text(Path(path), _MOST_YAML, error))
         try:
             node = loader.get_single_node()
-            if _yaml_size(node, {}) > _MOST_YAML:
-                raise error(f"{path} stands for more than {_MOST_YAML} values; write out what its anchors (&, *) repeat.")
+            _refuse_twice(node, Path(path), error)
+            if _yaml_size(node, {}) > _MOST_VALUES:
+                raise error(f"{path} stands for more than {_MOST_VALUES} values; write out what its anchors (&, *) repeat.")
             return None if node is None else loader.construct_document(node)
         finally:
             loader.dispose()
@@ -209,6 +222,58 @@ def read_yaml(path: Path, *, error: type[DiffCloudError] = DiffCloudError, kind:
         raise error(f"No such {kind}: {path}.") from missing
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as damage:
         raise error(f"{path} is not readable YAML: {damage}.") from damage
+
+
+def _read_text(path: Path, most: int, error: type[DiffCloudError]) -> str:
+    size = path.stat().st_size
+    if size > most:
+        raise error(f"{path} has {size / 1e6:.1f} MB; at most {most / 1e6:.0f} MB are read. Is it the right file?")
+    return path.read_text(encoding="utf-8")
+
+
+def _refuse_constant(text: str) -> float:
+    raise ValueError(f"{text} is no number of JSON")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is too large")
+    return value
+
+
+def _object(path: Path, error: type[DiffCloudError], pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object whose names are all different."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
+        raise error(f"{path} names {twice!r} twice in one object; keep one of both.")
+    return found
+
+
+def _refuse_twice(node: yaml.Node | None, path: Path, error: type[DiffCloudError]) -> None:
+    """
+    Raises:
+        error: a mapping names a key twice, of which one would be lost.
+    """
+    seen: set[int] = set()
+    open_nodes = [] if node is None else [node]
+    while open_nodes:
+        one = open_nodes.pop()
+        if not isinstance(one, yaml.CollectionNode) or id(one) in seen:
+            continue
+        seen.add(id(one))
+        if isinstance(one, yaml.MappingNode):
+            keys: set[str] = set()
+            for key, value in one.value:
+                if isinstance(key, yaml.ScalarNode) and key.value in keys:
+                    raise error(
+                        f"{path}, line {key.start_mark.line + 1}: {key.value!r} stands there twice; keep one of both."
+                    )
+                keys.add(str(key.value))
+                open_nodes += [key, value]
+        else:
+            open_nodes += one.value
 
 
 def _yaml_size(node: yaml.Node | None, known: dict[int, int]) -> int:

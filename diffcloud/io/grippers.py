@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.episodes import ONLY_GRIPPER
+from diffcloud.io.tables import read_csv
 
 _AXES = ["x", "y", "z"]
 _FARTHEST_M = 20.0
@@ -41,7 +42,9 @@ def read_tracks(files: Mapping[str, Path], frames: int) -> GripperTracks:
     Raises:
         EpisodeError: an unreadable file, missing columns or rows, positions in other units, or times that differ.
     """
-    tables = {name: _read(path) for name, path in files.items()}
+    tables = {
+        name: read_csv(path, kind="gripper file", error=EpisodeError, text=("gripper",)) for name, path in files.items()
+    }
     if len(files) == 1:
         (path,), (table,) = files.values(), tables.values()
         if "gripper" in table.columns:
@@ -90,12 +93,3 @@ def _numbers(table: pd.DataFrame, columns: list[str], place: str) -> NDArray[np.
         return table[columns].to_numpy(np.float64)
     except ValueError as error:
         raise EpisodeError(f"{place} is not a CSV of numbers: {error}.") from error
-
-
-def _read(path: Path) -> pd.DataFrame:
-    try:
-        return pd.read_csv(path, dtype={"gripper": str})
-    except FileNotFoundError as error:
-        raise EpisodeError(f"No such gripper file: {path}.") from error
-    except (OSError, ValueError) as error:
-        raise EpisodeError(f"{path} is not a CSV of numbers: {error}.") from error

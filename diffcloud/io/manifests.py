@@ -10,6 +10,7 @@ from diffcloud.errors import DiffCloudError
 from diffcloud.io.files import read_json, write_json
 
 NAME = "manifest.json"
+_LONGEST = 4096
 
 
 def read_manifest(folder: Path) -> set[str]:
@@ -23,7 +24,7 @@ def read_manifest(folder: Path) -> set[str]:
         return set()
     told = read_json(path)
     files = told.get("files") if isinstance(told, dict) else None
-    if not isinstance(files, list) or not all(isinstance(name, str) for name in files):
+    if not isinstance(files, list) or not all(isinstance(name, str) and len(name) <= _LONGEST for name in files):
         raise DiffCloudError(f"{path} must list `files`; remove it, and the command will remove no older results.")
     return set(files)
 

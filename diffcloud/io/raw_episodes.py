@@ -16,23 +16,25 @@ from __future__ import annotations
 
 import datetime
 import errno
-import io
 import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from diffcloud.errors import DiffCloudError, EpisodeError
-from diffcloud.io.camera_models import Intrinsics, read_transform
+from diffcloud.io.camera_models import Intrinsics, IntrinsicsFile, RigidTransform
 from diffcloud.io.files import read_json, write_json
 from diffcloud.io.images import read_color, read_depth, write_color, write_depth
+from diffcloud.io.schema import Checked, FileName, Vector, explain
+from diffcloud.io.tables import read_csv
 
 SCHEMA_VERSION = 1
 UNITS = {"length": "m", "angle": "rad", "time": "s", "force": "N", "torque": "N·m"}
@@ -42,6 +44,9 @@ _FILES = re.compile(
 )
 """Relative paths of a raw episode's files, with the truth of a synthetic one."""
 _TOOL = ("tool_x", "tool_y", "tool_z", "tool_qw", "tool_qx", "tool_qy", "tool_qz")
+_LATEST_S = 1e6
+_FARTHEST_RAD, _LARGEST = 200.0, 1e5
+"""Of joints that turn without end; and of any other number, which `episode validate` may yet find to be in another unit."""
 _WRENCH = ("wrench_fx", "wrench_fy", "wrench_fz", "wrench_tx", "wrench_ty", "wrench_tz")
 
 
@@ -68,6 +73,77 @@ class CameraInfo:
             "T_world_camera": None if self.T_world_camera is None else self.T_world_camera.tolist(),
             "calibration": self.calibration,
         }
+
+
+Name = Annotated[str, Field(max_length=200)]
+
+
+def _plain_word(name: str) -> str:
+    if not _plain(name):
+        raise ValueError("it must be a plain folder name, of letters, digits, _, - and .")
+    return name
+
+
+def _depth_scale(scale: float) -> float:
+    if not 1e-6 <= scale <= 0.02:
+        raise ValueError("it is metres per unit of the image, for a D435 0.001 (one millimetre)")
+    return scale
+
+
+class CameraFile(Checked):
+    """camera.json."""
+
+    name: Name | None = None
+    serial: Name
+    intrinsics: IntrinsicsFile
+    depth_scale_m: Annotated[float, AfterValidator(_depth_scale)]
+    T_world_camera: RigidTransform | None = None
+    calibration: FileName | None = None
+
+
+class PlacementFile(Checked):
+    """`ScenePlacement`."""
+
+    origin_m: Vector = (0.0, 0.0, 0.0)
+    yaw_rad: Annotated[float, Field(ge=-100, le=100)] = 0.0
+    length_unit_m: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
+
+
+class EpisodeFile(BaseModel):
+    """episode.json. Labels of one's own may stand beside these fields."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
+
+    schema_version: Literal[1]
+    scenario: Annotated[Name, AfterValidator(_plain_word)] | None = None
+    fabric: Name | None = None
+    category: Name | None = None
+    repeat: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
+    truth: dict[str, Annotated[float, Field(gt=0, le=1e12)]] = Field(default_factory=dict)
+    rate_hz: Annotated[float, Field(gt=0, le=1e5)] | None = None
+    cameras: Annotated[list[Annotated[Name, AfterValidator(_plain_word)]], Field(min_length=1, max_length=64)]
+    robot: dict[str, Any] | None = None
+    source: Name | None = None
+    units: dict[str, Any] = UNITS
+    started_at: Name | None = None
+    status: Literal["recording", "complete", "stopped"] | None = None
+    stop_reason: str | None = None
+    frames: dict[str, Annotated[int, Field(ge=0, le=100_000_000)]] | None = None
+    scene_in_world: PlacementFile = PlacementFile()
+
+    @field_validator("cameras")
+    @classmethod
+    def _each_once(cls, names: list[str]) -> list[str]:
+        if len(set(names)) < len(names):
+            raise ValueError("a camera is listed twice")
+        return names
+
+    @field_validator("units")
+    @classmethod
+    def _in_si(cls, units: dict[str, Any]) -> dict[str, Any]:
+        if any(units.get(key, value) != value for key, value in UNITS.items()):
+            raise ValueError(f"a raw episode is in {UNITS}; convert when you import")
+        return units
 
 
 @dataclass(frozen=True)
@@ -160,26 +236,9 @@ class RawEpisode:
 
     @property
     def placement(self) -> ScenePlacement:
-        """`scene_in_world` of episode.json; without it the scene's frame is the base frame.
-
-        Raises:
-            EpisodeError: not an origin of three numbers, a yaw and a positive length unit.
-        """
-        stated = self.description.get("scene_in_world", {})
-        try:
-            x, y, z = (float(value) for value in stated.get("origin_m", (0.0, 0.0, 0.0)))
-            placement = ScenePlacement(
-                (x, y, z), float(stated.get("yaw_rad", 0.0)), float(stated.get("length_unit_m", 1.0))
-            )
-        except (AttributeError, TypeError, ValueError) as error:
-            raise EpisodeError(f"{self.folder / 'episode.json'}: scene_in_world is damaged: {error}.") from error
-        numbers = [*placement.origin_m, placement.yaw_rad, placement.length_unit_m]
-        if not np.isfinite(numbers).all() or placement.length_unit_m <= 0:
-            raise EpisodeError(
-                f"{self.folder / 'episode.json'}: scene_in_world must be an origin_m [x, y, z], a yaw_rad and a positive "
-                f"length_unit_m, got {stated!r}."
-            )
-        return placement
+        """`scene_in_world` of episode.json; without it the scene's frame is the base frame."""
+        stated = PlacementFile.model_validate(self.description.get("scene_in_world") or {})
+        return ScenePlacement(stated.origin_m, stated.yaw_rad, stated.length_unit_m)
 
 
 def read_raw_episode(folder: Path) -> RawEpisode:
@@ -213,16 +272,11 @@ def read_description(folder: Path) -> dict[str, Any]:
     """
     path = Path(folder) / "episode.json"
     data = read_json(path, error=EpisodeError)
-    if not isinstance(data, dict) or data.get("schema_version") != SCHEMA_VERSION:
-        found = data.get("schema_version") if isinstance(data, dict) else type(data).__name__
-        raise EpisodeError(f"{path} has schema_version {found!r}; this version reads {SCHEMA_VERSION}.")
-    names = data.get("cameras")
-    if not isinstance(names, list) or not names or not all(isinstance(name, str) and _plain(name) for name in names):
-        raise EpisodeError(f"{path}: cameras must list at least one plain folder name, got {names!r}.")
-    units = data.get("units", UNITS)
-    if not isinstance(units, dict) or any(units.get(key, value) != value for key, value in UNITS.items()):
-        raise EpisodeError(f"{path}: units {units!r}; a raw episode is in {UNITS}. Convert when you import.")
-    return data
+    try:
+        EpisodeFile.model_validate(data)
+    except ValidationError as error:
+        raise explain(path, error, EpisodeError) from error
+    return dict(data)
 
 
 def read_camera_info(path: Path) -> CameraInfo:
@@ -231,30 +285,17 @@ def read_camera_info(path: Path) -> CameraInfo:
     Raises:
         EpisodeError: missing, damaged, or a number that no camera has; names the field.
     """
-    data = read_json(Path(path), error=EpisodeError)
-    if not isinstance(data, dict):
-        raise EpisodeError(f"{path} must be a JSON object.")
     try:
-        scale = float(data["depth_scale_m"])
-        serial = str(data["serial"])
-        intrinsics = Intrinsics.from_json(data["intrinsics"], str(path))
-    except (KeyError, TypeError, ValueError) as error:
-        raise EpisodeError(f"{path}: a field is missing or wrong: {error!r}.") from error
-    if not 1e-6 <= scale <= 0.02:
-        raise EpisodeError(
-            f"{path}: depth_scale_m is {scale:g}; it is metres per unit of the image, for a D435 0.001 (one millimetre)."
-        )
-    pose = data.get("T_world_camera")
-    if pose is not None:
-        pose = read_transform(pose, f"{path}: T_world_camera")
-    calibration = data.get("calibration")
+        told = CameraFile.model_validate(read_json(Path(path), error=EpisodeError))
+    except ValidationError as error:
+        raise explain(path, error, EpisodeError) from error
     return CameraInfo(
-        str(data.get("name", Path(path).parent.name)),
-        serial,
-        intrinsics,
-        scale,
-        pose,
-        None if calibration is None else str(calibration),
+        told.name or Path(path).parent.name,
+        told.serial,
+        told.intrinsics.intrinsics(),
+        told.depth_scale_m,
+        None if told.T_world_camera is None else np.array(told.T_world_camera),
+        told.calibration,
     )
 
 
@@ -268,6 +309,8 @@ def read_timestamps(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]
     frames = table["frame"].to_numpy(np.float64)
     if (frames != np.rint(frames)).any() or (frames < 0).any():
         raise EpisodeError(f"{path}: frame numbers must be whole and not negative.")
+    if len(np.unique(frames)) < len(frames):
+        raise EpisodeError(f"{path} lists a frame twice.")
     return frames.astype(np.int64), table["t_s"].to_numpy(np.float64)
 
 
@@ -281,19 +324,34 @@ def read_robot_log(path: Path) -> RobotLog:
     count = 1
     while f"joint_{count + 1}" in table.columns:
         count += 1
+    beyond = [name for name in table.columns if re.fullmatch(r"joint_\d+", name) and int(name[6:]) > count]
+    if beyond:
+        raise EpisodeError(f"{path} has the column {beyond[0]} and no joint_{count + 1}.")
     joints = table[[f"joint_{index + 1}" for index in range(count)]].to_numpy(np.float64)
     if not np.isfinite(joints).all():
         row = int(np.flatnonzero(~np.isfinite(joints).all(axis=1))[0])
         raise EpisodeError(f"{path}: row {row + 1} lacks a joint angle.")
 
+    if np.abs(joints).max(initial=0.0) > _FARTHEST_RAD:
+        raise EpisodeError(f"{path}: a joint angle is {np.abs(joints).max():g}; angles are radians, not degrees or ticks.")
+
     def columns(names: Sequence[str]) -> NDArray[np.float64]:
         empty = np.full(len(table), np.nan)
         return np.column_stack([table[name].to_numpy(np.float64) if name in table.columns else empty for name in names])
 
-    tool = columns(_TOOL)
-    return RobotLog(
-        table["t_s"].to_numpy(np.float64), joints, columns(["gripper"])[:, 0], tool[:, :3], tool[:, 3:], columns(_WRENCH)
-    )
+    tool, gripper, wrench = columns(_TOOL), columns(["gripper"])[:, 0], columns(_WRENCH)
+    for told, array, most in (
+        ("tool position", tool[:, :3], _LARGEST),
+        ("quaternion", tool[:, 3:], _LARGEST),
+        ("gripper, 0 open to 1 closed,", gripper, _LARGEST),
+        ("wrench", wrench, _LARGEST),
+    ):
+        largest = float(np.abs(array[~np.isnan(array)]).max(initial=0.0))
+        if largest > most:
+            raise EpisodeError(f"{path}: a {told} is {largest:g}; at most {most:g} can be right. Units are {UNITS}.")
+    if np.nanmin(gripper, initial=0.0) < -0.1:
+        raise EpisodeError(f"{path}: the gripper is at {np.nanmin(gripper):g}; it is 0 open to 1 closed.")
+    return RobotLog(table["t_s"].to_numpy(np.float64), joints, gripper, tool[:, :3], tool[:, 3:], wrench)
 
 
 def first_backwards(times: NDArray[np.float64]) -> int | None:
@@ -512,19 +570,13 @@ def _refuse_backwards(times: NDArray[np.float64], path: Path) -> None:
             f"{path}: row {bad + 1}: the time runs backwards ({times[bad]:.6f} s after {times[bad - 1]:.6f} s); the clock "
             "was set while recording, or rows were mixed up."
         )
+    if len(times) and max(abs(times[0]), abs(times[-1])) > _LATEST_S:
+        raise EpisodeError(f"{path}: a time is {times[-1]:g}; times are seconds since the start of the recording.")
 
 
 def _read_table(path: Path, required: Sequence[str]) -> pd.DataFrame:
+    table = read_csv(path, kind="table", error=EpisodeError, torn=True)
     try:
-        text = Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise EpisodeError(f"No such file: {path}.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise EpisodeError(f"{path} is not readable: {error}.") from error
-    # a power cut can leave the last line torn; a whole line ends with a line break
-    text = text[: text.rfind("\n") + 1]
-    try:
-        table = pd.read_csv(io.StringIO(text), skipinitialspace=True)
         missing = [name for name in required if name not in table.columns]
         if missing:
             raise EpisodeError(f"{path}: columns {missing} are missing; it has {list(table.columns)}.")

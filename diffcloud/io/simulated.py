@@ -14,21 +14,58 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Annotated, Any, Literal, cast, get_args
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from diffcloud.errors import DatasetError, unknown_name
+from diffcloud.io.arrays import read_npy, read_npz
 from diffcloud.io.files import atomic, read_json, write_json, write_npz, write_text
+from diffcloud.io.schema import Component, explain
 from diffcloud.mesh.topology import SurfaceMesh
 
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 SCHEMA = 1
 _LARGEST_BYTES = 16 * 2**30
+_LATEST_S = 1e6
 _DAMAGE = (ValueError, OSError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
+
+
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Count = Annotated[int, Field(ge=0, le=10_000_000)]
+
+
+class SetParameter(BaseModel):
+    """A parameter of set.json."""
+
+    name: Name
+    low: Component
+    high: Component
+
+
+class SetFile(BaseModel):
+    """set.json, beside what says how the set was made."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    schema_version: Literal[1] = Field(alias="schema")
+    scenario: Name
+    parameters: Annotated[list[SetParameter], Field(min_length=1, max_length=100)]
+    train: Count
+    test: Count
+    loss_frame: Count
+    first_frame: Count
+    length_unit_m: Annotated[float, Field(gt=0, le=1e3)]
+    draws: Name | None = None
+    seed: Annotated[int, Field(ge=0)] | None = None
+    integrator: Name | None = None
+    replaced: Count = 0
+    clouds: Count = 0
+    """Points of a frame's cloud, where clouds were written; 0: none were."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +114,8 @@ class SimulatedSet:
                 raise DatasetError(f"{name} must have shape {list(shape)}, got {list(getattr(self, name).shape)}.")
             if not np.isfinite(getattr(self, name)).all():
                 raise DatasetError(f"{name} holds NaN or infinite values; simulate the set again.")
+        if self.times[0] < 0 or (np.diff(self.times) <= 0).any() or self.times[-1] > _LATEST_S:
+            raise DatasetError("times must increase from zero or later, in seconds; simulate the set again.")
         for name in ("loss_frame", "first_frame"):
             if not 0 <= getattr(self, name) < frames:
                 raise DatasetError(f"{name} must be one of the frames 0..{frames - 1}, got {getattr(self, name)}.")
@@ -84,6 +123,8 @@ class SimulatedSet:
         for name, index, size in (("faces", self.faces, nodes), ("loss_faces", chosen, len(self.faces))):
             if not len(index) or index.min() < 0 or index.max() >= size:
                 raise DatasetError(f"{name} must hold indices in 0..{size - 1}, and at least one.")
+        if (self.faces == np.roll(self.faces, 1, axis=1)).any():
+            raise DatasetError("A face names a node twice; simulate the set again.")
         low, high = self.bounds.T
         if not ((low < high).all() and (self.parameters >= low).all() and (self.parameters <= high).all()):
             raise DatasetError(f"Parameters must lie in their bounds {self.bounds.tolist()}, which must be in order.")
@@ -111,11 +152,14 @@ class SimulatedSet:
         names = tuple(parameter["name"] for parameter in about["parameters"])
         surface = _surface(folder / "surface.npz")
         try:
+            parameters = _table(folder / f"{split}.csv", names)
+            if len(parameters) != about[split]:
+                raise DatasetError(f"set.json states {about[split]} runs, {split}.csv has {len(parameters)}.")
             return SimulatedSet(
                 scenario=about["scenario"],
                 names=names,
                 bounds=np.array([[parameter["low"], parameter["high"]] for parameter in about["parameters"]]),
-                parameters=_table(folder / f"{split}.csv", names),
+                parameters=parameters,
                 nodes=_nodes(folder / f"{split}_nodes.npy"),
                 loss_frame=about["loss_frame"],
                 first_frame=about["first_frame"],
@@ -187,24 +231,18 @@ def simulated_files(folder: Path) -> list[str]:
 
 def _about(path: Path) -> dict[str, Any]:
     about = read_json(path, error=DatasetError)
-    wanted: dict[str, type] = {"schema": int, "scenario": str, "parameters": list, "loss_frame": int, "first_frame": int}
-    wanted |= {"length_unit_m": float, "train": int, "test": int}
-    for name, kind in wanted.items():
-        if not isinstance(about, dict) or not isinstance(about.get(name), kind):
-            raise DatasetError(f"{path}: `{name}` is missing or of the wrong type; this is no simulated set.")
-    if about["schema"] != SCHEMA:
+    if isinstance(about, dict) and about.get("schema", SCHEMA) != SCHEMA:
         raise DatasetError(f"{path} has schema {about['schema']}; this version reads {SCHEMA}. Simulate the set again.")
-    for parameter in about["parameters"]:
-        bounds = [parameter.get(key) for key in ("low", "high")] if isinstance(parameter, dict) else []
-        if not all(isinstance(bound, (int, float)) for bound in bounds) or not isinstance(parameter.get("name"), str):
-            raise DatasetError(f"{path}: a parameter has `name`, `low` and `high`, got {parameter!r}.")
+    try:
+        SetFile.model_validate(about)
+    except ValidationError as error:
+        raise explain(f"{path} is no simulated set", error, DatasetError) from error
     return cast(dict[str, Any], about)
 
 
 def _surface(path: Path) -> dict[str, Any]:
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+        arrays = read_npz(path, kind="surface of a simulated set", error=DatasetError)
         obstacle = None
         if "obstacle_nodes" in arrays:
             obstacle = SurfaceMesh(
@@ -237,12 +275,7 @@ def _table(path: Path, names: tuple[str, ...]) -> NDArray[np.float64]:
 
 
 def _nodes(path: Path) -> NDArray[np.float32]:
-    try:
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise ValueError(f"it has {path.stat().st_size} bytes; at most {_LARGEST_BYTES} are read")
-        nodes = np.load(path, allow_pickle=False)
-        if nodes.dtype != np.float32:
-            raise ValueError(f"expected float32, got {nodes.dtype}")
-        return nodes
-    except _DAMAGE as error:
-        raise DatasetError(f"{path} holds no node trajectories: {error}.") from error
+    nodes = read_npy(path, kind="file of node trajectories", error=DatasetError, most_bytes=_LARGEST_BYTES)
+    if nodes.dtype != np.float32:
+        raise DatasetError(f"{path} holds no node trajectories: expected float32, got {nodes.dtype}.")
+    return nodes

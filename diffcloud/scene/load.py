@@ -12,9 +12,10 @@ from pydantic import ValidationError
 from diffcloud.errors import SceneError
 from diffcloud.io.files import read_json
 from diffcloud.io.obj import read_cloth, read_surface
+from diffcloud.io.schema import explain
 from diffcloud.mesh.topology import ClothMesh, FloatArray, SurfaceMesh
 from diffcloud.scene.description import Scene
-from diffcloud.scene.schema import KeyframeBlock, ObstacleBlock, SceneFile, TransformBlock, explain
+from diffcloud.scene.schema import KeyframeBlock, ObstacleBlock, SceneFile, TransformBlock
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import read_material
 from diffcloud.sim.motion import Keyframe, Motion, axis_angle_quaternion

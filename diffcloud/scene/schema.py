@@ -8,34 +8,28 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
-from diffcloud.errors import DiffCloudError
+from diffcloud.io.schema import Checked, Component, FileName, NonNegative, Positive, Vector
 from diffcloud.sim.surrounding import Integrator
 
-Vector = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
+Friction = Annotated[float, Field(ge=0, le=100)]
+_MANY = 200
+"""Obstacles, handles or motions of a scene."""
 Switch = Literal[
     "proximity", "physics", "strainlimiting", "collision", "remeshing", "separation", "popfilter", "plasticity"
 ]
 
 
-class Checked(BaseModel):
-    """A block of a file: frozen, every field known."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
 class TransformBlock(Checked):
     translate: Vector = (0.0, 0.0, 0.0)
     scale: NonNegative = 1.0
-    rotate: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)
+    rotate: tuple[Component, Component, Component, Component] = (0.0, 1.0, 0.0, 0.0)
     """Degrees, then the axis."""
 
 
 class MaterialBlock(Checked):
-    data: str
+    data: FileName
     density_mult: Positive = 1.0
     stretching_mult: Positive = 1.0
     bending_mult: Positive = 1.0
@@ -44,7 +38,7 @@ class MaterialBlock(Checked):
 
 
 class ClothBlock(Checked):
-    mesh: str
+    mesh: FileName
     transform: TransformBlock = TransformBlock()
     materials: Annotated[list[MaterialBlock], Field(min_length=1, max_length=1)]
     remeshing: dict[str, Any] | None = None
@@ -52,16 +46,16 @@ class ClothBlock(Checked):
 
 
 class KeyframeBlock(Checked):
-    time: float
+    time: Component
     transform: TransformBlock = TransformBlock()
     velocity: TransformBlock | None = None
 
 
 class HandleBlock(Checked):
     type: Literal["node"] = "node"
-    nodes: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
+    nodes: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1, max_length=100_000)]
     motion: Annotated[int, Field(ge=0)] | None = None
-    start_time: float = 0.0
+    start_time: Component = 0.0
     end_time: float = Field(default=math.inf, gt=-math.inf, allow_inf_nan=True)
     fade_time: NonNegative = 0.0
 
@@ -80,13 +74,13 @@ class BodyBlock(Checked):
 
 
 class ObstacleBlock(Checked):
-    mesh: str
+    mesh: FileName
     transform: TransformBlock = TransformBlock()
     movable: Literal[0, 1, False, True] | None = None
     """Whether what it touches moves it. Default: 1, as in ARCSim, unless it has a motion."""
     motion: Annotated[int, Field(ge=0)] | None = None
     """It acts on the transformed mesh."""
-    start_time: float = 0.0
+    start_time: Component = 0.0
     """Before this and after `end_time` [s] the motion stands still, and so does the obstacle; in ARCSim it is absent."""
     end_time: float = Field(default=math.inf, gt=-math.inf, allow_inf_nan=True)
     diffcloud: BodyBlock = BodyBlock()
@@ -130,31 +124,17 @@ class ExtensionBlock(Checked):
 
 class SceneFile(Checked):
     frame_time: Positive
-    frame_steps: Annotated[int, Field(ge=1)] = 1
+    frame_steps: Annotated[int, Field(ge=1, le=10_000)] = 1
     end_time: float = Field(default=math.inf, gt=0, allow_inf_nan=True)
     end_frame: Annotated[int, Field(ge=1)] | None = None
     cloths: Annotated[list[ClothBlock], Field(min_length=1, max_length=1)]
-    motions: list[Annotated[list[KeyframeBlock], Field(min_length=1)]] = []
-    handles: list[HandleBlock] = []
-    obstacles: list[ObstacleBlock] = []
+    motions: list[Annotated[list[KeyframeBlock], Field(min_length=1, max_length=100_000)]] = Field([], max_length=_MANY)
+    handles: list[HandleBlock] = Field([], max_length=_MANY)
+    obstacles: list[ObstacleBlock] = Field([], max_length=_MANY)
     gravity: Vector = (0.0, 0.0, 0.0)
     wind: WindBlock = WindBlock()
-    friction: NonNegative = 0.6
-    obs_friction: NonNegative = 0.3
-    disable: list[Switch] = []
+    friction: Friction = 0.6
+    obs_friction: Friction = 0.3
+    disable: list[Switch] = Field([], max_length=_MANY)
     magic: MagicBlock = MagicBlock()
     diffcloud: ExtensionBlock = ExtensionBlock()
-
-
-def explain(source: object, error: ValidationError, kind: type[DiffCloudError]) -> DiffCloudError:
-    """A validation error in one message: each field with its path, what came, and what is allowed."""
-    faults = []
-    for fault in error.errors():
-        place = ".".join(str(part) for part in fault["loc"]) or "(the whole)"
-        got = repr(fault["input"])
-        shown = got if len(got) <= 60 else got[:57] + "..."
-        if fault["type"] == "extra_forbidden":
-            faults.append(f"{place}: unknown or unsupported field (value {shown})")
-        else:
-            faults.append(f"{place}: {fault['msg']} (got {shown})")
-    return kind(f"{source}: " + "; ".join(faults) + ".")

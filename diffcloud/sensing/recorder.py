@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import EpisodeError
+from diffcloud.io.arrays import read_npz
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.clouds import import_open3d
 from diffcloud.io.files import read_json, write_json, write_npz
@@ -128,12 +129,8 @@ def read_truth(folder: Path) -> Truth:
     if not place.is_dir():
         raise EpisodeError(f"{folder} has no folder truth: only synthetic recordings know the truth.")
     poses = read_json(place / "cameras.json", error=EpisodeError)
-    try:
-        with np.load(place / "cloth.npz", allow_pickle=False) as cloth:
-            nodes, faces = cloth["nodes"], cloth["faces"]
-    except (OSError, ValueError, KeyError) as error:
-        raise EpisodeError(f"{place / 'cloth.npz'} is not readable: {error}.") from error
-    return Truth(nodes, faces, {name: np.array(pose) for name, pose in poses.items()}, place)
+    cloth = read_npz(place / "cloth.npz", kind="truth of a cloth", error=EpisodeError, names=("nodes", "faces"))
+    return Truth(cloth["nodes"], cloth["faces"], {name: np.array(pose) for name, pose in poses.items()}, place)
 
 
 def record(

@@ -109,3 +109,6 @@ def _finish(futures: Sequence[Future[Found]], look: Callable[[], None], stop: Ca
         wait(open_jobs)
         raise
     return [future.result() for future in futures]
+
+
+os.register_at_fork(after_in_child=_simulating.clear)  # its threads do not live there

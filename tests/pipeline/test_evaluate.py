@@ -153,7 +153,7 @@ def test_a_missing_network_is_a_labelled_gap(work):
 def test_a_fit_that_cannot_be_simulated_is_told_and_the_others_go_on(work):
     path = work / "data/fits/small/tan1.json"
     fit = json.loads(path.read_text())
-    fit["parameters"]["mass"] |= {"value": -1e9, "bounds": [-1e10, 10]}
+    fit["parameters"]["mass"] |= {"value": 1e-9, "bounds": [1e-10, 10]}
     path.write_text(json.dumps(fit))
     failed = invoke("evaluate", "--params", "params.yaml", code=1)
     assert "small/tan1" in failed.errors

@@ -109,7 +109,7 @@ class TestRefusals:
 
     def test_a_missing_motion(self, work):
         (work / "joint.npz").unlink()
-        assert "fit again" in invoke("export", "joint.json", "--to", "obj", "--out", "o", code=1).errors
+        assert "No such motion of a fit" in invoke("export", "joint.json", "--to", "obj", "--out", "o", code=1).errors
 
     def test_a_simulator_that_is_not_installed(self, work, monkeypatch):
         import pipeline.export

@@ -71,5 +71,5 @@ def test_bad_robots_and_places(tmp_path, params):
     assert "gone.stl' is missing" in invoke("preprocess", *common, "--urdf", urdf, code=1).errors
     description = raw / "episode.json"
     description.write_text(description.read_text().replace('"lift"', '"../lift"'), encoding="utf-8")
-    assert "names no scenario" in invoke("preprocess", *common, code=1).errors
+    assert "must be a plain folder name" in invoke("preprocess", *common, code=1).errors
     assert not (tmp_path / "episodes").exists()

@@ -13,8 +13,9 @@ import torch
 from pydantic import BaseModel
 
 from diffcloud.errors import SceneError
+from diffcloud.io.schema import Checked
 from diffcloud.scene import Scene, load_scene
-from diffcloud.scene.schema import Checked, SceneFile
+from diffcloud.scene.schema import SceneFile
 from diffcloud.sim.moved import moved_surfaces
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.surrounding import ReferenceContact

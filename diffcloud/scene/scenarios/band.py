@@ -10,12 +10,12 @@ from pydantic import Field
 
 from diffcloud.errors import SceneError
 from diffcloud.io.published import RELEASE_UNIT_M
+from diffcloud.io.schema import NonNegative
 from diffcloud.mesh.shapes import box_surface, cylinder_surface, loop_cloth
 from diffcloud.mesh.topology import SurfaceMesh
-from diffcloud.scene.scenarios.options import ScenarioOptions, assemble
+from diffcloud.scene.scenarios.options import Coordinate, Length, ScenarioOptions, assemble
 from diffcloud.scene.scenarios.release import PAPER_THRESHOLD
 from diffcloud.scene.scenarios.scenario import Scenario
-from diffcloud.scene.schema import NonNegative, Positive
 
 
 class BandScenario(ScenarioOptions):
@@ -26,24 +26,24 @@ class BandScenario(ScenarioOptions):
     """
 
     material: str = "basis-soft-foam"
-    contact_thickness_m: Positive = 0.008
+    contact_thickness_m: Length = 0.008
     contact_stiffness: NonNegative = 1e6
-    circumference_m: Positive = 1.75
-    width_m: Positive = 0.12
-    nodes: tuple[Annotated[int, Field(ge=4)], Annotated[int, Field(ge=2)]] = (32, 2)
+    circumference_m: Length = 1.75
+    width_m: Length = 0.12
+    nodes: tuple[Annotated[int, Field(ge=4, le=500)], Annotated[int, Field(ge=2, le=500)]] = (32, 2)
     """Node counts along the band and across it."""
-    center_m: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    center_m: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 1.0)
     """The middle of the band at the start."""
     pole: Literal["square", "round"] = "round"
-    pole_width_m: Positive = 0.08
+    pole_width_m: Length = 0.08
     """Side of the square, or diameter."""
-    pole_length_m: Positive = 0.4
+    pole_length_m: Length = 0.4
     """Along x, the band in its middle."""
-    pole_sides: Annotated[int, Field(ge=3)] = 24
+    pole_sides: Annotated[int, Field(ge=3, le=1000)] = 24
     """Of a round pole."""
-    pole_gap_m: Positive = 0.012
+    pole_gap_m: Length = 0.012
     """Between the band and the pole at the start."""
-    grasped_columns: Annotated[int, Field(ge=1)] = 3
+    grasped_columns: Annotated[int, Field(ge=1, le=500)] = 3
     """Nodes along the band that the gripper holds, over its whole width."""
 
 

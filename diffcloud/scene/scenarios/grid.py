@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from diffcloud.errors import SceneError, unknown_name
+from diffcloud.io.schema import Checked, NonNegative
 from diffcloud.mesh.shapes import grid_cloth, rectangle_surface
 from diffcloud.mesh.topology import ClothMesh
-from diffcloud.scene.scenarios.options import Coordinate, Keyframes, ScenarioOptions, assemble
+from diffcloud.scene.scenarios.options import Coordinate, Keyframes, Length, ScenarioOptions, assemble
 from diffcloud.scene.scenarios.scenario import Scenario
-from diffcloud.scene.schema import Checked, NonNegative, Positive
 
 Names = tuple[str | int, ...]
 """Nodes: corners (left/right_bottom/top of the unrotated cloth) or indices."""
@@ -33,13 +33,13 @@ class Gripper(Checked):
 class GridScenario(ScenarioOptions):
     """A rectangular cloth over a table: everything a person may change in a YAML file (SI units)."""
 
-    size_m: tuple[Positive, Positive]
+    size_m: tuple[Length, Length]
     """Extent along the cloth's own x and y."""
     nodes: tuple[Annotated[int, Field(ge=2, le=500)], Annotated[int, Field(ge=2, le=500)]] = (7, 7)
     """Node counts along x and y."""
     center_m: tuple[Coordinate, Coordinate] = (0.0, 0.0)
     """Where the cloth's centre lies on the table."""
-    yaw_deg: float = 45.0
+    yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 45.0
     """Rotation about the vertical; 45 lays a square cloth as a diamond."""
     table_height_m: Coordinate = 0.0
     gap_m: NonNegative = 0.002

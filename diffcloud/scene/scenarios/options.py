@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from diffcloud.errors import SceneError
+from diffcloud.io.schema import Checked, NonNegative, Vector
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.scene.description import Scene
 from diffcloud.scene.scenarios.scenario import Recorder, Scenario
 from diffcloud.scene.scenarios.sheet import Sheet
-from diffcloud.scene.schema import Checked, NonNegative, Positive, Vector
+from diffcloud.scene.schema import Friction
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import Material, preset, read_material
 from diffcloud.sim.motion import Keyframe, Motion
@@ -23,6 +24,8 @@ from diffcloud.sim.surrounding import ContactSettings, Integrator, ReferenceCont
 
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 """[m] Whatever lies farther off is a mistake."""
+Length = Annotated[float, Field(gt=0, le=100)]
+"""[m] Of a cloth, or of what it meets."""
 _Time = Annotated[float, Field(ge=-1e6, le=1e6)]
 Keyframes = Annotated[list[tuple[_Time, Coordinate, Coordinate, Coordinate]], Field(min_length=2)]
 """Keyframes (time s, dx, dy, dz m) of a displacement, in the world's axes."""
@@ -37,7 +40,7 @@ class ScenarioOptions(Checked):
     path: Keyframes
     """The gripper's displacement."""
     frames: Annotated[int, Field(ge=1, le=100_000)] = 25
-    rate_hz: Positive = 10.0
+    rate_hz: Annotated[float, Field(gt=0, le=1e5)] = 10.0
     steps_per_frame: Annotated[int, Field(ge=1, le=10_000)] = 8
     integrator: Integrator = "implicit"
     """"implicit" has steps of second order and smooth contact; "linearised" are ARCSim's steps, a quarter to a tenth as
@@ -50,20 +53,20 @@ class ScenarioOptions(Checked):
     every_frame: bool = True
     """Whether fits compare all usable frames; a file that names loss_frames has only those, unless it says true."""
     points: Annotated[int, Field(ge=1, le=1_000_000)] = 3500
-    learning_rate: Positive = 0.2
-    threshold_m2: NonNegative = 0.0
+    learning_rate: Annotated[float, Field(gt=0, le=1e3)] = 0.2
+    threshold_m2: Annotated[float, Field(ge=0, le=1)] = 0.0
     """A fit stops when its loss is below; 0: never."""
     recorder: Recorder = "depth_cameras"
     gravity: Vector = (0.0, 0.0, -9.81)
     air_density: NonNegative = 1.2
-    friction_obstacle: NonNegative = 0.3
-    friction_cloth: NonNegative = 0.6
+    friction_obstacle: Friction = 0.3
+    friction_cloth: Friction = 0.6
     mesh_contact: bool = True
     """For the linearised integrator: whether contact is with all meshes and the cloth itself, or with planes only."""
     self_contact: bool = True
     """Whether the cloth meets itself; without, layers pass through each other, and steps are several times quicker."""
     contact_stiffness: NonNegative = 1e4
-    contact_thickness_m: Positive = 0.003
+    contact_thickness_m: Annotated[float, Field(gt=0, le=1)] = 0.003
 
     @property
     def reach(self) -> float:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from diffcloud.scene.schema import Checked, NonNegative, Positive
+from diffcloud.io.schema import Checked, NonNegative, Positive
 from diffcloud.sim.materials import FABRIC_DAMPING, Material, isotropic
 
 _SHEET = ("density_kg_m2", "stretching_n_m", "bending_n_m")

@@ -10,11 +10,11 @@ from pydantic import Field
 
 from diffcloud.errors import SceneError
 from diffcloud.io.published import RELEASE_UNIT_M
+from diffcloud.io.schema import NonNegative
 from diffcloud.mesh.shapes import cylinder_surface, vest_cloth, vest_shoulder
-from diffcloud.scene.scenarios.options import ScenarioOptions, assemble
+from diffcloud.scene.scenarios.options import Coordinate, Length, ScenarioOptions, assemble
 from diffcloud.scene.scenarios.release import PAPER_THRESHOLD
 from diffcloud.scene.scenarios.scenario import Scenario
-from diffcloud.scene.schema import NonNegative, Positive
 
 _CLEARANCE = 0.015
 """Least distance between the shoulder and the hook at the start [m]: below it the straps converge on the hook."""
@@ -29,22 +29,22 @@ class VestScenario(ScenarioOptions):
 
     material: str = "basis-foam"
     shaped: bool = True
-    contact_thickness_m: Positive = 0.008
+    contact_thickness_m: Length = 0.008
     contact_stiffness: NonNegative = 3e6
-    width_m: Positive = 0.40
+    width_m: Length = 0.40
     """Of a panel, flat."""
-    height_m: Positive = 0.47
+    height_m: Length = 0.47
     """From the hem to the shoulder, flat."""
-    depth_m: Positive = 0.063
+    depth_m: Length = 0.063
     """Half the distance between front and back."""
-    center_m: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    center_m: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 1.0)
     """The middle of the hem."""
-    hook_radius_m: Positive = 0.0125
-    hook_length_m: Positive = 0.36
-    hook_sides: Annotated[int, Field(ge=3)] = 16
-    hook_inset_m: Positive = 0.09
+    hook_radius_m: Length = 0.0125
+    hook_length_m: Length = 0.36
+    hook_sides: Annotated[int, Field(ge=3, le=1000)] = 16
+    hook_inset_m: Length = 0.09
     """From the shoulder to the hook's axis, towards the hem."""
-    hook_reach_m: Positive = 0.047
+    hook_reach_m: Length = 0.047
     """How far the hook reaches under the shoulder, from its arm end."""
 
 

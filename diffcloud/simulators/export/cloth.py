@@ -223,6 +223,12 @@ def _held(scene: Scene, motion: FittedMotion, paths: NDArray[np.float64]) -> tup
     """Node -> how it is moved, as the fitted motion has it at every step, on paths [S + 1, K, 3]; and sentences of nodes
     that are let go."""
     times, rows = motion.held_times, {int(node): row for row, node in enumerate(motion.held)}
+    absent = {handle.node for handle in scene.handles.handles} - rows.keys()
+    if absent:
+        raise ConfigError(
+            f"The fit's motion holds the nodes {sorted(rows)}, its scenario's handles are at {sorted(absent)}, too: they "
+            "do not belong together. Give the --scenario that was fitted, or fit again."
+        )
     held: dict[int, Motion | None] = {}
     loose = set()
     for handle in scene.handles.handles:

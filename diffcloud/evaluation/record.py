@@ -1,0 +1,168 @@
+"""What `diffcloud evaluate` leaves for the report, as files hold it: checked before anything is drawn from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from diffcloud.errors import ConfigError
+from diffcloud.evaluation.intervals import Intervals
+from diffcloud.io.schema import NonNegative, explain
+
+Value = Annotated[float, Field(ge=-1e12, le=1e12)]
+Place = Annotated[float, Field(gt=0, le=1e12)]
+Text = Annotated[str, Field(max_length=10_000)]
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class _Metrics(BaseModel):
+    """Loss and errors, one for each parameter that has a known truth."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+    __pydantic_extra__: dict[str, Value | None] = Field(init=False)
+
+    loss: Value
+    loss_deviation: Value
+    rms_mm: Value
+    two_sided: Value
+    success: bool | None = None
+
+
+class MethodRecord(_Metrics):
+    """What one method found, and how good it is."""
+
+    method: Text
+    values: dict[str, Value]
+    clipped: dict[str, Value]
+    inside: bool
+    simulations: int | None
+    gradients: bool
+
+
+class TransferRecord(_Metrics):
+    """Parameters of another recording."""
+
+    source: Text
+    clipped: dict[str, Value]
+
+
+class GapRecord(_Record):
+    """A method without a result."""
+
+    method: Text
+    reason: Text
+    expected: bool
+
+
+class LandscapeRecord(_Record):
+    """Losses around a fit."""
+
+    names: Annotated[list[Text], Field(min_length=2, max_length=2)]
+    x: Annotated[list[Place], Field(min_length=1)]
+    y: Annotated[list[Place], Field(min_length=1)]
+    loss: list[list[Value | None]]
+    paths: list[list[list[Value]]]
+    fitted: list[Value]
+
+
+class StatedIntervals(Intervals):
+    """With a remark."""
+
+    level: Annotated[float, Field(gt=0, lt=1)]
+    within: Annotated[float, Field(gt=1, le=1e6)]
+    note: Text
+
+
+class ComparisonRecord(_Record):
+    """One episode."""
+
+    scenario: Text
+    episode: Text
+    fit: Text
+    fabric: Text | None
+    category: Text | None
+    repeat: int | None
+    source: Text | None
+    category_assumed: bool
+    truth: dict[str, Value]
+    length_unit_m: Place
+    threshold: Value | None
+    frames: list[int]
+    starts: int
+    start: _Metrics | None
+    methods: list[MethodRecord]
+    gaps: list[GapRecord]
+    failures: list[Text]
+    transfers: list[TransferRecord]
+    intervals: StatedIntervals | None
+    landscape: LandscapeRecord | None
+
+
+class ComparisonFile(_Record):
+    """tables/comparison.json."""
+
+    records: list[ComparisonRecord]
+    failures: list[Text]
+    references: list[tuple[Text, Text, Value]]
+
+
+class TimingsFile(BaseModel):
+    """timings.json."""
+
+    methods: dict[Annotated[str, Field(pattern=r".+/.+")], dict[str, dict[str, Annotated[float, Field(ge=0, le=1e9)]]]]
+
+
+class FitRow(BaseModel):
+    """A row of tables/fits.csv. Its other columns are losses, distances, parameters and their truth."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+    __pydantic_extra__: dict[str, NonNegative] = Field(init=False)
+
+    scenario: Text
+    episode: Text
+    loss: NonNegative
+    rms_start_mm: NonNegative
+    rms_mm: NonNegative
+
+
+class PredictionRow(BaseModel):
+    """A row of tables/predictions.csv. Its other columns are parameters and their truth."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+    __pydantic_extra__: dict[str, Value] = Field(init=False)
+
+    scenario: Text
+    episode: Text
+    model: Text
+    inside: bool
+    loss: NonNegative
+    rms_mm: NonNegative
+
+
+def check_file(model: type[BaseModel], path: Path, content: Any) -> None:
+    """
+    Raises:
+        ConfigError: a file is not as this version's `diffcloud evaluate` writes it; names the field.
+    """
+    try:
+        model.model_validate(content)
+    except ValidationError as error:
+        raise explain(
+            f"{path} was not written by this version's `diffcloud evaluate`; run it. There", error, ConfigError
+        ) from error
+
+
+def check_rows(model: type[BaseModel], path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """The same of a table."""
+    try:
+        TypeAdapter(list[model]).validate_python(rows)  # type: ignore[valid-type]
+    except ValidationError as error:
+        raise explain(
+            f"{path} was not written by this version's `diffcloud evaluate`; run it. There", error, ConfigError
+        ) from error

@@ -1,0 +1,112 @@
+"""Files of arrays, NPZ and NPY, from others: what a file says of itself is checked before memory is taken for it."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.errors import DiffCloudError
+
+MOST_BYTES = 1 << 30
+"""Of one file's arrays, unpacked."""
+_KINDS = "biufSU"
+"""Of elements: numbers and strings; an object would be a pointer."""
+_DIMENSIONS = 8
+
+
+def read_npz(
+    path: Path,
+    *,
+    kind: str,
+    error: type[DiffCloudError],
+    names: Collection[str] | None = None,
+    most_bytes: int = MOST_BYTES,
+) -> dict[str, NDArray[Any]]:
+    """Name -> array.
+
+    Args:
+        kind: what the file is, for messages: "episode".
+        names: of the arrays that are read; all of them where not given.
+
+    Raises:
+        error: missing, damaged, encrypted, too large, without one of the names, or with elements that are no numbers or
+            strings.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise error(f"No such {kind}: {path}.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+            if size > most_bytes:
+                raise error(f"{path} unpacks to {size / 1e9:.1f} GB; a {kind} may have {most_bytes / 1e9:.1f} GB.")
+            held = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+            missing = sorted(set(names or ()) - set(held))
+            if missing:
+                raise ValueError(f"it lacks {', '.join(missing)}")
+            found = {}
+            for name in held if names is None else names:
+                with archive.open(held[name]) as stream:
+                    found[name] = _array(cast(BinaryIO, stream), held[name].file_size, name)
+            return found
+    # zipfile says of what it does not know that it is not implemented, and of an encrypted entry that a password is
+    # missing (RuntimeError)
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, ValueError, OSError, EOFError) as damage:
+        raise error(f"{path} is not a readable {kind}: {damage}.") from damage
+
+
+def read_npy(path: Path, *, kind: str, error: type[DiffCloudError], most_bytes: int = MOST_BYTES) -> NDArray[Any]:
+    """The array of one file.
+
+    Args:
+        kind: as of `read_npz`.
+
+    Raises:
+        error: missing, damaged, too large, or with elements that are no numbers or strings.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise error(f"No such {kind}: {path}.")
+    try:
+        size = path.stat().st_size
+        if size > most_bytes:
+            raise error(f"{path} has {size / 1e9:.1f} GB; a {kind} may have {most_bytes / 1e9:.1f} GB.")
+        with path.open("rb") as stream:
+            return _array(stream, size, path.name)
+    except (ValueError, OSError, EOFError) as damage:
+        raise error(f"{path} is not a readable {kind}: {damage}.") from damage
+
+
+def _array(stream: BinaryIO, size: int, name: str) -> NDArray[Any]:
+    """One array, of a stream with so many bytes.
+
+    Raises:
+        ValueError: its header is none, or states more or less than there is.
+    """
+    try:
+        version = np.lib.format.read_magic(stream)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read_header(stream)
+    except Exception as damage:  # numpy parses the header as Python, which fails in many ways where it is damaged
+        raise ValueError(f"{name} has no header of an array ({damage})") from damage
+    if dtype.hasobject or dtype.kind not in _KINDS:
+        raise ValueError(f"{name} holds {dtype} elements, which may be numbers or text")
+    there = size - stream.tell()
+    if len(shape) > _DIMENSIONS or any(extent < 0 for extent in shape):
+        raise ValueError(f"{name} has the shape {list(shape)}")
+    stated = dtype.itemsize
+    for extent in shape:  # Python's numbers do not overflow
+        stated *= extent
+    if stated != there:
+        raise ValueError(f"{name} states {stated} bytes and has {there}")
+    data = stream.read(there)
+    if len(data) != there:
+        raise ValueError(f"{name} ends after {len(data)} of {there} bytes")
+    flat = np.frombuffer(data, dtype=dtype).copy() if dtype.itemsize else np.zeros(shape, dtype)
+    return flat.reshape(shape, order="F" if fortran else "C")

@@ -1,0 +1,246 @@
+"""Every command of the pipeline disturbed in the middle of its work: run again, it must end as if nothing had been."""
+
+from __future__ import annotations
+
+import csv
+import ctypes
+import io
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from tests.pipeline.invoke import DIFFCLOUD, ROOT
+from tests.robustness.inputs import SEED
+
+Disturbance = Literal["kill", "Ctrl-C", "full disk", "read-only", "two at once"]
+COMMANDS = {
+    "episodes": ("episodes --params params.yaml --out data/recorded", "data/recorded"),
+    "preprocess": ("preprocess --params params.yaml --out data/episodes data/recorded", "data/episodes"),
+    "simulate": ("simulate --params params.yaml --scenario small --out data/simulated/small", "data/simulated/small"),
+    "fit": ("fit --params params.yaml --out data/fits data/episodes", "data/fits"),
+    "train": ("train --params params.yaml --data data/simulated --out data/regressors", "data/regressors"),
+    "evaluate": (
+        "evaluate --params params.yaml --fits data/fits --episodes data/episodes --regressors data/regressors "
+        "--simulated data/simulated --out reports",
+        "reports",
+    ),
+    "report": (
+        "report --params params.yaml --fits data/fits --episodes data/episodes --regressors data/regressors "
+        "--tables reports/tables --out page/index.html",
+        "page",
+    ),
+    "rollout": ("rollout --scenario small --out motion/m.npz --obj motion/obj", "motion"),
+    "export": ("export data/fits/small/small_hidden1.json --to mujoco --out exported --scenario small", "exported"),
+}
+"""Command -> arguments and the folder that it fills, in the project of `kinds`."""
+COUNTS: dict[Disturbance, int] = {"kill": 5, "Ctrl-C": 3, "full disk": 2, "read-only": 1, "two at once": 1}
+"""How often each command meets each."""
+_TIMES = ("seconds", "date", "created")
+"""Fields of outputs that tell when, or how long."""
+_PATIENCE = 300.0
+_DAC_OVERRIDE, _DROP_BOUNDING = 1, 24
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One disturbed run."""
+
+    command: str
+    disturbance: Disturbance
+    seed: int
+
+
+@dataclass(frozen=True)
+class Survived:
+    """What became of it."""
+
+    fault: Fault
+    status: int | None
+    """Of the disturbed run; None: it hung."""
+    told: str
+    wrong: str | None
+
+
+def all_faults() -> list[Fault]:
+    return [
+        Fault(command, disturbance, seed)
+        for command in COMMANDS
+        for disturbance, count in COUNTS.items()
+        for seed in range(count)
+    ]
+
+
+def survive(fault: Fault, project: Path, reference: dict[str, Any], usual_s: float) -> Survived:
+    """Disturb a run of a command, then run it again.
+
+    Args:
+        project: with the outputs of all stages.
+        reference: `contents` of what the command makes undisturbed.
+        usual_s: how long that takes.
+    """
+    arguments, made = COMMANDS[fault.command]
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder) / "project"
+        shutil.copytree(project, work)
+        shutil.rmtree(work / made, ignore_errors=True)
+        done = _disturbed(fault, work, usual_s)
+        told, status = done
+        wrong = None
+        if status is None:
+            wrong = "hang"
+        elif "Traceback" in told or "Unexpected error" in told:
+            wrong = "traceback"
+        elif status == 0 and fault.disturbance in ("full disk", "read-only") and _differs(contents(work / made), reference):
+            wrong = "ended well, without all outputs"
+        else:
+            wrong = _half_written(contents(work / made), reference)
+        if wrong is None:
+            again = subprocess.run([*DIFFCLOUD, *arguments.split()], **_in(work), timeout=_PATIENCE, check=False)
+            if again.returncode != 0:
+                wrong = f"cannot be run again: {again.stderr[-300:]}"
+            elif differs := _differs(contents(work / made), reference):
+                wrong = f"another result: {differs}"
+            elif left := [path.name for path in (work / made).rglob(".*") if not path.name.endswith(".diffcloud-lock")]:
+                wrong = f"left over: {left}"
+        return Survived(fault, status, told[-400:], wrong)
+
+
+def undisturbed(command: str, project: Path) -> tuple[dict[str, Any], float]:
+    """What a command makes, and how long it takes."""
+    arguments, made = COMMANDS[command]
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder) / "project"
+        shutil.copytree(project, work)
+        shutil.rmtree(work / made, ignore_errors=True)
+        began = time.monotonic()
+        subprocess.run([*DIFFCLOUD, *arguments.split()], **_in(work), timeout=_PATIENCE, check=True)
+        return contents(work / made), time.monotonic() - began
+
+
+def _in(work: Path) -> dict[str, Any]:
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    return {"cwd": work, "env": env, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+
+
+def _disturbed(fault: Fault, work: Path, usual_s: float) -> tuple[str, int | None]:
+    """What a run printed, and its exit status."""
+    arguments, made = COMMANDS[fault.command]
+    draw = random.Random(f"{fault.command} {fault.disturbance} {fault.seed}")
+    prepare: Callable[[], None] | None = None
+    moment: float | None = None
+    signalled = signal.SIGKILL
+    match fault.disturbance:
+        case "kill" | "Ctrl-C":
+            moment = draw.uniform(0.1, 1.0) * usual_s
+            signalled = signal.SIGKILL if fault.disturbance == "kill" else signal.SIGINT
+        case "full disk":
+            limit = int(10 ** draw.uniform(2.0, 4.0))
+
+            def prepare() -> None:
+                signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+                resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+        case "read-only":
+            (work / made).mkdir(parents=True)
+            (work / made).chmod(0o555)
+            prepare = _no_override
+    command = [*DIFFCLOUD, *arguments.split()]
+    one = subprocess.Popen(command, **_in(work), start_new_session=True, preexec_fn=prepare)
+    other = None
+    if fault.disturbance == "two at once":
+        time.sleep(draw.uniform(0.0, 0.5) * usual_s)
+        other = subprocess.Popen(command, **_in(work), start_new_session=True)
+    if moment is not None:
+        with suppress(subprocess.TimeoutExpired):
+            one.wait(moment)
+        if one.poll() is None:
+            # Ctrl-C reaches all processes of a terminal, a kill by the system one of them
+            os.killpg(one.pid, signalled) if signalled == signal.SIGINT else one.send_signal(signalled)
+    try:
+        told = "".join(one.communicate(timeout=_PATIENCE))
+        if other is not None:
+            told += "".join(other.communicate(timeout=_PATIENCE))
+    except subprocess.TimeoutExpired:
+        os.killpg(one.pid, signal.SIGKILL)
+        return "", None
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(one.pid, signal.SIGKILL)  # workers whose parent was killed
+        if fault.disturbance == "read-only":
+            (work / made).chmod(0o755)
+    return told, one.returncode
+
+
+def _no_override() -> None:
+    """For the superuser, too, a folder that is read-only is so."""
+    if os.geteuid() == 0:
+        ctypes.CDLL(None).prctl(_DROP_BOUNDING, _DAC_OVERRIDE, 0, 0, 0)
+
+
+def contents(folder: Path) -> dict[str, Any]:
+    """File -> what is in it, without what tells how long it took, and without what is hidden."""
+    found: dict[str, Any] = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts):
+            name = path.relative_to(folder).as_posix()
+            if not name.endswith(("timings.json", "seconds.csv", "seconds.svg", "index.html")):
+                found[name] = _timeless(path)
+    return found
+
+
+def _timeless(path: Path) -> Any:
+    data = path.read_bytes()
+    with suppress(ValueError, UnicodeDecodeError, csv.Error):
+        if path.suffix == ".json":
+            return _without_times(json.loads(data))
+        if path.suffix == ".csv":
+            rows = csv.DictReader(io.StringIO(data.decode()))
+            return [{key: value for key, value in row.items() if key not in _TIMES} for row in rows]
+    return data
+
+
+def _without_times(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_times(one) for key, one in value.items() if key not in _TIMES}
+    return [_without_times(one) for one in value] if isinstance(value, list) else value
+
+
+def _differs(found: dict[str, Any], reference: dict[str, Any]) -> str:
+    """Files that differ; empty where none does."""
+    return ", ".join(sorted(name for name in found.keys() | reference.keys() if found.get(name) != reference.get(name)))
+
+
+def _half_written(found: dict[str, Any], reference: dict[str, Any]) -> str | None:
+    """What lies there under its name before its time: it must be as the undisturbed run makes it. Lists of what is done
+    grow, and a command's own log may be shorter."""
+    growing = ("manifest.json", "episode.json", "timestamps.csv", "robot.csv", ".tsv", "metrics.json")
+    damaged = [name for name, value in found.items() if value != reference.get(name) and not name.endswith(growing)]
+    return f"half-written: {', '.join(damaged)}" if damaged else None
+
+
+def all_of_command(name: str, project: Path, sample: int | None = None) -> list[dict[str, Any]]:
+    """Faults of one command: plain values, one mapping each."""
+    faults = [fault for fault in all_faults() if fault.command == name]
+    if sample is not None and sample < len(faults):
+        faults = random.Random(f"{SEED} {name}").sample(faults, sample)
+    reference, usual_s = undisturbed(name, project)
+    results = []
+    for fault in faults:
+        found = survive(fault, project, reference, usual_s)
+        verdict = "survived" if found.wrong is None else "not survived"
+        results.append({
+            "suite": "faults", "of": name, "where": f"seed {fault.seed}", "what": fault.disturbance, "wrong": found.wrong,
+            "verdict": verdict, "told": found.told,
+        })  # fmt: skip
+    return results

@@ -1,0 +1,227 @@
+"""Every kind of file that commands read: a good one, and the command that reads it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import yaml
+from pydantic import BaseModel
+
+from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, check_file, check_rows
+from diffcloud.fit import Objective, read_fit
+from diffcloud.io.calibrations import Calibration, CameraCalibration, read_calibration, write_calibration
+from diffcloud.io.clouds import import_open3d
+from diffcloud.io.files import read_json
+from diffcloud.io.manifests import read_manifest
+from diffcloud.io.obj import read_cloth, write_cloth
+from diffcloud.io.raw_episodes import read_raw_episode
+from diffcloud.io.simulated import SimulatedSet
+from diffcloud.scene.scenarios.catalogue import built_in
+from diffcloud.sensing.validation.episode import validate_raw_episode
+from pipeline.config import load_config
+from pipeline.report import table_rows
+from tests.conftest import small_lift
+from tests.fit.test_fit import clouds_of
+from tests.io.ros_bag import Bag, Habits
+from tests.pipeline.invoke import DIFFCLOUD
+from tests.scene.files import sheet_over_box, write_file, write_files
+from tests.sensing.table_scene import INTRINSICS, poses
+
+SCENARIO = {
+    "nodes": [4, 4], "frames": 4, "steps_per_frame": 1, "points": 200, "integrator": "linearised",
+    "path": [[0.0, 0.0, 0.0, 0.0], [0.4, 0.0, -0.03, 0.09]],
+}  # fmt: skip
+PARAMS = {
+    "scenarios": ["small"],
+    "episodes": {"per_scenario": 1, "image_size": [106, 60]},
+    "preprocess": {"outlier_neighbours": 5, "points": 200},
+    "simulate": {"scenarios": ["small"], "train": 8, "test": 4},
+    "fit": {"iterations": 2, "screen": 4},
+    "train": {"scenarios": ["small"], "models": ["mlp"], "profile": "quick", "epochs": 2, "points": 24},
+    "evaluate": {"draws": 1, "rivals": ["middle"], "landscapes": ["small/small_hidden1"], "landscape_size": 3},
+}
+STAGES = (
+    "episodes --params params.yaml --out data/recorded",
+    "preprocess --params params.yaml --out data/episodes data/recorded",
+    "simulate --params params.yaml --scenario small --out data/simulated/small",
+    "fit --params params.yaml --out data/fits data/episodes",
+    "train --params params.yaml --data data/simulated --out data/regressors",
+    "evaluate --params params.yaml --fits data/fits --episodes data/episodes --regressors data/regressors "
+    "--simulated data/simulated --out reports",
+)
+_RAW, _EPISODE = "data/recorded/small/small_hidden1", "data/episodes/small/small_hidden1.npz"
+_CAMERA, _TIMES = f"{_RAW}/cameras/side/camera.json", f"{_RAW}/cameras/side/timestamps.csv"
+_FITS, _PREDICTED, _COMPARED = (f"reports/tables/{name}" for name in ("fits.csv", "predictions.csv", "comparison.json"))
+_FIT, _NETWORK, _SET = "data/fits/small/small_hidden1", "data/regressors/small/mlp", "data/simulated/small"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file."""
+
+    name: str
+    form: Literal["document", "table", "arrays", "bytes"]
+    file: str
+    """Path of the good one in the project."""
+    read: Callable[[], object]
+    """In the project's folder."""
+    most: int = 1000
+    """Damages of its form that are tried, drawn at random where there are more."""
+    flips: int = 20
+    """Damages of its bytes."""
+    as_of: str | None = None
+    """The kind whose table of outcomes holds; this command reads the same file."""
+
+
+def make_project(folder: Path) -> None:
+    """A small project with the outputs of all stages, and files of all other kinds beside them."""
+    (folder / "raw" / "scenes").mkdir(parents=True)
+    options = built_in("lift").model_dump(mode="json") | SCENARIO
+    told = {key: value for key, value in options.items() if value is not None and key != "name"}
+    (folder / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump({"base": "lift", **told}, sort_keys=False))
+    (folder / "params.yaml").write_text(yaml.safe_dump(PARAMS))
+    for stage in STAGES:
+        subprocess.run([*DIFFCLOUD, *stage.split()], cwd=folder, check=True, capture_output=True)
+    (folder / "full.yaml").write_text(yaml.safe_dump(load_config(folder / "params.yaml").model_dump(mode="json")))
+    _write_clouds(folder)
+    stated = {
+        name: CameraCalibration(name, INTRINSICS, pose, 1e-6 * np.eye(6), name, {"rms_px": 0.2})
+        for name, pose in poses().items()
+    }
+    write_calibration(folder / "calibration.json", Calibration(stated, "charuco", {"square_m": 0.04}, "2026-01-01"))
+    write_cloth(folder / "cloth.obj", small_lift().scene.build()[0].mesh)
+    write_file(write_files(folder), sheet_over_box())
+    Bag(folder / "recording.bag", "rosbag1", Habits()).write()
+    Bag(folder / "recording", "mcap", Habits()).write()
+    rows = [f"{0.5 * index},{0.4 + 0.05 * index},0.0,{0.3 + 0.02 * index},0.9" for index in range(6)]
+    (folder / "path.csv").write_text("\n".join(["t_s,x,y,z,gripper", *rows]) + "\n")
+
+
+def _write_clouds(folder: Path) -> None:
+    """Three clouds in each format, and the track of a gripper."""
+    draw = np.random.default_rng(0)
+    for form in ("ply", "pcd", "xyz", "npy", "npz"):
+        (folder / form).mkdir()
+    for index in range(3):
+        points = (draw.normal(size=(60, 3)) / 10).astype(np.float32)
+        text = "".join(" ".join(f"{value:.6f}" for value in point) + "\n" for point in points)
+        axes = "".join(f"property float {axis}\n" for axis in "xyz")
+        (folder / "ply" / f"{index}.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 60\n{axes}end_header\n{text}")
+        head = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 60\nHEIGHT 1\nPOINTS 60\nDATA ascii\n"
+        (folder / "pcd" / f"{index}.pcd").write_text(head + text)
+        (folder / "xyz" / f"{index}.xyz").write_text(text)
+        np.save(folder / "npy" / f"{index}.npy", points)
+    rows = [f"{index / 10},0,0,{0.1 + index / 50}" for index in range(3)]
+    (folder / "gripper.csv").write_text("\n".join(["t_s,x,y,z", *rows]) + "\n")
+
+
+def command(arguments: str) -> Callable[[], None]:
+    """`diffcloud` with these arguments, in this process."""
+
+    def run() -> None:
+        from pipeline.app import main
+
+        sys.argv = ["diffcloud", *arguments.split()]
+        main()
+
+    return run
+
+
+def _cleaned() -> None:
+    """`preprocess`, with which `episode validate` must agree."""
+    faults = [one.message for one in validate_raw_episode(Path(_RAW)) if one.severity == "fault"]
+    try:
+        command("preprocess --params params.yaml --out cleaned data/recorded")()
+    except SystemExit as end:
+        if end.code and not faults:
+            print("Traceback: episode validate finds nothing wrong in what preprocess refuses")
+        raise
+
+
+def _check_table(model: type[BaseModel], path: str) -> None:
+    check_rows(model, Path(path), table_rows(Path(path)))
+
+
+def _check_document(model: type[BaseModel], path: str) -> None:
+    check_file(model, Path(path), read_json(Path(path)))
+
+
+_IMPORT = "import clouds {} --gripper gripper.csv --out imported.npz"
+_CAPTURE = command("capture --dry-run --trajectory path.csv --stretch-time 2 --camera a=1 --arm 0 --out e")
+_REPORT = command(
+    "report --params params.yaml --fits data/fits --episodes data/episodes --regressors data/regressors "
+    "--tables reports/tables --out page/index.html"
+)
+_LOSS = command(f"evaluate loss {_EPISODE} --scenario small --set stretch=1.0 --threads 1")
+_OF_FIT = command(f"evaluate loss {_EPISODE} --fit {_FIT}.json --scenario small --threads 1")
+_PREDICT = command(f"predict {_EPISODE} --checkpoint {_NETWORK}.safetensors")
+KINDS = (
+    Kind(
+        "scenario", "document", "raw/scenes/small.yaml", command("rollout --scenario raw/scenes/small.yaml --out m.npz")
+    ),
+    Kind("params", "document", "full.yaml", lambda: load_config(Path("full.yaml"))),
+    Kind("ARCSim scene", "document", "conf/scene.json", command("rollout --scene conf/scene.json --frames 2 --out m.npz")),
+    Kind("episode", "arrays", _EPISODE, _LOSS),
+    Kind("gripper track", "table", "gripper.csv", command(_IMPORT.format("ply"))),
+    *(Kind(f"cloud, {form}", "bytes", f"{form}/1.{form}", command(_IMPORT.format(form)), flips=60)
+      for form in ("ply", "pcd", "xyz", "npy")),
+    Kind("episode.json", "document", f"{_RAW}/episode.json", lambda: read_raw_episode(Path(_RAW))),
+    Kind("camera.json", "document", _CAMERA, lambda: read_raw_episode(Path(_RAW))),
+    Kind("timestamps.csv", "table", _TIMES, lambda: read_raw_episode(Path(_RAW))),
+    Kind("robot.csv", "table", f"{_RAW}/robot.csv", lambda: read_raw_episode(Path(_RAW))),
+    *(Kind(f"{name}, preprocessed", form, file, _cleaned, most=24, flips=6, as_of=name)
+      for name, form, file in (
+          ("episode.json", "document", f"{_RAW}/episode.json"), ("camera.json", "document", _CAMERA),
+          ("timestamps.csv", "table", _TIMES), ("robot.csv", "table", f"{_RAW}/robot.csv"))),
+    Kind("depth image", "bytes", f"{_RAW}/cameras/side/depth/000001.png", _cleaned),
+    Kind("colour image", "bytes", f"{_RAW}/cameras/side/color/000001.png", _cleaned),
+    Kind("calibration", "document", "calibration.json", lambda: read_calibration(Path("calibration.json"))),
+    Kind("fit, record", "document", f"{_FIT}.json", lambda: read_fit(Path(f"{_FIT}.json"))),
+    Kind("fit, record, evaluated", "document", f"{_FIT}.json", _OF_FIT, most=40, as_of="fit, record"),
+    Kind("fit, record, reported", "document", f"{_FIT}.json", _REPORT, most=12, flips=4, as_of="fit, record"),
+    Kind("fit, motion", "arrays", f"{_FIT}.npz", command(f"export {_FIT}.json --to obj --out exported --scenario small")),
+    Kind("manifest", "document", "data/fits/manifest.json", lambda: read_manifest(Path("data/fits"))),
+    Kind("network", "bytes", f"{_NETWORK}.safetensors", _PREDICT, flips=60),
+    Kind("simulated set", "document", f"{_SET}/set.json", lambda: SimulatedSet.read(Path(_SET), "train")),
+    Kind("runs", "table", f"{_SET}/train.csv", lambda: SimulatedSet.read(Path(_SET), "train")),
+    Kind("surface", "arrays", f"{_SET}/surface.npz", lambda: SimulatedSet.read(Path(_SET), "train")),
+    Kind("nodes", "bytes", f"{_SET}/train_nodes.npy", lambda: SimulatedSet.read(Path(_SET), "train"), flips=60),
+    Kind("fits", "table", _FITS, lambda: _check_table(FitRow, _FITS)),
+    Kind("predictions", "table", _PREDICTED, lambda: _check_table(PredictionRow, _PREDICTED)),
+    Kind("comparison", "document", _COMPARED, lambda: _check_document(ComparisonFile, _COMPARED)),
+    *(Kind(f"{name}, reported", form, file, _REPORT, most=12, flips=4, as_of=name)
+      for name, form, file in (
+          ("fits", "table", _FITS), ("predictions", "table", _PREDICTED), ("comparison", "document", _COMPARED))),
+    Kind("mesh", "bytes", "cloth.obj", lambda: read_cloth(Path("cloth.obj")), flips=80),
+    Kind("ROS bag", "bytes", "recording.bag", command("import recording recording.bag --out imported")),
+    Kind("MCAP", "bytes", "recording/recording.mcap", command("import recording recording --out imported")),
+    Kind("trajectory", "table", "path.csv", _CAPTURE),
+)  # fmt: skip
+
+
+def warm_up() -> None:
+    """Import and compile in this process what its forks would each import and compile."""
+    import matplotlib.figure
+
+    import pipeline.evaluate_release
+    import pipeline.export
+    import pipeline.importing
+    import pipeline.predict
+    import pipeline.preprocess
+    import pipeline.report
+    import pipeline.rollout
+
+    del matplotlib, pipeline
+    import_open3d()
+    torch.set_num_threads(1)
+    for integrator in ("linearised", "implicit"):
+        scenario = small_lift(integrator=integrator)
+        parameters = {"stretch": torch.ones(1, dtype=torch.float64)}
+        Objective(scenario, clouds_of(scenario, stretch=1.0))(parameters)

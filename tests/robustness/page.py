@@ -1,0 +1,110 @@
+"""docs/results/robustness.md."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from typing import Any
+
+from diffcloud.evaluation.markdown import markdown_table
+from tests.robustness.faults import COUNTS
+from tests.robustness.isolated import MEGABYTES, SECONDS
+
+_LONGEST = 260
+_HEAD = """# Damaged inputs and faults
+
+`make robustness` makes a small project with the outputs of all stages, damages its files one at a time, and reads each
+with the command that reads it; then it disturbs each command in the middle of its work, and runs it again. A fixed
+sample of both is part of the slow tests. The code is in `tests/robustness/`.
+
+## Damaged files
+
+Each field of a document, each column of a table and each array is, in turn, missing, of the wrong type, NaN, infinite,
+negative, zero, huge, there twice, or nested {levels} deep; and bytes are flipped or cut off at random. Each reading is
+a process of its own, which may take {seconds:.0f} seconds and {gigabytes:.0f} GB. It must end well or with an error of
+this project that names file and field, and leave nothing behind; which of both is decided by a table for every field
+(`tests/robustness/expected.yaml`: what may be taken; the rest must be refused). Flipped bytes may give another good
+file. `episode validate` must find a fault wherever `preprocess` refuses a raw episode.
+"""
+_FAULTS = """
+## Faults
+
+Every command of the pipeline, disturbed at a random moment: killed, interrupted with Ctrl-C, by a disk that is full (no
+file may grow beyond a random size of a hundred bytes to ten kilobytes), by a folder that cannot be written, or by the
+same command started twice. What lies under its final name afterwards must be whole, there must be no traceback and no
+hang, and the same command again must end with the same contents as an undisturbed run, and leave nothing else.
+"""
+_MESSAGES = """
+## Messages
+
+One message of each kind of file, as it was printed.
+"""
+
+
+def page(told: list[dict[str, Any]], sample: int | None) -> str:
+    """Of the results of both suites, or of a sample of so many of each kind of file."""
+    inputs = [one for one in told if one["suite"] == "inputs"]
+    faults = [one for one in told if one["suite"] == "faults"]
+    head = _HEAD.format(levels="100,000", seconds=SECONDS, gigabytes=MEGABYTES / 1000)
+    if sample is not None:
+        head += f"\nThe counts are those of a random sample, at most {sample} of each file.\n"
+    parts = [head, *_inputs(inputs), _FAULTS, *_faults(faults), _MESSAGES, *_messages(inputs)]
+    return "\n".join(parts).rstrip() + "\n"
+
+
+def _inputs(results: list[dict[str, Any]]) -> list[str]:
+    groups = defaultdict(list)
+    for one in results:
+        groups[one["of"]].append(one)
+    rows = [_counted(name, group) for name, group in groups.items()]
+    rows.append(_counted("all", results))
+    heads = [
+        "file",
+        "damages",
+        "refused",
+        "taken",
+        "traceback",
+        "hang or memory",
+        "left over",
+        "not as expected",
+        "longest s",
+    ]
+    return markdown_table(heads, rows)
+
+
+def _counted(name: str, group: list[dict[str, Any]]) -> list[str]:
+    verdicts = Counter(one["verdict"] for one in group)
+    unexpected = sum(one["wrong"] is not None and one["verdict"] in ("taken", "refused") for one in group)
+    counts = [
+        len(group), verdicts["refused"], verdicts["taken"], verdicts["traceback"], verdicts["hang"] + verdicts["memory"],
+        verdicts["left over"], unexpected,
+    ]  # fmt: skip
+    return [name, *map(str, counts), f"{max(one['seconds'] for one in group):.1f}"]
+
+
+def _faults(results: list[dict[str, Any]]) -> list[str]:
+    counts: dict[str, Counter[str]] = defaultdict(Counter)
+    for one in results:
+        counts[one["of"]][one["what"]] += 1
+        counts[one["of"]]["wrong"] += one["wrong"] is not None
+    rows = [[name, *(str(found[key]) for key in (*COUNTS, "wrong"))] for name, found in counts.items()]
+    rows.append(["all", *(str(sum(found[key] for found in counts.values())) for key in (*COUNTS, "wrong"))])
+    return markdown_table(["command", *COUNTS, "not survived"], rows)
+
+
+def _messages(results: list[dict[str, Any]]) -> list[str]:
+    rows = []
+    for name in dict.fromkeys(one["of"] for one in results):
+        refused = [one for one in results if one["of"] == name and one["verdict"] == "refused" and one["where"] != "bytes"]
+        refused = refused or [one for one in results if one["of"] == name and one["verdict"] == "refused"]
+        if refused:
+            one = refused[len(refused) // 3]
+            rows.append([name, f"{one['where']}: {one['what']}", f"{_plain(one['told'])}"])
+    return markdown_table(["file", "damage", "message"], rows)
+
+
+def _plain(text: str) -> str:
+    """Without what differs from one computer to the next, and what would end a cell."""
+    text = text.split("Error: ")[-1]
+    text = re.sub(r"(/\S*)?/(project|tmp)/", "", text).replace("|", "\\|")
+    return text if len(text) <= _LONGEST else text[:_LONGEST] + " …"

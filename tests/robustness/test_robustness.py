@@ -1,0 +1,61 @@
+"""A sample of the damaged inputs and of the faults, the same each time; `make robustness` tries all."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tests.pipeline.invoke import ROOT
+from tests.robustness import damage
+from tests.robustness.isolated import read_alone
+from tests.robustness.kinds import KINDS
+
+pytestmark = pytest.mark.slow
+
+
+def tried(*arguments: object) -> None:
+    command = [sys.executable, "-m", "tests.robustness", *map(str, arguments)]
+    env = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=1500, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr[-3000:]
+
+
+def test_damaged_files_are_taken_or_refused_as_the_table_says():
+    tried("--only", "inputs", "--sample", 7, "--workers", 1)
+
+
+def test_disturbed_commands_end_as_if_nothing_had_been():
+    tried("--only", "faults", "--sample", 1, "--workers", 1)
+
+
+class TestTheSuiteItself:
+    """It must see what it looks for."""
+
+    def read(self, folder, code: str):
+        def run() -> None:
+            exec(code, {})
+
+        return read_alone(folder, run)
+
+    def test_verdicts(self, tmp_path):
+        refused = "from diffcloud.errors import EpisodeError\nraise EpisodeError('no')"
+        assert self.read(tmp_path, "x = 1").verdict == "taken"
+        assert self.read(tmp_path, refused).verdict == "refused"
+        assert self.read(tmp_path, "1 / 0").verdict == "traceback"
+        assert self.read(tmp_path, "import numpy\nx = numpy.ones(2_500_000_000, numpy.int8)").verdict == "memory"
+        assert self.read(tmp_path, f"open('left', 'w').write('x')\n{refused}").verdict == "left over"
+        assert not list(tmp_path.iterdir())
+
+    def test_a_hang_ends(self, tmp_path, monkeypatch):
+        monkeypatch.setattr("tests.robustness.isolated.SECONDS", 0.5)
+        assert self.read(tmp_path, "while True: pass").verdict == "hang"
+
+    def test_every_damage_is_made(self):
+        told = list(damage.document(b'{"a": 1.5, "b": ["x"], "c": {"d": true}}', ".json"))
+        assert {one.field for one in told} == {"a", "b", "b[0]", "c", "c.d"}
+        assert {one.damage for one in told} == set(damage.KINDS)
+        assert any(b'"a": 1.5, ' in one.data and one.data.count(b'"a"') == 2 for one in told if one.damage == "duplicate")
+        assert len({kind.name for kind in KINDS}) == len(KINDS)
