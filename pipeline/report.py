@@ -14,7 +14,7 @@ import typer
 
 import diffcloud
 from diffcloud.errors import ConfigError
-from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, TimingsFile, check_file, check_rows
+from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, TimingsFile, check_file
 from diffcloud.evaluation.summary import tables as comparison_tables
 from diffcloud.fit import read_fit
 from diffcloud.fit.result import read_motion
@@ -53,7 +53,7 @@ def report(
         raise ConfigError(f"No such table: {table}; run `diffcloud evaluate` first.")
     entries = []
     rows = table_rows(table)
-    check_rows(FitRow, table, rows)
+    check_file(list[FitRow], table, rows)
     for known in rows:
         scenario, name = str(known["scenario"]), str(known["episode"])
         path = fit_file(fits, scenario, name)
@@ -92,7 +92,7 @@ def report(
     }
     comparison = _comparison(tables, entries)
     predictions = table_rows(tables / "predictions.csv")
-    check_rows(PredictionRow, tables / "predictions.csv", predictions)
+    check_file(list[PredictionRow], tables / "predictions.csv", predictions)
     page = build_page(
         entries,
         title=config.report.title,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,15 +9,11 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation.intervals import Intervals
-from diffcloud.io.schema import NonNegative, explain
+from diffcloud.io.schema import Checked, NonNegative, explain
 
 Value = Annotated[float, Field(ge=-1e12, le=1e12)]
 Place = Annotated[float, Field(gt=0, le=1e12)]
 Text = Annotated[str, Field(max_length=10_000)]
-
-
-class _Record(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 class _Metrics(BaseModel):
@@ -52,7 +47,7 @@ class TransferRecord(_Metrics):
     clipped: dict[str, Value]
 
 
-class GapRecord(_Record):
+class GapRecord(Checked):
     """A method without a result."""
 
     method: Text
@@ -60,7 +55,7 @@ class GapRecord(_Record):
     expected: bool
 
 
-class LandscapeRecord(_Record):
+class LandscapeRecord(Checked):
     """Losses around a fit."""
 
     names: Annotated[list[Text], Field(min_length=2, max_length=2)]
@@ -79,7 +74,7 @@ class StatedIntervals(Intervals):
     note: Text
 
 
-class ComparisonRecord(_Record):
+class ComparisonRecord(Checked):
     """One episode."""
 
     scenario: Text
@@ -104,7 +99,7 @@ class ComparisonRecord(_Record):
     landscape: LandscapeRecord | None
 
 
-class ComparisonFile(_Record):
+class ComparisonFile(Checked):
     """tables/comparison.json."""
 
     records: list[ComparisonRecord]
@@ -145,24 +140,16 @@ class PredictionRow(BaseModel):
     rms_mm: NonNegative
 
 
-def check_file(model: type[BaseModel], path: Path, content: Any) -> None:
+def check_file(model: Any, path: Path, content: Any) -> None:
     """
+    Args:
+        model: of the content; of a table, a list of the model of its rows.
+
     Raises:
         ConfigError: a file is not as this version's `diffcloud evaluate` writes it; names the field.
     """
     try:
-        model.model_validate(content)
+        TypeAdapter(model).validate_python(content)
     except ValidationError as error:
-        raise explain(
-            f"{path} was not written by this version's `diffcloud evaluate`; run it. There", error, ConfigError
-        ) from error
-
-
-def check_rows(model: type[BaseModel], path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """The same of a table."""
-    try:
-        TypeAdapter(list[model]).validate_python(rows)  # type: ignore[valid-type]
-    except ValidationError as error:
-        raise explain(
-            f"{path} was not written by this version's `diffcloud evaluate`; run it. There", error, ConfigError
-        ) from error
+        told = f"{path} was not written by this version's `diffcloud evaluate`; run it. There"
+        raise explain(told, error, ConfigError) from error

@@ -260,25 +260,24 @@ def _check_motion(path: Path, found: Mapping[str, NDArray[Any]]) -> None:
     Raises:
         ConfigError: an array of another shape or kind than `FittedMotion` has, or numbers that none of it can be.
     """
-    frames, nodes, held, steps = (
-        len(found[key]) if found[key].ndim else 0 for key in ("times", "nodes", "held", "held_times")
-    )
+    frames, held, steps = (found[key].size for key in ("times", "held", "held_times"))
     cloth = found["nodes"].shape[1] if found["nodes"].ndim == 3 else 0
+    bodies = len(np.atleast_1d(found["obstacle_nodes"]))
     shapes = {
         "nodes": (frames, cloth, 3), "start_nodes": (frames, cloth, 3), "faces": (-1, 3), "times": (frames,),
         "obstacle_nodes": (-1, 3), "obstacle_faces": (-1, 3), "held": (held,), "held_times": (steps,),
         "held_nodes": (steps, held, 3),
     }  # fmt: skip
+    points = {"faces": cloth, "obstacle_faces": bodies, "held": cloth}  # among which these arrays choose
+    least = {"faces": 1, "times": 2, "held_times": 2}
     for key, shape in shapes.items():
-        array, indices = found[key], key in ("faces", "obstacle_faces", "held")
-        least = {"faces": 1, "times": 2, "held_times": 2}.get(key, 0)
-        points = len(found["obstacle_nodes"]) if key == "obstacle_faces" else cloth
+        array = found[key]
         right = array.ndim == len(shape) and all(want in (-1, got) for want, got in zip(shape, array.shape, strict=True))
-        right = right and len(array) >= least and array.dtype.kind in ("iu" if indices else "f") and nodes > 0
-        if right and indices:
-            right = not array.size or (array.min() >= 0 and array.max() < points)
+        right = right and len(array) >= least.get(key, 0) and array.dtype.kind in ("iu" if key in points else "f")
+        if right and key in points:
+            right = bool(((array >= 0) & (array < points[key])).all())
         elif right:
-            right = bool(np.isfinite(array).all()) and (not array.size or float(np.abs(array).max()) < _FARTHEST)
+            right = bool((np.abs(array) < _FARTHEST).all())  # no NaN either
         if right and key.endswith("times"):
             right = bool((np.diff(array) > 0).all())
         if not right:

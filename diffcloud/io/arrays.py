@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zipfile
 import zlib
 from collections.abc import Collection
@@ -15,9 +16,11 @@ from diffcloud.errors import DiffCloudError
 
 MOST_BYTES = 1 << 30
 """Of one file's arrays, unpacked."""
-_KINDS = "biufSU"
-"""Of elements: numbers and strings; an object would be a pointer."""
+ELEMENTS = "biufSU"
+"""Kinds of elements that are read: numbers and strings; an object would be a pointer."""
 _DIMENSIONS = 8
+_PIECE = 16 << 20
+"""Bytes that are unpacked at a time, into their place: no array is in memory twice."""
 
 
 def read_npz(
@@ -90,23 +93,36 @@ def _array(stream: BinaryIO, size: int, name: str) -> NDArray[Any]:
         ValueError: its header is none, or states more or less than there is.
     """
     try:
-        version = np.lib.format.read_magic(stream)
-        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read_header(stream)
-    except Exception as damage:  # numpy parses the header as Python, which fails in many ways where it is damaged
+        shape, fortran, dtype = npy_header(stream)
+    except ValueError as damage:
         raise ValueError(f"{name} has no header of an array ({damage})") from damage
-    if dtype.hasobject or dtype.kind not in _KINDS:
+    if dtype.hasobject or dtype.kind not in ELEMENTS:
         raise ValueError(f"{name} holds {dtype} elements, which may be numbers or text")
     there = size - stream.tell()
     if len(shape) > _DIMENSIONS or any(extent < 0 for extent in shape):
         raise ValueError(f"{name} has the shape {list(shape)}")
-    stated = dtype.itemsize
-    for extent in shape:  # Python's numbers do not overflow
-        stated *= extent
+    stated = math.prod(shape) * dtype.itemsize  # of Python's numbers, which do not overflow
     if stated != there:
         raise ValueError(f"{name} states {stated} bytes and has {there}")
-    data = stream.read(there)
-    if len(data) != there:
-        raise ValueError(f"{name} ends after {len(data)} of {there} bytes")
-    flat = np.frombuffer(data, dtype=dtype).copy() if dtype.itemsize else np.zeros(shape, dtype)
+    flat: NDArray[Any] = np.empty(math.prod(shape), dtype)
+    whole, done = flat.view(np.uint8).data if there else memoryview(b""), 0
+    while done < there:
+        got = stream.readinto(whole[done : done + _PIECE])  # type: ignore[attr-defined]
+        if not got:
+            raise ValueError(f"{name} ends after {done} of {there} bytes")
+        done += got
     return flat.reshape(shape, order="F" if fortran else "C")
+
+
+def npy_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """(shape, whether in Fortran's order, elements) of an array that begins here.
+
+    Raises:
+        ValueError: there is no header.
+    """
+    try:
+        version = np.lib.format.read_magic(stream)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        return read_header(stream)
+    except Exception as damage:  # numpy parses the header as Python, which fails in many ways where it is damaged
+        raise ValueError(str(damage)) from damage

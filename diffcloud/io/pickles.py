@@ -19,13 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
+from diffcloud.io.arrays import ELEMENTS, npy_header
 
 _LARGEST_BYTES = 256 * 2**20
 _LARGEST_PICKLE_BYTES = 4 * 2**20
 """The published ones have less than a thousand."""
 _DEEPEST = 16
-_KINDS = "biufSU"
-"""Of array elements: numbers and strings; an object would be a pointer."""
 
 
 def load_npy(path: Path) -> Any:
@@ -48,10 +47,8 @@ def load_npy(path: Path) -> Any:
         raise EpisodeError(f"{path} is empty.")
     stream = io.BytesIO(data)
     try:
-        version = np.lib.format.read_magic(stream)
-        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, kind = read_header(stream)
-    except Exception as error:  # numpy parses the header as Python, which fails in many ways where it is damaged
+        shape, fortran, kind = npy_header(stream)
+    except ValueError as error:
         raise EpisodeError(f"{path} is not a readable .npy file: {error}.") from error
     content = data[stream.tell() :]
     try:
@@ -78,7 +75,7 @@ class _Call:
 def _array(kind: np.dtype[Any], shape: Any, fortran: bool, content: bytes) -> NDArray[Any]:
     """An array of its own memory, if the content is exactly as long as it must be."""
     whole = isinstance(shape, tuple) and all(isinstance(length, int) and length >= 0 for length in shape)
-    if not whole or kind.kind not in _KINDS:
+    if not whole or kind.kind not in ELEMENTS:
         raise _Refused(f"holds an array of {kind} and shape {shape}; only numbers and strings are read")
     if math.prod(shape) * kind.itemsize != len(content):
         wanted = math.prod(shape) * kind.itemsize
@@ -242,6 +239,6 @@ def _dtype_name(call: Any) -> str:
 def _dtype(call: Any) -> np.dtype[Any]:
     """The element type, in the byte order that the state tells."""
     kind = np.dtype(_dtype_name(call))
-    if kind.kind not in _KINDS:
+    if kind.kind not in ELEMENTS:
         raise _Refused(f"holds an array of {kind}; only numbers and strings are read")
     return kind.newbyteorder(">") if call.state and call.state[1] == ">" else kind

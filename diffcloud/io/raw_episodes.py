@@ -340,15 +340,15 @@ def read_robot_log(path: Path) -> RobotLog:
         return np.column_stack([table[name].to_numpy(np.float64) if name in table.columns else empty for name in names])
 
     tool, gripper, wrench = columns(_TOOL), columns(["gripper"])[:, 0], columns(_WRENCH)
-    for told, array, most in (
-        ("tool position", tool[:, :3], _LARGEST),
-        ("quaternion", tool[:, 3:], _LARGEST),
-        ("gripper, 0 open to 1 closed,", gripper, _LARGEST),
-        ("wrench", wrench, _LARGEST),
+    for told, array in (
+        ("tool position", tool[:, :3]),
+        ("quaternion", tool[:, 3:]),
+        ("gripper, 0 open to 1 closed,", gripper),
+        ("wrench", wrench),
     ):
         largest = float(np.abs(array[~np.isnan(array)]).max(initial=0.0))
-        if largest > most:
-            raise EpisodeError(f"{path}: a {told} is {largest:g}; at most {most:g} can be right. Units are {UNITS}.")
+        if largest > _LARGEST:
+            raise EpisodeError(f"{path}: a {told} is {largest:g}; at most {_LARGEST:g} can be right. Units are {UNITS}.")
     if np.nanmin(gripper, initial=0.0) < -0.1:
         raise EpisodeError(f"{path}: the gripper is at {np.nanmin(gripper):g}; it is 0 open to 1 closed.")
     return RobotLog(table["t_s"].to_numpy(np.float64), joints, gripper, tool[:, :3], tool[:, 3:], wrench)

@@ -10,7 +10,6 @@ are sampled when they are needed (`clouds.augmentation`).
 from __future__ import annotations
 
 import re
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +31,7 @@ SPLITS: tuple[Split, ...] = get_args(Split)
 SCHEMA = 1
 _LARGEST_BYTES = 16 * 2**30
 _LATEST_S = 1e6
-_DAMAGE = (ValueError, OSError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
+_DAMAGE = (ValueError, OSError, KeyError, TypeError)
 
 
 Name = Annotated[str, Field(min_length=1, max_length=200)]

@@ -52,7 +52,8 @@ def read_csv(
             warnings.simplefilter("error", pd.errors.ParserWarning)
             kinds = dict.fromkeys(text, str)
             table = pd.read_csv(io.StringIO(content), skipinitialspace=True, dtype=kinds, index_col=False)
-        longest = max((len(str(cell)) for name in table for cell in table[name] if isinstance(cell, str)), default=0)
+        words = table.select_dtypes(exclude=["number", "bool"])
+        longest = max((len(cell) for name in words for cell in words[name] if isinstance(cell, str)), default=0)
         if longest > _LONGEST_CELL:
             raise ValueError(f"a cell has {longest} letters")
         return table

@@ -19,6 +19,11 @@ DIFFCLOUD = [sys.executable, "-m", "pipeline.app"]
 ROOT = Path(__file__).parents[2]
 
 
+def environment() -> dict[str, str]:
+    """Of a process that runs this tree's commands."""
+    return {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+
+
 @dataclass(frozen=True)
 class Invoked:
     """What a command printed."""
@@ -45,8 +50,7 @@ def invoke(*arguments: object, code: int = 0, answer: str | None = None) -> Invo
 
 def run_process(*arguments: object, cwd: Path) -> dict[str, Any]:
     """Run as a person does, with --json; the JSON object."""
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [*DIFFCLOUD, *map(str, arguments), "--json"]
-    done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, cwd=cwd, env=environment(), capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, f"status {done.returncode}\n{done.stdout}\n{done.stderr}"
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))

@@ -22,7 +22,7 @@ from diffcloud.io.obj import read_cloth, read_surface
 from diffcloud.scene.scenarios import load_scenario
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
-from tests.pipeline.invoke import DIFFCLOUD, ROOT, Invoked, invoke
+from tests.pipeline.invoke import DIFFCLOUD, ROOT, Invoked, environment, invoke
 from tests.scene.files import MESHES, over_moving_box, write_file, write_files
 
 SMALL = {
@@ -251,7 +251,7 @@ def test_ctrl_c_stops_fits_in_processes_and_keeps_their_best(work):
     write_episode(work / "e2.npz", replace(moved, points=moved.points + 0.03))  # out of reach
     command = [*DIFFCLOUD, "fit", "--scenario", "small.yaml", "--out", "fits", "--solver", "adam"]
     command += ["--iterations", "1000000", "--workers", "2"]
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    env = environment()
     process = subprocess.Popen(
         [*command, "--threshold", "5e-5", "easy.npz", "e2.npz"], cwd=work, env=env, stderr=subprocess.PIPE, text=True
     )

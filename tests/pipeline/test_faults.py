@@ -4,7 +4,6 @@ the same command again ends with the bytes of an undisturbed one."""
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -20,7 +19,7 @@ from diffcloud.io.episodes import write_episode
 from diffcloud.io.simulated import write_simulated
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
-from tests.pipeline.invoke import DIFFCLOUD, ROOT, invoke, run_process
+from tests.pipeline.invoke import DIFFCLOUD, environment, invoke, run_process
 from tests.pipeline.test_commands import SMALL
 from tests.regressors.simulated import sagging_sheet
 
@@ -80,7 +79,7 @@ def work(tmp_path, monkeypatch):
 
 
 def run_code(code: str, *arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    env = environment()
     command = [sys.executable, "-c", code, *map(str, arguments)]
     return subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=120)
 
@@ -184,7 +183,7 @@ class TestTwoAtOnce:
         invoke(*command)
         undisturbed = contents(work / "out")
         (work / "out").rename(work / "whole")
-        env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+        env = environment()
         with subprocess.Popen(
             [*DIFFCLOUD, *map(str, command)], cwd=work, env=env, stderr=subprocess.PIPE, text=True
         ) as first:
@@ -209,7 +208,7 @@ class TestLostWorkers:
     def test_dask_workers_that_are_killed_are_an_error_with_a_name(self, work):
         invoke(*SET, "--workers", 0, "--out", "out")
         undisturbed = contents(work / "out")
-        env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+        env = environment()
         command = [*DIFFCLOUD, *map(str, SET), "--workers", "2", "--out", "killed"]
         process = subprocess.Popen(command, cwd=work, env=env, stderr=subprocess.PIPE, text=True, start_new_session=True)
         deadline = time.monotonic() + 60

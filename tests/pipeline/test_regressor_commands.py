@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -23,7 +22,7 @@ from diffcloud.regressors.training import train_regressor
 from pipeline.app import app
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
-from tests.pipeline.invoke import DIFFCLOUD, ROOT
+from tests.pipeline.invoke import DIFFCLOUD, environment
 from tests.pipeline.test_commands import SMALL
 from tests.regressors.simulated import sagging_sheet
 from tests.regressors.test_checkpoints import regressor
@@ -123,7 +122,7 @@ def test_a_fit_starts_from_a_prediction_and_the_report_shows_both(work):
 
 def test_an_interrupted_training_goes_on(work):
     options = ("--epochs", "4000", "--patience", "4000")
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    env = environment()
     (work / CHECKPOINT).unlink()
     process = subprocess.Popen([*DIFFCLOUD, *TRAIN, *options], cwd=work, env=env, stderr=subprocess.PIPE, text=True)
     metrics = work / "data/regressors/small/mlp/metrics.json"

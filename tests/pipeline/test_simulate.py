@@ -21,7 +21,7 @@ from diffcloud.io.simulated import SimulatedSet
 from diffcloud.regressors.dataset import Augmentation, CloudDataset
 from pipeline.app import app
 from tests.datasets.test_simulation import contents
-from tests.pipeline.invoke import DIFFCLOUD, ROOT, run_process
+from tests.pipeline.invoke import DIFFCLOUD, ROOT, environment, run_process
 from tests.pipeline.test_commands import SMALL
 
 SET = ("simulate", "--scenario", "small.yaml", "--train", 2 * CHUNK + 8, "--test", 18)
@@ -45,7 +45,7 @@ def whole(work) -> Path:
 
 def interrupted(work: Path, out: str, how: signal.Signals) -> tuple[int, str]:
     """Start a set in one process and stop it after its first chunk: (exit status, standard error)."""
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    env = environment()
     command = [*DIFFCLOUD, *map(str, SET), "--workers", "0", "--out", out]
     process = subprocess.Popen(command, cwd=work, env=env, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     deadline = time.monotonic() + 60

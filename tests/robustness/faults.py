@@ -14,32 +14,20 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from tests.pipeline.invoke import DIFFCLOUD, ROOT
+from tests.pipeline.invoke import DIFFCLOUD, environment
 from tests.robustness.inputs import SEED
+from tests.robustness.kinds import REPORT, STAGES
 
 Disturbance = Literal["kill", "Ctrl-C", "full disk", "read-only", "two at once"]
 COMMANDS = {
-    "episodes": ("episodes --params params.yaml --out data/recorded", "data/recorded"),
-    "preprocess": ("preprocess --params params.yaml --out data/episodes data/recorded", "data/episodes"),
-    "simulate": ("simulate --params params.yaml --scenario small --out data/simulated/small", "data/simulated/small"),
-    "fit": ("fit --params params.yaml --out data/fits data/episodes", "data/fits"),
-    "train": ("train --params params.yaml --data data/simulated --out data/regressors", "data/regressors"),
-    "evaluate": (
-        "evaluate --params params.yaml --fits data/fits --episodes data/episodes --regressors data/regressors "
-        "--simulated data/simulated --out reports",
-        "reports",
-    ),
-    "report": (
-        "report --params params.yaml --fits data/fits --episodes data/episodes --regressors data/regressors "
-        "--tables reports/tables --out page/index.html",
-        "page",
-    ),
+    **STAGES,
+    "report": (REPORT, "page"),
     "rollout": ("rollout --scenario small --out motion/m.npz --obj motion/obj", "motion"),
     "export": ("export data/fits/small/small_hidden1.json --to mujoco --out exported --scenario small", "exported"),
 }
@@ -61,17 +49,6 @@ class Fault:
     seed: int
 
 
-@dataclass(frozen=True)
-class Survived:
-    """What became of it."""
-
-    fault: Fault
-    status: int | None
-    """Of the disturbed run; None: it hung."""
-    told: str
-    wrong: str | None
-
-
 def all_faults() -> list[Fault]:
     return [
         Fault(command, disturbance, seed)
@@ -81,21 +58,17 @@ def all_faults() -> list[Fault]:
     ]
 
 
-def survive(fault: Fault, project: Path, reference: dict[str, Any], usual_s: float) -> Survived:
-    """Disturb a run of a command, then run it again.
+def survive(fault: Fault, project: Path, reference: dict[str, Any], usual_s: float) -> tuple[str | None, str]:
+    """Disturb a run of a command, then run it again: what is wrong with what became of it, and what it printed.
 
     Args:
         project: with the outputs of all stages.
         reference: `contents` of what the command makes undisturbed.
         usual_s: how long that takes.
     """
-    arguments, made = COMMANDS[fault.command]
-    with tempfile.TemporaryDirectory() as folder:
-        work = Path(folder) / "project"
-        shutil.copytree(project, work)
-        shutil.rmtree(work / made, ignore_errors=True)
-        done = _disturbed(fault, work, usual_s)
-        told, status = done
+    made = COMMANDS[fault.command][1]
+    with _without_output(fault.command, project) as work:
+        told, status = _disturbed(fault, work, usual_s)
         wrong = None
         if status is None:
             wrong = "hang"
@@ -106,36 +79,49 @@ def survive(fault: Fault, project: Path, reference: dict[str, Any], usual_s: flo
         else:
             wrong = _half_written(contents(work / made), reference)
         if wrong is None:
-            again = subprocess.run([*DIFFCLOUD, *arguments.split()], **_in(work), timeout=_PATIENCE, check=False)
+            again = _run(fault.command, work)
             if again.returncode != 0:
                 wrong = f"cannot be run again: {again.stderr[-300:]}"
             elif differs := _differs(contents(work / made), reference):
                 wrong = f"another result: {differs}"
             elif left := [path.name for path in (work / made).rglob(".*") if not path.name.endswith(".diffcloud-lock")]:
                 wrong = f"left over: {left}"
-        return Survived(fault, status, told[-400:], wrong)
+        return wrong, told[-400:]
 
 
 def undisturbed(command: str, project: Path) -> tuple[dict[str, Any], float]:
     """What a command makes, and how long it takes."""
-    arguments, made = COMMANDS[command]
+    with _without_output(command, project) as work:
+        began = time.monotonic()
+        _run(command, work).check_returncode()
+        return contents(work / COMMANDS[command][1]), time.monotonic() - began
+
+
+@contextmanager
+def _without_output(command: str, project: Path) -> Iterator[Path]:
+    """A copy of a project that lacks what the command makes."""
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder) / "project"
         shutil.copytree(project, work)
-        shutil.rmtree(work / made, ignore_errors=True)
-        began = time.monotonic()
-        subprocess.run([*DIFFCLOUD, *arguments.split()], **_in(work), timeout=_PATIENCE, check=True)
-        return contents(work / made), time.monotonic() - began
+        shutil.rmtree(work / COMMANDS[command][1], ignore_errors=True)
+        yield work
+
+
+def _run(command: str, work: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(_line(command), **_in(work), timeout=_PATIENCE, check=False)
+
+
+def _line(command: str) -> list[str]:
+    return [*DIFFCLOUD, *COMMANDS[command][0].split()]
 
 
 def _in(work: Path) -> dict[str, Any]:
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    return {"cwd": work, "env": env, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return {"cwd": work, "env": environment(), "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
 
 
 def _disturbed(fault: Fault, work: Path, usual_s: float) -> tuple[str, int | None]:
     """What a run printed, and its exit status."""
-    arguments, made = COMMANDS[fault.command]
+    made, command = COMMANDS[fault.command][1], _line(fault.command)
     draw = random.Random(f"{fault.command} {fault.disturbance} {fault.seed}")
     prepare: Callable[[], None] | None = None
     moment: float | None = None
@@ -155,7 +141,6 @@ def _disturbed(fault: Fault, work: Path, usual_s: float) -> tuple[str, int | Non
             (work / made).mkdir(parents=True)
             (work / made).chmod(0o555)
             prepare = _no_override
-    command = [*DIFFCLOUD, *arguments.split()]
     one = subprocess.Popen(command, **_in(work), start_new_session=True, preexec_fn=prepare)
     other = None
     if fault.disturbance == "two at once":
@@ -237,10 +222,10 @@ def all_of_command(name: str, project: Path, sample: int | None = None) -> list[
     reference, usual_s = undisturbed(name, project)
     results = []
     for fault in faults:
-        found = survive(fault, project, reference, usual_s)
-        verdict = "survived" if found.wrong is None else "not survived"
+        wrong, told = survive(fault, project, reference, usual_s)
+        verdict = "survived" if wrong is None else "not survived"
         results.append({
-            "suite": "faults", "of": name, "where": f"seed {fault.seed}", "what": fault.disturbance, "wrong": found.wrong,
-            "verdict": verdict, "told": found.told,
+            "suite": "faults", "of": name, "where": f"seed {fault.seed}", "what": fault.disturbance, "wrong": wrong,
+            "verdict": verdict, "told": told,
         })  # fmt: skip
     return results

@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from fnmatch import fnmatch
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ def damages(kind: Kind, good: bytes) -> list[Damaged]:
     return [*found, *damage.flipped(good, kind.flips, SEED)]
 
 
+@cache
 def expected() -> dict[str, dict[str, list[str]]]:
     """Kind -> pattern of fields -> damages that make no bad file: a number of that size or sign may stand there, or what is
     missing has a default. All others must be refused. Flipped bytes may be either."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 
 import pytest
 
-from tests.pipeline.invoke import ROOT
+from tests.pipeline.invoke import ROOT, environment
 from tests.robustness import damage
 from tests.robustness.isolated import read_alone
 from tests.robustness.kinds import KINDS
@@ -18,8 +17,7 @@ pytestmark = pytest.mark.slow
 
 def tried(*arguments: object) -> None:
     command = [sys.executable, "-m", "tests.robustness", *map(str, arguments)]
-    env = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=1500, check=False)
+    done = subprocess.run(command, cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=1500, check=False)
     assert done.returncode == 0, done.stdout + done.stderr[-3000:]
 
 
