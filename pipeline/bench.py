@@ -21,20 +21,20 @@ _BATCHES = (1, 16, 64)
 _SIDES = (16, 32, 64)
 _CONTACT_SIDES = (10, 14, 20, 28, 40)
 HEAD = ("scenario", "nodes", "steps", "batch", "forward ms", "forward + backward ms", "forward + 10 tangents ms")
-MATCHING_HEAD = ("frames", "points of a frame, each way", "ms", "ms where a pose beside it is known")
+MATCHING_HEAD = ("frames", "points of a frame, each way", "ms", "ms, given matches of a nearby pose")
 _POINTS = (200, 3500)
-"""Of a frame: what 25 frames have in a fit, and what one frame has."""
+"""Points per frame: in a fit of 25 frames, and in a fit of one."""
 CONTACT_HEAD = ("nodes", "contacts", "free ms per step", "on a sphere ms per step", "µs per contact")
 
 
 def bench(
     scene: SceneFile = None,
-    repeats: Annotated[int, typer.Option(min=1, help="The fastest of these counts.")] = 3,
+    repeats: Annotated[int, typer.Option(min=1, help="Runs of each; the fastest one counts.")] = 3,
     contact: Annotated[bool, typer.Option(help="What contacts cost instead: finer and finer cloths on a sphere.")] = False,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
-    """Time motions of the built-in scenarios, with --scene the published lift too, and comparisons with a recording."""
+    """Time motions of the built-in scenarios, with --scene of the published lift too, and comparisons with a recording."""
     use_threads(threads)
     if contact:
         costs = contact_benchmarks(repeats=repeats)
@@ -44,7 +44,7 @@ def bench(
     published = {} if scene is None else {"release_lift": scene}
     timings, matchings = run_benchmarks(published, repeats=repeats), matching_benchmarks(repeats=repeats)
     show(benchmark_table(timings), json)
-    table = Table(*MATCHING_HEAD, title="Finding who is nearest to whom")
+    table = Table(*MATCHING_HEAD, title="Finding nearest points, both ways")
     for row in matching_rows(matchings):
         table.add_row(*row)
     show(table, json)

@@ -37,7 +37,7 @@ def doctor(
     kept = Table("compiled code", "")
     kept.add_row("folder", compiled["folder"])
     kept.add_row("size", f"{compiled['bytes'] / 1e6:.1f} MB")
-    kept.add_row("built", "yes" if compiled["built"] else "no: at first use, or now by diffcloud doctor --compile")
+    kept.add_row("built", "yes" if compiled["built"] else "no: at first use, or now with diffcloud doctor --compile")
     show(kept, json)
     missing = [check.name for check in checks if check.state != "ok"]
     finish({"checks": [asdict(check) for check in checks], "missing": missing, "compiled": compiled}, json)

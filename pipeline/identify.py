@@ -39,7 +39,7 @@ _BOUNDS = {"stretch": (0.03, 30.0), "bending": (0.03, 30.0), "mass": (0.2, 5.0)}
 _STEPS = 8
 _MOST_STEPS = 64
 _NOISE_PART = 0.5
-"""Of the misfit that noise accounts for, which the distance to finer steps may be."""
+"""Largest distance to the motion with finer steps, as a part of the misfit that noise accounts for."""
 _TRANSFERS, _GAIN = 1.25, 0.5
 _HEAD = "# Found by diffcloud identify, with the reason beside each value. Edit and run the command again to overrule."
 
@@ -47,18 +47,23 @@ _HEAD = "# Found by diffcloud identify, with the reason beside each value. Edit 
 def identify(
     recordings: Annotated[
         list[Path],
-        typer.Argument(help="Of one cloth: folders of numbered clouds with a gripper.csv, raw episodes, or episode files."),
+        typer.Argument(
+            help="Recordings of one cloth: folders of numbered clouds with a gripper.csv, raw episodes, episode files."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder: cloth.yaml, recordings.yaml, fit.json, report.html.")],
     size: Annotated[str | None, typer.Option(help="Sides in metres, such as 0.40x0.30. Default: as seen.")] = None,
-    mass: Annotated[float | None, typer.Option(help="Of the cloth, weighed, in kg per square metre.")] = None,
+    mass: Annotated[float | None, typer.Option(help="Weighed mass of the cloth, in kg per square metre.")] = None,
     parameters: Annotated[
         str | None, typer.Option(help="Comma-separated. Default: stretch,bending, and mass if it was not weighed.")
     ] = None,
     level: Annotated[
-        float | None, typer.Option(min=0.01, max=0.999, help="Share of intervals meant to hold the truth. Default: 0.9.")
+        float | None,
+        typer.Option(min=0.01, max=0.999, help="Share of intervals that should contain the truth. Default: 0.9."),
     ] = None,
-    within: Annotated[float | None, typer.Option(help="Factor within which a parameter counts as identified: 1.5.")] = None,
+    within: Annotated[
+        float | None, typer.Option(help="Factor within which a parameter counts as identified. Default: 1.5.")
+    ] = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
@@ -213,7 +218,7 @@ def _chosen(parameters: str | None, cloth: Mapping[str, Any], mass: float | None
 def _scenarios(
     out: Path, cloth: Mapping[str, Any], layouts: Mapping[str, Mapping[str, Any]], steps: int
 ) -> dict[str, Scenario]:
-    """One a recording, each written to OUT/scenarios/ for other commands."""
+    """One per recording, each written to OUT/scenarios/ for other commands."""
     found = {}
     for name, fields in layouts.items():
         path = out / "scenarios" / f"{name}.yaml"
@@ -256,7 +261,7 @@ def _tell(update: Callable[[float, str], None], steps: int, done: float, text: s
 
 
 def _validation(record: FitRecord, objective: AnyObjective) -> str:
-    """Whether parameters found without a recording explain it."""
+    """Whether parameters fitted without a given recording still explain it."""
     if not isinstance(objective, JointObjective):
         return "One recording: whether its parameters carry over to another is not known."
     held, gains = [], []
@@ -275,7 +280,7 @@ def _validation(record: FitRecord, objective: AnyObjective) -> str:
 
 
 def _motion_of(objective: Objective) -> str:
-    """Recordings whose grippers end within a tenth of their way of each other show one motion."""
+    """What a motion is told by: its last displacement, in whole parts of the largest component."""
     track = objective.track
     if track is None:
         return "scene"

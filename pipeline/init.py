@@ -18,7 +18,7 @@ from diffcloud.io.files import files_in, read_yaml, together, write_text
 from pipeline.console import JsonFlag, errors, finish
 
 _PARAMS = """\
-# What the stages of dvc.yaml are told. A stage runs again when its section or a file that it reads has changed.
+# Settings for the stages of dvc.yaml. A stage runs again when its section or a file that it reads has changed.
 identify:
   options: {options}  # all of `diffcloud identify --help` but --out
 export:
@@ -40,7 +40,7 @@ stages:
       - scenarios:
           persist: true
       - fit.json:
-          persist: true  # the command knows whether it is still that of these recordings
+          persist: true  # the command checks whether it still belongs to these recordings
       - fit.npz:
           persist: true
 
@@ -74,7 +74,7 @@ def init(
 
 
 def _above(folder: Path, name: str) -> Path | None:
-    """The folder, or the nearest one that it lies in, with an entry of that name."""
+    """The folder, or its nearest parent, that has an entry of that name."""
     return next((one for one in (folder.resolve(), *folder.resolve().parents) if (one / name).exists()), None)
 
 
@@ -114,7 +114,7 @@ def _identified(folder: Path) -> FitRecord:
 
 
 def _options(folder: Path, record: FitRecord) -> str:
-    """Of `diffcloud identify`, with which it comes to the same fit."""
+    """Options with which `diffcloud identify` arrives at the same fit."""
     options = ["--parameters", ",".join(record.fitted)]
     if (mass := record.parameters.get("mass")) is not None and mass.fixed:
         try:
