@@ -22,8 +22,8 @@ sample of both is part of the slow tests. The code is in `tests/robustness/`.
 Each field of a document, each column of a table and each array is, in turn, missing, of the wrong type, NaN, infinite,
 negative, zero, huge, duplicated, or nested {levels} levels deep; and bytes are flipped or cut off at random. Each file
 is read in its own process, which may take {seconds:.0f} seconds and {gigabytes:.0f} GB. It must end well or with an
-error of this project that names file and field, and leave nothing behind; which of the two is set for every field in a table
-(`tests/robustness/expected.yaml`: what may be accepted; the rest must be refused). Flipped bytes may happen to give
+error of this project that names file and field, and leave nothing behind; which of the two is set for every field in a
+table (`tests/robustness/expected.yaml`: what may be accepted; the rest must be refused). Flipped bytes may happen to give
 another valid file. `episode validate` must find a fault wherever `preprocess` refuses a raw episode.
 """
 _FAULTS = """
@@ -32,7 +32,8 @@ _FAULTS = """
 Every command of the pipeline, disturbed at a random moment: by a kill, by Ctrl-C, by a full disk (no
 file may grow beyond a random size of a hundred bytes to ten kilobytes), by a folder that cannot be written to, or by a
 second start of the same command. Any output under its final name afterwards must be complete, there must be no
-traceback and no hang, and running the command again must end with the same contents as an undisturbed run, and leave nothing else.
+traceback and no hang, and running the command again must end with the same contents as an undisturbed run, and leave
+nothing else.
 """
 _MESSAGES = """
 ## Messages
