@@ -13,7 +13,7 @@ import torch
 import typer
 import yaml
 
-from diffcloud.errors import ConfigError, EpisodeError
+from diffcloud.errors import ConfigError, DiffCloudError, EpisodeError
 from diffcloud.evaluation.intervals import LEVEL, WITHIN, Intervals, significant, state_intervals
 from diffcloud.evaluation.methods import space_of
 from diffcloud.evaluation.summary import largest_sources
@@ -26,7 +26,8 @@ from diffcloud.io.files import claimed, read_yaml, together, write_json, write_t
 from diffcloud.io.imports import cloud_folder
 from diffcloud.report import EpisodeEntry, build_page
 from diffcloud.scene.scenarios import Scenario, load_scenario
-from diffcloud.scene.scenarios.layout import Found, find_layout, found_size, node_counts
+from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
+from diffcloud.scene.scenarios.layout import FIELDS, Found, find_layout, found_size, node_counts
 from diffcloud.sim.threads import use_threads
 from pipeline.config import Config, FitConfig
 from pipeline.console import JsonFlag, Threads, errors, finish, progress_bar, warn
@@ -36,6 +37,7 @@ from pipeline.preprocess import PreprocessJob
 _DENSITY = 0.16
 _MATERIAL = {"stretching_n_m": 60.0, "bending_n_m": 1e-5, "poisson": 0.3}
 _BOUNDS = {"stretch": (0.03, 30.0), "bending": (0.03, 30.0), "mass": (0.2, 5.0)}
+_CLOTH_FIELDS = ("base", "size_m", "nodes", "material", "steps_per_frame")
 _STEPS = 8
 _MOST_STEPS = 64
 _NOISE_PART = 0.5
@@ -75,12 +77,9 @@ def identify(
     if mass is not None and not (0 < mass < math.inf):
         raise ConfigError(f"--mass is in kg per square metre, above 0, got {mass:g}.")
     stated = None if size is None else _sides(size)
-    names = _names(recordings)
     out.mkdir(parents=True, exist_ok=True)
     with claimed(out):
-        episodes = {name: _read(path, name, out) for name, path in names.items()}
-        cloth = _cloth(out, episodes, stated, mass)
-        layouts = _layouts(out, episodes, names, cloth)
+        episodes, cloth, layouts = find_scene(recordings, out, stated, mass)
         chosen = _chosen(parameters, cloth, mass)
         record, objective, job = _fitted(out, episodes, cloth, layouts, chosen)
         found = state_intervals(objective, space_of(record), record.fitted, level=level, within=within)
@@ -92,6 +91,24 @@ def identify(
         errors.print(line, soft_wrap=True)
     errors.print(f"Wrote {out / 'report.html'}, {out / 'fit.json'}.")
     finish(_result(record, found, findings), json)
+
+
+def find_scene(
+    recordings: Sequence[Path], out: Path, size: tuple[float, float] | None, mass: float | None
+) -> tuple[dict[str, Episode], dict[str, Any], dict[str, dict[str, Any]]]:
+    """Read the recordings, and find or read what cloth.yaml and recordings.yaml say of them.
+
+    Returns:
+        Recording -> episode, the cloth's fields of a scenario, and recording -> its own.
+
+    Raises:
+        EpisodeError: a recording that cannot be used.
+        ConfigError, SceneError: one of both files says what cannot be.
+    """
+    names = _names(recordings)
+    episodes = {name: _read(path, name, out) for name, path in names.items()}
+    cloth = _cloth(out, episodes, size, mass)
+    return episodes, cloth, _layouts(out, episodes, names, cloth)
 
 
 def _sides(text: str) -> tuple[float, float]:
@@ -140,7 +157,12 @@ def _cloth(
     """The fields of cloth.yaml: read if it is there, else found and written."""
     path = out / "cloth.yaml"
     if path.is_file():
-        return _fields(path)
+        fields = _fields(path)
+        _refuse_missing(fields, _CLOTH_FIELDS, str(path))
+        own_options(fields, "cloth", path, folder=out)
+        if isinstance(fields.get("material"), str) and fields["material"].endswith(".json"):
+            fields["material"] = str((out / fields["material"]).resolve())  # scenarios are written to another folder
+        return fields
     size, reason = stated, "as stated"
     if size is None:
         sides = np.array([found_size(episode) for episode in episodes.values()])
@@ -170,8 +192,17 @@ def _layouts(
     size = (float(cloth["size_m"][0]), float(cloth["size_m"][1]))
     blocks, layouts = [path.read_text().rstrip()] if known else [_HEAD], {}
     for name, episode in episodes.items():
-        if isinstance(known.get(name), dict):
+        if name in known:
+            if not isinstance(known[name], dict):
+                raise ConfigError(f"{path}: {name} must be a mapping of a scenario's fields, got {known[name]!r:.60}.")
             layouts[name] = dict(known[name])
+            _refuse_missing(layouts[name], FIELDS, f"{path}: {name}")
+            where = f"{out / 'cloth.yaml'} with {name} of {path}"
+            options = own_options({**cloth, **layouts[name]}, name, where, folder=out)
+            try:
+                make_scenario(options)
+            except DiffCloudError as error:
+                raise ConfigError(f"{where}: {error}") from error
             continue
         try:
             layout = find_layout(episode, size)
@@ -184,6 +215,13 @@ def _layouts(
         blocks.append("\n".join([f"{name}:", *(f"  {line}" for line in lines)]))
     write_text(path, "\n".join(blocks) + "\n")
     return layouts
+
+
+def _refuse_missing(fields: Mapping[str, Any], needed: Sequence[str], where: str) -> None:
+    """A built-in's own value would stand in for what is missing, and nobody would know."""
+    missing = [name for name in needed if name not in fields]
+    if missing:
+        raise ConfigError(f"{where} lacks {', '.join(missing)}. Put it back, or remove the whole to have it found anew.")
 
 
 def _fields(path: Path) -> dict[str, Any]:

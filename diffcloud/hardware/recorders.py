@@ -18,6 +18,11 @@ from diffcloud.io.raw_episodes import RawEpisodeWriter, RobotSample
 _QUEUED_FRAMES = 64
 _QUEUED_ROWS = 1500
 """Half a minute of the arm's readings."""
+_OVERDUE_S = 0.5
+"""Beyond the timeout that a driver was given: it does not keep to it, and hangs."""
+_WATCH_S = 0.1
+_AHEAD_S = 1.0
+"""No frame was taken later than now; clocks that are tied to each other differ by milliseconds."""
 
 
 class Clock:
@@ -90,10 +95,19 @@ class Recorders:
             self._arm.join()
 
     def wait(self, seconds: float) -> None:
-        self._failed.wait(seconds)
-        self.raise_failure()
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._failed.wait(min(left, _WATCH_S))
+            self.raise_failure()
 
     def raise_failure(self) -> None:
+        """Of any recorder, the first.
+
+        Raises:
+            DiffCloudError: what a camera or the disk raised, or that a camera's driver hangs.
+        """
+        for camera in self._cameras:
+            camera.check_driver()
         if self._failed.is_set():
             for recorder in self._all():
                 if recorder.error is not None:
@@ -121,28 +135,50 @@ class _CameraRecorder:
         self._keep_every, self._timeout_s = keep_every, timeout_s
         self._failed, self._ending = failed, threading.Event()
         self._frames: queue.Queue[CameraFrame | None] = queue.Queue(_QUEUED_FRAMES)
-        self._threads = [
+        self._asked: float | None = None
+        """time.monotonic() when the driver was last asked for a frame; None while it is not."""
+        self._taker, self._writing = (
             threading.Thread(target=target, name=f"{camera.name}{target.__name__}", daemon=True)
             for target in (self._take, self._write)
-        ]
+        )
 
     def start(self) -> None:
-        for thread in self._threads:
-            thread.start()
+        self._taker.start()
+        self._writing.start()
 
     def end(self) -> None:
         self._ending.set()
 
     def join(self) -> None:
-        for thread in self._threads:
-            if thread.is_alive():
-                thread.join()
+        """What is queued is written. A driver that hangs is left behind: its thread ends with the process."""
+        while self._taker.is_alive() and not self._hangs():
+            self._taker.join(_WATCH_S)
+        if self._taker.is_alive():
+            self._frames.put(None)
+        if self._writing.is_alive():
+            self._writing.join()
+
+    def check_driver(self) -> None:
+        """Notice one that neither delivers nor raises."""
+        if self.error is None and self._hangs():
+            self._fail(
+                HardwareError(
+                    f"Camera {self._camera.name}: its driver has not come back for {self._timeout_s + _OVERDUE_S:g} s, "
+                    f"though it was given {self._timeout_s:g} s: it hangs. Reconnect the camera."
+                )
+            )
+
+    def _hangs(self) -> bool:
+        asked = self._asked
+        return asked is not None and time.monotonic() - asked > self._timeout_s + _OVERDUE_S
 
     def _take(self) -> None:
         count, last = 0, 0.0
         try:
             while not self._ending.is_set():
+                self._asked = time.monotonic()
                 frame = self._camera.read(self._timeout_s)
+                self._asked = None
                 t = self._clock.of(frame.time_s)
                 if count == 0 and t < 0:  # left over from before the start
                     continue
@@ -150,6 +186,11 @@ class _CameraRecorder:
                     raise HardwareError(
                         f"Camera {self._camera.name}: its clock ran backwards by {last - t:.3f} s; frames cannot be placed "
                         "in time."
+                    )
+                if t > self._clock.now() + _AHEAD_S:
+                    raise HardwareError(
+                        f"Camera {self._camera.name}: its clock is ahead by {t - self._clock.now():.3g} s; frames cannot "
+                        "be placed in time."
                     )
                 last = t
                 if count % self._keep_every == 0:
@@ -159,8 +200,9 @@ class _CameraRecorder:
             self._fail(HardwareError(f"Camera {self._camera.name}: the disk cannot keep up; lower the frame rate."))
         except Exception as error:  # whatever a driver raises must end the capture, not only this thread
             if not self._ending.is_set():
-                self._fail(error if isinstance(error, DiffCloudError) else HardwareError(f"{self._camera.name}: {error}"))
+                self._fail(_named(f"Camera {self._camera.name}", error))
         finally:
+            self._asked = None
             self._frames.put(None)
 
     def _write(self) -> None:
@@ -170,9 +212,9 @@ class _CameraRecorder:
                 continue
             try:
                 self._writer.add_frame(self._camera.name, self._clock.of(frame.time_s), frame.depth, frame.color)
-            except DiffCloudError as error:
+            except Exception as error:  # whatever an encoder or the disk raises
                 refused = True
-                self._fail(error)
+                self._fail(_named(f"Camera {self._camera.name}, writing a frame", error))
 
     def _fail(self, error: DiffCloudError) -> None:
         if self.error is None:
@@ -218,6 +260,11 @@ class _ArmRecorder:
                 continue
             try:
                 self._writer.add_robot(*(row for row in rows if row is not None))
-            except DiffCloudError as error:
-                refused, self.error = True, error
+            except Exception as error:
+                refused, self.error = True, _named("Writing robot.csv", error)
                 self._failed.set()
+
+
+def _named(where: str, error: Exception) -> DiffCloudError:
+    """An error of this project; another one with its type, which a driver's text alone does not tell."""
+    return error if isinstance(error, DiffCloudError) else HardwareError(f"{where}: {type(error).__name__}: {error}")

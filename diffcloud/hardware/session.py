@@ -153,7 +153,7 @@ def capture(
             return CaptureReport(writer.folder, writer.frame_counts, writer.robot_rows, clock.now(), largest)
     finally:
         for camera in opened:
-            with suppress(HardwareError):
+            with suppress(Exception):  # the next one must be closed whatever this driver raises
                 camera.close()
 
 

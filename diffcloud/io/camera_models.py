@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from diffcloud.errors import DiffCloudError, EpisodeError, unknown_name
-from diffcloud.io.schema import Checked, Component, explain
+from diffcloud.errors import EpisodeError, unknown_name
+from diffcloud.io.schema import Checked, Component
 
 Pixels = Annotated[int, Field(ge=1, le=20_000)]
 
@@ -100,18 +100,6 @@ class IntrinsicsFile(Checked):
             raise ValueError(str(error)) from error
 
 
-def read_intrinsics(value: Any, where: str, error: type[DiffCloudError] = EpisodeError) -> Intrinsics:
-    """From the JSON of a file that is not this project's own.
-
-    Raises:
-        error: a field is missing, unknown or wrong; the message starts with `where`.
-    """
-    try:
-        return IntrinsicsFile.model_validate(value).intrinsics()
-    except ValidationError as damage:
-        raise explain(f"{where}: intrinsics", damage, error) from damage
-
-
 def square(rows: list[list[float]], size: int) -> NDArray[np.float64]:
     """[n, n] of rows.
 
@@ -140,15 +128,3 @@ def _rigid(rows: list[list[float]]) -> list[list[float]]:
 
 RigidTransform = Annotated[list[list[Component]], AfterValidator(_rigid)]
 """[4, 4], from camera to world [m]."""
-
-
-def read_transform(value: Any, where: str, error: type[DiffCloudError] = EpisodeError) -> NDArray[np.float64]:
-    """[4, 4] rigid transform from JSON.
-
-    Raises:
-        error: not 4 x 4 finite numbers, not a rotation, or a translation of more than 20 m (millimetres).
-    """
-    try:
-        return np.array(TypeAdapter(RigidTransform).validate_python(value))
-    except ValidationError as damage:
-        raise explain(where, damage, error) from damage

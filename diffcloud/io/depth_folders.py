@@ -10,15 +10,18 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Annotated, Self
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from diffcloud.errors import EpisodeError
-from diffcloud.io.camera_models import read_intrinsics, read_transform
+from diffcloud.io.camera_models import Intrinsics, IntrinsicsFile, Pixels
 from diffcloud.io.files import files_in, read_json
 from diffcloud.io.images import decode_color, read_depth
-from diffcloud.io.raw_episodes import CameraInfo, first_backwards, read_timestamps
+from diffcloud.io.raw_episodes import CameraFile, CameraInfo, Name, first_backwards, read_timestamps
 from diffcloud.io.recordings import RecordedFrame, Recording
+from diffcloud.io.schema import Component, explain
 
 _JSON_NAMES = ("camera.json", "intrinsics.json", "camera_intrinsic.json", "intrinsic.json")
 
@@ -55,22 +58,49 @@ def _camera(folder: Path, name: str) -> CameraInfo:
     if path is None:
         raise EpisodeError(f"{folder} has none of {', '.join(_JSON_NAMES)}; the intrinsics must be stated.")
     data = read_json(path, error=EpisodeError)
-    if not isinstance(data, dict):
-        raise EpisodeError(f"{path} must be a JSON object.")
+    kind = _Open3DCamera if isinstance(data, dict) and "intrinsic_matrix" in data else _OwnCamera
     try:
-        if "intrinsic_matrix" in data:
-            matrix = np.asarray(data["intrinsic_matrix"], dtype=np.float64).reshape(3, 3).T
-            held = {"width": data["width"], "height": data["height"], "fx": matrix[0, 0], "fy": matrix[1, 1]}
-            intrinsics = read_intrinsics({**held, "cx": matrix[0, 2], "cy": matrix[1, 2]}, str(path))
-            scale = 1 / float(data.get("depth_scale", 1000.0))  # Open3D: units per metre
-        else:
-            intrinsics = read_intrinsics(data["intrinsics"], str(path))
-            scale = float(data["depth_scale_m"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise EpisodeError(f"{path}: a field is missing or wrong: {error!r}.") from error
-    pose = data.get("T_world_camera")
-    place = None if pose is None else read_transform(pose, f"{path}: T_world_camera")
-    return CameraInfo(name, str(data.get("serial", data.get("serial_number", name))), intrinsics, scale, place)
+        told = kind.model_validate(data)
+        return told.camera(name)
+    except ValidationError as error:
+        raise explain(path, error, EpisodeError) from error
+
+
+class _OwnCamera(CameraFile):
+    """camera.json as in raw episodes; its folder names the camera where it does not say its serial number."""
+
+    serial: Name | None = None  # type: ignore[assignment]
+
+    def camera(self, name: str) -> CameraInfo:
+        place = None if self.T_world_camera is None else np.array(self.T_world_camera)
+        return CameraInfo(name, self.serial or name, self.intrinsics.intrinsics(), self.depth_scale_m, place)
+
+
+class _Open3DCamera(BaseModel):
+    """Other fields, of which Open3D writes many, are not looked at."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+    width: Pixels
+    height: Pixels
+    intrinsic_matrix: Annotated[list[Component], Field(min_length=9, max_length=9)]
+    """Column by column."""
+    depth_scale: Annotated[float, Field(ge=50, le=1e6)] = 1000.0
+    """Units per metre."""
+    serial_number: Name | None = None
+
+    @model_validator(mode="after")
+    def _is_a_camera(self) -> Self:
+        self.intrinsics()
+        return self
+
+    def intrinsics(self) -> Intrinsics:
+        fx, _, _, _, fy, _, cx, cy, _ = self.intrinsic_matrix
+        held = {"width": self.width, "height": self.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+        return IntrinsicsFile.model_validate(held).intrinsics()
+
+    def camera(self, name: str) -> CameraInfo:
+        return CameraInfo(name, self.serial_number or name, self.intrinsics(), 1 / self.depth_scale)
 
 
 def _times(folder: Path, numbers: list[int], rate_hz: float | None) -> dict[int, float]:

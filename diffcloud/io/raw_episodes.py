@@ -85,9 +85,17 @@ def _plain_word(name: str) -> str:
 
 
 def _depth_scale(scale: float) -> float:
+    """
+    Raises:
+        ValueError: of no depth camera.
+    """
     if not 1e-6 <= scale <= 0.02:
         raise ValueError("it is metres per unit of the image, for a D435 0.001 (one millimetre)")
     return scale
+
+
+DepthScale = Annotated[float, AfterValidator(_depth_scale)]
+"""[m] for each unit of a depth image."""
 
 
 class CameraFile(Checked):
@@ -96,7 +104,7 @@ class CameraFile(Checked):
     name: Name | None = None
     serial: Name
     intrinsics: IntrinsicsFile
-    depth_scale_m: Annotated[float, AfterValidator(_depth_scale)]
+    depth_scale_m: DepthScale
     T_world_camera: RigidTransform | None = None
     calibration: FileName | None = None
 

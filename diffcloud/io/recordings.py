@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
+from diffcloud.io.files import staged
 from diffcloud.io.raw_episodes import (
     CameraInfo,
     RawEpisodeWriter,
@@ -71,6 +72,21 @@ def write_recording(
     if first is None:
         raise EpisodeError(f"{recording.source}: no depth image was found.")
     start = first.time_s
+    if Path(folder).exists():
+        raise EpisodeError(f"{folder} exists; raw episodes are never overwritten. Choose another name.")
+    with staged(folder) as temporary:
+        return _written(temporary, recording, chain([first], frames), start, rate_hz, meta)
+
+
+def _written(
+    folder: Path,
+    recording: Recording,
+    frames: Iterator[RecordedFrame],
+    start: float,
+    rate_hz: float | None,
+    meta: Mapping[str, Any] | None,
+) -> dict[str, int]:
+    """The episode in this folder; frames by camera."""
     robot = recording.robot
     joint_count = 7 if robot is None else robot.joints_rad.shape[1]
     writer = RawEpisodeWriter(
@@ -87,7 +103,7 @@ def write_recording(
     with writer:
         for sample in [] if robot is None else _samples(robot, start):
             writer.add_robot(sample)
-        for frame in chain([first], frames):
+        for frame in frames:
             before = latest.get(frame.camera)
             if before is not None and frame.time_s <= before:
                 raise EpisodeError(
@@ -97,9 +113,10 @@ def write_recording(
                 )
             latest[frame.camera] = frame.time_s
             writer.add_frame(frame.camera, frame.time_s - start, frame.depth, frame.color)
-        counted = writer.frame_counts[first.camera] - 1
+        first = next(iter(latest))
+        counted = writer.frame_counts[first] - 1
         if not rate_hz and counted:
-            writer.state_rate(round(counted / (latest[first.camera] - start), 3))
+            writer.state_rate(round(counted / (latest[first] - start), 3))
     return writer.frame_counts
 
 

@@ -29,6 +29,9 @@ _LARGEST_MESH = 64 * 2**20
 _MESH_FORMATS = (".dae", ".obj", ".ply", ".stl")
 _LARGEST_M = 10.0
 """No link is larger: one that is has its meshes in millimetres."""
+_LARGEST = 1000.0
+"""[m or rad] Of any number that is used."""
+_ONCE = ("origin", "geometry", "axis", "limit", "mimic", "parent", "child")
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ def read_urdf(path: Path) -> RobotDescription:
     root = _xml(path)
     if root.tag != "robot":
         raise RobotError(f"{path} starts with <{root.tag}>; a URDF starts with <robot>. Run xacro on a .xacro file first.")
+    _refuse_doubles(root, path)
     links = [_text(element, "name", path) for element in root.iterfind("link")]
     doubled = sorted({name for name in links if links.count(name) > 1})
     if doubled or not links:
@@ -220,14 +224,12 @@ def _shape(element: ElementTree.Element, path: Path, loaded: dict[Path, LinkMesh
         mesh = loaded[file]
         scale = _numbers(shape, "scale", "1 1 1", where)
     elif shape.tag == "box":
-        mesh = _of(trimesh.creation.box(extents=_numbers(shape, "size", "", where)))
+        mesh = _of(trimesh.creation.box(extents=_sizes(shape, "size", where, count=3)))
     elif shape.tag == "cylinder":
-        radius, length = (float(_numbers(shape, key, "", where, count=1)[0]) for key in ("radius", "length"))
+        radius, length = (float(_sizes(shape, key, where)[0]) for key in ("radius", "length"))
         mesh = _of(trimesh.creation.cylinder(radius=radius, height=length, sections=32))
     elif shape.tag == "sphere":
-        mesh = _of(
-            trimesh.creation.icosphere(subdivisions=3, radius=float(_numbers(shape, "radius", "", where, count=1)[0]))
-        )
+        mesh = _of(trimesh.creation.icosphere(subdivisions=3, radius=float(_sizes(shape, "radius", where)[0])))
     else:
         raise RobotError(f"{where}: {unknown_name('shape', shape.tag, ('mesh', 'box', 'cylinder', 'sphere'))}")
     return LinkMesh((mesh.vertices * scale) @ pose[:3, :3].T + pose[:3, 3], mesh.faces)
@@ -322,9 +324,28 @@ def _numbers(element: ElementTree.Element, key: str, default: str, where: str, *
         values = np.array(text.split(), dtype=np.float64)
     except ValueError:
         values = np.array([])
-    if len(values) != count or not np.isfinite(values).all():
-        raise RobotError(f"{where}: {key} of <{element.tag}> must be {count} finite numbers, got {text!r}.")
+    if len(values) != count or not (np.abs(values) <= _LARGEST).all():
+        raise RobotError(
+            f"{where}: {key} of <{element.tag}> must be {count} numbers of at most {_LARGEST:g} (m, rad), got {text!r:.60}."
+        )
     return values
+
+
+def _sizes(element: ElementTree.Element, key: str, where: str, *, count: int = 1) -> Floats:
+    values = _numbers(element, key, "", where, count=count)
+    if not (values > 0).all():
+        raise RobotError(f"{where}: {key} of <{element.tag}> must be positive, got {element.get(key)!r}.")
+    return values
+
+
+def _refuse_doubles(root: ElementTree.Element, path: Path) -> None:
+    """Of two, one would be taken in silence."""
+    for element in root.iter():
+        for tag in _ONCE:
+            if len(element.findall(tag)) > 1:
+                raise RobotError(f"{path}: <{element.tag}> {element.get('name', '')} has <{tag}> twice; keep one of both.")
+        if element.tag == "geometry" and len(element) > 1:
+            raise RobotError(f"{path}: a <geometry> holds {len(element)} shapes; it takes one.")
 
 
 def _text(element: ElementTree.Element, key: str, path: Path) -> str:

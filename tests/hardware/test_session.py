@@ -309,6 +309,55 @@ def test_a_camera_whose_clock_runs_backwards_ends_the_capture(tmp_path):
     assert (episode.description["status"], len(episode.cameras["side"].frames)) == ("stopped", 10)
 
 
+def test_a_camera_whose_clock_is_ahead_ends_the_capture(tmp_path):
+    """Such times would be written, and nothing could read the recording again."""
+
+    class Ahead(TestCard):
+        def read(self, timeout_s):
+            frame = super().read(timeout_s)
+            return replace(frame, time_s=frame.time_s + (1e9 if self.delivered > 10 else 0.0))
+
+    with pytest.raises(HardwareError, match=r"Camera side: its clock is ahead by 1e\+09 s"):
+        capture(tmp_path / "e", [Ahead()], seconds=5, settings=QUICK)
+    assert len(read_raw_episode(tmp_path / "e").cameras["side"].frames) == 10
+
+
+def test_a_driver_that_hangs_ends_the_capture(tmp_path):
+    """It neither delivers nor raises; its thread is left behind, what the other camera delivered is kept."""
+    freed = threading.Event()
+
+    class Hanging(TestCard):
+        def read(self, timeout_s):
+            if self.delivered == 5:
+                freed.wait(60)
+            return super().read(timeout_s)
+
+    arm, began = PointArm(), time.monotonic()
+    settings = replace(QUICK, camera_timeout_s=0.2, hold_s=20.0)
+    with pytest.raises(HardwareError, match=r"Camera side: its driver has not come back for 0\.7 s"):
+        run(tmp_path / "e", arm, cameras=[TestCard("overhead"), Hanging()], settings=settings)
+    assert time.monotonic() - began < 20
+    assert arm.stopped
+    assert len(read_raw_episode(tmp_path / "e").cameras["side"].frames) == 5
+    freed.set()
+
+
+@pytest.mark.parametrize(
+    ("name", "call"), [("Camera side, writing a frame", "add_frame"), ("Writing robot.csv", "add_robot")]
+)
+def test_a_bug_in_a_thread_that_writes_stops_the_arm(tmp_path, monkeypatch, name, call):
+    """Not only errors of this project: a thread that ended in silence would be waited for, for ever."""
+
+    def bug(self, *arguments):
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(RawEpisodeWriter, call, bug)
+    arm = PointArm()
+    with pytest.raises(HardwareError, match=f"{name}: ZeroDivisionError: a bug"):
+        run(tmp_path / "e", arm, path=short_path(0.02, 2.0), settings=replace(QUICK, hold_s=20.0))
+    assert arm.stopped
+
+
 def test_setting_the_time_of_day_changes_nothing(tmp_path, monkeypatch):
     right, start = time.time, time.monotonic()
     monkeypatch.setattr(time, "time", lambda: right() - (3600.0 if time.monotonic() > start + 0.3 else 0.0))

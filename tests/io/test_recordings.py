@@ -96,6 +96,31 @@ def test_folders_of_png(tmp_path):
     assert len(episode.robot.times) == 10
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"depth_scale": 0}, "depth_scale: Input should be greater than or equal to 50"),
+        ({"intrinsic_matrix": [1.0] * 9}, "does not go with"),
+        ({"intrinsic_matrix": [1.0]}, "intrinsic_matrix: List should have at least 9 items"),
+        ({"width": "wide"}, "width: Input should be a valid integer"),
+    ],
+)
+def test_cameras_of_folders_that_no_camera_is(tmp_path, changes, message):
+    folder = as_folders(tmp_path)[0][1]
+    told = json.loads((folder / "camera.json").read_text())
+    (folder / "camera.json").write_text(json.dumps({**told, **changes}))
+    assert message in invoke("import", "recording", folder, "--out", tmp_path / "e", code=1).errors
+
+
+def test_an_import_that_fails_leaves_nothing(tmp_path):
+    folders, _ = as_folders(tmp_path)
+    image = folders[0] / "depth" / "000002.png"
+    image.write_bytes(image.read_bytes()[:-20])
+    before = set(tmp_path.iterdir())
+    assert "is truncated" in invoke("import", "recording", folders[0], "--out", tmp_path / "e", code=1).errors
+    assert set(tmp_path.iterdir()) == before
+
+
 def test_folders_that_are_damaged(tmp_path):
     folders, log = as_folders(tmp_path)
     (folders[0] / "depth" / "000001.png").unlink()

@@ -162,8 +162,17 @@ class TestRefusals:
         (work / "found").mkdir()
         (work / "found" / "cloth.yaml").write_text("[1, 2]")
         assert "must be a mapping" in invoke(*COMMAND, code=1).errors
-        (work / "found" / "cloth.yaml").write_text("size_m: [0.16, 0.12]\nmaterial: denim\n")
+        whole = "base: lift\nsize_m: [0.16, 0.12]\nnodes: [5, 5]\nsteps_per_frame: 8\nmaterial: denim\n"
+        (work / "found" / "cloth.yaml").write_text(whole.replace("nodes: [5, 5]\n", ""))
+        assert "cloth.yaml lacks nodes. Put it back, or remove the whole" in invoke(*COMMAND, code=1).errors
+        (work / "found" / "cloth.yaml").write_text(whole.replace("lift", "vest_hang"))
+        assert "cloth.yaml: size_m: unknown or unsupported field" in invoke(*COMMAND, code=1).errors
+        (work / "found" / "cloth.yaml").write_text(whole)
         assert "stated density_kg_m2" in invoke(*COMMAND, code=1).errors
+        (work / "found" / "recordings.yaml").write_text("first: 3\n")
+        assert "recordings.yaml: first must be a mapping" in invoke(*COMMAND, code=1).errors
+        (work / "found" / "recordings.yaml").write_text("first: {yaw_deg: 10.0}\n")
+        assert "recordings.yaml: first lacks center_m, table_height_m" in invoke(*COMMAND, code=1).errors
 
     def test_two_of_one_name(self, work):
         twice = invoke("identify", "recorded/first", "recorded/first", "--out", "found", code=1)

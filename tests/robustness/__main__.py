@@ -1,4 +1,4 @@
-"""Damaged files of every kind, and every command disturbed: `python -m tests.robustness --out PAGE.md`."""
+"""Damaged files, disturbed commands, and faults of a moving arm: `python -m tests.robustness --out PAGE.md`."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from tests.robustness.arm import all_of_arm
 from tests.robustness.faults import COMMANDS, all_of_command
 from tests.robustness.inputs import all_of
 from tests.robustness.kinds import KINDS, make_project, warm_up
@@ -22,7 +23,7 @@ from tests.robustness.page import page
 
 def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=("inputs", "faults"))
+    parser.add_argument("--only", choices=("inputs", "faults", "arm"), action="append", help="default: all three")
     parser.add_argument("--kind", action="append", choices=[kind.name for kind in KINDS], help="of file; default: all")
     parser.add_argument("--sample", type=int, help="so many of each file and each command, drawn at random; default: all")
     parser.add_argument("--sample-faults", type=int, help="so many of each command; default: as --sample")
@@ -30,21 +31,29 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--log", type=Path, help="JSON lines, one for each, added to what is there")
     parser.add_argument("--out", type=Path, help="page with the counts")
     asked = parser.parse_args(arguments)
+    suites = asked.only or ["inputs", "faults", "arm"]
     told: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory() as folder:
-        project = Path(folder) / "project"
-        project.mkdir()
-        make_project(project)
-        jobs: list[Callable[[], list[dict[str, Any]]]] = []
-        if asked.only != "faults":
-            jobs += [partial(all_of, name, project, asked.sample) for name in asked.kind or [kind.name for kind in KINDS]]
-        if asked.only != "inputs" and not asked.kind:
-            jobs += [partial(all_of_command, name, project, asked.sample_faults or asked.sample) for name in COMMANDS]
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(asked.workers, mp_context=context, initializer=warm_up) as pool:
-            for done in as_completed([pool.submit(job) for job in jobs]):
-                told += done.result()
-                _report(done.result(), asked.log)
+    if {"inputs", "faults"} & set(suites):
+        with tempfile.TemporaryDirectory() as folder:
+            project = Path(folder) / "project"
+            project.mkdir()
+            make_project(project)
+            jobs: list[Callable[[], list[dict[str, Any]]]] = []
+            if "inputs" in suites:
+                jobs += [
+                    partial(all_of, name, project, asked.sample) for name in asked.kind or [kind.name for kind in KINDS]
+                ]
+            if "faults" in suites and not asked.kind:
+                jobs += [partial(all_of_command, name, project, asked.sample_faults or asked.sample) for name in COMMANDS]
+            context = multiprocessing.get_context("spawn")
+            with ProcessPoolExecutor(asked.workers, mp_context=context, initializer=warm_up) as pool:
+                for done in as_completed([pool.submit(job) for job in jobs]):
+                    told += done.result()
+                    _report(done.result(), asked.log)
+    if "arm" in suites and not asked.kind:  # alone: it measures times
+        found = list(all_of_arm(asked.sample_faults or asked.sample))
+        told += found
+        _report(found, asked.log)
     if asked.out is not None:
         asked.out.write_text(page(told, asked.sample), encoding="utf-8")
     return int(any(one["wrong"] for one in told))

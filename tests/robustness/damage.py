@@ -10,6 +10,7 @@ import random
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import yaml
@@ -160,6 +161,41 @@ def _filled(array: np.ndarray, value: float) -> np.ndarray:
     if changed.size:
         changed.reshape(-1)[-1] = np.asarray(value).astype(changed.dtype) if changed.dtype.kind == "f" else int(value)
     return changed
+
+
+def xml(data: bytes) -> Iterator[Damaged]:
+    """Every attribute of an XML file in turn, every element twice, and none, and one far down."""
+    values = {
+        "wrong type": "text", "NaN": "nan", "infinite": "inf", "negative": "-1", "zero": "0", "huge": "1e300",
+        "too long": "9" * _LONG,
+    }  # fmt: skip
+    for place in range(1, len(list(ElementTree.fromstring(data).iter()))):
+        for damage in ("missing", "duplicate", "too deep"):
+            tree = ElementTree.fromstring(data)
+            element = list(tree.iter())[place]
+            parent = next(one for one in tree.iter() if element in list(one))
+            name = f"{element.tag} {element.get('name', place)}"
+            if damage == "duplicate":
+                parent.insert(0, copy.deepcopy(element))
+            else:
+                parent.remove(element)
+                if damage == "too deep":
+                    parent.text = _DEEP
+            deep = f"<{element.tag}>" * _LEVELS + f"</{element.tag}>" * _LEVELS
+            yield Damaged(name, damage, ElementTree.tostring(tree).replace(_DEEP.encode(), deep.encode()))
+        for key in list(ElementTree.fromstring(data).iter())[place].attrib:
+            for damage, value in {**values, "missing": None}.items():
+                tree = ElementTree.fromstring(data)
+                element = list(tree.iter())[place]
+                name = f"{element.tag} {element.get('name', place)}.{key}"
+                parts = element.attrib[key].split()
+                if value is None:
+                    del element.attrib[key]
+                elif element.attrib[key] != (changed := " ".join([value, *parts[1:]])):
+                    element.set(key, changed)
+                else:
+                    continue
+                yield Damaged(name, damage, ElementTree.tostring(tree))
 
 
 def flipped(data: bytes, count: int, seed: int) -> Iterator[Damaged]:

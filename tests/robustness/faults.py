@@ -12,30 +12,69 @@ import resource
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
+
+import psutil
 
 from tests.pipeline.invoke import DIFFCLOUD, environment
 from tests.robustness.inputs import SEED
 from tests.robustness.kinds import REPORT, STAGES
 
-Disturbance = Literal["kill", "Ctrl-C", "full disk", "read-only", "two at once"]
+Disturbance = Literal["kill", "Ctrl-C", "worker killed", "full disk", "read-only", "two at once"]
+_USUAL: Mapping[Disturbance, int] = {"kill": 5, "Ctrl-C": 3, "full disk": 2, "read-only": 1, "two at once": 1}
+_OF_WORKERS: Mapping[Disturbance, int] = {"worker killed": 5}
+_OF_DVC: Mapping[Disturbance, int] = {"kill": 4, "Ctrl-C": 3, "two at once": 1}
+"""Of a full or a read-only disk its own messages tell."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """What is disturbed."""
+
+    line: tuple[str, ...]
+    made: tuple[str, ...]
+    """Folders that it fills."""
+    counts: Mapping[Disturbance, int] = field(default_factory=lambda: _USUAL)
+    """How often it meets each."""
+
+    @staticmethod
+    def of(arguments: str, *made: str, **options: Any) -> Command:
+        return Command((*DIFFCLOUD, *arguments.split()), made, **options)
+
+
 COMMANDS = {
-    **STAGES,
-    "report": (REPORT, "page"),
-    "rollout": ("rollout --scenario small --out motion/m.npz --obj motion/obj", "motion"),
-    "export": ("export data/fits/small/small_hidden1.json --to mujoco --out exported --scenario small", "exported"),
+    **{name: Command.of(*stage) for name, stage in STAGES.items()},
+    "report": Command.of(REPORT, "page"),
+    "rollout": Command.of("rollout --scenario small --out motion/m.npz --obj motion/obj", "motion"),
+    "export": Command.of(
+        "export data/fits/small/small_hidden1.json --to mujoco --out exported --scenario small", "exported"
+    ),
+    "identify": Command.of(
+        "identify data/episodes/small/small_hidden1.npz --out known --parameters stretch --mass 0.2 --threads 1", "known"
+    ),
+    "preprocess, two workers": Command.of(
+        "preprocess --params params.yaml --workers 2 --out twice/episodes twice/recorded",
+        "twice/episodes",
+        counts=_OF_WORKERS,
+    ),
+    "fit, two workers": Command.of(
+        "fit --params params.yaml --workers 2 --out twice/fits twice/given", "twice/fits", counts=_OF_WORKERS
+    ),
+    "dvc repro": Command((sys.executable, "-m", "dvc", "repro"), ("data/fits", "reports"), counts=_OF_DVC),
 }
-"""Command -> arguments and the folder that it fills, in the project of `kinds`."""
-COUNTS: dict[Disturbance, int] = {"kill": 5, "Ctrl-C": 3, "full disk": 2, "read-only": 1, "two at once": 1}
-"""How often each command meets each."""
+"""In the project of `kinds`."""
+DISTURBANCES = get_args(Disturbance)
 _TIMES = ("seconds", "date", "created")
 """Fields of outputs that tell when, or how long."""
+_TELL_TIMES = ("timings.json", "seconds.csv", "seconds.svg", "index.html", "report.html")
+"""Outputs that hold them in places of their own."""
 _PATIENCE = 300.0
 _DAC_OVERRIDE, _DROP_BOUNDING = 1, 24
 
@@ -51,9 +90,9 @@ class Fault:
 
 def all_faults() -> list[Fault]:
     return [
-        Fault(command, disturbance, seed)
-        for command in COMMANDS
-        for disturbance, count in COUNTS.items()
+        Fault(name, disturbance, seed)
+        for name, command in COMMANDS.items()
+        for disturbance, count in command.counts.items()
         for seed in range(count)
     ]
 
@@ -66,53 +105,56 @@ def survive(fault: Fault, project: Path, reference: dict[str, Any], usual_s: flo
         reference: `contents` of what the command makes undisturbed.
         usual_s: how long that takes.
     """
-    made = COMMANDS[fault.command][1]
-    with _without_output(fault.command, project) as work:
+    command = COMMANDS[fault.command]
+    with _without_output(command, project) as work:
         told, status = _disturbed(fault, work, usual_s)
         wrong = None
         if status is None:
             wrong = "hang"
         elif "Traceback" in told or "Unexpected error" in told:
             wrong = "traceback"
-        elif status == 0 and fault.disturbance in ("full disk", "read-only") and _differs(contents(work / made), reference):
+        elif (
+            status == 0 and fault.disturbance in ("full disk", "read-only") and _differs(contents(work, command), reference)
+        ):
             wrong = "ended well, without all outputs"
         else:
-            wrong = _half_written(contents(work / made), reference)
+            wrong = _half_written(contents(work, command), reference)
         if wrong is None:
-            again = _run(fault.command, work)
+            again = _run(command, work)
             if again.returncode != 0:
                 wrong = f"cannot be run again: {again.stderr[-300:]}"
-            elif differs := _differs(contents(work / made), reference):
+            elif differs := _differs(contents(work, command), reference):
                 wrong = f"another result: {differs}"
-            elif left := [path.name for path in (work / made).rglob(".*") if not path.name.endswith(".diffcloud-lock")]:
+            elif left := [name for name in _hidden(work, command) if not name.endswith((".diffcloud-lock", ".gitignore"))]:
                 wrong = f"left over: {left}"
         return wrong, told[-400:]
 
 
-def undisturbed(command: str, project: Path) -> tuple[dict[str, Any], float]:
+def _hidden(work: Path, command: Command) -> list[str]:
+    return [path.name for made in command.made for path in (work / made).rglob(".*")]
+
+
+def undisturbed(command: Command, project: Path) -> tuple[dict[str, Any], float]:
     """What a command makes, and how long it takes."""
     with _without_output(command, project) as work:
         began = time.monotonic()
         _run(command, work).check_returncode()
-        return contents(work / COMMANDS[command][1]), time.monotonic() - began
+        return contents(work, command), time.monotonic() - began
 
 
 @contextmanager
-def _without_output(command: str, project: Path) -> Iterator[Path]:
+def _without_output(command: Command, project: Path) -> Iterator[Path]:
     """A copy of a project that lacks what the command makes."""
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder) / "project"
         shutil.copytree(project, work)
-        shutil.rmtree(work / COMMANDS[command][1], ignore_errors=True)
+        for made in command.made:
+            shutil.rmtree(work / made, ignore_errors=True)
         yield work
 
 
-def _run(command: str, work: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(_line(command), **_in(work), timeout=_PATIENCE, check=False)
-
-
-def _line(command: str) -> list[str]:
-    return [*DIFFCLOUD, *COMMANDS[command][0].split()]
+def _run(command: Command, work: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command.line, **_in(work), timeout=_PATIENCE, check=False)
 
 
 def _in(work: Path) -> dict[str, Any]:
@@ -121,15 +163,15 @@ def _in(work: Path) -> dict[str, Any]:
 
 def _disturbed(fault: Fault, work: Path, usual_s: float) -> tuple[str, int | None]:
     """What a run printed, and its exit status."""
-    made, command = COMMANDS[fault.command][1], _line(fault.command)
+    line, made = COMMANDS[fault.command].line, COMMANDS[fault.command].made[0]
     draw = random.Random(f"{fault.command} {fault.disturbance} {fault.seed}")
     prepare: Callable[[], None] | None = None
     moment: float | None = None
     signalled = signal.SIGKILL
     match fault.disturbance:
-        case "kill" | "Ctrl-C":
+        case "kill" | "Ctrl-C" | "worker killed":
             moment = draw.uniform(0.1, 1.0) * usual_s
-            signalled = signal.SIGKILL if fault.disturbance == "kill" else signal.SIGINT
+            signalled = signal.SIGINT if fault.disturbance == "Ctrl-C" else signal.SIGKILL
         case "full disk":
             limit = int(10 ** draw.uniform(2.0, 4.0))
 
@@ -141,17 +183,21 @@ def _disturbed(fault: Fault, work: Path, usual_s: float) -> tuple[str, int | Non
             (work / made).mkdir(parents=True)
             (work / made).chmod(0o555)
             prepare = _no_override
-    one = subprocess.Popen(command, **_in(work), start_new_session=True, preexec_fn=prepare)
+    one = subprocess.Popen(line, **_in(work), start_new_session=True, preexec_fn=prepare)
     other = None
     if fault.disturbance == "two at once":
         time.sleep(draw.uniform(0.0, 0.5) * usual_s)
-        other = subprocess.Popen(command, **_in(work), start_new_session=True)
+        other = subprocess.Popen(line, **_in(work), start_new_session=True)
     if moment is not None:
         with suppress(subprocess.TimeoutExpired):
             one.wait(moment)
         if one.poll() is None:
             # Ctrl-C reaches all processes of a terminal, a kill by the system one of them
-            os.killpg(one.pid, signalled) if signalled == signal.SIGINT else one.send_signal(signalled)
+            if signalled == signal.SIGINT:
+                os.killpg(one.pid, signalled)
+            else:
+                victims = _workers(one.pid) if fault.disturbance == "worker killed" else []
+                (draw.choice(victims) if victims else one).send_signal(signalled)
     try:
         told = "".join(one.communicate(timeout=_PATIENCE))
         if other is not None:
@@ -167,20 +213,24 @@ def _disturbed(fault: Fault, work: Path, usual_s: float) -> tuple[str, int | Non
     return told, one.returncode
 
 
+def _workers(pid: int) -> list[psutil.Process]:
+    """Children of a process that are computing or waiting for work."""
+    return [child for child in psutil.Process(pid).children() if any("spawn_main" in word for word in child.cmdline())]
+
+
 def _no_override() -> None:
     """For the superuser, too, a folder that is read-only is so."""
     if os.geteuid() == 0:
         ctypes.CDLL(None).prctl(_DROP_BOUNDING, _DAC_OVERRIDE, 0, 0, 0)
 
 
-def contents(folder: Path) -> dict[str, Any]:
+def contents(work: Path, command: Command) -> dict[str, Any]:
     """File -> what is in it, without what tells how long it took, and without what is hidden."""
     found: dict[str, Any] = {}
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts):
-            name = path.relative_to(folder).as_posix()
-            if not name.endswith(("timings.json", "seconds.csv", "seconds.svg", "index.html")):
-                found[name] = _timeless(path)
+    for path in sorted(path for made in command.made for path in (work / made).rglob("*")):
+        name = path.relative_to(work)
+        if path.is_file() and not any(part.startswith(".") for part in name.parts) and path.name not in _TELL_TIMES:
+            found[name.as_posix()] = _timeless(path)
     return found
 
 
@@ -219,7 +269,7 @@ def all_of_command(name: str, project: Path, sample: int | None = None) -> list[
     faults = [fault for fault in all_faults() if fault.command == name]
     if sample is not None and sample < len(faults):
         faults = random.Random(f"{SEED} {name}").sample(faults, sample)
-    reference, usual_s = undisturbed(name, project)
+    reference, usual_s = undisturbed(COMMANDS[name], project)
     results = []
     for fault in faults:
         wrong, told = survive(fault, project, reference, usual_s)

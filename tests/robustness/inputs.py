@@ -29,6 +29,7 @@ def damages(kind: Kind, good: bytes) -> list[Damaged]:
         "document": lambda: damage.document(good, Path(kind.file).suffix),
         "table": lambda: damage.table(good),
         "arrays": lambda: damage.arrays(good),
+        "xml": lambda: damage.xml(good),
         "bytes": lambda: iter(()),
     }
     found = list(forms[kind.form]())

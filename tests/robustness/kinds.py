@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
@@ -23,13 +25,15 @@ from diffcloud.io.obj import read_cloth, write_cloth
 from diffcloud.io.raw_episodes import read_raw_episode
 from diffcloud.io.simulated import SimulatedSet
 from diffcloud.scene.scenarios.catalogue import built_in
+from diffcloud.sensing.robot import Robot
 from diffcloud.sensing.validation.episode import validate_raw_episode
 from pipeline.config import load_config
+from pipeline.identify import find_scene
 from pipeline.report import table_rows
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
 from tests.io.ros_bag import Bag, Habits
-from tests.pipeline.invoke import DIFFCLOUD, environment
+from tests.pipeline.invoke import ROOT, environment
 from tests.scene.files import sheet_over_box, write_file, write_files
 from tests.sensing.table_scene import INTRINSICS, poses
 
@@ -45,6 +49,7 @@ PARAMS = {
     "fit": {"iterations": 2, "screen": 4},
     "train": {"scenarios": ["small"], "models": ["mlp"], "profile": "quick", "epochs": 2, "points": 24},
     "evaluate": {"draws": 1, "rivals": ["middle"], "landscapes": ["small/small_hidden1"], "landscape_size": 3},
+    "report": {},
 }
 _FITTED = "--params params.yaml --fits data/fits --episodes data/episodes --regressors data/regressors"
 STAGES = {
@@ -55,7 +60,7 @@ STAGES = {
     "train": ("train --params params.yaml --data data/simulated --out data/regressors", "data/regressors"),
     "evaluate": (f"evaluate {_FITTED} --simulated data/simulated --out reports", "reports"),
 }
-"""Command -> arguments and the folder that it fills, in the order in which they make a project."""
+"""Command -> arguments and the folder that it fills: the stages of dvc.yaml, one scenario of those that have several."""
 REPORT = f"report {_FITTED} --tables reports/tables --out page/index.html"
 _RAW, _EPISODE = "data/recorded/small/small_hidden1", "data/episodes/small/small_hidden1.npz"
 _CAMERA, _TIMES = f"{_RAW}/cameras/side/camera.json", f"{_RAW}/cameras/side/timestamps.csv"
@@ -68,7 +73,7 @@ class Kind:
     """A kind of file."""
 
     name: str
-    form: Literal["document", "table", "arrays", "bytes"]
+    form: Literal["document", "table", "arrays", "xml", "bytes"]
     file: str
     """Path of the good one in the project."""
     read: Callable[[], object]
@@ -88,8 +93,7 @@ def make_project(folder: Path) -> None:
     told = {key: value for key, value in options.items() if value is not None and key != "name"}
     (folder / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump({"base": "lift", **told}, sort_keys=False))
     (folder / "params.yaml").write_text(yaml.safe_dump(PARAMS))
-    for arguments, _ in STAGES.values():
-        subprocess.run([*DIFFCLOUD, *arguments.split()], cwd=folder, env=environment(), check=True, capture_output=True)
+    _run_pipeline(folder)
     (folder / "full.yaml").write_text(yaml.safe_dump(load_config(folder / "params.yaml").model_dump(mode="json")))
     _write_clouds(folder)
     stated = {
@@ -101,8 +105,28 @@ def make_project(folder: Path) -> None:
     write_file(write_files(folder), sheet_over_box())
     Bag(folder / "recording.bag", "rosbag1", Habits()).write()
     Bag(folder / "recording", "mcap", Habits()).write()
+    for kind, source in (("recorded", folder / "data" / "recorded"), ("given", folder / "data" / "episodes")):
+        shutil.copytree(source, folder / "twice" / kind)
+        one = next((folder / "twice" / kind).rglob("small_hidden1*"))
+        two = one.with_name(one.name.replace("hidden1", "hidden2"))
+        shutil.copytree(one, two) if one.is_dir() else shutil.copy(one, two)
+    find_scene([folder / _EPISODE], folder / "found", None, None)
+    shutil.copy(files("diffcloud.sensing") / "gen3_robotiq_2f_85.urdf", folder / "robot.urdf")
+    shutil.copytree(folder / _RAW / "cameras" / "side" / "depth", folder / "images" / "depth")
+    shutil.copy(folder / _CAMERA, folder / "images" / "camera.json")
     rows = [f"{0.5 * index},{0.4 + 0.05 * index},0.0,{0.3 + 0.02 * index},0.9" for index in range(6)]
     (folder / "path.csv").write_text("\n".join(["t_s,x,y,z,gripper", *rows]) + "\n")
+
+
+def _run_pipeline(folder: Path) -> None:
+    """`dvc repro` of this project's own stages; they do not depend on the code there."""
+    told = yaml.safe_load((ROOT / "dvc.yaml").read_text())
+    for stage in told["stages"].values():
+        stage["deps"] = [path for path in stage.get("deps", []) if not path.startswith(("diffcloud", "pipeline"))]
+    (folder / "dvc.yaml").write_text(yaml.safe_dump({"stages": told["stages"]}, sort_keys=False))
+    for arguments in (["init", "--no-scm"], ["config", "core.analytics", "false"], ["repro"]):
+        line = [sys.executable, "-m", "dvc", *arguments, "--quiet"]
+        subprocess.run(line, cwd=folder, env=environment(), check=True, capture_output=True)
 
 
 def _write_clouds(folder: Path) -> None:
@@ -146,6 +170,12 @@ def _cleaned() -> None:
         raise
 
 
+def _scene_of_recording() -> None:
+    """`identify`, up to its fit."""
+    _, cloth, layouts = find_scene([Path(_EPISODE)], Path("found"), None, None)
+    print(sorted(cloth), sorted(layouts))
+
+
 def _left(model: object, path: str) -> Callable[[], None]:
     """The check of a file that `evaluate` has left."""
     read = read_json if path.endswith(".json") else table_rows
@@ -155,6 +185,7 @@ def _left(model: object, path: str) -> Callable[[], None]:
 _IMPORT = "import clouds {} --gripper gripper.csv --out imported.npz"
 _CAPTURE = command("capture --dry-run --trajectory path.csv --stretch-time 2 --camera a=1 --arm 0 --out e")
 _REPORT = command(REPORT)
+_IMAGES = command("import recording a=images --rate-hz 10 --out imported")
 _LOSS = command(f"evaluate loss {_EPISODE} --scenario small --set stretch=1.0 --threads 1")
 _OF_FIT = command(f"evaluate loss {_EPISODE} --fit {_FIT}.json --scenario small --threads 1")
 _PREDICT = command(f"predict {_EPISODE} --checkpoint {_NETWORK}.safetensors")
@@ -195,6 +226,11 @@ KINDS = (
     *(Kind(f"{name}, reported", form, file, _REPORT, most=12, flips=4, as_of=name)
       for name, form, file in (
           ("fits", "table", _FITS), ("predictions", "table", _PREDICTED), ("comparison", "document", _COMPARED))),
+    Kind("cloth.yaml", "document", "found/cloth.yaml", _scene_of_recording),
+    Kind("recordings.yaml", "document", "found/recordings.yaml", _scene_of_recording),
+    Kind("URDF", "xml", "robot.urdf", lambda: Robot.from_urdf(Path("robot.urdf")), most=200, flips=40),
+    Kind("depth folder, camera", "document", "images/camera.json", _IMAGES),
+    Kind("depth folder, image", "bytes", "images/depth/000001.png", _IMAGES),
     Kind("mesh", "bytes", "cloth.obj", lambda: read_cloth(Path("cloth.obj")), flips=80),
     Kind("ROS bag", "bytes", "recording.bag", command("import recording recording.bag --out imported")),
     Kind("MCAP", "bytes", "recording/recording.mcap", command("import recording recording --out imported")),

@@ -7,15 +7,16 @@ from collections import Counter, defaultdict
 from typing import Any
 
 from diffcloud.evaluation.markdown import markdown_table
-from tests.robustness.faults import COUNTS
+from tests.robustness.arm import STOP_WITHIN_S
+from tests.robustness.faults import DISTURBANCES
 from tests.robustness.isolated import MEGABYTES, SECONDS
 
 _LONGEST = 260
 _HEAD = """# Damaged inputs and faults
 
 `make robustness` makes a small project with the outputs of all stages, damages its files one at a time, and reads each
-with the command that reads it; then it disturbs each command in the middle of its work, and runs it again. A fixed
-sample of both is part of the slow tests. The code is in `tests/robustness/`.
+with the command that reads it; it disturbs each command in the middle of its work, and runs it again; and it lets things
+go wrong while an arm moves. A fixed sample of each is part of the slow tests. The code is in `tests/robustness/`.
 
 ## Damaged files
 
@@ -27,13 +28,23 @@ table (`tests/robustness/expected.yaml`: what may be accepted; the rest must be 
 another valid file. `episode validate` must find a fault wherever `preprocess` refuses a raw episode.
 """
 _FAULTS = """
-## Faults
+## Disturbed commands
 
-Every command of the pipeline, disturbed at a random moment: by a kill, by Ctrl-C, by a full disk (no
-file may grow beyond a random size of a hundred bytes to ten kilobytes), by a folder that cannot be written to, or by a
-second start of the same command. Any output under its final name afterwards must be complete, there must be no
-traceback and no hang, and running the command again must end with the same contents as an undisturbed run, and leave
-nothing else.
+Every command of the pipeline, `identify`, and `dvc repro` itself, disturbed at a random moment: by a kill, by Ctrl-C, by
+the end of one of its worker processes, by a full disk (no file may grow beyond a random size of a hundred bytes to ten
+kilobytes), by a folder that cannot be written to, or by a second start of the same command. Any output under its final
+name afterwards must be complete, there must be no traceback and no hang, and running the command again must end with the
+same contents as an undisturbed run, and leave nothing else.
+"""
+_ARM = """
+## Faults while an arm moves
+
+A capture with two cameras and an arm that moves at 0.1 m/s, over the protocol of the real one. Detection is how long
+after the fault it can be noticed at all: at the next reading of the arm (20 ms), at the next velocity (100 ms), when a
+camera has been silent for its timeout (500 ms here), when a driver has not come back for half a second longer, or when
+the capture has been silent for the watchdog's half second. Where process and link live, Stop must reach the arm within
+{stop:.0f} ms of that; where they do not, the arm's own timeout for a silent link (500 ms) must have stopped it. What was
+recorded until then must be readable.
 """
 _MESSAGES = """
 ## Messages
@@ -43,13 +54,22 @@ One message of each kind of file, as it was printed.
 
 
 def page(told: list[dict[str, Any]], sample: int | None) -> str:
-    """Of the results of both suites, or of a sample of so many of each kind of file."""
+    """Of the results of the suites, or of a sample of so many of each kind of file."""
     inputs = [one for one in told if one["suite"] == "inputs"]
     faults = [one for one in told if one["suite"] == "faults"]
+    arm = [one for one in told if one["suite"] == "arm"]
     head = _HEAD.format(levels="100,000", seconds=SECONDS, gigabytes=MEGABYTES / 1000)
     if sample is not None:
         head += f"\nThe counts are those of a random sample, at most {sample} of each file.\n"
-    parts = [head, *_inputs(inputs), _FAULTS, *_faults(faults), _MESSAGES, *_messages(inputs)]
+    parts = [head]
+    if inputs:
+        parts += _inputs(inputs)
+    if faults:
+        parts += [_FAULTS, *_faults(faults)]
+    if arm:
+        parts += [_ARM.format(stop=1000 * STOP_WITHIN_S), *_arm(arm)]
+    if inputs:
+        parts += [_MESSAGES, *_messages(inputs)]
     return "\n".join(parts).rstrip() + "\n"
 
 
@@ -88,9 +108,23 @@ def _faults(results: list[dict[str, Any]]) -> list[str]:
     for one in results:
         counts[one["of"]][one["what"]] += 1
         counts[one["of"]]["wrong"] += one["wrong"] is not None
-    rows = [[name, *(str(found[key]) for key in (*COUNTS, "wrong"))] for name, found in counts.items()]
-    rows.append(["all", *(str(sum(found[key] for found in counts.values())) for key in (*COUNTS, "wrong"))])
-    return markdown_table(["command", *COUNTS, "not survived"], rows)
+    rows = [[name, *(str(found[key]) for key in (*DISTURBANCES, "wrong"))] for name, found in counts.items()]
+    rows.append(["all", *(str(sum(found[key] for found in counts.values())) for key in (*DISTURBANCES, "wrong"))])
+    return markdown_table(["command", *DISTURBANCES, "not survived"], rows)
+
+
+def _arm(results: list[dict[str, Any]]) -> list[str]:
+    rows = []
+    for one in results:
+        late = "" if one["late_ms"] is None else f"{one['late_ms']:.1f}"
+        kept = "yes" if one["wrong"] is None else one["wrong"]
+        within, counts = f"{1000 * one['detected_s']:.0f}", (str(one["frames"]), str(one["rows"]))
+        rows.append([one["where"], one["what"], within, late, *counts, kept, _plain(one["told"])])
+    heads = ["fault", "stopped by", "detected within ms", "Stop after that, ms", "frames", "rows", "as it must", "message"]
+    right = sum(one["wrong"] is None for one in results)
+    latest = max((one["late_ms"] for one in results if one["late_ms"] is not None), default=0.0)
+    summary = f"{right} of {len(results)} as they must be; the latest Stop came {latest:.0f} ms after the detection."
+    return [*markdown_table(heads, rows), "", summary]
 
 
 def _messages(results: list[dict[str, Any]]) -> list[str]:

@@ -29,6 +29,10 @@ def test_disturbed_commands_end_as_if_nothing_had_been():
     tried("--only", "faults", "--sample", 1, "--workers", 1)
 
 
+def test_a_moving_arm_is_stopped_and_what_was_recorded_is_kept():
+    tried("--only", "arm", "--sample", 12)
+
+
 class TestTheSuiteItself:
     """It must see what it looks for."""
 

@@ -182,7 +182,13 @@ def test_missing_damaged_and_oversized_meshes(tmp_path):
         ('<link name="a"/><joint name="j" type="fixed"><parent link="a"/><child link="x"/></joint>', "no link 'x'"),
         ('<link name="a"/><joint name="j" type="floating"><parent link="a"/><child link="a"/></joint>', "Unknown type"),
         ('<link name="a"/><joint name="j" type="fixed"><parent link="a"/><child link="a"/></joint>', "tree"),
-        ('<link name="a"><visual><geometry><box size="1 2"/></geometry></visual></link>', "3 finite numbers"),
+        ('<link name="a"><visual><geometry><box size="1 2"/></geometry></visual></link>', "3 numbers of at most 1000"),
+        (
+            '<link name="a"><visual><geometry><box size="1 2 0"/></geometry></visual></link>',
+            "positive, got '1 2 0'",
+        ),
+        ('<link name="a"><visual><geometry><sphere radius="1e300"/></geometry></visual></link>', "at most 1000"),
+        ('<link name="a"><visual><geometry/><geometry/></visual></link>', "<visual>  has <geometry> twice"),
         ('<link name="a"><visual><geometry><cone/></geometry></visual></link>', "Unknown shape"),
     ],
 )

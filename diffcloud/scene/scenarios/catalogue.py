@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, overload
 
@@ -101,12 +102,27 @@ def read_options(path: Path) -> Options:
     data = read_yaml(path, error=SceneError, kind="scenario file")
     if not isinstance(data, dict):
         raise SceneError(f"{path}: a scenario is a mapping of fields, got {type(data).__name__}.")
+    return own_options(data, Path(path).stem, path, folder=Path(path).parent)
+
+
+def own_options(fields: Mapping[str, object], name: str, source: object, *, folder: Path) -> Options:
+    """What `read_options` makes of the fields of a file.
+
+    Args:
+        name: of the scenario.
+        source: of the fields, for messages.
+        folder: from which the path of a material is meant.
+
+    Raises:
+        SceneError: an unknown field, or a value out of range.
+    """
+    data = dict(fields)
     base = data.pop("base", "lift")
     if not isinstance(base, str) or base not in _BUILT_IN:
-        raise SceneError(f"{path}: " + unknown_name("base", str(base), _BUILT_IN))
+        raise SceneError(f"{source}: " + unknown_name("base", str(base), _BUILT_IN))
     material = data.get("material")
     if isinstance(material, str) and material.endswith(".json"):
-        data["material"] = str((Path(path).parent / material).resolve())
+        data["material"] = str((folder / material).resolve())
     options = _BUILT_IN[base]
     given = options.model_dump()
     if "loss_frames" in data:
@@ -115,6 +131,6 @@ def read_options(path: Path) -> Options:
         if own in data:
             given.pop(other, None)
     try:
-        return type(options).model_validate({**given, "name": Path(path).stem, **data})
+        return type(options).model_validate({**given, "name": name, **data})
     except ValidationError as error:
-        raise explain(path, error, SceneError) from error
+        raise explain(source, error, SceneError) from error

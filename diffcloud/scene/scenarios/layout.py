@@ -34,6 +34,8 @@ _TRAVEL_M = 0.03
 _CELL_M = 0.034
 _NODES = (5, 13)
 _FEW_POINTS = 100
+FIELDS = ("center_m", "yaw_deg", "table_height_m", "grasped", "rate_hz", "frames", "path")
+"""Of a scenario, those that `find_layout` finds."""
 
 
 @dataclass(frozen=True)

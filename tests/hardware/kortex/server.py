@@ -47,6 +47,8 @@ class FakeArm:
 
     def __init__(self, *, password: str = "admin", start: Any = HOME_M) -> None:
         self.calls: list[tuple[str, Any]] = []
+        self.call_times: list[float] = []
+        """time.monotonic() of each of `calls`."""
         self.twist_times: list[float] = []
         self.sessions: dict[int, Session] = {}
         self.connection_timeouts_ms: list[int] = []
@@ -238,6 +240,7 @@ class FakeArm:
             if name not in ("KeepAlive", "RefreshFeedback", "GetMeasuredGripperMovement"):
                 request = parsed(messages.TwistCommand, frame.payload) if name == "SendTwistCommand" else None
                 self.calls.append((name, request))
+                self.call_times.append(time.monotonic())
             return Frame.build(3, frame.uid, session, frame.number, reply.SerializeToString(), *error)
 
     def _forget_silent_sessions(self) -> None:
