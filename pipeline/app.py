@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shlex
+import signal
 import sys
 import tempfile
+import threading
 import traceback
 from typing import Annotated
 
@@ -72,6 +74,7 @@ def main() -> None:
     # spinning costs tenfold. Said to OpenMP, which reads it when torch is imported, by those commands that need torch.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     keep_freed_memory()
+    sys.unraisablehook = _hear_again
     try:
         app()
     except DiffCloudError as error:
@@ -85,6 +88,17 @@ def main() -> None:
             raise
         say("Error:", _unforeseen(error), style="bold red")
         sys.exit(1)
+
+
+def _hear_again(lost: sys.UnraisableHookArgs) -> None:
+    """Python loses a Ctrl-C that comes in a callback, such as those of the import system: it is pressed once more then."""
+    if isinstance(lost.exc_value, KeyboardInterrupt):
+        # a real signal, which ends a wait of the main thread too
+        again = threading.Timer(0.02, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
+        again.daemon = True
+        again.start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _unforeseen(error: Exception) -> str:

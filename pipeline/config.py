@@ -192,7 +192,7 @@ class FitConfig(Section):
     """Of cma_es and random_search: as many at most; by default 200."""
     threshold: NonNegative | None = None
     points: Count | None = None
-    frames: list[int] | None = None
+    frames: Annotated[list[Annotated[int, Field(ge=-100_000, le=100_000)]], Field(min_length=1)] | None = None
     seed: Seed = 0
     paper: bool = False
     """The published measure: one-sided, squared, at the scenario's loss frames, without a pose, down to its threshold."""

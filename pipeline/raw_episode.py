@@ -23,10 +23,16 @@ def episode() -> None:
 def validate(
     folder: Annotated[Path, typer.Argument(help="Raw episode: holds episode.json, cameras/, robot.csv.")],
     calibration: Annotated[Path | None, typer.Option(help="Calibration file its cameras should be in.")] = None,
+    urdf: Annotated[Path | None, typer.Option(help="Description of the arm whose joints were logged.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Explain each fault of a raw episode; exit status 1 if there is one."""
-    findings = validate_raw_episode(folder, calibration=calibration)
+    robot = None
+    if urdf is not None:
+        from diffcloud.sensing.robot import Robot  # not above: it brings torch, which nothing else here needs
+
+        robot = Robot.from_urdf(urdf)
+    findings = validate_raw_episode(folder, calibration=calibration, robot=robot)
     faults = [finding for finding in findings if finding.severity == "fault"]
     screen = errors if json else output
     for finding in findings:

@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Self
@@ -17,12 +16,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.camera_models import Intrinsics, IntrinsicsFile, Pixels
-from diffcloud.io.files import files_in, read_json
+from diffcloud.io.files import numbered_files, read_json
 from diffcloud.io.images import decode_color, read_depth
 from diffcloud.io.raw_episodes import CameraFile, CameraInfo, Name, first_backwards, read_timestamps
 from diffcloud.io.recordings import RecordedFrame, Recording
 from diffcloud.io.schema import Component, explain
 
+_IMAGES = (".png", ".jpg", ".jpeg")
 _JSON_NAMES = ("camera.json", "intrinsics.json", "camera_intrinsic.json", "intrinsic.json")
 
 
@@ -37,7 +37,7 @@ def depth_folders(folders: Mapping[str, Path], *, rate_hz: float | None = None) 
         EpisodeError: no images, no camera JSON, gaps in the numbers, JPEG depth, no times, or times that run backwards.
     """
     cameras = {name: _camera(Path(folder), name) for name, folder in folders.items()}
-    images = {name: _numbered(Path(folder) / "depth", (".png", ".jpg", ".jpeg")) for name, folder in folders.items()}
+    images = {name: numbered_files(Path(folder) / "depth", _IMAGES, kind="images") for name, folder in folders.items()}
     times = {name: _times(Path(folder), sorted(images[name]), rate_hz) for name, folder in folders.items()}
     order = sorted((times[name][number], name, number) for name in folders for number in images[name])
 
@@ -125,7 +125,7 @@ def _times(folder: Path, numbers: list[int], rate_hz: float | None) -> dict[int,
 
 
 def _colors(folder: Path) -> dict[int, Path]:
-    return _numbered(folder / "color", (".png", ".jpg", ".jpeg")) if (folder / "color").is_dir() else {}
+    return numbered_files(folder / "color", _IMAGES, kind="images") if (folder / "color").is_dir() else {}
 
 
 def _lost_colors(images: Mapping[str, dict[int, Path]], colors: Mapping[str, dict[int, Path]]) -> Iterator[str]:
@@ -136,19 +136,3 @@ def _lost_colors(images: Mapping[str, dict[int, Path]], colors: Mapping[str, dic
                 f"Camera {name}: {len(lost)} of {len(numbers)} frames have no colour image of their number, such as frame "
                 f"{lost[0]}."
             )
-
-
-def _numbered(folder: Path, formats: tuple[str, ...]) -> dict[int, Path]:
-    if not folder.is_dir():
-        raise EpisodeError(f"No such folder of images: {folder}.")
-    found: dict[int, Path] = {}
-    for path in files_in(folder, *formats):
-        match = re.search(r"(\d+)$", path.stem)
-        if match:
-            found[int(match.group(1))] = path
-    if not found:
-        raise EpisodeError(f"{folder} holds no numbered images such as 000000.png.")
-    gaps = sorted(set(range(min(found), max(found) + 1)) - set(found))
-    if gaps:
-        raise EpisodeError(f"{folder}: frames {gaps[:10]} are missing between {min(found)} and {max(found)}.")
-    return found

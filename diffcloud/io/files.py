@@ -14,6 +14,7 @@ import fcntl
 import json
 import math
 import os
+import re
 import shlex
 import shutil
 import socket
@@ -24,18 +25,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 import yaml
 
-from diffcloud.errors import DiffCloudError
+from diffcloud.errors import DiffCloudError, EpisodeError
 
 _MOST_VALUES = 100_000
 """Values that a YAML file may stand for."""
 _MOST_JSON, _MOST_YAML = 50_000_000, 1_000_000
 """Bytes of a file of text that is read as a whole: JSON; YAML, whose reader is slow."""
+_MOST_FRAMES = 100_000_000
 TEMPORARY, LOCK = ".diffcloud-tmp", ".diffcloud-lock"
 """Suffixes of a file that is being written, and of the lock file beside an output that a command holds."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EINVAL}
@@ -297,6 +300,43 @@ def files_in(folder: Path, *suffixes: str) -> list[Path]:
         for path in Path(folder).iterdir()
         if not path.name.startswith(".") and (not suffixes or path.suffix.lower() in suffixes) and path.is_file()
     )
+
+
+def numbered_files(folder: Path, formats: tuple[str, ...], *, kind: str) -> dict[int, Path]:
+    """Data files whose names end in numbers without a gap, by number.
+
+    Args:
+        kind: of file, for messages, such as "clouds".
+
+    Raises:
+        EpisodeError: no such folder or file, two files of one number, or numbers that are missing.
+    """
+    if not Path(folder).is_dir():
+        raise EpisodeError(f"No such folder of {kind}: {folder}.")
+    found: dict[int, Path] = {}
+    for path in files_in(folder, *formats):
+        match = re.search(r"(\d+)$", path.stem)
+        if match is None:
+            continue
+        number = int(match.group(1))
+        if number in found:
+            raise EpisodeError(f"{folder}: {found[number].name} and {path.name} are both frame {number}.")
+        found[number] = path
+    if not found:
+        raise EpisodeError(f"{folder} holds no numbered {kind} ({', '.join(formats)}), such as 000{formats[0]}.")
+    numbers = sorted(found)
+    gaps = [(before, after) for before, after in pairwise(numbers) if after > before + 1]  # not each number in them
+    if numbers[-1] > _MOST_FRAMES:
+        raise EpisodeError(
+            f"{folder}: its files end in numbers such as {numbers[0]} and {numbers[-1]}, which are times and not frames. "
+            "Number them in order from 0, and state the times beside them."
+        )
+    if gaps:
+        missing = [number for before, after in gaps[:10] for number in range(before + 1, min(after, before + 11))][:10]
+        raise EpisodeError(
+            f"{folder}: frames {missing} are missing between {numbers[0]} and {numbers[-1]}; renumber or record again."
+        )
+    return {number: found[number] for number in numbers}
 
 
 def folders_in(folder: Path) -> list[Path]:

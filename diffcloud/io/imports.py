@@ -12,7 +12,7 @@ import numpy as np
 from diffcloud.errors import EpisodeError
 from diffcloud.io.clouds import FORMATS, read_cloud
 from diffcloud.io.episodes import Episode
-from diffcloud.io.files import files_in, folders_in
+from diffcloud.io.files import folders_in, numbered_files
 from diffcloud.io.grippers import read_tracks
 from diffcloud.io.pickles import load_npy
 
@@ -63,7 +63,7 @@ def release_episodes(folder: Path) -> Iterator[tuple[str, str, Episode]]:
             }
             if episode.name in truth:
                 meta["truth"] = _pair(truth[episode.name])
-            frames = [read_cloud(path) for path in _numbered(episode, (".npy",))]
+            frames = [read_cloud(path) for path in numbered_files(episode, (".npy",), kind="clouds").values()]
             times = RELEASE_FRAME_TIME * (np.arange(len(frames), dtype=np.float64) + RELEASE_FOLDERS[scenario][1])
             yield f"release_{scenario}", episode.name, Episode.from_frames(frames, times, meta=meta)
 
@@ -85,7 +85,7 @@ def cloud_folder(
     Raises:
         EpisodeError: no clouds, a gap in the numbers, a bad cloud, or a CSV that does not match.
     """
-    paths = _numbered(Path(folder), FORMATS)
+    paths = list(numbered_files(Path(folder), FORMATS, kind="clouds").values())
     frames = [read_cloud(path) for path in paths]
     tracks = read_tracks(grippers, len(frames)) if grippers else None
     times = None if tracks is None else tracks.times
@@ -97,29 +97,6 @@ def cloud_folder(
     if tracks is None:
         return Episode.from_frames(frames, times, meta=about)
     return Episode.from_frames(frames, times, gripper=tracks.positions, grippers=tracks.names, meta=about)
-
-
-def _numbered(folder: Path, formats: tuple[str, ...]) -> list[Path]:
-    if not folder.is_dir():
-        raise EpisodeError(f"No such folder of clouds: {folder}.")
-    numbers: dict[int, Path] = {}
-    for path in files_in(folder, *formats):
-        match = re.search(r"(\d+)$", path.stem)
-        if match is None:
-            continue
-        number = int(match.group(1))
-        if number in numbers:
-            raise EpisodeError(f"{folder}: {numbers[number].name} and {path.name} are both frame {number}.")
-        numbers[number] = path
-    if not numbers:
-        raise EpisodeError(f"{folder} holds no numbered clouds ({', '.join(formats)}), such as 000.ply, 001.ply.")
-    first, last = min(numbers), max(numbers)
-    gaps = [number for number in range(first, last + 1) if number not in numbers]
-    if gaps:
-        raise EpisodeError(
-            f"{folder}: frames {gaps[:10]} are missing between {first} and {last}; renumber or record again."
-        )
-    return [numbers[number] for number in sorted(numbers)]
 
 
 def _table(path: Path) -> dict[str, Any]:

@@ -108,6 +108,10 @@ def train_regressor(
         KeyboardInterrupt: interrupted; the same call goes on from the last whole epoch.
     """
     began = time.perf_counter()
+    if device == "gpu" and not (torch.cuda.is_available() or torch.backends.mps.is_available()):
+        raise ConfigError(
+            "Torch finds no GPU on this machine. Use --device cpu, or auto, which takes one where there is one."
+        )
     _check_sets(train, test, settings)
     clouds = _Clouds.build(model, train, test, settings)
     centre, length = _centre_and_length(clouds.train)
@@ -169,6 +173,11 @@ def _check_sets(train: SimulatedSet, test: SimulatedSet, settings: TrainingSetti
         raise ConfigError("The train and test draws are of different scenarios or parameters; simulate them together.")
     if len(train) < 2 or len(test) < 4:
         raise ConfigError(f"Training needs at least 2 train and 4 test draws, got {len(train)} and {len(test)}.")
+    if (settings.draws or 2) < 2 or settings.batch_size < 2:
+        raise ConfigError(
+            f"A batch needs at least 2 draws, for its normalisation; got draws {settings.draws}, batch_size "
+            f"{settings.batch_size}."
+        )
     if settings.target == "logarithmic" and (train.bounds <= 0).any():
         raise ConfigError("A logarithmic target needs positive bounds; use target: linear.")
 

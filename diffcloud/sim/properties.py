@@ -84,10 +84,17 @@ class Parameter:
             raise ConfigError(
                 f"{what} is a multiplier: above 0, got {value:g}; the lowest usual value is {self.bounds[0]:g}."
             )
+        if value > _LARGEST or (self.basis is not None and value < 1 / _LARGEST):
+            raise ConfigError(
+                f"{what} is {value:g}; values from {1 / _LARGEST:g} to {_LARGEST:g} are simulated, and from "
+                f"{self.bounds[0]:g} to {self.bounds[1]:g} are usual."
+            )
         if value < 0:
             raise ConfigError(f"{what} must not be negative, got {value:g}; the nearest allowed value is 0.")
 
 
+_LARGEST = 1e6
+"""Of a multiplier; its inverse is the least one. Beyond, arithmetic loses what is added."""
 _MULTIPLIED = (0.1, 10.0)
 PARAMETERS: dict[str, Parameter] = {
     parameter.name: parameter

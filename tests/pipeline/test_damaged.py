@@ -6,20 +6,32 @@ import contextlib
 import json
 import re
 import subprocess
+import sys
+import tracemalloc
+from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 import pipeline.app
 from diffcloud.errors import EpisodeError, MeshError, SceneError
 from diffcloud.io.clouds import read_cloud
 from diffcloud.io.files import read_yaml
+from diffcloud.io.images import decode_depth
 from diffcloud.io.obj import read_surface
+from diffcloud.mesh.topology import ClothMesh
+from diffcloud.scene.description import Scene
+from diffcloud.sensing.validation.episode import validate_raw_episode
+from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import Material, preset
 from diffcloud.sim.motion import axis_angle_quaternion
-from tests.pipeline.invoke import DIFFCLOUD, invoke
+from diffcloud.sim.simulate import rollout
+from diffcloud.sim.surrounding import Surrounding
+from tests.pipeline.invoke import DIFFCLOUD, environment, invoke
+from tests.sensing.table_scene import write_table_episode
 
 SMALL = {"base": "lift", "nodes": [4, 4], "frames": 3, "steps_per_frame": 1}
 
@@ -141,6 +153,95 @@ def test_numbers_out_of_range_are_refused_by_name(work, command):
     assert f"Invalid value for '{command[1]}'" in invoke(*command, code=2).errors
 
 
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("stretch=0", "is a multiplier: above 0, got 0"),
+        ("drag=-100", "is a multiplier: above 0, got -100"),
+        ("body_mass=-1", "is a multiplier: above 0, got -1"),
+        ("mass=1e300", "values from 1e-06 to 1e+06 are simulated"),
+        ("mass=1e-300", "values from 1e-06 to 1e+06 are simulated"),
+        ("damping=1e30", "values from 1e-06 to 1e+06 are simulated"),
+    ],
+)
+def test_parameters_that_no_cloth_has_are_refused(work, value, message):
+    assert message in invoke("rollout", "--scenario", "small.yaml", "--set", value, "--out", "r.npz", code=1).errors
+    assert not (work / "r.npz").exists()
+
+
+def test_no_frames_are_none_to_fit(work):
+    (work / "params.yaml").write_text("fit: {frames: []}\n")
+    said = invoke("fit", "--params", "params.yaml", "--scenario", "small.yaml", "--out", "f", "e.npz", code=1).errors
+    assert "fit.frames: List should have at least 1 item" in said
+
+
+@pytest.mark.parametrize("kind", ["clouds", "images"])
+def test_files_numbered_by_time_are_refused_and_take_no_memory(work, kind):
+    """Two stamps are 33 million numbers apart."""
+    stamps = (1_700_000_000_000_000_000, 1_700_000_000_033_000_000)
+    if kind == "clouds":
+        (work / "clouds").mkdir()
+        for stamp in stamps:
+            np.save(work / "clouds" / f"{stamp}.npy", np.zeros((5, 3)))
+        command = ("import", "clouds", "clouds", "--rate-hz", 10, "--out", "e.npz")
+    else:
+        folder = write_table_episode(work / "raw", frames=2) / "cameras" / "side"
+        for path, stamp in zip(sorted((folder / "depth").iterdir()), stamps, strict=True):
+            path.rename(path.with_name(f"{stamp}.png"))
+        command = ("import", "recording", f"side={folder}", "--rate-hz", 10, "--out", "e")
+    tracemalloc.start()
+    assert "which are times and not frames" in invoke(*command, code=1).errors
+    assert tracemalloc.get_traced_memory()[1] < 100e6
+    tracemalloc.stop()
+
+
+def test_a_png_that_ends_in_its_header_is_refused(tmp_path):
+    for length in range(34):
+        data = b"\x89PNG\r\n\x1a\n\x00\x00\x00\x0dIHDR\x00\x00\x00\x02\x00\x00\x00\x02\x10\x00\x00\x00\x00"[:length]
+        with pytest.raises(EpisodeError, match=r"a\.png"):
+            decode_depth(data, "a.png")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"scene_in_world": {"origin_m": [float("nan"), 0, 0]}}, "NaN is no number"),
+        ({"scene_in_world": {"length_unit_m": 0}}, "length_unit_m: Input should be greater than or equal to 0.001"),
+    ],
+)
+def test_what_preprocess_refuses_is_a_fault_of_the_episode(work, change, message):
+    folder = write_table_episode(work / "raw" / "lift" / "one", frames=2)
+    (folder / "episode.json").write_text(json.dumps({**json.loads((folder / "episode.json").read_text()), **change}))
+    faults = [found.message for found in validate_raw_episode(folder) if found.severity == "fault"]
+    assert any(message in fault for fault in faults), faults
+    assert message in invoke("preprocess", folder, "--out", "cleaned", code=1).errors
+
+
+def test_joints_of_another_arm_are_pointed_out(work):
+    folder = write_table_episode(work / "raw" / "lift" / "one", frames=2)
+    lines = [line.split(",") for line in (folder / "robot.csv").read_text().splitlines()]
+    (folder / "robot.csv").write_text("\n".join(",".join(line[:4]) for line in lines) + "\n")
+    found = {one.code: one for one in validate_raw_episode(folder)}["joint_count"]
+    assert (found.severity, found.message[:29]) == ("warning", "It has 3 joints, the Gen3 7: ")
+    with as_file(files("diffcloud.sensing") / "gen3_robotiq_2f_85.urdf") as urdf:
+        invoke("episode", "validate", folder, "--urdf", urdf, code=1)
+    (work / "params.yaml").write_text("scenarios: [lift]\n")
+    assert "joints" in invoke("preprocess", folder, "--params", "params.yaml", "--out", "cleaned", code=1).errors
+
+
+def test_a_cloth_of_one_face_moves_without_hinges():
+    """And falls as all of it falls."""
+    nodes, face = np.array([[0.0, 0, 1], [0.1, 0, 1], [0, 0.1, 1]]), np.array([[0, 1, 2]])
+    mesh = ClothMesh(nodes, nodes[:, :2], np.arange(3), face)
+    assert not len(mesh.hinges.length)
+    surrounding = Surrounding(air_density=0.0)
+    system = Scene(
+        mesh=mesh, material=preset("denim"), handles=Handles(()), surrounding=surrounding, frame_time=0.1, frame_steps=8
+    ).build()[0]
+    fallen = rollout(system, 8).positions[0, -1] - torch.as_tensor(mesh.nodes)
+    assert fallen[:, 2].numpy() == pytest.approx(np.full(3, -0.5 * 9.81 * 0.1**2), rel=0.15)
+
+
 class TestUnforeseen:
     """An error that nobody foresaw is a fault of the program: one line, and its traceback in a file."""
 
@@ -175,6 +276,27 @@ class TestUnforeseen:
     def test_debug_shows_it(self, told):
         with pytest.raises(KeyError):
             told(KeyError("status"), "--debug", "fit")
+
+    def test_a_ctrl_c_that_python_loses_is_pressed_again(self, tmp_path):
+        """It comes in the callback of a weak reference, from which no exception gets out."""
+        code = """
+import os, signal, time, weakref
+import pipeline.app
+
+class Thing:
+    pass
+
+def work():
+    thing = Thing()
+    weakly = weakref.ref(thing, lambda _: (os.kill(os.getpid(), signal.SIGINT), time.sleep(0.1)))
+    del thing
+    time.sleep(30)
+
+pipeline.app.app = work
+pipeline.app.main()
+"""
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment(), timeout=25)
+        assert (done.returncode, done.stderr.strip()) == (130, "Interrupted.")
 
     def test_debug_stands_before_any_command(self, work):
         done = subprocess.run([*DIFFCLOUD, "--debug", "materials", "--json"], capture_output=True, text=True, check=True)

@@ -10,6 +10,7 @@ import time
 
 import pandas as pd
 import pytest
+import torch
 import yaml
 from click.testing import Result
 from typer.testing import CliRunner
@@ -64,6 +65,18 @@ def work(tmp_path, monkeypatch):
     write_simulated(tmp_path / "sim", sets, about={}, replaced="")
     regressor(scenario="small").write(tmp_path / CHECKPOINT)
     return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [(("--draws", 1), "A batch needs at least 2 draws"), (("--device", "gpu"), "Torch finds no GPU on this machine")],
+)
+def test_trainings_that_cannot_be(work, monkeypatch, options, message):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    before = (work / CHECKPOINT).read_bytes()
+    assert message in str(run(*TRAIN, *options, code=1).exception)
+    assert (work / CHECKPOINT).read_bytes() == before
 
 
 def test_train_then_predict(work):

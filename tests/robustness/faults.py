@@ -229,7 +229,7 @@ def contents(work: Path, command: Command) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for path in sorted(path for made in command.made for path in (work / made).rglob("*")):
         name = path.relative_to(work)
-        if path.is_file() and not any(part.startswith(".") for part in name.parts) and path.name not in _TELL_TIMES:
+        if path.is_file() and not any(part.startswith(".") for part in name.parts) and not name.name.endswith(_TELL_TIMES):
             found[name.as_posix()] = _timeless(path)
     return found
 
@@ -258,9 +258,17 @@ def _differs(found: dict[str, Any], reference: dict[str, Any]) -> str:
 
 def _half_written(found: dict[str, Any], reference: dict[str, Any]) -> str | None:
     """What lies there under its name before its time: it must be as the undisturbed run makes it. Lists of what is done
-    grow, and a command's own log may be shorter."""
+    grow, a command's own log may be shorter, and a fit that Ctrl-C ended is the best so far, and says so."""
     growing = ("manifest.json", "episode.json", "timestamps.csv", "robot.csv", ".tsv", "metrics.json")
-    damaged = [name for name, value in found.items() if value != reference.get(name) and not name.endswith(growing)]
+    ended = {
+        name.removesuffix(".json")
+        for name, value in found.items()
+        if isinstance(value, dict) and value.get("stop_reason") == "interrupted"
+    }
+    damaged = [
+        name for name, value in found.items()
+        if value != reference.get(name) and not name.endswith(growing) and name.rpartition(".")[0] not in ended
+    ]  # fmt: skip
     return f"half-written: {', '.join(damaged)}" if damaged else None
 
 

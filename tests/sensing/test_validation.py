@@ -193,5 +193,5 @@ def test_the_command_explains_and_fails(episode, tmp_path):
     (episode / "cameras/side/depth/000002.png").write_bytes(b"")
     (episode / "robot.csv").write_text("t_s,joint_1\n0,0\n")
     done = invoke("episode", "validate", episode, code=1)
-    assert {finding["code"] for finding in done.result["findings"]} == {"image", "short_robot_log"}
+    assert {finding["code"] for finding in done.result["findings"]} == {"image", "joint_count", "short_robot_log"}
     assert "No such folder" in invoke("episode", "validate", tmp_path / "none", code=1).errors

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,21 +25,27 @@ from diffcloud.io.raw_episodes import (
 from diffcloud.sensing.validation.calibration import calibration_findings, exchanged_cameras
 from diffcloud.sensing.validation.findings import Finding, RecordedCamera
 
+if TYPE_CHECKING:
+    from diffcloud.sensing.robot import Robot
+
 _GAP = 2.5
 """A gap is this many times the median interval."""
 _NEAREST_M, _FARTHEST_M = 0.1, 8.0
 """Median depth of a table-top scene lies between."""
 _LONGEST_REACH_M = 3.0
 """No arm of this kind reaches farther."""
+_GEN3_JOINTS = 7
 _SPARSE = 0.02
 """Fewer valid pixels than this are a warning."""
 
 
-def validate_raw_episode(folder: Path, *, calibration: Path | None = None) -> list[Finding]:
+def validate_raw_episode(folder: Path, *, calibration: Path | None = None, robot: Robot | None = None) -> list[Finding]:
     """All findings about a raw episode, faults first.
 
     Args:
         calibration: a calibration file the cameras should be in; those that camera.json names are read anyway.
+        robot: whose joints robot.csv should have; None where that is not known, which makes another number than the Gen3's
+            a warning.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -74,7 +80,7 @@ def validate_raw_episode(folder: Path, *, calibration: Path | None = None) -> li
         except EpisodeError as error:
             findings.append(Finding("fault", "robot_log", "robot.csv", str(error)))
         else:
-            findings += [*_robot(log), *_coverage(log, cameras)]
+            findings += [*_robot(log), *_joint_count(log, robot), *_coverage(log, cameras)]
     return sorted(findings, key=lambda finding: finding.severity != "fault")
 
 
@@ -281,6 +287,18 @@ def _robot(log: RobotLog) -> Iterator[Finding]:
             worst = int(intervals.argmax())
             message = f"A gap of {intervals[worst]:.3f} s after {log.times[worst]:.3f} s, where {usual:.3f} s is usual."
             yield Finding("warning", "clock_gap", place, message)
+
+
+def _joint_count(log: RobotLog, robot: Robot | None) -> Iterator[Finding]:
+    logged, wanted = log.joints_rad.shape[1], _GEN3_JOINTS if robot is None else len(robot.arm)
+    if logged == wanted:
+        return
+    if robot is None:
+        message = f"It has {logged} joints, the Gen3 {wanted}: give `preprocess` the description of this arm with --urdf."
+        yield Finding("warning", "joint_count", "robot.csv", message)
+    else:
+        message = f"It has {logged} joints, the description {robot.description.name} has {wanted}."
+        yield Finding("fault", "joint_count", "robot.csv", message)
 
 
 def _coverage(log: RobotLog, cameras: list[RecordedCamera]) -> Iterator[Finding]:
