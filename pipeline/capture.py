@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from diffcloud.errors import ConfigError
+from diffcloud.errors import ConfigError, DiffCloudError, LimitError
 from diffcloud.hardware import (
     ArmLimits,
     ArmProcess,
@@ -20,33 +22,64 @@ from diffcloud.hardware import (
     ToolTrajectory,
     capture,
     check_trajectory,
+    conformance,
+    drivers,
     read_trajectory,
 )
+from diffcloud.hardware.arm_limits import ArmChecker
+from diffcloud.hardware.devices import Camera
+from diffcloud.hardware.installed import Check
 from diffcloud.hardware.kinova import KinovaArm
+from diffcloud.hardware.motion import plan_motion
 from diffcloud.hardware.realsense import RealSenseCamera
 from diffcloud.io.calibrations import read_calibration
-from diffcloud.sensing.robot import Robot
-from pipeline.console import JsonFlag, errors, finish, warn
+from diffcloud.sensing.robot import Robot, gen3
+from pipeline.console import JsonFlag, errors, finish, show_checks, warn
 
 
-def open_arm(address: str) -> ArmProcess:
-    """The arm at an address; user and password come from DIFFCLOUD_ARM_USER and DIFFCLOUD_ARM_PASSWORD."""
+def open_arm(address: str, driver: str | None = None) -> ArmProcess:
+    """The arm at an address; a Gen3's user and password come from DIFFCLOUD_ARM_USER and DIFFCLOUD_ARM_PASSWORD."""
+    if driver is not None:
+        return drivers.open_arm(driver, address)
     user, password = (os.environ.get(f"DIFFCLOUD_ARM_{name}", "admin") for name in ("USER", "PASSWORD"))
     return ArmProcess(partial(KinovaArm, address, username=user, password=password))
 
 
-def make_camera(name: str, serial: str, **options: Any) -> RealSenseCamera:
-    """A camera, not yet open."""
-    return RealSenseCamera(name, serial, **options)
+def make_camera(
+    name: str, serial: str, driver: str | None = None, *, record_to: Path | None = None, **options: Any
+) -> Camera:
+    """A camera, not yet open.
+
+    Args:
+        record_to: of a RealSense, where its own SDK records too.
+        options: width, height and fps.
+    """
+    if driver is not None:
+        return drivers.make_camera(driver, name, serial, **options)
+    return RealSenseCamera(name, serial, record_to=record_to, warm_up=options["fps"] // 2, **options)
 
 
 def record(
-    out: Annotated[Path, typer.Option(help="Folder of the episode, such as raw/episodes/lift_tan1; must not exist.")],
-    camera: Annotated[list[str], typer.Option(help="NAME=SERIAL; one or more.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the episode, such as raw/episodes/lift_tan1; must not exist.")
+    ] = None,
+    camera: Annotated[list[str] | None, typer.Option(help="NAME=SERIAL; one or more.")] = None,
     trajectory: Annotated[
         Path | None, typer.Option(help="CSV (t_s, x, y, z[, gripper]) or NPY [T, 3]: tool in the base frame, metres.")
     ] = None,
     arm: Annotated[str | None, typer.Option(help="Address of the arm.")] = None,
+    arm_driver: Annotated[
+        str | None, typer.Option(help="module:Class of an arm that is no Gen3 (docs/drivers.md).")
+    ] = None,
+    camera_driver: Annotated[
+        str | None, typer.Option(help="module:Class of cameras that are no RealSense (docs/drivers.md).")
+    ] = None,
+    check_arm: Annotated[
+        bool, typer.Option("--check-arm", help="Record nothing: move the arm a little and check what a capture relies on.")
+    ] = False,
+    check_cameras: Annotated[
+        bool, typer.Option("--check-cameras", help="Record nothing: check what the cameras deliver.")
+    ] = False,
     seconds: Annotated[float | None, typer.Option(help="Without an arm: how long to record.")] = None,
     rate_hz: Annotated[float, typer.Option("--rate", help="Of control, of keyframes without times, and of frames.")] = 10.0,
     fps: Annotated[int, typer.Option(help="Of the cameras; frames beyond --rate are not written.")] = 30,
@@ -88,8 +121,21 @@ def record(
     arm_limits = ArmLimits(table_m=table, margin_m=arm_margin)
     robot = None if urdf is None else Robot.from_urdf(urdf)
     path = None if trajectory is None else read_trajectory(trajectory, rate_hz=rate_hz, stretch_time=stretch_time)
-    serials = _serials(camera)
+    serials = _serials(camera or [])
     width, height = _size(size)
+    options: dict[str, Any] = {"width": width, "height": height, "fps": fps}
+    if check_arm or check_cameras:
+        if check_arm and arm is None:
+            raise ConfigError("--check-arm needs the arm's address: --arm.")
+        if check_cameras and not serials:
+            raise ConfigError("--check-cameras needs cameras: --camera NAME=SERIAL.")
+        cameras = [make_camera(name, serial, camera_driver, **options) for name, serial in serials.items()]
+        checker = ArmChecker(robot or gen3(), limits, arm_limits) if check_arm else None
+        connect = partial(open_arm, arm or "", arm_driver)
+        _check(cameras if check_cameras else [], checker, connect, path, ask=not yes, json=json)
+        return
+    if out is None or not serials:
+        raise ConfigError("A capture needs --out, the folder of the episode, and at least one --camera NAME=SERIAL.")
     calibrated = {} if calibration is None else read_calibration(calibration).cameras
     for name, serial in serials.items():
         if calibration is not None and serial not in calibrated:
@@ -103,13 +149,15 @@ def record(
         return
     if arm is not None and not yes:
         typer.confirm("Is the workspace clear, and a hand on the emergency stop? The arm will move", abort=True, err=True)
-    options: dict[str, Any] = {"width": width, "height": height, "fps": fps, "warm_up": fps // 2}
     cameras = [
-        make_camera(name, serial, record_to=out.parent / f"{out.name}_{name}.db3" if keep_recording else None, **options)
+        make_camera(
+            name, serial, camera_driver, record_to=out.parent / f"{out.name}_{name}.db3" if keep_recording else None,
+            **options,
+        )
         for name, serial in serials.items()
-    ]
+    ]  # fmt: skip
     settings = CaptureSettings(rate_hz=rate_hz, keep_every=max(1, round(fps / rate_hz)), go_home=home)
-    opened = None if arm is None else open_arm(arm)
+    opened = None if arm is None else open_arm(arm, arm_driver)
     try:
         if opened is not None and clear_faults:
             opened.clear_faults()
@@ -135,12 +183,62 @@ def record(
     finally:
         if opened is not None:
             opened.close()
-    dropped = {camera.name: camera.dropped for camera in cameras}
+    dropped = {camera.name: getattr(camera, "dropped", 0) for camera in cameras}  # not all drivers count them
     if any(dropped.values()):
         warn(f"Frames that the cameras lost: {dropped}. Use USB 3, a controller for each camera, or a lower --fps.")
     errors.print(f"{report.frames} frames and {report.robot_rows} robot rows in {report.seconds:.1f} s to {out!s}.")
     result = {"out": str(out), "frames": report.frames, "robot_rows": report.robot_rows, "seconds": report.seconds}
     finish(result | {"largest_error_m": report.largest_error_m, "dropped": dropped}, json)
+
+
+def _check(
+    cameras: Sequence[Camera],
+    checker: ArmChecker | None,
+    connect: Callable[[], ArmProcess],
+    path: ToolTrajectory | None,
+    *,
+    ask: bool,
+    json: bool,
+) -> None:
+    """Check cameras and arm, print what came of it; exit status 1 if something is wrong."""
+    checks: list[Check] = []
+    for camera in cameras:
+        checks += [replace(one, name=f"camera {camera.name}: {one.name}") for one in conformance.check_camera(camera)]
+    failure: DiffCloudError | None = None
+    if checker is not None:
+        if path is not None:
+            check_trajectory(path, checker.limits)
+            with closing(connect()) as arm:
+                checks.append(_planned(arm, checker, path))
+        if ask:
+            typer.confirm(
+                "Is the workspace clear, and a hand on the emergency stop? The arm will move", abort=True, err=True
+            )
+        try:
+            for one in conformance.check_arm(connect, checker, move=True, say=errors.print, ask=_request if ask else None):
+                checks.append(replace(one, name=f"arm: {one.name}"))
+        except DiffCloudError as error:  # what was found until then is told first
+            failure = error
+    show_checks(checks, json)
+    wrong = [one.name for one in checks if one.state != "ok"]
+    finish({"checks": [asdict(one) for one in checks], "wrong": wrong}, json)
+    if failure is not None:
+        raise failure
+    if wrong:
+        raise typer.Exit(1)
+
+
+def _request(text: str) -> None:
+    typer.prompt(text, default="", show_default=False, err=True)
+
+
+def _planned(arm: ArmProcess, checker: ArmChecker, path: ToolTrajectory) -> Check:
+    """Whether the arm, from where it is, may go along the trajectory: joints, singularity, links, table."""
+    try:
+        plan_motion(checker, path, arm.read(), speed_m_s=CaptureSettings.approach_speed_m_s)
+    except LimitError as error:
+        return Check("arm: trajectory", "wrong", str(error))
+    return Check("arm: trajectory", "ok", f"{len(path.times)} keyframes: within joints, reach, box and above the table")
 
 
 def _limits(box: str | None, **values: float) -> Limits:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from diffcloud.errors import CheckpointError, ConfigError, EpisodeError
+from diffcloud.errors import CheckpointError, ConfigError, DiffCloudError, EpisodeError
 from diffcloud.evaluation import ComparisonSettings, EpisodeRecord, Estimate, Gap, compare_episode
 from diffcloud.evaluation.methods import predicted
 from diffcloud.evaluation.repeats import other_repeats
@@ -27,6 +27,8 @@ from pipeline.workers import Tell, run_all
 
 _CODE = ("mesh", "io", "sim", "scene", "clouds", "fit", "evaluation")
 """Packages whose source decides the numbers of a finished episode."""
+
+_MOST_REASONS = 5
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,11 @@ class Comparison:
 
 
 def compare(jobs: Sequence[Job], workers: int) -> Comparison:
-    """All episodes."""
+    """All episodes.
+
+    Raises:
+        DiffCloudError: nothing could be compared in any of them.
+    """
     comparison = Comparison()
     for job, found, error in run_all("evaluate", jobs, workers):
         if error is not None:
@@ -109,6 +115,9 @@ def compare(jobs: Sequence[Job], workers: int) -> Comparison:
         else:
             comparison.records.append(found.record)
             comparison.seconds[job.group, job.name] = {method: dict(told) for method, told in found.seconds.items()}
+    if not comparison.records:
+        reasons = "; ".join(comparison.failures[:_MOST_REASONS])
+        raise DiffCloudError(f"Nothing was compared in {len(jobs)} episodes, and nothing is written. {reasons}")
     return comparison
 
 

@@ -6,11 +6,11 @@ import inspect
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, Protocol, TypeVar, cast
 
 import typer
 from rich.console import Console
@@ -59,6 +59,28 @@ def finish(result: dict[str, Any], as_json: bool) -> None:
 def show(table: Table, as_json: bool) -> None:
     """Print a table; with --json to standard error, so that standard output stays clean."""
     (errors if as_json else output).print(table)
+
+
+class Checked(Protocol):
+    """A line of a report on what is installed, or of a conformance test."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def state(self) -> str:
+        """ok, missing or wrong."""
+
+    @property
+    def detail(self) -> str: ...
+
+
+def show_checks(checks: Sequence[Checked], as_json: bool) -> None:
+    """Print a report; see `show`."""
+    table = Table("", "state", "detail")
+    for check in checks:
+        table.add_row(check.name, Text(check.state, "green" if check.state == "ok" else "red"), check.detail)
+    show(table, as_json)
 
 
 def warn(message: str) -> None:

@@ -8,12 +8,9 @@ from typing import Annotated, Any
 
 import typer
 from rich.table import Table
-from rich.text import Text
 
 from diffcloud.hardware.installed import check_installation
-from pipeline.console import JsonFlag, finish, progress_bar, show
-
-_COLORS = {"ok": "green", "missing": "red"}
+from pipeline.console import JsonFlag, finish, progress_bar, show, show_checks
 
 
 def doctor(
@@ -28,11 +25,7 @@ def doctor(
     if compile_:
         _compile()
     checks = check_installation(arm=arm, folder=folder)
-    table = Table("", "state", "detail")
-    for check in checks:
-        color = _COLORS[check.state]
-        table.add_row(check.name, Text(check.state, color), check.detail)
-    show(table, json)
+    show_checks(checks, json)
     compiled = _compiled()
     kept = Table("compiled code", "")
     kept.add_row("folder", compiled["folder"])

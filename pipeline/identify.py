@@ -234,8 +234,8 @@ def _fields(path: Path) -> dict[str, Any]:
 def _yaml(found: Mapping[str, Found], *, head: bool = True) -> str:
     lines = [_HEAD] if head else []
     for name, entry in found.items():
-        value = yaml.safe_dump(entry.value, default_flow_style=True, width=1000).strip().removesuffix("...").strip()
-        lines.append(f"{name}: {value}  # {entry.reason}")
+        value = yaml.safe_dump(entry.value, default_flow_style=True, width=1000, sort_keys=False)
+        lines.append(f"{name}: {value.strip().removesuffix('...').strip()}  # {entry.reason}")
     return "\n".join(lines) + "\n"
 
 

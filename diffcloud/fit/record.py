@@ -14,8 +14,9 @@ SCHEMA = 5
 """Of the file. Another one is refused, by name."""
 
 
-NonNegative = Annotated[float, Field(ge=0, le=1e12)]
-Positive = Annotated[float, Field(gt=0, le=1e12)]
+LARGEST = 1e12
+NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0, le=LARGEST)]
 Count = Annotated[int, Field(ge=0, le=1_000_000_000)]
 Text = Annotated[str, Field(max_length=1000)]
 Friction = Annotated[float, Field(ge=0, le=100)]
@@ -130,7 +131,7 @@ class Measure(_Model):
 
 
 class History(_Model):
-    """N iterations of B starts; k parameters. What diverged is None."""
+    """N iterations of B starts; k parameters. What diverged, or grew beyond `LARGEST`, is None."""
 
     names: list[Text]
     """[k]"""

@@ -19,7 +19,7 @@ from diffcloud.fit.joint import AnyObjective, mean_loss
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.pose import PoseSpace
-from diffcloud.fit.record import FitRecord, FittedParameter, History, Measure, RecordingFit, WholeMaterial
+from diffcloud.fit.record import LARGEST, FitRecord, FittedParameter, History, Measure, RecordingFit, WholeMaterial
 from diffcloud.fit.solvers import SOLVER_NAMES, FitOutcome, Settings
 from diffcloud.io.arrays import read_npz
 from diffcloud.io.files import together, write_json, write_npz
@@ -336,4 +336,4 @@ def _history(outcome: FitOutcome) -> History:
 
 
 def _finite(row: list[float]) -> list[Any]:
-    return [value if np.isfinite(value) else None for value in row]
+    return [value if abs(value) <= LARGEST else None for value in row]

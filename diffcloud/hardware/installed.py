@@ -24,7 +24,7 @@ class Check:
 
     name: str
     state: str
-    """ok or missing."""
+    """ok, missing or wrong."""
     detail: str
 
 

@@ -137,18 +137,19 @@ def go_to_start(motion: Motion, trajectory: ToolTrajectory, tell: Callable[[str]
         HardwareError: the arm is in fault, driven by somebody else, or lost.
     """
     arm, limits, checker = motion.arm, motion.limits, motion.checker
+    approaching = motion.settings.approach_speed_m_s
     arm.prepare()
     rest, contact = at_rest(arm, limits)
     checker.check_tool_frame(rest)
     if motion.settings.go_home:
         speed = min(motion.settings.approach_speed_m_s, limits.speed_m_s)
         path = checker.plan_home(arm.home_joints(), rest, speed_m_s=speed)
-        _plan(motion, trajectory, checker.at(path.joints_rad[-1], rest))
+        plan_motion(checker, trajectory, checker.at(path.joints_rad[-1], rest), speed_m_s=approaching)
         tell(f"moving home, {path.duration_s:.1f} s")
         run(motion, JointFollower(motion, "way home", path, rest, contact))
         arm.prepare()
         rest, contact = at_rest(arm, limits)
-    way = _plan(motion, trajectory, rest)
+    way = plan_motion(checker, trajectory, rest, speed_m_s=approaching)
     if way is not None:
         tell(f"approaching the first keyframe, {way.duration_s:.1f} s")
         run(motion, ToolFollower(motion, "approach", way, rest, contact))
@@ -185,20 +186,28 @@ def run(
     motion.arm.stop()
 
 
-def _plan(motion: Motion, trajectory: ToolTrajectory, start: ArmReading) -> ToolTrajectory | None:
-    """The approach from `start`, or None where it is at the first keyframe; it and the trajectory keep the limits."""
-    position, limits = start.tool_position_m, motion.limits
+def plan_motion(
+    checker: ArmChecker, trajectory: ToolTrajectory, start: ArmReading, *, speed_m_s: float
+) -> ToolTrajectory | None:
+    """The approach from `start`, or None where it is at the first keyframe; it and the trajectory keep the limits.
+
+    Args:
+        speed_m_s: of the approach.
+
+    Raises:
+        LimitError: one of both breaks a limit: box, joints, reach, singularity, links.
+    """
+    position, limits = start.tool_position_m, checker.limits
     if limits.outside(position, limits.box_slack_m):
         raise LimitError(
             f"The tool is at {position.round(3).tolist()} m, outside the workspace box {limits.box_low_m} to "
             f"{limits.box_high_m}. Bring it inside first (--home, or by hand), or widen --box."
         )
     # a box is convex: between a start and a goal inside it the straight line is inside too
-    speed = min(motion.settings.approach_speed_m_s, limits.speed_m_s)
-    way = approach(position, trajectory.positions[0], speed_m_s=speed)
+    way = approach(position, trajectory.positions[0], speed_m_s=min(speed_m_s, limits.speed_m_s))
     if way is not None:
-        start = motion.checker.check_trajectory("approach", way, start)
-    motion.checker.check_trajectory("trajectory", trajectory, start)
+        start = checker.check_trajectory("approach", way, start)
+    checker.check_trajectory("trajectory", trajectory, start)
     return way
 
 

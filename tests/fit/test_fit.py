@@ -158,6 +158,17 @@ class TestRun:
         assert first.loss <= min(float(losses.min()) for losses in first.history.losses)
         assert first.simulations == 7 * (2 + 8)
 
+    def test_losses_and_gradients_that_grow_beyond_a_record_are_none_in_it(self, objective):
+        """A rough loss may well have a gradient that no file need hold."""
+        space, settings = FitSpace.build(["stretch"]), AdamSettings(iterations=1)
+        outcome = fit_adam(objective, space, settings)
+        outcome.history.gradients[0][...] = 1e20
+        outcome.history.losses[-1][...] = math.inf
+        told = describe_fit(objective, space, settings, outcome, episodes=["e"]).record.history
+        assert told.gradient_norm[0] == [None]
+        assert told.loss[-1] == [None]
+        assert told.loss[0][0] > 0
+
     def test_threshold_stops(self, objective):
         outcome = fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings(threshold=1.0))
         assert outcome.stop_reason == "threshold"

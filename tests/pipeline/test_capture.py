@@ -26,8 +26,8 @@ class Card(TestCard):
 @pytest.fixture
 def server(monkeypatch):
     with FakeArm(start=HOME_M) as arm:
-        monkeypatch.setattr(capture, "open_arm", lambda address: in_process(arm, address=address))
-        monkeypatch.setattr(capture, "make_camera", lambda name, serial, **options: Card(name, fps=60))
+        monkeypatch.setattr(capture, "open_arm", lambda address, driver=None: in_process(arm, address=address))
+        monkeypatch.setattr(capture, "make_camera", lambda name, serial, driver=None, **options: Card(name, fps=60))
         yield arm
 
 

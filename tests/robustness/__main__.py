@@ -25,10 +25,11 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", choices=("inputs", "faults", "arm"), action="append", help="default: all three")
     parser.add_argument("--kind", action="append", choices=[kind.name for kind in KINDS], help="of file; default: all")
+    parser.add_argument("--command", action="append", choices=list(COMMANDS), help="that is disturbed; default: all")
     parser.add_argument("--sample", type=int, help="so many of each file and each command, drawn at random; default: all")
     parser.add_argument("--sample-faults", type=int, help="so many of each command; default: as --sample")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--log", type=Path, help="JSON lines, one for each, added to what is there")
+    parser.add_argument("--log", type=Path, help="JSON lines, added to what is there; --out tells of all")
     parser.add_argument("--out", type=Path, help="page with the counts")
     asked = parser.parse_args(arguments)
     suites = asked.only or ["inputs", "faults", "arm"]
@@ -43,20 +44,29 @@ def main(arguments: list[str]) -> int:
                 jobs += [
                     partial(all_of, name, project, asked.sample) for name in asked.kind or [kind.name for kind in KINDS]
                 ]
-            if "faults" in suites and not asked.kind:
-                jobs += [partial(all_of_command, name, project, asked.sample_faults or asked.sample) for name in COMMANDS]
+            if "faults" in suites:
+                count = asked.sample_faults or asked.sample
+                jobs += [partial(all_of_command, name, project, count) for name in asked.command or COMMANDS]
             context = multiprocessing.get_context("spawn")
             with ProcessPoolExecutor(asked.workers, mp_context=context, initializer=warm_up) as pool:
                 for done in as_completed([pool.submit(job) for job in jobs]):
                     told += done.result()
                     _report(done.result(), asked.log)
-    if "arm" in suites and not asked.kind:  # alone: it measures times
+    if "arm" in suites:  # alone: it measures times
         found = list(all_of_arm(asked.sample_faults or asked.sample))
         told += found
         _report(found, asked.log)
+    if asked.out is not None and asked.log is not None:
+        told = _latest(asked.log)
     if asked.out is not None:
         asked.out.write_text(page(told, asked.sample), encoding="utf-8")
     return int(any(one["wrong"] for one in told))
+
+
+def _latest(log: Path) -> list[dict[str, Any]]:
+    """Of each damage and fault, what came of it last."""
+    lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    return list({tuple(one[key] for key in ("suite", "of", "where", "what")): one for one in lines}.values())
 
 
 def _report(results: list[dict[str, Any]], log: Path | None) -> None:
