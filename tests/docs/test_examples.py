@@ -42,6 +42,9 @@ LEFT = {
     "pip install": "installs",
     "source .venv/bin/activate": "changes the shell",
     "diffcloud doctor --arm": "an arm",
+    "diffcloud capture --arm-driver": "a lab's own hardware",
+    "diffcloud capture --check-": "a lab's own hardware",
+    "python -m diffcloud.hardware.examples": "runs until it is ended",
     "diffcloud import recording overhead=a.db3": "recordings of two cameras, made by the SDK of their maker",
     ".venv/bin/python -m pytest": "a test of its own",
 }
