@@ -9,7 +9,7 @@ import sys
 import tempfile
 import threading
 import traceback
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -81,13 +81,20 @@ def main() -> None:
         say("Error:", str(error), style="bold red")
         sys.exit(1)
     except KeyboardInterrupt:
-        errors.print("Interrupted.")
-        sys.exit(130)
+        _interrupted()
     except Exception as error:
+        # numba's dispatcher overlooks a Ctrl-C that comes in it; the interpreter finds that, and names it as the cause
+        if isinstance(error, SystemError) and isinstance(error.__cause__, KeyboardInterrupt):
+            _interrupted()
         if "--debug" in sys.argv[1:2]:
             raise
         say("Error:", _unforeseen(error), style="bold red")
         sys.exit(1)
+
+
+def _interrupted() -> NoReturn:
+    errors.print("Interrupted.")
+    sys.exit(130)
 
 
 def _hear_again(lost: sys.UnraisableHookArgs) -> None:

@@ -24,6 +24,8 @@ from diffcloud.fit.uncertainty import refined_distance_mm
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import claimed, read_yaml, together, write_json, write_text
 from diffcloud.io.imports import cloud_folder
+from diffcloud.io.recordings import write_recording
+from diffcloud.io.ros.recording import ros_recording
 from diffcloud.report import EpisodeEntry, build_page
 from diffcloud.scene.scenarios import Scenario, load_scenario
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
@@ -37,6 +39,7 @@ from pipeline.preprocess import PreprocessJob
 _DENSITY = 0.16
 _MATERIAL = {"stretching_n_m": 60.0, "bending_n_m": 1e-5, "poisson": 0.3}
 _BOUNDS = {"stretch": (0.03, 30.0), "bending": (0.03, 30.0), "mass": (0.2, 5.0)}
+_BAGS = (".bag", ".mcap", ".db3")
 _CLOTH_FIELDS = ("base", "size_m", "nodes", "material", "steps_per_frame")
 _STEPS = 8
 _MOST_STEPS = 64
@@ -50,7 +53,8 @@ def identify(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            help="Recordings of one cloth: folders of numbered clouds with a gripper.csv, raw episodes, episode files."
+            help="Recordings of one cloth: folders of numbered clouds with a gripper.csv, raw episodes, ROS bags, episode "
+            "files."
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder: cloth.yaml, recordings.yaml, fit.json, report.html.")],
@@ -137,6 +141,8 @@ def _names(recordings: Sequence[Path]) -> dict[str, Path]:
 def _read(path: Path, name: str, out: Path) -> Episode:
     """A recording as an episode, kept in OUT/episodes/."""
     kept = out / "episodes" / f"{name}.npz"
+    if path.suffix in _BAGS or (path / "metadata.yaml").is_file():
+        path = _unpacked(path, out / "recordings" / name)
     if path.is_file():
         episode = read_episode(path)
     elif (path / "episode.json").is_file():
@@ -149,6 +155,20 @@ def _read(path: Path, name: str, out: Path) -> Episode:
         episode = cloud_folder(path, grippers={"gripper": track})
     write_episode(kept, episode)
     return episode
+
+
+def _unpacked(bag: Path, folder: Path) -> Path:
+    """A ROS recording as a raw episode, kept in OUT/recordings/; its frames are those of `import recording`'s defaults."""
+    from pipeline.importing import recording_kind  # not above: it brings the SDK's library
+
+    if recording_kind(bag) != "ros":
+        raise EpisodeError(
+            f"{bag} is a recording of the RealSense SDK, which does not say where the camera stands: make a raw episode of "
+            "it first, by `diffcloud import recording NAME=FILE` and a calibration."
+        )
+    if not folder.is_dir():
+        write_recording(folder, ros_recording(bag))
+    return folder
 
 
 def _cloth(

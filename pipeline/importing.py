@@ -130,7 +130,7 @@ def recording(
 ) -> None:
     """Import depth recordings of others as a raw episode. Check it with `diffcloud episode validate`."""
     named = _named(source)
-    kinds = {_kind(path) for path in named.values()}
+    kinds = {recording_kind(path) for path in named.values()}
     if len(kinds) > 1:
         raise ConfigError("Give one ROS recording, or one RealSense recording or folder per camera, not a mixture.")
     with ExitStack() as stack:
@@ -187,8 +187,17 @@ def _named(sources: list[Path]) -> dict[str, Path]:
     return named
 
 
-def _kind(path: Path) -> str:
-    """ros, realsense or folder."""
+def recording_kind(path: Path) -> str:
+    """ros, realsense or folder.
+
+    Raises:
+        ConfigError: a file of another kind.
+    """
+    if (path / "meta" / "info.json").is_file() and not (path / "metadata.yaml").is_file():
+        raise ConfigError(
+            f"{path} is a LeRobot data set: its videos hold no depth in metres. Export depth images and joints, and import "
+            "them as a folder with depth/*.png, camera.json and --joint-log."
+        )
     if path.is_dir():
         return "ros" if (path / "metadata.yaml").is_file() else "folder"
     if path.suffix not in (".bag", ".db3", ".mcap"):

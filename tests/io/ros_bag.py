@@ -182,7 +182,36 @@ def compressed_depth(depth, message_format):
         b = 1 - a / furthest_m
         metres = np.where(depth > 0, depth / 1000, np.inf)
         depth = np.where(metres < furthest_m, a / metres + b, 0).astype(np.uint16)
-    return struct.pack("<iff", 1, a, b) + cv2.imencode(".png", depth)[1].tobytes()
+    image = rvl(depth) if message_format.endswith("rvl") else cv2.imencode(".png", depth)[1].tobytes()
+    return struct.pack("<iff", 1, a, b) + image
+
+
+def rvl(depth):
+    """Written number by number, as the paper's encoder does."""
+    bits = ""
+
+    def write(number):
+        nonlocal bits
+        while True:
+            group, number = number & 7, number >> 3
+            bits += f"{group | (8 if number else 0):04b}"
+            if not number:
+                return
+
+    pixels, place, before = [int(value) for value in depth.ravel()], 0, 0
+    while place < len(pixels):
+        for measured in (False, True):
+            count = 0
+            while place + count < len(pixels) and (pixels[place + count] > 0) == measured:
+                count += 1
+            write(count)
+            for value in pixels[place : place + count] if measured else []:
+                step, before = value - before, value
+                write(2 * step if step >= 0 else -2 * step - 1)
+            place += count
+    bits += "0" * (-len(bits) % 32)
+    words = [int(bits[start : start + 32], 2) for start in range(0, len(bits), 32)]
+    return struct.pack(f"<ii{len(words)}I", depth.shape[1], depth.shape[0], *words)
 
 
 def bag(tmp_path, kind, **habits):

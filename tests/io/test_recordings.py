@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from diffcloud.errors import EpisodeError, HardwareError
+from diffcloud.io.files import write_json
 from diffcloud.io.raw_episodes import CameraInfo, read_raw_episode
 from diffcloud.io.recordings import RecordedFrame, Recording, write_recording
 from diffcloud.sensing.validation.episode import validate_raw_episode
@@ -110,6 +111,12 @@ def test_cameras_of_folders_that_no_camera_is(tmp_path, changes, message):
     told = json.loads((folder / "camera.json").read_text())
     (folder / "camera.json").write_text(json.dumps({**told, **changes}))
     assert message in invoke("import", "recording", folder, "--out", tmp_path / "e", code=1).errors
+
+
+def test_data_sets_of_lerobot_are_refused_by_name(tmp_path):
+    write_json(tmp_path / "set" / "meta" / "info.json", {"codebase_version": "v2.1"})
+    done = invoke("import", "recording", tmp_path / "set", "--out", tmp_path / "e", code=1)
+    assert "is a LeRobot data set: its videos hold no depth in metres" in done.errors
 
 
 def test_an_import_that_fails_leaves_nothing(tmp_path):

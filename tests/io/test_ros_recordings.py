@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import shutil
+import struct
+from contextlib import suppress
 
 import numpy as np
 import pytest
 
+from diffcloud.errors import EpisodeError
 from diffcloud.io.raw_episodes import read_raw_episode
-from tests.io.ros_bag import FRAMES, Bag, Habits, bag
+from diffcloud.io.rvl import decode_rvl
+from tests.io.ros_bag import FRAMES, Bag, Habits, bag, rvl
 from tests.pipeline.invoke import invoke
 from tests.sensing.table_scene import INTRINSICS, poses, table_depth
 
@@ -48,7 +52,9 @@ class TestCompressedDepth:
         assert (found[1:40] == 0).all()
         np.testing.assert_allclose(found[40:], far[40:] / 1000, atol=2e-3)
 
-    @pytest.mark.parametrize("stated", ["16UC1; compressedDepth png", "16UC1; compressedDepth"])
+    @pytest.mark.parametrize(
+        "stated", ["16UC1; compressedDepth png", "16UC1; compressedDepth", "16UC1; compressedDepth rvl"]
+    )
     def test_integers_are_millimetres(self, tmp_path, stated):
         imported(tmp_path, bag(tmp_path, "rosbag2", encoding=stated, unaligned=False))
         expected = table_depth(poses()["side"])
@@ -58,8 +64,7 @@ class TestCompressedDepth:
     @pytest.mark.parametrize(
         ("stated", "message"),
         [
-            ("32FC1; compressedDepth rvl", "compressed by 'rvl'"),
-            ("16UC1; compressedDepth rvl", "compressed by 'rvl'"),
+            ("32FC1; compressedDepth zstd", "compressed by 'zstd'"),
             ("; compressedDepth", "must state its encoding"),
             ("32FC1; png compressed", "loses floats"),
         ],
@@ -68,6 +73,29 @@ class TestCompressedDepth:
         path = bag(tmp_path, "rosbag2", encoding=stated, unaligned=False)
         assert message in imported(tmp_path, path, code=1).errors
         assert not (tmp_path / "e").exists()
+
+
+class TestRvl:
+    @pytest.mark.parametrize("share", [0.0, 0.3, 0.95, 1.0])
+    def test_what_was_coded_comes_back(self, rng, share):
+        depth = rng.integers(1, 65536, (31, 47)).astype(np.uint16)
+        depth[rng.random(depth.shape) < share] = 0
+        np.testing.assert_array_equal(decode_rvl(rvl(depth), "a"), depth)
+
+    def test_damage_is_named(self, rng):
+        good = rvl(rng.integers(0, 3000, (20, 30)).astype(np.uint16))
+        huge, negative = struct.pack("<ii", 10**6, 10**6), struct.pack("<ii", -1, 5)
+        for data in (b"", good[:8], good[:40], good[:-8], huge + good[8:], negative + good[8:]):
+            with pytest.raises(EpisodeError, match=r"RVL image of a .*damaged"):
+                decode_rvl(data, "a")
+
+    def test_any_flipped_bytes_give_an_image_or_a_clear_error(self, rng):
+        good = rvl(rng.integers(0, 3000, (20, 30)).astype(np.uint16))
+        for _ in range(300):
+            data = bytearray(good)
+            data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
+            with suppress(EpisodeError):
+                assert decode_rvl(bytes(data), "a").dtype == np.uint16
 
 
 class TestNames:

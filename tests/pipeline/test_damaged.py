@@ -298,6 +298,16 @@ pipeline.app.main()
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment(), timeout=25)
         assert (done.returncode, done.stderr.strip()) == (130, "Interrupted.")
 
+    def test_a_ctrl_c_that_compiled_code_overlooks_is_none_of_the_programs_faults(self, monkeypatch, capsys):
+        def fails():
+            raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+        monkeypatch.setattr(pipeline.app, "app", fails)
+        with pytest.raises(SystemExit) as stopped:
+            pipeline.app.main()
+        assert stopped.value.code == 130
+        assert capsys.readouterr().err.strip() == "Interrupted."
+
     def test_debug_stands_before_any_command(self, work):
         done = subprocess.run([*DIFFCLOUD, "--debug", "materials", "--json"], capture_output=True, text=True, check=True)
         assert "denim" in json.loads(done.stdout.splitlines()[-1])

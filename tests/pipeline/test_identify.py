@@ -19,8 +19,10 @@ import yaml
 from diffcloud.clouds import SurfaceSampler
 from diffcloud.fit import read_fit
 from diffcloud.io.clouds import write_ply
+from diffcloud.io.raw_episodes import read_raw_episode
 from diffcloud.scene.scenarios import built_in, make_scenario
 from diffcloud.sim.simulate import rollout
+from tests.io.ros_bag import bag
 from tests.pipeline.invoke import invoke
 from tests.test_architecture import check_commands
 
@@ -157,6 +159,20 @@ class TestRefusals:
         assert "No such recording: nothing" in invoke("identify", "nothing", "--out", "found", code=1).errors
         (work / "recorded/first/gripper.csv").unlink()
         assert "holds no gripper.csv" in invoke("identify", "recorded/first", "--out", "found", code=1).errors
+
+    def test_of_a_bag_comes_after_it_was_read(self, work):
+        """It shows a table without a cloth, which is what is refused."""
+        for kind in ("mcap", "rosbag2"):
+            (work / kind).mkdir()
+            path = bag(work / kind, kind)
+            said = invoke("identify", path, "--size", "0.16x0.12", "--out", "found", code=1).errors
+            name = path.stem if path.is_file() else path.name
+            assert said.startswith(f"{path}: ")
+            assert read_raw_episode(work / "found" / "recordings" / name).robot is not None
+            shutil.rmtree(work / "found")
+        (work / "d435.bag").write_bytes(b"#ROSBAG V2.0 /device_0/sensor_0/info")
+        said = invoke("identify", "d435.bag", "--out", "found", code=1).errors
+        assert "is a recording of the RealSense SDK" in said
 
     def test_of_damaged_notes(self, work):
         (work / "found").mkdir()

@@ -1,8 +1,9 @@
 """What ROS messages hold, of either generation: stamps, depth and colour images, intrinsics.
 
 Depth comes as 16-bit integers in millimetres (16UC1), as 32-bit floats in metres (32FC1), or as a PNG of either in a
-CompressedImage. A PNG has no floats: compressed_depth_image_transport stores inverse depth in 16 bits instead, and how to
-get back in 12 bytes before the PNG (a format number and two floats a, b): depth = a / (value - b), 0 is no measurement.
+CompressedImage, or in RVL. Neither has floats: compressed_depth_image_transport stores inverse depth in 16 bits instead,
+and how to get back in 12 bytes before the image (a format number and two floats a, b): depth = a / (value - b), 0 is no
+measurement.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from diffcloud.errors import EpisodeError
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.images import decode_color, decode_depth
+from diffcloud.io.rvl import decode_rvl
 
 DepthEncoding = Literal["16UC1", "32FC1"]
 DEPTH_UNITS_M: dict[DepthEncoding, float] = {"16UC1": 0.001, "32FC1": 0.00025}
@@ -50,10 +52,10 @@ def depth_encoding(message: Any, topic: str) -> DepthEncoding:
             raise EpisodeError(f"{topic} has the format {message.format!r}, which loses floats; record compressedDepth.")
         return "16UC1"
     codec = compression.removeprefix("compressedDepth").strip()
-    if codec not in ("", "png"):
+    if codec not in ("", "png", "rvl"):
         raise EpisodeError(
-            f"{topic} is compressed by {codec!r} (format {message.format!r}); of compressedDepth PNG is read. Record with "
-            "the publisher's parameter format:=png, or republish the topic as raw images."
+            f"{topic} is compressed by {codec!r} (format {message.format!r}); of compressedDepth PNG and RVL are read. "
+            "Record with the publisher's parameter format:=png, or republish the topic as raw images."
         )
     if stated == "32FC1":
         return "32FC1"
@@ -86,7 +88,8 @@ def depth_image(message: Any, topic: str, encoding: DepthEncoding) -> NDArray[np
     size = _COMPRESSED_DEPTH_HEADER.size
     if len(data) <= size:
         raise EpisodeError(f"A compressedDepth image of {topic} has {len(data)} bytes; the recording is damaged.")
-    values = decode_depth(data[size:], topic)
+    rvl = message.format.rstrip().endswith("rvl")
+    values = decode_rvl(data[size:], topic) if rvl else decode_depth(data[size:], topic)
     if own == "16UC1":
         return values
     _, a, b = _COMPRESSED_DEPTH_HEADER.unpack(data[:size])
