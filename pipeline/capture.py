@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from diffcloud.errors import ConfigError, DiffCloudError, LimitError
+from diffcloud.errors import ConfigError, DiffCloudError, LimitError, unknown_name
 from diffcloud.hardware import (
     ArmLimits,
     ArmProcess,
@@ -27,6 +27,7 @@ from diffcloud.hardware import (
     read_trajectory,
 )
 from diffcloud.hardware.arm_limits import ArmChecker
+from diffcloud.hardware.camera_settings import CameraSettings, Pace
 from diffcloud.hardware.devices import Camera
 from diffcloud.hardware.installed import Check
 from diffcloud.hardware.kinova import KinovaArm
@@ -46,17 +47,24 @@ def open_arm(address: str, driver: str | None = None) -> ArmProcess:
 
 
 def make_camera(
-    name: str, serial: str, driver: str | None = None, *, record_to: Path | None = None, **options: Any
+    name: str,
+    serial: str,
+    driver: str | None = None,
+    *,
+    record_to: Path | None = None,
+    settings: CameraSettings | None = None,
+    **options: Any,
 ) -> Camera:
     """A camera, not yet open.
 
     Args:
         record_to: of a RealSense, where its own SDK records too.
+        settings: of a RealSense.
         options: width, height and fps.
     """
     if driver is not None:
         return drivers.make_camera(driver, name, serial, **options)
-    return RealSenseCamera(name, serial, record_to=record_to, warm_up=options["fps"] // 2, **options)
+    return RealSenseCamera(name, serial, record_to=record_to, warm_up=options["fps"] // 2, settings=settings, **options)
 
 
 def record(
@@ -84,6 +92,16 @@ def record(
     rate_hz: Annotated[float, typer.Option("--rate", help="Of control, of keyframes without times, and of frames.")] = 10.0,
     fps: Annotated[int, typer.Option(help="Of the cameras; frames beyond --rate are not written.")] = 30,
     size: Annotated[str, typer.Option(help="Of the images, WIDTHxHEIGHT.")] = "640x480",
+    preset: Annotated[
+        str | None, typer.Option(help="Visual preset of RealSense depth sensors, such as high_accuracy.")
+    ] = None,
+    laser: Annotated[float | None, typer.Option(help="Power of RealSense projectors, mW; 0: off.")] = None,
+    master: Annotated[
+        str | None, typer.Option(help="Name of the RealSense camera whose trigger cable the others follow.")
+    ] = None,
+    auto_exposure: Annotated[
+        bool, typer.Option("--auto-exposure", help="Let exposure and white balance follow the picture while recording.")
+    ] = False,
     calibration: Annotated[Path | None, typer.Option(help="Calibration file; its poses go into camera.json.")] = None,
     box: Annotated[str | None, typer.Option(help="Workspace: x0,y0,z0,x1,y1,z1 in metres.")] = None,
     speed: Annotated[float, typer.Option(help="Limit, m/s.")] = Limits.speed_m_s,
@@ -124,12 +142,23 @@ def record(
     serials = _serials(camera or [])
     width, height = _size(size)
     options: dict[str, Any] = {"width": width, "height": height, "fps": fps}
+    if camera_driver is not None and (preset, laser, master, auto_exposure) != (None, None, None, False):
+        raise ConfigError("--preset, --laser, --master and --auto-exposure are settings of RealSense cameras.")
+    if master is not None and master not in serials:
+        raise ConfigError(unknown_name("--master", master, serials))
+    settings_of = {
+        name: CameraSettings(not auto_exposure, preset, laser, None if master is None else _pace(name, master))
+        for name in serials
+    }
     if check_arm or check_cameras:
         if check_arm and arm is None:
             raise ConfigError("--check-arm needs the arm's address: --arm.")
         if check_cameras and not serials:
             raise ConfigError("--check-cameras needs cameras: --camera NAME=SERIAL.")
-        cameras = [make_camera(name, serial, camera_driver, **options) for name, serial in serials.items()]
+        cameras = [
+            make_camera(name, serial, camera_driver, settings=settings_of[name], **options)
+            for name, serial in serials.items()
+        ]
         checker = ArmChecker(robot or gen3(), limits, arm_limits) if check_arm else None
         connect = partial(open_arm, arm or "", arm_driver)
         _check(cameras if check_cameras else [], checker, connect, path, ask=not yes, json=json)
@@ -152,7 +181,7 @@ def record(
     cameras = [
         make_camera(
             name, serial, camera_driver, record_to=out.parent / f"{out.name}_{name}.db3" if keep_recording else None,
-            **options,
+            settings=settings_of[name], **options,
         )
         for name, serial in serials.items()
     ]  # fmt: skip
@@ -239,6 +268,10 @@ def _planned(arm: ArmProcess, checker: ArmChecker, path: ToolTrajectory) -> Chec
     except LimitError as error:
         return Check("arm: trajectory", "wrong", str(error))
     return Check("arm: trajectory", "ok", f"{len(path.times)} keyframes: within joints, reach, box and above the table")
+
+
+def _pace(name: str, master: str) -> Pace:
+    return "master" if name == master else "slave"
 
 
 def _limits(box: str | None, **values: float) -> Limits:

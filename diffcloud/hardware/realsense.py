@@ -11,6 +11,7 @@ import heapq
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from typing import Any
 import numpy as np
 
 from diffcloud.errors import HardwareError
+from diffcloud.hardware import camera_settings
+from diffcloud.hardware.camera_settings import CameraSettings
 from diffcloud.hardware.devices import CameraFrame
 from diffcloud.hardware.frame_times import FrameTimes, monotonic_of_day
 from diffcloud.io.camera_models import Intrinsics
@@ -74,6 +77,7 @@ class RealSenseCamera:
         fps: of the camera (a D435 knows 6, 15, 30 and 60).
         record_to: also write the SDK's own recording (`.db3`), which keeps depth as it was before alignment.
         warm_up: pairs dropped at the start, while exposure settles.
+        settings: exposure, laser, preset and pace.
     """
 
     def __init__(
@@ -87,7 +91,9 @@ class RealSenseCamera:
         fps: int = 30,
         record_to: Path | None = None,
         warm_up: int = 0,
+        settings: CameraSettings | None = None,
     ) -> None:
+        self._settings = settings or CameraSettings()
         self.name, self.serial = name, serial
         self._context, self._size, self._fps = context, (width, height), fps
         self._record_to, self._warm_up = record_to, warm_up
@@ -128,10 +134,15 @@ class RealSenseCamera:
             profile = self._pipeline.start(config, self._queue)
             self._align = rs.align(rs.stream.color)
             info = _camera_info(rs, self.name, self.serial, profile)
+            sensors = _sensors(rs, profile)
         self._last_number, self._times = None, None
         try:
+            camera_settings.apply(rs, sensors, self._settings, self.name)
             for _ in range(self._warm_up):
                 self.read(5.0)
+            if self._settings.hold:
+                camera_settings.hold(rs, sensors, self.name)
+            info = replace(info, settings=camera_settings.read_back(rs, sensors))
         except HardwareError:
             self.close()
             raise
@@ -264,16 +275,21 @@ def _frame(frames: Any) -> CameraFrame:
     return CameraFrame(depth.get_timestamp() / 1000, np.array(depth.get_data()), np.array(color.get_data()))
 
 
+def _sensors(rs: Any, profile: Any) -> dict[str, Any]:
+    """depth, and color where it is a sensor of its own."""
+    # not first_depth_sensor(): the wrapper around a device that is being recorded does not know its kind
+    found = list(profile.get_device().query_sensors())
+    depth = next((sensor for sensor in found if sensor.supports(rs.option.depth_units)), None)
+    others = [sensor for sensor in found if not sensor.supports(rs.option.depth_units)]
+    return {} if depth is None else {"depth": depth, **({"color": others[0]} if others else {})}
+
+
 def _camera_info(rs: Any, name: str, serial: str, profile: Any) -> CameraInfo:
     """Of a started pipeline; depth is aligned to colour, so the intrinsics are those of colour."""
-    # not first_depth_sensor(): the wrapper around a device that is being recorded does not know its kind
-    scales = [
-        sensor.get_option(rs.option.depth_units)
-        for sensor in profile.get_device().query_sensors()
-        if sensor.supports(rs.option.depth_units)
-    ]
-    if not scales:
+    sensors = _sensors(rs, profile)
+    if not sensors:
         raise HardwareError(f"Camera {name} ({serial}) states no depth scale: it is not a depth camera.")
+    scale = sensors["depth"].get_option(rs.option.depth_units)
     held = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
     models = {
         rs.distortion.none: "none",
@@ -294,7 +310,7 @@ def _camera_info(rs: Any, name: str, serial: str, profile: Any) -> CameraInfo:
         coefficients=tuple(held.coeffs) if distorted else (),
     )
     # 0.001 arrives as a float32
-    return CameraInfo(name, serial, intrinsics, float(np.format_float_positional(np.float32(scales[0]), unique=True)))
+    return CameraInfo(name, serial, intrinsics, float(np.format_float_positional(np.float32(scale), unique=True)))
 
 
 @contextmanager

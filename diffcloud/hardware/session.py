@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -166,7 +166,7 @@ def _gen3() -> Robot:
 def _placed(info: CameraInfo, poses: Mapping[str, Floats]) -> CameraInfo:
     if info.serial not in poses:
         return info
-    return CameraInfo(info.name, info.serial, info.intrinsics, info.depth_scale_m, poses[info.serial])
+    return replace(info, T_world_camera=poses[info.serial])
 
 
 def _drive(motion: Motion, follower: ToolFollower, recorders: Recorders, clock: Clock) -> None:

@@ -73,7 +73,8 @@ class _OwnCamera(CameraFile):
 
     def camera(self, name: str) -> CameraInfo:
         place = None if self.T_world_camera is None else np.array(self.T_world_camera)
-        return CameraInfo(name, self.serial or name, self.intrinsics.intrinsics(), self.depth_scale_m, place)
+        held = self.intrinsics.intrinsics()
+        return CameraInfo(name, self.serial or name, held, self.depth_scale_m, place, settings=self.settings)
 
 
 class _Open3DCamera(BaseModel):

@@ -19,7 +19,7 @@ import errno
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Literal, Self
@@ -63,9 +63,11 @@ class CameraInfo:
     """[4, 4] maps camera points to world points [m]; None: not calibrated yet, or in the calibration file."""
     calibration: str | None = None
     """Path of a calibration file, relative to the episode's folder."""
+    settings: Mapping[str, float] = field(default_factory=dict)
+    """What the camera was set to while it recorded, where that is known: option -> value, such as depth.exposure."""
 
     def to_json(self) -> dict[str, Any]:
-        return {
+        told = {
             "name": self.name,
             "serial": self.serial,
             "intrinsics": self.intrinsics.to_json(),
@@ -73,6 +75,7 @@ class CameraInfo:
             "T_world_camera": None if self.T_world_camera is None else self.T_world_camera.tolist(),
             "calibration": self.calibration,
         }
+        return told | ({"settings": dict(self.settings)} if self.settings else {})
 
 
 Name = Annotated[str, Field(max_length=200)]
@@ -107,6 +110,7 @@ class CameraFile(Checked):
     depth_scale_m: DepthScale
     T_world_camera: RigidTransform | None = None
     calibration: FileName | None = None
+    settings: dict[Name, Annotated[float, Field(ge=-1e9, le=1e9)]] = Field(default_factory=dict)
 
 
 class PlacementFile(Checked):
@@ -304,6 +308,7 @@ def read_camera_info(path: Path) -> CameraInfo:
         told.depth_scale_m,
         None if told.T_world_camera is None else np.array(told.T_world_camera),
         told.calibration,
+        told.settings,
     )
 
 

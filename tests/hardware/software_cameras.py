@@ -19,6 +19,18 @@ so that depth can be compared bit by bit. With others it moves one pixel in ten 
 which is what the SDK's recordings keep."""
 
 
+OPTIONS = {
+    "depth": {
+        "enable_auto_exposure": (0, 1, 1), "exposure": (1, 165000, 8500), "gain": (16, 248, 16),
+        "emitter_enabled": (0, 2, 1), "laser_power": (0, 360, 150), "visual_preset": (0, 6, 0),
+        "inter_cam_sync_mode": (0, 2, 0),
+    },
+    "color": {
+        "enable_auto_exposure": (0, 1, 1), "exposure": (1, 10000, 156), "enable_auto_white_balance": (0, 1, 1),
+        "white_balance": (2800, 6500, 4600),
+    },
+}  # fmt: skip
+"""Sensor -> option -> lowest, highest and usual value."""
 _NOISE = np.random.default_rng(0).integers(20, 120, (HEIGHT, WIDTH)).astype(np.uint16)
 
 
@@ -34,12 +46,21 @@ class SoftwareD435:
 
     Args:
         baseline_m: of colour to the depth sensor; 0 makes alignment the identity, so that depth can be compared bit by bit.
+        settable: with the options of a D435 (`OPTIONS`), which software devices lack.
     """
 
     _uid = 100
 
     def __init__(
-        self, rs, context, serial: str, *, baseline_m: float = 0.0, depth_scale: float = DEPTH_SCALE, seed: int = 0
+        self,
+        rs,
+        context,
+        serial: str,
+        *,
+        baseline_m: float = 0.0,
+        depth_scale: float = DEPTH_SCALE,
+        seed: int = 0,
+        settable: bool = False,
     ) -> None:
         self._rs, self.serial, self._seed, self._scale = rs, serial, seed, depth_scale
         self._device = rs.software_device()
@@ -51,6 +72,13 @@ class SoftwareD435:
         )
         self._depth_sensor.add_read_only_option(rs.option.depth_units, depth_scale)
         self._depth_sensor.add_read_only_option(rs.option.stereo_baseline, 50.0)
+        self.sensors = {"depth": self._depth_sensor, "color": self._color_sensor}
+        for kind, options in OPTIONS.items() if settable else ():
+            for name, (low, high, default) in options.items():
+                span = rs.option_range()
+                span.min, span.max, span.step, span.default = low, high, 1.0, default
+                self.sensors[kind].add_option(getattr(rs.option, name), span, True)
+                self.sensors[kind].set_option(getattr(rs.option, name), default)
         self._depth_profile = self._depth_sensor.add_video_stream(self._stream(rs.stream.depth, rs.format.z16, 2))
         self._color_profile = self._color_sensor.add_video_stream(self._stream(rs.stream.color, rs.format.rgb8, 3))
         for first, second, shift in (

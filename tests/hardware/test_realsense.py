@@ -9,8 +9,10 @@ import pytest
 
 from diffcloud.errors import HardwareError
 from diffcloud.hardware import CaptureSettings, capture
+from diffcloud.hardware.camera_settings import CameraSettings
 from diffcloud.hardware.realsense import RealSenseCamera, connected_cameras, import_realsense, play_recording
-from diffcloud.io.raw_episodes import read_raw_episode
+from diffcloud.io.files import write_json
+from diffcloud.io.raw_episodes import read_camera_info, read_raw_episode
 from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.hardware.simulated import PointArm, short_path
 from tests.hardware.software_cameras import CX, CY, DEPTH_SCALE, FPS, FX, FY, HEIGHT, WIDTH, Cameras, numbered_depth
@@ -177,6 +179,68 @@ def test_a_camera_that_stops_mid_run_ends_the_capture_and_stops_the_arm(tmp_path
     assert numbers[-1] == 100  # all frames so far
     faults = {finding.code for finding in validate_raw_episode(tmp_path / "e") if finding.severity == "fault"}
     assert "truncated_image" not in faults
+
+
+class TestSettings:
+    @pytest.fixture
+    def cameras(self, make_cameras):
+        return make_cameras(settable=True)
+
+    def opened(self, cameras, index=0, **settings):
+        size = {"width": WIDTH, "height": HEIGHT, "fps": FPS}
+        camera = RealSenseCamera(
+            "a", cameras.SERIALS[index], context=cameras.context, settings=CameraSettings(**settings), **size
+        )
+        return camera, camera.open()
+
+    def value(self, cameras, kind, name, index=0):
+        return cameras.cameras[index].sensors[kind].get_option(getattr(rs.option, name))
+
+    def test_what_the_camera_found_is_held_and_kept(self, cameras, tmp_path):
+        for kind, name, value in (("depth", "exposure", 7000), ("depth", "gain", 32), ("color", "white_balance", 5200)):
+            cameras.cameras[0].sensors[kind].set_option(getattr(rs.option, name), value)  # what it finds by itself
+        camera, info = self.opened(cameras)
+        camera.close()
+        assert self.value(cameras, "depth", "enable_auto_exposure") == 0
+        assert self.value(cameras, "color", "enable_auto_white_balance") == 0
+        assert info.settings["depth.exposure"] == 7000
+        assert info.settings["depth.gain"] == 32
+        assert info.settings["color.white_balance"] == 5200
+        write_json(tmp_path / "camera.json", info.to_json())
+        assert read_camera_info(tmp_path / "camera.json").settings == info.settings
+
+    def test_exposure_may_follow_the_picture(self, cameras):
+        cameras.cameras[0].sensors["depth"].set_option(rs.option.enable_auto_exposure, 0)  # left so by a former program
+        camera, info = self.opened(cameras, hold=False)
+        camera.close()
+        assert info.settings["depth.enable_auto_exposure"] == 1
+
+    def test_laser_preset_and_pace(self, cameras):
+        camera, info = self.opened(cameras, preset="high_accuracy", laser_mw=240.0, pace="slave")
+        camera.close()
+        told = info.settings
+        assert (told["depth.laser_power"], told["depth.emitter_enabled"], told["depth.inter_cam_sync_mode"]) == (240, 1, 2)
+        assert told["depth.visual_preset"] == int(rs.rs400_visual_preset.high_accuracy)
+        camera, info = self.opened(cameras, laser_mw=0.0)
+        camera.close()
+        assert info.settings["depth.emitter_enabled"] == 0
+
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"preset": "best"}, "Camera a: Unknown preset 'best'"),
+            ({"laser_mw": 1000.0}, "laser_power is from 0 to 360, got 1000"),
+        ],
+    )
+    def test_what_cannot_be_set_is_said_and_the_camera_closed(self, cameras, settings, message):
+        with pytest.raises(HardwareError, match=message):
+            self.opened(cameras, **settings)
+        camera, _ = self.opened(cameras)  # nobody holds it
+        camera.close()
+
+    def test_a_camera_without_such_an_option(self, make_cameras):
+        with pytest.raises(HardwareError, match="Camera a has no option emitter_enabled"):
+            self.opened(make_cameras(), laser_mw=100.0)
 
 
 def test_what_is_no_recording(tmp_path):

@@ -89,6 +89,8 @@ def test_one_camera_without_an_arm(tmp_path, server):
         (("--camera", "side=1", "--box", "1,2,3"), "--box takes x0,y0,z0,x1,y1,z1"),
         (("--camera", "side=1", "--size", "big"), "--size takes WIDTHxHEIGHT"),
         (("--camera", "side=1"), "say how long to record"),
+        (("--camera", "side=1", "--master", "top"), "Unknown --master 'top'"),
+        (("--camera", "side=1", "--camera-driver", "a:B", "--laser", 100), "are settings of RealSense cameras"),
         (("--camera", "side=1", "--arm", "127.0.0.1", "--yes"), "An arm needs a trajectory"),
         (("--camera", "side=1", "--box", "0.4,-0.3,0.1,0.9,0.3,0.44", "--trajectory", "up.csv"), "outside the workspace"),
     ],

@@ -188,6 +188,23 @@ def test_units_that_are_not_si(episode):
     assert codes(episode) == {"description"}
 
 
+@pytest.mark.parametrize(
+    ("settings", "code"),
+    [
+        (({"depth.laser_power": 150}, {"depth.laser_power": 360}), "settings_differ"),
+        (({"depth.enable_auto_exposure": 1}, {"depth.enable_auto_exposure": 0}), "auto_exposure"),
+        (({"depth.inter_cam_sync_mode": 2}, {"depth.inter_cam_sync_mode": 2}), "pace"),
+        (({"depth.inter_cam_sync_mode": 1}, {"depth.inter_cam_sync_mode": 0}), "pace"),
+        (({"depth.inter_cam_sync_mode": 1}, {"depth.inter_cam_sync_mode": 2}), None),
+        (({"depth.laser_power": 150}, {}), None),
+    ],
+)
+def test_cameras_that_are_not_set_alike(episode, settings, code):
+    for folder, told in zip(sorted((episode / "cameras").iterdir()), settings, strict=True):
+        edit_json(folder / "camera.json", settings=told)
+    assert [finding.code for finding in validate_raw_episode(episode)] == ([] if code is None else [code])
+
+
 def test_the_command_explains_and_fails(episode, tmp_path):
     assert invoke("episode", "validate", episode).result == {"episode": str(episode), "valid": True, "findings": []}
     (episode / "cameras/side/depth/000002.png").write_bytes(b"")

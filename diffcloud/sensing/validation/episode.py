@@ -35,6 +35,8 @@ _NEAREST_M, _FARTHEST_M = 0.1, 8.0
 _LONGEST_REACH_M = 3.0
 """No arm of this kind reaches farther."""
 _GEN3_JOINTS = 7
+_ALIKE = ("depth.emitter_enabled", "depth.laser_power", "depth.visual_preset")
+_PACE = "depth.inter_cam_sync_mode"
 _SPARSE = 0.02
 """Fewer valid pixels than this are a warning."""
 
@@ -73,6 +75,7 @@ def validate_raw_episode(folder: Path, *, calibration: Path | None = None, robot
             cameras.append(camera)
     for camera in cameras:
         findings += [*_clock(camera, description), *_images(camera), *calibration_findings(camera, folder, calibration)]
+    findings += [*_settings(cameras)]
     findings += exchanged_cameras(cameras, folder, calibration)
     if description.get("robot") is not None:
         try:
@@ -242,6 +245,26 @@ def _colour(camera: RecordedCamera) -> Iterator[Finding]:
             message = f"{size[0]} x {size[1]} pixels; depth and colour of an episode are aligned and of one size."
             yield Finding("fault", "image_size", f"{place}/{path.name}", message)
             return
+
+
+def _settings(cameras: list[RecordedCamera]) -> Iterator[Finding]:
+    """Cameras that see one cloth should see it alike."""
+    told = {camera.name: camera.info.settings for camera in cameras if camera.info is not None and camera.info.settings}
+    for name, settings in told.items():
+        free = [key for key in ("depth.enable_auto_exposure", "color.enable_auto_exposure") if settings.get(key)]
+        if free:
+            message = (
+                f"Its exposure follows the picture ({', '.join(free)}): the noise of depth changes from frame to frame."
+            )
+            yield Finding("warning", "auto_exposure", f"cameras/{name}/camera.json", message)
+    for key in _ALIKE:
+        values = {name: settings[key] for name, settings in told.items() if key in settings}
+        if len(set(values.values())) > 1:
+            yield Finding("warning", "settings_differ", "cameras", f"{key} is not the same in all cameras: {values}.")
+    paces = {name: settings[_PACE] for name, settings in told.items() if _PACE in settings}
+    if any(paces.values()) and sorted(paces.values()) != [1.0, *[2.0] * (len(paces) - 1)]:
+        message = f"{_PACE} is {paces}: one camera must be the master (1), all others slaves (2), or all free (0)."
+        yield Finding("warning", "pace", "cameras", message)
 
 
 def _robot(log: RobotLog) -> Iterator[Finding]:
