@@ -125,6 +125,8 @@ def import_open3d() -> Any:
         load_libusb()
         import open3d
     except (ImportError, OSError) as error:
+        if isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):  # as libraries in C report a Ctrl-C
+            raise KeyboardInterrupt from error
         raise EpisodeError(
             f"open3d cannot be imported ({error}). On Debian: apt-get install libgl1 libegl1 libx11-6 libudev1 libgomp1. "
             "Or convert PCD files to PLY."

@@ -18,7 +18,7 @@ import yaml
 
 import pipeline.app
 from diffcloud.errors import EpisodeError, MeshError, SceneError
-from diffcloud.io.clouds import read_cloud
+from diffcloud.io.clouds import import_open3d, read_cloud
 from diffcloud.io.files import read_yaml
 from diffcloud.io.images import decode_depth
 from diffcloud.io.obj import read_surface
@@ -297,6 +297,17 @@ pipeline.app.main()
 """
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment(), timeout=25)
         assert (done.returncode, done.stderr.strip()) == (130, "Interrupted.")
+
+    def test_a_ctrl_c_while_open3d_is_imported_is_no_missing_library(self, monkeypatch):
+        def interrupted():
+            try:
+                raise KeyboardInterrupt
+            except KeyboardInterrupt as pressed:
+                raise ImportError("initialization failed") from pressed
+
+        monkeypatch.setattr("diffcloud.io.clouds.load_libusb", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            import_open3d()
 
     def test_a_ctrl_c_that_compiled_code_overlooks_is_none_of_the_programs_faults(self, monkeypatch, capsys):
         def fails():

@@ -21,16 +21,14 @@ def tried(*arguments: object) -> None:
     assert done.returncode == 0, done.stdout + done.stderr[-3000:]
 
 
-def test_damaged_files_are_taken_or_refused_as_the_table_says():
-    tried("--only", "inputs", "--sample", 4, "--workers", 1)
-
-
-def test_disturbed_commands_end_as_if_nothing_had_been():
-    tried("--only", "faults", "--sample", 1, "--workers", 1)
+def test_a_sample_of_damaged_files_and_disturbed_commands():
+    """Two of each kind of file; one disturbance each of a command with workers, one that writes a folder, and a report."""
+    commands = [part for name in ("fit", "evaluate", "export") for part in ("--command", name)]
+    tried("--only", "inputs", "--only", "faults", "--sample", 2, "--sample-faults", 1, *commands, "--workers", 2)
 
 
 def test_a_moving_arm_is_stopped_and_what_was_recorded_is_kept():
-    tried("--only", "arm", "--sample", 12)
+    tried("--only", "arm", "--sample", 8)
 
 
 class TestTheSuiteItself:
