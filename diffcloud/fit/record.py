@@ -147,6 +147,8 @@ class History(_Model):
         starts = [len(row) for row in self.loss]
         if self.values and [len(row) for row in self.values] != starts:
             raise ValueError("values must be [N][B][k] for loss [N][B], or empty")
+        if any(len(start) != len(self.names) for row in self.values for start in row):
+            raise ValueError("values must hold one number for each of the names")
         if self.gradient_norm and [len(row) for row in self.gradient_norm] != starts:
             raise ValueError("gradient_norm must be [N][B] as loss is, or empty")
         return self
