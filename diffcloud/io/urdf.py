@@ -325,8 +325,9 @@ def _numbers(element: ElementTree.Element, key: str, default: str, where: str, *
     except ValueError:
         values = np.array([])
     if len(values) != count or not (np.abs(values) <= _LARGEST).all():
+        wanted = "a number" if count == 1 else f"{count} numbers"
         raise RobotError(
-            f"{where}: {key} of <{element.tag}> must be {count} numbers of at most {_LARGEST:g} (m, rad), got {text!r:.60}."
+            f"{where}: {key} of <{element.tag}> must be {wanted} of at most {_LARGEST:g} (m, rad), got {text!r:.60}."
         )
     return values
 

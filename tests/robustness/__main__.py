@@ -7,6 +7,7 @@ import json
 import multiprocessing
 import sys
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -64,9 +65,10 @@ def main(arguments: list[str]) -> int:
 
 
 def _latest(log: Path) -> list[dict[str, Any]]:
-    """Of each damage and fault, what came of it last."""
+    """Of each kind of file and each command, what its last run told."""
     lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
-    return list({tuple(one[key] for key in ("suite", "of", "where", "what")): one for one in lines}.values())
+    last = {(one["suite"], one["of"]): one["run"] for one in lines}
+    return [one for one in lines if one["run"] == last[one["suite"], one["of"]]]
 
 
 def _report(results: list[dict[str, Any]], log: Path | None) -> None:
@@ -77,8 +79,9 @@ def _report(results: list[dict[str, Any]], log: Path | None) -> None:
         if one["wrong"]:
             print(f"  {one['where']}, {one['what']}: {one['wrong']}: {one['told'][-200:]}", flush=True)
     if log is not None:
+        run = time.time()
         with log.open("a", encoding="utf-8") as stream:
-            stream.writelines(json.dumps(one) + "\n" for one in results)
+            stream.writelines(json.dumps({**one, "run": run}) + "\n" for one in results)
 
 
 if __name__ == "__main__":

@@ -134,12 +134,11 @@ def _messages(results: list[dict[str, Any]]) -> list[str]:
         refused = refused or [one for one in results if one["of"] == name and one["verdict"] == "refused"]
         if refused:
             one = refused[len(refused) // 3]
-            rows.append([name, f"{one['where']}: {one['what']}", f"{_plain(one['told'])}"])
+            rows.append([name, f"{one['where']}: {one['what']}", _plain(one["told"].split("Error: ")[-1])])
     return markdown_table(["file", "damage", "message"], rows)
 
 
 def _plain(text: str) -> str:
     """Without what differs from one computer to the next, and what would end a cell."""
-    text = text.split("Error: ")[-1]
     text = re.sub(r"(/\S*)?/(project|tmp)/", "", text).replace("|", "\\|")
     return text if len(text) <= _LONGEST else text[:_LONGEST] + " …"
