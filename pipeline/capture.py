@@ -77,39 +77,39 @@ def record(
     ] = None,
     arm: Annotated[str | None, typer.Option(help="Address of the arm.")] = None,
     arm_driver: Annotated[
-        str | None, typer.Option(help="module:Class of an arm that is no Gen3 (docs/drivers.md).")
+        str | None, typer.Option(help="module:Class of the driver, if the arm is not a Gen3 (docs/drivers.md).")
     ] = None,
     camera_driver: Annotated[
-        str | None, typer.Option(help="module:Class of cameras that are no RealSense (docs/drivers.md).")
+        str | None, typer.Option(help="module:Class of the driver, if the cameras are not RealSense (docs/drivers.md).")
     ] = None,
     check_arm: Annotated[
-        bool, typer.Option("--check-arm", help="Record nothing: move the arm a little and check what a capture relies on.")
+        bool, typer.Option("--check-arm", help="Record nothing; move the arm a little, check what a capture relies on.")
     ] = False,
     check_cameras: Annotated[
-        bool, typer.Option("--check-cameras", help="Record nothing: check what the cameras deliver.")
+        bool, typer.Option("--check-cameras", help="Record nothing; check what the cameras deliver.")
     ] = False,
-    seconds: Annotated[float | None, typer.Option(help="Without an arm: how long to record.")] = None,
-    rate_hz: Annotated[float, typer.Option("--rate", help="Of control, of keyframes without times, and of frames.")] = 10.0,
-    fps: Annotated[int, typer.Option(help="Of the cameras; frames beyond --rate are not written.")] = 30,
-    size: Annotated[str, typer.Option(help="Of the images, WIDTHxHEIGHT.")] = "640x480",
+    seconds: Annotated[float | None, typer.Option(help="How long to record without an arm, s.")] = None,
+    rate_hz: Annotated[float, typer.Option("--rate", help="Hz, of control, frames, and keyframes without times.")] = 10.0,
+    fps: Annotated[int, typer.Option(help="Frame rate of the cameras; frames beyond --rate are not written.")] = 30,
+    size: Annotated[str, typer.Option(help="Size of the images, WIDTHxHEIGHT.")] = "640x480",
     preset: Annotated[
         str | None, typer.Option(help="Visual preset of RealSense depth sensors, such as high_accuracy.")
     ] = None,
-    laser: Annotated[float | None, typer.Option(help="Power of RealSense projectors, mW; 0: off.")] = None,
+    laser: Annotated[float | None, typer.Option(help="Power of RealSense projectors, mW; 0 is off.")] = None,
     master: Annotated[
-        str | None, typer.Option(help="Name of the RealSense camera whose trigger cable the others follow.")
+        str | None, typer.Option(help="Name of the RealSense camera whose trigger the others follow (sync cable).")
     ] = None,
     auto_exposure: Annotated[
-        bool, typer.Option("--auto-exposure", help="Let exposure and white balance follow the picture while recording.")
+        bool, typer.Option("--auto-exposure", help="Do not hold exposure, gain and white balance while recording.")
     ] = False,
     calibration: Annotated[Path | None, typer.Option(help="Calibration file; its poses go into camera.json.")] = None,
     box: Annotated[str | None, typer.Option(help="Workspace: x0,y0,z0,x1,y1,z1 in metres.")] = None,
-    speed: Annotated[float, typer.Option(help="Limit, m/s.")] = Limits.speed_m_s,
-    acceleration: Annotated[float, typer.Option(help="Limit, m/s².")] = Limits.acceleration_m_s2,
-    force: Annotated[float, typer.Option(help="Limit, N.")] = Limits.force_N,
-    torque: Annotated[float, typer.Option(help="Limit, N·m.")] = Limits.torque_Nm,
-    preload: Annotated[float, typer.Option(help="Limit of what the tool feels at rest, N.")] = Limits.preload_N,
-    table: Annotated[float, typer.Option(help="Height of the table in the base frame, m; no link goes below.")] = (
+    speed: Annotated[float, typer.Option(help="Limit of the tool's speed, m/s.")] = Limits.speed_m_s,
+    acceleration: Annotated[float, typer.Option(help="Limit of its acceleration, m/s².")] = Limits.acceleration_m_s2,
+    force: Annotated[float, typer.Option(help="Limit of the change of the force at the tool, N.")] = Limits.force_N,
+    torque: Annotated[float, typer.Option(help="Limit of the change of the torque, N·m.")] = Limits.torque_Nm,
+    preload: Annotated[float, typer.Option(help="Limit of the force at rest, N.")] = Limits.preload_N,
+    table: Annotated[float, typer.Option(help="Height of the table in the base frame, m; no link may be lower.")] = (
         ArmLimits.table_m
     ),
     arm_margin: Annotated[
@@ -118,20 +118,20 @@ def record(
     urdf: Annotated[
         Path | None, typer.Option(help="Description of the arm with its tool; without it, a Gen3 with a 2F-85.")
     ] = None,
-    stretch_time: Annotated[float, typer.Option(help="2: half as fast.")] = 1.0,
+    stretch_time: Annotated[float, typer.Option(help="Factor on the trajectory's times; 2 is half as fast.")] = 1.0,
     home: Annotated[bool, typer.Option(help="Move to the arm's home position first.")] = False,
     clear_faults: Annotated[bool, typer.Option(help="Clear the arm's faults first.")] = False,
-    keep_recording: Annotated[bool, typer.Option(help="Also keep the SDK's own .db3, beside the episode.")] = False,
-    scenario: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
-    fabric: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
+    keep_recording: Annotated[bool, typer.Option(help="Also keep the SDK's own .db3 beside the episode.")] = False,
+    scenario: Annotated[str | None, typer.Option(help="Name that is kept in episode.json.")] = None,
+    fabric: Annotated[str | None, typer.Option(help="Name that is kept in episode.json.")] = None,
     dry_run: Annotated[bool, typer.Option(help="Print the plan and check it; open nothing.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves, nor for a pulled cable.")] = False,
     json: JsonFlag = False,
 ) -> None:
-    """Drive the arm along a trajectory, record cameras and arm, write while it runs.
+    """Drive the arm along a trajectory and record cameras and arm, writing to disk while it runs.
 
-    The arm is stopped whatever ends the capture: the end, a limit, a fault, a lost camera, Ctrl-C or Ctrl-Z, even if this
-    process is killed. What was recorded so far stays.
+    The arm is stopped whatever ends the capture: the trajectory's end, a limit, a fault, a lost camera, Ctrl-C or Ctrl-Z,
+    even if this process is killed. What was recorded so far stays.
     """
     limits = _limits(
         box, speed_m_s=speed, acceleration_m_s2=acceleration, force_N=force, torque_Nm=torque, preload_N=preload
@@ -207,7 +207,7 @@ def record(
         )
     except BaseException:
         if (out / "episode.json").is_file():
-            errors.print(f"What was recorded so far is in {out!s}; diffcloud episode validate {out!s}")
+            errors.print(f"What was recorded so far is in {out!s}; check it with: diffcloud episode validate {out!s}")
         raise
     finally:
         if opened is not None:
@@ -229,7 +229,7 @@ def _check(
     ask: bool,
     json: bool,
 ) -> None:
-    """Check cameras and arm, print what came of it; exit status 1 if something is wrong."""
+    """Check cameras and arm and print the results; exit status 1 if something is wrong."""
     checks: list[Check] = []
     for camera in cameras:
         checks += [replace(one, name=f"camera {camera.name}: {one.name}") for one in conformance.check_camera(camera)]
@@ -246,7 +246,7 @@ def _check(
         try:
             for one in conformance.check_arm(connect, checker, move=True, say=errors.print, ask=_request if ask else None):
                 checks.append(replace(one, name=f"arm: {one.name}"))
-        except DiffCloudError as error:  # what was found until then is told first
+        except DiffCloudError as error:  # what was found before it is printed first
             failure = error
     show_checks(checks, json)
     wrong = [one.name for one in checks if one.state != "ok"]
@@ -267,7 +267,7 @@ def _planned(arm: ArmProcess, checker: ArmChecker, path: ToolTrajectory) -> Chec
         plan_motion(checker, path, arm.read(), speed_m_s=CaptureSettings.approach_speed_m_s)
     except LimitError as error:
         return Check("arm: trajectory", "wrong", str(error))
-    return Check("arm: trajectory", "ok", f"{len(path.times)} keyframes: within joints, reach, box and above the table")
+    return Check("arm: trajectory", "ok", f"{len(path.times)} keyframes within joints, reach and box, above the table")
 
 
 def _pace(name: str, master: str) -> Pace:

@@ -1,7 +1,7 @@
-"""What a RealSense camera is set to while it records: exposure and white balance that stand still, laser, preset, pace.
+"""What a RealSense camera is set to while it records: exposure and white balance that are held, laser, preset, pace.
 
-Exposure that follows the picture changes the noise of depth, and where it fails, from one frame to the next: so by default
-the camera finds it while it warms up, and then holds it. What it is set to is read back and kept in camera.json.
+An exposure that keeps adjusting changes, from one frame to the next, the noise of depth and where depth is missing. So by
+default the camera finds it while it warms up, and then holds it. The settings are read back and kept in camera.json.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def apply(rs: Any, sensors: Mapping[str, Any], settings: CameraSettings, camera:
             _set(rs, depth, "laser_power", settings.laser_mw, camera)
     if settings.pace is not None:
         _set(rs, depth, "inter_cam_sync_mode", float(_PACES[settings.pace]), camera)
-    for sensor in sensors.values():  # a camera that a former program left held finds new values
+    for sensor in sensors.values():  # an earlier program may have left them held
         for automatic, _ in _HELD:
             if sensor.supports(getattr(rs.option, automatic)):
                 _set(rs, sensor, automatic, 1.0, camera)
@@ -71,7 +71,7 @@ def hold(rs: Any, sensors: Mapping[str, Any], camera: str) -> None:
                 continue
             found = {name: _get(rs, sensor, name) for name in names if sensor.supports(getattr(rs.option, name))}
             _set(rs, sensor, automatic, 0.0, camera)
-            for name, value in found.items():  # switching it off brings some firmware back to its defaults
+            for name, value in found.items():  # switching it off makes some firmware return to its defaults
                 _set(rs, sensor, name, value, camera)
 
 
@@ -92,7 +92,7 @@ def _get(rs: Any, sensor: Any, name: str) -> float:
 def _set(rs: Any, sensor: Any, name: str, value: float, camera: str) -> None:
     option = getattr(rs.option, name)
     if not sensor.supports(option):
-        raise HardwareError(f"Camera {camera} has no option {name}; leave it out.")
+        raise HardwareError(f"Camera {camera} has no option {name}; leave that setting out.")
     allowed = sensor.get_option_range(option)
     if not allowed.min <= value <= allowed.max:
         raise HardwareError(f"Camera {camera}: {name} is from {allowed.min:g} to {allowed.max:g}, got {value:g}.")

@@ -1,7 +1,7 @@
 """Whether a driver does what a capture relies on: units, frames, times, and how soon an arm stands still.
 
-Some of it no reading shows: the arm has to move, slowly and little, and to be stopped in each of the ways that a capture
-relies on: by Stop, by the silence of the capture, and by the silence of the whole link, as when a cable is cut.
+Readings do not show all of it: the arm has to move, slowly and a little, and to be stopped in each of the ways that a
+capture relies on: by Stop, by the silence of the capture, and by the silence of the whole link, as when a cable is cut.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SPEED_M_S = 0.02
 """Of all motion here."""
 _MOVED_S = 1.0
 _READ_MS = 20.0
-"""Of one reading, in the middle; the control loop reads 50 times a second."""
+"""Of one reading, the median; the control loop reads 50 times a second."""
 _COMMAND_S = 0.1
 _STOP_S = 0.3
 """From Stop to standstill."""
@@ -38,7 +38,7 @@ _LINK_S = 1.0
 """From the loss of a link to standstill."""
 _STILL_M = 2e-4
 _OFF = 0.3
-"""Part by which the measured velocity may differ from the commanded one."""
+"""The measured velocity may differ from the commanded one by this fraction of it."""
 _TURNED_RAD = float(np.deg2rad(2.0))
 _NEEDED_M = 0.08
 """Free above the tool."""
@@ -75,7 +75,7 @@ def check_camera(camera: Camera, *, seconds: float = 2.0, timeout_s: float = 1.0
     yield _check("times increase", step > 0, f"smallest step {step:.4f} s")
     yield _check(
         "times are time.monotonic()", bool((ages > -0.05).all() and (ages < 2.0).all()),
-        f"frames are {ages.min():.3f} to {ages.max():.3f} s old when they come; must be 0 to 2",
+        f"frames are {ages.min():.3f} to {ages.max():.3f} s old when they arrive; must be 0 to 2",
     )  # fmt: skip
     frame, size = frames[-1][0], (info.intrinsics.height, info.intrinsics.width)
     yield _check(
@@ -91,8 +91,9 @@ def check_camera(camera: Camera, *, seconds: float = 2.0, timeout_s: float = 1.0
     seen = frame.depth[frame.depth > 0]
     middle = float(np.median(seen)) * info.depth_scale_m if seen.size else 0.0
     yield _check(
-        "depth scale", 0.1 < middle < 8.0, f"the middle depth is {middle:.2f} m with {info.depth_scale_m:g} m a unit"
-    )
+        "depth scale", 0.1 < middle < 8.0,
+        f"the median depth is {middle:.2f} m with {info.depth_scale_m:g} m per unit; must be 0.1 to 8",
+    )  # fmt: skip
     try:
         camera.read(0.05)
         yield Check("closed", "wrong", "it delivers frames after close()")
@@ -172,8 +173,8 @@ def check_arm(
         top = rest.tool_position_m + np.array([0.0, 0.0, needed])
         if checker.limits.outside(top):
             raise LimitError(
-                f"The tool needs {100 * needed:.0f} cm above it; {top.round(3).tolist()} m is outside the workspace box. "
-                "Move the tool down, or widen --box."
+                f"The tool needs {100 * needed:.0f} cm above it within the workspace box, and {top.round(3).tolist()} m is "
+                "outside. Move the tool down, or widen --box."
             )
         say("moving up at 2 cm/s")
         yield from _motion(guarded)
@@ -187,6 +188,10 @@ def check_arm(
         yield _lost("stops by itself when its process is lost", arm, last)
         pulled = None if ask is None else _pulled(_Guarded(arm, checker), ask)
         if pulled is None:
+            if ask is not None:
+                yield Check(
+                    "stops by itself when its cable is pulled", "missing", f"nobody pulled it within {_PULLED_S:g} s"
+                )
             yield _back(_Guarded(arm, checker), rest, say)
             return
     with closing(connect()) as arm:
@@ -203,7 +208,7 @@ def _pulled(guarded: _Guarded, ask: Callable[[str], None]) -> Floats | None:
         while time.monotonic() < end:
             last = guarded.up(_COMMAND_S)[1][-1]
     except HardwareError:
-        ask("Plug the cable in again, wait until the arm answers, and press Enter")
+        ask("Plug the cable in again, wait until the arm can be reached, and press Enter")
         return last
     guarded.arm.stop()
     return None
@@ -214,8 +219,8 @@ def _lost(name: str, arm: ArmProcess, last: Floats) -> Check:
     time.sleep(_COMMAND_S)
     still = float(np.linalg.norm(arm.read().tool_position_m - found)) < _STILL_M
     moved = float(np.linalg.norm(found - last))
-    told = f"{1000 * moved:.0f} mm after the last reading; at most {1000 * SPEED_M_S * _LINK_S:.0f}"
-    return _check(name, still and moved < SPEED_M_S * _LINK_S, told if still else "it moves on")
+    told = f"{1000 * moved:.0f} mm after the last reading; must be less than {1000 * SPEED_M_S * _LINK_S:.0f}"
+    return _check(name, still and moved < SPEED_M_S * _LINK_S, told if still else "it still moves")
 
 
 def _readings(arm: ArmProcess, checker: ArmChecker) -> Iterator[Check]:
@@ -225,13 +230,13 @@ def _readings(arm: ArmProcess, checker: ArmChecker) -> Iterator[Check]:
         readings.append(arm.read())
         took.append(time.monotonic() - began)
     milliseconds = 1000 * float(np.median(took))
-    yield _check("reading", milliseconds <= _READ_MS, f"{milliseconds:.1f} ms in the middle; at most {_READ_MS:g}")
+    yield _check("reading", milliseconds <= _READ_MS, f"the median is {milliseconds:.1f} ms; at most {_READ_MS:g}")
     last = readings[-1]
     wanted = len(checker.robot.arm)
     largest = float(np.abs(last.joints_rad).max())
     yield _check(
         "joints", len(last.joints_rad) == wanted == arm.joint_count and largest < 4 * np.pi,
-        f"{len(last.joints_rad)} angles up to {largest:.2f}; must be {wanted} in radians",
+        f"{len(last.joints_rad)} angles, the largest {largest:.2f}; must be {wanted}, in radians",
     )  # fmt: skip
     length = float(np.linalg.norm(last.tool_quaternion))
     yield _check("quaternion", abs(length - 1) < 0.01, f"length {length:.4f}; must be 1, order w, x, y, z")
@@ -244,7 +249,7 @@ def _readings(arm: ArmProcess, checker: ArmChecker) -> Iterator[Check]:
     size = float(np.linalg.norm(np.mean([reading.wrench for reading in readings], axis=0)[:3]))
     yield _check(
         "wrench", finite and len(last.wrench) == 6 and size <= checker.limits.preload_N,
-        f"{size:.1f} N at rest; six finite numbers, N and N·m, at most {checker.limits.preload_N:g} N (--preload)",
+        f"{size:.1f} N at rest; must be six finite numbers, force at most {checker.limits.preload_N:g} N (--preload)",
     )  # fmt: skip
     grip = last.gripper
     yield _check("gripper", grip is None or -0.05 <= grip <= 1.05, f"{grip}; must be 0 (open) to 1 (closed), or None")
@@ -253,7 +258,7 @@ def _readings(arm: ArmProcess, checker: ArmChecker) -> Iterator[Check]:
         arm.send_velocity(np.zeros(3))
     except HardwareError as error:
         _refused = str(error)
-    yield _check("velocities before prepare()", bool(_refused), _refused or "were taken")
+    yield _check("velocities before prepare()", bool(_refused), _refused or "were accepted")
 
 
 def _motion(guarded: _Guarded) -> Iterator[Check]:
@@ -264,11 +269,14 @@ def _motion(guarded: _Guarded) -> Iterator[Check]:
     off = float(np.linalg.norm(velocity - _UP)) / SPEED_M_S
     yield _check(
         "velocity", off < _OFF,
-        f"{(1000 * velocity).round(1).tolist()} mm/s where {(1000 * _UP).tolist()} was commanded: base frame, m/s",
+        f"{(1000 * velocity).round(1).tolist()} mm/s where {(1000 * _UP).tolist()} was commanded, in the base frame",
     )  # fmt: skip
     frames = [Rotation.from_quat(np.roll(one.tool_quaternion, -1)) for one in (guarded.rest, guarded.read())]
     turned = float((frames[1] * frames[0].inv()).magnitude())
-    yield _check("orientation", turned < _TURNED_RAD, f"turned by {np.rad2deg(turned):.2f}°; must keep it")
+    yield _check(
+        "orientation", turned < _TURNED_RAD,
+        f"turned by {np.rad2deg(turned):.2f}°; must be less than {np.rad2deg(_TURNED_RAD):g}°",
+    )  # fmt: skip
 
 
 def _stopped(guarded: _Guarded) -> _Way:
@@ -316,7 +324,7 @@ def _back(guarded: _Guarded, rest: ArmReading, say: Callable[[str], None]) -> Ch
     finally:
         guarded.arm.stop()
     left = float(np.linalg.norm(rest.tool_position_m - guarded.arm.read().tool_position_m))
-    return _check("is back", left < 3e-3, f"{1000 * left:.1f} mm from where it was")
+    return _check("is back", left < 3e-3, f"{1000 * left:.1f} mm from where it began; must be less than 3")
 
 
 def _check(name: str, right: bool, told: str) -> Check:

@@ -1,8 +1,8 @@
-"""Drivers for arms and cameras of other makes: classes of a person's own, named as module:Class.
+"""Drivers for arms and cameras of other makes: a user's own classes, named as module:Class.
 
-A camera's class is called with its name in the episode and its serial number, and keeps the protocol `devices.Camera`; an
-arm's with its address, and keeps `devices.Arm`. It lives in the arm's own process (`arm_process`), which watches it as it
-watches the Gen3's.
+A camera's class is called with its name in the episode and its serial number, and implements `devices.Camera`. An arm's
+class is called with its address, and implements `devices.Arm`; it runs in the arm's own process (`arm_process`), which
+watches it as it watches the Gen3's.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def open_arm(driver: str, address: str) -> ArmProcess:
         ConfigError: no such driver, or one that lacks a method.
         HardwareError: the driver could not connect.
     """
-    _load(driver, Arm)  # here first: what is wrong with it is said before a process is started
+    _load(driver, Arm)  # here first, so that its faults are reported before a process is started
     return ArmProcess(partial(_make_arm, driver, address))
 
 
@@ -57,13 +57,13 @@ def _load(driver: str, protocol: type) -> Callable[..., Any]:
         sys.path.insert(0, here)
     try:
         found = getattr(importlib.import_module(module), name)
-    except Exception as error:  # whatever a module raises while it is imported
+    except Exception as error:  # a module may raise anything while it is imported
         raise ConfigError(f"The driver {driver} cannot be imported ({type(error).__name__}: {error}).") from error
     methods = [key for key in vars(protocol) if not key.startswith("_") and callable(getattr(protocol, key))]
     missing = [key for key in methods if not callable(getattr(found, key, None))]
     if missing or not callable(found):
         raise ConfigError(
-            f"The driver {driver} lacks {', '.join(missing) or 'a constructor'}; what a driver must do is written in "
+            f"The driver {driver} lacks {', '.join(missing) or 'a constructor'}; what a driver must do is described at "
             f"diffcloud.hardware.devices.{protocol.__name__}."
         )
     return found

@@ -1,4 +1,4 @@
-"""What writes a recording while it runs: nothing here is waited for by the arm's control loop.
+"""What writes a recording while it runs; the arm's control loop waits for nothing here.
 
 Each camera has a thread that takes its frames and one that writes them; the arm's readings have a queue and a thread that
 writes them, many rows at a time when the disk is slow. So neither a slow disk nor a slow camera holds up the arm.
@@ -19,7 +19,7 @@ _QUEUED_FRAMES = 64
 _QUEUED_ROWS = 1500
 """Half a minute of the arm's readings."""
 _OVERDUE_S = 0.5
-"""Beyond the timeout that a driver was given: it does not keep to it, and hangs."""
+"""A driver that takes this much longer than its timeout hangs."""
 _WATCH_S = 0.1
 _AHEAD_S = 1.0
 """No frame was taken later than now; clocks that are tied to each other differ by milliseconds."""
@@ -136,7 +136,7 @@ class _CameraRecorder:
         self._failed, self._ending = failed, threading.Event()
         self._frames: queue.Queue[CameraFrame | None] = queue.Queue(_QUEUED_FRAMES)
         self._asked: float | None = None
-        """time.monotonic() when the driver was last asked for a frame; None while it is not."""
+        """time.monotonic() when the driver was asked for a frame; None while it is not being asked."""
         self._taker, self._writing = (
             threading.Thread(target=target, name=f"{camera.name}{target.__name__}", daemon=True)
             for target in (self._take, self._write)
@@ -164,7 +164,7 @@ class _CameraRecorder:
             self._fail(
                 HardwareError(
                     f"Camera {self._camera.name}: its driver has not come back for {self._timeout_s + _OVERDUE_S:g} s, "
-                    f"though it was given {self._timeout_s:g} s: it hangs. Reconnect the camera."
+                    f"though its timeout is {self._timeout_s:g} s: it hangs. Reconnect the camera."
                 )
             )
 
@@ -182,7 +182,7 @@ class _CameraRecorder:
                 t = self._clock.of(frame.time_s)
                 if count == 0 and t < 0:  # left over from before the start
                     continue
-                if count and t <= last:  # left out in silence, such frames would make a gap look like a recording
+                if count and t <= last:  # dropped silently, such frames would hide a gap
                     raise HardwareError(
                         f"Camera {self._camera.name}: its clock ran backwards by {last - t:.3f} s; frames cannot be placed "
                         "in time."
@@ -239,7 +239,7 @@ class _ArmRecorder:
             self._rows.put_nowait(sample)
         except queue.Full as error:
             raise HardwareError(
-                f"{_QUEUED_ROWS} rows of robot.csv wait for the disk: it has stopped, or is far too slow."
+                f"{_QUEUED_ROWS} rows of robot.csv are waiting for the disk: it has stopped, or is far too slow."
             ) from error
 
     def end(self) -> None:

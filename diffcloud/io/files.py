@@ -250,7 +250,7 @@ def _object(path: Path, error: type[DiffCloudError], pairs: list[tuple[str, Any]
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
-        raise error(f"{path} names {twice!r} twice in one object; keep one of both.")
+        raise error(f"{path} names {twice!r} twice in one object; keep one of them.")
     return found
 
 
@@ -271,7 +271,7 @@ def _refuse_twice(node: yaml.Node | None, path: Path, error: type[DiffCloudError
             for key, value in one.value:
                 if isinstance(key, yaml.ScalarNode) and key.value in keys:
                     raise error(
-                        f"{path}, line {key.start_mark.line + 1}: {key.value!r} stands there twice; keep one of both."
+                        f"{path}, line {key.start_mark.line + 1}: {key.value!r} stands there twice; keep one of them."
                     )
                 keys.add(str(key.value))
                 open_nodes += [key, value]
@@ -329,7 +329,7 @@ def numbered_files(folder: Path, formats: tuple[str, ...], *, kind: str) -> dict
     if numbers[-1] > _MOST_FRAMES:
         raise EpisodeError(
             f"{folder}: its files end in numbers such as {numbers[0]} and {numbers[-1]}, which are times and not frames. "
-            "Number them in order from 0, and state the times beside them."
+            "Number them in order from 0, and give the times by --rate-hz or in a CSV with t_s."
         )
     if gaps:
         missing = [number for before, after in gaps[:10] for number in range(before + 1, min(after, before + 11))][:10]

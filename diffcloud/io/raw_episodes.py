@@ -528,8 +528,8 @@ class _CameraFiles:
             self.rows.append([self.count, t_s])
         except (OSError, DiffCloudError) as error:
             raise DiffCloudError(
-                f"Frame {self.count} of camera {self._folder.name} could not be written: {error} The {self.count} frames "
-                "before it are kept. Free the disk and record again."
+                f"Frame {self.count} of camera {self._folder.name} could not be written: {str(error).rstrip('.')}. The "
+                f"{self.count} frames before it are kept."
             ) from error
         self.count += 1
 

@@ -1,8 +1,8 @@
 """RVL, a lossless code for depth images (Wilson 2017, "Fast lossless depth image compression").
 
-Runs of pixels without a measurement and runs with one take turns. Each pixel of the latter is its difference from the one
-before, with the sign in the lowest bit. All numbers are written in groups of three bits, the lowest first, each with a
-fourth bit that says whether another group follows; eight such groups fill a 32-bit word from the top.
+Runs of pixels without a measurement alternate with runs of measured ones. Each measured pixel is stored as its difference
+from the one before, with the sign in the lowest bit. All numbers are written in groups of three bits, the lowest first,
+each with a fourth bit that says whether another group follows; eight such groups fill a 32-bit word from the top.
 """
 
 from __future__ import annotations
@@ -45,17 +45,18 @@ def decode_rvl(data: bytes, name: str) -> NDArray[np.uint16]:
         coded.append(numbers[read + 2 : read + 2 + count])
         place, read = place + count, read + 2 + count
     if place != len(pixels):
-        raise EpisodeError(f"An RVL image of {name} ends after {min(place, len(pixels))} of {len(pixels)} pixels: damaged.")
+        read_pixels = f"{min(place, len(pixels))} of {len(pixels)} pixels"
+        raise EpisodeError(f"An RVL image of {name} ends after {read_pixels}; it is damaged.")
     signed = np.concatenate([np.zeros(0, np.int64), *coded])
     depth = np.cumsum((signed >> 1) ^ -(signed & 1))
     if depth.size and not (depth.min() >= 0 and depth.max() <= 65535):
-        raise EpisodeError(f"An RVL image of {name} holds values beyond 16 bits: damaged.")
+        raise EpisodeError(f"An RVL image of {name} holds values beyond 16 bits; it is damaged.")
     pixels[np.concatenate([np.zeros(0, np.int64), *measured])] = depth
     return pixels.reshape(height, width)
 
 
 def _numbers(code: bytes) -> NDArray[np.int64]:
-    """All numbers of a code; what the last word is filled up with makes zeros."""
+    """All numbers of a code; the padding of the last word gives zeros."""
     words = np.frombuffer(code[: len(code) // 4 * 4], "<u4")
     groups = ((words[:, None] >> np.arange(28, -1, -4, dtype=np.uint32)) & 0xF).ravel().astype(np.int64)
     last = np.flatnonzero(groups < 8)

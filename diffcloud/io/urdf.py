@@ -344,7 +344,7 @@ def _refuse_doubles(root: ElementTree.Element, path: Path) -> None:
     for element in root.iter():
         for tag in _ONCE:
             if len(element.findall(tag)) > 1:
-                raise RobotError(f"{path}: <{element.tag}> {element.get('name', '')} has <{tag}> twice; keep one of both.")
+                raise RobotError(f"{path}: <{element.tag}> {element.get('name', '')} has <{tag}> twice; keep one of them.")
         if element.tag == "geometry" and len(element) > 1:
             raise RobotError(f"{path}: a <geometry> holds {len(element)} shapes; it takes one.")
 

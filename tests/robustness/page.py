@@ -15,41 +15,43 @@ _LONGEST = 260
 _HEAD = """# Damaged inputs and faults
 
 `make robustness` makes a small project with the outputs of all stages, damages its files one at a time, and reads each
-with the command that reads it; it disturbs each command in the middle of its work, and runs it again; and it lets things
+with the command that takes it. It disturbs each command in the middle of its work and runs it again, and it makes things
 go wrong while an arm moves. A fixed sample of each is part of the slow tests. The code is in `tests/robustness/`.
 
 ## Damaged files
 
 Each field of a document, each column of a table and each array is, in turn, missing, of the wrong type, NaN, infinite,
 negative, zero, huge, duplicated, or nested {levels} levels deep; and bytes are flipped or cut off at random. Each file
-is read in its own process, which may take {seconds:.0f} seconds and {gigabytes:.0f} GB. It must end well or with an
-error of this project that names file and field, and leave nothing behind; which of the two is set for every field in a
-table (`tests/robustness/expected.yaml`: what may be accepted; the rest must be refused). Flipped bytes may happen to give
-another valid file. `episode validate` must find a fault wherever `preprocess` refuses a raw episode.
+is read in its own process, which may take {seconds:.0f} seconds and {gigabytes:.0f} GB. It must either succeed, or
+end with an error of this project that names file and field, and leave nothing behind. Which of the two is right is set
+for every field by `tests/robustness/expected.yaml`: it lists what may be accepted, and the rest must be refused. Flipped
+bytes may happen to give another valid file. `episode validate` must find a fault wherever `preprocess` refuses a raw
+episode.
 """
 _FAULTS = """
 ## Disturbed commands
 
-Every command of the pipeline, `identify`, and `dvc repro` itself, disturbed at a random moment: by a kill, by Ctrl-C, by
-the end of one of its worker processes, by a full disk (no file may grow beyond a random size of a hundred bytes to ten
-kilobytes), by a folder that cannot be written to, or by a second start of the same command. Any output under its final
-name afterwards must be complete, there must be no traceback and no hang, and running the command again must end with the
-same contents as an undisturbed run, and leave nothing else.
+Every command of the pipeline, `identify`, and `dvc repro` itself are disturbed at a random moment: by a kill, by Ctrl-C,
+by a kill of one of their worker processes, by a full disk (no file may grow beyond a random size of a hundred bytes to
+ten kilobytes), by a folder that cannot be written to, or by a second start of the same command. Afterwards, any output
+under its final name must be complete. There must be no traceback and no hang. Running the command again must give the
+same contents as an undisturbed run, and leave nothing else behind.
 """
 _ARM = """
 ## Faults while an arm moves
 
-A capture with two cameras and an arm that moves at 0.1 m/s, over the protocol of the real one. Detection is how long
-after the fault it can be noticed at all: at the next reading of the arm (20 ms), at the next velocity (100 ms), when a
-camera has been silent for its timeout (500 ms here), when a driver has not come back for half a second longer, or when
-the capture has been silent for the watchdog's half second. Where process and link live, Stop must reach the arm within
-{stop:.0f} ms of that; where they do not, the arm's own timeout for a silent link (500 ms) must have stopped it. What was
-recorded until then must be readable.
+A capture runs with two cameras and a loopback arm that moves at 0.1 m/s and speaks the real arm's protocol. "Detected
+within" is when the fault can be noticed at the latest: at the next reading of the arm (20 ms) or the next velocity
+(100 ms), when a call to the arm is given up (400 ms; 2 s if the arm's own process does not answer), when a camera has been
+silent for its timeout (500 ms here), when its driver has not returned half a second after that, when the disk refuses or
+its queue is full (up to 1.2 s), or when the capture has been silent for the watchdog's half second. As long as the arm's
+process and its link work, Stop must reach the arm within {stop:.0f} ms of that. Otherwise the arm's own timeout for a
+silent link (500 ms) must stop it. What was recorded until then must be readable.
 """
 _MESSAGES = """
 ## Messages
 
-One message of each kind of file, as it was printed.
+One message for each kind of file, as it was printed.
 """
 
 
@@ -120,10 +122,10 @@ def _arm(results: list[dict[str, Any]]) -> list[str]:
         kept = "yes" if one["wrong"] is None else one["wrong"]
         within, counts = f"{1000 * one['detected_s']:.0f}", (str(one["frames"]), str(one["rows"]))
         rows.append([one["where"], one["what"], within, late, *counts, kept, _plain(one["told"])])
-    heads = ["fault", "stopped by", "detected within ms", "Stop after that, ms", "frames", "rows", "as it must", "message"]
+    heads = ["fault", "stopped by", "detected within ms", "Stop after that, ms", "frames", "rows", "as required", "message"]
     right = sum(one["wrong"] is None for one in results)
     latest = max((one["late_ms"] for one in results if one["late_ms"] is not None), default=0.0)
-    summary = f"{right} of {len(results)} as they must be; the latest Stop came {latest:.0f} ms after the detection."
+    summary = f"{right} of {len(results)} as required; the latest Stop came {latest:.0f} ms after the detection."
     return [*markdown_table(heads, rows), "", summary]
 
 
