@@ -37,6 +37,8 @@ from diffcloud.io.calibrations import read_calibration
 from diffcloud.sensing.robot import Robot, gen3
 from pipeline.console import JsonFlag, errors, finish, show_checks, warn
 
+_CLEAR = "Is the workspace clear, and a hand on the emergency stop? The arm will move"
+
 
 def open_arm(address: str, driver: str | None = None) -> ArmProcess:
     """The arm at an address; a Gen3's user and password come from DIFFCLOUD_ARM_USER and DIFFCLOUD_ARM_PASSWORD."""
@@ -124,7 +126,7 @@ def record(
     keep_recording: Annotated[bool, typer.Option(help="Also keep the SDK's own .db3 beside the episode.")] = False,
     scenario: Annotated[str | None, typer.Option(help="Name that is kept in episode.json.")] = None,
     fabric: Annotated[str | None, typer.Option(help="Name that is kept in episode.json.")] = None,
-    dry_run: Annotated[bool, typer.Option(help="Print the plan and check it; open nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option(help="Check the plan; open nothing. With --check-arm: move nothing.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves, nor for a pulled cable.")] = False,
     json: JsonFlag = False,
 ) -> None:
@@ -161,7 +163,7 @@ def record(
         ]
         checker = ArmChecker(robot or gen3(), limits, arm_limits) if check_arm else None
         connect = partial(open_arm, arm or "", arm_driver)
-        _check(cameras if check_cameras else [], checker, connect, path, ask=not yes, json=json)
+        _check(cameras if check_cameras else [], checker, connect, path, move=not dry_run, ask=not yes, json=json)
         return
     if out is None or not serials:
         raise ConfigError("A capture needs --out, the folder of the episode, and at least one --camera NAME=SERIAL.")
@@ -177,7 +179,7 @@ def record(
         finish({"dry_run": True, "plan": plan}, json)
         return
     if arm is not None and not yes:
-        typer.confirm("Is the workspace clear, and a hand on the emergency stop? The arm will move", abort=True, err=True)
+        typer.confirm(_CLEAR, abort=True, err=True)
     cameras = [
         make_camera(
             name, serial, camera_driver, record_to=out.parent / f"{out.name}_{name}.db3" if keep_recording else None,
@@ -226,10 +228,12 @@ def _check(
     connect: Callable[[], ArmProcess],
     path: ToolTrajectory | None,
     *,
+    move: bool,
     ask: bool,
     json: bool,
 ) -> None:
-    """Check cameras and arm and print the results; exit status 1 if something is wrong."""
+    """Check cameras and arm and print the results; exit status 1 if something is wrong. The arm is read but moves only if
+    `move` is set."""
     checks: list[Check] = []
     for camera in cameras:
         checks += [replace(one, name=f"camera {camera.name}: {one.name}") for one in conformance.check_camera(camera)]
@@ -239,12 +243,10 @@ def _check(
             check_trajectory(path, checker.limits)
             with closing(connect()) as arm:
                 checks.append(_planned(arm, checker, path))
-        if ask:
-            typer.confirm(
-                "Is the workspace clear, and a hand on the emergency stop? The arm will move", abort=True, err=True
-            )
+        if ask and move:
+            typer.confirm(_CLEAR, abort=True, err=True)
         try:
-            for one in conformance.check_arm(connect, checker, move=True, say=errors.print, ask=_request if ask else None):
+            for one in conformance.check_arm(connect, checker, move=move, say=errors.print, ask=_request if ask else None):
                 checks.append(replace(one, name=f"arm: {one.name}"))
         except DiffCloudError as error:  # what was found before it is printed first
             failure = error

@@ -225,6 +225,15 @@ class TestCommand:
         assert {"arm: trajectory", "arm: velocity", "camera side: depth"} <= names
         assert done.result["wrong"] == []
 
+    def test_a_dry_check_reads_the_arm_and_does_not_move_it(self, controller):
+        before = controller.tool_position
+        with description() as urdf:
+            done = invoke(
+                "capture", "--check-arm", "--dry-run", "--urdf", urdf, "--arm-driver", EXAMPLE, "--arm", controller.address
+            )
+        assert {"arm: joints", "arm: tool frame"} <= {one["name"] for one in done.result["checks"]}
+        np.testing.assert_array_equal(controller.tool_position, before)
+
     @pytest.mark.slow
     def test_a_trajectory_beyond_the_arms_reach_is_wrong(self, tmp_path, controller):
         rows = "t_s,x,y,z\n0,0.49,0.13,0.36\n9,0.94,0.35,0.9\n"
