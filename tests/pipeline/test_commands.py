@@ -497,7 +497,7 @@ class TestBadInput:
         explodes = ("--set", "bending=1e6", "--set", "mass=1e-6", "--frames", 2)
         done = run("rollout", "--scenario", "vest_hang", *explodes, "--out", "r.npz", cwd=work, code=1)
         assert "diverged at step" in done.errors
-        assert "bending=1e+15, mass=0.1" in done.errors
+        assert "bending=1e+06, mass=1e-06" in done.errors
         assert not (work / "r.npz").exists()
 
     def test_a_disk_that_cannot_be_written(self, work):
