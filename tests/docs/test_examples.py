@@ -73,7 +73,7 @@ def run(example: Example, *, slow: bool) -> None:
         write(example, Path.cwd())
     elif example.kind == "python":
         exec(compile(example.text, "example", "exec"), {})
-    elif words[0] == "python":
+    elif words[0] == "python" and words[1] != "-m":
         runpy.run_path(words[1])
     elif words[0] == "make":
         targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
