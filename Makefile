@@ -7,7 +7,7 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 # the tests start hundreds of processes; without byte code each would compile the package again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv repro test tests test-slow lint format bench acceptance comparison simulated recordings coverage robustness docs clean
+.PHONY: venv repro test tests test-slow test-longest lint format bench acceptance comparison simulated recordings coverage robustness docs clean
 
 venv: $(STAMP)
 
@@ -36,7 +36,11 @@ tests: venv
 	$(TESTS)
 
 test-slow: venv
-	$(TESTS) -m slow
+	$(TESTS) -m "slow and not longest"
+
+# minutes each on a slow machine: the simulator that compiles for itself, and the lag of sixteen recordings
+test-longest: venv
+	$(TESTS) -m longest
 
 lint: venv
 	ruff check .
