@@ -148,22 +148,20 @@ def record(
         raise ConfigError("--preset, --laser, --master and --auto-exposure are settings of RealSense cameras.")
     if master is not None and master not in serials:
         raise ConfigError(unknown_name("--master", master, serials))
-    settings_of = {
-        name: CameraSettings(not auto_exposure, preset, laser, None if master is None else _pace(name, master))
-        for name in serials
-    }
+
+    def camera_of(name: str, record_to: Path | None = None) -> Camera:
+        asked = CameraSettings(not auto_exposure, preset, laser, None if master is None else _pace(name, master))
+        return make_camera(name, serials[name], camera_driver, record_to=record_to, settings=asked, **options)
+
     if check_arm or check_cameras:
         if check_arm and arm is None:
             raise ConfigError("--check-arm needs the arm's address: --arm.")
         if check_cameras and not serials:
             raise ConfigError("--check-cameras needs cameras: --camera NAME=SERIAL.")
-        cameras = [
-            make_camera(name, serial, camera_driver, settings=settings_of[name], **options)
-            for name, serial in serials.items()
-        ]
+        cameras = [camera_of(name) for name in serials] if check_cameras else []
         checker = ArmChecker(robot or gen3(), limits, arm_limits) if check_arm else None
         connect = partial(open_arm, arm or "", arm_driver)
-        _check(cameras if check_cameras else [], checker, connect, path, move=not dry_run, ask=not yes, json=json)
+        _check(cameras, checker, connect, path, move=not dry_run, ask=not yes, json=json)
         return
     if out is None or not serials:
         raise ConfigError("A capture needs --out, the folder of the episode, and at least one --camera NAME=SERIAL.")
@@ -180,13 +178,7 @@ def record(
         return
     if arm is not None and not yes:
         typer.confirm(_CLEAR, abort=True, err=True)
-    cameras = [
-        make_camera(
-            name, serial, camera_driver, record_to=out.parent / f"{out.name}_{name}.db3" if keep_recording else None,
-            settings=settings_of[name], **options,
-        )
-        for name, serial in serials.items()
-    ]  # fmt: skip
+    cameras = [camera_of(name, out.parent / f"{out.name}_{name}.db3" if keep_recording else None) for name in serials]
     settings = CaptureSettings(rate_hz=rate_hz, keep_every=max(1, round(fps / rate_hz)), go_home=home)
     opened = None if arm is None else open_arm(arm, arm_driver)
     try:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
 
 import typer
 from rich.console import Console
@@ -20,6 +20,9 @@ from rich.text import Text
 
 from diffcloud.errors import ConfigError
 from diffcloud.io.files import claimed, files_in
+
+if TYPE_CHECKING:
+    from diffcloud.hardware.installed import Check
 
 _QUIET_S = 10.0
 """Between lines of progress where standard error is no terminal."""
@@ -61,22 +64,8 @@ def show(table: Table, as_json: bool) -> None:
     (errors if as_json else output).print(table)
 
 
-class Checked(Protocol):
-    """A line of a report on what is installed, or of a conformance test."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def state(self) -> str:
-        """ok, missing or wrong."""
-
-    @property
-    def detail(self) -> str: ...
-
-
-def show_checks(checks: Sequence[Checked], as_json: bool) -> None:
-    """Print a report; see `show`."""
+def show_checks(checks: Sequence[Check], as_json: bool) -> None:
+    """Print a report on what is installed, or of a conformance test; see `show`."""
     table = Table("", "state", "detail")
     for check in checks:
         table.add_row(check.name, Text(check.state, "green" if check.state == "ok" else "red"), check.detail)

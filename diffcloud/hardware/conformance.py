@@ -23,6 +23,7 @@ from diffcloud.hardware.arm_process import WATCHDOG_S, ArmProcess
 from diffcloud.hardware.contact import at_rest
 from diffcloud.hardware.devices import ArmReading, Camera
 from diffcloud.hardware.installed import Check
+from diffcloud.sensing.validation.episode import FARTHEST_M, NEAREST_M
 
 Floats = NDArray[np.float64]
 
@@ -91,8 +92,9 @@ def check_camera(camera: Camera, *, seconds: float = 2.0, timeout_s: float = 1.0
     seen = frame.depth[frame.depth > 0]
     middle = float(np.median(seen)) * info.depth_scale_m if seen.size else 0.0
     yield _check(
-        "depth scale", 0.1 < middle < 8.0,
-        f"the median depth is {middle:.2f} m with {info.depth_scale_m:g} m per unit; must be 0.1 to 8",
+        "depth scale", NEAREST_M < middle < FARTHEST_M,
+        f"the median depth is {middle:.2f} m with {info.depth_scale_m:g} m per unit; must be {NEAREST_M:g} to "
+        f"{FARTHEST_M:g}",
     )  # fmt: skip
     try:
         camera.read(0.05)
@@ -253,12 +255,12 @@ def _readings(arm: ArmProcess, checker: ArmChecker) -> Iterator[Check]:
     )  # fmt: skip
     grip = last.gripper
     yield _check("gripper", grip is None or -0.05 <= grip <= 1.05, f"{grip}; must be 0 (open) to 1 (closed), or None")
-    _refused = ""
+    refused = ""
     try:
         arm.send_velocity(np.zeros(3))
     except HardwareError as error:
-        _refused = str(error)
-    yield _check("velocities before prepare()", bool(_refused), _refused or "were accepted")
+        refused = str(error)
+    yield _check("velocities before prepare()", bool(refused), refused or "were accepted")
 
 
 def _motion(guarded: _Guarded) -> Iterator[Check]:

@@ -137,19 +137,18 @@ def go_to_start(motion: Motion, trajectory: ToolTrajectory, tell: Callable[[str]
         HardwareError: the arm is in fault, driven by somebody else, or lost.
     """
     arm, limits, checker = motion.arm, motion.limits, motion.checker
-    approaching = motion.settings.approach_speed_m_s
+    speed = min(motion.settings.approach_speed_m_s, limits.speed_m_s)
     arm.prepare()
     rest, contact = at_rest(arm, limits)
     checker.check_tool_frame(rest)
     if motion.settings.go_home:
-        speed = min(motion.settings.approach_speed_m_s, limits.speed_m_s)
         path = checker.plan_home(arm.home_joints(), rest, speed_m_s=speed)
-        plan_motion(checker, trajectory, checker.at(path.joints_rad[-1], rest), speed_m_s=approaching)
+        plan_motion(checker, trajectory, checker.at(path.joints_rad[-1], rest), speed_m_s=speed)
         tell(f"moving home, {path.duration_s:.1f} s")
         run(motion, JointFollower(motion, "way home", path, rest, contact))
         arm.prepare()
         rest, contact = at_rest(arm, limits)
-    way = plan_motion(checker, trajectory, rest, speed_m_s=approaching)
+    way = plan_motion(checker, trajectory, rest, speed_m_s=speed)
     if way is not None:
         tell(f"approaching the first keyframe, {way.duration_s:.1f} s")
         run(motion, ToolFollower(motion, "approach", way, rest, contact))

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffcloud.errors import EpisodeError, HardwareError
+from diffcloud.errors import HardwareError
 from diffcloud.hardware.arm_limits import ArmChecker, ArmLimits
 from diffcloud.hardware.devices import ArmReading, Camera, GuardedArm
 from diffcloud.hardware.interruption import Interruption
@@ -28,7 +28,7 @@ from diffcloud.hardware.motion import Motion, ToolFollower, go_to_start, run
 from diffcloud.hardware.recorders import Clock, Recorders
 from diffcloud.hardware.settings import CaptureSettings
 from diffcloud.hardware.trajectory import Limits, ToolTrajectory, check_trajectory
-from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter
+from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter, exists_already
 
 if TYPE_CHECKING:
     from diffcloud.sensing.robot import Robot
@@ -96,7 +96,7 @@ def capture(
         raise HardwareError("Without an arm, say how long to record: --seconds.")
     # all that can be refused is refused before a camera is opened, and long before the arm moves
     if Path(folder).exists():
-        raise EpisodeError(f"{folder} exists; raw episodes are never overwritten. Choose another name.")
+        raise exists_already(folder)
     if trajectory is not None:
         check_trajectory(trajectory, limits)
     import_module("cv2")  # encodes the images; imported at the first of them it would hold the control loop up

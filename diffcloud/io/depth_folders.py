@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -60,8 +61,7 @@ def _camera(folder: Path, name: str) -> CameraInfo:
     data = read_json(path, error=EpisodeError)
     kind = _Open3DCamera if isinstance(data, dict) and "intrinsic_matrix" in data else _OwnCamera
     try:
-        told = kind.model_validate(data)
-        return told.camera(name)
+        return kind.model_validate(data).camera(name)
     except ValidationError as error:
         raise explain(path, error, EpisodeError) from error
 
@@ -72,9 +72,7 @@ class _OwnCamera(CameraFile):
     serial: Name | None = None  # type: ignore[assignment]
 
     def camera(self, name: str) -> CameraInfo:
-        place = None if self.T_world_camera is None else np.array(self.T_world_camera)
-        held = self.intrinsics.intrinsics()
-        return CameraInfo(name, self.serial or name, held, self.depth_scale_m, place, settings=self.settings)
+        return replace(super().camera(name), serial=self.serial or name, calibration=None)
 
 
 class _Open3DCamera(BaseModel):

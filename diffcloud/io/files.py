@@ -309,7 +309,7 @@ def numbered_files(folder: Path, formats: tuple[str, ...], *, kind: str) -> dict
         kind: of file, for messages, such as "clouds".
 
     Raises:
-        EpisodeError: no such folder or file, two files of one number, or numbers that are missing.
+        EpisodeError: no such folder or file, two files of one number, numbers that are missing, or that are times.
     """
     if not Path(folder).is_dir():
         raise EpisodeError(f"No such folder of {kind}: {folder}.")

@@ -97,20 +97,22 @@ def _depth_scale(scale: float) -> float:
     return scale
 
 
-DepthScale = Annotated[float, AfterValidator(_depth_scale)]
-"""[m] for each unit of a depth image."""
-
-
 class CameraFile(Checked):
     """camera.json."""
 
     name: Name | None = None
     serial: Name
     intrinsics: IntrinsicsFile
-    depth_scale_m: DepthScale
+    depth_scale_m: Annotated[float, AfterValidator(_depth_scale)]
     T_world_camera: RigidTransform | None = None
     calibration: FileName | None = None
     settings: dict[Name, Annotated[float, Field(ge=-1e9, le=1e9)]] = Field(default_factory=dict)
+
+    def camera(self, name: str) -> CameraInfo:
+        """What it says of a camera of this name."""
+        place = None if self.T_world_camera is None else np.array(self.T_world_camera)
+        held = self.intrinsics.intrinsics()
+        return CameraInfo(name, self.serial, held, self.depth_scale_m, place, self.calibration, self.settings)
 
 
 class PlacementFile(Checked):
@@ -301,15 +303,7 @@ def read_camera_info(path: Path) -> CameraInfo:
         told = CameraFile.model_validate(read_json(Path(path), error=EpisodeError))
     except ValidationError as error:
         raise explain(path, error, EpisodeError) from error
-    return CameraInfo(
-        told.name or Path(path).parent.name,
-        told.serial,
-        told.intrinsics.intrinsics(),
-        told.depth_scale_m,
-        None if told.T_world_camera is None else np.array(told.T_world_camera),
-        told.calibration,
-        told.settings,
-    )
+    return told.camera(told.name or Path(path).parent.name)
 
 
 def read_timestamps(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -382,6 +376,11 @@ def raw_episode_files(folder: Path) -> tuple[list[str], list[str]]:
     return own, sorted(set(seen) - set(own))
 
 
+def exists_already(folder: Path) -> EpisodeError:
+    """What is raised where a raw episode should be written to a folder that is there."""
+    return EpisodeError(f"{folder} exists; raw episodes are never overwritten. Choose another name.")
+
+
 class RawEpisodeWriter:
     """Writes a raw episode while it is recorded; a context manager.
 
@@ -422,7 +421,7 @@ class RawEpisodeWriter:
         try:
             self.folder.mkdir(parents=True, exist_ok=False)
         except FileExistsError as error:
-            raise EpisodeError(f"{folder} exists; raw episodes are never overwritten. Choose another name.") from error
+            raise exists_already(folder) from error
         except OSError as error:
             raise DiffCloudError(f"Cannot write {folder}: {error.strerror}.") from error
         self._description: dict[str, Any] = {

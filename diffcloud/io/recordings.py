@@ -18,6 +18,7 @@ from diffcloud.io.raw_episodes import (
     RawEpisodeWriter,
     RobotLog,
     RobotSample,
+    exists_already,
     first_backwards,
     read_robot_log,
 )
@@ -73,7 +74,7 @@ def write_recording(
         raise EpisodeError(f"{recording.source}: no depth image was found.")
     start = first.time_s
     if Path(folder).exists():
-        raise EpisodeError(f"{folder} exists; raw episodes are never overwritten. Choose another name.")
+        raise exists_already(folder)
     with staged(folder) as temporary:
         return _written(temporary, recording, chain([first], frames), start, rate_hz, meta)
 

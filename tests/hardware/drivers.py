@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from diffcloud.errors import HardwareError
 from diffcloud.hardware.examples.simulated_ur5e import SimulatedUR5e
 from diffcloud.io.images import write_color, write_depth
 from tests.hardware.simulated import TestCard
@@ -80,8 +81,6 @@ class Silent(TestCard):
     def read(self, timeout_s):
         if self.delivered >= 3:
             time.sleep(timeout_s)
-            from diffcloud.errors import HardwareError
-
             raise HardwareError(f"no frame for {timeout_s:g} s")
         return super().read(timeout_s)
 

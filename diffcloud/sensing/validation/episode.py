@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 _GAP = 2.5
 """A gap is this many times the median interval."""
-_NEAREST_M, _FARTHEST_M = 0.1, 8.0
+NEAREST_M, FARTHEST_M = 0.1, 8.0
 """Median depth of a table-top scene lies between."""
 _LONGEST_REACH_M = 3.0
 """No arm of this kind reaches farther."""
@@ -204,17 +204,17 @@ def _images(camera: RecordedCamera) -> Iterator[Finding]:
         yield Finding("warning", "sparse_depth", f"{place}/depth", f"{_numbers(sparse)} depth in under 2 % of the pixels.")
     if medians and camera.info is not None:
         distance = float(np.median(medians)) * camera.info.depth_scale_m
-        if not _NEAREST_M <= distance <= _FARTHEST_M:
-            factor = 1000 if distance > _FARTHEST_M else 0.001
+        if not NEAREST_M <= distance <= FARTHEST_M:
+            factor = 1000 if distance > FARTHEST_M else 0.001
             hint = f"; depth_scale_m is off by a factor of {factor:g} (millimetres for metres)"
-            plausible = _NEAREST_M <= distance / factor <= _FARTHEST_M
+            plausible = NEAREST_M <= distance / factor <= FARTHEST_M
             yield Finding(
                 "fault",
                 "depth_unit",
                 f"{place}/camera.json",
                 f"The median depth is {distance:.3g} m with depth_scale_m = {camera.info.depth_scale_m:g}"
                 + (hint if plausible else "")
-                + f". A table-top scene lies between {_NEAREST_M} and {_FARTHEST_M} m.",
+                + f". A table-top scene lies between {NEAREST_M} and {FARTHEST_M} m.",
             )
 
 
