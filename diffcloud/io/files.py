@@ -40,6 +40,7 @@ _MOST_JSON, _MOST_YAML = 50_000_000, 1_000_000
 """Bytes of a file of text that is read as a whole: JSON; YAML, whose reader is slow."""
 _MOST_FRAMES = 100_000_000
 TEMPORARY, LOCK = ".diffcloud-tmp", ".diffcloud-lock"
+_SHARED_TIME = 1_600_000_000  # of change, of files that several processes write alike [s]
 """Suffixes of a file that is being written, and of the lock file beside an output that a command holds."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EINVAL}
 """What a file system without locks answers; nothing is locked there."""
@@ -167,6 +168,27 @@ def write_bytes(path: Path, data: bytes) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically (UTF-8)."""
     write_bytes(path, text.encode("utf-8"))
+
+
+def write_shared(path: Path, text: str) -> None:
+    """Write a text file that other processes may be writing at this moment with the same text.
+
+    Whoever comes last, the file is the same, and so is its time of change, which caches compare.
+
+    Raises:
+        DiffCloudError: the system refused the write; names the file.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY}")
+    try:
+        try:
+            temporary.write_text(text, encoding="utf-8")
+            os.utime(temporary, (_SHARED_TIME, _SHARED_TIME))
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise _refused(path, error) from error
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -53,6 +53,17 @@ class TestAtomicWrites:
         assert target.read_text() == "old"
         assert names(tmp_path) == ["a.txt"]
 
+    def test_processes_that_write_the_same_do_not_hinder_each_other(self, tmp_path):
+        target = tmp_path / "shared.py"
+        code = (
+            "import sys; from pathlib import Path; from diffcloud.io.files import write_shared\n"
+            "for _ in range(300): write_shared(Path(sys.argv[1]), 'the same\\n' * 2000)"
+        )
+        processes = [subprocess.Popen([sys.executable, "-c", code, str(target)]) for _ in range(4)]
+        assert [process.wait() for process in processes] == [0] * 4
+        assert target.read_text() == "the same\n" * 2000
+        assert names(tmp_path) == ["shared.py"]
+
     def test_a_full_disk_is_a_clear_error_and_leaves_nothing(self, tmp_path):
         target = tmp_path / "a.txt"
         with pytest.raises(DiffCloudError, match=r"Cannot write .*a\.txt: No space left"):

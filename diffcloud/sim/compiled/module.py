@@ -16,7 +16,7 @@ from functools import cache
 from types import ModuleType
 
 from diffcloud.compiled import cache_folder
-from diffcloud.io.files import write_text
+from diffcloud.io.files import write_shared
 from diffcloud.sim.compiled.data import Motion
 from diffcloud.sim.compiled.derivatives import directional, gradient
 from diffcloud.sim.compiled.function import Function
@@ -59,7 +59,7 @@ def terms_module(terms: tuple[Term, ...], contacts: tuple[Term, ...], functions:
     name = f"diffcloud_terms_{folder.name}"
     path = folder / f"{name}.py"
     if not path.is_file():
-        write_text(path, source_of(terms, contacts, functions))
+        write_shared(path, source_of(terms, contacts, functions))
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
