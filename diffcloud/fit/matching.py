@@ -26,8 +26,6 @@ from diffcloud.clouds.sampling import SurfacePoints
 from diffcloud.fit.pose import PoseSpace
 from diffcloud.fit.targets import Target
 
-_TINY = 1e-300
-
 
 @dataclass(frozen=True)
 class Pairs:
@@ -73,16 +71,14 @@ class Pairs:
         Args:
             rates: [k, B, L, N, 3] of the places.
         """
-        away = moved - self.partners
-        squared = away.square().sum(-1)
-        weights = torch.where(squared < cap**2, self.weights, 0.0)
-        flat = away - (away * self.normals).sum(-1, keepdim=True) * self.normals
-        beside = flat.square().sum(-1) + self.spacing[:, None] ** 2
-        rim = flat / beside.sqrt().clamp(min=_TINY)[..., None]  # sqrt(w) t
-        rows = torch.stack([(rates * one).sum(-1) for one in (self.normals, rim)])  # [2, k, B, L, N]
-        slope = torch.einsum("kblni,blni,bln->bk", rates, away, weights)
-        curvature = torch.einsum("rjbln,rkbln,bln->bjk", rows, rows, weights)
-        return self.losses(moved, cap).sum(-1), slope, curvature
+        from diffcloud.fit.curvature import sum_terms  # numba takes a moment to import
+
+        batch, count = len(moved), len(rates)
+        loss, slope, curvature = (moved.new_zeros(batch, *[count] * order) for order in range(3))
+        given = (moved, self.partners, self.normals, self.spacing, self.weights, rates)
+        arrays = [tensor.detach().contiguous().numpy() for tensor in given]
+        sum_terms(*arrays, cap, self.share * cap**2, loss.numpy(), slope.numpy(), curvature.numpy())
+        return loss, slope, curvature
 
 
 @dataclass(frozen=True)

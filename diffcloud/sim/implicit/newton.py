@@ -14,10 +14,10 @@ from diffcloud.sim.implicit.matrix import newton_matrix
 from diffcloud.sim.implicit.room import Room, away, cover, distances_at, free_way, room_around
 from diffcloud.sim.implicit.scene import Work
 
-_TOLERANCE = 1e-10
+_TOLERANCE = 1e-11
 """Expected next change of velocity, relative to the largest, at which Newton's method has converged.
 
-It is overestimated: convergence is quadratic in the end, so what is left is far smaller."""
+It is overestimated: convergence is faster than linear, so what is left is far smaller."""
 _ROUNDING = 1e-7
 """Below this relative change a step that no longer shrinks has reached the arithmetic's precision."""
 _ITERATIONS = 30
@@ -28,12 +28,16 @@ _LEAST_CAUTION = 0.05
 """Of the step after one that the exact matrix led astray."""
 _ROUGH = 1e-4
 """Relative changes above this are checked, and shortened where they lead astray."""
-_REUSE = 1e-1
+_REUSE = 5e-1
 """Below this relative change a matrix serves once more, be it that of the part before, and then as long as changes shrink:
-a new one costs as much as five to ten steps with an old one."""
+a new one costs as much as five to ten steps with an old one, which Broyden's updates correct."""
 _SHRINKING = 0.3
 _WHOLE = 1 - 1e-9
 """A way that is free so far is free: where it has been shortened before, only rounding keeps it from being whole."""
+_ALMOST_WHOLE = 0.999
+"""A step of this part of its direction shows what the residual does along it."""
+_LEAST_REST = 0.2
+"""Of the divisor in Broyden's update: a smaller one makes too much of a step."""
 _PROBE = 1e-4
 """Part of the obstacles' way over which its effect is measured."""
 
@@ -87,19 +91,22 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
     caution, reused = 1.0 if stale else 0.0, not stale
     work.serves = 0.0
     right, direction = np.empty((len(first), 3)), np.empty((len(first), 3))
+    steps, sizes, taken = np.empty((_ITERATIONS, len(first), 3)), np.empty(_ITERATIONS), 0  # whole ones of this matrix
     for _ in range(_ITERATIONS):
         fresh = stale
         if stale:
             set_motion(work, here.velocity, here.points)
             matrix = newton_matrix(work, here.velocity, here.turned, here.listed, here.numbers, here.touching, caution)
+            taken = 0
         _pushed(work, here, left_over, right)
         if not solve_general(matrix, right, 0, direction):
             return False, here, room, change
+        _correct(steps, sizes, taken, direction)
         downhill, size = _judge(work.holder, left_over, direction, here.velocity)
         rough = size > _ROUGH
         bad = (rough and downhill <= 0 and caution < 1) or (reused and size > _REUSE)
         if not bad:
-            here, short = _search(work, here, direction, downhill, room, rough, trial_left)
+            here, short, part = _search(work, here, direction, downhill, room, rough, trial_left)
             left_over, trial_left = trial_left, left_over
             before, change = change, size
             expected = change * min(change / before, 1.0) if np.isfinite(before) else change
@@ -109,6 +116,7 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
                 if not trouble:
                     work.serves = work.time_step
                 return True, here, room, change
+            taken = _remember(steps, sizes, taken, direction) if part > _ALMOST_WHOLE else 0
             bad = short
             stale = bad or caution > 0 or change > _REUSE or not (fresh or change < _SHRINKING * before)
             if not stale:
@@ -118,6 +126,48 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
         caution = (1.0 if reused else min(max(4 * caution, _LEAST_CAUTION), 1.0)) if bad else 0.0
         reused = False
     return False, here, room, change
+
+
+@kernel
+def _correct(steps: Floats, sizes: Floats, taken: int, direction: Floats) -> None:
+    """Correct the solution [D, 3] of an old matrix by what the steps since then have shown of the true one.
+
+    Broyden's update of the inverse, from these steps alone (Kelley, Iterative Methods for Linear and Nonlinear Equations,
+    SIAM 1995, section 7.3). The direction is still that of the residual: its sign is turned round afterwards.
+    """
+    if taken == 0:
+        return
+    for k in range(taken - 1):
+        share = _along(steps[k], direction) / sizes[k]
+        for i in range(len(direction)):
+            for axis in range(3):
+                direction[i, axis] += share * steps[k + 1, i, axis]
+    rest = 1.0 + _along(steps[taken - 1], direction) / sizes[taken - 1]
+    if rest > _LEAST_REST:
+        for i in range(len(direction)):
+            for axis in range(3):
+                direction[i, axis] /= rest
+
+
+@kernel
+def _remember(steps: Floats, sizes: Floats, taken: int, direction: Floats) -> int:
+    """Keep a step [D, 3]; how many there are."""
+    size = 0.0
+    for i in range(len(direction)):
+        for axis in range(3):
+            steps[taken, i, axis] = direction[i, axis]
+            size += direction[i, axis] ** 2
+    sizes[taken] = size
+    return taken + 1 if size > 0 else taken
+
+
+@kernel
+def _along(first: Floats, second: Floats) -> float:
+    found = 0.0
+    for i in range(len(first)):
+        for axis in range(3):
+            found += first[i, axis] * second[i, axis]
+    return found
 
 
 @kernel
@@ -171,16 +221,16 @@ def _pushed(work: Work, here: Place, left_over: Floats, found: Floats) -> None:
 @kernel
 def _search(
     work: Work, here: Place, direction: Floats, downhill: float, room: Room, rough: bool, found: Floats
-) -> tuple[Place, bool]:
+) -> tuple[Place, bool, float]:
     """The step along `direction` at whose end it leads downhill still, or uphill less steeply than it began.
 
     Where forces have a potential, that is a step along which it falls; friction, drag and damping are judged alike.
     `found` [D, 3] takes the residual at its end.
 
     Returns:
-        (the place, whether the step had to be shortened for it)
+        (the place, whether the step had to be shortened for it, which part of the direction it goes)
     """
-    alpha, short, trial, holder = 1.0, False, here, work.holder
+    alpha, short, trial, holder, part = 1.0, False, here, work.holder, 1.0
     most = 1e-300
     for i in range(len(direction)):
         for axis in range(3):
@@ -195,11 +245,12 @@ def _search(
                 if i >= len(holder) or holder[i] < 0:
                     uphill += found[i, axis] * direction[i, axis]
                 gone = max(gone, abs(new[i, axis] - old[i, axis]))
+        part = gone / most
         if not rough or uphill <= 0.9 * max(downhill, 0.0):
             break
         short = True
-        alpha = 0.5 * gone / most
-    return trial, short
+        alpha = 0.5 * part
+    return trial, short, part
 
 
 @kernel
