@@ -79,7 +79,7 @@ def compare_episode(
     told += [*predictions, *methods.published(episode.meta)]
     estimates = [entry for entry in told if isinstance(entry, Estimate)]
     gaps = [entry for entry in told if isinstance(entry, Gap)]
-    meter = EpisodeMeter(scenario, episode, **measure, draws=settings.draws, seed=settings.seed)
+    meter = EpisodeMeter(objective, draws=settings.draws, seed=settings.seed)
     sources = dict(transfers or {})
     sets = [methods.clipped(values, space) for values in (*(e.values for e in estimates), *sources.values())]
     measured = meter.measure([*sets, fit.start])

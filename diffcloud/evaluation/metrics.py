@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,6 @@ import torch
 from diffcloud.clouds.losses import chamfer
 from diffcloud.fit import Objective
 from diffcloud.fit.batches import without_diverged
-from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import PAPER_THRESHOLD, RELEASE_UNIT_M, Scenario
 
 
@@ -36,32 +36,26 @@ class EpisodeMeter:
     The points are drawn anew: no method has seen them.
     """
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        episode: Episode,
-        *,
-        frames: Sequence[int] | None = None,
-        points: int | None = None,
-        paper: bool = False,
-        nuisance: Mapping[str, float] | None = None,
-        draws: int = 4,
-        seed: int = 1000,
-    ) -> None:
+    def __init__(self, objective: Objective, *, draws: int = 4, seed: int = 1000) -> None:
         """
         Args:
-            frames, points, paper, nuisance: those of the fit, as of `Objective`.
-            draws: of points, over which distances at the fit's frames are averaged.
+            objective: whose measure counts; it stays as it is.
+            draws: of points, over which distances at its frames are averaged.
             seed: of the first draw.
         """
+        scenario, episode = objective.scenario, objective.episode
         self.scenario, self.episode = scenario, episode
-        measure: dict[str, Any] = {"points": points, "paper": paper, "nuisance": nuisance, "seed": seed}
-        self._own = Objective(scenario, episode, frames=frames, **measure)
+        self._own = copy(objective)
         last = scenario.steps * scenario.scene.time_step + 1e-6
         # frame 0 is before the motion and the same for all parameters
-        used = self._own.frames
+        used = objective.frames
         others = [f for f in range(1, episode.frame_count) if f not in used and episode.times[f] <= last]
-        self._others = Objective(scenario, episode, frames=others, **measure) if others else None
+        measure: dict[str, Any] = {
+            "points": objective.asked_points,
+            "paper": objective.paper,
+            "nuisance": objective.nuisance,
+        }
+        self._others = Objective(scenario, episode, frames=others, seed=seed, **measure) if others else None
         self._seeds = range(seed, seed + draws)
 
     def measure(self, sets: Sequence[Mapping[str, float]]) -> Measured:

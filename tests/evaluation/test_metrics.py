@@ -39,7 +39,7 @@ def batch(*sets):
 
 @pytest.fixture(scope="module")
 def rows(scenario, episode):
-    return EpisodeMeter(scenario, episode, frames=[-1], paper=True, draws=2, seed=7).measure([TRUTH, OTHER]).rows
+    return EpisodeMeter(Objective(scenario, episode, frames=[-1], paper=True), draws=2, seed=7).measure([TRUTH, OTHER]).rows
 
 
 class TestMeter:
@@ -72,7 +72,7 @@ class TestMeter:
         assert [row["success"] for row in rows] == [row["loss"] < success_threshold(scenario) for row in rows]
 
     def test_one_that_diverges_costs_only_itself(self, scenario, episode, rows):
-        meter = EpisodeMeter(scenario, episode, frames=[-1], paper=True, draws=2, seed=7)
+        meter = EpisodeMeter(Objective(scenario, episode, frames=[-1], paper=True), draws=2, seed=7)
         found = meter.measure([TRUTH, {"stretch": -1e9, "mass": 1.0}, OTHER])
         assert list(found.diverged) == [1]
         assert "diverged at step" in found.diverged[1]
@@ -81,7 +81,7 @@ class TestMeter:
 
     def test_an_episode_of_the_loss_frame_alone(self, scenario, episode):
         short = Episode.from_frames([episode.frame(0), episode.frame(-1)], episode.times[[0, -1]])
-        row = EpisodeMeter(scenario, short, frames=[-1], paper=True, draws=1).measure([TRUTH]).rows[0]
+        row = EpisodeMeter(Objective(scenario, short, frames=[-1], paper=True), draws=1).measure([TRUTH]).rows[0]
         assert "loss_other_frames" not in row
         assert "success" not in row  # nothing is known of it
         assert row["loss_deviation"] == 0.0
@@ -138,7 +138,7 @@ class TestEpisode:
         assert found.seconds["diffcloud"] == {"optimisation": summary.seconds}
 
     def test_the_start_is_measured_as_the_methods_are(self, scenario, episode, found, summary):
-        meter = EpisodeMeter(scenario, episode, paper=True, draws=2)
+        meter = EpisodeMeter(Objective(scenario, episode, paper=True), draws=2)
         assert found.record["start"] == pytest.approx(meter.measure([summary.start]).rows[0])
 
     def test_transfer_is_measured_as_the_methods_are(self, found):
