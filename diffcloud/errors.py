@@ -22,6 +22,10 @@ class EpisodeError(DiffCloudError):
     """A recorded episode or a cloud file that is damaged, empty, or of the wrong shape."""
 
 
+class EmptyCloudError(EpisodeError):
+    """A cloud file without points."""
+
+
 class HardwareError(DiffCloudError):
     """A camera or an arm that is missing, cannot be opened, or failed while it ran."""
 

@@ -45,6 +45,8 @@ _STEPS = 8
 _MOST_STEPS = 64
 _NOISE_PART = 0.5
 """Largest distance to the motion with finer steps, as a part of the misfit that noise accounts for."""
+_RESTARTS = 2
+"""From a lower loss that was met while intervals were stated."""
 _TRANSFERS, _GAIN = 1.25, 0.5
 _HEAD = "# Found by diffcloud identify, with the reason beside each value. Edit and run the command again to overrule."
 
@@ -85,8 +87,7 @@ def identify(
     with claimed(out):
         episodes, cloth, layouts = find_scene(recordings, out, stated, mass)
         chosen = _chosen(parameters, cloth, mass)
-        record, objective, job = _fitted(out, episodes, cloth, layouts, chosen)
-        found = state_intervals(objective, space_of(record), record.fitted, level=level, within=within)
+        record, objective, job, found = _stated(out, episodes, cloth, layouts, chosen, level=level, within=within)
         findings = _findings(record, objective, found)
         with together():
             write_text(out / "report.html", _page(record, found, findings, episodes, job))
@@ -285,15 +286,44 @@ def _scenarios(
     return found
 
 
+def _stated(
+    out: Path,
+    episodes: Mapping[str, Episode],
+    cloth: Mapping[str, Any],
+    layouts: Mapping[str, Mapping[str, Any]],
+    settings: FitConfig,
+    *,
+    level: float,
+    within: float,
+) -> tuple[FitRecord, AnyObjective, FitJob, Intervals]:
+    """Fit and state intervals; where these meet a lower loss, fit again from there."""
+    steps, init = int(cloth.get("steps_per_frame", _STEPS)), dict[str, float]()
+    for left in range(_RESTARTS, -1, -1):
+        record, objective, job, steps = _fitted(out, episodes, cloth, layouts, settings, steps, init)
+        found = state_intervals(objective, space_of(record), record.fitted, level=level, within=within)
+        if found.lower is None or not left:
+            break
+        near = ", ".join(f"{name} {value:.3g}" for name, value in found.lower.items())
+        errors.print(f"The loss is lower at {near}; fitting again from there.")
+        init, settings = found.lower, _single_start(settings)
+    return record, objective, job, found
+
+
+def _single_start(settings: FitConfig) -> FitConfig:
+    """From a place that is known."""
+    return settings.model_copy(update={"starts": 1, "screen": 0})
+
+
 def _fitted(
     out: Path,
     episodes: Mapping[str, Episode],
     cloth: Mapping[str, Any],
     layouts: Mapping[str, Mapping[str, Any]],
     settings: FitConfig,
-) -> tuple[FitRecord, AnyObjective, FitJob]:
-    """Fit, with finer and finer steps from the place found, until they no longer matter."""
-    steps, init = int(cloth.get("steps_per_frame", _STEPS)), dict[str, float]()
+    steps: int,
+    init: dict[str, float],
+) -> tuple[FitRecord, AnyObjective, FitJob, int]:
+    """Fit, with finer and finer steps from the place found, until they no longer matter; and the steps a frame."""
     while True:
         scenarios = _scenarios(out, cloth, layouts, steps)
         members = [Recording(scenarios[name], name, episode) for name, episode in episodes.items()]
@@ -309,9 +339,8 @@ def _fitted(
         if apart <= _NOISE_PART * noise or 2 * steps > _MOST_STEPS:
             if apart > _NOISE_PART * noise:
                 warn(f"finer steps still move the cloth by {apart:.1f} mm: what is found includes an error of that size.")
-            return record, objective, job
-        steps, init = 2 * steps, record.fitted
-        settings = settings.model_copy(update={"starts": 1, "screen": 0})
+            return record, objective, job, steps
+        steps, init, settings = 2 * steps, record.fitted, _single_start(settings)
 
 
 def _tell(update: Callable[[float, str], None], steps: int, done: float, text: str) -> None:

@@ -114,6 +114,8 @@ class Intervals(_Model):
     """Whether the recordings' noise accounts for the misfit."""
     reason: str
     """Why there is no interval, or the verdict is not of the parameters; else empty."""
+    lower: dict[str, float] | None = None
+    """Where a clearly lower loss was met, from which a fit may start again."""
 
 
 def state_intervals(
@@ -216,6 +218,7 @@ def state_intervals(
         arrived=arrived,
         explains=explains,
         reason=reason,
+        lower=lower,
     )
 
 

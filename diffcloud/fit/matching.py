@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -75,9 +76,19 @@ class Pairs:
 
         batch, count = len(moved), len(rates)
         loss, slope, curvature = (moved.new_zeros(batch, *[count] * order) for order in range(3))
-        given = (moved, self.partners, self.normals, self.spacing, self.weights, rates)
-        arrays = [tensor.detach().contiguous().numpy() for tensor in given]
-        sum_terms(*arrays, cap, self.share * cap**2, loss.numpy(), slope.numpy(), curvature.numpy())
+        sum_terms(
+            _array(moved),
+            _array(self.partners),
+            _array(self.normals),
+            _array(self.spacing),
+            _array(self.weights),
+            _array(rates),
+            cap,
+            self.share * cap**2,
+            _array(loss),
+            _array(slope),
+            _array(curvature),
+        )
         return loss, slope, curvature
 
 
@@ -97,6 +108,11 @@ class Motion:
     def shown(self, space: PoseSpace) -> Tensor:
         """[B, L, V, 3] where the nodes are when the recording looks at them."""
         return _shown(self.nodes, self.velocities, self.pose, space)
+
+
+def _array(tensor: Tensor) -> Any:
+    """The numbers of a tensor; where it is contiguous, its own ones."""
+    return tensor.detach().contiguous().numpy()
 
 
 class Matcher:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffcloud.errors import EpisodeError
+from diffcloud.errors import EmptyCloudError, EpisodeError
 from diffcloud.io.files import atomic
 from diffcloud.io.libusb import load_libusb
 from diffcloud.io.pickles import load_npy
@@ -25,7 +25,7 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
     """[N, 3] points of one file; colours, normals and further columns are left out.
 
     Raises:
-        EpisodeError: missing, damaged, empty, of the wrong shape, or with NaN/Inf points.
+        EpisodeError: missing, damaged, empty (`EmptyCloudError`), of the wrong shape, or with NaN/Inf points.
     """
     path = Path(path)
     if not path.is_file():
@@ -39,7 +39,7 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
     if points.ndim != 2 or points.shape[1] != 3:
         raise EpisodeError(f"{path} has shape {list(points.shape)}; a cloud has shape [points, 3].")
     if len(points) == 0:
-        raise EpisodeError(f"{path} is an empty cloud.")
+        raise EmptyCloudError(f"{path} is an empty cloud.")
     if not np.isfinite(points).all():
         count = int((~np.isfinite(points).all(axis=1)).sum())
         raise EpisodeError(f"{path} holds {count} NaN or infinite points; remove them first.")

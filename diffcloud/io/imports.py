@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from diffcloud.errors import EpisodeError
+from diffcloud.errors import EmptyCloudError, EpisodeError
 from diffcloud.io.clouds import FORMATS, read_cloud
 from diffcloud.io.episodes import Episode
 from diffcloud.io.files import folders_in, numbered_files
@@ -36,6 +36,8 @@ ASSUMED_CATEGORIES = {
 }
 """The paper names the categories, not which fabric is in which: this is our reading of its text and figures."""
 _MODELS = ("mlp", "pointnet2", "meteornet")
+_MOST_NAMED = 5
+"""Empty frames in a message."""
 
 
 def release_episodes(folder: Path) -> Iterator[tuple[str, str, Episode]]:
@@ -83,10 +85,21 @@ def cloud_folder(
         rate_hz: frame rate where the CSV has no t_s.
 
     Raises:
-        EpisodeError: no clouds, a gap in the numbers, a bad cloud, or a CSV that does not match.
+        EpisodeError: no clouds, a gap in the numbers, a bad or an empty cloud, or a CSV that does not match.
     """
-    paths = list(numbered_files(Path(folder), FORMATS, kind="clouds").values())
-    frames = [read_cloud(path) for path in paths]
+    frames, empty = [], []
+    for number, path in numbered_files(Path(folder), FORMATS, kind="clouds").items():
+        try:
+            frames.append(read_cloud(path))
+        except EmptyCloudError:
+            empty.append(number)
+    if empty:
+        named = ", ".join(map(str, empty[:_MOST_NAMED])) + (" and more" if len(empty) > _MOST_NAMED else "")
+        raise EpisodeError(
+            f"{folder}: {len(empty)} of {len(empty) + len(frames)} clouds are empty (frames {named}). Every frame needs "
+            "points of the cloth: lower the height below which points were cut off, or leave these frames out and renumber "
+            "the others."
+        )
     tracks = read_tracks(grippers, len(frames)) if grippers else None
     times = None if tracks is None else tracks.times
     if times is None:

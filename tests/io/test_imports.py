@@ -129,6 +129,13 @@ def test_bad_gripper_files(tmp_path, text, message):
         cloud_folder(folder, grippers={"any": tmp_path / "g.csv"})
 
 
+def test_empty_clouds_are_counted(tmp_path):
+    for index in range(9):
+        np.save(tmp_path / f"{index}.npy", np.zeros((index // 7, 3)))
+    with pytest.raises(EpisodeError, match=r"7 of 9 clouds are empty \(frames 0, 1, 2, 3, 4 and more\).*lower the height"):
+        cloud_folder(tmp_path, rate_hz=10.0)
+
+
 def test_a_folder_without_clouds(tmp_path):
     (tmp_path / "readme.txt").write_text("")
     with pytest.raises(EpisodeError, match="no numbered clouds"):

@@ -1,0 +1,133 @@
+"""The pages in a browser: they draw without an error or the network, and a keyboard and a screen reader are enough."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+from diffcloud.report.overlay import Overlay, recorded_layers
+from diffcloud.report.view import build_view
+from tests.report.pages import entry, page_of
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no chromium on PATH: pages are not opened"),
+]
+CONTRAST = 4.5
+"""Of text on its background (WCAG 2.2, 1.4.3)."""
+# text whose colour contrasts too little with the nearest background that is painted
+_FAINT = """least => {
+  const parse = c => { const n = c.match(/[\\d.]+/g).map(Number); return n.length < 4 ? [...n, 1] : n; };
+  const light = ([r, g, b]) => [r, g, b].map(v => (v /= 255) <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
+  const behind = e => { for (; e; e = e.parentElement) { const c = parse(getComputedStyle(e).backgroundColor);
+    if (c[3] > 0.99) return c; } return [255, 255, 255, 1]; };
+  const found = [];
+  for (const e of document.querySelectorAll("main *")) {
+    const own = [...e.childNodes].some(n => n.nodeType === 3 && n.textContent.trim());
+    if (!own || !e.checkVisibility() || e.closest("#scene, svg, .js-plotly-plot")) continue;
+    const a = light(parse(getComputedStyle(e).color)), b = light(behind(e));
+    const contrast = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+    if (contrast < least) found.push(`${e.tagName} ${e.textContent.trim().slice(0, 40)}: ${contrast.toFixed(2)}`);
+  }
+  return found;
+}"""
+_NAMELESS = """() => [...document.querySelectorAll("input, select, button, a, img, [role=img]")]
+  .filter(e => e.checkVisibility() && !e.closest(".js-plotly-plot .main-svg"))
+  .filter(e => !(e.getAttribute("aria-label") || e.getAttribute("alt") || e.textContent.trim()
+    || (e.labels && [...e.labels].some(l => l.textContent.trim()))))
+  .map(e => e.outerHTML.slice(0, 80))"""
+
+
+def pages():
+    episode = entry().episode
+    frames = [0, 1]
+    layers = recorded_layers(episode, frames, points=4, rng=np.random.default_rng(0))
+    overlay = Overlay("tan1", frames, episode.times, layers)
+    view = build_view([overlay], title="A recording", note="Two frames.", facts=[("tan1", "2 frames")])
+    return {"report": page_of(entry("tan1"), entry("tan2")), "view": view}
+
+
+@pytest.fixture(scope="module")
+def browser():
+    api = pytest.importorskip("playwright.sync_api")
+    with api.sync_playwright() as playwright:
+        quiet = [
+            "--no-sandbox",
+            "--use-angle=swiftshader",
+            "--enable-unsafe-swiftshader",
+            "--disable-background-networking",
+        ]
+        one = playwright.chromium.launch(executable_path=CHROMIUM, args=quiet)
+        yield one
+        one.close()
+
+
+@pytest.fixture(params=["report", "view"])
+def page(request, browser, tmp_path):
+    """A page that is open, with what went wrong in `wrong`."""
+    file = tmp_path / "page.html"
+    file.write_text(pages()[request.param])
+    tab = browser.new_page(viewport={"width": 1200, "height": 900})
+    tab.wrong = []
+    tab.on("pageerror", lambda error: tab.wrong.append(str(error)))
+    tab.on("console", lambda message: tab.wrong.append(message.text) if message.type == "error" else None)
+    tab.on("request", lambda asked: tab.wrong.append(asked.url) if asked.url.startswith("http") else None)
+    tab.goto(file.as_uri())
+    tab.wait_for_selector("#scene canvas")
+    yield tab
+    assert tab.wrong == []
+    tab.close()
+
+
+def test_the_scene_is_drawn(page):
+    canvas = page.locator("#scene canvas").first
+    drawn = canvas.screenshot()
+    for box in page.locator("#layers input").all():
+        box.uncheck()
+    page.wait_for_timeout(300)
+    assert canvas.screenshot() != drawn
+
+
+def test_the_keyboard_is_enough(page):
+    page.locator("#frame").focus()
+    page.keyboard.press("Home")
+    before = page.inner_text("#time")
+    page.keyboard.press("ArrowRight")
+    assert page.inner_text("#time") != before
+    page.locator("#play").focus()
+    page.keyboard.press("Enter")
+    assert page.inner_text("#play") == "Stop"
+    page.keyboard.press("Enter")
+    assert page.inner_text("#play") == "Play"
+    box = page.locator("#layers input").first
+    box.focus()
+    was = box.is_checked()
+    page.keyboard.press("Space")
+    assert box.is_checked() != was
+    assert was in page.evaluate("document.querySelector('#scene').data.map(one => !one.visible)")
+    heads = page.locator("#fits thead button")
+    if heads.count():  # the report's table
+        heads.nth(1).focus()
+        page.keyboard.press("Enter")
+        assert page.locator("#fits th").nth(1).get_attribute("aria-sort") == "ascending"
+
+
+def test_everything_has_a_name(page):
+    assert page.evaluate(_NAMELESS) == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_stands_out(page, scheme):
+    page.emulate_media(color_scheme=scheme)
+    assert page.evaluate(_FAINT, 21.1)  # more than black on white
+    assert page.evaluate(_FAINT, CONTRAST) == []
+
+
+def test_a_narrow_window_scrolls_only_down(page):
+    page.set_viewport_size({"width": 420, "height": 800})
+    page.wait_for_timeout(300)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 420
