@@ -160,7 +160,7 @@ def _read(path: Path, name: str, out: Path) -> Episode:
 
 def _unpacked(bag: Path, folder: Path) -> Path:
     """A ROS recording as a raw episode, kept in OUT/recordings/; its frames are those of `import recording`'s defaults."""
-    from pipeline.importing import recording_kind  # not above: it brings the SDK's library
+    from pipeline.importing import recording_kind, robot_description  # not above: it brings the SDK's library
 
     if recording_kind(bag) != "ros":
         raise EpisodeError(
@@ -168,7 +168,7 @@ def _unpacked(bag: Path, folder: Path) -> Path:
             "it first, by `diffcloud import recording NAME=FILE` and a calibration."
         )
     if not folder.is_dir():
-        write_recording(folder, ros_recording(bag))
+        write_recording(folder, ros_recording(bag, description=partial(robot_description, None)))
     return folder
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Annotated
@@ -24,6 +25,7 @@ from diffcloud.io.published import RECORDED_START_M, read_trajectories, recorded
 from diffcloud.io.recordings import Recording, read_joint_log, write_recording
 from diffcloud.io.ros.joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
 from diffcloud.io.ros.recording import ros_recording
+from diffcloud.io.urdf import RobotDescription, read_urdf
 from pipeline.console import JsonFlag, errors, finish, warn, writes
 
 _FARTHEST_M = 50.0
@@ -124,6 +126,12 @@ def recording(
     gripper_closed: Annotated[
         float | None, typer.Option(help=f"ROS: its angle when closed, rad; {GRIPPER_CLOSED_RAD} if not given.")
     ] = None,
+    urdf: Annotated[
+        Path | None,
+        typer.Option(
+            help="ROS without joint_states: the robot, whose link frames are in tf. Default: a Kinova Gen3 with a 2F-85."
+        ),
+    ] = None,
     scenario: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
     fabric: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
     json: JsonFlag = False,
@@ -142,6 +150,7 @@ def recording(
                 joint_names=joint or None,
                 gripper_joint=None if gripper_joint == "none" else gripper_joint,
                 gripper_closed_rad=gripper_closed,
+                description=partial(robot_description, urdf),
             )
         elif kinds == {"realsense"}:
             found = stack.enter_context(play_recordings(named))
@@ -185,6 +194,13 @@ def _named(sources: list[Path]) -> dict[str, Path]:
             raise ConfigError(f"No such recording: {entry[1]}.")
         named[entry[0]] = entry[1]
     return named
+
+
+def robot_description(urdf: Path | None) -> RobotDescription:
+    """A URDF's, or that of the package's own Gen3."""
+    from diffcloud.sensing.robot import gen3  # not above: it brings torch
+
+    return gen3().description if urdf is None else read_urdf(urdf)
 
 
 def recording_kind(path: Path) -> str:

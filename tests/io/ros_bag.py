@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from diffcloud.sensing.cameras import inverse
+from diffcloud.sensing.robot import gen3
 from tests.sensing.table_scene import HOME_RAD, INTRINSICS, poses, table_depth
 
 START = 1_700_000_000.0
@@ -54,6 +55,8 @@ class Habits:
     own_joints: dict[str, float] = field(default_factory=dict)
     """Joints that another driver sends in messages of its own."""
     arm: bool = True
+    links: bool = False
+    """Send all links of the arm and its gripper in tf, whose third joint turns by 0.5 rad a second."""
 
 
 class Bag:
@@ -144,7 +147,7 @@ class Bag:
         edges += [(f"{name}_link", f"{name}_optical", OPTICAL) for name in poses()]
         tool = np.eye(4)
         tool[:3, 3] = np.add(TOOL, [0, 0, 0.1 * (t - START)])
-        edges.append(("base_link", "tool_frame", tool))
+        edges += self._links(t) if self._habits.links else [("base_link", "tool_frame", tool)]
         moves = []
         for parent, child, place in edges:
             x, y, z, w = Rotation.from_matrix(place[:3, :3]).as_quat()
@@ -154,6 +157,15 @@ class Bag:
             kind = self._type("geometry_msgs/msg/TransformStamped")
             moves.append(kind(header=self._header(t, parent), child_frame_id=child, transform=move))
         self._send("/tf", t, "tf2_msgs/msg/TFMessage", header=False, transforms=moves)
+
+    def _links(self, t):
+        robot = gen3()
+        angles = dict(zip([robot.moving[index].name for index in robot.arm], HOME_RAD, strict=True))
+        angles |= {"finger_joint": 0.4, "joint_3": HOME_RAD[2] + 0.5 * (t - START)}
+        for joint in robot.description.joints:
+            place = np.eye(4)
+            place[:3, :3] = Rotation.from_rotvec(angles.get(joint.name, 0.0) * joint.axis).as_matrix()
+            yield joint.parent, joint.child, joint.T_parent_joint @ place
 
     def _type(self, name):
         return self._store.types[name]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import struct
 from contextlib import suppress
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ import pytest
 from diffcloud.errors import EpisodeError
 from diffcloud.io.raw_episodes import read_raw_episode
 from diffcloud.io.rvl import decode_rvl
-from tests.io.ros_bag import FRAMES, Bag, Habits, bag, rvl
+from diffcloud.sensing.robot import gen3
+from tests.io.ros_bag import FRAMES, START, Bag, Habits, bag, rvl
 from tests.pipeline.invoke import invoke
-from tests.sensing.table_scene import INTRINSICS, poses, table_depth
+from tests.sensing.table_scene import HOME_RAD, INTRINSICS, poses, table_depth
 
 KINDS = pytest.mark.parametrize("kind", ["rosbag1", "rosbag2"])
 
@@ -274,6 +276,38 @@ class TestTransforms:
         done = imported(tmp_path, tmp_path / "bag")
         assert read_raw_episode(tmp_path / "e").cameras["side"].info.T_world_camera is None
         assert any("puts 'side_link' into both 'base_link' and 'elsewhere'" in text for text in done.result["warnings"])
+
+
+class TestLinksInTf:
+    """Of a recording without joint_states."""
+
+    @KINDS
+    def test_joints_and_gripper_are_read_from_them(self, tmp_path, kind):
+        done = imported(tmp_path, bag(tmp_path, kind, arm=False, links=True))
+        assert done.result["warnings"] == []
+        log = read_raw_episode(tmp_path / "e").robot
+        assert len(log.times) == 2 * FRAMES + 4
+        expected = np.tile(HOME_RAD, (len(log.times), 1))
+        expected[:, 2] += 0.5 * (log.times - START)
+        turns = (log.joints_rad - expected) / (2 * np.pi)
+        np.testing.assert_allclose(turns, turns.round(), atol=1e-6)
+        np.testing.assert_allclose(log.gripper, 0.5, atol=1e-6)
+        told = gen3().tool_pose(log.joints_rad)
+        np.testing.assert_allclose(log.tool_position_m, told[:, :3, 3], atol=1e-6)
+
+    def test_of_another_robot_there_is_no_log(self, tmp_path):
+        other = files("diffcloud.hardware.examples") / "ur5e.urdf"
+        path = bag(tmp_path, "rosbag2", arm=False, links=True)
+        texts = " ".join(imported(tmp_path, path, options=("--urdf", other)).result["warnings"])
+        assert "There are no joint_states, and tf does not give the joints either: in tf 'shoulder_link' lies" in texts
+        assert read_raw_episode(tmp_path / "e").robot is None
+
+    def test_links_that_lie_elsewhere_are_not_believed(self, tmp_path):
+        bent = (files("diffcloud.sensing") / "gen3_robotiq_2f_85.urdf").read_text()
+        (tmp_path / "bent.urdf").write_text(bent.replace('xyz="0 0 0.15643"', 'xyz="0 0 0.25643"'))
+        path = bag(tmp_path, "rosbag2", arm=False, links=True)
+        texts = " ".join(imported(tmp_path, path, options=("--urdf", tmp_path / "bent.urdf")).result["warnings"])
+        assert "by 100 mm and 0.0 degrees otherwise than joint_1 of the robot's description lets it" in texts
 
 
 class TestGripper:

@@ -1,4 +1,4 @@
-"""The joint log of a ROS recording: joint_states, and the tool's pose from tf."""
+"""The joint log of a ROS recording: joint_states or else the links in tf, and the tool's pose from tf."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ from scipy.spatial.transform import Rotation
 from diffcloud.errors import EpisodeError
 from diffcloud.io.raw_episodes import RobotLog
 from diffcloud.io.ros.transforms import TransformTree
+from diffcloud.io.urdf import Joint, RobotDescription
 
 GRIPPER_JOINT, GRIPPER_CLOSED_RAD = "finger_joint", 0.8
 """Of a Robotiq 2F-85, in its maker's description."""
 _LATEST_S = 0.5
 """As with images: a message that is older than one before it by more is of another clock."""
+_OFF_M, _OFF_RAD = 0.005, np.deg2rad(1.0)
+"""By how much a link in tf may lie beside where the robot's description has it."""
 
 
 def joint_log(
@@ -82,13 +85,79 @@ def joint_log(
         )
     position, quaternion = np.full((len(rows), 3), np.nan), np.full((len(rows), 4), np.nan)
     try:
-        poses = tree.lookup(world_frame, tool_frame, rows)
+        position, quaternion = _placed(tree.lookup(world_frame, tool_frame, rows))
     except EpisodeError as error:
         warnings.append(f"The tool's pose stays unknown: {error}. Name its frames with --tool-frame and --world-frame.")
-    else:
-        position = poses[:, :3, 3]
-        quaternion = np.roll(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), 1, axis=1)
     return RobotLog(rows, angles, gripper, position, quaternion, np.full((len(rows), 6), np.nan)), tuple(warnings)
+
+
+def log_from_links(
+    tree: TransformTree,
+    description: RobotDescription,
+    *,
+    world_frame: str,
+    tool_frame: str,
+    gripper_joint: str | None,
+    gripper_closed_rad: float | None,
+) -> tuple[RobotLog, tuple[str, ...]]:
+    """The same of a recording without joint_states, whose tf has the robot's links: each joint's angle is how far its child
+    is turned about its axis against the description.
+
+    Args:
+        description: of the robot, whose links are named as in tf.
+
+    Raises:
+        EpisodeError: the description has no such tool, or tf has not all links that carry it, or none of them moves, or a
+            link lies otherwise than the description's joint lets it.
+    """
+    carriers = {joint.child: joint for joint in description.joints}
+    chain, link = list[Joint](), tool_frame
+    while link in carriers:
+        chain.insert(0, carriers[link])
+        link = carriers[link].parent
+    arm = [joint for joint in chain if joint.kind != "fixed"]
+    if not arm:
+        raise EpisodeError(f"the robot's description {description.name} has no joints that carry {tool_frame!r}")
+    rows = np.unique(np.concatenate([tree.stamps(joint.child) for joint in arm]))
+    angles = np.stack([_angle(tree, joint, rows) for joint in arm], axis=1)
+    if not np.ptp(angles, axis=0).any():
+        raise EpisodeError(f"no link of {', '.join(joint.child for joint in arm)} moves in tf")
+    gripper, warnings = np.full(len(rows), np.nan), list[str]()
+    finger = next((joint for joint in description.joints if joint.name == gripper_joint), None)
+    if gripper_joint is not None:
+        try:
+            if finger is None:
+                raise EpisodeError(f"the description has no joint {gripper_joint!r}")
+            closed = GRIPPER_CLOSED_RAD if gripper_closed_rad is None else gripper_closed_rad
+            gripper = _angle(tree, finger, rows) / closed
+        except EpisodeError as error:
+            warnings.append(f"How far the gripper is open stays unknown, and it is masked as open: {error}.")
+    position, quaternion = _placed(tree.lookup(world_frame, tool_frame, rows))
+    return RobotLog(rows, angles, gripper, position, quaternion, np.full((len(rows), 6), np.nan)), tuple(warnings)
+
+
+def _angle(tree: TransformTree, joint: Joint, times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[T] angle of a joint [rad], or its way [m].
+
+    Raises:
+        EpisodeError: tf does not connect its links, or moves its child otherwise than the joint does.
+    """
+    moved = np.linalg.inv(joint.T_parent_joint) @ tree.lookup(joint.parent, joint.child, times)
+    turn, shift = Rotation.from_matrix(moved[:, :3, :3]).as_rotvec(), moved[:, :3, 3]
+    along = (shift if joint.kind == "prismatic" else turn) @ joint.axis
+    off_turn = np.linalg.norm(turn - (0.0 if joint.kind == "prismatic" else along[:, None] * joint.axis), axis=1).max()
+    off_shift = np.linalg.norm(shift - (along[:, None] * joint.axis if joint.kind == "prismatic" else 0.0), axis=1).max()
+    if off_turn > _OFF_RAD or off_shift > _OFF_M:
+        raise EpisodeError(
+            f"in tf {joint.child!r} lies in {joint.parent!r} by {1000 * off_shift:.0f} mm and {np.rad2deg(off_turn):.1f} "
+            f"degrees otherwise than {joint.name} of the robot's description lets it"
+        )
+    return np.asarray(along)
+
+
+def _placed(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Positions [T, 3] and quaternions [T, 4] (w, x, y, z) of poses [T, 4, 4]."""
+    return poses[:, :3, 3], np.roll(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), 1, axis=1)
 
 
 def _series(

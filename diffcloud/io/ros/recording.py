@@ -10,7 +10,7 @@ come: it is left out, with a warning.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import CameraInfo
 from diffcloud.io.recordings import RecordedFrame, Recording
 from diffcloud.io.ros.files import opened, refuse_lone_parts
-from diffcloud.io.ros.joints import GRIPPER_JOINT, joint_log
+from diffcloud.io.ros.joints import GRIPPER_JOINT, joint_log, log_from_links
 from diffcloud.io.ros.messages import (
     DEPTH_UNITS_M,
     DepthEncoding,
@@ -36,6 +36,7 @@ from diffcloud.io.ros.messages import (
 from diffcloud.io.ros.pairing import Pairing, pair
 from diffcloud.io.ros.topics import CAMERA_INFO, CameraTopics, aligned_by_name, depth_cameras, info_topic, same_camera
 from diffcloud.io.ros.transforms import TransformTree
+from diffcloud.io.urdf import RobotDescription
 
 _JOINTS = "sensor_msgs/msg/JointState"
 _TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
@@ -48,6 +49,7 @@ def ros_recording(
     joint_names: list[str] | None = None,
     gripper_joint: str | None = GRIPPER_JOINT,
     gripper_closed_rad: float | None = None,
+    description: Callable[[], RobotDescription] | None = None,
 ) -> Recording:
     """A recording of ROS; images are read lazily.
 
@@ -57,6 +59,8 @@ def ros_recording(
         joint_names: of the arm, in order; None takes joint_1, joint_2, ... of joint_states.
         gripper_joint: its angle becomes 0 (open, at 0) to 1 (closed). None: the arm has no gripper.
         gripper_closed_rad: that angle when closed; None takes that of a Robotiq 2F-85.
+        description: gives the robot's, for a recording without joint_states whose tf has the robot's links; None: then
+            there is no joint log.
 
     Raises:
         EpisodeError: unreadable, one part of a split recording, without depth and camera_info, stamps that run backwards,
@@ -101,6 +105,19 @@ def ros_recording(
             gripper_closed_rad=gripper_closed_rad,
         )
         warnings += unknown
+    elif description is not None and scan.transforms:
+        try:
+            robot, unknown = log_from_links(
+                tree,
+                description(),
+                world_frame=world_frame,
+                tool_frame=tool_frame,
+                gripper_joint=gripper_joint,
+                gripper_closed_rad=gripper_closed_rad,
+            )
+            warnings += unknown
+        except EpisodeError as error:
+            warnings.append(f"There are no joint_states, and tf does not give the joints either: {error}.")
     return Recording(cameras, _frames(paths, sources), f"ros recording {shown}", robot, tuple(warnings))
 
 

@@ -76,6 +76,11 @@ class TransformTree:
         up, down = self._way(target, source)
         return np.linalg.inv(self._chain(down, times)) @ self._chain(up, times)
 
+    def stamps(self, frame: str) -> Floats:
+        """[N] when a frame's place in its parent was told [s]; empty where it never was."""
+        edge = self._edges.get(_plain(frame))
+        return np.empty(0) if edge is None else edge.stamps
+
     def fixed(self, target: str, source: str) -> Floats:
         """[4, 4] that maps points of `source` to `target` for good.
 
