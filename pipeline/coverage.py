@@ -15,7 +15,7 @@ import typer
 from rich.table import Table
 
 from diffcloud.errors import ConfigError, DiffCloudError
-from diffcloud.evaluation.intervals import LEVEL, state_intervals
+from diffcloud.evaluation.intervals import LEVEL, settled_intervals
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.fit import solve
 from diffcloud.fit.uncertainty import REFINED
@@ -173,7 +173,7 @@ class CoverageJob:
         outcome = solve(objective, space, fit.solver_settings(self.scenario))
         if outcome.stop_reason == "interrupted":
             raise KeyboardInterrupt
-        found = state_intervals(
+        found = settled_intervals(
             objective,
             space,
             outcome.values,

@@ -13,7 +13,7 @@ import typer
 from rich.table import Table
 
 from diffcloud.errors import ConfigError
-from diffcloud.evaluation.intervals import LEVEL, WITHIN, Intervals, significant, state_intervals
+from diffcloud.evaluation.intervals import LEVEL, WITHIN, Intervals, settled_intervals, significant
 from diffcloud.evaluation.markdown import comparison_page
 from diffcloud.evaluation.methods import space_of
 from diffcloud.evaluation.summary import PREDICTORS, label, largest_sources, sentences, tables
@@ -133,7 +133,7 @@ def intervals(
         chosen = choose_scenario(stated or fitted_scenario(fit, one.scenario), scene)
         members.append(Objective(chosen, read_episode(path), **measure))
     objective = members[0] if len(members) == 1 else JointObjective(members)
-    found = state_intervals(objective, space_of(record), record.fitted, level=level, within=within, doubts=doubts)
+    found = settled_intervals(objective, space_of(record), record.fitted, level=level, within=within, doubts=doubts)
     if out is not None:
         write_json(with_suffix(out, ".json"), found.model_dump(mode="json"))
     if not json:
@@ -152,6 +152,8 @@ def _show_intervals(found: Intervals) -> None:
     output.print(table)
     if found.ratio is not None and found.ratio.factor is not None:
         output.print(f"stretch / mass {found.ratio.value:.3g}, within a factor of {found.ratio.factor:.3g}")
+    if found.restarts:
+        output.print("The fit had not arrived: it was started again from a lower loss, to which the table belongs.")
     if found.reason:
         output.print(found.reason[0].upper() + found.reason[1:] + ".", soft_wrap=True)
 

@@ -14,7 +14,7 @@ import typer
 import yaml
 
 from diffcloud.errors import ConfigError, DiffCloudError, EpisodeError
-from diffcloud.evaluation.intervals import LEVEL, WITHIN, Intervals, significant, state_intervals
+from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, Intervals, significant, state_intervals
 from diffcloud.evaluation.methods import space_of
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitRecord, JointObjective, Objective
@@ -45,8 +45,6 @@ _STEPS = 8
 _MOST_STEPS = 64
 _NOISE_PART = 0.5
 """Largest distance to the motion with finer steps, as a part of the misfit that noise accounts for."""
-_RESTARTS = 2
-"""From a lower loss that was met while intervals were stated."""
 _TRANSFERS, _GAIN = 1.25, 0.5
 _HEAD = "# Found by diffcloud identify, with the reason beside each value. Edit and run the command again to overrule."
 
@@ -298,7 +296,7 @@ def _stated(
 ) -> tuple[FitRecord, AnyObjective, FitJob, Intervals]:
     """Fit and state intervals; where these meet a lower loss, fit again from there."""
     steps, init = int(cloth.get("steps_per_frame", _STEPS)), dict[str, float]()
-    for left in range(_RESTARTS, -1, -1):
+    for left in range(RESTARTS, -1, -1):
         record, objective, job, steps = _fitted(out, episodes, cloth, layouts, settings, steps, init)
         found = state_intervals(objective, space_of(record), record.fitted, level=level, within=within)
         if found.lower is None or not left:

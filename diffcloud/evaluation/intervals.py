@@ -4,7 +4,8 @@ Variances come from `fit.uncertainty`. An interval lies symmetrically on the axi
 multipliers) and ends at the bounds. Its half-width is the variance's root times the quantile of Student's t with the
 degrees of freedom of Welch and Satterthwaite: the noise is estimated from few clusters, the stated doubts are not.
 
-No interval is stated where a fit has not arrived: Gauss and Newton's next step would leave a good part of it.
+No interval is stated where a fit has not arrived: Gauss and Newton's next step would leave a good part of it, or a loss
+nearby is clearly lower. `settled_intervals` starts the fit again there.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis
 from diffcloud.fit.result import physical_values
 from diffcloud.fit.scan import scan
+from diffcloud.fit.solvers import GaussNewtonSettings, solve
 from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, Uncertainty, noise_mm, uncertainty
 from diffcloud.io.files import read_json
 from diffcloud.scene.scenarios import Scenario
@@ -44,6 +46,8 @@ Verdict = Literal[
 WITHIN = 1.5
 """A parameter counts as identified if its interval ends within this factor of the fitted value."""
 LEVEL = 0.9
+RESTARTS = 2
+"""Of a fit that has not arrived, from a lower loss beside it."""
 _UNEXPLAINED = 2.0
 """RMS over what noise and spacing of the points account for, from which the model does not explain the recording."""
 _STEP = 0.5
@@ -116,6 +120,8 @@ class Intervals(_Model):
     """Why there is no interval, or the verdict is not of the parameters; else empty."""
     lower: dict[str, float] | None = None
     """Where a clearly lower loss was met, from which a fit may start again."""
+    restarts: int = 0
+    """How often the fit was started again there; the values are those that it ended at."""
 
 
 def state_intervals(
@@ -220,6 +226,35 @@ def state_intervals(
         reason=reason,
         lower=lower,
     )
+
+
+def settled_intervals(
+    objective: AnyObjective,
+    space: FitSpace,
+    values: Mapping[str, float],
+    *,
+    level: float = LEVEL,
+    within: float = WITHIN,
+    doubts: Mapping[str, float] = MATERIAL_DOUBTS,
+) -> Intervals:
+    """The same, by Gauss–Newton from any lower loss that is met on the way, a few times at most.
+
+    Args:
+        values: as of `state_intervals`, and so are the others.
+
+    Raises:
+        DivergedError: the fitted motion diverges.
+    """
+    found = state_intervals(objective, space, values, level=level, within=within, doubts=doubts)
+    for restarts in range(1, RESTARTS + 1):
+        if found.lower is None:
+            break
+        outcome = solve(objective, space, GaussNewtonSettings(starts=1, screen=0, init=found.lower))
+        if outcome.stop_reason == "interrupted":
+            raise KeyboardInterrupt
+        found = state_intervals(objective, space, outcome.values, level=level, within=within, doubts=doubts)
+        found = found.model_copy(update={"restarts": restarts})
+    return found
 
 
 def _with_scan(objective: AnyObjective, space: FitSpace, found: Uncertainty) -> tuple[Uncertainty, dict[str, float] | None]:

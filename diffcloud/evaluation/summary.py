@@ -163,6 +163,7 @@ def interval_table(records: Records) -> pd.DataFrame:
             row |= {"ratio": ratio.get("value"), "ratio_factor": ratio.get("factor")}
             row |= {"combination": None if told["best"] is None else str(Combination.model_validate(told["best"]))}
             row |= {"sources": largest_sources(told["sources"], name), "level": told["level"], "reason": told["reason"]}
+            row |= {"restarts": told["restarts"]}
             rows.append(row)
     return pd.DataFrame(rows)
 
@@ -348,6 +349,12 @@ def _identified(table: pd.DataFrame) -> list[str]:
             found.append(f"{scenario!s}: stretch / mass is known within {_times(group['ratio_factor'].median())} (median).")
     for row in table[table["reason"] != ""].drop_duplicates(["scenario", "episode"]).to_dict("records"):
         found.append(f"{row['scenario']} / {row['episode']}: {row['reason']}.")
+    again = table[(table["reason"] == "") & (table["restarts"] > 0)].drop_duplicates(["scenario", "episode"])
+    for row in again.to_dict("records"):
+        found.append(
+            f"{row['scenario']} / {row['episode']}: the fit had not arrived; the intervals are those of a lower loss, "
+            "found by starting again beside it."
+        )
     return found
 
 

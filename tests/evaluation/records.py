@@ -100,6 +100,7 @@ def _intervals(stretch: float, reason: str) -> dict[str, Any]:
         "clusters": 16,
         "covariance": [[0.1, 0.098], [0.098, 0.1]],
         "arrived": True,
+        "restarts": 0,
         "explains": not reason,
         "reason": reason,
         "note": "",

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import norm, t
 
 from diffcloud.evaluation import intervals as module
-from diffcloud.evaluation.intervals import significant, state_intervals
+from diffcloud.evaluation.intervals import settled_intervals, significant, state_intervals
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitSpace, Objective
 from diffcloud.fit.uncertainty import Uncertainty, uncertainty
@@ -121,6 +121,18 @@ class TestVerdicts:
         found = told({"noise": np.diag([0.01, 0.01])}, lower={"stretch": 1.3, "mass": 1.0})
         assert found.parameters["stretch"].verdict == "the fit has not arrived"
         assert "the loss is lower at stretch=1.3,mass=1;" in found.reason
+
+    def test_it_starts_again_from_a_lower_loss(self, objective):
+        """From far off, whose own interval would not be stated."""
+        found = settled_intervals(objective, SPACE, {"stretch": 2.5, "mass": 1.0})
+        assert found.restarts > 0
+        assert found.arrived
+        assert found.ratio.value == pytest.approx(0.7, rel=0.05)
+
+    def test_where_none_is_lower_it_stays(self, objective):
+        found = settled_intervals(objective, SPACE, VALUES)
+        assert found.restarts == 0
+        assert found.parameters["stretch"].value == VALUES["stretch"]
 
     def test_a_misfit_far_above_the_noise_is_no_statement_on_the_cloth(self, told):
         found = told({"noise": np.diag([0.01, 0.01])}, misfit=(9.0, 4.0))
