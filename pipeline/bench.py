@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import io
+import tempfile
+import time
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+import torch
 import typer
 from rich.table import Table
 
+from diffcloud.clouds import SurfaceSampler
 from diffcloud.fit.benchmark import time_contact, time_episode, time_matching
-from diffcloud.scene.scenarios import GridScenario, Scenario, built_in, grid_scenario
+from diffcloud.io.clouds import write_ply
+from diffcloud.scene.scenarios import GridScenario, Scenario, built_in, grid_scenario, make_scenario
+from diffcloud.sim.simulate import rollout
 from diffcloud.sim.threads import thread_count, use_threads
-from pipeline.console import JsonFlag, Threads, finish, progress_bar, show
+from pipeline.console import JsonFlag, Threads, finish, output, progress_bar, show
 from pipeline.scenario_options import SceneFile, choose_scenario
 
 _BATCHES = (1, 16, 64)
@@ -24,6 +31,11 @@ HEAD = ("scenario", "nodes", "steps", "batch", "forward ms", "forward + backward
 MATCHING_HEAD = ("frames", "points of a frame, each way", "ms", "ms, given matches of a nearby pose")
 _POINTS = (200, 3500)
 """Points per frame: in a fit of 25 frames, and in a fit of one."""
+_TOWEL: dict[str, Any] = {
+    "size_m": (0.40, 0.30), "nodes": (9, 7), "yaw_deg": 0.0, "center_m": (0.55, 0.0), "table_height_m": 0.02,
+    "material": "jersey-knit", "steps_per_frame": 16, "grasped": ("right_top",),
+    "path": [(0.0, 0.0, 0.0, 0.0), (2.5, -0.1, -0.1, 0.45)],
+}  # fmt: skip
 CONTACT_HEAD = ("nodes", "contacts", "free ms per step", "on a sphere ms per step", "µs per contact")
 
 
@@ -31,6 +43,9 @@ def bench(
     scene: SceneFile = None,
     repeats: Annotated[int, typer.Option(min=1, help="Runs of each; the fastest one counts.")] = 3,
     contact: Annotated[bool, typer.Option(help="What contacts cost instead: finer and finer cloths on a sphere.")] = False,
+    identify: Annotated[
+        bool, typer.Option("--identify", help="Instead, how long `diffcloud identify` takes for the tutorial's towel.")
+    ] = False,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
@@ -40,6 +55,12 @@ def bench(
         costs = contact_benchmarks(repeats=repeats)
         show(contact_table(costs), json)
         finish({"threads": thread_count(), "timings": costs}, json)
+        return
+    if identify:
+        seconds = time_identify()
+        if not json:
+            output.print(f"identify, one lift of the towel, {thread_count()} threads: {seconds:.0f} s")
+        finish({"threads": thread_count(), "identify_seconds": seconds}, json)
         return
     published = {} if scene is None else {"release_lift": scene}
     timings, matchings = run_benchmarks(published, repeats=repeats), matching_benchmarks(repeats=repeats)
@@ -75,6 +96,34 @@ def run_benchmarks(published: Mapping[str, Path], *, repeats: int) -> list[dict[
             update(index, f"{name}, batch {batch}")
             timings.append({"scenario": name, **asdict(time_episode(scenario, batch=batch, repeats=repeats))})
     return timings
+
+
+def time_identify() -> float:
+    """Seconds from a folder of clouds to the report of `identify`: one lift of the towel of docs/own-clouds.md, of half the
+    basis's stiffness and one and a half times its mass, with 2 mm of noise."""
+    from pipeline.identify import identify  # not above: only this needs it
+
+    towel = built_in("lift").model_copy(update=_TOWEL)
+    scenario = make_scenario(towel)
+    system, _ = scenario.scene.build()
+    values = {"stretch": torch.tensor([0.5], dtype=torch.float64), "mass": torch.tensor([1.5], dtype=torch.float64)}
+    with torch.no_grad():
+        run = rollout(system, scenario.steps, properties=scenario.properties(system, values))
+    nodes = run.positions[0, :: scenario.scene.frame_steps]
+    generator = torch.Generator().manual_seed(0)
+    sampler = SurfaceSampler.build(torch.as_tensor(system.mesh.faces), 2500, generator=generator)
+    clouds = sampler.sample(nodes).numpy()
+    noise = 0.002 * np.random.default_rng(0).standard_normal(clouds.shape)
+    with tempfile.TemporaryDirectory() as folder:
+        recording = Path(folder) / "towel"
+        recording.mkdir()
+        for index, cloud in enumerate(clouds + noise):
+            write_ply(recording / f"{index:03d}.ply", cloud)
+        track = np.column_stack([np.arange(len(nodes)) / towel.rate_hz, nodes[:, scenario.grasped[0]].numpy()])
+        np.savetxt(recording / "gripper.csv", track, delimiter=",", header="t_s,x,y,z", comments="")
+        begin = time.perf_counter()
+        identify([recording], Path(folder) / "found", size="0.40x0.30", mass=0.24, threads=thread_count())
+        return time.perf_counter() - begin
 
 
 def matching_benchmarks(*, repeats: int) -> list[dict[str, Any]]:

@@ -46,6 +46,8 @@ Verdict = Literal[
 WITHIN = 1.5
 """A parameter counts as identified if its interval ends within this factor of the fitted value."""
 LEVEL = 0.9
+_PLAIN = 1e6
+"""Below it numbers are written out."""
 RESTARTS = 2
 """Of a fit that has not arrived, from a lower loss beside it."""
 _UNEXPLAINED = 2.0
@@ -318,7 +320,14 @@ def significant(low: float | None, high: float | None) -> Callable[[float | None
     digits = 3
     if low is not None and high is not None and 0 < low < high:
         digits = 2 + min(max(math.floor(-math.log10((high - low) / (high + low))), 0), 4)
-    return lambda value: "–" if value is None else f"{value:.{digits}g}"
+
+    def shown(value: float | None) -> str:
+        if value is None:
+            return "–"
+        text = f"{value:.{digits}g}"
+        return f"{float(text):.0f}" if "e+" in text and abs(value) < _PLAIN else text
+
+    return shown
 
 
 def node_set_note(scenario: Scenario) -> str:

@@ -201,6 +201,11 @@ def test_digits_are_those_that_the_interval_bears(low, high, told):
     assert significant(low, high)(None) == "–"
 
 
+def test_numbers_of_everyday_size_are_written_out():
+    shown = significant(46.0, 110.0)
+    assert [shown(value) for value in (107.0, 2345.6, 0.00001234, 3.2e7)] == ["110", "2300", "1.2e-05", "3.2e+07"]
+
+
 def test_a_note_where_mass_multiplies_a_part_of_the_cloth():
     scene = SimpleNamespace(mesh=SimpleNamespace(nodes=np.zeros((49, 3))))
     assert module.node_set_note(SimpleNamespace(node_sets={}, scene=scene)) == ""

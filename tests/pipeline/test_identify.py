@@ -268,6 +268,13 @@ class TestTowelOfAnotherSimulator:
         assert "6 of 61 clouds are empty (frames 0, 1, 2, 3, 4 and more)" in told
 
 
+@pytest.mark.slow
+def test_how_long_it_takes_is_measured():
+    told = invoke("bench", "--identify", "--threads", 1)
+    assert told.result["threads"] == 1
+    assert told.result["identify_seconds"] > 0
+
+
 def test_results_are_plain_json(found):
     folder, _ = found
     told = json.loads((folder / "found" / "intervals.json").read_text())
