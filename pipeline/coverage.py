@@ -15,7 +15,7 @@ import typer
 from rich.table import Table
 
 from diffcloud.errors import ConfigError, DiffCloudError
-from diffcloud.evaluation.intervals import LEVEL, settled_intervals
+from diffcloud.evaluation.intervals import LEVEL, RESTARTS, state_intervals
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.fit import solve
 from diffcloud.fit.uncertainty import REFINED
@@ -173,13 +173,14 @@ class CoverageJob:
         outcome = solve(objective, space, fit.solver_settings(self.scenario))
         if outcome.stop_reason == "interrupted":
             raise KeyboardInterrupt
-        found = settled_intervals(
+        found = state_intervals(
             objective,
             space,
             outcome.values,
             level=self.level,
             within=self.config.evaluate.within,
             doubts=self.config.evaluate.doubts,
+            restarts=RESTARTS,
         )
         told = {"loss": outcome.loss, "stop_reason": outcome.stop_reason, "simulations": outcome.simulations}
         return told | {"seconds": outcome.seconds, "intervals": found.model_dump(mode="json")}

@@ -13,7 +13,7 @@ import typer
 from rich.table import Table
 
 from diffcloud.errors import ConfigError
-from diffcloud.evaluation.intervals import LEVEL, WITHIN, Intervals, settled_intervals, significant
+from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, Intervals, significant, state_intervals
 from diffcloud.evaluation.markdown import comparison_page
 from diffcloud.evaluation.methods import space_of
 from diffcloud.evaluation.summary import PREDICTORS, label, largest_sources, sentences, tables
@@ -133,7 +133,9 @@ def intervals(
         chosen = choose_scenario(stated or fitted_scenario(fit, one.scenario), scene)
         members.append(Objective(chosen, read_episode(path), **measure))
     objective = members[0] if len(members) == 1 else JointObjective(members)
-    found = settled_intervals(objective, space_of(record), record.fitted, level=level, within=within, doubts=doubts)
+    found = state_intervals(
+        objective, space_of(record), record.fitted, level=level, within=within, doubts=doubts, restarts=RESTARTS
+    )
     if out is not None:
         write_json(with_suffix(out, ".json"), found.model_dump(mode="json"))
     if not json:

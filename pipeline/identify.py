@@ -46,6 +46,8 @@ _MOST_STEPS = 64
 _NOISE_PART = 0.5
 """Largest distance to the motion with finer steps, as a part of the misfit that noise accounts for."""
 _TRANSFERS, _GAIN = 1.25, 0.5
+_Fitted = tuple[FitRecord, AnyObjective, FitJob, int]
+"""A fit, what it minimised, the job, and the steps a frame that it ended with."""
 _HEAD = "# Found by diffcloud identify, with the reason beside each value. Edit and run the command again to overrule."
 
 
@@ -85,7 +87,9 @@ def identify(
     with claimed(out):
         episodes, cloth, layouts = find_scene(recordings, out, stated, mass)
         chosen = _chosen(parameters, cloth, mass)
-        record, objective, job, found = _stated(out, episodes, cloth, layouts, chosen, level=level, within=within)
+        fit = partial(_fitted, out, episodes, cloth, layouts)
+        steps = int(cloth.get("steps_per_frame", _STEPS))
+        record, objective, job, found = _stated(fit, chosen, steps, level=level, within=within)
         findings = _findings(record, objective, found)
         with together():
             write_text(out / "report.html", _page(record, found, findings, episodes, job))
@@ -285,19 +289,24 @@ def _scenarios(
 
 
 def _stated(
-    out: Path,
-    episodes: Mapping[str, Episode],
-    cloth: Mapping[str, Any],
-    layouts: Mapping[str, Mapping[str, Any]],
+    fit: Callable[[FitConfig, int, Mapping[str, float]], _Fitted],
     settings: FitConfig,
+    steps: int,
     *,
     level: float,
     within: float,
 ) -> tuple[FitRecord, AnyObjective, FitJob, Intervals]:
-    """Fit and state intervals; where these meet a lower loss, fit again from there."""
-    steps, init = int(cloth.get("steps_per_frame", _STEPS)), dict[str, float]()
+    """Fit and state intervals; where these meet a lower loss, fit again from there.
+
+    Not `state_intervals`' own restarts: here the record belongs to the intervals, and finer steps may be asked for anew.
+
+    Args:
+        fit: `_fitted` of the recordings.
+        steps: a frame, to begin with.
+    """
+    init: Mapping[str, float] = {}
     for left in range(RESTARTS, -1, -1):
-        record, objective, job, steps = _fitted(out, episodes, cloth, layouts, settings, steps, init)
+        record, objective, job, steps = fit(settings, steps, init)
         found = state_intervals(objective, space_of(record), record.fitted, level=level, within=within)
         if found.lower is None or not left:
             break
@@ -319,8 +328,8 @@ def _fitted(
     layouts: Mapping[str, Mapping[str, Any]],
     settings: FitConfig,
     steps: int,
-    init: dict[str, float],
-) -> tuple[FitRecord, AnyObjective, FitJob, int]:
+    init: Mapping[str, float],
+) -> _Fitted:
     """Fit, with finer and finer steps from the place found, until they no longer matter; and the steps a frame."""
     while True:
         scenarios = _scenarios(out, cloth, layouts, steps)

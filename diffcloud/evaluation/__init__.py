@@ -1,7 +1,7 @@
 """Comparing methods on equal terms, and what can be known of the parameters."""
 
 from diffcloud.evaluation.episode import RIVALS, ComparisonSettings, EpisodeRecord, compare_episode
-from diffcloud.evaluation.intervals import Intervals, settled_intervals, state_intervals
+from diffcloud.evaluation.intervals import Intervals, state_intervals
 from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter
@@ -17,6 +17,5 @@ __all__ = [
     "Rival",
     "compare_episode",
     "loss_landscape",
-    "settled_intervals",
     "state_intervals",
 ]

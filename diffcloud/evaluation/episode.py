@@ -8,7 +8,7 @@ from typing import Any
 
 from diffcloud.errors import DiffCloudError
 from diffcloud.evaluation import methods
-from diffcloud.evaluation.intervals import LEVEL, WITHIN, node_set_note, settled_intervals
+from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, node_set_note, state_intervals
 from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
@@ -130,8 +130,8 @@ def compare_episode(
     if 0 in measured.diverged:  # the fit itself: there is no optimum to look around
         return EpisodeRecord(record, seconds)
     if settings.level is not None and len(fit.episodes) == 1:  # those of a joint fit are of all its recordings together
-        told_intervals = settled_intervals(
-            objective, space, best, level=settings.level, within=settings.within, doubts=settings.doubts
+        told_intervals = state_intervals(
+            objective, space, best, level=settings.level, within=settings.within, doubts=settings.doubts, restarts=RESTARTS
         )
         record["intervals"] = told_intervals.model_dump(mode="json") | {"note": node_set_note(scenario)}
     objective.reseed(fit.measure.seed)

@@ -5,7 +5,7 @@ multipliers) and ends at the bounds. Its half-width is the variance's root times
 degrees of freedom of Welch and Satterthwaite: the noise is estimated from few clusters, the stated doubts are not.
 
 No interval is stated where a fit has not arrived: Gauss and Newton's next step would leave a good part of it, or a loss
-nearby is clearly lower. `settled_intervals` starts the fit again there.
+nearby is clearly lower. `restarts` lets the fit start again there.
 """
 
 from __future__ import annotations
@@ -134,6 +134,7 @@ def state_intervals(
     level: float = LEVEL,
     within: float = WITHIN,
     doubts: Mapping[str, float] = MATERIAL_DOUBTS,
+    restarts: int = 0,
 ) -> Intervals:
     """
     Args:
@@ -141,11 +142,21 @@ def state_intervals(
         level: of the intervals.
         within: factor within which a parameter counts as identified.
         doubts: of what is not fitted, see `fit.uncertainty`.
+        restarts: how often Gauss–Newton may start again at a clearly lower loss that is met on the way; the intervals are
+            then those of where it ends.
 
     Raises:
         DivergedError: the fitted motion diverges.
     """
     found, lower = _with_scan(objective, space, uncertainty(objective, space, values, doubts=doubts))
+    if lower is not None and restarts > 0:
+        outcome = solve(objective, space, GaussNewtonSettings(starts=1, screen=0, init=lower))
+        if outcome.stop_reason == "interrupted":
+            raise KeyboardInterrupt
+        told_again = state_intervals(
+            objective, space, outcome.values, level=level, within=within, doubts=doubts, restarts=restarts - 1
+        )
+        return told_again.model_copy(update={"restarts": told_again.restarts + 1})
     total = found.covariance
     deviations = np.sqrt(np.maximum(total.diagonal(), 1e-300))
     arrived = lower is None and bool((np.abs(found.step) <= _STEP * deviations).all())
@@ -228,35 +239,6 @@ def state_intervals(
         reason=reason,
         lower=lower,
     )
-
-
-def settled_intervals(
-    objective: AnyObjective,
-    space: FitSpace,
-    values: Mapping[str, float],
-    *,
-    level: float = LEVEL,
-    within: float = WITHIN,
-    doubts: Mapping[str, float] = MATERIAL_DOUBTS,
-) -> Intervals:
-    """The same, by Gauss–Newton from any lower loss that is met on the way, a few times at most.
-
-    Args:
-        values: as of `state_intervals`, and so are the others.
-
-    Raises:
-        DivergedError: the fitted motion diverges.
-    """
-    found = state_intervals(objective, space, values, level=level, within=within, doubts=doubts)
-    for restarts in range(1, RESTARTS + 1):
-        if found.lower is None:
-            break
-        outcome = solve(objective, space, GaussNewtonSettings(starts=1, screen=0, init=found.lower))
-        if outcome.stop_reason == "interrupted":
-            raise KeyboardInterrupt
-        found = state_intervals(objective, space, outcome.values, level=level, within=within, doubts=doubts)
-        found = found.model_copy(update={"restarts": restarts})
-    return found
 
 
 def _with_scan(objective: AnyObjective, space: FitSpace, found: Uncertainty) -> tuple[Uncertainty, dict[str, float] | None]:

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import norm, t
 
 from diffcloud.evaluation import intervals as module
-from diffcloud.evaluation.intervals import settled_intervals, significant, state_intervals
+from diffcloud.evaluation.intervals import RESTARTS, significant, state_intervals
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitSpace, Objective
 from diffcloud.fit.uncertainty import Uncertainty, uncertainty
@@ -124,13 +124,13 @@ class TestVerdicts:
 
     def test_it_starts_again_from_a_lower_loss(self, objective):
         """From far off, whose own interval would not be stated."""
-        found = settled_intervals(objective, SPACE, {"stretch": 2.5, "mass": 1.0})
+        found = state_intervals(objective, SPACE, {"stretch": 2.5, "mass": 1.0}, restarts=RESTARTS)
         assert found.restarts > 0
         assert found.arrived
         assert found.ratio.value == pytest.approx(0.7, rel=0.05)
 
     def test_where_none_is_lower_it_stays(self, objective):
-        found = settled_intervals(objective, SPACE, VALUES)
+        found = state_intervals(objective, SPACE, VALUES, restarts=RESTARTS)
         assert found.restarts == 0
         assert found.parameters["stretch"].value == VALUES["stretch"]
 

@@ -144,15 +144,17 @@ def _angle(tree: TransformTree, joint: Joint, times: NDArray[np.float64]) -> NDA
     """
     moved = np.linalg.inv(joint.T_parent_joint) @ tree.lookup(joint.parent, joint.child, times)
     turn, shift = Rotation.from_matrix(moved[:, :3, :3]).as_rotvec(), moved[:, :3, 3]
-    along = (shift if joint.kind == "prismatic" else turn) @ joint.axis
-    off_turn = np.linalg.norm(turn - (0.0 if joint.kind == "prismatic" else along[:, None] * joint.axis), axis=1).max()
-    off_shift = np.linalg.norm(shift - (along[:, None] * joint.axis if joint.kind == "prismatic" else 0.0), axis=1).max()
+    slides = joint.kind == "prismatic"
+    along = np.asarray((shift if slides else turn) @ joint.axis)
+    explained = along[:, None] * joint.axis
+    off_turn = np.linalg.norm(turn if slides else turn - explained, axis=1).max()
+    off_shift = np.linalg.norm(shift - explained if slides else shift, axis=1).max()
     if off_turn > _OFF_RAD or off_shift > _OFF_M:
         raise EpisodeError(
             f"in tf {joint.child!r} lies in {joint.parent!r} by {1000 * off_shift:.0f} mm and {np.rad2deg(off_turn):.1f} "
             f"degrees otherwise than {joint.name} of the robot's description lets it"
         )
-    return np.asarray(along)
+    return along
 
 
 def _placed(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
