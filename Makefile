@@ -12,8 +12,8 @@ unexport PYTHONDONTWRITEBYTECODE
 venv: $(STAMP)
 
 # torch first and pinned: an unpinned one brings gigabytes of CUDA builds; kernels last, which otherwise every process that
-# needs one would compile for itself. --no-compile: byte code of all files takes a third of the time, and Python makes that of
-# the files it uses
+# needs one would compile for itself. --no-compile: compiling every file takes a third of the time, and Python compiles the
+# files it uses anyway
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile "torch==2.13.0"

@@ -155,7 +155,9 @@ def _show_intervals(found: Intervals) -> None:
     if found.ratio is not None and found.ratio.factor is not None:
         output.print(f"stretch / mass {found.ratio.value:.3g}, within a factor of {found.ratio.factor:.3g}")
     if found.restarts:
-        output.print("The fit had not arrived: it was started again from a lower loss, to which the table belongs.")
+        output.print(
+            "The fit had not arrived: it was started again from a lower loss, and the table is for where it ended."
+        )
     if found.reason:
         output.print(found.reason[0].upper() + found.reason[1:] + ".", soft_wrap=True)
 

@@ -352,8 +352,8 @@ def _identified(table: pd.DataFrame) -> list[str]:
     again = table[(table["reason"] == "") & (table["restarts"] > 0)].drop_duplicates(["scenario", "episode"])
     for row in again.to_dict("records"):
         found.append(
-            f"{row['scenario']} / {row['episode']}: the fit had not arrived; the intervals are those of a lower loss, "
-            "found by starting again beside it."
+            f"{row['scenario']} / {row['episode']}: the fit had not arrived; it was started again from a lower loss "
+            "nearby, and the intervals are for where it ended."
         )
     return found
 

@@ -111,7 +111,7 @@ class Motion:
 
 
 def _array(tensor: Tensor) -> Any:
-    """The numbers of a tensor; where it is contiguous, its own ones."""
+    """The numbers of a tensor as an array; where it is contiguous, they share its memory."""
     return tensor.detach().contiguous().numpy()
 
 

@@ -39,8 +39,9 @@ _MOST_VALUES = 100_000
 _MOST_JSON, _MOST_YAML = 50_000_000, 1_000_000
 """Bytes of a file of text that is read as a whole: JSON; YAML, whose reader is slow."""
 _MOST_FRAMES = 100_000_000
+_SHARED_TIME = 1_600_000_000
+"""Modification time given to files that several processes write with the same text [s]."""
 TEMPORARY, LOCK = ".diffcloud-tmp", ".diffcloud-lock"
-_SHARED_TIME = 1_600_000_000  # of change, of files that several processes write alike [s]
 """Suffixes of a file that is being written, and of the lock file beside an output that a command holds."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EINVAL}
 """What a file system without locks answers; nothing is locked there."""

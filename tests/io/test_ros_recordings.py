@@ -307,7 +307,7 @@ class TestLinksInTf:
         (tmp_path / "bent.urdf").write_text(bent.replace('xyz="0 0 0.15643"', 'xyz="0 0 0.25643"'))
         path = bag(tmp_path, "rosbag2", arm=False, links=True)
         texts = " ".join(imported(tmp_path, path, options=("--urdf", tmp_path / "bent.urdf")).result["warnings"])
-        assert "by 100 mm and 0.0 degrees otherwise than joint_1 of the robot's description lets it" in texts
+        assert "100 mm and 0.0 degrees away from where joint_1 of the robot's description can put it relative to" in texts
 
 
 class TestGripper:

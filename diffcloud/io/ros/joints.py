@@ -20,7 +20,7 @@ GRIPPER_JOINT, GRIPPER_CLOSED_RAD = "finger_joint", 0.8
 _LATEST_S = 0.5
 """As with images: a message that is older than one before it by more is of another clock."""
 _OFF_M, _OFF_RAD = 0.005, np.deg2rad(1.0)
-"""By how much a link in tf may lie beside where the robot's description has it."""
+"""How far a link in tf may lie from where the robot's description puts it."""
 
 
 def joint_log(
@@ -100,15 +100,15 @@ def log_from_links(
     gripper_joint: str | None,
     gripper_closed_rad: float | None,
 ) -> tuple[RobotLog, tuple[str, ...]]:
-    """The same of a recording without joint_states, whose tf has the robot's links: each joint's angle is how far its child
-    is turned about its axis against the description.
+    """The joint log of a recording without joint_states whose tf has the robot's links: each joint's angle is how far its
+    child is turned about its axis from its zero in the description.
 
     Args:
         description: of the robot, whose links are named as in tf.
 
     Raises:
-        EpisodeError: the description has no such tool, or tf has not all links that carry it, or none of them moves, or a
-            link lies otherwise than the description's joint lets it.
+        EpisodeError: the description has no such tool, tf lacks some of the links that carry it, none of them moves, or one
+            lies where the description's joint cannot put it.
     """
     carriers = {joint.child: joint for joint in description.joints}
     chain, link = list[Joint](), tool_frame
@@ -151,8 +151,8 @@ def _angle(tree: TransformTree, joint: Joint, times: NDArray[np.float64]) -> NDA
     off_shift = np.linalg.norm(shift - explained if slides else shift, axis=1).max()
     if off_turn > _OFF_RAD or off_shift > _OFF_M:
         raise EpisodeError(
-            f"in tf {joint.child!r} lies in {joint.parent!r} by {1000 * off_shift:.0f} mm and {np.rad2deg(off_turn):.1f} "
-            f"degrees otherwise than {joint.name} of the robot's description lets it"
+            f"in tf {joint.child!r} lies {1000 * off_shift:.0f} mm and {np.rad2deg(off_turn):.1f} degrees away from where "
+            f"{joint.name} of the robot's description can put it relative to {joint.parent!r}"
         )
     return along
 

@@ -59,8 +59,8 @@ def ros_recording(
         joint_names: of the arm, in order; None takes joint_1, joint_2, ... of joint_states.
         gripper_joint: its angle becomes 0 (open, at 0) to 1 (closed). None: the arm has no gripper.
         gripper_closed_rad: that angle when closed; None takes that of a Robotiq 2F-85.
-        description: gives the robot's, for a recording without joint_states whose tf has the robot's links; None: then
-            there is no joint log.
+        description: returns the robot's description, for a recording without joint_states whose tf has the robot's
+            links; None: such a recording gets no joint log.
 
     Raises:
         EpisodeError: unreadable, one part of a split recording, without depth and camera_info, stamps that run backwards,
