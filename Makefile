@@ -39,7 +39,7 @@ tests: venv
 test-slow: venv
 	$(TESTS) -m "slow and not longest"
 
-# minutes each on a slow machine: the simulator that compiles for itself, and the lag of sixteen recordings
+# minutes each on a slow machine: the lag of sixteen recordings, and two more towels of MuJoCo
 test-longest: venv
 	$(TESTS) -m longest
 

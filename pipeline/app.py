@@ -16,6 +16,7 @@ import typer
 from diffcloud import __version__
 from diffcloud.errors import DiffCloudError
 from pipeline.console import errors, say
+from pipeline.fork_server import begin_importing
 from pipeline.lazy import lazy_group
 from pipeline.memory import keep_freed_memory
 
@@ -51,6 +52,8 @@ COMMANDS = {
     "coverage": "pipeline.coverage:coverage",
 }
 """Name -> where it lies; it is imported when it is run."""
+_PARALLEL = ("episodes", "preprocess", "fit", "train", "evaluate", "coverage")
+"""Those whose jobs `pipeline.workers` runs."""
 
 app = typer.Typer(
     cls=lazy_group(COMMANDS),
@@ -76,6 +79,8 @@ def main() -> None:
     keep_freed_memory()
     sys.unraisablehook = _hear_again
     try:
+        if sys.argv[1:2] and sys.argv[1] in _PARALLEL:
+            begin_importing(COMMANDS[sys.argv[1]].partition(":")[0], sys.argv[1:])
         app()
     except DiffCloudError as error:
         say("Error:", str(error), style="bold red")

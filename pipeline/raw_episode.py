@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import time
+import webbrowser
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from diffcloud.io.calibrations import read_calibration
 from diffcloud.sensing.validation.episode import validate_raw_episode
 from pipeline.console import JsonFlag, errors, finish, output, say
+
+_POLL_S = 0.1
+"""Between looks at the folder."""
 
 app = typer.Typer(no_args_is_help=True, help="Raw episodes: what cameras and arm recorded.")
 
@@ -44,3 +51,29 @@ def validate(
     finish({"episode": str(folder), "valid": not faults, "findings": [asdict(finding) for finding in findings]}, json)
     if faults:
         raise typer.Exit(1)
+
+
+@app.command()
+def watch(
+    folder: Annotated[Path, typer.Argument(help="Raw episode that is being recorded, or that will be.")],
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file; default: what the episode says.")] = None,
+    points: Annotated[int, typer.Option(min=100, max=500_000, help="Points shown of each camera.")] = 20_000,
+    port: Annotated[int, typer.Option(min=1024, max=65535, help="Of this machine; if taken, the next free one.")] = 8080,
+    open_: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
+) -> None:
+    """Show the clouds of both cameras and the tool in a browser while an episode is recorded. Ctrl-C ends it."""
+    from diffcloud.live.follower import Follower
+    from diffcloud.live.page import LivePage
+
+    known = None if calibration is None else read_calibration(calibration)
+    follower = Follower(folder, known, points=points)
+    with LivePage(port=port, title=folder.name) as page, suppress(KeyboardInterrupt):  # which is how this ends
+        errors.print(f"Watching {folder} at {page.url} (Ctrl-C ends).", soft_wrap=True)
+        if open_:
+            webbrowser.open(page.url)
+        while True:
+            if (frame := follower.newest()) is not None:
+                page.show(frame)
+                if frame.status != "recording":
+                    errors.print(f"The recording is {frame.status}; its last frame stays until Ctrl-C.")
+            time.sleep(_POLL_S)

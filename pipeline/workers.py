@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import pickle
 import signal
@@ -19,6 +18,7 @@ from typing import Any, Protocol, TypeVar
 from diffcloud.errors import DiffCloudError
 from diffcloud.sim.threads import use_threads
 from pipeline.console import progress_bar
+from pipeline.fork_server import worker_context
 from pipeline.lazy import imports
 from pipeline.memory import keep_freed_memory
 
@@ -65,7 +65,7 @@ def run_all(
                 update(index, job.label)
                 yield (job, *_attempt(job, partial(_tell, update, index, job.label)))
             return
-        context = multiprocessing.get_context("spawn")  # not forked: a fork of a process with torch's threads may hang
+        context = worker_context()
         stop = context.Event()
         with (
             # jobs travel in files: a pool whose processes have ended waits for ever to send them what does not fit into a

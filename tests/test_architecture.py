@@ -22,6 +22,7 @@ ALLOWED = {
     "simulators": {"mesh", "io", "sim", "scene", "fit"},
     "sensing": {"mesh", "io", "clouds"},
     "hardware": {"mesh", "io", "clouds", "sensing"},
+    "live": {"mesh", "io", "clouds", "sensing"},
     "report": {"mesh", "io", "sim", "scene", "clouds", "fit", "regressors", "sensing", "evaluation"},
 }
 """Sub-package -> the sub-packages it may import; all may import errors."""

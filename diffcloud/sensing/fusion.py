@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -155,7 +156,8 @@ def fuse(
     if mask is not None and raw.robot is None:
         raise EpisodeError("The recording has no joint log (robot.csv), so the robot cannot be masked: go without a mask.")
     views = {
-        name: View(camera.info.intrinsics, _pose(camera.info, raw, calibration)) for name, camera in raw.cameras.items()
+        name: View(camera.info.intrinsics, camera_pose(camera.info, raw.folder, calibration))
+        for name, camera in raw.cameras.items()
     }
     cameras, quality = _Cameras(raw, views, mask, settings), _Quality(list(raw.cameras))
     if settings.refine and len(raw.cameras) > 1:
@@ -448,9 +450,15 @@ def _tool(raw: RawEpisode, times: Floats, mask: RobotMask | None, settings: Fusi
     return None
 
 
-def _pose(info: CameraInfo, raw: RawEpisode, calibration: Calibration | None) -> Floats:
+def camera_pose(info: CameraInfo, folder: Path, calibration: Calibration | None) -> Floats:
+    """T_world_camera [4, 4] of a camera of the raw episode in a folder, by default as its camera.json says.
+
+    Raises:
+        EpisodeError: neither is there.
+        CalibrationError: an unreadable calibration, or one without this camera.
+    """
     if calibration is None and info.calibration is not None:
-        calibration = read_calibration(raw.folder / info.calibration)
+        calibration = read_calibration(folder / info.calibration)
     if calibration is not None:
         return calibration.camera(info.serial, name=info.name).T_world_camera
     if info.T_world_camera is None:

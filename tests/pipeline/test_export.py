@@ -130,7 +130,7 @@ class TestRefusals:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("target", ["mujoco", pytest.param("newton", marks=pytest.mark.longest)])
+@pytest.mark.parametrize("target", ["mujoco", "newton"])
 def test_the_export_runs_and_moves_as_fitted(work, target):
     pytest.importorskip(target)
     done = invoke("export", "joint.json", "--to", target, "--check", "--out", "out")

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import subprocess
+import sys
 from dataclasses import dataclass
 
 import pytest
 
 from diffcloud.errors import ConfigError, DiffCloudError
+from pipeline.fork_server import asked_workers
 from pipeline.workers import Tell, run_all
 
 
@@ -47,3 +51,41 @@ def test_a_process_that_dies_is_an_error(luggage):
     """Also where the other jobs are too large to wait in a pipe."""
     with pytest.raises(DiffCloudError, match="A worker process died"):
         list(run_all("squares", [Square(number, luggage) for number in (7, 1, 2, 4, 5, 6)], 2))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "count"),
+    [
+        (["fit", "e.npz", "--workers", "2"], 2),
+        (["fit", "--workers=3", "e.npz"], 3),
+        (["fit", "--params", "params.yaml"], 4),
+        (["train", "--params=params.yaml"], 1),
+        (["fit", "--params", "params.yaml", "--workers", "1"], 1),
+        (["fit", "--params", "none.yaml"], 1),
+        (["fit", "--workers"], 1),
+        (["fit", "--workers", "many"], 1),
+    ],
+)
+def test_the_server_of_workers_begins_where_the_command_line_asks_for_several(tmp_path, monkeypatch, arguments, count):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "params.yaml").write_text("fit: {workers: 4}\ntrain: {epochs: 1}\n")
+    assert asked_workers(arguments) == count
+
+
+@pytest.mark.skipif("forkserver" not in multiprocessing.get_all_start_methods(), reason="this system has no fork server")
+def test_workers_have_imported_what_their_command_needs_and_no_interrupt_reaches_them(tmp_path):
+    """In a process of its own: a server lasts as long as the process that began it."""
+    script = tmp_path / "begins.py"
+    script.write_text(
+        "import sys, signal\n"
+        "from concurrent.futures import ProcessPoolExecutor\n"
+        "from pipeline.fork_server import begin_importing, worker_context\n"
+        "def told():\n"
+        "    return 'pipeline.fit' in sys.modules, signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])\n"
+        "if __name__ == '__main__':\n"
+        "    begin_importing('pipeline.fit', ['fit', '--workers', '2'])\n"
+        "    with ProcessPoolExecutor(1, mp_context=worker_context()) as pool:\n"
+        "        print(*pool.submit(told).result(), signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.split() == ["True", "True", "False"]

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
+from diffcloud.io.camera_models import Intrinsics
+from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter
 from diffcloud.report.overlay import Overlay, recorded_layers
 from diffcloud.report.view import build_view
 from tests.report.pages import entry, page_of
@@ -131,3 +137,27 @@ def test_a_narrow_window_scrolls_only_down(page):
     page.set_viewport_size({"width": 420, "height": 800})
     page.wait_for_timeout(300)
     assert page.evaluate("document.documentElement.scrollWidth") <= 420
+
+
+def test_a_recording_is_watched_while_it_grows(browser, tmp_path):
+    """The command in a process of its own, as beside a capture; Ctrl-C ends it."""
+    pytest.importorskip("viser")
+    folder = tmp_path / "episode"
+    command = [sys.executable, "-m", "pipeline.app", "episode", "watch", str(folder), "--port", "8741"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            told = process.stderr.readline()
+            url = re.search(r"http://127\.0\.0\.1:\d+", told).group()
+            tab = browser.new_page(viewport={"width": 1000, "height": 700})
+            tab.goto(url)
+            tab.get_by_text("Waiting for the first frame").wait_for()
+            info = CameraInfo("top", "1", Intrinsics(width=8, height=6, fx=10, fy=10, cx=3.5, cy=2.5), 0.001, np.eye(4))
+            with RawEpisodeWriter(folder, {"top": info}, rate_hz=30, source="test") as writer:
+                writer.add_frame("top", 0.25, np.full((6, 8), 700, dtype=np.uint16))
+                tab.get_by_text("top: frame 0, 0.25 s, 48 points").wait_for()
+            tab.get_by_text("complete").wait_for()
+            tab.close()
+        finally:
+            process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == 0
+        assert "The recording is complete" in process.stderr.read()

@@ -1,0 +1,1 @@
+"""What cameras see while an episode is recorded."""

@@ -1,0 +1,102 @@
+"""A raw episode while it is being recorded: its newest frame, as clouds in the base frame.
+
+What is read is what the recorder has promised, rows of timestamps.csv whose images are whole (`io.raw_episodes`), so
+following disturbs no capture, and works for any program that writes raw episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.io.calibrations import Calibration
+from diffcloud.io.camera_models import Intrinsics
+from diffcloud.io.raw_episodes import RawCamera, read_camera_info, read_description, read_robot_log, read_timestamps
+from diffcloud.sensing.cameras import Floats, depth_points, transform
+from diffcloud.sensing.fusion import camera_pose
+
+
+@dataclass(frozen=True)
+class LiveCloud:
+    """What one camera saw last."""
+
+    frame: int
+    """Its number."""
+    t_s: float
+    points: Floats
+    """[P, 3] in the base frame [m], evenly thinned; robot, table and background among them."""
+    colors: NDArray[np.uint8] | None
+    """[P, 3] RGB; None where no colour is recorded."""
+    T_world_camera: Floats
+    """[4, 4]"""
+    intrinsics: Intrinsics
+
+
+@dataclass(frozen=True)
+class LiveFrame:
+    """The state of a recording."""
+
+    status: str
+    """recording, complete or stopped."""
+    clouds: Mapping[str, LiveCloud]
+    """Camera -> its newest cloud; without those that have delivered nothing yet."""
+    tool: Floats | None
+    """[3] newest tool position in the base frame [m], if one is logged."""
+
+
+class Follower:
+    """Reads what is new in a folder.
+
+    Args:
+        folder: of a raw episode; it may not be there yet.
+        calibration: of its cameras; by default what camera.json says.
+        points: of each camera at most.
+    """
+
+    def __init__(self, folder: Path, calibration: Calibration | None = None, *, points: int = 20_000) -> None:
+        self._folder, self._calibration, self._points = folder, calibration, points
+        self._shown: tuple[object, ...] | None = None
+        self._poses: dict[str, Floats] = {}
+
+    def newest(self) -> LiveFrame | None:
+        """The state now; None if it is that of the last call, or if nothing is there yet.
+
+        Raises:
+            EpisodeError: a file is damaged, or a camera is not calibrated.
+        """
+        if not (self._folder / "episode.json").is_file():
+            return None
+        description = read_description(self._folder)
+        status = str(description.get("status") or "complete")
+        cameras = {name: camera for name in description["cameras"] if len((camera := self._camera(name)).frames)}
+        shown = (status, *((name, int(camera.frames[-1])) for name, camera in cameras.items()))
+        if shown == self._shown:
+            return None
+        self._shown = shown
+        tool = None
+        if description.get("robot") is not None:
+            known = read_robot_log(self._folder / "robot.csv").tool_position_m[-1:]
+            tool = known[0] if len(known) and np.isfinite(known).all() else None
+        return LiveFrame(status, {name: self._cloud(name, camera) for name, camera in cameras.items()}, tool)
+
+    def _camera(self, name: str) -> RawCamera:
+        place = self._folder / "cameras" / name
+        frames, times = read_timestamps(place / "timestamps.csv")
+        return RawCamera(read_camera_info(place / "camera.json"), place, frames, times)
+
+    def _cloud(self, name: str, camera: RawCamera) -> LiveCloud:
+        if name not in self._poses:  # it is written before the first frame, and does not change
+            self._poses[name] = camera_pose(camera.info, self._folder, self._calibration)
+        last = len(camera.frames) - 1
+        depth, color = camera.depth(last), camera.color(last)
+        step = max(1, int(np.ceil(np.sqrt(depth.size / self._points))))
+        points, pixels = depth_points(depth, camera.info.intrinsics, camera.info.depth_scale_m, step=step)
+        colors = None if color is None or color.shape[:2] != depth.shape else color[pixels[:, 1], pixels[:, 0]]
+        world = transform(self._poses[name], points)
+        return LiveCloud(
+            int(camera.frames[-1]), float(camera.times[-1]), world, colors, self._poses[name], camera.info.intrinsics
+        )

@@ -1,0 +1,72 @@
+"""The process that forks workers, started while this one still imports.
+
+torch and the kernels take seconds to import. This process, and one after the other those that work for it, would wait for
+that; a server that imports the same beside it hands out workers that have it already. It is not this process that forks:
+a fork of one that has torch's threads may hang, and would keep its locks of folders.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Sequence
+from contextlib import suppress
+from multiprocessing import resource_tracker
+from multiprocessing.context import BaseContext
+from pathlib import Path
+
+from diffcloud.errors import DiffCloudError
+from diffcloud.io.files import read_yaml
+
+_KIND = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+
+
+def worker_context() -> BaseContext:
+    """How worker processes start: from the server, or by themselves where the system has none."""
+    return multiprocessing.get_context(_KIND)
+
+
+def begin_importing(module: str, arguments: Sequence[str]) -> None:
+    """Let the server import a command's module, if its arguments ask for several workers; else do nothing.
+
+    Args:
+        arguments: of the command line, after `diffcloud`.
+    """
+    if _KIND == "spawn" or asked_workers(arguments) < 2:
+        return
+    from multiprocessing import forkserver
+
+    worker_context().set_forkserver_preload(["pipeline.app", module])
+    # Ctrl-C is for this process, which tells its workers; the server inherits what is blocked, and they do. The tracker
+    # comes first, because its start unblocks
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def asked_workers(arguments: Sequence[str]) -> int:
+    """What --workers says, or the section of the command in the file of --params. What is wrong is said by the command."""
+    told: object = _after("--workers", arguments)
+    file = _after("--params", arguments)
+    if told is None and file is not None:
+        with suppress(DiffCloudError):
+            section = read_yaml(Path(file))
+            for name in (arguments[0], "workers"):
+                section = section.get(name) if isinstance(section, dict) else None
+            told = section
+    try:
+        return int(str(told))
+    except ValueError:
+        return 1
+
+
+def _after(option: str, arguments: Sequence[str]) -> str | None:
+    """The value of an option, as two words or with an equals sign."""
+    for index, word in enumerate(arguments):
+        name, equals, value = word.partition("=")
+        if name == option:
+            return value if equals else next(iter(arguments[index + 1 :]), None)
+    return None
