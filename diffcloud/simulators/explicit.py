@@ -40,7 +40,7 @@ def simulate(problem: Problem, choices: Choices | None = None, *, step: float = 
     count = problem.steps_of(step)
     step, total = 1 / (problem.rate * count), (len(problem.times) - 1) * count
     held, places = list(problem.held), problem.held_at(np.arange(total + 1) * step)
-    parts = [_membrane(problem, chosen), _hinges(problem, chosen), _table(problem)]
+    parts = [membrane_force(problem, chosen), _hinges(problem, chosen), _table(problem)]
     mass = problem.node_mass[:, None]
     x, v = problem.mesh.nodes.copy(), np.zeros_like(problem.mesh.nodes)
     frames, began = [x.copy()], time.process_time()
@@ -60,9 +60,12 @@ def _gathered(index: NDArray[np.int64], nodes: int) -> csr_array:
     return csr_array((np.ones(len(flat)), (flat, np.arange(len(flat)))), shape=(nodes, len(flat)))
 
 
-def _membrane(problem: Problem, chosen: Choices) -> Callable[[Array, Array], Array]:
-    """Stretching and its damping. Of the neo-Hookean sheet the energy per area is μ (tr FᵀF - 2)/2 + (λ + μ) (J - α)²/2
-    with J the ratio of areas and α = 1 + μ/(λ + μ)."""
+def membrane_force(problem: Problem, chosen: Choices) -> Callable[[Array, Array], Array]:
+    """Stretching and its damping: nodes and velocities [V, 3] -> forces [V, 3].
+
+    Of the neo-Hookean sheet the energy per area is μ (tr FᵀF - 2)/2 + (λ + μ) (J - α)²/2 with J the ratio of areas and
+    α = 1 + μ/(λ + μ).
+    """
     mesh, sheet = problem.mesh, problem.sheet
     inverse = np.linalg.inv(mesh.material_edges)  # [F, 2, 2]
     gather, area = _gathered(mesh.faces, len(mesh.nodes)), mesh.face_area[:, None, None]
@@ -97,6 +100,18 @@ def _membrane(problem: Problem, chosen: Choices) -> Callable[[Array, Array], Arr
         return np.asarray(gather @ corners.reshape(-1, 3))
 
     return force
+
+
+def neo_hookean_gain(problem: Problem, motion: Array) -> float:
+    """By what a neo-Hookean membrane's stiffness must be multiplied, so that its forces on the nodes of a motion [T, V, 3]
+    are the nearest to those of Saint Venant's and Kirchhoff's, in least squares."""
+    still = np.zeros_like(motion[0])
+    linear, other = (
+        np.array([force(nodes, still) for nodes in motion])
+        for force in (membrane_force(problem, Choices(neo_hookean=chosen)) for chosen in (False, True))
+    )
+    size = float((other**2).sum())
+    return float((linear * other).sum()) / size if size > 0 else 1.0
 
 
 def _hinges(problem: Problem, chosen: Choices) -> Callable[[Array, Array], Array]:

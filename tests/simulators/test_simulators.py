@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from diffcloud.errors import ConfigError
+from diffcloud.mesh.shapes import grid_cloth
 from diffcloud.simulators import explicit, mujoco, newton, ours, problem
-from diffcloud.simulators.problem import Track, distances
+from diffcloud.simulators.problem import Problem, Sheet, Track, distances
 from diffcloud.simulators.problems import cantilever, elastica, fold, lift, strip, swing
 
 NOISY = pytest.mark.filterwarnings("ignore")
@@ -118,6 +119,22 @@ def test_mujoco_is_the_third_opinion_with_its_choices():
     given = short(swing(), 0.75)
     third = explicit.simulate(given, explicit.Choices(chord=True))
     assert distances(mujoco.simulate(given, mujoco.Settings(step=1e-4)), third).max() < 1e-3
+
+
+@pytest.mark.parametrize(("along", "across"), [(1.25, 1.25), (1.25, 1.0), (0.99, 1.02)])
+def test_the_stiffness_that_makes_up_for_a_neo_hookean_membrane(along, across):
+    """Of a square stretched evenly: with ν = 0, E = 2 μ, the stresses of the two membranes by hand (both sides alike)."""
+    flat = grid_cloth(5, 5, 0.4, 0.4)
+    sheet = Sheet(density=0.2, stretching=30.0, poisson=0.0, bending=1e-6, damping=0.0)
+    given = Problem("square", flat, sheet, 0.1, {0: None})
+    area = along * across
+    linear = np.array([along * (along**2 - 1), across * (across**2 - 1)])  # μ times these
+    other = np.array([along + (area - 2) * across, across + (area - 2) * along])
+    motion = (flat.nodes * [along, across, 1.0])[None]
+    expected = linear @ other / (other @ other)
+    assert explicit.neo_hookean_gain(given, motion) == pytest.approx(expected, rel=1e-9)
+    if along == across:
+        assert expected == pytest.approx(1.0)
 
 
 @NOISY

@@ -15,6 +15,7 @@ from diffcloud.io.files import together, write_json, write_npz, write_text
 from diffcloud.io.obj import write_cloth, write_surface
 from diffcloud.scene.write import write_scene
 from diffcloud.simulators import mujoco
+from diffcloud.simulators.explicit import neo_hookean_gain
 from diffcloud.simulators.export.cloth import ExportedCloth
 from diffcloud.simulators.export.isaac import layer
 from diffcloud.simulators.problem import Problem
@@ -94,12 +95,16 @@ def _mujoco(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[li
 
 
 def _newton(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
+    gain = neo_hookean_gain(cloth.problem, cloth.motion)
+    sheet = cloth.problem.sheet
+    stiffer = replace(sheet, stretching=gain * sheet.stretching, damping=sheet.damping / gain)  # damping times stiffness
     more = [
-        "Newton's membrane is neo-Hookean; it agrees with the fit's at small strains.",
+        "Newton's membrane is neo-Hookean, and softer where strains are large: its stretching stiffness is "
+        f"{gain:.3g} times the sheet's, so that its forces in the fitted motion are the nearest to the sheet's.",
         *_one_friction(cloth.problem),
         *_flat_hinges(cloth.problem),
     ]
-    return _script("run_newton.py", cloth.problem, folder), more
+    return _script("run_newton.py", replace(cloth.problem, sheet=stiffer), folder), more
 
 
 def _one_friction(problem: Problem) -> list[str]:
