@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import pickle
 import signal
@@ -134,8 +135,17 @@ def _begin(stop: Event, patient: bool) -> None:
     torch.set_num_threads(1)
     use_threads(1)
     keep_freed_memory()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     if not patient:
         threading.Thread(target=_end_at, args=(stop,), daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A process that was killed tells its workers nothing; they would wait for it for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _end_at(stop: Event) -> None:

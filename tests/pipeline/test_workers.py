@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 
+import psutil
 import pytest
 
 from diffcloud.errors import ConfigError, DiffCloudError
@@ -51,6 +52,29 @@ def test_a_process_that_dies_is_an_error(luggage):
     """Also where the other jobs are too large to wait in a pipe."""
     with pytest.raises(DiffCloudError, match="A worker process died"):
         list(run_all("squares", [Square(number, luggage) for number in (7, 1, 2, 4, 5, 6)], 2))
+
+
+def test_workers_end_with_a_process_that_is_killed(tmp_path):
+    script = tmp_path / "killed.py"
+    script.write_text(
+        "import os, time\n"
+        "from dataclasses import dataclass\n"
+        "from pipeline.workers import run_all\n"
+        "@dataclass(frozen=True)\n"
+        "class Endless:\n"
+        "    label = 'endless'\n"
+        "    def run(self, tell):\n"
+        "        print(os.getpid(), flush=True)\n"
+        "        time.sleep(600)\n"
+        "if __name__ == '__main__':\n"
+        "    list(run_all('endless', [Endless(), Endless()], 2))\n"
+    )
+    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as process:
+        workers = [psutil.Process(int(process.stdout.readline())) for _ in range(2)]
+        servers = {worker.parent() for worker in workers}
+        process.kill()
+    _, alive = psutil.wait_procs([*workers, *servers], timeout=30)
+    assert not alive
 
 
 @pytest.mark.parametrize(
