@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from multiprocessing import resource_tracker
@@ -18,11 +19,12 @@ from pathlib import Path
 from diffcloud.errors import DiffCloudError
 from diffcloud.io.files import read_yaml
 
-_KIND = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+_KIND = "forkserver" if sys.platform == "linux" else "spawn"
+"""On macOS libraries that torch loads may not survive a fork."""
 
 
 def worker_context() -> BaseContext:
-    """How worker processes start: from the server, or by themselves where the system has none."""
+    """How worker processes start: from the server, or elsewhere than on Linux by themselves."""
     return multiprocessing.get_context(_KIND)
 
 
