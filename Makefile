@@ -39,7 +39,7 @@ tests: venv
 test-slow: venv
 	$(TESTS) -m "slow and not longest"
 
-# minutes each on a slow machine: the lag of sixteen recordings, and two more towels of MuJoCo
+# minutes each on a slow machine: the lag in sixteen recordings, and identifying two more MuJoCo towels
 test-longest: venv
 	$(TESTS) -m longest
 

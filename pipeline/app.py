@@ -53,7 +53,7 @@ COMMANDS = {
 }
 """Name -> where it lies; it is imported when it is run."""
 _PARALLEL = ("episodes", "preprocess", "fit", "train", "evaluate", "coverage")
-"""Those whose jobs `pipeline.workers` runs."""
+"""Commands that run their jobs through `pipeline.workers`."""
 
 app = typer.Typer(
     cls=lazy_group(COMMANDS),

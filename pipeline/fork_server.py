@@ -1,8 +1,8 @@
 """The process that forks workers, started while this one still imports.
 
-torch and the kernels take seconds to import. This process, and one after the other those that work for it, would wait for
-that; a server that imports the same beside it hands out workers that have it already. It is not this process that forks:
-a fork of one that has torch's threads may hang, and would keep its locks of folders.
+torch and the kernels take seconds to import. Without a server, the command would wait for that, and then its workers.
+The server imports the same modules in parallel with the command and forks workers that have them already. The command
+itself must not fork: with torch's threads the child may hang, and it would inherit the locks on folders.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from diffcloud.errors import DiffCloudError
 from diffcloud.io.files import read_yaml
 
 _KIND = "forkserver" if sys.platform == "linux" else "spawn"
-"""On macOS libraries that torch loads may not survive a fork."""
+"""On macOS, libraries that torch loads may not survive a fork."""
 
 
 def worker_context() -> BaseContext:
-    """How worker processes start: from the server, or elsewhere than on Linux by themselves."""
+    """How worker processes start: forked from the server on Linux, spawned elsewhere."""
     return multiprocessing.get_context(_KIND)
 
 
@@ -39,8 +39,8 @@ def begin_importing(module: str, arguments: Sequence[str]) -> None:
     from multiprocessing import forkserver
 
     worker_context().set_forkserver_preload(["pipeline.app", module])
-    # Ctrl-C is for this process, which tells its workers; the server inherits what is blocked, and they do. The tracker
-    # comes first, because its start unblocks
+    # Ctrl-C is meant for this process, which tells its workers. The server and its workers inherit the blocked signal. The
+    # tracker starts first, because starting it unblocks signals
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -50,7 +50,8 @@ def begin_importing(module: str, arguments: Sequence[str]) -> None:
 
 
 def asked_workers(arguments: Sequence[str]) -> int:
-    """What --workers says, or the section of the command in the file of --params. What is wrong is said by the command."""
+    """The value of --workers, else `workers` of the command's section in the file of --params, else 1. Invalid values are
+    left for the command to report."""
     told: object = _after("--workers", arguments)
     file = _after("--params", arguments)
     if told is None and file is not None:

@@ -55,25 +55,29 @@ def validate(
 
 @app.command()
 def watch(
-    folder: Annotated[Path, typer.Argument(help="Raw episode that is being recorded, or that will be.")],
-    calibration: Annotated[Path | None, typer.Option(help="Calibration file; default: what the episode says.")] = None,
-    points: Annotated[int, typer.Option(min=100, max=500_000, help="Points shown of each camera.")] = 20_000,
-    port: Annotated[int, typer.Option(min=1024, max=65535, help="Of this machine; if taken, the next free one.")] = 8080,
+    folder: Annotated[Path, typer.Argument(help="Raw episode; it need not exist yet, or may be finished.")],
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file. Default: what camera.json says.")] = None,
+    points: Annotated[int, typer.Option(min=100, max=500_000, help="Maximum number of points shown per camera.")] = 20_000,
+    port: Annotated[
+        int, typer.Option(min=1024, max=65535, help="Local port; if it is taken, the next free one is used.")
+    ] = 8080,
     open_: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
 ) -> None:
-    """Show the clouds of both cameras and the tool in a browser while an episode is recorded. Ctrl-C ends it."""
+    """Show clouds, cameras and tool in a browser while an episode is recorded. Ctrl-C stops watching, not the recording."""
     from diffcloud.live.follower import Follower
     from diffcloud.live.page import LivePage
 
     known = None if calibration is None else read_calibration(calibration)
     follower = Follower(folder, known, points=points)
     with LivePage(port=port, title=folder.name) as page, suppress(KeyboardInterrupt):  # which is how this ends
-        errors.print(f"Watching {folder} at {page.url} (Ctrl-C ends).", soft_wrap=True)
+        errors.print(f"Watching {folder} at {page.url} (Ctrl-C stops watching).", soft_wrap=True)
+        if not folder.exists():
+            errors.print(f"{folder} does not exist yet; waiting for it.", soft_wrap=True)
         if open_:
             webbrowser.open(page.url)
         while True:
             if (frame := follower.newest()) is not None:
                 page.show(frame)
                 if frame.status != "recording":
-                    errors.print(f"The recording is {frame.status}; its last frame stays until Ctrl-C.")
+                    errors.print(f"Recording {frame.status}. The page keeps its last frame until Ctrl-C.")
             time.sleep(_POLL_S)

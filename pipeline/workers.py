@@ -141,7 +141,7 @@ def _begin(stop: Event, patient: bool) -> None:
 
 
 def _end_with_parent() -> None:
-    """A process that was killed tells its workers nothing; they would wait for it for ever."""
+    """A process that is killed cannot tell its workers; without this they would wait for it forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

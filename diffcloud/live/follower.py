@@ -1,7 +1,7 @@
 """A raw episode while it is being recorded: its newest frame, as clouds in the base frame.
 
-What is read is what the recorder has promised, rows of timestamps.csv whose images are whole (`io.raw_episodes`), so
-following disturbs no capture, and works for any program that writes raw episodes.
+Only frames that timestamps.csv lists already are read; their images are complete by then (`io.raw_episodes`). So following
+works with any program that writes raw episodes.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Follower:
     Args:
         folder: of a raw episode; it may not be there yet.
         calibration: of its cameras; by default what camera.json says.
-        points: of each camera at most.
+        points: maximum number per camera.
     """
 
     def __init__(self, folder: Path, calibration: Calibration | None = None, *, points: int = 20_000) -> None:
@@ -67,6 +67,7 @@ class Follower:
 
         Raises:
             EpisodeError: a file is damaged, or a camera is not calibrated.
+            CalibrationError: an unreadable calibration, or one without a camera of the episode.
         """
         if not (self._folder / "episode.json").is_file():
             return None

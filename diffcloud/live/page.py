@@ -18,15 +18,14 @@ _TINTS = ((70, 120, 200), (220, 140, 60), (90, 170, 110), (180, 90, 170))
 """Of the points of cameras without colour."""
 _AXES_M = 0.1
 _FROM_M = np.array([0.9, -0.9, 0.8])
-"""Where one looks from first, beside the middle of what was seen."""
+"""Initial viewpoint, relative to the centre of the clouds."""
 
 
 class LivePage:
     """A page that shows the newest frame; close it with `close`, or use it as a context.
 
     Args:
-        port: on this machine alone: nobody else can look, and nothing is sent elsewhere. A taken port is left for the next
-            free one; see `url`.
+        port: of this machine; no other can open the page. If the port is taken, the next free one is used: see `url`.
 
     Raises:
         ConfigError: viser is not installed.
@@ -37,7 +36,7 @@ class LivePage:
             import viser
         except ImportError as error:
             raise ConfigError("Watching needs viser: pip install 'diffcloud[live]'.") from error
-        with redirect_stdout(io.StringIO()):  # a box of its own, which the command's line replaces
+        with redirect_stdout(io.StringIO()):  # hides viser's own banner; the command prints one line instead
             self._server = viser.ViserServer(host="127.0.0.1", port=port, label=title, verbose=False)
         self._server.scene.set_up_direction("+z")
         self._server.scene.add_frame("/base", axes_length=_AXES_M, axes_radius=_AXES_M / 25)
@@ -77,7 +76,7 @@ class LivePage:
             self._aim(np.median(np.concatenate([cloud.points for cloud in frame.clouds.values()]), axis=0))
 
     def _aim(self, centre: Floats) -> None:
-        """Let those who look, and who will, see the table from near by."""
+        """Point current and future viewers at the scene from close up."""
         self._aimed = True
         first = self._server.initial_camera
         first.position, first.look_at = centre + _FROM_M, centre

@@ -454,7 +454,7 @@ def camera_pose(info: CameraInfo, folder: Path, calibration: Calibration | None)
     """T_world_camera [4, 4] of a camera of the raw episode in a folder, by default as its camera.json says.
 
     Raises:
-        EpisodeError: neither is there.
+        EpisodeError: no calibration was given, and camera.json has neither a pose nor a calibration file.
         CalibrationError: an unreadable calibration, or one without this camera.
     """
     if calibration is None and info.calibration is not None:

@@ -63,7 +63,7 @@ def _gathered(index: NDArray[np.int64], nodes: int) -> csr_array:
 def membrane_force(problem: Problem, chosen: Choices) -> Callable[[Array, Array], Array]:
     """Stretching and its damping: nodes and velocities [V, 3] -> forces [V, 3].
 
-    Of the neo-Hookean sheet the energy per area is μ (tr FᵀF - 2)/2 + (λ + μ) (J - α)²/2 with J the ratio of areas and
+    The neo-Hookean sheet's energy per area is μ (tr FᵀF - 2)/2 + (λ + μ) (J - α)²/2 with J the ratio of areas and
     α = 1 + μ/(λ + μ).
     """
     mesh, sheet = problem.mesh, problem.sheet
@@ -103,8 +103,8 @@ def membrane_force(problem: Problem, chosen: Choices) -> Callable[[Array, Array]
 
 
 def neo_hookean_gain(problem: Problem, motion: Array) -> float:
-    """By what a neo-Hookean membrane's stiffness must be multiplied, so that its forces on the nodes of a motion [T, V, 3]
-    are the nearest to those of Saint Venant's and Kirchhoff's, in least squares."""
+    """The factor on a neo-Hookean membrane's stiffness that brings its forces on the nodes of a motion [T, V, 3] closest,
+    in least squares, to those of the Saint Venant-Kirchhoff membrane."""
     still = np.zeros_like(motion[0])
     linear, other = (
         np.array([force(nodes, still) for nodes in motion])

@@ -126,6 +126,7 @@ class Problem:
             "density": sheet.density,
             "shear": sheet.shear,
             "lateral": sheet.lateral,
+            "membrane_gain": 1.0,
             "damping": sheet.damping,
             "hinge_edges": hinges.nodes[:, :2],
             "hinge_stiffness": self.hinge_stiffness,

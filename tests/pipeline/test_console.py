@@ -8,7 +8,7 @@ from pipeline import console
 
 
 def test_where_there_is_no_terminal_a_line_comes_every_ten_seconds(monkeypatch, capsys):
-    """A third of a job a call, a call every four seconds: the third one is late enough, and the sixth."""
+    """Each call adds a third of a job and comes four seconds after the last, so the third and the sixth print a line."""
     clock = itertools.count(step=4.0)
     monkeypatch.setattr(console.time, "monotonic", lambda: next(clock))
     with console.progress_bar("fit", 10) as update:

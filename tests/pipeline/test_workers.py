@@ -95,7 +95,7 @@ def test_the_server_of_workers_begins_where_the_command_line_asks_for_several(tm
     assert asked_workers(arguments) == count
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere than on Linux workers start by themselves")
+@pytest.mark.skipif(sys.platform != "linux", reason="workers are spawned elsewhere")
 def test_workers_have_imported_what_their_command_needs_and_no_interrupt_reaches_them(tmp_path):
     """In a process of its own: a server lasts as long as the process that began it."""
     script = tmp_path / "begins.py"

@@ -147,6 +147,7 @@ def test_a_recording_is_watched_while_it_grows(browser, tmp_path):
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             told = process.stderr.readline()
+            assert "does not exist yet" in process.stderr.readline()
             url = re.search(r"http://127\.0\.0\.1:\d+", told).group()
             tab = browser.new_page(viewport={"width": 1000, "height": 700})
             tab.goto(url)
@@ -160,4 +161,4 @@ def test_a_recording_is_watched_while_it_grows(browser, tmp_path):
         finally:
             process.send_signal(signal.SIGINT)
         assert process.wait(timeout=30) == 0
-        assert "The recording is complete" in process.stderr.read()
+        assert "Recording complete" in process.stderr.read()

@@ -123,7 +123,7 @@ def test_mujoco_is_the_third_opinion_with_its_choices():
 
 @pytest.mark.parametrize(("along", "across"), [(1.25, 1.25), (1.25, 1.0), (0.99, 1.02)])
 def test_the_stiffness_that_makes_up_for_a_neo_hookean_membrane(along, across):
-    """Of a square stretched evenly: with ν = 0, E = 2 μ, the stresses of the two membranes by hand (both sides alike)."""
+    """A uniformly stretched square: with ν = 0 and E = 2 μ, the stresses of both membranes are worked out by hand."""
     flat = grid_cloth(5, 5, 0.4, 0.4)
     sheet = Sheet(density=0.2, stretching=30.0, poisson=0.0, bending=1e-6, damping=0.0)
     given = Problem("square", flat, sheet, 0.1, {0: None})

@@ -96,15 +96,13 @@ def _mujoco(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[li
 
 def _newton(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
     gain = neo_hookean_gain(cloth.problem, cloth.motion)
-    sheet = cloth.problem.sheet
-    stiffer = replace(sheet, stretching=gain * sheet.stretching, damping=sheet.damping / gain)  # damping times stiffness
     more = [
-        "Newton's membrane is neo-Hookean, and softer where strains are large: its stretching stiffness is "
-        f"{gain:.3g} times the sheet's, so that its forces in the fitted motion are the nearest to the sheet's.",
+        "Newton's membrane is neo-Hookean and too soft at large strains. To compensate, the stretching stiffness is "
+        f"exported {gain:.3g} times as large, which brings its forces in the fitted motion closest to the sheet's.",
         *_one_friction(cloth.problem),
         *_flat_hinges(cloth.problem),
     ]
-    return _script("run_newton.py", replace(cloth.problem, sheet=stiffer), folder), more
+    return _script("run_newton.py", cloth.problem, folder, membrane_gain=gain), more
 
 
 def _one_friction(problem: Problem) -> list[str]:
@@ -119,8 +117,8 @@ def _flat_hinges(problem: Problem) -> list[str]:
     return [told] if problem.shaped else []
 
 
-def _script(name: str, problem: Problem, folder: Path) -> list[str]:
-    arrays: dict[str, Any] = {key: np.asarray(value) for key, value in problem.arrays().items()}
+def _script(name: str, problem: Problem, folder: Path, **changes: float) -> list[str]:
+    arrays: dict[str, Any] = {key: np.asarray(value) for key, value in (problem.arrays() | changes).items()}
     write_npz(folder / "cloth.npz", **arrays)
     write_text(folder / name, (files("diffcloud.simulators.scripts") / name).read_text(encoding="utf-8"))
     return ["cloth.npz", name]

@@ -33,6 +33,7 @@ def add_cloth(builder, cloth, explicit=False):
         explicit: for the explicit solver, whose elasticity has other constants than that of VBD.
     """
     shear, lateral, damping = (float(cloth[name]) for name in ("shear", "lateral", "damping"))
+    gain = float(cloth["membrane_gain"])  # makes up for a membrane that is too soft at large strains
     builder.add_cloth_mesh(
         pos=warp.vec3(0.0),
         rot=warp.quat_identity(),
@@ -41,9 +42,9 @@ def add_cloth(builder, cloth, explicit=False):
         vertices=[warp.vec3(*map(float, node)) for node in cloth["nodes"]],
         indices=cloth["faces"].ravel().tolist(),
         density=float(cloth["density"]),
-        tri_ke=shear,
+        tri_ke=gain * shear,
         # the explicit solver's λ is that of its energy, VBD's that of small strains
-        tri_ka=lateral + (shear if explicit else 0.0),
+        tri_ka=gain * (lateral + (shear if explicit else 0.0)),
         # VBD multiplies rates of FᵀF = 2 E + 1; the explicit solver those of F, which resists rigid rotation too
         tri_kd=shear * damping * (2.0 if explicit else 0.5),
         tri_drag=0.0,
