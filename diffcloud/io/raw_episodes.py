@@ -265,17 +265,26 @@ def read_raw_episode(folder: Path) -> RawEpisode:
     description = read_description(folder)
     cameras = {}
     for name in description["cameras"]:
-        place = folder / "cameras" / name
-        frames, times = read_timestamps(place / "timestamps.csv")
-        _refuse_backwards(times, place / "timestamps.csv")
-        if not len(frames):
-            raise EpisodeError(f"{place / 'timestamps.csv'} lists no frame: the camera delivered nothing.")
-        cameras[name] = RawCamera(read_camera_info(place / "camera.json"), place, frames, times)
+        cameras[name] = camera = read_raw_camera(folder, name)
+        if not len(camera.frames):
+            raise EpisodeError(f"{camera.folder / 'timestamps.csv'} lists no frame: the camera delivered nothing.")
     robot = None
     if description.get("robot") is not None:
         robot = read_robot_log(folder / "robot.csv")
         _refuse_backwards(robot.times, folder / "robot.csv")
     return RawEpisode(folder, description, cameras, robot)
+
+
+def read_raw_camera(folder: Path, name: str) -> RawCamera:
+    """One camera of the raw episode in a folder; of one that is being recorded, with the frames so far, maybe none.
+
+    Raises:
+        EpisodeError: a file is missing or damaged, or times run backwards: names file and row.
+    """
+    place = folder / "cameras" / name
+    frames, times = read_timestamps(place / "timestamps.csv")
+    _refuse_backwards(times, place / "timestamps.csv")
+    return RawCamera(read_camera_info(place / "camera.json"), place, frames, times)
 
 
 def read_description(folder: Path) -> dict[str, Any]:

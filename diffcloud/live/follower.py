@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from diffcloud.io.calibrations import Calibration
 from diffcloud.io.camera_models import Intrinsics
-from diffcloud.io.raw_episodes import RawCamera, read_camera_info, read_description, read_robot_log, read_timestamps
+from diffcloud.io.raw_episodes import RawCamera, read_description, read_raw_camera, read_robot_log
 from diffcloud.sensing.cameras import Floats, depth_points, transform
 from diffcloud.sensing.fusion import camera_pose
 
@@ -73,7 +73,8 @@ class Follower:
             return None
         description = read_description(self._folder)
         status = str(description.get("status") or "complete")
-        cameras = {name: camera for name in description["cameras"] if len((camera := self._camera(name)).frames)}
+        every = {name: read_raw_camera(self._folder, name) for name in description["cameras"]}
+        cameras = {name: camera for name, camera in every.items() if len(camera.frames)}
         shown = (status, *((name, int(camera.frames[-1])) for name, camera in cameras.items()))
         if shown == self._shown:
             return None
@@ -83,11 +84,6 @@ class Follower:
             known = read_robot_log(self._folder / "robot.csv").tool_position_m[-1:]
             tool = known[0] if len(known) and np.isfinite(known).all() else None
         return LiveFrame(status, {name: self._cloud(name, camera) for name, camera in cameras.items()}, tool)
-
-    def _camera(self, name: str) -> RawCamera:
-        place = self._folder / "cameras" / name
-        frames, times = read_timestamps(place / "timestamps.csv")
-        return RawCamera(read_camera_info(place / "camera.json"), place, frames, times)
 
     def _cloud(self, name: str, camera: RawCamera) -> LiveCloud:
         if name not in self._poses:  # it is written before the first frame, and does not change
