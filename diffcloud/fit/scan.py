@@ -20,6 +20,9 @@ LOWER = 0.02
 """Part by which a loss nearby must be lower to be another minimum."""
 LENGTHS = (0.04, 0.1, 0.25, 0.6)
 """On the axis, to both sides."""
+AXES = 3
+"""The flattest ones: minima lie side by side along them, and the cost does not grow with the number of variables. Along a
+steep axis the loss rises over the shortest of these lengths already."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +30,11 @@ class Scan:
     """Around one place, of k variables."""
 
     directions: Tensor
-    """[k, k] principal axes, in rows."""
+    """[a, k] principal axes, in rows, the flattest first."""
     lengths: Tensor
-    """[k, n] along each, negative ones first; where a bound cuts one short, its length is what is left."""
+    """[a, n] along each, negative ones first; where a bound cuts one short, its length is what is left."""
     losses: Tensor
-    """[k, n] with priors; infinite where a motion diverges."""
+    """[a, n] with priors; infinite where a motion diverges."""
 
     def place(self, centre: Tensor) -> tuple[Tensor, float]:
         """Where the loss is lowest [k], and that loss."""
@@ -55,7 +58,7 @@ def scan(objective: AnyObjective, space: FitSpace, place: Tensor, curvature: Ten
     """
     axis = Axis.of(space)
     low, high = axis.ends
-    directions = torch.linalg.eigh(curvature)[1].T
+    directions = torch.linalg.eigh(curvature)[1].T[:AXES]
     ways = torch.tensor([-length for length in reversed(LENGTHS)] + list(LENGTHS), dtype=torch.float64)
     lengths = ways.expand(len(directions), -1).clone()
     for row, direction in enumerate(directions):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from diffcloud.regressors.layers import Head, shared_layers
+from diffcloud.regressors.layers import Head, highest, shared_layers
 
 WIDTHS = (64, 64, 64, 128, 1024)
 
@@ -22,5 +22,5 @@ class MLP(nn.Module):
 
     def forward(self, clouds: Tensor) -> Tensor:
         """[B, T, P, 3] -> [B, outputs]; the points of all frames are one set."""
-        outputs: Tensor = self.head(self.points(clouds.flatten(1, 2)).max(1).values)
+        outputs: Tensor = self.head(highest(self.points(clouds.flatten(1, 2))))
         return outputs

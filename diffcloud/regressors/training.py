@@ -289,7 +289,7 @@ class _Training(lightning.LightningModule):
         self.log("validation_loss", (torch.stack(losses) * weights).sum() / weights.sum())
 
     def configure_optimizers(self) -> Any:
-        optimiser = torch.optim.Adam(self.network.parameters(), lr=self.settings.learning_rate)
+        optimiser = torch.optim.Adam(self.network.parameters(), lr=self.settings.learning_rate, fused=True)
         if self.settings.schedule == "constant":
             return optimiser
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, int(self.trainer.estimated_stepping_batches))

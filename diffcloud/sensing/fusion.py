@@ -209,11 +209,13 @@ class _Cameras:
                 )
                 for name, camera in raw.cameras.items()
             }
+        self._samples: dict[str, list[tuple[Floats, NDArray[np.uint8] | None]]] = {}
         self._tables: dict[str, Table | None] = dict.fromkeys(raw.cameras)
         if settings.table:
             for name, camera in raw.cameras.items():
                 chosen = _spread(len(camera.frames), _TABLE_FRAMES)
-                self._tables[name] = fit_table([_sample(self._cloud(name, index)) for index in chosen])
+                self._samples[name] = [_sample(self._cloud(name, index)) for index in chosen]
+                self._tables[name] = fit_table(self._samples[name])
 
     def cloth(self, frame: int) -> dict[str, Seen]:
         """What is left in each camera's image of a frame; cameras without an image near its time are absent."""
@@ -243,9 +245,7 @@ class _Cameras:
         table = self._tables[name]
         if table is None:
             return np.zeros((0, 3))
-        points = np.concatenate(
-            [_sample(self._cloud(name, index))[0] for index in _spread(len(self._raw.cameras[name].frames), _TABLE_FRAMES)]
-        )
+        points = np.concatenate([sample for sample, _ in self._samples[name]])
         return _few(points[np.abs(table.height(points)) < _ON_TABLE_M], _TABLE_POINTS)
 
     def _images(self, frame: int) -> dict[str, int]:

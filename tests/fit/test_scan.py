@@ -64,3 +64,11 @@ def test_it_goes_along_the_principal_axes_within_the_bounds():
     where, lowest = found.place(place)
     assert lowest == float(found.losses.min())
     assert float(Bowl()(SPACE.parameters(Axis.of(SPACE).bounded(where[None])))) == pytest.approx(lowest)
+
+
+def test_of_many_variables_it_looks_along_the_flattest_axes():
+    space = FitSpace.build(["stretch", "mass", "bending", "drag", "damping"])
+    place = Axis.of(space).places(torch.ones(1, 5).double())[0]
+    found, simulations = scan(Bowl(), space, place, torch.tensor([5.0, 4.0, 0.1, 0.3, 0.2]).double().diag())
+    assert simulations == 3 * 2 * len(LENGTHS)
+    torch.testing.assert_close(found.directions.abs(), torch.eye(5).double()[[2, 4, 3]])

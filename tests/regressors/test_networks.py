@@ -11,7 +11,7 @@ import torch
 from diffcloud.errors import ConfigError
 from diffcloud.regressors import MODEL_NAMES, build_network, frames_seen, layer_sizes
 from diffcloud.regressors.grouping import gather_points
-from diffcloud.regressors.layers import LocalNetwork
+from diffcloud.regressors.layers import LocalNetwork, highest
 
 HEAD = [(1024, 512), (512, 256), (256, 2)]
 GLOBAL = [(256, 512), (512, 1024)]
@@ -117,3 +117,13 @@ def test_one_batch_can_be_learned_by_heart(model, generator):
 def test_an_unknown_model_is_named():
     with pytest.raises(ConfigError, match=r"'pointnet'. Did you mean 'pointnet2'.* Allowed: meteornet, mlp, pointnet2"):
         frames_seen("pointnet")
+
+
+def test_highest_is_torchs_maximum_also_of_repeated_points():
+    values = torch.randn(3, 4, 7, 5).double()
+    values = torch.relu(torch.cat([values, values[:, :, :2]], dim=2)).requires_grad_(True)  # zeros and repeats are ties
+    weights = torch.randn(3, 4, 5).double()
+    found, expected = highest(values), values.max(2).values
+    assert torch.equal(found, expected)
+    gradients = [torch.autograd.grad((one * weights).sum(), values)[0] for one in (found, expected)]
+    assert torch.equal(*gradients)
