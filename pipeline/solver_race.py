@@ -1,0 +1,206 @@
+"""`diffcloud bench --fits`: what each solver spends until it has found a cloth, over scenarios and numbers of parameters.
+
+A target is a cloth of drawn parameters, seen as its whole surface with noise and put down a little beside its place. Every
+solver gets the same objective, priors and pose included, and stops at 1.05 times the lowest loss that a fit of several
+times the budget has met, which is also started at the truth.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from diffcloud.errors import DivergedError
+from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.fit import GaussNewtonSettings, JointObjective, Objective, solve
+from diffcloud.fit.solvers import SOLVERS, Settings
+from diffcloud.io.episodes import Episode
+from diffcloud.io.files import read_json, write_json
+from diffcloud.io.fingerprints import fingerprint
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sensing.whole_surface import sample_surface
+from diffcloud.sim.properties import PARAMETERS
+from diffcloud.sim.simulate import rollout
+from pipeline.config import FitConfig
+from pipeline.fit_jobs import FitJob, Recording
+from pipeline.scenario_options import choose_scenario
+from pipeline.workers import Tell
+
+SCENARIOS = ("lift", "fold", "band_stretch", "vest_hang")
+ORDER = ("stretch", "mass", "bending", "drag", "damping", "friction_cloth", "friction_obstacle")
+"""The first two, four, and all of them are fitted."""
+COUNTS = (2, 4, 7)
+WITHIN = 1.05
+"""Of the reference's loss, at which a solver has arrived."""
+BUDGET = 200
+"""Simulations of each solver."""
+_NOISE_M = 0.002
+_BESIDE_M = 0.02
+_TURNED = math.radians(5)
+_CODE = ("mesh", "io", "sim", "scene", "clouds", "sensing", "fit")
+
+
+@dataclass(frozen=True)
+class RaceJob:
+    """One target, and all solvers on it. A finished one is kept."""
+
+    scenario: Scenario
+    count: int
+    index: int
+    seed: int
+    out: Path
+
+    @property
+    def label(self) -> str:
+        return f"{self.scenario.name}/{self.count}/{self.index}"
+
+    @property
+    def names(self) -> list[str]:
+        return list(ORDER[: self.count])
+
+    def run(self, tell: Tell) -> dict[str, Any]:
+        """The record: truth, the reference's loss, and of each solver the loss, seconds of processor time, simulations, and
+        whether it arrived.
+
+        Raises:
+            DivergedError: the truth, or every start of the reference, diverges.
+        """
+        path = self.out / self.scenario.name / str(self.count) / f"{self.index:04d}.json"
+        mark = fingerprint([self.scenario, self.names, self.index, self.seed, BUDGET, WITHIN], packages=_CODE)
+        if path.is_file():
+            kept = read_json(path)
+            if isinstance(kept, dict) and kept.get("fingerprint") == mark:
+                return kept
+        truth = self.truth()
+        recording = Recording(self.scenario, self.label, self._episode(truth))
+        job = FitJob(self.label, [recording], FitConfig(parameters=self.names), self.out)
+        objective, space = job.objective(), job.space
+        tell(0.0, "reference")
+        wide = GaussNewtonSettings(starts=6, screen=96, scans=3, seed=self.seed)
+        near = GaussNewtonSettings(starts=1, screen=0, init=truth)
+        lowest = min(solve(objective, space, settings).loss for settings in (near, wide))
+        told: dict[str, Any] = {"truth": truth, "reference": lowest, "solvers": {}}
+        for place, name in enumerate(SOLVERS):
+            tell((place + 1) / (len(SOLVERS) + 1), name)
+            told["solvers"][name] = self._timed(objective, space, self._settings(name, WITHIN * lowest))
+        record = {"fingerprint": mark, "scenario": self.scenario.name, "count": self.count, **told}
+        write_json(path, record)
+        return record
+
+    def truth(self) -> dict[str, float]:
+        """Multipliers within a factor of three, log-uniform; what may be zero, in the lower half of its bounds."""
+        rng = np.random.default_rng([self.seed, SCENARIOS.index(self.scenario.name), self.index])
+        found = {}
+        for name in ORDER:  # more parameters leave the first as they are
+            low, high = self.scenario.bounds.get(name, PARAMETERS[name].bounds)
+            share = rng.uniform()
+            found[name] = 3.0 ** (2 * share - 1) if low > 0 else low + share * (high - low) / 2
+        return {name: found[name] for name in self.names}
+
+    def _episode(self, truth: dict[str, float]) -> Episode:
+        scene = self.scenario.scene
+        system, _ = scene.build()
+        sets = {name: torch.tensor([value], dtype=torch.float64) for name, value in truth.items()}
+        with torch.no_grad():
+            run = rollout(system, self.scenario.steps, properties=self.scenario.properties(system, sets))
+        nodes, times = run.positions[0, :: scene.frame_steps].numpy(), run.times[:: scene.frame_steps].numpy()
+        obstacles = scene.surrounding.obstacles if self.scenario.recorder == "whole_surface" else ()  # cameras cut tables
+        seen = sample_surface(
+            nodes, system.mesh.faces, times, obstacles[0] if obstacles else None, points=self.scenario.points,
+            seed=self.seed, meta={"truth": truth},
+        )  # fmt: skip
+        rng = np.random.default_rng([self.seed, self.index, 1])
+        angle, (x, y) = rng.normal(0, _TURNED), rng.normal(0, _BESIDE_M, 2)
+        turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
+        middle = seen.points.mean(axis=0)
+        moved = (seen.points - middle) @ turn.T + middle + [x, y, 0] + rng.normal(0, _NOISE_M, seen.points.shape)
+        return replace(seen, points=moved.astype(np.float32))
+
+    def _settings(self, solver: str, threshold: float) -> Settings:
+        """What `diffcloud fit` takes, with the same budget for all; Adam gets Gauss–Newton's starts and screen."""
+        given: dict[str, Any] = {"solver": solver, "threshold": threshold, "seed": self.seed}
+        if solver == "adam":
+            like = GaussNewtonSettings()
+            iterations = (BUDGET - 1 - like.screen) // like.starts - 1
+            given |= {"starts": like.starts, "screen": like.screen, "iterations": iterations, "smoothing": 0.0}
+        elif solver in ("cma_es", "random_search"):
+            given["simulations"] = BUDGET
+        return FitConfig(parameters=self.names, **given).solver_settings(self.scenario)
+
+    def _timed(self, objective: Objective | JointObjective, space: Any, settings: Settings) -> dict[str, Any]:
+        began = time.process_time()
+        try:
+            found = solve(objective, space, settings)
+        except DivergedError as error:
+            return {"arrived": False, "error": str(error)}
+        seconds = time.process_time() - began
+        if found.stop_reason == "interrupted":
+            raise KeyboardInterrupt
+        arrived = found.loss <= settings.threshold and found.simulations <= BUDGET
+        return {"arrived": arrived, "loss": found.loss, "seconds": seconds, "simulations": found.simulations}
+
+
+def race_jobs(targets: int, seed: int, out: Path) -> list[RaceJob]:
+    """Of all cells, one target of each after the other."""
+    return [
+        RaceJob(choose_scenario(name), count, index, seed, out)
+        for index in range(targets)
+        for name in SCENARIOS
+        for count in COUNTS
+    ]
+
+
+HEAD = ("scenario", "parameters", "targets", *SOLVERS)
+
+
+def race_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """A row for each cell: of each solver the median of seconds and simulations, and how often it arrived."""
+    rows = []
+    for name in SCENARIOS:
+        for count in COUNTS:
+            cell = [record["solvers"] for record in records if (record["scenario"], record["count"]) == (name, count)]
+            if cell:
+                told = [_cell([solvers[solver] for solvers in cell]) for solver in SOLVERS]
+                rows.append([name, str(count), str(len(cell)), *told])
+    return rows
+
+
+def _cell(runs: Sequence[dict[str, Any]]) -> str:
+    """Medians over all targets, where those that did not arrive took for ever."""
+    arrived = sum(run["arrived"] for run in runs)
+    seconds, simulations = (
+        float(np.median([run[key] if run["arrived"] else math.inf for run in runs])) for key in ("seconds", "simulations")
+    )
+    spent = f"{seconds:.1f} s, {simulations:.0f} runs" if math.isfinite(seconds) else "–"
+    return f"{spent} ({arrived} of {len(runs)})"
+
+
+def race_page(rows: Sequence[Sequence[str]], seed: int) -> str:
+    """Markdown of docs/results/solvers.md."""
+    lines = [
+        "# Solvers on drawn cloths",
+        "",
+        f"How long each solver takes until its loss is at most {WITHIN:g} times that of a reference fit: the lower one of "
+        "Gauss–Newton from the truth, and from the six best of 97 candidates. A target is a cloth of drawn parameters "
+        f"(seed {seed}), its whole surface with {1e3 * _NOISE_M:g} mm of noise, put down about {1e2 * _BESIDE_M:g} cm and "
+        "5° beside its place. All solvers minimise the same objective, with priors and with the pose (x, y, yaw) found for "
+        f"every parameter set, and may spend {BUDGET} simulations; Adam has the starts and the screen of Gauss–Newton.",
+        "",
+        "Cells hold medians over all targets of processor time on one thread and of simulations (one with derivatives "
+        "counts once), and how many targets were reached. A dash: half of them or more were not. Two parameters are stretch "
+        "and mass; four, bending and drag too; seven, also damping and both frictions.",
+        "",
+        *markdown_table(HEAD, rows),
+        "",
+        f"Command: `diffcloud bench --fits build/solvers --seed {seed} --workers 2 --markdown docs/results/solvers.md`; "
+        "finished targets are kept.",
+        "",
+    ]
+    return "\n".join(lines)
