@@ -7,7 +7,7 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 # the tests start hundreds of processes; without byte code each would compile the package again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv repro test tests test-slow test-longest lint format bench acceptance comparison simulated recordings coverage robustness docs clean
+.PHONY: venv repro test tests test-slow test-longest lint format bench acceptance comparison simulated recordings moved coverage robustness docs clean
 
 venv: $(STAMP)
 
@@ -89,6 +89,19 @@ recordings: venv
 	diffcloud preprocess --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/clouds $(RECORDINGS)/raw
 	diffcloud recordings --params $(RECORDINGS_PARAMS) --recorded $(RECORDINGS)/raw --episodes $(RECORDINGS)/clouds \
 	    --out docs/results/raw-recordings.md
+
+# Synthetic raw recordings whose cameras and cloth are not where they are said to be.
+MOVED := build/moved
+NUISANCE := --nuisance none --nuisance x=10cm,y=10cm,yaw=30deg \
+    --nuisance x=1cm,y=1cm,z=5mm,tilt_x=0.5deg,tilt_y=0.5deg,yaw=3deg,lag=5ms
+moved: venv
+	set -e; for kind in together apart; do \
+	    params=docs/results/moved-$$kind.yaml; \
+	    diffcloud episodes --params $$params --out $(MOVED)/$$kind/raw; \
+	    diffcloud preprocess --params $$params --out $(MOVED)/$$kind/clouds $(MOVED)/$$kind/raw; \
+	    diffcloud recordings --params $$params --recorded $(MOVED)/$$kind/raw --episodes $(MOVED)/$$kind/clouds \
+	        --out docs/results/moved-$$kind.md --workers 2 $(NUISANCE); \
+	done
 
 # How often intervals hold the truth: drawn cloths, recorded, fitted, and held against what was drawn.
 COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --out build/coverage --seed 20261124 --workers 2

@@ -72,11 +72,20 @@ class EpisodesConfig(Section):
     """How late the joint log is."""
     extrinsic_error: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """(millimetres, degrees) by which the stated place of each camera but the first is off."""
+    cameras_moved: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    """The same of all cameras together."""
+    beside: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    """(millimetres, degrees) by which cloth and gripper are not where the recording says."""
     workers: Workers = 1
     """Scenarios at once."""
 
     def recorder(self) -> RecorderSettings:
-        return RecorderSettings(lag_s=self.lag_s, extrinsic_error=self.extrinsic_error)
+        return RecorderSettings(
+            lag_s=self.lag_s,
+            extrinsic_error=self.extrinsic_error,
+            cameras_moved=self.cameras_moved,
+            beside=self.beside,
+        )
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

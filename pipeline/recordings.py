@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from diffcloud.errors import ConfigError
+from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.fit import FitSpace, Objective, solve
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import folders_in, write_text
@@ -17,9 +17,11 @@ from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.evaluation import CloudFigures, evaluate_clouds, visible_clouds
 from diffcloud.sensing.recorder import Truth, read_truth
-from pipeline.config import FitConfig, load_config
+from pipeline.config import EpisodesConfig, FitConfig, load_config
 from pipeline.console import JsonFlag, ParamsFile, finish, output, progress_bar, writes
+from pipeline.recorded_poses import PoseJob, parsed, pose_page, pose_rows
 from pipeline.scenario_options import choose_scenario
+from pipeline.workers import run_all
 
 
 @writes(".md")
@@ -28,6 +30,13 @@ def recordings(
     episodes: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.npz of `diffcloud preprocess`.")],
     out: Annotated[Path, typer.Option(help="Markdown file.")],
     fits: Annotated[bool, typer.Option(help="Also fit each: raw clouds, noise-free clouds, one camera.")] = True,
+    nuisance: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Instead, fit with this nuisance (as of `diffcloud fit`) and compare the pose found; repeatable."
+        ),
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="With --nuisance: recordings at once, each on one thread.")] = 1,
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
@@ -41,6 +50,13 @@ def recordings(
     ]
     if not found:
         raise ConfigError(f"{recorded} holds no synthetic raw episodes of {', '.join(config.scenarios)}.")
+    if nuisance:
+        jobs = [
+            PoseJob(choose_scenario(name), folder, episodes / name / f"{folder.name}.npz", parsed(nuisance), config.fit)
+            for name, folder in found
+        ]
+        _poses(jobs, workers, out, config.episodes, json)
+        return
     measured: list[tuple[str, CloudFigures, Mapping[str, Any]]] = []
     fitted: list[_Fits] = []
     with progress_bar("recordings", len(found)) as update:
@@ -57,6 +73,22 @@ def recordings(
     if not json:
         output.print(page)
     finish({"out": str(out), "episodes": len(measured), **_summary(measured, fitted)}, json)
+
+
+def _poses(jobs: list[PoseJob], workers: int, out: Path, recorded: EpisodesConfig, json: bool) -> None:
+    done, failures = [], []
+    for job, told, error in run_all("recordings", jobs, workers):
+        if error is None:
+            done.append(told)
+        else:
+            failures.append(f"{job.label}: {error}")
+    if failures:
+        raise DiffCloudError("; ".join(failures))
+    page = pose_page(pose_rows(done), recorded)
+    write_text(out, page)
+    if not json:
+        output.print(page)
+    finish({"out": str(out), "recordings": done}, json)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from pipeline.console import warn
 
 if TYPE_CHECKING:
     from diffcloud.scene.scenarios import Scenario
+    from diffcloud.scene.scenarios.catalogue import Options
 
 OWN_SCENARIOS = Path("raw/scenes")
 """A person's own scenario files, found by name."""
@@ -37,6 +38,17 @@ def choose_scenario(name: str | None, scene: Path | None = None) -> Scenario:
     for message in limits(scenario):
         warn(message)
     return scenario
+
+
+def scenario_options(name: str) -> Options:
+    """The fields of a built-in scenario, or of a person's own one, to vary.
+
+    Raises:
+        ConfigError, SceneError: neither, or a damaged file.
+    """
+    from diffcloud.scene.scenarios import SCENARIO_NAMES, built_in, read_options
+
+    return read_options(_own(name)) if name not in SCENARIO_NAMES and _own(name).is_file() else built_in(name)
 
 
 def fitted_scenario(fit: Path, name: str) -> str:

@@ -194,8 +194,8 @@ def race_page(rows: Sequence[Sequence[str]], seed: int) -> str:
         f"every parameter set, and may spend {BUDGET} simulations; Adam has the starts and the screen of Gauss–Newton.",
         "",
         "Cells hold medians over all targets of processor time on one thread and of simulations (one with derivatives "
-        "counts once), and how many targets were reached. A dash: half of them or more were not. Two parameters are stretch "
-        "and mass; four, bending and drag too; seven, also damping and both frictions.",
+        "counts once), and how many targets were reached. A dash: half of them or more were not. Two parameters are "
+        "stretch and mass; four, bending and drag too; seven, also damping and both frictions.",
         "",
         *markdown_table(HEAD, rows),
         "",

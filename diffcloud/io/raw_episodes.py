@@ -251,8 +251,16 @@ class RawEpisode:
     @property
     def placement(self) -> ScenePlacement:
         """`scene_in_world` of episode.json; without it the scene's frame is the base frame."""
-        stated = PlacementFile.model_validate(self.description.get("scene_in_world") or {})
-        return ScenePlacement(stated.origin_m, stated.yaw_rad, stated.length_unit_m)
+        return read_placement(self.description.get("scene_in_world") or {})
+
+
+def read_placement(fields: Mapping[str, Any]) -> ScenePlacement:
+    """
+    Raises:
+        ValidationError: no placement; of pydantic.
+    """
+    stated = PlacementFile.model_validate(fields)
+    return ScenePlacement(stated.origin_m, stated.yaw_rad, stated.length_unit_m)
 
 
 def read_raw_episode(folder: Path) -> RawEpisode:

@@ -4,7 +4,7 @@ What is written is a raw episode like any other. Beside it, in the folder `truth
 shows what, where the cloth was, where the cameras stood. Nothing that reads raw episodes looks there.
 
     truth/cloth.npz                   nodes [T, V, 3] [m] in the world, faces [F, 3], times [T] [s]
-    truth/cameras.json                T_world_camera of each camera
+    truth/cameras.json                T_world_camera of each camera, and where the scene was
     truth/<cam>/000000.png            16-bit [H, W] labels: NOTHING, TABLE, CLOTH, ROBOT
 
 What is rendered is not what a mask is made of (`arm_body`), and the joint log is late: the mask has something to prove.
@@ -13,7 +13,7 @@ What is rendered is not what a mask is made of (`arm_body`), and the joint log i
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.clouds import import_open3d
 from diffcloud.io.files import read_json, write_json, write_npz
 from diffcloud.io.images import read_depth, write_depth
-from diffcloud.io.raw_episodes import RawEpisodeWriter, RobotSample, ScenePlacement
+from diffcloud.io.raw_episodes import RawEpisodeWriter, RobotSample, ScenePlacement, read_placement
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.sensing.arm_body import cable, lookalike
 from diffcloud.sensing.cameras import rotate, transform
@@ -75,6 +75,10 @@ class RecorderSettings:
     extrinsic_error: tuple[float, float] = (0.0, 0.0)
     """(millimetres, degrees) by which the stated place of each camera but the first is off, in a direction drawn for the
     episode."""
+    cameras_moved: tuple[float, float] = (0.0, 0.0)
+    """The same of all cameras together, which then still agree with one another, but not with the arm."""
+    beside: tuple[float, float] = (0.0, 0.0)
+    """(millimetres, degrees about the vertical) by which cloth and gripper are not where the recording says."""
     table_size_m: tuple[float, float] = (1.1, 1.3)
     """Along x and y of the base frame, its middle under the scene's origin."""
 
@@ -102,6 +106,8 @@ class Truth:
     """[T, V, 3] of the cloth in the world [m]."""
     faces: NDArray[np.int64]
     T_world_camera: Mapping[str, Floats]
+    placement: ScenePlacement
+    """Where the scene truly was."""
     folder: Path
 
     def labels(self, camera: str, index: int) -> NDArray[np.uint16]:
@@ -130,7 +136,8 @@ def read_truth(folder: Path) -> Truth:
         raise EpisodeError(f"{folder} has no folder truth: only synthetic recordings know the truth.")
     poses = read_json(place / "cameras.json", error=EpisodeError)
     cloth = read_npz(place / "cloth.npz", kind="truth of a cloth", error=EpisodeError, names=("nodes", "faces"))
-    return Truth(cloth["nodes"], cloth["faces"], {name: np.array(pose) for name, pose in poses.items()}, place)
+    cameras = {name: np.array(pose) for name, pose in poses["T_world_camera"].items()}
+    return Truth(cloth["nodes"], cloth["faces"], cameras, read_placement(poses["scene_in_world"]), place)
 
 
 def record(
@@ -158,15 +165,19 @@ def record(
         RobotError: the cloth's path is out of the arm's reach.
     """
     settings = settings or RecorderSettings()
-    rng = np.random.default_rng(seed)
+    rng, others = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     robot = gen3()
-    nodes = settings.placement.to_world(motion.nodes)
+    placement = _laid_beside(settings, motion.nodes, others)
+    nodes = placement.to_world(motion.nodes)
     held = nodes[:, list(motion.grasped)].mean(axis=1)
     joints = robot.inverse_kinematics(held - _GRASP_M * _DOWN[:, 2], rotations=_DOWN)
     poses = robot.forward_kinematics(robot.configuration(joints, _GRIPPER_CLOSED))
     scene = _Scene(robot, motion.faces, _table(motion, settings), settings, np.array(cloth_color, dtype=np.float64), rng)
+    moved = _motion(*settings.cameras_moved, nodes, others)
     stated = {
-        camera.name: _off(camera.view.T_world_camera, *(settings.extrinsic_error if index else (0.0, 0.0)), nodes, rng)
+        camera.name: _motion(*(settings.extrinsic_error if index else (0.0, 0.0)), nodes, rng)
+        @ moved
+        @ camera.view.T_world_camera
         for index, camera in enumerate(cameras)
     }
     interval = float(np.median(np.diff(motion.times))) if len(motion.times) > 1 else 1.0
@@ -193,7 +204,8 @@ def record(
                 writer.add_frame(camera.name, float(time), camera.measure(depth_m, hidden, rng), color)
                 write_depth(folder / "truth" / camera.name / f"{index:06d}.png", labels)
             tell(index + 1, f"frame {index}")
-    write_json(folder / "truth" / "cameras.json", {camera.name: camera.view.T_world_camera.tolist() for camera in cameras})
+    true = {camera.name: camera.view.T_world_camera.tolist() for camera in cameras}
+    write_json(folder / "truth" / "cameras.json", {"T_world_camera": true, "scene_in_world": asdict(placement)})
     cloth = {"nodes": nodes, "faces": motion.faces, "times": motion.times}
     write_npz(folder / "truth" / "cloth.npz", compressed=False, **cloth)
 
@@ -293,16 +305,25 @@ def _table(motion: ClothMotion, settings: RecorderSettings) -> SurfaceMesh:
     return SurfaceMesh(np.column_stack([corners, np.full(4, z)]), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-def _off(pose: Floats, millimetres: float, degrees: float, nodes: Floats, rng: np.random.Generator) -> Floats:
-    """A pose turned about the scene's middle and moved, by these amounts in directions drawn at random."""
+def _motion(millimetres: float, degrees: float, nodes: Floats, rng: np.random.Generator) -> Floats:
+    """[4, 4] that turns about the scene's middle and moves, by these amounts in directions drawn at random."""
     turn_axis, direction = rng.normal(size=(2, 3))
+    middle, found = nodes.reshape(-1, 3).mean(axis=0), np.eye(4)
     turn = Rotation.from_rotvec(np.deg2rad(degrees) * turn_axis / np.linalg.norm(turn_axis)).as_matrix()
-    middle = nodes.reshape(-1, 3).mean(axis=0)
-    shifted = pose.copy()
-    shifted[:3, :3] = turn @ pose[:3, :3]
-    shifted[:3, 3] = turn @ (pose[:3, 3] - middle) + middle
-    shifted[:3, 3] += 1e-3 * millimetres * direction / np.linalg.norm(direction)
-    return shifted
+    found[:3, :3] = turn
+    found[:3, 3] = middle - turn @ middle + 1e-3 * millimetres * direction / np.linalg.norm(direction)
+    return found
+
+
+def _laid_beside(settings: RecorderSettings, nodes: Floats, rng: np.random.Generator) -> ScenePlacement:
+    """The stated placement, turned about the cloth's middle and shifted on the table, in directions drawn at random."""
+    stated, (millimetres, degrees) = settings.placement, settings.beside
+    way, sign = rng.uniform(0.5 * np.pi, 1.5 * np.pi), rng.choice([-1.0, 1.0])  # not away from the arm: that is its reach
+    turned = replace(stated, yaw_rad=stated.yaw_rad + sign * np.deg2rad(degrees))
+    middle = nodes[0].mean(axis=0)
+    shift = stated.to_world(middle) - turned.to_world(middle)
+    shift += 1e-3 * millimetres * np.array([np.cos(way), np.sin(way), 0.0])
+    return replace(turned, origin_m=tuple(np.array(stated.origin_m) + shift))
 
 
 def _write_log(writer: RawEpisodeWriter, robot: Robot, times: Floats, joints: Floats, settings: RecorderSettings) -> None:

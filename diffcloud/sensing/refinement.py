@@ -1,12 +1,11 @@
 """Where the cameras stand relative to each other, found again from the recording itself.
 
-A calibration is off by millimetres once a camera has been touched. The recording knows better: both cameras saw the arm,
-whose place its joints tell, the same table, and in part the same cloth. The pose of every camera but the first is
-refined by Gauss–Newton on distances along normals, over several frames at once:
+A calibration is off by millimetres once a camera has been touched, and by centimetres once their stand has. The recording
+knows better: both cameras saw the arm, whose place its joints tell, the same table, and in part the same cloth. The poses
+are refined by Gauss–Newton on distances along normals, over several frames at once:
 
 - arm: from each measured point to the described surface on its ray. How much thicker each link is than its description
-  (its *skin*), by how much each patch of it differs from that, and how late the joint log is are unknown too; the first
-  camera, which stays where it is, helps to find them.
+  (its *skin*), by how much each patch of it differs from that, and how late the joint log is are unknown too.
 - table: from the other camera's points to the first camera's plane.
 - cloth: from the other camera's points to the first camera's points nearby.
 
@@ -14,6 +13,9 @@ An arm is rounder than its description, and cables lie on it. Such errors are th
 off by the same amount in every image of every camera. Taken for noise they become lag, because an arm that goes one way
 shows other places when it is fast than when it is slow. So each patch of a link has an offset of its own, which is
 eliminated, and the lag is read off how the same patches move.
+
+Only the arm tells where all cameras together are. It is rounder and thicker than described, and says so no better than a
+usable calibration: what it finds is taken where it is farther off than that, else the first camera stays where it is.
 
 Weights come from the depth's own noise, and fall off for outliers by Tukey's function of the residuals' median deviation.
 Neighbouring points of table and cloth share their surface's errors, so they count as few. The calibration is the prior:
@@ -33,7 +35,7 @@ from scipy.spatial.transform import Rotation
 
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import RawEpisode, RobotLog
-from diffcloud.sensing.cameras import inverse, transform
+from diffcloud.sensing.cameras import inverse, rotate, transform
 from diffcloud.sensing.masking import RobotMask, View, joints_at
 
 Floats = NDArray[np.float64]
@@ -66,6 +68,8 @@ _WINDOW = 4
 """So many thinned pixels share a window of stereo matching, and with it their noise."""
 _PRIOR_M, _PRIOR_RAD = 0.005, np.deg2rad(0.5)
 """How far calibrations tend to be off, along and about each axis."""
+_USABLE_M, _USABLE_RAD = 0.005, np.deg2rad(0.5)
+"""What all cameras together are off by is found to about 2 mm and 0.2°; less than this is left as it is."""
 _PRIOR_SKIN_M, _PRIOR_LAG_S = 0.005, 0.1
 _LAG_STEP_S = 0.01
 _STEEPEST = 0.35
@@ -90,7 +94,7 @@ class Refinement:
     """The recording's own calibration."""
 
     T_world_camera: Mapping[str, Floats]
-    """The first camera's is as it was."""
+    """The first camera's is as it was, unless all cameras were found to be elsewhere."""
     skin_m: float
     """By which the arm is thicker than described, as the median over the links that were seen; 0 without an arm."""
     lag_s: float
@@ -123,7 +127,7 @@ class _Rows:
 def refine_extrinsics(
     raw: RawEpisode, views: Mapping[str, View], arm: RobotMask | None, sight: Sight, *, sigma_per_m: float, lag_s: float
 ) -> Refinement:
-    """Refine all cameras but the first.
+    """Refine the cameras' poses.
 
     Args:
         views: by camera, at the calibration's poses.
@@ -143,8 +147,7 @@ def refine_extrinsics(
     if not seen:
         return Refinement(poses, 0.0, lag_s, dict.fromkeys(names, 0.0))
     centre = np.concatenate(seen).mean(axis=0)
-    plane = _plane(transform(poses[first], sight.table[first]))
-    surfaces = [_with_normals(transform(poses[first], points)) for points in sight.cloth[first]]
+    plane, surfaces = _plane(sight.table[first]), [_with_normals(points) for points in sight.cloth[first]]
     images = {} if arm is None else {name: _thinned(raw, name, views[name], sight.frames[name]) for name in names}
     poses_end, links = 6 * len(names), 0 if arm is None else len(arm.robot.links)
     prior = np.concatenate(
@@ -155,11 +158,14 @@ def refine_extrinsics(
         ]
     )
     found = np.zeros(len(prior))
-    """Corrections of the poses, of the lag, and the skins."""
-    free = np.arange(6, len(prior))  # the first camera stays
+    """Corrections of the poses (the first camera takes the others along), of the lag, and the skins."""
+    free, together = np.arange(len(prior)), np.eye(4)
     surface, thickened = arm, np.zeros(links)
     for iteration in range(_ITERATIONS):
         if arm is not None and iteration == _THICKENED_AT:
+            if np.linalg.norm(found[:3]) < _USABLE_RAD and np.linalg.norm(found[3:6]) < _USABLE_M:
+                free, found[:6] = free[6:], 0.0
+                poses = {name: inverse(together) @ pose for name, pose in poses.items()}
             thickened = found[poses_end + 1 :].copy()
             surface = RobotMask(arm.robot, inflation_m=dict(zip(arm.robot.links, thickened.tolist(), strict=True)))
         information, right = np.diag(prior), -prior * found
@@ -170,12 +176,15 @@ def refine_extrinsics(
                 view = replace(images[name].view, T_world_camera=poses[name])
                 lag, skin = lag_s + float(found[poses_end]), found[poses_end + 1 :] - thickened
                 rows = _arm_rows(log, surface, images[name], view, centre, skin, lag, sigma_per_m)
-                of_arm.append(rows.among(len(prior), np.concatenate([own, np.arange(poses_end, len(prior))])))
+                rows = rows.among(len(prior), np.concatenate([own, np.arange(poses_end, len(prior))]))
+                rows.J[:, :6] = rows.J[:, own]  # the first camera takes the others along
+                of_arm.append(rows)
             if index:
                 if plane is not None and len(sight.table[name]):
-                    rows = _table_rows(sight.table[name], poses[name], plane, centre, sigma_per_m)
+                    rows = _table_rows(sight.table[name], poses[name], _placed(*plane, poses[first]), centre, sigma_per_m)
                     groups.append(rows.among(len(prior), own))
-                rows = _cloth_rows(sight.cloth[name], poses[name], surfaces, centre, sigma_per_m)
+                placed = [_placed(normals, points, poses[first]) for points, normals in surfaces]
+                rows = _cloth_rows(sight.cloth[name], poses[name], placed, centre, sigma_per_m)
                 groups.append(rows.among(len(prior), own))
         if of_arm:
             groups.append(_joined(of_arm))  # the cameras see the same patches
@@ -186,8 +195,11 @@ def refine_extrinsics(
         step = np.zeros(len(prior))
         step[free] = np.linalg.solve(information[np.ix_(free, free)], right[free])
         found += step
+        together = _moved(together, step[:6], centre)
         for index, name in enumerate(names):
-            poses[name] = _moved(poses[name], step[6 * index : 6 * index + 6], centre)
+            poses[name] = _moved(poses[name], step[:6], centre)
+            if index:
+                poses[name] = _moved(poses[name], step[6 * index : 6 * index + 6], centre)
         if iteration >= _THICKENED_AT and np.abs(step[:poses_end]).max() < _CONVERGED:
             break
     skins = found[poses_end + 1 :]
@@ -292,10 +304,16 @@ def _normal_equations(rows: _Rows) -> tuple[Floats, Floats]:
     return weighted.T @ rows.J - (sums / total[:, None]).T @ sums, -weighted.T @ rows.r + sums.T @ offset
 
 
-def _table_rows(points: Floats, pose: Floats, plane: tuple[Floats, float], centre: Floats, sigma_per_m: float) -> _Rows:
-    world = transform(pose, points)
-    normal, offset = plane
-    return _plane_rows(world, np.broadcast_to(normal, world.shape), world @ normal - offset, points, centre, sigma_per_m)
+def _table_rows(points: Floats, pose: Floats, plane: tuple[Floats, Floats], centre: Floats, sigma_per_m: float) -> _Rows:
+    """From points to the plane (a point of it, its normal)."""
+    world, (place, normal) = transform(pose, points), plane
+    off = (world - place) @ normal[0]
+    return _plane_rows(world, np.broadcast_to(normal, world.shape), off, points, centre, sigma_per_m)
+
+
+def _placed(normals: Floats, points: Floats, pose: Floats) -> tuple[Floats, Floats]:
+    """Points [..., 3] and normals [..., 3] of a camera in the world."""
+    return transform(pose, points), rotate(pose, normals)
 
 
 def _cloth_rows(
@@ -360,12 +378,12 @@ def _with_normals(points: Floats) -> tuple[Floats, Floats]:
     return points, vectors[..., 0]
 
 
-def _plane(points: Floats) -> tuple[Floats, float] | None:
+def _plane(points: Floats) -> tuple[Floats, Floats] | None:
+    """The normal [1, 3] of the plane through points [P, 3], and a point of it [1, 3]."""
     if len(points) < 3:
         return None
-    centre = points.mean(axis=0)
-    normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
-    return normal, float(centre @ normal)
+    centre = points.mean(axis=0, keepdims=True)
+    return np.linalg.svd(points - centre, full_matrices=False)[2][2:], centre
 
 
 def _moved(pose: Floats, step: Floats, centre: Floats) -> Floats:

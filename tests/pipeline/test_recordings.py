@@ -164,3 +164,26 @@ def test_a_truncated_image_and_one_without_depth_are_named(work):
     write_depth(raw / "cameras" / "overhead" / "depth" / "000001.png", np.zeros((240, 424), np.uint16))
     assert "overhead, frame 1: 0 valid depth" in invoke(*common, code=1).errors
     assert not (work / "damaged" / "small").exists()
+
+
+def test_poses_found_are_held_against_the_true_ones(work, tmp_path):
+    told = invoke(
+        "recordings", "--recorded", "recorded", "--episodes", "episodes", "--params", "params.yaml",
+        "--out", tmp_path / "poses.md", "--nuisance", "none", "--nuisance", "x=1cm,yaw=2deg,lag=5ms",
+    )  # fmt: skip
+    (fits,) = told.result["recordings"]
+    assert [(fit["start"][:6], fit["nuisance"]) for fit in fits[:2]] == [
+        ("as the", "none"),
+        ("as the", "x=1cm,yaw=2deg,lag=5ms"),
+    ]
+    assert fits[0]["shift_mm"] < 0.5  # stated exactly
+    assert fits[2]["shift_mm"] < 5  # found from a noisy cloud
+    assert fits[0]["lag_ms"] is None
+    assert fits[1]["lag_ms"] is not None
+    page = (tmp_path / "poses.md").read_text()
+    assert "off by 0 mm and 0° together" in page
+    assert page.count("as the first frame shows it") == 2
+    broken = invoke("recordings", "--recorded", "recorded", "--episodes", "episodes", "--params", "params.yaml",
+                    "--out", tmp_path / "poses2.md", "--nuisance", "sideways=2", code=1)  # fmt: skip
+    assert "sideways" in broken.errors
+    assert not (tmp_path / "poses2.md").exists()

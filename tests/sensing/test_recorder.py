@@ -117,6 +117,16 @@ class TestRecording:
         off = np.linalg.norm(logged - held - [0, 0, 0.071], axis=1)
         assert off.max() < 1.5e-4  # straight from image to image it would be 0.5 mm off
 
+    def test_a_scene_beside_its_stated_place_is_turned_and_shifted_there(self, folder, tmp_path):
+        beside = write_recorded_episode(tmp_path / "beside", beside=(30.0, 10.0))
+        home, truth = read_truth(folder), read_truth(beside)
+        assert read_raw_episode(beside).placement == read_raw_episode(folder).placement == home.placement
+        np.testing.assert_allclose(truth.placement.to_scene(truth.nodes), home.placement.to_scene(home.nodes), atol=1e-12)
+        middles = [one.nodes[0].mean(axis=0) for one in (home, truth)]
+        assert np.linalg.norm(middles[1] - middles[0]) == pytest.approx(0.03, abs=1e-9)
+        assert middles[1][0] <= middles[0][0]  # towards the arm
+        assert abs(truth.placement.yaw_rad - home.placement.yaw_rad) == pytest.approx(np.deg2rad(10))
+
     def test_the_same_seed_gives_the_same_bytes(self, folder, tmp_path):
         again = write_recorded_episode(tmp_path / "again")
         files = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file() and path.suffix != ".npz")
@@ -157,6 +167,18 @@ class TestFoundBack:
         found = fuse(raw, mask, SETTINGS).meta["quality"]["refinement"]
         assert off_by(truth, np.array(found["T_world_camera"]["side"]), "side") < 0.002
         assert found["shift_m"]["overhead"] == 0.0
+
+    def test_cameras_moved_together_are_found_by_the_arm(self, tmp_path, mask):
+        seen = smooth_motion(LIFT, frames=6)
+        folder = write_recorded_episode(tmp_path / "moved", seen=seen, cameras_moved=(20.0, 2.0))
+        raw, truth = read_raw_episode(folder), read_truth(folder)
+        stated = {name: camera.info.T_world_camera for name, camera in raw.cameras.items()}
+        assert min(off_by(truth, stated[name], name) for name in stated) > 0.02
+        between = [inverse(poses["overhead"]) @ poses["side"] for poses in (stated, truth.T_world_camera)]
+        np.testing.assert_allclose(*between, atol=1e-12)
+        found = fuse(raw, mask, SETTINGS).meta["quality"]["refinement"]
+        assert max(off_by(truth, np.array(pose), name) for name, pose in found["T_world_camera"].items()) < 0.005
+        assert found["lag_s"] == pytest.approx(0.02, abs=0.004)
 
     def test_right_extrinsics_are_not_made_worse(self, folder, mask):
         raw, truth = read_raw_episode(folder), read_truth(folder)

@@ -1,0 +1,194 @@
+"""Part of `diffcloud recordings`: the pose that a fit finds of a recording, against the true one, and what it is worth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from diffcloud.errors import ConfigError, EpisodeError
+from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.fit import Objective, solve
+from diffcloud.fit.pose import parse_priors
+from diffcloud.fit.result import describe_recording, recorded_pose
+from diffcloud.io.episodes import Episode, read_episode
+from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
+from diffcloud.scene.scenarios import GridScenario, Scenario, make_scenario
+from diffcloud.scene.scenarios.layout import find_layout
+from diffcloud.sensing.cameras import inverse, transform
+from diffcloud.sensing.recorder import Truth, read_truth
+from pipeline.config import EpisodesConfig, FitConfig
+from pipeline.fit_jobs import FitJob, Recording
+from pipeline.scenario_options import scenario_options
+from pipeline.workers import Tell
+
+POSE_HEAD = (
+    "cloth at the start",
+    "nuisance",
+    "recordings",
+    "stretch: median error",
+    "greatest",
+    "start: median mm off",
+    "median ° off",
+    "within 3 mm and 1°",
+    "lag: median ms",
+)
+STARTS = ("as the scenario says", "as the first frame shows it")
+
+
+@dataclass(frozen=True)
+class PoseJob:
+    """Fits of one recording with its mass known, one for each nuisance and start of the cloth."""
+
+    scenario: Scenario
+    folder: Path
+    """Raw episode with its truth."""
+    episode: Path
+    nuisance: tuple[str, ...]
+    config: FitConfig
+
+    @property
+    def label(self) -> str:
+        return f"{self.scenario.name}/{self.folder.name}"
+
+    def run(self, tell: Tell) -> list[dict[str, Any]]:
+        """Of each fit: error of the stretch's logarithm, RMS distance [mm] of the nodes at the start from where the clouds
+        have them, angle [°] between both, and the lag found [ms], None where it is not free."""
+        episode = read_episode(self.episode)
+        raw, truth = read_raw_episode(self.folder), read_truth(self.folder)
+        true = recorded_places(raw, truth, episode)
+        hidden, found = episode.meta["truth"], []
+        every = [(start, nuisance) for start in STARTS for nuisance in self.nuisance]
+        for place, (start, nuisance) in enumerate(every):
+            tell(place / len(every), f"{start}, {nuisance}")
+            scenario = self.scenario if start == STARTS[0] else laid(self.scenario, episode)
+            config = self.config.model_copy(
+                update={"parameters": ["stretch"], "fixed": {"mass": hidden["mass"]}, "nuisance": nuisance}
+            )
+            job = FitJob(self.label, [Recording(scenario, self.label, episode)], config, self.folder)
+            objective = job.objective()
+            assert isinstance(objective, Objective)
+            outcome = solve(objective, job.space, config.solver_settings(scenario))
+            if outcome.stop_reason == "interrupted":
+                raise KeyboardInterrupt
+            values = {name: torch.tensor([value], dtype=torch.float64) for name, value in outcome.values.items()}
+            with torch.no_grad():
+                run = objective.simulate_to_loss(values)
+            told = describe_recording(objective, run, self.label)
+            space, pose = recorded_pose(told, length_unit_m=scenario.length_unit_m)
+            moved = space.moved(run.positions[:, 0], pose)[0].numpy()
+            lag = told.nuisance.get("lag")
+            found.append(
+                {
+                    "start": start,
+                    "nuisance": nuisance,
+                    "stretch": abs(math.log(outcome.values["stretch"] / hidden["stretch"])),
+                    "shift_mm": 1e3 * float(np.sqrt(((moved - true) ** 2).sum(-1).mean())),
+                    "turn_deg": _angle(moved, true),
+                    "lag_ms": None if lag is None else 1e3 * lag.value,
+                }
+            )
+        return found
+
+
+def laid(scenario: Scenario, episode: Episode) -> Scenario:
+    """A grid scenario whose cloth lies where the recording's first frame shows it, as `diffcloud identify` lays it.
+
+    Raises:
+        ConfigError: not a grid scenario.
+        EpisodeError: the first frame does not show a flat cloth of the scenario's size.
+    """
+    options = scenario_options(scenario.name)
+    if not isinstance(options, GridScenario):
+        raise ConfigError(f"{scenario.name} is no cloth that lies on a table.")
+    found = find_layout(episode, options.size_m).fields
+    center, yaw, table = (found[name].value for name in ("center_m", "yaw_deg", "table_height_m"))
+    quarter = 90.0 if math.isclose(*options.size_m) else 180.0  # turns after which the rectangle looks the same
+    yaw = float(cast(float, yaw))
+    yaw += quarter * round((options.yaw_deg - yaw) / quarter)
+    return make_scenario(options.model_copy(update={"center_m": center, "yaw_deg": yaw, "table_height_m": table}))
+
+
+def recorded_places(raw: RawEpisode, truth: Truth, episode: Episode) -> NDArray[np.float64]:
+    """[V, 3] where the clouds have the cloth's nodes at the start, in the scene's frame as the recording states it.
+
+    The mean over the cameras, which are not where preprocessing had them.
+
+    Raises:
+        EpisodeError: the episode does not say where preprocessing had its cameras.
+    """
+    refined = episode.meta.get("quality", {}).get("refinement", {}).get("T_world_camera")
+    if refined is None:
+        raise EpisodeError("The episode does not say where the refinement had the cameras: preprocess it with raw.refine.")
+    seen = [
+        transform(np.array(refined[name]) @ inverse(truth.T_world_camera[name]), truth.nodes[0]) for name in raw.cameras
+    ]
+    return raw.placement.to_scene(np.mean(seen, axis=0))
+
+
+def _angle(found: NDArray[np.float64], true: NDArray[np.float64]) -> float:
+    """[°] between two rigid images [..., 3] of the same points (Kabsch)."""
+    a, b = (points.reshape(-1, 3) - points.reshape(-1, 3).mean(axis=0) for points in (found, true))
+    u, _, vt = np.linalg.svd(a.T @ b)
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return math.degrees(math.acos(min(1.0, max(-1.0, (np.trace(turn) - 1) / 2))))
+
+
+def pose_rows(found: Sequence[Sequence[dict[str, Any]]]) -> list[list[str]]:
+    """Under `POSE_HEAD`, a row for each nuisance."""
+    rows = []
+    for fits in zip(*found, strict=True):
+        off, shift, turn = (np.array([fit[key] for fit in fits]) for key in ("stretch", "shift_mm", "turn_deg"))
+        lags = [abs(fit["lag_ms"]) for fit in fits if fit["lag_ms"] is not None]
+        right = int(((shift <= 3) & (turn <= 1)).sum())
+        rows.append(
+            [
+                fits[0]["start"],
+                fits[0]["nuisance"],
+                str(len(fits)),
+                f"{100 * math.expm1(float(np.median(off))):.1f} %",
+                f"{100 * math.expm1(float(off.max())):.0f} %",
+                f"{np.median(shift):.1f}",
+                f"{np.median(turn):.2f}",
+                f"{right} of {len(fits)}",
+                f"{np.median(lags):.1f}" if lags else "–",
+            ]
+        )
+    return rows
+
+
+def pose_page(rows: Sequence[Sequence[str]], recorded: EpisodesConfig) -> str:
+    """Markdown: what was recorded, and the table."""
+    (together, turned), (apart, twisted), (beside, yaw) = recorded.cameras_moved, recorded.extrinsic_error, recorded.beside
+    lines = [
+        "# Recordings whose cameras and cloth are not where they are said to be",
+        "",
+        f"Synthetic raw recordings (`make moved`). The cameras' stated places are off by {together:g} mm and {turned:g}° "
+        f"together, the second camera's by {apart:g} mm and {twisted:g}° more; cloth and gripper are {beside:g} mm and "
+        f"{yaw:g}° beside the stated place; the joint log is {1e3 * recorded.lag_s:g} ms late. `diffcloud preprocess` finds "
+        "the cameras' places and the lag again. Then the stretch is fitted, with the mass known, and the cloth starts where "
+        "the scenario says, or where the recording's first frame shows it, as `diffcloud identify` lays it.",
+        "",
+        "*Start off*: RMS distance and angle between the nodes at the start, in the pose found, and where the clouds have "
+        "the true ones.",
+        "",
+        *markdown_table(POSE_HEAD, rows),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def parsed(nuisance: Sequence[str]) -> tuple[str, ...]:
+    """
+    Raises:
+        ConfigError: one that no fit takes.
+    """
+    for one in nuisance:
+        parse_priors(one)
+    return tuple(nuisance)
