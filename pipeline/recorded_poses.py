@@ -172,8 +172,8 @@ def pose_page(rows: Sequence[Sequence[str]], recorded: EpisodesConfig) -> str:
         f"Synthetic raw recordings (`make moved`). The cameras' stated places are off by {together:g} mm and {turned:g}° "
         f"together, the second camera's by {apart:g} mm and {twisted:g}° more; cloth and gripper are {beside:g} mm and "
         f"{yaw:g}° beside the stated place; the joint log is {1e3 * recorded.lag_s:g} ms late. `diffcloud preprocess` "
-        "finds the cameras' places and the lag again. Then the stretch is fitted, with the mass known. The cloth starts where "
-        "the scenario says, or where the recording's first frame shows it, as `diffcloud identify` lays it.",
+        "finds the cameras' places and the lag again. Then the stretch is fitted, with the mass known. The cloth starts "
+        "where the scenario says, or where the recording's first frame shows it, as `diffcloud identify` lays it.",
         "",
         "*Start off*: RMS distance and angle between the nodes at the start, in the pose found, and where the clouds have "
         "the true ones.",
