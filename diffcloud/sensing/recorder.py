@@ -136,8 +136,15 @@ def read_truth(folder: Path) -> Truth:
         raise EpisodeError(f"{folder} has no folder truth: only synthetic recordings know the truth.")
     poses = read_json(place / "cameras.json", error=EpisodeError)
     cloth = read_npz(place / "cloth.npz", kind="truth of a cloth", error=EpisodeError, names=("nodes", "faces"))
-    cameras = {name: np.array(pose) for name, pose in poses["T_world_camera"].items()}
-    return Truth(cloth["nodes"], cloth["faces"], cameras, read_placement(poses["scene_in_world"]), place)
+    try:
+        cameras = {name: np.array(pose, dtype=np.float64) for name, pose in poses["T_world_camera"].items()}
+        placement = read_placement(poses["scene_in_world"])
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise EpisodeError(
+            f"{place / 'cameras.json'} does not say where the cameras and the scene were; record again with "
+            "`diffcloud episodes`."
+        ) from error
+    return Truth(cloth["nodes"], cloth["faces"], cameras, placement, place)
 
 
 def record(

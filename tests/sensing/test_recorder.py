@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -121,6 +122,11 @@ class TestRecording:
         beside = write_recorded_episode(tmp_path / "beside", beside=(30.0, 10.0))
         home, truth = read_truth(folder), read_truth(beside)
         assert read_raw_episode(beside).placement == read_raw_episode(folder).placement == home.placement
+        (tmp_path / "old" / "truth").mkdir(parents=True)
+        (tmp_path / "old" / "truth" / "cameras.json").write_text('{"overhead": [[1.0]]}')
+        shutil.copyfile(beside / "truth" / "cloth.npz", tmp_path / "old" / "truth" / "cloth.npz")
+        with pytest.raises(EpisodeError, match=r"cameras\.json does not say where .* record again"):
+            read_truth(tmp_path / "old")
         np.testing.assert_allclose(truth.placement.to_scene(truth.nodes), home.placement.to_scene(home.nodes), atol=1e-12)
         middles = [one.nodes[0].mean(axis=0) for one in (home, truth)]
         assert np.linalg.norm(middles[1] - middles[0]) == pytest.approx(0.03, abs=1e-9)
