@@ -55,8 +55,10 @@ def bench(
         ),
     ] = None,
     targets: Annotated[int, typer.Option(min=1, help="With --fits: drawn cloths of each scenario.")] = 3,
-    seed: Annotated[int, typer.Option(min=0, help="With --fits: of the cloths.")] = 0,
-    workers: Annotated[int, typer.Option(min=1, help="With --fits: targets at once, each on one thread.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="With --fits: random seed of the cloths.")] = 0,
+    workers: Annotated[
+        int, typer.Option(min=1, help="With --fits: how many targets to run at once, each on one thread.")
+    ] = 1,
     markdown: Annotated[Path | None, typer.Option(help="With --fits: write the table to this Markdown file too.")] = None,
     threads: Threads = None,
     json: JsonFlag = False,

@@ -1,4 +1,5 @@
-"""Part of `diffcloud recordings`: the pose that a fit finds of a recording, against the true one, and what it is worth."""
+"""Part of `diffcloud recordings`: compares the pose that a fit finds for a recording with the true one, and shows what it
+does to the stretch."""
 
 from __future__ import annotations
 
@@ -58,11 +59,11 @@ class PoseJob:
         return f"{self.scenario.name}/{self.folder.name}"
 
     def run(self, tell: Tell) -> list[dict[str, Any]]:
-        """Of each fit: error of the stretch's logarithm, RMS distance [mm] of the nodes at the start from where the clouds
-        have them, angle [°] between both, and the lag found [ms], None where it is not free."""
+        """Of each fit: error of the stretch's logarithm, RMS distance [mm] and angle [°] between the nodes' starting
+        positions and those in the clouds, and the lag found [ms], None where it is not free; with `cameras_off`."""
         episode = read_episode(self.episode)
         raw, truth = read_raw_episode(self.folder), read_truth(self.folder)
-        true = recorded_places(raw, truth, episode)
+        true, preprocessed = recorded_places(raw, truth, episode), cameras_off(truth, episode)
         hidden, found = episode.meta["truth"], []
         every = [(start, nuisance) for start in STARTS for nuisance in self.nuisance]
         for place, (start, nuisance) in enumerate(every):
@@ -92,6 +93,7 @@ class PoseJob:
                     "shift_mm": 1e3 * float(np.sqrt(((moved - true) ** 2).sum(-1).mean())),
                     "turn_deg": _angle(moved, true),
                     "lag_ms": None if lag is None else 1e3 * lag.value,
+                    **preprocessed,
                 }
             )
         return found
@@ -106,7 +108,7 @@ def laid(scenario: Scenario, episode: Episode) -> Scenario:
     """
     options = scenario_options(scenario.name)
     if not isinstance(options, GridScenario):
-        raise ConfigError(f"{scenario.name} is no cloth that lies on a table.")
+        raise ConfigError(f"{scenario.name} is not a scenario with a cloth lying on a table.")
     found = find_layout(episode, options.size_m).fields
     center, yaw, table = (found[name].value for name in ("center_m", "yaw_deg", "table_height_m"))
     quarter = 90.0 if math.isclose(*options.size_m) else 180.0  # turns after which the rectangle looks the same
@@ -125,11 +127,28 @@ def recorded_places(raw: RawEpisode, truth: Truth, episode: Episode) -> NDArray[
     """
     refined = episode.meta.get("quality", {}).get("refinement", {}).get("T_world_camera")
     if refined is None:
-        raise EpisodeError("The episode does not say where the refinement had the cameras: preprocess it with raw.refine.")
+        raise EpisodeError(
+            "The episode does not give the refined camera poses: preprocess it with `preprocess.raw.refine: true`."
+        )
     seen = [
         transform(np.array(refined[name]) @ inverse(truth.T_world_camera[name]), truth.nodes[0]) for name in raw.cameras
     ]
     return raw.placement.to_scene(np.mean(seen, axis=0))
+
+
+def cameras_off(truth: Truth, episode: Episode) -> dict[str, float]:
+    """How far preprocessing had the worse camera from its place, as the mean shift of its picture of the cloth (camera_mm),
+    and the lag that it found for the joint log (log_late_ms)."""
+    refined = episode.meta["quality"]["refinement"]
+    nodes = truth.nodes.reshape(-1, 3)
+    shifts = [
+        transform(np.array(refined["T_world_camera"][name]) @ inverse(pose), nodes).mean(axis=0) - nodes.mean(axis=0)
+        for name, pose in truth.T_world_camera.items()
+    ]
+    return {
+        "camera_mm": 1e3 * max(float(np.linalg.norm(shift)) for shift in shifts),
+        "log_late_ms": 1e3 * refined["lag_s"],
+    }
 
 
 def _angle(found: NDArray[np.float64], true: NDArray[np.float64]) -> float:
@@ -163,20 +182,27 @@ def pose_rows(found: Sequence[Sequence[dict[str, Any]]]) -> list[list[str]]:
     return rows
 
 
-def pose_page(rows: Sequence[Sequence[str]], recorded: EpisodesConfig) -> str:
-    """Markdown: what was recorded, and the table."""
+def pose_page(rows: Sequence[Sequence[str]], recordings: Sequence[dict[str, Any]], recorded: EpisodesConfig) -> str:
+    """Markdown: what was recorded, what preprocessing found (`cameras_off` of each recording), and the table."""
+    shifts = [one["camera_mm"] for one in recordings]
+    late = [abs(one["log_late_ms"] - 1e3 * recorded.lag_s) for one in recordings]
     (together, turned), (apart, twisted), (beside, yaw) = recorded.cameras_moved, recorded.extrinsic_error, recorded.beside
     lines = [
         "# Recordings whose cameras and cloth are not where they are said to be",
         "",
         f"Synthetic raw recordings (`make moved`). The cameras' stated places are off by {together:g} mm and {turned:g}° "
-        f"together, the second camera's by {apart:g} mm and {twisted:g}° more; cloth and gripper are {beside:g} mm and "
-        f"{yaw:g}° beside the stated place; the joint log is {1e3 * recorded.lag_s:g} ms late. `diffcloud preprocess` "
-        "finds the cameras' places and the lag again. Then the stretch is fitted, with the mass known. The cloth starts "
-        "where the scenario says, or where the recording's first frame shows it, as `diffcloud identify` lays it.",
+        f"together, the second camera's by {apart:g} mm and {twisted:g}° more; cloth and gripper are shifted by {beside:g} "
+        f"mm and turned by {yaw:g}° from the stated place; the joint log is {1e3 * recorded.lag_s:g} ms late. `diffcloud "
+        "preprocess` finds the cameras' places and the lag again. Then the stretch is fitted, with the mass known. The "
+        "cloth starts where the scenario says, or where the recording's first frame shows it, as `diffcloud identify` lays "
+        "it.",
         "",
-        "*Start off*: RMS distance and angle between the nodes at the start, in the pose found, and where the clouds have "
-        "the true ones.",
+        f"Preprocessing had the worse camera {np.median(shifts):.1f} mm from its place in the median and "
+        f"{max(shifts):.1f} mm at most, and the log's lag within {np.median(late):.1f} ms in the median and "
+        f"{max(late):.1f} ms at most.",
+        "",
+        "*start: median mm off*, *median ° off*: RMS distance and angle between the nodes' starting positions in the "
+        "fitted pose and their true positions as seen in the clouds.",
         "",
         *markdown_table(POSE_HEAD, rows),
         "",

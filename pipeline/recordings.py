@@ -32,9 +32,7 @@ def recordings(
     fits: Annotated[bool, typer.Option(help="Also fit each: raw clouds, noise-free clouds, one camera.")] = True,
     nuisance: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Instead, fit with this nuisance (as of `diffcloud fit`) and compare the pose found; repeatable."
-        ),
+        typer.Option(help="Instead, fit with this nuisance, and compare the pose found with the true one; repeatable."),
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="With --nuisance: recordings at once, each on one thread.")] = 1,
     params: ParamsFile = None,
@@ -84,7 +82,7 @@ def _poses(jobs: list[PoseJob], workers: int, out: Path, recorded: EpisodesConfi
             failures.append(f"{job.label}: {error}")
     if failures:
         raise DiffCloudError("; ".join(failures))
-    page = pose_page(pose_rows(done), recorded)
+    page = pose_page(pose_rows(done), [fits[0] for fits in done], recorded)
     write_text(out, page)
     if not json:
         output.print(page)

@@ -1,8 +1,8 @@
 """`diffcloud bench --fits`: what each solver spends until it has found a cloth, over scenarios and numbers of parameters.
 
 A target is a cloth of drawn parameters, seen as its whole surface with noise and put down a little beside its place. Every
-solver gets the same objective, priors and pose included, and stops at 1.05 times the lowest loss that a fit of several
-times the budget has met, which is also started at the truth.
+solver gets the same objective, priors and pose included, and stops at 1.05 times the reference loss: the lower one of a
+much longer fit's and of a fit started at the truth.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ ORDER = ("stretch", "mass", "bending", "drag", "damping", "friction_cloth", "fri
 """The first two, four, and all of them are fitted."""
 COUNTS = (2, 4, 7)
 WITHIN = 1.05
-"""Of the reference's loss, at which a solver has arrived."""
+"""A solver has arrived at this multiple of the reference's loss."""
 BUDGET = 200
 """Simulations of each solver."""
 _NOISE_M = 0.002
@@ -95,7 +95,8 @@ class RaceJob:
         return record
 
     def truth(self) -> dict[str, float]:
-        """Multipliers within a factor of three, log-uniform; what may be zero, in the lower half of its bounds."""
+        """Multipliers, log-uniform within a factor of three of 1; parameters that may be zero are uniform in the lower half
+        of their bounds."""
         rng = np.random.default_rng([self.seed, SCENARIOS.index(self.scenario.name), self.index])
         found = {}
         for name in ORDER:  # more parameters leave the first as they are
@@ -111,7 +112,8 @@ class RaceJob:
         with torch.no_grad():
             run = rollout(system, self.scenario.steps, properties=self.scenario.properties(system, sets))
         nodes, times = run.positions[0, :: scene.frame_steps].numpy(), run.times[:: scene.frame_steps].numpy()
-        obstacles = scene.surrounding.obstacles if self.scenario.recorder == "whole_surface" else ()  # cameras cut tables
+        # what depth cameras record comes without its table
+        obstacles = scene.surrounding.obstacles if self.scenario.recorder == "whole_surface" else ()
         seen = sample_surface(
             nodes, system.mesh.faces, times, obstacles[0] if obstacles else None, points=self.scenario.points,
             seed=self.seed, meta={"truth": truth},
@@ -148,7 +150,7 @@ class RaceJob:
 
 
 def race_jobs(targets: int, seed: int, out: Path) -> list[RaceJob]:
-    """Of all cells, one target of each after the other."""
+    """The first target of every cell, then the second of every cell, and so on."""
     return [
         RaceJob(choose_scenario(name), count, index, seed, out)
         for index in range(targets)
@@ -189,9 +191,9 @@ def race_page(rows: Sequence[Sequence[str]], seed: int) -> str:
         "",
         f"How long each solver takes until its loss is at most {WITHIN:g} times that of a reference fit: the lower one of "
         "Gauss–Newton from the truth, and from the six best of 97 candidates. A target is a cloth of drawn parameters "
-        f"(seed {seed}), its whole surface with {1e3 * _NOISE_M:g} mm of noise, put down about {1e2 * _BESIDE_M:g} cm and "
-        "5° beside its place. All solvers minimise the same objective, with priors and with the pose (x, y, yaw) found for "
-        f"every parameter set, and may spend {BUDGET} simulations; Adam has the starts and the screen of Gauss–Newton.",
+        f"(seed {seed}), its whole surface with {1e3 * _NOISE_M:g} mm of noise, shifted by about {1e2 * _BESIDE_M:g} cm "
+        "and turned by about 5°. All solvers minimise the same objective, with priors and with the pose (x, y, yaw) found "
+        f"for every parameter set, and may spend {BUDGET} simulations; Adam has the starts and the screen of Gauss–Newton.",
         "",
         "Cells hold medians over all targets of processor time on one thread and of simulations (one with derivatives "
         "counts once), and how many targets were reached. A dash: half of them or more were not. Two parameters are "

@@ -257,7 +257,7 @@ class RawEpisode:
 def read_placement(fields: Mapping[str, Any]) -> ScenePlacement:
     """
     Raises:
-        ValidationError: no placement; of pydantic.
+        ValidationError: (pydantic's) the fields are not a valid placement.
     """
     stated = PlacementFile.model_validate(fields)
     return ScenePlacement(stated.origin_m, stated.yaw_rad, stated.length_unit_m)

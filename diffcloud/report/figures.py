@@ -321,6 +321,7 @@ def _finished(canvas: Canvas, name: str, title: str, caption: str, source: str) 
     # without a date and with a fixed salt the same data gives the same bytes; text stays text
     with matplotlib.rc_context({"svg.hashsalt": name, "svg.fonttype": "none"}):
         canvas.savefig(svg, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    canvas.set_layout_engine("none")  # what was laid out stays: that takes longer than drawing
     canvas.savefig(png, format="png", dpi=150, facecolor="white", metadata={"Software": None})
     return Figure(name, title, caption, source, svg.getvalue(), png.getvalue(), canvas.get_figwidth())
 

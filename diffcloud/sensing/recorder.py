@@ -76,7 +76,7 @@ class RecorderSettings:
     """(millimetres, degrees) by which the stated place of each camera but the first is off, in a direction drawn for the
     episode."""
     cameras_moved: tuple[float, float] = (0.0, 0.0)
-    """The same of all cameras together, which then still agree with one another, but not with the arm."""
+    """The same for all cameras together, which then still agree with one another, but not with the arm."""
     beside: tuple[float, float] = (0.0, 0.0)
     """(millimetres, degrees about the vertical) by which cloth and gripper are not where the recording says."""
     table_size_m: tuple[float, float] = (1.1, 1.3)
@@ -325,7 +325,10 @@ def _motion(millimetres: float, degrees: float, nodes: Floats, rng: np.random.Ge
 def _laid_beside(settings: RecorderSettings, nodes: Floats, rng: np.random.Generator) -> ScenePlacement:
     """The stated placement, turned about the cloth's middle and shifted on the table, in directions drawn at random."""
     stated, (millimetres, degrees) = settings.placement, settings.beside
-    way, sign = rng.uniform(0.5 * np.pi, 1.5 * np.pi), rng.choice([-1.0, 1.0])  # not away from the arm: that is its reach
+    way, sign = (
+        rng.uniform(0.5 * np.pi, 1.5 * np.pi),
+        rng.choice([-1.0, 1.0]),
+    )  # never away from the arm, whose reach is limited
     turned = replace(stated, yaw_rad=stated.yaw_rad + sign * np.deg2rad(degrees))
     middle = nodes[0].mean(axis=0)
     shift = stated.to_world(middle) - turned.to_world(middle)

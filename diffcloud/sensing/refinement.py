@@ -1,8 +1,8 @@
-"""Where the cameras stand relative to each other, found again from the recording itself.
+"""Where the cameras stand, found again from the recording itself.
 
-A calibration is off by millimetres once a camera has been touched, and by centimetres once their stand has. The recording
-knows better: both cameras saw the arm, whose place its joints tell, the same table, and in part the same cloth. The poses
-are refined by Gauss–Newton on distances along normals, over several frames at once:
+A calibration is off by millimetres once a camera has been touched, and by centimetres once the cameras' stand has been
+moved. The recording knows better: both cameras saw the arm, whose place its joints tell, the same table, and in part the
+same cloth. The poses are refined by Gauss–Newton on distances along normals, over several frames at once:
 
 - arm: from each measured point to the described surface on its ray. How much thicker each link is than its description
   (its *skin*), by how much each patch of it differs from that, and how late the joint log is are unknown too.
@@ -14,8 +14,8 @@ off by the same amount in every image of every camera. Taken for noise they beco
 shows other places when it is fast than when it is slow. So each patch of a link has an offset of its own, which is
 eliminated, and the lag is read off how the same patches move.
 
-Only the arm tells where all cameras together are. It is rounder and thicker than described, and says so no better than a
-usable calibration: what it finds is taken where it is farther off than that, else the first camera stays where it is.
+Only the arm tells where all cameras together are. It is rounder and thicker than described, so its answer is no
+better than a usable calibration: a shift larger than that error is applied; otherwise the first camera stays where it is.
 
 Weights come from the depth's own noise, and fall off for outliers by Tukey's function of the residuals' median deviation.
 Neighbouring points of table and cloth share their surface's errors, so they count as few. The calibration is the prior:
@@ -69,7 +69,7 @@ _WINDOW = 4
 _PRIOR_M, _PRIOR_RAD = 0.005, np.deg2rad(0.5)
 """How far calibrations tend to be off, along and about each axis."""
 _USABLE_M, _USABLE_RAD = 0.005, np.deg2rad(0.5)
-"""What all cameras together are off by is found to about 2 mm and 0.2°; less than this is left as it is."""
+"""A common shift of all cameras is found to about 2 mm and 0.2°; one smaller than these limits is left uncorrected."""
 _PRIOR_SKIN_M, _PRIOR_LAG_S = 0.005, 0.1
 _LAG_STEP_S = 0.01
 _STEEPEST = 0.35
@@ -158,7 +158,7 @@ def refine_extrinsics(
         ]
     )
     found = np.zeros(len(prior))
-    """Corrections of the poses (the first camera takes the others along), of the lag, and the skins."""
+    """Corrections of the poses (the first camera's also moves all others) and of the lag, then the skins."""
     free, together = np.arange(len(prior)), np.eye(4)
     surface, thickened = arm, np.zeros(links)
     for iteration in range(_ITERATIONS):
