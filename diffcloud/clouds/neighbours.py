@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _NEIGHBOURS = 12
 """Whose plane gives a point's normal."""
+_UNCLEAR = 1e-2
+"""Of the squared size of a group's spread: a shorter cross product of its rows hardly has a direction."""
 _NO_GUESS = np.empty(0, np.int64)
 
 
@@ -58,9 +60,8 @@ class NeighbourIndex:
         if count < 3:
             return torch.zeros_like(self.points), 0.0
         distance, index = cKDTree(points).query(points, k=count)
-        around = points[index] - points[index].mean(axis=1, keepdims=True)
-        _, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", around, around))
-        return torch.from_numpy(axes[:, :, 0].copy()).to(self.points), float(np.median(distance[:, 1]))
+        normals = torch.from_numpy(flattest_directions(points, index))
+        return normals.to(self.points), float(np.median(distance[:, 1]))
 
     @cached_property
     def _tree(self) -> Tree:
@@ -106,3 +107,34 @@ def compile_neighbours() -> None:
 
 def _as_array(points: Tensor) -> Floats:
     return np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float64)
+
+
+def flattest_directions(points: Floats, groups: Ints) -> Floats:
+    """[G, 3] the unit directions along which groups [G, n] of points [P, 3] spread least.
+
+    Eigenvectors of 3 × 3 matrices in closed form (Smith 1961), five times as fast as a solver's; by the solver where two
+    spreads are about equal, as of points on a line.
+    """
+    x, y, z = (np.ascontiguousarray(column)[groups] for column in points.T)
+    for part in (x, y, z):
+        part -= part.mean(axis=1, keepdims=True)
+    xx, xy, xz, yy, yz, zz = ((a * b).sum(axis=1) for a, b in ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z)))
+    mean = (xx + yy + zz) / 3
+    a, b, c = xx - mean, yy - mean, zz - mean
+    size = np.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
+    determinant = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
+    angle = np.arccos(np.clip(determinant / np.maximum(2 * size**3, 1e-300), -1, 1)) / 3
+    least = 2 * size * np.cos(angle + 2 * np.pi / 3)
+    first, second, third = (
+        np.stack(row, axis=-1) for row in ((a - least, xy, xz), (xy, b - least, yz), (xz, yz, c - least))
+    )
+    across = np.stack([np.cross(first, second), np.cross(first, third), np.cross(second, third)], axis=1)
+    lengths = (across * across).sum(axis=-1)
+    longest, every = lengths.argmax(axis=1), np.arange(len(groups))
+    across, length = across[every, longest], np.sqrt(lengths[every, longest])
+    unclear = ~(length > _UNCLEAR * size**2)
+    found: Floats = across / np.where(unclear, 1.0, length)[:, None]
+    if unclear.any():
+        spread = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1)[unclear].reshape(-1, 3, 3)
+        found[unclear] = np.linalg.eigh(spread)[1][:, :, 0]
+    return found

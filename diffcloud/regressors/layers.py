@@ -25,7 +25,8 @@ class Layer(nn.Module):
 
     def activate(self, linear: Tensor) -> Tensor:
         """What follows the linear part."""
-        return functional.relu(self.norm(linear.flatten(0, -2))).view_as(linear)
+        # in place: neither derivative needs what comes between
+        return functional.relu(self.norm(linear.flatten(0, -2)), inplace=True).view_as(linear)
 
     def forward(self, values: Tensor) -> Tensor:
         return self.activate(self.linear(values))

@@ -83,16 +83,23 @@ class RobotMask:
 
     def __init__(self, robot: Robot, *, inflation_m: float | Mapping[str, float] = 0.01) -> None:
         self.robot = robot
-        self._links: list[tuple[int, Any, Floats]] = []
-        """(place among the robot's links, its ray-casting scene, the corners [8, 3] of its box)."""
+        self._indices: list[int] = []
+        """Places among the robot's links of those that have a surface."""
+        self._scenes: list[Any] = []
+        """Their ray-casting scenes."""
         open3d = import_open3d()
+        boxes: list[Floats] = []
         for name, mesh in robot.description.meshes.items():
             solid = inflate(mesh, inflation_m.get(name, 0.0) if isinstance(inflation_m, Mapping) else inflation_m)
             scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # threads cost more than they gain on these few rays
             scene.add_triangles(solid.vertices.astype(np.float32), solid.faces.astype(np.uint32))
             ends = np.stack([solid.vertices.min(axis=0), solid.vertices.max(axis=0)])
             corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(8, 3)
-            self._links.append((robot.links.index(name), scene, corners))
+            self._indices.append(robot.links.index(name))
+            self._scenes.append(scene)
+            boxes.append(corners)
+        self._corners = np.array(boxes).reshape(-1, 8, 3)
+        """Of their boxes."""
 
     def surface(self, view: View, poses: Floats) -> NDArray[np.float32]:
         """z-depth [H, W] [m] of the inflated robot, infinite beside it.
@@ -141,16 +148,15 @@ class RobotMask:
         self, T_world_camera: Floats, poses: Floats, eye: Floats
     ) -> Iterator[tuple[int, Any, Floats, Floats, Floats]]:
         """(link, scene, T_link_camera, least and greatest (x, y) of rays from the eye that can meet it) of each link."""
-        for index, scene, corners in self._links:  # links have trees of their own
-            T_link_camera = inverse(poses[index]) @ T_world_camera
-            seen = transform(inverse(T_link_camera), corners) - eye
-            if (seen[:, 2] < _NEAREST_M).all():
-                continue
-            plane = seen[:, :2] / np.maximum(seen[:, 2:], _NEAREST_M)
-            low, high = plane.min(axis=0), plane.max(axis=0)
-            if (seen[:, 2] < _NEAREST_M).any():  # reaches behind the camera: its picture may be anywhere
-                low, high = np.full(2, -np.inf), np.full(2, np.inf)
-            yield index, scene, T_link_camera, low, high
+        T_link_camera = inverse(poses[self._indices]) @ T_world_camera
+        seen = transform(inverse(T_link_camera), self._corners) - eye
+        behind = seen[..., 2] < _NEAREST_M
+        plane = seen[..., :2] / np.maximum(seen[..., 2:], _NEAREST_M)
+        low, high = plane.min(axis=1), plane.max(axis=1)
+        anywhere = behind.any(axis=1)  # what reaches behind the camera may have its picture anywhere
+        low[anywhere], high[anywhere] = -np.inf, np.inf
+        for row in np.flatnonzero(~behind.all(axis=1)):  # links have trees of their own
+            yield self._indices[row], self._scenes[row], T_link_camera[row], low[row], high[row]
 
 
 @dataclass(frozen=True)

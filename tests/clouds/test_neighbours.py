@@ -8,6 +8,7 @@ import torch
 
 from diffcloud.clouds import NeighbourIndex, chamfer, one_sided_chamfer
 from diffcloud.clouds.curve import curve_order
+from diffcloud.clouds.neighbours import flattest_directions
 from diffcloud.mesh import grid_cloth
 
 SIZES = [1, 2, 7, 8, 9, 127, 128, 129, 700, 2200]  # around full leaves, groups, and levels
@@ -97,3 +98,24 @@ def test_derivatives_of_both_sides(rng):
     target = torch.as_tensor(grid_cloth(4, 5, 1.0, 1.0).nodes + 0.03).requires_grad_(True)
     assert torch.autograd.gradcheck(lambda s: one_sided_chamfer(s, NeighbourIndex(target.detach())), (source,))
     assert torch.autograd.gradcheck(lambda s, t: chamfer(s, [NeighbourIndex(t)]), (source, target))
+
+
+@pytest.mark.parametrize(
+    "shape", [(1.0, 1.0, 1.0), (1.0, 1.0, 0.01), (1.0, 0.05, 0.04), (1.0, 0.01, 0.01), (1.0, 0.0, 0.0)]
+)
+def test_flattest_directions_are_those_of_an_eigenvalue_solver(shape):
+    rng = np.random.default_rng(3)
+    points = (rng.standard_normal((400, 3)) * shape) @ np.linalg.qr(rng.standard_normal((3, 3)))[0] + [5.0, -2.0, 1.0]
+    groups = rng.integers(0, 400, (200, 13))
+    found = flattest_directions(points, groups)
+    around = points[groups] - points[groups].mean(axis=1, keepdims=True)
+    spread = np.swapaxes(around, 1, 2) @ around
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-12)
+    along = np.einsum("gi,gij,gj->g", found, spread, found)
+    scale = np.trace(spread, axis1=1, axis2=2)
+    np.testing.assert_allclose(along / scale, np.linalg.eigvalsh(spread)[:, 0] / scale, atol=1e-10)
+
+
+def test_points_in_one_place_have_some_direction():
+    found = flattest_directions(np.ones((5, 3)), np.array([[0, 1, 2, 3]]))
+    assert np.linalg.norm(found) == pytest.approx(1.0)
