@@ -20,7 +20,6 @@ from diffcloud.fit.benchmark import time_contact, time_episode, time_matching
 from diffcloud.io.clouds import write_ply
 from diffcloud.io.files import write_text
 from diffcloud.scene.scenarios import GridScenario, Scenario, built_in, grid_scenario, make_scenario
-from diffcloud.sim.simulate import rollout
 from diffcloud.sim.threads import thread_count, use_threads
 from pipeline.console import JsonFlag, Threads, errors, finish, output, progress_bar, show
 from pipeline.scenario_options import SceneFile, choose_scenario
@@ -138,25 +137,22 @@ def run_benchmarks(published: Mapping[str, Path], *, repeats: int) -> list[dict[
 def time_identify() -> float:
     """Seconds from a folder of clouds to the report of `identify`: one lift of the towel of docs/own-clouds.md, of half the
     basis's stiffness and one and a half times its mass, with 2 mm of noise."""
-    from pipeline.identify import identify  # not above: only this needs it
+    from pipeline.episodes import simulated_frames  # not above: only this needs them
+    from pipeline.identify import identify
 
     towel = built_in("lift").model_copy(update=_TOWEL)
     scenario = make_scenario(towel)
-    system, _ = scenario.scene.build()
-    values = {"stretch": torch.tensor([0.5], dtype=torch.float64), "mass": torch.tensor([1.5], dtype=torch.float64)}
-    with torch.no_grad():
-        run = rollout(system, scenario.steps, properties=scenario.properties(system, values))
-    nodes = run.positions[0, :: scenario.scene.frame_steps]
+    system, (nodes,), _ = simulated_frames(scenario, {"stretch": np.array([0.5]), "mass": np.array([1.5])})
     generator = torch.Generator().manual_seed(0)
     sampler = SurfaceSampler.build(torch.as_tensor(system.mesh.faces), 2500, generator=generator)
-    clouds = sampler.sample(nodes).numpy()
+    clouds = sampler.sample(torch.from_numpy(nodes)).numpy()
     noise = 0.002 * np.random.default_rng(0).standard_normal(clouds.shape)
     with tempfile.TemporaryDirectory() as folder:
         recording = Path(folder) / "towel"
         recording.mkdir()
         for index, cloud in enumerate(clouds + noise):
             write_ply(recording / f"{index:03d}.ply", cloud)
-        track = np.column_stack([np.arange(len(nodes)) / towel.rate_hz, nodes[:, scenario.grasped[0]].numpy()])
+        track = np.column_stack([np.arange(len(nodes)) / towel.rate_hz, nodes[:, scenario.grasped[0]]])
         np.savetxt(recording / "gripper.csv", track, delimiter=",", header="t_s,x,y,z", comments="")
         begin = time.perf_counter()
         identify([recording], Path(folder) / "found", size="0.40x0.30", mass=0.24, threads=thread_count())

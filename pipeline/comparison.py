@@ -18,7 +18,7 @@ from diffcloud.evaluation.summary import PREDICTORS
 from diffcloud.fit import FitRecord, read_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import files_in, read_json, write_json, write_text
-from diffcloud.io.fingerprints import fingerprint
+from diffcloud.io.fingerprints import fingerprint, kept_record
 from diffcloud.regressors import Regressor, predict_episode
 from diffcloud.scene.scenarios import Scenario
 from pipeline.config import Config
@@ -63,10 +63,8 @@ class Job:
         told = [(entry.method, entry.values if isinstance(entry, Estimate) else entry.reason) for entry in self.predictions]
         inputs = [self.name, self.fit, self.episode, self.fitted.plain(), told, self.transfers, self.settings]
         mark = fingerprint([self.scenario, self.group, *inputs], packages=_CODE)
-        if self.kept.is_file():
-            known = read_json(self.kept)
-            if isinstance(known, dict) and known.get("fingerprint") == mark:
-                return EpisodeRecord(known["record"], known["seconds"])
+        if (known := kept_record(self.kept, mark)) is not None:
+            return EpisodeRecord(known["record"], known["seconds"])
         found = compare_episode(
             self.scenario,
             self.episode,

@@ -10,7 +10,6 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
-import torch
 import typer
 from rich.table import Table
 
@@ -21,13 +20,12 @@ from diffcloud.fit import solve
 from diffcloud.fit.uncertainty import REFINED
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import files_in, read_json, write_json, write_text
-from diffcloud.io.fingerprints import fingerprint
+from diffcloud.io.fingerprints import fingerprint, kept_record
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS
-from diffcloud.sim.simulate import rollout
 from pipeline.config import Config, load_config
 from pipeline.console import JsonFlag, ParamsFile, errors, finish, show, writes
-from pipeline.episodes import hidden_parameters, record_motion
+from pipeline.episodes import hidden_parameters, record_motion, simulated_frames
 from pipeline.fit_jobs import FitJob, Recording
 from pipeline.preprocess import PreprocessJob
 from pipeline.scenario_options import choose_scenario
@@ -136,10 +134,8 @@ class CoverageJob:
         plan = [self.scenario, self.index, self.seed, self.known, self.level, self.refined]
         sections = [self.config.episodes, self.config.preprocess, self.config.fit, self.config.evaluate.doubts]
         mark = fingerprint([*plan, [str(section) for section in sections]], packages=_CODE)
-        if path.is_file():
-            kept = read_json(path)
-            if isinstance(kept, dict) and kept.get("fingerprint") == mark:
-                return kept
+        if (kept := kept_record(path, mark)) is not None:
+            return kept
         record: dict[str, Any] = {"fingerprint": mark, "truth": self.truth()}
         try:
             record |= self._measured(record["truth"], tell)
@@ -204,12 +200,8 @@ class CoverageJob:
         scene = self.scenario.scene
         if self.refined:
             scene = replace(scene, frame_steps=REFINED * scene.frame_steps)
-        system, _ = scene.build()
-        sets = {name: torch.tensor([value], dtype=torch.float64) for name, value in truth.items()}
-        steps = self.scenario.frames * scene.frame_steps
-        with torch.no_grad():
-            run = rollout(system, steps, properties=self.scenario.properties(system, sets))
-        nodes, times = run.positions[0, :: scene.frame_steps].numpy(), run.times[:: scene.frame_steps].numpy()
+        sets = {name: np.array([value]) for name, value in truth.items()}
+        system, (nodes,), times = simulated_frames(replace(self.scenario, scene=scene), sets)
         seed = int(np.random.default_rng([self.seed, self.index, 1]).integers(2**31))
         with TemporaryDirectory(prefix="diffcloud-") as folder:
             work = Path(folder)

@@ -82,12 +82,7 @@ def _synthetic(
     """Simulate cloths of hidden parameters and record them: by depth cameras as raw episodes, or by their whole surface."""
     rng = np.random.default_rng([config.seed, index])
     hidden = hidden_parameters(scenario, config, rng)
-    system, _ = scenario.scene.build()
-    properties = scenario.properties(system, {name: torch.as_tensor(values) for name, values in hidden.items()})
-    with torch.no_grad():
-        run = rollout(system, scenario.steps, properties=properties)
-    nodes = run.positions[:, :: scenario.scene.frame_steps].numpy()
-    times = run.times[:: scenario.scene.frame_steps].numpy()
+    system, nodes, times = simulated_frames(scenario, hidden)
     names = []
     for repeat in range(config.per_scenario):
         name, seed = f"{scenario.name}_hidden{repeat + 1}", int(rng.integers(2**31))
@@ -100,6 +95,22 @@ def _synthetic(
         record_motion(scenario, system, nodes[repeat], times, out, name, config, seed=seed, meta=meta, tell=tell)
         names.append(name)
     return names
+
+
+def simulated_frames(
+    scenario: Scenario, values: Mapping[str, NDArray[np.float64]]
+) -> tuple[System, NDArray[np.float64], NDArray[np.float64]]:
+    """The scenario's system, and its motions [E, T, V, 3] at the times [T] of its frames [s], at parameters [E] by name.
+
+    Raises:
+        DivergedError: a motion diverges.
+    """
+    system, _ = scenario.scene.build()
+    properties = scenario.properties(system, {name: torch.as_tensor(column) for name, column in values.items()})
+    with torch.no_grad():
+        run = rollout(system, scenario.steps, properties=properties)
+    steps = scenario.scene.frame_steps
+    return system, run.positions[:, ::steps].numpy(), run.times[::steps].numpy()
 
 
 def record_motion(

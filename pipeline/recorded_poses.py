@@ -12,16 +12,17 @@ from typing import Any, cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.fit import Objective, solve
-from diffcloud.fit.pose import parse_priors
 from diffcloud.fit.result import describe_recording, recorded_pose
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
 from diffcloud.scene.scenarios import GridScenario, Scenario, make_scenario
 from diffcloud.scene.scenarios.layout import find_layout
+from diffcloud.sensing.calibration.checkerboard import rigid_motion
 from diffcloud.sensing.cameras import inverse, transform
 from diffcloud.sensing.recorder import Truth, read_truth
 from pipeline.config import EpisodesConfig, FitConfig
@@ -91,7 +92,7 @@ class PoseJob:
                     "nuisance": nuisance,
                     "stretch": abs(math.log(outcome.values["stretch"] / hidden["stretch"])),
                     "shift_mm": 1e3 * float(np.sqrt(((moved - true) ** 2).sum(-1).mean())),
-                    "turn_deg": _angle(moved, true),
+                    "turn_deg": math.degrees(Rotation.from_matrix(rigid_motion(moved, true)[:3, :3]).magnitude()),
                     "lag_ms": None if lag is None else 1e3 * lag.value,
                     **preprocessed,
                 }
@@ -125,38 +126,30 @@ def recorded_places(raw: RawEpisode, truth: Truth, episode: Episode) -> NDArray[
     Raises:
         EpisodeError: the episode does not say where preprocessing had its cameras.
     """
-    refined = episode.meta.get("quality", {}).get("refinement", {}).get("T_world_camera")
-    if refined is None:
-        raise EpisodeError(
-            "The episode does not give the refined camera poses: preprocess it with `preprocess.raw.refine: true`."
-        )
-    seen = [
-        transform(np.array(refined[name]) @ inverse(truth.T_world_camera[name]), truth.nodes[0]) for name in raw.cameras
-    ]
+    world = truth.nodes[0]
+    seen = [transform(off, world) for off in _displacements(truth, episode)]
     return raw.placement.to_scene(np.mean(seen, axis=0))
 
 
 def cameras_off(truth: Truth, episode: Episode) -> dict[str, float]:
     """How far preprocessing had the worse camera from its place, as the mean shift of its picture of the cloth (camera_mm),
     and the lag that it found for the joint log (log_late_ms)."""
-    refined = episode.meta["quality"]["refinement"]
     nodes = truth.nodes.reshape(-1, 3)
-    shifts = [
-        transform(np.array(refined["T_world_camera"][name]) @ inverse(pose), nodes).mean(axis=0) - nodes.mean(axis=0)
-        for name, pose in truth.T_world_camera.items()
-    ]
+    shifts = [transform(off, nodes).mean(axis=0) - nodes.mean(axis=0) for off in _displacements(truth, episode)]
     return {
         "camera_mm": 1e3 * max(float(np.linalg.norm(shift)) for shift in shifts),
-        "log_late_ms": 1e3 * refined["lag_s"],
+        "log_late_ms": 1e3 * episode.meta["quality"]["refinement"]["lag_s"],
     }
 
 
-def _angle(found: NDArray[np.float64], true: NDArray[np.float64]) -> float:
-    """[°] between two rigid images [..., 3] of the same points (Kabsch)."""
-    a, b = (points.reshape(-1, 3) - points.reshape(-1, 3).mean(axis=0) for points in (found, true))
-    u, _, vt = np.linalg.svd(a.T @ b)
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return math.degrees(math.acos(min(1.0, max(-1.0, (np.trace(turn) - 1) / 2))))
+def _displacements(truth: Truth, episode: Episode) -> list[NDArray[np.float64]]:
+    """[4, 4] of each camera, from where something is to where the clouds have it, since preprocessing had it elsewhere."""
+    refined = episode.meta.get("quality", {}).get("refinement", {}).get("T_world_camera")
+    if refined is None:
+        raise EpisodeError(
+            "The episode does not give the refined camera poses: preprocess it with `preprocess.raw.refine: true`."
+        )
+    return [np.array(refined[name]) @ inverse(pose) for name, pose in truth.T_world_camera.items()]
 
 
 def pose_rows(found: Sequence[Sequence[dict[str, Any]]]) -> list[list[str]]:
@@ -208,13 +201,3 @@ def pose_page(rows: Sequence[Sequence[str]], recordings: Sequence[dict[str, Any]
         "",
     ]
     return "\n".join(lines)
-
-
-def parsed(nuisance: Sequence[str]) -> tuple[str, ...]:
-    """
-    Raises:
-        ConfigError: one that no fit takes.
-    """
-    for one in nuisance:
-        parse_priors(one)
-    return tuple(nuisance)

@@ -11,6 +11,7 @@ import typer
 
 from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.fit import FitSpace, Objective, solve
+from diffcloud.fit.pose import parse_priors
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import folders_in, write_text
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
@@ -19,7 +20,7 @@ from diffcloud.sensing.evaluation import CloudFigures, evaluate_clouds, visible_
 from diffcloud.sensing.recorder import Truth, read_truth
 from pipeline.config import EpisodesConfig, FitConfig, load_config
 from pipeline.console import JsonFlag, ParamsFile, finish, output, progress_bar, writes
-from pipeline.recorded_poses import PoseJob, parsed, pose_page, pose_rows
+from pipeline.recorded_poses import PoseJob, pose_page, pose_rows
 from pipeline.scenario_options import choose_scenario
 from pipeline.workers import run_all
 
@@ -49,8 +50,10 @@ def recordings(
     if not found:
         raise ConfigError(f"{recorded} holds no synthetic raw episodes of {', '.join(config.scenarios)}.")
     if nuisance:
+        for one in nuisance:
+            parse_priors(one)  # refused before anything is fitted
         jobs = [
-            PoseJob(choose_scenario(name), folder, episodes / name / f"{folder.name}.npz", parsed(nuisance), config.fit)
+            PoseJob(choose_scenario(name), folder, episodes / name / f"{folder.name}.npz", tuple(nuisance), config.fit)
             for name, folder in found
         ]
         _poses(jobs, workers, out, config.episodes, json)

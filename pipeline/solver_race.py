@@ -15,20 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from diffcloud.errors import DivergedError
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.fit import GaussNewtonSettings, JointObjective, Objective, solve
 from diffcloud.fit.solvers import SOLVERS, Settings
 from diffcloud.io.episodes import Episode
-from diffcloud.io.files import read_json, write_json
-from diffcloud.io.fingerprints import fingerprint
+from diffcloud.io.files import write_json
+from diffcloud.io.fingerprints import fingerprint, kept_record
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.whole_surface import sample_surface
 from diffcloud.sim.properties import PARAMETERS
-from diffcloud.sim.simulate import rollout
 from pipeline.config import FitConfig
+from pipeline.episodes import simulated_frames
 from pipeline.fit_jobs import FitJob, Recording
 from pipeline.scenario_options import choose_scenario
 from pipeline.workers import Tell
@@ -74,10 +73,8 @@ class RaceJob:
         """
         path = self.out / self.scenario.name / str(self.count) / f"{self.index:04d}.json"
         mark = fingerprint([self.scenario, self.names, self.index, self.seed, BUDGET, WITHIN], packages=_CODE)
-        if path.is_file():
-            kept = read_json(path)
-            if isinstance(kept, dict) and kept.get("fingerprint") == mark:
-                return kept
+        if (kept := kept_record(path, mark)) is not None:
+            return kept
         truth = self.truth()
         recording = Recording(self.scenario, self.label, self._episode(truth))
         job = FitJob(self.label, [recording], FitConfig(parameters=self.names), self.out)
@@ -106,14 +103,10 @@ class RaceJob:
         return {name: found[name] for name in self.names}
 
     def _episode(self, truth: dict[str, float]) -> Episode:
-        scene = self.scenario.scene
-        system, _ = scene.build()
-        sets = {name: torch.tensor([value], dtype=torch.float64) for name, value in truth.items()}
-        with torch.no_grad():
-            run = rollout(system, self.scenario.steps, properties=self.scenario.properties(system, sets))
-        nodes, times = run.positions[0, :: scene.frame_steps].numpy(), run.times[:: scene.frame_steps].numpy()
+        sets = {name: np.array([value]) for name, value in truth.items()}
+        system, (nodes,), times = simulated_frames(self.scenario, sets)
         # what depth cameras record comes without its table
-        obstacles = scene.surrounding.obstacles if self.scenario.recorder == "whole_surface" else ()
+        obstacles = self.scenario.scene.surrounding.obstacles if self.scenario.recorder == "whole_surface" else ()
         seen = sample_surface(
             nodes, system.mesh.faces, times, obstacles[0] if obstacles else None, points=self.scenario.points,
             seed=self.seed, meta={"truth": truth},

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 import diffcloud
+from diffcloud.io.files import read_json
 
 
 def fingerprint(plan: Any, *, packages: Sequence[str]) -> str:
@@ -28,6 +29,16 @@ def fingerprint(plan: Any, *, packages: Sequence[str]) -> str:
             digest.update(source.read_bytes())
     digest.update(json.dumps([torch.__version__, np.__version__, _described(plan)], sort_keys=True).encode())
     return digest.hexdigest()
+
+
+def kept_record(path: Path, mark: str) -> dict[str, Any] | None:
+    """The JSON object that an earlier run left at `path`, if it has this fingerprint; None if there is none.
+
+    Raises:
+        DiffCloudError: a file that is no JSON.
+    """
+    kept = read_json(path) if path.is_file() else None
+    return kept if isinstance(kept, dict) and kept.get("fingerprint") == mark else None
 
 
 def _described(value: Any) -> Any:
