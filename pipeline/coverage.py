@@ -177,6 +177,7 @@ class CoverageJob:
             within=self.config.evaluate.within,
             doubts=self.config.evaluate.doubts,
             restarts=RESTARTS,
+            seen=outcome.scan,
         )
         told = {"loss": outcome.loss, "stop_reason": outcome.stop_reason, "simulations": outcome.simulations}
         return told | {"seconds": outcome.seconds, "intervals": found.model_dump(mode="json")}

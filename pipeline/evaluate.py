@@ -15,7 +15,7 @@ from rich.table import Table
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, Intervals, significant, state_intervals
 from diffcloud.evaluation.markdown import comparison_page
-from diffcloud.evaluation.methods import space_of
+from diffcloud.evaluation.methods import scan_of, space_of
 from diffcloud.evaluation.summary import PREDICTORS, label, largest_sources, sentences, tables
 from diffcloud.evaluation.summary import metrics as summary_metrics
 from diffcloud.fit import JointObjective, Objective, read_fit
@@ -134,8 +134,9 @@ def intervals(
         members.append(Objective(chosen, read_episode(path), **measure))
     objective = members[0] if len(members) == 1 else JointObjective(members)
     found = state_intervals(
-        objective, space_of(record), record.fitted, level=level, within=within, doubts=doubts, restarts=RESTARTS
-    )
+        objective, space_of(record), record.fitted,
+        level=level, within=within, doubts=doubts, restarts=RESTARTS, seen=scan_of(record),
+    )  # fmt: skip
     if out is not None:
         write_json(with_suffix(out, ".json"), found.model_dump(mode="json"))
     if not json:

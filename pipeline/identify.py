@@ -15,7 +15,7 @@ import yaml
 
 from diffcloud.errors import ConfigError, DiffCloudError, EpisodeError
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, Intervals, significant, state_intervals
-from diffcloud.evaluation.methods import space_of
+from diffcloud.evaluation.methods import scan_of, space_of
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitRecord, JointObjective, Objective
 from diffcloud.fit.joint import AnyObjective
@@ -307,7 +307,7 @@ def _stated(
     init: Mapping[str, float] = {}
     for left in range(RESTARTS, -1, -1):
         record, objective, job, steps = fit(settings, steps, init)
-        found = state_intervals(objective, space_of(record), record.fitted, level=level, within=within)
+        found = state_intervals(objective, space_of(record), record.fitted, level=level, within=within, seen=scan_of(record))
         if found.lower is None or not left:
             break
         near = ", ".join(f"{name} {value:.3g}" for name, value in found.lower.items())

@@ -131,8 +131,10 @@ def compare_episode(
         return EpisodeRecord(record, seconds)
     if settings.level is not None and len(fit.episodes) == 1:  # those of a joint fit are of all its recordings together
         told_intervals = state_intervals(
-            objective, space, best, level=settings.level, within=settings.within, doubts=settings.doubts, restarts=RESTARTS
-        )
+            objective, space, best,
+            level=settings.level, within=settings.within, doubts=settings.doubts, restarts=RESTARTS,
+            seen=methods.scan_of(fit),
+        )  # fmt: skip
         record["intervals"] = told_intervals.model_dump(mode="json") | {"note": node_set_note(scenario)}
     objective.reseed(fit.measure.seed)
     if settings.landscape_size:

@@ -28,7 +28,7 @@ from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis
 from diffcloud.fit.result import physical_values
-from diffcloud.fit.scan import scan
+from diffcloud.fit.scan import Scan, scan
 from diffcloud.fit.solvers import GaussNewtonSettings, solve
 from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, Uncertainty, noise_mm, uncertainty
 from diffcloud.io.files import read_json
@@ -135,6 +135,7 @@ def state_intervals(
     within: float = WITHIN,
     doubts: Mapping[str, float] = MATERIAL_DOUBTS,
     restarts: int = 0,
+    seen: Scan | None = None,
 ) -> Intervals:
     """
     Args:
@@ -144,18 +145,20 @@ def state_intervals(
         doubts: of what is not fitted, see `fit.uncertainty`.
         restarts: how often Gauss–Newton may start again at a clearly lower loss that is met on the way; the intervals are
             then those of where it ends.
+        seen: the losses beside the fitted place, where they are known; otherwise they are simulated.
 
     Raises:
         DivergedError: the fitted motion diverges.
     """
-    found, lower = _with_scan(objective, space, uncertainty(objective, space, values, doubts=doubts))
+    found, lower = _with_scan(objective, space, uncertainty(objective, space, values, doubts=doubts), seen)
     if lower is not None and restarts > 0:
         outcome = solve(objective, space, GaussNewtonSettings(starts=1, screen=0, init=lower))
         if outcome.stop_reason == "interrupted":
             raise KeyboardInterrupt
         told_again = state_intervals(
-            objective, space, outcome.values, level=level, within=within, doubts=doubts, restarts=restarts - 1
-        )
+            objective, space, outcome.values,
+            level=level, within=within, doubts=doubts, restarts=restarts - 1, seen=outcome.scan,
+        )  # fmt: skip
         return told_again.model_copy(update={"restarts": told_again.restarts + 1})
     total = found.covariance
     deviations = np.sqrt(np.maximum(total.diagonal(), 1e-300))
@@ -241,12 +244,19 @@ def state_intervals(
     )
 
 
-def _with_scan(objective: AnyObjective, space: FitSpace, found: Uncertainty) -> tuple[Uncertainty, dict[str, float] | None]:
-    """The uncertainty with one more source: how far along its principal axes the loss stays as low as noise of so few
-    clusters may make it. And the values of a clearly lower loss, if the scan meets one."""
+def _with_scan(
+    objective: AnyObjective, space: FitSpace, found: Uncertainty, seen: Scan | None
+) -> tuple[Uncertainty, dict[str, float] | None]:
+    """The uncertainty with one more source: how far along the scan's axes the loss stays as low as noise of so few clusters
+    may make it. And the values of a clearly lower loss, if the scan meets one.
+
+    Args:
+        seen: the scan of the solver; without it, one along the principal axes of the covariance.
+    """
     centre = torch.from_numpy(found.places)
-    inverse = torch.from_numpy(np.linalg.pinv(found.covariance, hermitian=True))
-    seen, _ = scan(objective, space, centre, inverse)
+    if seen is None:
+        inverse = torch.from_numpy(np.linalg.pinv(found.covariance, hermitian=True))
+        seen, _ = scan(objective, space, centre, inverse)
     axis = Axis.of(space)
     of_data = mean_loss(torch.from_numpy(found.losses)[:, None], paper=objective.paper)
     loss = float(of_data + space.prior_loss(axis.values(centre[None]), objective.length_unit_m))

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from diffcloud.fit import AdamSettings, CmaEsSettings, FitRecord, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
 from diffcloud.fit.parameters import Variable
+from diffcloud.fit.scan import Scan
 from diffcloud.fit.solvers import SOLVER_NAMES, SOLVERS, FitOutcome, SearchSettings
 
 Rival = Literal["single_start", "middle", "random_search", "cma_es"]
@@ -54,6 +55,11 @@ def space_of(fit: FitRecord) -> FitSpace:
         tuple(Variable(name, low, high, prior) for name, (low, high), prior in free),
         {name: entry.value for name, entry in fit.parameters.items() if entry.bounds is None},
     )
+
+
+def scan_of(fit: FitRecord) -> Scan | None:
+    """The losses beside the fitted place; None if the solver has not looked around there."""
+    return None if fit.scan is None else Scan.of(fit.scan)
 
 
 def fitted(fit: FitRecord) -> Estimate:

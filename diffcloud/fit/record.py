@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from diffcloud.errors import ConfigError
 from diffcloud.io.files import read_json
 
-SCHEMA = 5
+SCHEMA = 6
 """Of the file. Another one is refused, by name."""
 
 
@@ -154,6 +154,24 @@ class History(_Model):
         return self
 
 
+class ScanRecord(_Model):
+    """Losses beside the fitted place, on the axis of the fit: a directions, n places along each; k fitted parameters."""
+
+    directions: list[list[Annotated[float, Field(ge=-1.001, le=1.001)]]]
+    """[a][k]"""
+    lengths: list[list[Annotated[float, Field(ge=-1e3, le=1e3)]]]
+    """[a][n]"""
+    losses: list[list[NonNegative | None]]
+    """[a][n] with priors; None of what diverged, or grew beyond `LARGEST`."""
+
+    @model_validator(mode="after")
+    def _has_one_shape(self) -> Self:
+        counts = {len(row) for row in (*self.lengths, *self.losses)}
+        if not (len(self.directions) == len(self.lengths) == len(self.losses) > 0 and len(counts) == 1 and 0 not in counts):
+            raise ValueError("directions [a][k], lengths [a][n] and losses [a][n] must be of one shape")
+        return self
+
+
 class FitRecord(_Model):
     """One fit."""
 
@@ -188,11 +206,19 @@ class FitRecord(_Model):
     settings: dict[str, Annotated[int, Field(ge=0)] | bool | NonNegative | None]
     """Of the solver."""
     history: History
+    scan: ScanRecord | None
+    """Of the place where it ended; None if the solver has not looked around there."""
     failures: list[str]
     """Of starts that diverged."""
     versions: dict[str, str]
     fingerprint: Text = ""
     """Of inputs and code, by which a later call knows a finished fit."""
+
+    @model_validator(mode="after")
+    def _scans_what_is_fitted(self) -> Self:
+        if self.scan is not None and {len(row) for row in self.scan.directions} != {len(self.fitted)}:
+            raise ValueError("scan.directions must hold one number for each fitted parameter")
+        return self
 
     @property
     def values(self) -> dict[str, float]:

@@ -170,6 +170,7 @@ def describe_fit(
         ),
         settings={name: value for name, value in asdict(settings).items() if name != "init"},
         history=_history(outcome),
+        scan=None if outcome.scan is None else outcome.scan.record(),
         failures=list(outcome.failures),
         versions={"diffcloud": diffcloud.__version__, "torch": torch.__version__, "python": platform.python_version()},
     )

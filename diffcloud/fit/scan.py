@@ -14,6 +14,7 @@ from torch import Tensor
 from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
+from diffcloud.fit.record import LARGEST, ScanRecord
 from diffcloud.fit.residuals import Axis
 
 LOWER = 0.02
@@ -40,6 +41,18 @@ class Scan:
         """Where the loss is lowest [k], and that loss."""
         axis, index = divmod(int(self.losses.argmin()), self.losses.shape[1])
         return centre + self.lengths[axis, index] * self.directions[axis], float(self.losses[axis, index])
+
+    @staticmethod
+    def of(record: ScanRecord) -> Scan:
+        """That of a fit's record."""
+        directions, lengths = (torch.tensor(part, dtype=torch.float64) for part in (record.directions, record.lengths))
+        losses = [[torch.inf if loss is None else loss for loss in row] for row in record.losses]
+        return Scan(directions, lengths, torch.tensor(losses, dtype=torch.float64))
+
+    def record(self) -> ScanRecord:
+        """As a fit's file has it."""
+        losses = [[loss if loss <= LARGEST else None for loss in row] for row in self.losses.tolist()]
+        return ScanRecord(directions=self.directions.tolist(), lengths=self.lengths.tolist(), losses=losses)
 
     def lower(self, centre: Tensor, loss: float) -> Tensor | None:
         """A place [k] of another minimum, lower than the centre's loss; None if the scan has met none."""

@@ -7,12 +7,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from scipy.stats import norm, t
 
 from diffcloud.evaluation import intervals as module
 from diffcloud.evaluation.intervals import RESTARTS, significant, state_intervals
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitSpace, Objective
+from diffcloud.fit.scan import scan
 from diffcloud.fit.uncertainty import Uncertainty, uncertainty
 from tests.conftest import small_lift
 from tests.evaluation.bowls import Bowl
@@ -39,7 +41,7 @@ def told(objective, monkeypatch):
         found = Uncertainty(space.names, places, np.ones(1), covariances, clusters, np.full(k, step))
         monkeypatch.setattr(module, "uncertainty", lambda *arguments, **given: found)
         monkeypatch.setattr(module, "_misfit", lambda *arguments: misfit)
-        monkeypatch.setattr(module, "_with_scan", lambda objective, space, found: (found, lower))
+        monkeypatch.setattr(module, "_with_scan", lambda objective, space, found, seen: (found, lower))
         return state_intervals(objective, space, values, **options)
 
     return tell
@@ -155,11 +157,11 @@ class Wells(Bowl):
 class TestScan:
     SPACE = FitSpace.build(["stretch"])
 
-    def found(self, depth):
+    def found(self, depth, seen=None):
         well = Wells()
         well.depth = depth
         flat = Uncertainty(("stretch",), np.zeros(1), np.ones(1), {"noise": np.array([[1e-6]])}, 16, np.zeros(1))
-        return module._with_scan(well, self.SPACE, flat)
+        return module._with_scan(well, self.SPACE, flat, seen)
 
     def test_what_noise_hides_widens_the_interval(self):
         """Of 16 clusters a loss 20 % higher: 0.1 is hidden, 0.25 is not; with the second minimum it is."""
@@ -174,6 +176,14 @@ class TestScan:
     def test_a_lower_loss_is_told(self):
         _, lower = self.found(1.2)
         assert lower["stretch"] == pytest.approx(math.exp(0.25))
+
+    def test_what_the_solver_saw_is_not_simulated_again(self):
+        """Its losses count, not those of the objective at hand."""
+        well = Wells()
+        well.depth = 0.6
+        seen, _ = scan(well, self.SPACE, torch.zeros(1).double(), torch.ones(1, 1).double())
+        told, _ = self.found(0.0, seen)
+        assert told.sources["nearly as low"] == self.found(0.6)[0].sources["nearly as low"]
 
 
 def test_the_misfit_is_the_fits_own(objective):

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from diffcloud.fit import FitSpace, GaussNewtonSettings, fit_gauss_newton, residuals
+from diffcloud.fit.record import ScanRecord
 from diffcloud.fit.residuals import Axis, Linearisation
-from diffcloud.fit.scan import LENGTHS, scan
+from diffcloud.fit.scan import LENGTHS, Scan, scan
 from diffcloud.fit.solvers import gauss_newton
 from tests.evaluation.bowls import SPACE, Bowl
 
@@ -46,6 +48,29 @@ def test_a_fit_goes_on_where_a_scan_meets_a_lower_loss(monkeypatch):
     assert [float(row.min()) for row in found.history.losses] == sorted(
         (float(row.min()) for row in found.history.losses), reverse=True
     )
+
+
+def test_a_fit_keeps_what_it_saw_where_it_ended(monkeypatch):
+    """But not what it saw before it went on, nor anything where it has not looked."""
+    monkeypatch.setattr(gauss_newton, "linearise", linearised)
+    space = FitSpace.build(["stretch"])
+    start = GaussNewtonSettings(starts=1, screen=0, init={"stretch": 1.1})
+    found = fit_gauss_newton(TwoWells(), space, start)
+    place = Axis.of(space).places(torch.tensor([list(found.values.values())]).double())[0]
+    assert float(found.scan.losses.min()) >= found.loss
+    again, _ = scan(TwoWells(), space, place, torch.ones(1, 1).double())
+    torch.testing.assert_close(found.scan.losses, again.losses)
+    assert fit_gauss_newton(TwoWells(), space, replace(start, scans=0)).scan is None
+    assert fit_gauss_newton(TwoWells(), space, replace(start, scans=1)).scan is None
+
+
+def test_it_is_the_same_after_a_file():
+    found = Scan(torch.eye(2).double(), torch.tensor([[-0.1, 0.1], [-0.2, 0.3]]).double(), torch.ones(2, 2).double())
+    found.losses[1, 0] = math.inf
+    told = ScanRecord.model_validate_json(found.record().model_dump_json())
+    assert told.losses == [[1.0, 1.0], [None, 1.0]]
+    for before, after in zip(vars(found).values(), vars(Scan.of(told)).values(), strict=True):
+        assert before.equal(after)
 
 
 def test_it_goes_along_the_principal_axes_within_the_bounds():

@@ -244,7 +244,6 @@ class TestTowelOfAnotherSimulator:
 
     @pytest.mark.longest
     def test_soft_in_one_recording(self, tmp_path):
-        """Its first fit ends beside the lowest loss; stating the interval meets that, and the fit starts again there."""
         lifted_by_mujoco(tmp_path, "soft", stretching=10.0)
         found = self.identified(tmp_path, "soft")
         told = found["parameters"]["stretch"]

@@ -36,7 +36,6 @@ def test_an_arm_that_is_shaped_otherwise_does_not_look_late(tmp_path, mask):
     assert abs(np.mean(off)) < 0.001
 
 
-@pytest.mark.slow
 @pytest.mark.longest
 def test_the_lag_is_found_without_bias(tmp_path, mask):
     """Eight lifts and eight folds, of four lags and speeds."""

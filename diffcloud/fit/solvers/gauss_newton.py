@@ -80,7 +80,7 @@ def fit_gauss_newton(
     start, simulations = _starts(objective, space, settings, axis)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
-    scans = 0
+    scans, looked = 0, None
     try:
         at = linearise(objective, space, start)
         simulations += at.simulations
@@ -107,6 +107,7 @@ def fit_gauss_newton(
                 simulations += spent
                 lower = found_near.lower(place, float(search.losses.min()))
                 if lower is None:
+                    looked = found_near
                     break
                 at = linearise(objective, space, lower[None])
                 simulations += at.simulations
@@ -130,6 +131,7 @@ def fit_gauss_newton(
         stop_reason=reason,
         seconds=time.perf_counter() - began,
         history=history,
+        scan=looked,
     )
 
 

@@ -9,6 +9,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from diffcloud.fit.scan import Scan
+
 StopReason = Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
 """`converged`: the best start cannot get lower by more than a thousandth, or the candidates of a search lie together.
 `rough`: steps along its slope lower the loss no more. `threshold`: low enough. `iterations`, or `simulations` of a search:
@@ -55,6 +57,8 @@ class FitOutcome:
     history: FitHistory
     failures: tuple[str, ...] = ()
     """Messages of starts that diverged."""
+    scan: Scan | None = None
+    """Of the place where it ended, which then has no lower minimum beside it."""
 
     @property
     def iterations(self) -> int:
