@@ -307,7 +307,8 @@ def _stated(
     init: Mapping[str, float] = {}
     for left in range(RESTARTS, -1, -1):
         record, objective, job, steps = fit(settings, steps, init)
-        found = state_intervals(objective, space_of(record), record.fitted, level=level, within=within, seen=scan_of(record))
+        space, seen = space_of(record), scan_of(record)
+        found = state_intervals(objective, space, record.fitted, level=level, within=within, seen=seen)
         if found.lower is None or not left:
             break
         near = ", ".join(f"{name} {value:.3g}" for name, value in found.lower.items())

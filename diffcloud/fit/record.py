@@ -166,7 +166,7 @@ class ScanRecord(_Model):
 
     @model_validator(mode="after")
     def _has_one_shape(self) -> Self:
-        counts = {len(row) for row in (*self.lengths, *self.losses)}
+        counts = {len(row) for row in self.lengths} | {len(row) for row in self.losses}
         if not (len(self.directions) == len(self.lengths) == len(self.losses) > 0 and len(counts) == 1 and 0 not in counts):
             raise ValueError("directions [a][k], lengths [a][n] and losses [a][n] must be of one shape")
         return self

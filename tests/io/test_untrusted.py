@@ -204,5 +204,5 @@ def test_a_fit_whose_scan_has_no_shape_is_refused(tmp_path, changes):
     assert read_fit(tmp_path / "f.json").scan.losses == [[0.2, None]]
     told["scan"] |= changes
     (tmp_path / "f.json").write_text(json.dumps(told))
-    with pytest.raises(ConfigError, match="f.json"):
+    with pytest.raises(ConfigError, match=r"f\.json"):
         read_fit(tmp_path / "f.json")
