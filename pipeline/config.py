@@ -14,7 +14,7 @@ from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
 from diffcloud.evaluation.intervals import LEVEL, WITHIN
 from diffcloud.fit.pose import parse_priors
 from diffcloud.fit.solvers import SOLVERS, Settings
-from diffcloud.fit.solvers.gauss_newton import ROUGH_SCREEN
+from diffcloud.fit.solvers.gauss_newton import ROUGH_SCREEN, ROUGH_STARTS
 from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, check_doubts
 from diffcloud.io.files import read_yaml
 from diffcloud.io.raw_episodes import ScenePlacement
@@ -183,7 +183,8 @@ class FitConfig(Section):
     iterations: Count | None = None
     """Of gauss_newton and adam: steps at most; by default 20 and 50."""
     starts: Count | None = None
-    """Of gauss_newton and adam: descents from as many places; by default 3 and 1."""
+    """Of gauss_newton and adam: descents from as many places, of gauss_newton at most; by default 8 (3 if cameras
+    recorded, or with the linearised integrator) and 1."""
     screen: CountOrNone | None = None
     """Of gauss_newton and adam: candidates simulated once to choose the starts from; by default 24 of gauss_newton (96 with
     the linearised integrator), none of adam, whose further starts are then spread over the box."""
@@ -245,7 +246,7 @@ class FitConfig(Section):
         if self.solver == "adam":
             given |= {"learning_rate": scenario.learning_rate, "patience": 10, "smoothing": SMOOTHING}
         elif self.solver == "gauss_newton" and scenario.scene.integrator == "linearised":
-            given["screen"] = ROUGH_SCREEN
+            given |= {"screen": ROUGH_SCREEN, "starts": ROUGH_STARTS}
         own = scenario.threshold if self.paper else 0.0
         given |= {"seed": self.seed, "threshold": own if self.threshold is None else self.threshold}
         return SOLVERS[self.solver](**given | self._solver_options())

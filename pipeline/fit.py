@@ -66,7 +66,10 @@ def fit(
         int | None, typer.Option(help="Of cma_es and random_search: as many at most. Default: 200.")
     ] = None,
     starts: Annotated[
-        int | None, typer.Option(help="Descents from as many places. Default: 3 of gauss_newton, 1 of adam.")
+        int | None,
+        typer.Option(
+            help="Descents from as many places; gauss_newton: at most. Default: 8 (3 if cameras recorded); 1 of adam."
+        ),
     ] = None,
     screen: Annotated[
         int | None,

@@ -51,17 +51,28 @@ class NeighbourIndex:
         """Median distance between neighbours [m]."""
         return self._surface[1]
 
+    @property
+    def from_surface(self) -> tuple[float, float]:
+        """Mean squared distances [m²] from a place of the surface to the nearest point, and from a point to the surface:
+        places are points dropped onto the plane of their neighbours, and each one's own point does not count."""
+        return self._surface[2]
+
     @cached_property
-    def _surface(self) -> tuple[Tensor, float]:
-        from scipy.spatial import cKDTree  # slow to import, and only second derivatives need it
+    def _surface(self) -> tuple[Tensor, float, tuple[float, float]]:
+        from scipy.spatial import cKDTree  # slow to import, and only fits need it
 
         points = _as_array(self.points)
         count = min(_NEIGHBOURS + 1, len(points))
         if count < 3:
-            return torch.zeros_like(self.points), 0.0
+            return torch.zeros_like(self.points), 0.0, (0.0, 0.0)
         distance, index = cKDTree(points).query(points, k=count)
-        normals = torch.from_numpy(flattest_directions(points, index))
-        return normals.to(self.points), float(np.median(distance[:, 1]))
+        normals = flattest_directions(points, index)
+        beside = points[index[:, 1:]]
+        above = ((points - beside.mean(axis=1)) * normals).sum(axis=-1)
+        places = points - above[:, None] * normals
+        nearest = np.square(beside - places[:, None]).sum(axis=-1).min(axis=1)
+        away = float(nearest.mean()), float(np.square(above).mean())
+        return torch.from_numpy(normals).to(self.points), float(np.median(distance[:, 1])), away
 
     @cached_property
     def _tree(self) -> Tree:

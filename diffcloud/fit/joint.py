@@ -46,6 +46,12 @@ class JointObjective:
     def length_unit_m(self) -> float:
         return self.members[0].length_unit_m
 
+    @property
+    def explained(self) -> float:
+        """As of `Objective`."""
+        levels = torch.tensor([[one.explained] for one in self.members], dtype=torch.float64)
+        return float(mean_loss(levels, paper=self.paper))
+
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Losses [B], as of `Objective`."""
         return mean_loss(torch.stack(map_threads(lambda one: one(parameters), self.members)), paper=self.paper)

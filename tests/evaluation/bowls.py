@@ -24,6 +24,7 @@ class Bowl:
     length_unit_m: float = 1.0
     members: tuple[None, ...] = (None,)
     paper: bool = False
+    explained: float = 0.0
     calls: int = 0
 
     def __post_init__(self) -> None:

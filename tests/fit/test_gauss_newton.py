@@ -180,7 +180,31 @@ class TestFits:
     def test_losses_never_rise(self):
         found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=3, screen=7))
         losses = torch.stack(found.history.losses)
-        assert bool((losses.diff(dim=0) <= 0).all())
+        begun = losses[-1].isfinite()
+        assert bool((losses[:, begun].diff(dim=0).nan_to_num() <= 0).all())
+
+    def test_starts_are_followed_one_after_the_other_until_one_explains_the_recording(self, monkeypatch):
+        settings, fits = GaussNewtonSettings(starts=3, screen=7), []
+        for explained in (1e-12, 1.0):  # never, at once
+            monkeypatch.setattr(Objective, "explained", explained)
+            fits.append(fit_gauss_newton(lifted(), SPACE, settings))
+        every, enough = fits
+        begun = [torch.stack(found.history.losses).isfinite().sum(0).tolist() for found in (every, enough)]
+        assert begun[1][1:] == [0, 0]
+        assert begun[0][0] > begun[0][1] > begun[0][2] > 0
+        assert enough.simulations < every.simulations
+        assert enough.stop_reason == every.stop_reason == "converged"
+
+    def test_the_truth_explains_a_recording_and_others_do_not(self):
+        objective = lifted(nuisance={})
+        told = {name: torch.tensor([TRUTH[name], 1.3 * TRUTH[name]]).double() for name in TRUTH} | {
+            "mass": torch.tensor([TRUTH["mass"]] * 2).double()
+        }
+        right, wrong = objective(told).tolist()
+        assert right < objective.explained < wrong
+        assert lifted().explained == 0.0  # the paper's measure
+        objective.episode = replace(objective.episode, camera=np.zeros(len(objective.episode.points), np.uint8))
+        assert objective.explained == 0.0  # a camera may have missed a part of it
 
     def test_when_all_diverge(self, monkeypatch):
         objective = lifted()

@@ -50,6 +50,22 @@ def test_a_fit_goes_on_where_a_scan_meets_a_lower_loss(monkeypatch):
     )
 
 
+@pytest.mark.parametrize(("apart", "followed"), [(0.0, 2), (0.1, 3)])
+def test_where_it_is_not_known_what_explains_a_recording_two_equal_ends_are_enough(monkeypatch, apart, followed):
+    """Of three starts, each in a well of its own, as deep as stated."""
+
+    class Wells(Bowl):
+        def __call__(self, parameters):
+            u = parameters["stretch"].log()
+            wells = [0.01 + (u - middle).square() + apart * index for index, middle in enumerate((-2.0, 0.0, 2.0))]
+            return torch.stack(wells).amin(0)
+
+    monkeypatch.setattr(gauss_newton, "linearise", linearised)
+    space = FitSpace.build(["stretch"], bounds={"stretch": (0.05, 20.0)})
+    found = fit_gauss_newton(Wells(), space, GaussNewtonSettings(screen=0, scans=0))
+    assert int(found.history.losses[-1].isfinite().sum()) == followed
+
+
 def test_a_fit_keeps_what_it_saw_where_it_ended(monkeypatch):
     """But not what it saw before it went on, nor anything where it has not looked."""
     monkeypatch.setattr(gauss_newton, "linearise", linearised)

@@ -1,4 +1,4 @@
-"""Gauss–Newton with Levenberg–Marquardt damping and bounds, over several starts at once.
+"""Gauss–Newton with Levenberg–Marquardt damping and bounds, from one start after the other.
 
 With half of the loss's slope g and of its curvature H on the axis of `residuals.Axis`, a step s solves
 
@@ -6,8 +6,9 @@ With half of the loss's slope g and of its curvature H on the axis of `residuals
 
 over the variables that no bound holds (Marquardt 1963; Madsen, Nielsen and Tingleff 2004, section 3.2). Each start keeps
 its own λ: it falls by how much of the predicted decrease a step brings, and grows, faster and faster, where it brings
-none. Starts are the best of a screen of candidates spread over the box. Where they have ended, losses along the principal
-axes of the best place tell whether another minimum is lower nearby; from there a start goes on.
+none. Starts are the best of a screen of candidates spread over the box, the best one first, and the rest stays where it is
+as soon as one explains the recording; where that cannot be known, as soon as two have ended equally low. Then losses along
+the principal axes of the best place tell whether another minimum is lower nearby; from there it goes on.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ from diffcloud.fit.residuals import Axis, Linearisation, linearise
 from diffcloud.fit.scan import scan
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
 
-ROUGH_SCREEN = 96
-"""Candidates where the loss is too rough for derivatives: more minima, and their simulations cost a tenth."""
+ROUGH_SCREEN, ROUGH_STARTS = 96, 3
+"""Candidates and starts where the loss is too rough for derivatives: there are more minima, a candidate costs a tenth, and
+a step takes several simulations."""
 _FIRST_DAMPING = 1e-2
 _LARGEST_STEP = 1.0
 """On the axis: a factor e, or the whole range."""
@@ -37,7 +39,11 @@ _SMALLEST_STEP = 1e-3
 """A step below 0.1 % of a value, or a predicted decrease below this part of the loss, means that a start has arrived."""
 _SMALLEST_DECREASE = 1e-3
 _SAME = 0.02
-"""A start that comes as close to the best one, on the axis, leaves the rest of the way to it."""
+"""A start that comes as close to a better one, on the axis, leaves the rest of the way to it."""
+_MOST, _FEW = 8, 3
+"""Starts where it is known which loss explains the recording, and where not."""
+_EQUALLY = 1.01
+"""Losses within this factor are equally low."""
 _GIVE_UP = 6
 """Steps in vain, one after the other: the loss is rougher than its slope."""
 
@@ -54,8 +60,8 @@ class GaussNewtonSettings:
     """Times that a lower minimum is looked for around the best place; 0: never."""
     screen: int = 24
     """Candidates beside the first that are simulated once, without derivatives; 0: the starts are taken unseen."""
-    starts: int = 3
-    """The best of them, which are followed."""
+    starts: int | None = None
+    """The best of them, followed as far as it takes; by default 8 if it is known what explains the recording, else 3."""
     seed: int = 0
     """Of the candidates."""
     init: Mapping[str, float] = field(default_factory=dict)
@@ -77,56 +83,57 @@ def fit_gauss_newton(
     """
     began = time.perf_counter()
     axis = Axis.of(space)
-    start, simulations = _starts(objective, space, settings, axis)
+    explained = objective.explained
+    most = settings.starts or (_MOST if explained else _FEW)
+    places, simulations = _starts(objective, space, settings, axis, most)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
-    scans, looked = 0, None
+    scans, looked, ways = 0, None, _Ways(places, settings.iterations)
     try:
-        at = linearise(objective, space, start)
-        simulations += at.simulations
-        if not bool(torch.isfinite(at.losses).any()):
-            raise DivergedError(0, [], f"all {len(start)} starts diverged")
-        search = _Search(start, at)
-        for iteration in range(settings.iterations + 1):
-            _remember(history, search, axis)
-            if progress is not None:
-                best = axis.bounded(search.places[search.best]).tolist()
-                loss = float(search.losses.min())
-                progress(Progress(iteration, loss, loss, dict(zip(space.names, best, strict=True))))
-            if float(search.losses.min()) < settings.threshold:
-                reason = "threshold"
-                break
-            going = search.going
-            if not len(going):
-                reason = "converged" if bool(search.arrived[search.best]) else "rough"
-                if scans == settings.scans or iteration == settings.iterations:
+        while True:
+            way = ways.going
+            if way is not None:
+                tried = way.propose(*axis.ends)
+                found = linearise(objective, space, tried[None])
+                simulations += found.simulations
+                ways.judge(way, tried, found)
+            elif ways.waiting and not ways.enough(explained):
+                found = linearise(objective, space, ways.waiting[0][None])
+                simulations += found.simulations
+                ways.begin(found)
+            else:
+                reason = ways.best.end or reason
+                if scans == settings.scans or reason == "iterations":
                     break
                 scans += 1
-                place = search.places[search.best]
-                found_near, spent = scan(objective, space, place, search.normal[search.best])
+                seen, spent = scan(objective, space, ways.best.place, ways.best.normal)
                 simulations += spent
-                lower = found_near.lower(place, float(search.losses.min()))
+                lower = seen.lower(ways.best.place, ways.best.loss)
                 if lower is None:
-                    looked = found_near
+                    looked = seen
                     break
-                at = linearise(objective, space, lower[None])
-                simulations += at.simulations
-                going = search.restart(lower, at)
-                reason = "iterations"
-            if iteration < settings.iterations:
-                tried = search.propose(going, *axis.ends)
-                found = linearise(objective, space, tried)
+                found = linearise(objective, space, lower[None])
                 simulations += found.simulations
-                search.judge(going, tried, found)
+                ways.go_on(lower, found)
+            if not math.isfinite(ways.best.loss):
+                if ways.waiting:
+                    continue
+                raise DivergedError(0, [], f"all {len(places)} starts diverged")
+            _remember(history, ways, axis)
+            if progress is not None:
+                values = dict(zip(space.names, axis.bounded(ways.best.place).tolist(), strict=True))
+                progress(Progress(len(history.losses) - 1, ways.best.loss, ways.best.loss, values))
+            if ways.best.loss < settings.threshold:
+                reason = "threshold"
+                break
     except KeyboardInterrupt:
         if not history.losses:
             raise
         reason = "interrupted"
-    values = axis.bounded(search.places[search.best]).tolist()
     return FitOutcome(
-        values=dict(zip(space.names, values, strict=True)),
-        loss=float(search.losses.min()),
-        best_start=search.best,
+        values=dict(zip(space.names, axis.bounded(ways.best.place).tolist(), strict=True)),
+        loss=ways.best.loss,
+        best_start=ways.every.index(ways.best),
         simulations=simulations,
         stop_reason=reason,
         seconds=time.perf_counter() - began,
@@ -135,80 +142,110 @@ def fit_gauss_newton(
     )
 
 
-class _Search:
-    """B starts, each at its lowest place so far."""
+class _Way:
+    """From one start, at its lowest place so far."""
 
-    def __init__(self, places: Tensor, found: Linearisation) -> None:
-        self.places, self.losses = places.clone(), found.losses.clone()
-        self.slope, self.normal = found.slope.clone(), found.curvature.clone()
-        count = len(places)
-        self._damping = torch.full((count,), _FIRST_DAMPING, dtype=torch.float64)
-        self._growth = torch.full((count,), 2.0, dtype=torch.float64)
-        self._in_vain = torch.zeros(count, dtype=torch.long)
-        self.arrived = torch.zeros(count, dtype=torch.bool)
-        self._predicted = torch.zeros(count, dtype=torch.float64)
+    def __init__(self, place: Tensor, found: Linearisation, steps: int) -> None:
+        """
+        Args:
+            place: [k]
+            found: there.
+            steps: it may take.
+        """
+        self._take(place, found)
+        self._steps, self._damping, self._growth, self._in_vain = steps, _FIRST_DAMPING, 2.0, 0
+        self._predicted = 0.0
+        self.arrived = False
+
+    def _take(self, place: Tensor, found: Linearisation) -> None:
+        self.place, self.loss = place, float(found.losses[0])
+        self.slope, self.normal = found.slope[0], found.curvature[0]
 
     @property
-    def best(self) -> int:
-        return int(self.losses.argmin())
+    def end(self) -> StopReason | None:
+        """Why it goes no further; None while it does."""
+        if self.arrived:
+            return "converged"
+        if self._in_vain >= _GIVE_UP or not math.isfinite(self.loss):
+            return "rough"
+        return None if self._steps else "iterations"
+
+    def propose(self, low: Tensor, high: Tensor) -> Tensor:
+        """[k] the next place, between the bounds [k]."""
+        place, slope, normal = self.place, self.slope, self.normal
+        free = ~(((place <= low) & (slope > 0)) | ((place >= high) & (slope < 0))) & (normal.diagonal() > 0)
+        step = torch.zeros_like(place)
+        if bool(free.any()):
+            inner = normal[free][:, free]
+            step[free] = -torch.linalg.solve(inner + self._damping * inner.diagonal().diag(), slope[free])
+        step *= min(1.0, _LARGEST_STEP / max(float(step.abs().max()), 1e-300))
+        step = torch.minimum(torch.maximum(place + step, low), high) - place
+        self._predicted = float(-2 * slope @ step - step @ normal @ step)
+        return place + step
+
+    def judge(self, tried: Tensor, found: Linearisation) -> None:
+        """Take the step if it lowered the loss, and set the damping for the next."""
+        self._steps -= 1
+        step, decrease = float((tried - self.place).abs().max()), self.loss - float(found.losses[0])
+        self.arrived = step < _SMALLEST_STEP or self._predicted < _SMALLEST_DECREASE * self.loss
+        if decrease > 0:
+            ratio = decrease / max(self._predicted, 1e-300)
+            self._damping *= max(1 / 3, 1 - (2 * min(ratio, 1.0) - 1) ** 3)
+            self._growth, self._in_vain = 2.0, 0
+            self._take(tried, found)
+        else:
+            self._damping *= self._growth
+            self._growth *= 2
+            self._in_vain += 1
+
+
+class _Ways:
+    """From B starts, one after the other."""
+
+    def __init__(self, places: Tensor, steps: int) -> None:
+        """
+        Args:
+            places: [B, k] starts, in their order.
+            steps: each may take.
+        """
+        self.waiting, self.every, self._steps = list(places), list[_Way](), steps
 
     @property
-    def going(self) -> Tensor:
-        """Starts [b] that have neither arrived nor given up."""
-        return (~self.arrived & (self._in_vain < _GIVE_UP) & torch.isfinite(self.losses)).nonzero().flatten()
+    def best(self) -> _Way:
+        """Of those that have begun."""
+        return min(self.every, key=lambda way: way.loss)
 
-    def restart(self, place: Tensor, found: Linearisation) -> Tensor:
-        """Another place [k] in that of the highest loss, which has ended; its index [1]."""
-        row = int(self.losses.argmax()) if len(self.losses) > 1 else 0
-        self.places[row], self.losses[row] = place, found.losses[0]
-        self.slope[row], self.normal[row] = found.slope[0], found.curvature[0]
-        self._damping[row], self._growth[row], self._in_vain[row] = _FIRST_DAMPING, 2.0, 0
-        self.arrived[row] = False
-        return torch.tensor([row])
+    @property
+    def going(self) -> _Way | None:
+        """The one under way."""
+        return next((way for way in self.every if way.end is None), None)
 
-    def propose(self, going: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """[b, k] the next places of some starts, between the bounds [k]."""
-        tried = []
-        for start in going.tolist():
-            place, slope, normal = self.places[start], self.slope[start], self.normal[start]
-            free = ~(((place <= low) & (slope > 0)) | ((place >= high) & (slope < 0))) & (normal.diagonal() > 0)
-            step = torch.zeros_like(place)
-            if bool(free.any()):
-                inner = normal[free][:, free]
-                damped = inner + self._damping[start] * inner.diagonal().diag()
-                step[free] = -torch.linalg.solve(damped, slope[free])
-            step *= min(1.0, _LARGEST_STEP / max(float(step.abs().max()), 1e-300))
-            step = torch.minimum(torch.maximum(place + step, low), high) - place
-            self._predicted[start] = float(-2 * slope @ step - step @ normal @ step)
-            tried.append(place + step)
-        return torch.stack(tried)
+    def enough(self, explained: float) -> bool:
+        """Whether the best one explains the recording; if that is not known (0), whether another one is equally low."""
+        if explained or not self.every:
+            return bool(self.every) and self.best.loss <= explained
+        return sum(way.loss <= _EQUALLY * self.best.loss for way in self.every) > 1
 
-    def judge(self, going: Tensor, tried: Tensor, found: Linearisation) -> None:
-        """Take the steps that lowered a loss, and set each damping for the next."""
-        for row, start in enumerate(going.tolist()):
-            before, predicted = float(self.losses[start]), float(self._predicted[start])
-            decrease = before - float(found.losses[row])
-            step = float((tried[row] - self.places[start]).abs().max())
-            small = step < _SMALLEST_STEP or predicted < _SMALLEST_DECREASE * before
-            if decrease > 0:
-                ratio = decrease / max(predicted, 1e-300)
-                self._damping[start] *= max(1 / 3, 1 - (2 * min(ratio, 1.0) - 1) ** 3)
-                self._growth[start], self._in_vain[start] = 2.0, 0
-                self.places[start], self.losses[start] = tried[row], found.losses[row]
-                self.slope[start], self.normal[start] = found.slope[row], found.curvature[row]
-            else:
-                self._damping[start] *= self._growth[start]
-                self._growth[start] *= 2
-                self._in_vain[start] += 1
-            self.arrived[start] = small
-        beside = (self.places - self.places[self.best]).abs().amax(-1) < _SAME
-        beside[self.best] = False
-        self.arrived |= beside
+    def begin(self, found: Linearisation) -> None:
+        """The next start, with what was found there."""
+        self.every.append(_Way(self.waiting.pop(0), found, self._steps))
+
+    def judge(self, way: _Way, tried: Tensor, found: Linearisation) -> None:
+        """As of the way; one that comes close to a better one leaves it the rest."""
+        way.judge(tried, found)
+        if way is not self.best:
+            way.arrived |= float((way.place - self.best.place).abs().max()) < _SAME
+
+    def go_on(self, place: Tensor, found: Linearisation) -> None:
+        """From a lower place [k] than the best one's."""
+        self.every[self.every.index(self.best)] = _Way(place, found, self._steps)
 
 
-def _starts(objective: AnyObjective, space: FitSpace, settings: GaussNewtonSettings, axis: Axis) -> tuple[Tensor, int]:
-    """Places [B, k] to start at, and how many simulations it took to choose them."""
-    count = max(1 + settings.screen, settings.starts)
+def _starts(
+    objective: AnyObjective, space: FitSpace, settings: GaussNewtonSettings, axis: Axis, most: int
+) -> tuple[Tensor, int]:
+    """Places [B, k] to start at, of which there are at most so many, and how many simulations it took to choose them."""
+    count = max(1 + settings.screen, most)
     values = space.starts(count, seed=settings.seed, first=settings.init)[0].double()
     if not settings.screen:
         return axis.places(values), 0
@@ -218,10 +255,13 @@ def _starts(objective: AnyObjective, space: FitSpace, settings: GaussNewtonSetti
     order = losses.argsort()
     if settings.init:
         order = torch.cat([torch.zeros(1, dtype=torch.long), order[order > 0]])
-    return axis.places(values[order[: settings.starts]]), count * len(objective.members)
+    return axis.places(values[order[:most]]), count * len(objective.members)
 
 
-def _remember(history: FitHistory, search: _Search, axis: Axis) -> None:
-    history.losses.append(search.losses.clone())
-    history.values.append(axis.bounded(search.places))
-    history.gradients.append(2 * search.slope.clone())
+def _remember(history: FitHistory, ways: _Ways, axis: Axis) -> None:
+    """A row of all starts; those that have not begun have no loss yet."""
+    begun, waiting = ways.every, len(ways.waiting)
+    history.losses.append(torch.tensor([way.loss for way in begun] + [math.inf] * waiting, dtype=torch.float64))
+    history.values.append(axis.bounded(torch.stack([*(way.place for way in begun), *ways.waiting])))
+    slopes = torch.stack([way.slope for way in begun])
+    history.gradients.append(2 * torch.nn.functional.pad(slopes, (0, 0, 0, waiting)))
