@@ -182,6 +182,8 @@ class _Network:
     expected: bool
     seconds: Mapping[str, float]
     """Of its data set and its training."""
+    level: float | None
+    """Of the intervals that a posterior tells; None: none."""
 
     def of(self, episode: Episode) -> Estimate | Gap:
         if self.regressor is None:
@@ -192,11 +194,15 @@ class _Network:
         except EpisodeError as error:
             return Gap(self.model, str(error))
         values = dict(zip(prediction.names, prediction.values[0].tolist(), strict=True))
-        return predicted(self.model, values, {**self.seconds, "inference": time.perf_counter() - began})
+        seconds, intervals = {**self.seconds, "inference": time.perf_counter() - began}, None
+        if prediction.samples is not None and self.level is not None:
+            low, high = (end[0].tolist() for end in prediction.interval(self.level))
+            intervals = dict(zip(prediction.names, zip(low, high, strict=True), strict=True))
+        return predicted(self.model, values, seconds, intervals)
 
 
 def _networks(config: Config, scenario: str, regressors: Path, simulated: Path) -> list[_Network]:
-    folder = regressors / scenario
+    folder, level = regressors / scenario, config.evaluate.level
     asked = set(config.train.models) if scenario in config.train.scenarios else set()
     found = []
     for model in (name for name in PREDICTORS if not name.startswith("published_")):
@@ -211,13 +217,14 @@ def _networks(config: Config, scenario: str, regressors: Path, simulated: Path) 
         }
         if path.is_file():
             try:
-                found.append(_Network(model, Regressor.read(path), "", True, seconds))
+                found.append(_Network(model, Regressor.read(path), "", True, seconds, level))
             except CheckpointError as error:
-                found.append(_Network(model, None, str(error), True, {}))
+                found.append(_Network(model, None, str(error), True, {}, level))
         elif model in asked:
-            found.append(_Network(model, None, f"no checkpoint {path}; run `diffcloud train`", True, {}))
-        else:
-            found.append(_Network(model, None, "not trained for this scenario (train.scenarios, train.models)", False, {}))
+            found.append(_Network(model, None, f"no checkpoint {path}; run `diffcloud train`", True, {}, level))
+        elif model != "posterior":  # an extra, which nobody misses
+            reason = "not trained for this scenario (train.scenarios, train.models)"
+            found.append(_Network(model, None, reason, False, {}, level))
     return found
 
 

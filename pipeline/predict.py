@@ -6,13 +6,15 @@ import time
 from pathlib import Path
 from typing import Annotated, Any
 
+import pandas as pd
 import typer
 from rich.table import Table
 
 from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.io.episodes import Episode, read_episode
+from diffcloud.io.files import write_text
 from diffcloud.regressors import MODEL_NAMES, Regressor, predict_episode
-from pipeline.console import JsonFlag, episode_files, errors, finish, show
+from pipeline.console import JsonFlag, episode_files, errors, finish, show, with_suffix
 
 REGRESSORS = Path("data/regressors")
 """Where the pipeline keeps checkpoints: <scenario>/<model>.safetensors."""
@@ -23,10 +25,16 @@ def predict(
     checkpoint: Annotated[Path, typer.Option(help="Written by `diffcloud train`.")],
     level: Annotated[float, typer.Option(min=0.01, max=0.99, help="Probability of the intervals shown.")] = 0.9,
     seed: Annotated[int, typer.Option(min=0, help="Of the choice of points.")] = 0,
+    samples: Annotated[
+        Path | None, typer.Option(help="CSV for what is drawn from a posterior: episode, and a column for each parameter.")
+    ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Predict the parameters of episodes. Values outside the bounds are shown as they are, and said to be outside."""
     regressor = Regressor.read(checkpoint)
+    if samples is not None and regressor.description.model != "posterior":
+        raise ConfigError(f"--samples needs a posterior; {checkpoint} is a {regressor.description.model}, which has none.")
+    drawn: list[pd.DataFrame] = []
     names = regressor.description.names
     found: dict[str, dict[str, Any]] = {}
     outside: list[str] = []
@@ -40,6 +48,10 @@ def predict(
         except EpisodeError as error:
             raise EpisodeError(f"{path}: {error}") from error
         seconds.append(time.perf_counter() - began)
+        if samples is not None and prediction.samples is not None:
+            told = pd.DataFrame(prediction.samples[0].numpy(), columns=list(names))
+            told.insert(0, "episode", path.stem)
+            drawn.append(told)
         values = dict(zip(names, prediction.values[0].tolist(), strict=True))
         low, high = (end[0].tolist() for end in prediction.interval(level))
         inside = dict(zip(names, prediction.inside[0].tolist(), strict=True))
@@ -50,6 +62,8 @@ def predict(
         found[path.stem] = {**values, "outside": beyond, "clipped": clipped, "interval": interval}
         ranges = ", ".join(f"{name} {a:.2f} to {b:.2f}" for name, a, b in zip(names, low, high, strict=True))
         table.add_row(path.stem, *(f"{value:.3f}{'' if inside[name] else ' !'}" for name, value in values.items()), ranges)
+    if samples is not None:
+        write_text(with_suffix(samples, ".csv"), pd.concat(drawn).to_csv(index=False))
     show(table, json)
     if outside:
         bounds = ", ".join(f"{n} {list(b)}" for n, b in zip(names, regressor.description.bounds, strict=True))

@@ -41,7 +41,10 @@ def train(
         ),
     ],
     scenario: Annotated[str | None, typer.Option(help="That was simulated. Default: all of train.scenarios.")] = None,
-    model: Annotated[list[str] | None, typer.Option(help="mlp, pointnet2 or meteornet; repeatable. Default: all.")] = None,
+    model: Annotated[
+        list[str] | None,
+        typer.Option(help="mlp, pointnet2, meteornet, or posterior (an extra); repeatable. Default: the first three."),
+    ] = None,
     params: ParamsFile = None,
     profile: Annotated[str | None, typer.Option(help="quick, reduced or paper.")] = None,
     epochs: Annotated[int | None, typer.Option(help="Passes over the training draws.")] = None,

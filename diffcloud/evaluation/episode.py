@@ -97,6 +97,7 @@ def compare_episode(
                 "inside": all(v.low <= told_values.get(v.name, v.low) <= v.high for v in space.variables),
                 "simulations": estimate.simulations,
                 "gradients": estimate.gradients,
+                "intervals": None if estimate.intervals is None else {k: list(v) for k, v in estimate.intervals.items()},
                 **measured.rows[index],
             }
         )

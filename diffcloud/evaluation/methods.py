@@ -36,6 +36,8 @@ class Estimate:
     """Whether each of these runs was differentiated too, which costs two to three times as much."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Phase -> wall time, of those that are known; data set and training serve all episodes of a scenario."""
+    intervals: Mapping[str, tuple[float, float]] | None = None
+    """Of a method that tells a posterior."""
 
 
 @dataclass(frozen=True)
@@ -126,9 +128,14 @@ def _estimate(method: str, found: FitOutcome, *, gradients: bool) -> Estimate:
     )
 
 
-def predicted(method: str, values: Mapping[str, float], seconds: Mapping[str, float]) -> Estimate:
+def predicted(
+    method: str,
+    values: Mapping[str, float],
+    seconds: Mapping[str, float],
+    intervals: Mapping[str, tuple[float, float]] | None = None,
+) -> Estimate:
     """A network's prediction."""
-    return Estimate(method, dict(values), seconds=seconds)
+    return Estimate(method, dict(values), seconds=seconds, intervals=intervals)
 
 
 def published(meta: Mapping[str, Any]) -> list[Estimate]:

@@ -38,6 +38,8 @@ class MethodRecord(_Metrics):
     inside: bool
     simulations: int | None
     gradients: bool
+    intervals: dict[str, tuple[Value, Value]] | None = None
+    """Of a posterior, at the level of the fit's."""
 
 
 class TransferRecord(_Metrics):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from diffcloud.evaluation.intervals import Combination
+from diffcloud.evaluation.intervals import Combination, significant
 from diffcloud.evaluation.methods import PHASES
 from diffcloud.evaluation.repeats import consistency, fit_of, parameter_table, repeatability, transfer
 
@@ -27,7 +27,9 @@ LABELS = {
     "cma_es": "CMA-ES",
 }
 """Method -> what a person reads."""
-PREDICTORS = ("mlp", "pointnet2", "meteornet", "published_mlp", "published_pointnet2", "published_meteornet")
+PREDICTORS = (
+    "mlp", "pointnet2", "meteornet", "posterior", "published_mlp", "published_pointnet2", "published_meteornet",
+)  # fmt: skip
 """Methods that have learned."""
 _CLEARLY = 2.0
 """Standard deviations by which losses of two methods must differ to count as different."""
@@ -164,8 +166,15 @@ def interval_table(records: Records) -> pd.DataFrame:
             row |= {"combination": None if told["best"] is None else str(Combination.model_validate(told["best"]))}
             row |= {"sources": largest_sources(told["sources"], name), "level": told["level"], "reason": told["reason"]}
             row |= {"restarts": told["restarts"]}
+            row |= dict(zip(("posterior_low", "posterior_high"), _posterior(record, name), strict=True))
             rows.append(row)
     return pd.DataFrame(rows)
+
+
+def _posterior(record: Mapping[str, Any], name: str) -> tuple[float | None, float | None]:
+    """The interval that a posterior gives a parameter, if one was asked."""
+    stated = [row["intervals"] for row in record["methods"] if row.get("intervals")]
+    return tuple(stated[0].get(name, (None, None))) if stated else (None, None)
 
 
 def largest_sources(sources: Mapping[str, Mapping[str, float]], name: str, count: int = 3) -> str:
@@ -349,6 +358,14 @@ def _identified(table: pd.DataFrame) -> list[str]:
             found.append(f"{scenario!s}: stretch / mass is known within {_times(group['ratio_factor'].median())} (median).")
     for row in table[table["reason"] != ""].drop_duplicates(["scenario", "episode"]).to_dict("records"):
         found.append(f"{row['scenario']} / {row['episode']}: {row['reason']}.")
+    for row in table[table["low"].notna() & table["posterior_low"].notna()].to_dict("records"):
+        if row["posterior_low"] > row["high"] or row["posterior_high"] < row["low"]:
+            digits = significant(row["low"], row["high"])
+            fitted, told = (f"{digits(row[f'{kind}low'])} to {digits(row[f'{kind}high'])}" for kind in ("", "posterior_"))
+            found.append(
+                f"{row['scenario']} / {row['episode']}: fit and posterior disagree on {row['parameter']} by more than "
+                f"their widths: {fitted} and {told}. Believe neither before you know why."
+            )
     again = table[(table["reason"] == "") & (table["restarts"] > 0)].drop_duplicates(["scenario", "episode"])
     for row in again.to_dict("records"):
         found.append(

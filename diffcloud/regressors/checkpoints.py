@@ -7,6 +7,7 @@ clouds are centred and scaled, and what the outputs stand for.
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -19,17 +20,22 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from diffcloud.clouds.background import Background
-from diffcloud.errors import CheckpointError
+from diffcloud.errors import CheckpointError, ConfigError
 from diffcloud.io.files import write_bytes
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.regressors.grouping import Order
 from diffcloud.regressors.networks import ModelName, build_network
+from diffcloud.regressors.posterior import Posterior
 from diffcloud.regressors.settings import Target
 
 _KEY = "diffcloud"
 _LARGEST_BYTES = 2**30
 _WIDEST = 5.0
 """Bound of the logarithm of a predicted width: what is beyond is an accident of the last layer."""
+SAMPLES = 1000
+"""Drawn from a posterior."""
+_SEED = 0
+"""Of these draws: the same clouds give the same prediction."""
 Count = Annotated[int, Field(ge=1, le=10**6)]
 
 
@@ -97,6 +103,8 @@ class Description(BaseModel):
             raise ValueError(
                 f"{len(self.names)} names need as many bounds and spreads, got {len(self.bounds)} and {len(self.spread)}"
             )
+        if self.model == "posterior" and self.heteroscedastic:
+            raise ValueError("a posterior has widths of its own, and no second output for them")
         for name, (low, high) in zip(self.names, self.bounds, strict=True):
             if not low < high or (self.target == "logarithmic" and low <= 0):
                 raise ValueError(f"bounds of {name} must be in order (and positive if logarithmic), got {[low, high]}")
@@ -128,6 +136,11 @@ class OutputScale:
             return low * (high / low) ** fractions
         return low + (high - low) * fractions
 
+    def fractions(self, values: Tensor) -> Tensor:
+        """The inverse of `values`."""
+        low, high = self.bounds.unbind(-1)
+        return self.from_linear((values - low) / (high - low))
+
     def from_linear(self, fractions: Tensor) -> Tensor:
         """[..., k] linear fractions, as data sets have them -> fractions on this scale."""
         if self.target == "linear":
@@ -146,8 +159,10 @@ class Prediction:
     fractions: Tensor
     """[B, k] on the scale of the target."""
     width: Tensor
-    """[B, k] Laplace width on that scale."""
+    """[B, k] Laplace width on that scale; of a posterior, the one with the same central half."""
     scale: OutputScale
+    samples: Tensor | None = None
+    """[B, S, k] draws from a posterior, in the parameters' units; values are their medians."""
 
     @property
     def inside(self) -> Tensor:
@@ -162,7 +177,10 @@ class Prediction:
         return self.values.clamp(low, high)
 
     def interval(self, level: float) -> tuple[Tensor, Tensor]:
-        """[B, k] lower and upper end that hold the truth with this probability, if the widths are right."""
+        """[B, k] lower and upper end that hold the truth with this probability, if the widths or the posterior are."""
+        if self.samples is not None:
+            low, high = torch.quantile(self.samples, torch.tensor([0.5 - level / 2, 0.5 + level / 2]), dim=1)
+            return low, high
         reach = laplace_reach(level) * self.width
         return self.scale.values(self.fractions - reach), self.scale.values(self.fractions + reach)
 
@@ -202,11 +220,20 @@ class Regressor:
         parameter = next(self.network.parameters())
         clouds = clouds.to(parameter)
         self.network.eval()
-        outputs = self.network((clouds - clouds.new_tensor(told.centre)) / told.length).float().cpu()
+        scaled, scale = self.scaled(clouds), self.scale
+        if isinstance(self.network, Posterior):
+            drawn = self.network.sample(scaled, SAMPLES, _SEED).cpu()
+            low, fractions, high = torch.quantile(drawn, torch.tensor([0.25, 0.5, 0.75]), dim=1)
+            width = (high - low) / (2 * laplace_reach(0.5))
+            return Prediction(told.names, scale.values(fractions), fractions, width, scale, scale.values(drawn))
+        outputs = self.network(scaled).float().cpu()
         fractions, log_width = split_outputs(outputs, len(told.names))
-        scale = self.scale
         width = log_width.exp() * torch.tensor(told.spread)
         return Prediction(told.names, scale.values(fractions), fractions, width, scale)
+
+    def scaled(self, clouds: Tensor) -> Tensor:
+        """[B, T, P, 3] clouds as the network sees them."""
+        return (clouds - clouds.new_tensor(self.description.centre)) / self.description.length
 
     def write(self, path: Path) -> None:
         """Write atomically; the same regressor gives the same bytes."""
@@ -239,8 +266,11 @@ class Regressor:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"])) or "description"
             raise CheckpointError(f"{path}: {where}: {first['msg']}, got {first['input']!r}.") from error
-        with torch.device("meta"):
-            network = described.build()
+        try:
+            with nullcontext() if described.model == "posterior" else torch.device("meta"):  # whose masks are computed
+                network = described.build()
+        except ConfigError as error:
+            raise CheckpointError(f"{path}: {error}") from error
         _check_tensors(path, network, tensors)
         # copies, since kernels take other paths, with other last bits, where memory is not aligned as torch aligns it
         network.load_state_dict({name: tensor.clone() for name, tensor in tensors.items()}, assign=True)

@@ -1,4 +1,4 @@
-"""The three networks by name, and their sizes."""
+"""The networks by name, and their sizes."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from diffcloud.regressors.layers import Layer
 from diffcloud.regressors.meteornet import MeteorNet
 from diffcloud.regressors.mlp import MLP
 from diffcloud.regressors.pointnet2 import PointNet2
+from diffcloud.regressors.posterior import Posterior
 
-ModelName = Literal["mlp", "pointnet2", "meteornet"]
+ModelName = Literal["mlp", "pointnet2", "meteornet", "posterior"]
 MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
 
 
 def frames_seen(model: str) -> Frames:
-    """MeteorNet sees the sequence, the others the loss frame of the scenario.
+    """MeteorNet, and the posterior that it tells, see the sequence, the others the loss frame of the scenario.
 
     Raises:
         ConfigError: no such model.
     """
     if model not in MODEL_NAMES:
         raise ConfigError(unknown_name("model", model, MODEL_NAMES))
-    return "all" if model == "meteornet" else "loss"
+    return "all" if model in ("meteornet", "posterior") else "loss"
 
 
 def build_network(
@@ -39,10 +40,11 @@ def build_network(
     order: Order = "cloud",
     density: float = 1.0,
 ) -> nn.Module:
-    """A network with fresh weights from torch's global generator: [B, T, P, 3] -> [B, outputs].
+    """A network with fresh weights from torch's global generator: [B, T, P, 3] -> [B, outputs], or a `Posterior` of as many
+    parameters.
 
     Args:
-        frames: T of the training; only MeteorNet uses it.
+        frames: T of the training; only MeteorNet uses it, alone and in the posterior.
         dropout: in the head; None for the model's own.
         order, density: of the grouping (see `grouping`, `layers.thinned`); the MLP has none.
     """
@@ -54,6 +56,8 @@ def build_network(
             return PointNet2(outputs, order=order, density=density, **head)
         case "meteornet":
             return MeteorNet(outputs, frames=frames, order=order, density=density, **head)
+        case "posterior":
+            return Posterior(outputs, frames=frames, order=order, density=density, dropout=dropout)
 
 
 @dataclass(frozen=True)

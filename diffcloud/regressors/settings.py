@@ -78,11 +78,13 @@ PROFILES: Mapping[Profile, Mapping[ModelName, TrainingSettings]] = {
         "mlp": replace(_SHORT, points=128, epochs=16),
         "pointnet2": replace(_SHORT, points=96, epochs=10, density=0.125, batch_size=8),
         "meteornet": replace(_SHORT, points=16, epochs=12, density=0.125),
+        "posterior": replace(_SHORT, points=16, epochs=12, density=0.125),
     },
     "reduced": {
         "mlp": replace(_SHORT, points=512, epochs=60),
         "pointnet2": replace(_SHORT, points=512, epochs=18, density=0.25),
         "meteornet": replace(_SHORT, points=64, epochs=30, density=0.25),
+        "posterior": replace(_SHORT, points=64, epochs=30, density=0.25),
     },
     "paper": dict.fromkeys(MODEL_NAMES, _PAPER),
 }

@@ -27,6 +27,7 @@ import numpy as np
 import torch
 from lightning.fabric.utilities.warnings import PossibleUserWarning
 from lightning.pytorch.callbacks import EarlyStopping
+from scipy.stats import kstest
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset, Sampler
 
@@ -38,12 +39,12 @@ from diffcloud.regressors.checkpoints import (
     Description,
     OutputScale,
     Regressor,
-    laplace_reach,
     split_outputs,
     timings_path,
 )
 from diffcloud.regressors.dataset import Augmentation, CloudDataset, SimulatedSet
 from diffcloud.regressors.networks import ModelName, frames_seen
+from diffcloud.regressors.posterior import Posterior
 from diffcloud.regressors.settings import BACKGROUND_REACH_M, Loss, TrainingSettings
 
 Device = Literal["auto", "cpu", "gpu"]
@@ -113,6 +114,8 @@ def train_regressor(
             "Torch finds no GPU on this machine. Use --device cpu, or auto, which takes one where there is one."
         )
     _check_sets(train, test, settings)
+    if model == "posterior" and (settings.heteroscedastic or settings.loss != "normalised"):
+        raise ConfigError("A posterior has a loss and widths of its own; leave out heteroscedastic, and loss: raw.")
     clouds = _Clouds.build(model, train, test, settings)
     centre, length = _centre_and_length(clouds.train)
     told = Description(
@@ -150,8 +153,9 @@ def train_regressor(
     module.network.load_state_dict(recorder.weights)
     network = module.network.cpu()
     regressor = Regressor(told, network)
-    spread, _ = _errors(regressor, clouds.test, clouds.validation)
-    regressor = Regressor(told.model_copy(update={"spread": tuple(spread.mean(0).tolist())}), network)
+    if not isinstance(network, Posterior):  # whose widths are its own
+        spread = _measured(regressor, clouds.test, clouds.validation).in_widths.mean(0)
+        regressor = Regressor(told.model_copy(update={"spread": tuple(spread.tolist())}), network)
     summary = {
         "description": regressor.description.model_dump(mode="json"),
         "best_epoch": recorder.best_epoch,
@@ -267,8 +271,11 @@ class _Training(lightning.LightningModule):
 
     def loss(self, batch: tuple[Tensor, Tensor]) -> Tensor:
         clouds, parameters = batch
-        outputs = self.network((clouds - clouds.new_tensor(self.told.centre)) / self.told.length).float()
+        clouds = (clouds - clouds.new_tensor(self.told.centre)) / self.told.length
         scale = OutputScale(parameters.new_tensor(self.told.bounds), self.told.target)
+        if isinstance(self.network, Posterior):
+            return self.network.loss(clouds, scale.from_linear(parameters))
+        outputs = self.network(clouds).float()
         return parameter_loss(outputs, parameters, scale, loss=self.settings.loss)
 
     def on_train_epoch_start(self) -> None:
@@ -481,29 +488,52 @@ def _resume_path(out: Path, told: Description, train: SimulatedSet, test: Simula
     return out.parent / f".{out.stem}.{digest.hexdigest()[:12]}.resume"
 
 
-def _errors(regressor: Regressor, dataset: CloudDataset, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """Of some draws: |error| in widths, and values in the parameters' units minus the true ones, [n, k] each."""
+@dataclass(frozen=True)
+class _Measured:
+    """What is predicted of n draws, beside the truth."""
+
+    in_widths: Tensor
+    """[n, k] |error| in widths."""
+    off: Tensor
+    """[n, k] values in the parameters' units minus the true ones."""
+    inside: Tensor
+    """bool [n, L, k] whether intervals of these `LEVELS` hold the truth."""
+    ranks: Tensor | None
+    """[n, k + 1] of a posterior: the share of draws below the truth, and the share that is denser than it."""
+
+
+def _measured(regressor: Regressor, dataset: CloudDataset, indices: Sequence[int]) -> _Measured:
     dataset.set_epoch(0)
-    in_widths, off = [], []
-    step = regressor.description.training["settings"]["batch_size"]
+    parts: list[tuple[Tensor, ...]] = []
+    step, network = regressor.description.training["settings"]["batch_size"], regressor.network
     for begin in range(0, len(indices), step):
         clouds, parameters = dataset.batch(indices[begin : begin + step])
         found = regressor.predict(clouds)
-        in_widths.append((found.fractions - found.scale.from_linear(parameters)).abs() / found.width)
-        low, high = found.scale.bounds.unbind(-1)
-        off.append(found.values - (low + (high - low) * parameters))
-    return torch.cat(in_widths), torch.cat(off)
+        fractions, (low, high) = found.scale.from_linear(parameters), found.scale.bounds.unbind(-1)
+        true = low + (high - low) * parameters
+        ends = [found.interval(level) for level in LEVELS]
+        inside = torch.stack([(low <= true) & (true <= high) for low, high in ends], dim=1)
+        ranks = torch.empty(len(true), 0)
+        if isinstance(network, Posterior) and found.samples is not None:
+            drawn = torch.cat([fractions[:, None], found.scale.fractions(found.samples)], dim=1)
+            with torch.no_grad():
+                density = network.log_density(regressor.scaled(clouds), drawn)
+            denser = (density[:, 1:] > density[:, :1]).float().mean(1)
+            ranks = torch.cat([(found.samples < true[:, None]).float().mean(1), denser[:, None]], dim=1)
+        parts.append(((found.fractions - fractions).abs() / found.width, found.values - true, inside, ranks))
+    in_widths, off, inside, ranks = (torch.cat(column) for column in zip(*parts, strict=True))
+    return _Measured(in_widths, off, inside, ranks if ranks.shape[1] else None)
 
 
 def _held_out(regressor: Regressor, clouds: _Clouds) -> dict[str, Any]:
     """Errors on the draws that nothing was chosen by, beside those of always predicting the training's mean or median."""
     names = regressor.description.names
-    in_widths, off = (tensor.double().numpy() for tensor in _errors(regressor, clouds.test, clouds.held_out))
+    measured = _measured(regressor, clouds.test, clouds.held_out)
+    off, coverage = measured.off.double().numpy(), measured.inside.double().mean(0).numpy()
     true = clouds.test.simulated.parameters[clouds.held_out]
     trained = clouds.train.simulated.parameters[: clouds.draws]
     span = np.ptp(clouds.train.simulated.bounds, axis=1)
-    coverage = [(in_widths <= laplace_reach(level)).mean(axis=0) for level in LEVELS]
-    return {
+    told: dict[str, Any] = {
         "draws": len(true),
         "parameters": {
             name: {
@@ -515,12 +545,21 @@ def _held_out(regressor: Regressor, clouds: _Clouds) -> dict[str, Any]:
                 "mean_error_of_range_of_median": float(
                     np.abs(np.median(trained[:, index]) - true[:, index]).mean() / span[index]
                 ),
-                "coverage": [float(row[index]) for row in coverage],
+                "coverage": coverage[:, index].tolist(),
             }
             for index, name in enumerate(names)
         },
         "levels": list(LEVELS),
     }
+    if measured.ranks is not None:
+        ranks = measured.ranks.double().numpy()
+        told["calibration"] = {
+            # of the smallest regions that hold the truth, over all parameters together (Hermans et al. 2022)
+            "expected_coverage": [float((ranks[:, -1] <= level).mean()) for level in LEVELS],
+            # simulation-based calibration: ranks of the truth are uniform (Talts et al. 2018), p of Kolmogorov and Smirnov
+            "uniform_ranks": {name: float(kstest(ranks[:, index], "uniform").pvalue) for index, name in enumerate(names)},
+        }
+    return told
 
 
 def _versions() -> dict[str, str]:

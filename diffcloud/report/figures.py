@@ -318,10 +318,13 @@ def _finished(canvas: Canvas, name: str, title: str, caption: str, source: str) 
     import matplotlib
 
     svg, png = io.StringIO(), io.BytesIO()
+    engine = canvas.get_layout_engine()
+    if engine is not None:  # laid out once: that takes longer than drawing, and each savefig would do both twice
+        engine.execute(canvas)
+        canvas.set_layout_engine(None)
     # without a date and with a fixed salt the same data gives the same bytes; text stays text
     with matplotlib.rc_context({"svg.hashsalt": name, "svg.fonttype": "none"}):
         canvas.savefig(svg, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-    canvas.set_layout_engine("none")  # what was laid out stays: that takes longer than drawing
     canvas.savefig(png, format="png", dpi=150, facecolor="white", metadata={"Software": None})
     return Figure(name, title, caption, source, svg.getvalue(), png.getvalue(), canvas.get_figwidth())
 

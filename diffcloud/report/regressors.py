@@ -60,13 +60,18 @@ def training_data(trainings: Sequence[TrainingEntry]) -> list[dict[str, Any]]:
             "name": f"{entry.scenario} / {entry.model}",
             "loss": [float(f"{row['validation_loss']:.4g}") for row in entry.summary["history"]],
             "levels": entry.summary["held_out"]["levels"],
-            "coverage": {
-                name: [round(value, 4) for value in row["coverage"]]
-                for name, row in entry.summary["held_out"]["parameters"].items()
-            },
+            "coverage": {name: [round(value, 4) for value in row] for name, row in _coverage(entry).items()},
         }
         for entry in trainings
     ]
+
+
+def _coverage(entry: TrainingEntry) -> dict[str, list[float]]:
+    """How often the truth is inside at each level: of each parameter, and of all of a posterior's together."""
+    held_out = entry.summary["held_out"]
+    found = {name: list(row["coverage"]) for name, row in held_out["parameters"].items()}
+    together = held_out.get("calibration")
+    return found | ({} if together is None else {"all together": list(together["expected_coverage"])})
 
 
 def _prediction_row(row: Mapping[str, Any], names: Sequence[str], fitted_mm: Mapping[tuple[str, str], float]) -> list[Cell]:
@@ -87,4 +92,13 @@ def _error_row(entry: TrainingEntry, name: str) -> list[Cell]:
         row["median_relative_error_of_mean"],
         row["coverage"][held_out["levels"].index(0.9)],
     )
-    return [Cell(entry.scenario), Cell(entry.model), Cell(name), *(number(s, 0, factor=100, unit=" %") for s in shares)]
+    ranks = held_out.get("calibration")
+    note = "" if ranks is None else f"ranks uniform: p = {ranks['uniform_ranks'][name]:.2g}"
+    cells = [number(share, 0, factor=100, unit=" %") for share in shares[:2]]
+    return [
+        Cell(entry.scenario),
+        Cell(entry.model),
+        Cell(name),
+        *cells,
+        number(shares[2], 0, factor=100, unit=" %", note=note),
+    ]

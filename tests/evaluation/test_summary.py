@@ -115,6 +115,18 @@ class TestWords:
         assert "lift / tan2: the misfit is 14.2 mm." in told_of
         assert any("stretch a factor of 2" in line for line in said["repeats"])
 
+    @pytest.mark.parametrize(("ends", "disagree"), [((3.0, 4.0), True), ((0.1, 0.2), True), ((0.1, 9.0), False)])
+    def test_a_posterior_is_a_second_opinion(self, ends, disagree):
+        one = record("lift", "tan1", methods={"diffcloud": 0.001, "posterior": 0.002})
+        one["methods"][1]["intervals"] = {"stretch": list(ends)}
+        told = tables([one], {})
+        row = told["intervals"].set_index("parameter").loc["stretch"]
+        assert row["low"] < 1 < row["high"] < 3
+        assert (row["posterior_low"], row["posterior_high"]) == ends
+        said = [line for line in sentences(told)["intervals"] if "posterior" in line]
+        assert len(said) == disagree
+        assert all("fit and posterior disagree on stretch by more than their widths" in line for line in said)
+
     def test_credibility_holds_one_recording_against_repeats_and_another_motion(self, told):
         said = sentences(told)["credibility"]
         stretch = next(line for line in said if "stretch" in line)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from diffcloud.errors import ConfigError
-from diffcloud.regressors import MODEL_NAMES, build_network, frames_seen, layer_sizes
+from diffcloud.regressors import build_network, frames_seen, layer_sizes
 from diffcloud.regressors.grouping import gather_points
 from diffcloud.regressors.layers import LocalNetwork, highest
 
@@ -38,7 +38,7 @@ SIZES = {
 """(inputs, outputs) of every layer for two parameters, from the papers."""
 
 
-@pytest.mark.parametrize("model", MODEL_NAMES)
+@pytest.mark.parametrize("model", SIZES)
 def test_layers_have_the_published_sizes(model):
     network = build_network(model, 2)
     rows = layer_sizes(network)
@@ -61,7 +61,7 @@ def test_centroids_neighbours_radii_and_dropout_are_the_published_ones():
     assert {model: frames_seen(model) for model in SIZES} == {"mlp": "loss", "pointnet2": "loss", "meteornet": "all"}
 
 
-@pytest.mark.parametrize("model", MODEL_NAMES)
+@pytest.mark.parametrize("model", SIZES)
 def test_the_order_of_the_points_does_not_matter(model, generator):
     torch.manual_seed(0)
     frames = 3 if model == "meteornet" else 1
@@ -88,7 +88,7 @@ def test_the_first_layer_is_that_of_joined_positions_and_features(generator):
     torch.testing.assert_close(network(relative, features, index), expected)
 
 
-@pytest.mark.parametrize("model", MODEL_NAMES)
+@pytest.mark.parametrize("model", SIZES)
 def test_networks_keep_double_precision_and_take_small_clouds(model):
     network = build_network(model, 3, frames=2).double()
     outputs = network(torch.rand(2, 2, 6, 3, dtype=torch.float64))
@@ -96,7 +96,7 @@ def test_networks_keep_double_precision_and_take_small_clouds(model):
     assert outputs.dtype == torch.float64
 
 
-@pytest.mark.parametrize("model", MODEL_NAMES)
+@pytest.mark.parametrize("model", SIZES)
 def test_one_batch_can_be_learned_by_heart(model, generator):
     torch.manual_seed(0)
     frames = 3 if model == "meteornet" else 1
