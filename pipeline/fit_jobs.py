@@ -170,9 +170,9 @@ class FitJob:
             values = "  ".join(f"{key} {value:.3g}" for key, value in progress.values.items())
             if isinstance(settings, SearchSettings):
                 done, most = progress.simulations or 0, settings.simulations
-            else:
+            else:  # of Gauss–Newton for each start, of which it is not known how many are followed
                 done, most = progress.iteration, settings.iterations
-            tell(done / max(most, 1), f"{done} of at most {most}  best {progress.best:.3e}  {values}")
+            tell(min(done / max(most, 1), 1.0), f"step {done}  best {progress.best:.3e}  {values}")
 
         objective, space = self.objective(), self.space
         settings = replace(self.settings.solver_settings(self.scenario), init=self.init)

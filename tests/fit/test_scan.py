@@ -66,6 +66,24 @@ def test_where_it_is_not_known_what_explains_a_recording_two_equal_ends_are_enou
     assert int(found.history.losses[-1].isfinite().sum()) == followed
 
 
+def test_starts_that_diverge_are_passed_over(monkeypatch):
+    """Here the first two of three, from above."""
+
+    def cut(objective, space, places):
+        found = linearised(objective, space, places)
+        found.losses[places[:, 0] > 0.5] = math.inf
+        return found
+
+    monkeypatch.setattr(gauss_newton, "linearise", cut)
+    space = FitSpace.build(["stretch"])
+    values = torch.tensor([[9.0], [5.0], [0.2]]).double()
+    monkeypatch.setattr(FitSpace, "starts", lambda self, count, **_: (values, None))
+    found = fit_gauss_newton(Bowl(target={"stretch": 0.7}), space, GaussNewtonSettings(screen=0, starts=3))
+    assert found.values["stretch"] == pytest.approx(0.7, rel=1e-3)
+    assert found.best_start == 2
+    assert found.history.losses[0].isfinite().tolist() == [False, False, True]
+
+
 def test_a_fit_keeps_what_it_saw_where_it_ended(monkeypatch):
     """But not what it saw before it went on, nor anything where it has not looked."""
     monkeypatch.setattr(gauss_newton, "linearise", linearised)

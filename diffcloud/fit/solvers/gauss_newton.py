@@ -222,8 +222,10 @@ class _Ways:
 
     def enough(self, explained: float) -> bool:
         """Whether the best one explains the recording; if that is not known (0), whether another one is equally low."""
-        if explained or not self.every:
-            return bool(self.every) and self.best.loss <= explained
+        if not self.every or not math.isfinite(self.best.loss):
+            return False
+        if explained:
+            return self.best.loss <= explained
         return sum(way.loss <= _EQUALLY * self.best.loss for way in self.every) > 1
 
     def begin(self, found: Linearisation) -> None:
