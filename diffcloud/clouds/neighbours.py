@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _NEIGHBOURS = 12
 """Whose plane gives a point's normal."""
+_FEWEST = 3
+"""Points of a plane."""
 _UNCLEAR = 1e-2
 """Of the squared size of a group's spread: a shorter cross product of its rows hardly has a direction."""
 _NO_GUESS = np.empty(0, np.int64)
@@ -40,39 +42,44 @@ class NeighbourIndex:
             raise EpisodeError("A target cloud holds NaN or infinite points; filter them before the loss.")
         self.points = points
 
-    @property
+    @cached_property
     def normals(self) -> Tensor:
         """[P, 3] unit normals of the surface that the points were taken from, by the plane through each one's neighbours;
         their signs mean nothing. Of fewer than three points: zero."""
-        return self._surface[0]
+        index = self._beside[1]
+        if index.shape[1] < _FEWEST:
+            return torch.zeros_like(self.points)
+        return torch.from_numpy(flattest_directions(_as_array(self.points), index)).to(self.points)
 
     @property
     def spacing(self) -> float:
-        """Median distance between neighbours [m]."""
-        return self._surface[1]
+        """Median distance between neighbours [m]; zero of fewer than three points."""
+        distance = self._beside[0]
+        return 0.0 if distance.shape[1] < _FEWEST else float(np.median(distance[:, 1]))
 
     @property
     def from_surface(self) -> tuple[float, float]:
         """Mean squared distances [m²] from a place of the surface to the nearest point, and from a point to the surface:
-        places are points dropped onto the plane of their neighbours, and each one's own point does not count."""
-        return self._surface[2]
+        places are points dropped onto the plane of their neighbours, and each one's own point does not count. Zero of fewer
+        than three points."""
+        index = self._beside[1]
+        if index.shape[1] < _FEWEST:
+            return 0.0, 0.0
+        points, normals = _as_array(self.points), _as_array(self.normals)
+        others = points[index[:, 1:]]
+        above = ((points - others.mean(axis=1)) * normals).sum(axis=-1)
+        places = points - above[:, None] * normals
+        nearest = np.square(others - places[:, None]).sum(axis=-1).min(axis=1)
+        return float(nearest.mean()), float(np.square(above).mean())
 
     @cached_property
-    def _surface(self) -> tuple[Tensor, float, tuple[float, float]]:
+    def _beside(self) -> tuple[Floats, Ints]:
+        """[P, n] distances to the nearest points, itself first, and their numbers."""
         from scipy.spatial import cKDTree  # slow to import, and only fits need it
 
         points = _as_array(self.points)
-        count = min(_NEIGHBOURS + 1, len(points))
-        if count < 3:
-            return torch.zeros_like(self.points), 0.0, (0.0, 0.0)
-        distance, index = cKDTree(points).query(points, k=count)
-        normals = flattest_directions(points, index)
-        beside = points[index[:, 1:]]
-        above = ((points - beside.mean(axis=1)) * normals).sum(axis=-1)
-        places = points - above[:, None] * normals
-        nearest = np.square(beside - places[:, None]).sum(axis=-1).min(axis=1)
-        away = float(nearest.mean()), float(np.square(above).mean())
-        return torch.from_numpy(normals).to(self.points), float(np.median(distance[:, 1])), away
+        distance, index = cKDTree(points).query(points, k=range(1, min(_NEIGHBOURS + 1, len(points)) + 1))
+        return distance, index
 
     @cached_property
     def _tree(self) -> Tree:

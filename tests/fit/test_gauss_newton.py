@@ -109,6 +109,15 @@ class TestSurface:
         cloud = NeighbourIndex(torch.rand(count, 3, dtype=torch.float64))
         assert bool((cloud.normals == 0).all())
         assert cloud.spacing == 0.0
+        assert cloud.from_surface == (0.0, 0.0)
+
+    def test_how_far_points_and_their_surface_are_apart(self, generator):
+        """Of a Poisson process on a plane, E|x - nearest|² = 1 / (π density); across it, the points' own noise."""
+        points = torch.rand(20_000, 3, generator=generator, dtype=torch.float64)
+        points[:, 2] = 1e-4 * torch.randn(20_000, generator=generator, dtype=torch.float64)
+        along, across = NeighbourIndex(points).from_surface
+        assert along == pytest.approx(1 / (math.pi * 20_000), rel=0.1)
+        assert across**0.5 == pytest.approx(1e-4 * (1 + 1 / 12) ** 0.5, rel=0.1)
 
 
 class TestFits:
