@@ -197,8 +197,8 @@ def race_page(rows: Sequence[Sequence[str]], seed: int) -> str:
         "",
         *markdown_table(HEAD, rows),
         "",
-        f"Command: `diffcloud bench --fits build/solvers --seed {seed} --workers 2 --markdown docs/results/solvers.md`; "
-        "finished targets are kept.",
+        f"Command: `diffcloud bench --fits build/solvers --targets {rows[0][2]} --seed {seed} --workers 2 --markdown "
+        "docs/results/solvers.md`; finished targets are kept.",
         "",
     ]
     return "\n".join(lines)

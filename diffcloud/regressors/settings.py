@@ -78,7 +78,7 @@ PROFILES: Mapping[Profile, Mapping[ModelName, TrainingSettings]] = {
         "mlp": replace(_SHORT, points=128, epochs=16),
         "pointnet2": replace(_SHORT, points=96, epochs=10, density=0.125, batch_size=8),
         "meteornet": replace(_SHORT, points=16, epochs=12, density=0.125),
-        "posterior": replace(_SHORT, points=16, epochs=12, density=0.125),
+        "posterior": replace(_SHORT, points=24, epochs=48, density=0.125),
     },
     "reduced": {
         "mlp": replace(_SHORT, points=512, epochs=60),
