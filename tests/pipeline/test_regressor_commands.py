@@ -229,7 +229,7 @@ class TestBadInput:
             ((*fit, "meteornet"), "No such checkpoint: data/regressors/small/meteornet.safetensors"),
             (
                 (*fit, "best"),
-                "A start is middle, PARAMETER=VALUE,..., mlp, pointnet2, meteornet or a checkpoint, got 'best'",
+                "A start is middle, PARAMETER=VALUE,..., mlp, pointnet2, meteornet, posterior or a checkpoint, got 'best'",
             ),
             ((*fit, "fold.safetensors"), "fold.safetensors was trained for fold, not for small"),
             ((*TRAIN, "--scenario", "lift"), "sim holds draws of small, not of lift"),
