@@ -47,6 +47,7 @@ LEFT = {
     "python -m diffcloud.hardware.examples": "runs until it is ended",
     "diffcloud import recording overhead=a.db3": "recordings of two cameras, made by the SDK of their maker",
     "diffcloud episode watch": "runs until it is ended",
+    "diffcloud bench --fits": "an hour, and has a test of its own",
     ".venv/bin/python -m pytest": "a test of its own",
 }
 """Beginnings of commands that are not run -> what they need, or why."""
