@@ -83,8 +83,8 @@ def fit_gauss_newton(
     """
     began = time.perf_counter()
     axis = Axis.of(space)
-    most = settings.starts or (_MOST if objective.explained else _FEW)
-    explained = objective.explained or settings.threshold
+    known = objective.explained
+    most, explained = settings.starts or (_MOST if known else _FEW), known or settings.threshold
     places, simulations = _starts(objective, space, settings, axis, most)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
