@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields
 from fnmatch import fnmatch
 from pathlib import Path
@@ -12,10 +13,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
 from diffcloud.evaluation.intervals import LEVEL, WITHIN
+from diffcloud.fit.doubts import MATERIAL_DOUBTS, parse_doubts
 from diffcloud.fit.pose import parse_priors
 from diffcloud.fit.solvers import SOLVERS, Settings
 from diffcloud.fit.solvers.gauss_newton import ROUGH_SCREEN, ROUGH_STARTS
-from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, check_doubts
 from diffcloud.io.files import read_yaml
 from diffcloud.io.raw_episodes import ScenePlacement
 from diffcloud.io.schema import Component, NonNegative, Positive, Vector, explain
@@ -183,8 +184,8 @@ class FitConfig(Section):
     iterations: Count | None = None
     """Of gauss_newton and adam: steps at most; by default 20 and 50."""
     starts: Count | None = None
-    """Of gauss_newton and adam: descents from as many places, of gauss_newton at most; by default 8 (3 if cameras
-    recorded, or with the linearised integrator) and 1."""
+    """Of gauss_newton and adam: descents from as many places, of gauss_newton at most; by default 8 (3
+    with the linearised integrator) and 1."""
     screen: CountOrNone | None = None
     """Of gauss_newton and adam: candidates simulated once to choose the starts from; by default 24 of gauss_newton (96 with
     the linearised integrator), none of adam, whose further starts are then spread over the box."""
@@ -211,6 +212,9 @@ class FitConfig(Section):
     "none". Variables: `fit.pose.NUISANCE`."""
     prior: Name | None = None
     """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""
+    doubts: Name | None = None
+    """Within which factor material that is neither fitted nor fixed is known: "bending=1.5x,drag=1.3x", or "none". It is
+    fitted along, and is no result (`fit.doubts`). By default `MATERIAL_DOUBTS`, of gauss_newton where derivatives hold."""
     joint: bool = False
     """One parameter set for all episodes, whatever their scenario: they must be of one cloth."""
     workers: Workers = 1
@@ -230,6 +234,8 @@ class FitConfig(Section):
         for name, pair in self.bounds.items():
             _check_bounds(f"bounds.{name}", pair)
         parse_priors(self.nuisance or "none")
+        if self.paper and parse_doubts(self.doubts or "none"):
+            raise ValueError("doubts: the published measure takes the rest of the material for known; leave them out")
         if foreign := [name for name in self._solver_options() if self.solver not in _solvers_with(name)]:
             told = "; ".join(f"{name}: of solver {' or '.join(_solvers_with(name))}" for name in foreign)
             raise ValueError(f"{told}; not of {self.solver}: leave out, or choose that solver")
@@ -239,6 +245,14 @@ class FitConfig(Section):
         """Keyword arguments of `Objective`."""
         priors = None if self.nuisance is None else parse_priors(self.nuisance)
         return {"paper": self.paper, "nuisance": priors, "frames": self.frames, "points": self.points, "seed": self.seed}
+
+    def known_within(self, scenarios: Sequence[Scenario]) -> dict[str, float]:
+        """Material that is not known exactly in a fit of recordings in these scenarios -> factor of one deviation."""
+        if self.doubts is not None:
+            return parse_doubts(self.doubts)
+        if self.paper or self.solver != "gauss_newton" or any(one.scene.integrator != "implicit" for one in scenarios):
+            return {}
+        return {name: factor for name, factor in MATERIAL_DOUBTS.items() if name not in {*self.parameters, *self.fixed}}
 
     def solver_settings(self, scenario: Scenario) -> Settings:
         """Of the solver, with what the scenario says where nothing is given."""
@@ -304,19 +318,12 @@ class EvaluateConfig(Section):
     """Of the intervals; null: none."""
     within: Factor = WITHIN
     """A parameter counts as identified if its interval ends within this factor."""
-    doubts: dict[str, Factor] = dict(MATERIAL_DOUBTS)
-    """Factors within which material that is not fitted is known; {}: exactly."""
     landscapes: Annotated[list[Name], Field(max_length=10_000)] = []
     """Patterns of <scenario>/<episode> whose loss landscape is simulated."""
     landscape_size: Annotated[int, Field(ge=2, le=1000)] = 7
     """Places along each of its axes."""
     workers: Workers = 1
     """Processes, one episode each; they change nothing but the time."""
-
-    @model_validator(mode="after")
-    def _known(self) -> Self:
-        check_doubts(self.doubts)
-        return self
 
     def comparison(self, episode: str) -> ComparisonSettings:
         """For <scenario>/<episode>."""
@@ -330,7 +337,6 @@ class EvaluateConfig(Section):
             seed=self.seed,
             level=self.level,
             within=self.within,
-            doubts=self.doubts,
             landscape_size=self.landscape_size if chosen(self.landscapes) else 0,
         )
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -31,6 +31,9 @@ from pipeline.preprocess import PreprocessJob
 from pipeline.scenario_options import choose_scenario
 from pipeline.workers import Tell, run_all
 
+if TYPE_CHECKING:
+    from diffcloud.regressors import Regressor
+
 _RECORDS = ("mesh", "io", "sim", "scene", "clouds", "sensing")
 """Packages whose source decides what is recorded."""
 _CODE = (*_RECORDS, "fit", "evaluation")
@@ -42,6 +45,7 @@ HEAD = (
     "stated",
     "hold the truth",
     "RMS error",
+    "median error",
     "median half-width",
     "identified",
 )
@@ -60,6 +64,10 @@ def coverage(
     refined: Annotated[
         bool, typer.Option("--refined", help="Simulate the truth with four times the steps that fits take.")
     ] = False,
+    checkpoint: Annotated[
+        list[Path] | None,
+        typer.Option(help="Written by `diffcloud train`, repeatable: what it predicts of the same recordings."),
+    ] = None,
     markdown: Annotated[Path | None, typer.Option(help="Write all that the folder holds to this page.")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Recordings at once, each in a process with one thread.")] = 1,
     params: ParamsFile = None,
@@ -68,7 +76,7 @@ def coverage(
     """Draw cloths, record and fit them, and count how often the stated intervals hold the truth.
 
     Stretch and mass are drawn as `diffcloud episodes` draws them; material that is not fitted is off by the factors of
-    `evaluate.doubts`. A recording whose fit fails or gets no interval counts as a miss.
+    `fit.doubts`. A recording whose fit fails or gets no interval counts as a miss.
     """
     config = load_config(params)
     known = tuple(fix or ())
@@ -84,11 +92,14 @@ def coverage(
         for name in scenario or config.scenarios
         for index in range(recordings)
     ]
+    readers = _regressors(checkpoint or (), jobs)
     failures = []
     for job, _, error in run_all("coverage", jobs, workers):
         if error is not None:
             failures.append(f"{job.label}: {error}")
             errors.print(failures[-1], soft_wrap=True)
+    for regressor in readers:
+        _predict(regressor, jobs)
     rows = summary_rows(out)
     table = Table(*HEAD)
     for row in rows:
@@ -132,7 +143,7 @@ class CoverageJob:
         """
         path = self.folder / f"{self.index:04d}.json"
         plan = [self.scenario, self.index, self.seed, self.known, self.level, self.refined]
-        sections = [self.config.episodes, self.config.preprocess, self.config.fit, self.config.evaluate.doubts]
+        sections = [self.config.episodes, self.config.preprocess, self.config.fit]
         mark = fingerprint([*plan, [str(section) for section in sections]], packages=_CODE)
         if (kept := kept_record(path, mark)) is not None:
             return kept
@@ -152,7 +163,7 @@ class CoverageJob:
         drawn = hidden_parameters(self.scenario, self.config.episodes.model_copy(update={"per_scenario": 1}), rng)
         found = {name: float(value[0]) for name, value in drawn.items()}
         system, _ = self.scenario.scene.build()
-        for name, factor in self.config.evaluate.doubts.items():
+        for name, factor in self.config.fit.known_within([self.scenario]).items():
             off = math.exp(rng.standard_normal() * math.log(factor))
             base = 1.0 if PARAMETERS[name].basis else float(getattr(system.properties, name)[0])
             if name not in found and base > 0:
@@ -160,7 +171,7 @@ class CoverageJob:
         return found
 
     def _measured(self, truth: Mapping[str, float], tell: Tell) -> dict[str, Any]:
-        episode = self._episode(truth, tell)
+        episode = self.episode(truth, tell)
         tell(0.5, "fit")
         fit = self.config.fit
         fit = fit.model_copy(update={"fixed": {**fit.fixed, **{name: truth[name] for name in self.known}}})
@@ -175,14 +186,13 @@ class CoverageJob:
             outcome.values,
             level=self.level,
             within=self.config.evaluate.within,
-            doubts=self.config.evaluate.doubts,
             restarts=RESTARTS,
             seen=outcome.scan,
         )
         told = {"loss": outcome.loss, "stop_reason": outcome.stop_reason, "simulations": outcome.simulations}
         return told | {"seconds": outcome.seconds, "intervals": found.model_dump(mode="json")}
 
-    def _episode(self, truth: Mapping[str, float], tell: Tell) -> Episode:
+    def episode(self, truth: Mapping[str, float], tell: Tell) -> Episode:
         """Recorded and preprocessed; fits with other known parameters share it."""
         place = self.out / self.scenario.name / ("episodes_refined" if self.refined else "episodes")
         path = place / f"{self.index:04d}.npz"
@@ -215,6 +225,46 @@ class CoverageJob:
         return episode
 
 
+def _regressors(checkpoints: Sequence[Path], jobs: Sequence[CoverageJob]) -> list[Regressor]:
+    """
+    Raises:
+        CheckpointError, ConfigError: a damaged checkpoint, or one of a scenario whose cloths are not drawn.
+    """
+    if not checkpoints:
+        return []
+    from diffcloud.regressors import Regressor  # takes seconds to import
+
+    found = [Regressor.read(path) for path in checkpoints]
+    for path, regressor in zip(checkpoints, found, strict=True):
+        if (scenario := regressor.description.scenario) not in {job.scenario.name for job in jobs}:
+            raise ConfigError(f"{path} was trained for {scenario}, which is not among the scenarios.")
+    return found
+
+
+def _predict(regressor: Regressor, jobs: Sequence[CoverageJob]) -> None:
+    """Records of a network's predictions, beside those of the fits: <scenario>/<model>/<number>.json."""
+    from diffcloud.regressors import predict_episode
+
+    told = regressor.description
+    for job in (job for job in jobs if job.scenario.name == told.scenario):
+        truth = job.truth()
+        try:
+            found = predict_episode(regressor, job.episode(truth, lambda done, text: None))
+        except DiffCloudError as error:
+            record: dict[str, Any] = {"error": str(error)}
+        else:
+            low, high = (end[0].tolist() for end in found.interval(job.level))
+            ends = zip(told.names, found.values[0].tolist(), low, high, strict=True)
+            parameters = {name: {"value": value, "low": a, "high": b} for name, value, a, b in ends}
+            record = {"intervals": {"parameters": parameters, "within": job.config.evaluate.within}}
+            if found.samples is not None and {"stretch", "mass"} <= set(told.names):
+                stretch, mass = (found.samples[0, :, told.names.index(name)] for name in ("stretch", "mass"))
+                ends = np.quantile((stretch / mass).numpy(), [0.5, 0.5 - job.level / 2, 0.5 + job.level / 2])
+                record["intervals"]["ratio"] = dict(zip(("value", "low", "high"), ends.tolist(), strict=True))
+        folder = job.out / job.scenario.name / (f"{told.model}_refined" if job.refined else told.model)
+        write_json(folder / f"{job.index:04d}.json", {"truth": truth, **record})
+
+
 def counted(folder: Path) -> dict[str, Any]:
     """What the records of one folder say.
 
@@ -227,7 +277,7 @@ def counted(folder: Path) -> dict[str, Any]:
     fitted = next((list(one["intervals"]["parameters"]) for one in records if "intervals" in one), [])
     parameters = {name: _count(records, name) for name in fitted}
     told: dict[str, Any] = {"parameters": parameters}
-    if {"stretch", "mass"} <= set(fitted):
+    if any("ratio" in one.get("intervals", {}) for one in records) and {"stretch", "mass"} <= set(fitted):
         told["ratio"] = _count(records, "ratio")
     return told
 
@@ -280,6 +330,7 @@ def summary_rows(out: Path) -> list[list[str]]:
                         str(count["stated"]),
                         share,
                         _number(count["rms_error"]),
+                        _number(count["median_error"]),
                         _number(count["median_half_width"]),
                         "" if name == "stretch / mass" else f"{count['identified_within']} of {called}",
                     ]
@@ -293,10 +344,11 @@ def coverage_page(rows: Sequence[Sequence[str]]) -> str:
         "",
         "Cloths of drawn parameters are simulated, recorded (`lift` and `fold` by two depth cameras through `preprocess`, "
         "the others by their whole surface), fitted, and the 90 % interval is held against the truth. Material that fits "
-        "take for known is off by the factors that the intervals state (`evaluate.doubts`). Errors and half-widths are of "
+        "take for known is off by the factors that the fits state (`fit.doubts`). Errors and half-widths are of "
         "the natural logarithm: 0.1 is about 10 %. A fit that fails or states no interval is a miss. *Identified*: of the "
         "recordings with that verdict, how many are within its factor of the truth. *Refined*: the truth has four times "
-        "the steps that fits take. Command: `make coverage`.",
+        "the steps that fits take. A row named after a network is what that predicts of these recordings (`--checkpoint`); "
+        "it was trained on cloths whose other material is as the scenario has it. Command: `make coverage`.",
         "",
         *markdown_table(HEAD, rows),
         "",

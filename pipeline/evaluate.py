@@ -22,7 +22,6 @@ from diffcloud.fit import JointObjective, Objective, read_fit
 from diffcloud.fit.pose import parse_priors
 from diffcloud.fit.record import FitRecord
 from diffcloud.fit.result import describe_recording
-from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, check_doubts
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import claimed, files_in, together, write_json, write_text
 from diffcloud.sim.properties import check_values
@@ -102,13 +101,6 @@ def intervals(
     scene: SceneFile = None,
     level: Annotated[float, typer.Option(min=0.01, max=0.999, help="Share of intervals meant to hold the truth.")] = LEVEL,
     within: Annotated[float, typer.Option(help="Factor within which a parameter counts as identified.")] = WITHIN,
-    doubt: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="PARAMETER=FACTOR, repeatable: the factor within which material that is not fitted is known. none: "
-            "exactly. Default: " + ", ".join(f"{name}={factor:g}" for name, factor in MATERIAL_DOUBTS.items()) + "."
-        ),
-    ] = None,
     out: Annotated[Path | None, typer.Option(help="JSON for the result, which `export --samples` draws from.")] = None,
     threads: Threads = None,
     json: JsonFlag = False,
@@ -121,10 +113,6 @@ def intervals(
         raise ConfigError(f"{fit} is a fit to {len(record.episodes)} episodes ({names}), {len(episodes)} were given.")
     if within <= 1:
         raise ConfigError(f"--within takes a factor above 1, got {within:g}.")
-    doubts = dict(MATERIAL_DOUBTS)
-    if doubt:
-        doubts = {} if doubt == ["none"] else doubts | assignments([item.rstrip("x") for item in doubt], "--doubt")
-    check_doubts(doubts)
     measure = record.measure.model_dump()
     members = []
     for path, one in zip(episodes, record.episodes, strict=True):
@@ -134,8 +122,8 @@ def intervals(
         members.append(Objective(chosen, read_episode(path), **measure))
     objective = members[0] if len(members) == 1 else JointObjective(members)
     found = state_intervals(
-        objective, space_of(record), record.fitted,
-        level=level, within=within, doubts=doubts, restarts=RESTARTS, seen=scan_of(record),
+        objective, space_of(record), record.free,
+        level=level, within=within, restarts=RESTARTS, seen=scan_of(record),
     )  # fmt: skip
     if out is not None:
         write_json(with_suffix(out, ".json"), found.model_dump(mode="json"))

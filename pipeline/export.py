@@ -124,7 +124,7 @@ def _draws(record: FitRecord, path: Path, count: int, seed: int) -> list[dict[st
     from diffcloud.evaluation.intervals import draws, read_intervals
     from diffcloud.evaluation.methods import space_of
 
-    space = space_of(record)
+    space = space_of(record).asked
     return [{**record.values, **values} for values in draws(read_intervals(path, space), space, count, seed)]
 
 

@@ -67,9 +67,7 @@ def fit(
     ] = None,
     starts: Annotated[
         int | None,
-        typer.Option(
-            help="Descents from as many places; gauss_newton: at most. Default: 8 (3 if cameras recorded); 1 of adam."
-        ),
+        typer.Option(help="Descents from as many places; of gauss_newton at most. Default: 8; of adam, 1."),
     ] = None,
     screen: Annotated[
         int | None,
@@ -110,6 +108,13 @@ def fit(
             "Default: x=0.1m,y=0.1m,yaw=30deg."
         ),
     ] = None,
+    doubts: Annotated[
+        str | None,
+        typer.Option(
+            help="The factor within which material that is neither fitted nor fixed is known; it is fitted along, and is "
+            "no result. none: exactly. Default of gauss_newton: 1.5x of bending and damping, 1.3x of drag and frictions."
+        ),
+    ] = None,
     prior: Annotated[
         str | None,
         typer.Option(
@@ -148,6 +153,7 @@ def fit(
         paper=paper,
         nuisance=nuisance,
         prior=prior,
+        doubts=doubts,
         joint=joint,
         workers=workers,
     )
@@ -161,7 +167,7 @@ def fit(
     # everything is read before anything is fitted: a damaged last file must not cost the first ones' time
     for job in jobs:
         job.objective()
-    space = jobs[0].space
+    space = jobs[0].space.asked
     table = Table("episode", "start", "final", "rms mm", *space.names, "iterations", "seconds", "stopped by")
     results: dict[str, Any] = {}
     failures: list[str] = []

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit import FitSpace, JointObjective, Objective, Progress, read_fit, solve, write_fit
+from diffcloud.fit.doubts import with_doubts
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.left_out import leave_each_out
 from diffcloud.fit.priors import parameter_priors
@@ -127,7 +128,7 @@ class FitJob:
     def space(self) -> FitSpace:
         """
         Raises:
-            ConfigError: bounds, priors or fixed values that do not fit the parameters.
+            ConfigError: bounds, priors, doubts or fixed values that do not fit the parameters.
         """
         settings = self.settings
         for recording in self.recordings:
@@ -136,7 +137,9 @@ class FitJob:
         space = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed)
         ranges = {variable.name: (variable.low, variable.high) for variable in space.variables}
         priors = parameter_priors("none" if settings.paper else settings.prior, space.names, ranges)
-        return FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed, priors=priors)
+        space = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed, priors=priors)
+        scenarios = [recording.scenario for recording in self.recordings]
+        return with_doubts(space, settings.known_within(scenarios), scenarios)
 
     def objective(self) -> AnyObjective:
         """
@@ -167,7 +170,7 @@ class FitJob:
 
         def show_progress(progress: Progress) -> None:
             check_interrupt()
-            values = "  ".join(f"{key} {value:.3g}" for key, value in progress.values.items())
+            values = "  ".join(f"{key} {progress.values[key]:.3g}" for key in space.asked.names)
             if isinstance(settings, SearchSettings):
                 done, most = progress.simulations or 0, settings.simulations
             else:  # of Gauss–Newton for each start, of which it is not known how many are followed

@@ -308,7 +308,7 @@ def _stated(
     for left in range(RESTARTS, -1, -1):
         record, objective, job, steps = fit(settings, steps, init)
         space, seen = space_of(record), scan_of(record)
-        found = state_intervals(objective, space, record.fitted, level=level, within=within, seen=seen)
+        found = state_intervals(objective, space, record.free, level=level, within=within, seen=seen)
         if found.lower is None or not left:
             break
         near = ", ".join(f"{name} {value:.3g}" for name, value in found.lower.items())
@@ -348,7 +348,7 @@ def _fitted(
             if apart > _NOISE_PART * noise:
                 warn(f"finer steps still move the cloth by {apart:.1f} mm: what is found includes an error of that size.")
             return record, objective, job, steps
-        steps, init, settings = 2 * steps, record.fitted, _single_start(settings)
+        steps, init, settings = 2 * steps, record.free, _single_start(settings)
 
 
 def _tell(update: Callable[[float, str], None], steps: int, done: float, text: str) -> None:

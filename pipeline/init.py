@@ -125,7 +125,7 @@ def _options(folder: Path, record: FitRecord) -> str:
                 "run `diffcloud identify` again."
             ) from error
         options += ["--mass", f"{mass.value * density:.12g}"]
-    told = read_intervals(folder / "intervals.json", space_of(record))
+    told = read_intervals(folder / "intervals.json", space_of(record).asked)
     for name, value, usual in (("level", told.level, LEVEL), ("within", told.within, WITHIN)):
         if value != usual:
             options += [f"--{name}", f"{value:g}"]

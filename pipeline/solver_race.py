@@ -79,7 +79,7 @@ class RaceJob:
             return kept
         truth = self.truth()
         recording = Recording(self.scenario, self.label, self._episode(truth))
-        job = FitJob(self.label, [recording], FitConfig(parameters=self.names), self.out)
+        job = FitJob(self.label, [recording], FitConfig(parameters=self.names, doubts="none"), self.out)
         objective, space = job.objective(), job.space
         tell(0.0, "reference")
         wide = GaussNewtonSettings(starts=6, screen=96, scans=3, seed=self.seed)
@@ -129,7 +129,7 @@ class RaceJob:
             given |= {"starts": _ADAM_STARTS, "screen": like.screen, "iterations": iterations, "smoothing": 0.0}
         elif solver in ("cma_es", "random_search"):
             given["simulations"] = BUDGET
-        return FitConfig(parameters=self.names, **given).solver_settings(self.scenario)
+        return FitConfig(parameters=self.names, doubts="none", **given).solver_settings(self.scenario)
 
     def _timed(self, objective: Objective | JointObjective, space: Any, settings: Settings) -> dict[str, Any]:
         began = time.process_time()

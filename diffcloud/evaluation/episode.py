@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from diffcloud.errors import DiffCloudError
@@ -13,7 +13,6 @@ from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
 from diffcloud.fit import AdamSettings, CmaEsSettings, FitRecord, FitSpace, Objective, RandomSearchSettings
-from diffcloud.fit.uncertainty import MATERIAL_DOUBTS
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 
@@ -33,7 +32,6 @@ class ComparisonSettings:
     """Of intervals; None: state none."""
     within: float = WITHIN
     """Factor within which a parameter counts as identified."""
-    doubts: Mapping[str, float] = field(default_factory=lambda: dict(MATERIAL_DOUBTS))
     """Of the material that is not fitted, see `fit.uncertainty`."""
     landscape_size: int = 0
     """Places along each axis of the loss landscape; 0: none."""
@@ -46,7 +44,7 @@ class EpisodeRecord:
     record: dict[str, Any]
     """Plain values, the same for the same inputs: scenario, episode, its fit, labels, `start` (metrics of the fit's start,
     None if that diverges), `methods` (a row each: values, clipped values, metrics, simulations), `gaps`, `transfers`,
-    `intervals`, `landscape`."""
+    `intervals`, `landscape`, and `doubtful`: parameters that were fitted along, and are no result."""
     seconds: dict[str, dict[str, float]]
     """Method -> phase -> wall time."""
 
@@ -75,7 +73,7 @@ def compare_episode(
     space = methods.space_of(fit)
     objective = Objective(scenario, episode, **measure, seed=fit.measure.seed)
     told: list[Estimate | Gap] = [methods.fitted(fit)]
-    told += [_run(rival, objective, space, fit, settings.seed) for rival in settings.rivals]
+    told += [_run(rival, objective, space.asked, fit, settings.seed) for rival in settings.rivals]
     told += [*predictions, *methods.published(episode.meta)]
     estimates = [entry for entry in told if isinstance(entry, Estimate)]
     gaps = [entry for entry in told if isinstance(entry, Gap)]
@@ -119,6 +117,7 @@ def compare_episode(
         "length_unit_m": scenario.length_unit_m,
         "threshold": success_threshold(scenario),
         "frames": list(objective.frames),
+        "doubtful": [variable.name for variable in space.variables if variable.doubtful],
         "starts": int(fit.settings.get("starts") or 1),  # a search is one
         "start": None if len(sets) in measured.diverged else measured.rows[-1],
         "methods": rows,
@@ -133,8 +132,7 @@ def compare_episode(
     if settings.level is not None and len(fit.episodes) == 1:  # those of a joint fit are of all its recordings together
         told_intervals = state_intervals(
             objective, space, best,
-            level=settings.level, within=settings.within, doubts=settings.doubts, restarts=RESTARTS,
-            seen=methods.scan_of(fit),
+            level=settings.level, within=settings.within, restarts=RESTARTS, seen=methods.scan_of(fit),
         )  # fmt: skip
         record["intervals"] = told_intervals.model_dump(mode="json") | {"note": node_set_note(scenario)}
     objective.reseed(fit.measure.seed)

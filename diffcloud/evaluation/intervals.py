@@ -4,8 +4,9 @@ Variances come from `fit.uncertainty`. An interval lies symmetrically on the axi
 multipliers) and ends at the bounds. Its half-width is the variance's root times the quantile of Student's t with the
 degrees of freedom of Welch and Satterthwaite: the noise is estimated from few clusters, the stated doubts are not.
 
-No interval is stated where a fit has not arrived: Gauss and Newton's next step would leave a good part of it, or a loss
-nearby is clearly lower. `restarts` lets the fit start again there.
+Gauss and Newton's next step, which the fit has not taken, is one of its sources. No interval is stated where a fit has not
+arrived: that step is far longer than the deviations, or a loss nearby is clearly lower. `restarts` lets the fit start again
+there.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from diffcloud.fit.residuals import Axis
 from diffcloud.fit.result import physical_values
 from diffcloud.fit.scan import Scan, scan
 from diffcloud.fit.solvers import GaussNewtonSettings, solve
-from diffcloud.fit.uncertainty import MATERIAL_DOUBTS, Uncertainty, noise_mm, uncertainty
+from diffcloud.fit.uncertainty import Uncertainty, noise_mm, uncertainty
 from diffcloud.io.files import read_json
 from diffcloud.scene.scenarios import Scenario
 
@@ -52,7 +53,7 @@ RESTARTS = 2
 """Of a fit that has not arrived, from a lower loss beside it."""
 _UNEXPLAINED = 2.0
 """RMS over what noise and spacing of the points account for, from which the model does not explain the recording."""
-_STEP = 0.5
+_STEP = 2.0
 """The largest next step of a fit that has arrived, in standard deviations."""
 _PRIOR = 0.5
 """Part of the variance from which it is the prior that speaks."""
@@ -133,16 +134,14 @@ def state_intervals(
     *,
     level: float = LEVEL,
     within: float = WITHIN,
-    doubts: Mapping[str, float] = MATERIAL_DOUBTS,
     restarts: int = 0,
     seen: Scan | None = None,
 ) -> Intervals:
     """
     Args:
-        values: the fitted ones.
+        values: the fitted ones, of doubtful material too; intervals are of what was asked for.
         level: of the intervals.
         within: factor within which a parameter counts as identified.
-        doubts: of what is not fitted, see `fit.uncertainty`.
         restarts: how often Gauss–Newton may start again at a clearly lower loss that is met on the way; the intervals are
             then those of where it ends.
         seen: the losses beside the fitted place, where they are known; otherwise they are simulated.
@@ -150,28 +149,30 @@ def state_intervals(
     Raises:
         DivergedError: the fitted motion diverges.
     """
-    found, lower = _with_scan(objective, space, uncertainty(objective, space, values, doubts=doubts), seen)
+    found, lower = _with_scan(objective, space, values, uncertainty(objective, space, values), seen)
     if lower is not None and restarts > 0:
         outcome = solve(objective, space, GaussNewtonSettings(starts=1, screen=0, init=lower))
         if outcome.stop_reason == "interrupted":
             raise KeyboardInterrupt
         told_again = state_intervals(
             objective, space, outcome.values,
-            level=level, within=within, doubts=doubts, restarts=restarts - 1, seen=outcome.scan,
+            level=level, within=within, restarts=restarts - 1, seen=outcome.scan,
         )  # fmt: skip
         return told_again.model_copy(update={"restarts": told_again.restarts + 1})
-    total = found.covariance
-    deviations = np.sqrt(np.maximum(total.diagonal(), 1e-300))
+    space = space.asked
+    deviations = np.sqrt(np.maximum(found.covariance.diagonal(), 1e-300))
     arrived = lower is None and bool((np.abs(found.step) <= _STEP * deviations).all())
+    found = replace(found, sources={**found.sources, "next step": np.outer(found.step, found.step)})
+    total = found.covariance
     misfit = [_misfit(member, loss) for member, loss in zip(objective.members, found.losses.tolist(), strict=True)]
     worst_fit = max(misfit, key=lambda pair: pair[0] / pair[1])
     explains = objective.paper or worst_fit[0] <= _UNEXPLAINED * worst_fit[1]
     reason = ""
     if explains and lower is not None:
-        near = ",".join(f"{name}={value:.3g}" for name, value in lower.items())
+        near = ",".join(f"{name}={lower[name]:.3g}" for name in space.names)
         reason = f"the fit has not arrived: the loss is lower at {near}; fit again with `diffcloud fit --init {near}`"
     elif explains and not arrived:
-        reason = "the fit has not arrived: its next step is a good part of the interval; fit again with more iterations"
+        reason = "the fit has not arrived: its next step is longer than the interval; fit again with more iterations"
     elif not explains:
         reason = (
             f"the misfit is {worst_fit[0]:.1f} mm RMS, but noise and spacing of the points account for only "
@@ -245,27 +246,34 @@ def state_intervals(
 
 
 def _with_scan(
-    objective: AnyObjective, space: FitSpace, found: Uncertainty, seen: Scan | None
+    objective: AnyObjective, space: FitSpace, values: Mapping[str, float], found: Uncertainty, seen: Scan | None
 ) -> tuple[Uncertainty, dict[str, float] | None]:
-    """The uncertainty with one more source: how far along the scan's axes the loss stays as low as noise of so few clusters
-    may make it. And the values of a clearly lower loss, if the scan meets one.
+    """The uncertainty with one more source: along the scan's axes, how much further than noise and priors say the loss is
+    hardly higher. And the values of a clearly lower loss, if the scan meets one.
+
+    Hardly higher is what these two make of it: along an axis of curvature H, their variance V raises the loss by H V at one
+    deviation. A quadratic loss reaches no further than they say, and the source is zero.
 
     Args:
-        seen: the scan of the solver; without it, one along the principal axes of the covariance.
+        values: the fitted ones.
+        seen: the scan of the solver; without it, the losses are simulated.
     """
-    centre = torch.from_numpy(found.places)
-    if seen is None:
-        inverse = torch.from_numpy(np.linalg.pinv(found.covariance, hermitian=True))
-        seen, _ = scan(objective, space, centre, inverse)
     axis = Axis.of(space)
+    centre = axis.places(torch.tensor([values[name] for name in space.names], dtype=torch.float64))
+    if seen is None:
+        seen, _ = scan(objective, space, centre, torch.from_numpy(found.curvature))
     of_data = mean_loss(torch.from_numpy(found.losses)[:, None], paper=objective.paper)
-    loss = float(of_data + space.prior_loss(axis.values(centre[None]), objective.length_unit_m))
+    loss = float(of_data + space.prior_loss(axis.values(centre[None]), objective.prior_cost))
     place = seen.lower(centre, loss)
     lower = None if place is None else dict(zip(space.names, axis.bounded(place[None])[0].tolist(), strict=True))
     quantile = float(stdtrit(max(found.clusters - 1, 1), 0.95))
-    hidden = seen.losses <= (1 + quantile**2 / max(found.clusters - len(space.names), 1)) * loss
+    directions = seen.directions[:, [not variable.doubtful for variable in space.variables]]
+    known = torch.from_numpy(found.of_noise_and_priors)
+    variance = torch.einsum("ai,ij,aj->a", directions, known, directions)
+    curvature = torch.einsum("ai,ij,aj->a", seen.directions, torch.from_numpy(found.curvature), seen.directions)
+    hidden = seen.losses <= loss + quantile**2 * (curvature * variance)[:, None]
     reach = torch.where(hidden, seen.lengths.abs(), 0.0).amax(-1) / quantile
-    spread = (seen.directions.T * reach.square()) @ seen.directions
+    spread = (directions.T * (reach.square() - variance).clamp(min=0.0)) @ directions
     return replace(found, sources={**found.sources, "nearly as low": spread.numpy()}), lower
 
 

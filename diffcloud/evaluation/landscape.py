@@ -16,7 +16,7 @@ from diffcloud.fit.record import History
 def loss_landscape(
     objective: Objective, space: FitSpace, values: Mapping[str, float], history: History, *, size: int
 ) -> dict[str, Any] | None:
-    """Losses over the first two fitted parameters, the others as fitted.
+    """Losses over the first two parameters that were asked for, the others as fitted.
 
     Args:
         values: the fitted ones.
@@ -25,9 +25,9 @@ def loss_landscape(
 
     Returns:
         names; x, y: [n] of the first and the second parameter; loss: [n][n], rows of y, None where a run diverged; paths:
-        for each start [iterations][2]; fitted: [2]. None if fewer than two parameters are fitted.
+        for each start [iterations][2]; fitted: [2]. None if fewer than two were asked for.
     """
-    if len(space.variables) < 2:
+    if len(space.asked.variables) < 2:
         return None
     first, second = space.variables[:2]
     axes = [np.geomspace(v.low, v.high, size) if v.low > 0 else np.linspace(v.low, v.high, size) for v in (first, second)]

@@ -51,12 +51,14 @@ class Gap:
 
 
 def space_of(fit: FitRecord) -> FitSpace:
-    """The fitted parameters of a fit with their bounds and priors, and those that were given."""
-    free = [(name, entry.bounds, entry.prior) for name, entry in fit.parameters.items() if entry.bounds is not None]
-    return FitSpace(
-        tuple(Variable(name, low, high, prior) for name, (low, high), prior in free),
-        {name: entry.value for name, entry in fit.parameters.items() if entry.bounds is None},
-    )
+    """The free parameters of a fit with their bounds and priors, and those that were given."""
+    variables, fixed = [], {}
+    for name, entry in fit.parameters.items():
+        if entry.bounds is None:
+            fixed[name] = entry.value
+        else:
+            variables.append(Variable(name, *entry.bounds, entry.prior, entry.centre, entry.doubtful))
+    return FitSpace(tuple(variables), fixed)
 
 
 def scan_of(fit: FitRecord) -> Scan | None:
@@ -77,7 +79,7 @@ def fitted(fit: FitRecord) -> Estimate:
 
 def middle(space: FitSpace) -> Estimate:
     """The middle of each range on the paper's linear scale: what no learning and no search gives."""
-    return Estimate("middle", {variable.name: 0.5 * (variable.low + variable.high) for variable in space.variables})
+    return Estimate("middle", {variable.name: 0.5 * (variable.low + variable.high) for variable in space.asked.variables})
 
 
 def single_start(objective: Objective, space: FitSpace, settings: AdamSettings) -> Estimate:
@@ -144,8 +146,9 @@ def published(meta: Mapping[str, Any]) -> list[Estimate]:
 
 
 def clipped(values: Mapping[str, float], space: FitSpace) -> dict[str, float]:
-    """Values within the bounds, with the given ones in place; what a method leaves out is the middle."""
-    found = {**middle(space).values, **space.fixed}
+    """Values within the bounds, with the given ones in place; what a method leaves out is the middle, or what is known of
+    doubtful material."""
+    found = {**middle(space).values, **space.asked.fixed}
     for variable in space.variables:
         value = float(values.get(variable.name, found[variable.name]))
         found[variable.name] = min(max(value, variable.low), variable.high)

@@ -91,6 +91,7 @@ class ComparisonRecord(Checked):
     length_unit_m: Place
     threshold: Value | None
     frames: list[int]
+    doubtful: list[Text]
     starts: int
     start: _Metrics | None
     methods: list[MethodRecord]

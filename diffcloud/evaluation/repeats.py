@@ -21,8 +21,8 @@ def fit_of(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """One row per episode: scenario, episode, fabric, category, repeat, loss, and a column per fitted parameter, with
-    `ratio` of stretch to mass where both are there."""
+    """One row per episode: scenario, episode, fabric, category, repeat, loss, and a column per parameter but those fitted
+    along because they are not known exactly, with `ratio` of stretch to mass where both are there."""
     rows = []
     for record in records:
         fit = fit_of(record)
@@ -31,7 +31,8 @@ def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         row = {key: record[key] for key in ("scenario", "episode", "fabric", "category", "repeat")}
         if record["truth"]:
             row["fabric"] = None  # a simulated target has known parameters; its label names no cloth that is met again
-        row |= {"loss": fit["loss"], **fit["clipped"]}
+        row |= {"loss": fit["loss"]}
+        row |= {name: value for name, value in fit["clipped"].items() if name not in record["doubtful"]}
         if {"stretch", "mass"} <= fit["clipped"].keys():
             row["ratio"] = fit["clipped"]["stretch"] / fit["clipped"]["mass"]
         rows.append(row)

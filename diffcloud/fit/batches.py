@@ -44,7 +44,7 @@ def posterior_losses(objective: AnyObjective, space: FitSpace, values: Tensor) -
     Raises:
         DivergedError: names step and batch entries.
     """
-    return objective(space.parameters(values)) + space.prior_loss(values, objective.length_unit_m)
+    return objective(space.parameters(values)) + space.prior_loss(values, objective.prior_cost)
 
 
 def batch_losses(objective: AnyObjective, space: FitSpace, values: Tensor) -> Tensor:

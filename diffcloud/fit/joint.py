@@ -47,10 +47,21 @@ class JointObjective:
         return self.members[0].length_unit_m
 
     @property
+    def sees_all(self) -> bool:
+        """As of `Objective`, of every one."""
+        return all(one.sees_all for one in self.members)
+
+    @property
     def explained(self) -> float:
         """As of `Objective`."""
         levels = torch.tensor([[one.explained] for one in self.members], dtype=torch.float64)
         return float(mean_loss(levels, paper=self.paper))
+
+    @property
+    def prior_cost(self) -> float:
+        """As of `Objective`. The loss is a mean over recordings, which say the more, the more there are."""
+        costs = torch.tensor([[one.prior_cost] for one in self.members], dtype=torch.float64)
+        return float(mean_loss(costs, paper=self.paper)) / len(self.members)
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Losses [B], as of `Objective`."""

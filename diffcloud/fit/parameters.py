@@ -19,7 +19,6 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from diffcloud.errors import ConfigError, unknown_name
-from diffcloud.fit.priors import prior_cost
 from diffcloud.sim.properties import PARAMETERS, check_values
 
 _EDGE = 1e-6
@@ -33,7 +32,11 @@ class Variable:
     low: float
     high: float
     prior: float | None = None
-    """Factor of one deviation of its log-normal prior about 1, the basis material; None: none."""
+    """Factor of one deviation of its log-normal prior; None: none."""
+    centre: float = 1.0
+    """Of the prior; by default the basis material."""
+    doubtful: bool = False
+    """Nobody asked for it: it is fitted along, because it is not known exactly (`fit.doubts`)."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
@@ -88,6 +91,12 @@ class FitSpace:
     def names(self) -> tuple[str, ...]:
         return tuple(variable.name for variable in self.variables)
 
+    @property
+    def asked(self) -> FitSpace:
+        """What was asked for; doubtful material is where its prior has it."""
+        known = {variable.name: variable.centre for variable in self.variables if variable.doubtful}
+        return FitSpace(tuple(v for v in self.variables if not v.doubtful), {**self.fixed, **known})
+
     def check_start(self, first: Mapping[str, float]) -> None:
         """
         Args:
@@ -96,7 +105,7 @@ class FitSpace:
         Raises:
             ConfigError: one of what is not fitted, or outside of its bounds; names the nearest that is allowed.
         """
-        bounds = {variable.name: (variable.low, variable.high) for variable in self.variables}
+        bounds = {variable.name: (variable.low, variable.high) for variable in self.asked.variables}
         for name, value in first.items():
             if name not in bounds:
                 raise ConfigError(f"--init: {unknown_name('fitted parameter', name, bounds)}")
@@ -133,21 +142,25 @@ class FitSpace:
         """Initial values [count, k] and which scale each start uses, bool [count].
 
         The first start is the middle of the range on the paper's linear scale, or `first` where given; the others are
-        spread over the box log-uniformly by a scrambled Sobol sequence.
+        spread over the box log-uniformly by a scrambled Sobol sequence. Doubtful material starts where its prior has it.
         """
-        low = np.array([variable.low for variable in self.variables])
-        high = np.array([variable.high for variable in self.variables])
+        asked = self.asked.variables
+        low, high = np.array([variable.low for variable in asked]), np.array([variable.high for variable in asked])
         middle = 0.5 * (low + high)
-        for index, name in enumerate(self.names):
-            if first and name in first:
-                middle[index] = first[name]
+        for index, variable in enumerate(asked):
+            middle[index] = (first or {}).get(variable.name, middle[index])
         values = np.repeat(middle[None], count, axis=0)
         if count > 1:
             sobol = SobolEngine(len(low), scramble=True, seed=seed).draw(count - 1, dtype=torch.float64).numpy()
             safe = np.where(low > 0, low, 1.0)
             logs = safe * np.where(low > 0, high / safe, 1.0) ** sobol
             values[1:] = np.where(low > 0, logs, low + (high - low) * sobol)
-        return torch.as_tensor(values), torch.arange(count) > 0
+        columns = dict(zip((variable.name for variable in asked), values.T, strict=True))
+        every = [
+            columns[v.name] if not v.doubtful else np.full(count, (first or {}).get(v.name, v.centre))
+            for v in self.variables
+        ]
+        return torch.as_tensor(np.stack(every, axis=1)), torch.arange(count) > 0
 
     def moved(self, values: Tensor, parts: Tensor) -> Tensor:
         """[..., k] values moved by these parts of themselves, or of the range where the lower bound is zero, inside the
@@ -161,16 +174,24 @@ class FitSpace:
         columns = dict(zip(self.names, values.unbind(-1), strict=True))
         return columns | {name: torch.full_like(values[:, 0], value) for name, value in self.fixed.items()}
 
-    def prior_weights(self, length_unit_m: float) -> Tensor:
-        """[k] what the loss gains by the square of each variable's logarithm [squared length unit]."""
-        cost = prior_cost(length_unit_m)
+    def prior_weights(self, cost: float) -> Tensor:
+        """[k] what the loss gains by the square of each variable's `off_centre` [squared length unit].
+
+        Args:
+            cost: what it gains at one deviation: the objective's `prior_cost`.
+        """
         weights = [0.0 if v.prior is None else cost / math.log(v.prior) ** 2 for v in self.variables]
         return torch.tensor(weights, dtype=torch.float64)
 
-    def prior_loss(self, values: Tensor, length_unit_m: float) -> Tensor:
-        """[B] what the priors add to the loss of values [B, k]."""
-        weights = self.prior_weights(length_unit_m)
-        return (weights * torch.where(weights > 0, values, 1.0).log().square()).sum(-1)
+    def prior_loss(self, values: Tensor, cost: float) -> Tensor:
+        """[B] what the priors add to the loss of values [B, k]; `cost` as of `prior_weights`."""
+        return (self.prior_weights(cost) * self.off_centre(values).square()).sum(-1)
+
+    def off_centre(self, values: Tensor) -> Tensor:
+        """[..., k] logarithms of values over the centres of their priors; zero for those without one."""
+        centres = values.new_tensor([variable.centre for variable in self.variables])
+        known = torch.tensor([variable.prior is not None for variable in self.variables])
+        return torch.where(known, values / centres, 1.0).log()
 
     def _bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
         low = [variable.low for variable in self.variables]

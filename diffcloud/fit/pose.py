@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from diffcloud.errors import ConfigError, unknown_name
-from diffcloud.fit.priors import prior_cost
 from diffcloud.fit.record import NuisanceValue
 
 NUISANCE: dict[str, Literal["m", "rad", "s"]] = {
@@ -90,10 +89,11 @@ class PoseSpace:
     """[3] of the recording."""
 
     @staticmethod
-    def build(priors: Mapping[str, float], centre: Tensor, *, length_unit_m: float) -> PoseSpace:
+    def build(priors: Mapping[str, float], centre: Tensor, *, length_unit_m: float, prior_cost: float = 0.0) -> PoseSpace:
         """
         Args:
             priors: name -> standard deviation [m, rad, s].
+            prior_cost: what they add to the loss at one deviation; only fits need it.
 
         Raises:
             ConfigError: an unknown name, or what is no positive number.
@@ -106,7 +106,7 @@ class PoseSpace:
         names = tuple(name for name in NUISANCE if name in priors)
         scale = [priors[name] / (length_unit_m if NUISANCE[name] == "m" else 1.0) for name in names]
         deviations = torch.tensor(scale, dtype=torch.float64)
-        return PoseSpace(names, deviations, prior_cost(length_unit_m) / deviations**2, centre)
+        return PoseSpace(names, deviations, prior_cost / deviations**2, centre)
 
     def described(self, values: Tensor, *, length_unit_m: float) -> dict[str, NuisanceValue]:
         """[d] values as records keep them: name -> value and its prior, in SI."""

@@ -1,8 +1,8 @@
 """How much a prior says, of the pose and of the parameters, beside a recording; and the priors of parameters.
 
 A multiplier has a log-normal prior about the basis material: one deviation off is a factor. At one deviation a prior adds
-as much to the loss as a residual of 5 mm among a hundred: far less than a recording says of what it shows. It decides
-where nothing is shown.
+as much to the loss as one of a hundred independent residuals of the recording's own noise: far less than a recording says
+of what it shows. It decides where nothing is shown.
 """
 
 from __future__ import annotations
@@ -16,13 +16,18 @@ from diffcloud.sim.properties import PARAMETERS
 
 DEFAULT_FACTOR = 10.0
 """One deviation of a multiplier."""
-_NOISE_M = 0.005
 _INDEPENDENT = 100
+_LEAST_M = 0.0005
+"""Of a recording's noise: points of a simulation without any have a spacing at least."""
 
 
-def prior_cost(length_unit_m: float) -> float:
-    """What a prior adds to the loss at one deviation [squared length unit]."""
-    return (_NOISE_M / length_unit_m) ** 2 / _INDEPENDENT
+def prior_cost(noise_loss: float, length_unit_m: float) -> float:
+    """What a prior adds to the loss at one deviation [squared length unit].
+
+    Args:
+        noise_loss: what noise and spacing of the recorded points leave of the loss [squared length unit].
+    """
+    return max(noise_loss, (_LEAST_M / length_unit_m) ** 2) / _INDEPENDENT
 
 
 def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str, tuple[float, float]]) -> dict[str, float]:
@@ -47,7 +52,7 @@ def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str
             raise ConfigError(f"prior: {unknown_name('fitted parameter', name, names)}")
         if PARAMETERS[name].basis is None:
             raise ConfigError(f"prior: {name} is no multiplier; what is known of it are its bounds, {list(bounds[name])}.")
-        factor = _factor(value)
+        factor = parse_factor(value)
         if not (factor > 1 and math.isfinite(factor)):
             raise ConfigError(
                 f"prior {item.strip()!r}: {name} takes the factor within which it probably lies, above 1 and with an x, "
@@ -62,7 +67,8 @@ def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str
     return found
 
 
-def _factor(text: str) -> float:
+def parse_factor(text: str) -> float:
+    """Of "1.5x"; NaN if it is none."""
     match = re.fullmatch(r"([0-9.eE+-]+)\s*x", text)
     try:
         return float(match[1]) if match else math.nan

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from diffcloud.errors import ConfigError
 from diffcloud.io.files import read_json
 
-SCHEMA = 6
+SCHEMA = 7
 """Of the file. Another one is refused, by name."""
 
 
@@ -92,7 +92,11 @@ class FittedParameter(_Model):
     bounds: tuple[NonNegative, NonNegative] | None = None
     """Of a fitted one."""
     prior: Annotated[float, Field(gt=1, le=1e6)] | None = None
-    """Factor of one deviation of its log-normal prior about the basis material; None: none."""
+    """Factor of one deviation of its log-normal prior; None: none."""
+    centre: Positive = 1.0
+    """Of the prior; by default the basis material."""
+    doubtful: bool = False
+    """Not asked for, and fitted along because it is not known exactly."""
     at_bound: bool = False
 
 
@@ -155,9 +159,10 @@ class History(_Model):
 
 
 class ScanRecord(_Model):
-    """Losses beside the fitted place, on the axis of the fit: a directions, n places along each; k fitted parameters."""
+    """Losses beside the fitted place, on the axis of the fit: a directions, n places along each; k parameters that are
+    fitted, doubtful ones among them."""
 
-    directions: list[list[Annotated[float, Field(ge=-1.001, le=1.001)]]]
+    directions: list[list[Annotated[float, Field(ge=-1e3, le=1e3)]]]
     """[a][k]"""
     lengths: list[list[Annotated[float, Field(ge=-1e3, le=1e3)]]]
     """[a][n]"""
@@ -216,7 +221,7 @@ class FitRecord(_Model):
 
     @model_validator(mode="after")
     def _scans_what_is_fitted(self) -> Self:
-        if self.scan is not None and {len(row) for row in self.scan.directions} != {len(self.fitted)}:
+        if self.scan is not None and {len(row) for row in self.scan.directions} != {len(self.free)}:
             raise ValueError("scan.directions must hold one number for each fitted parameter")
         return self
 
@@ -227,7 +232,12 @@ class FitRecord(_Model):
 
     @property
     def fitted(self) -> dict[str, float]:
-        """Parameter -> value, of those that were not given."""
+        """Parameter -> value, of those that were asked for."""
+        return {name: value for name, value in self.free.items() if not self.parameters[name].doubtful}
+
+    @property
+    def free(self) -> dict[str, float]:
+        """Parameter -> value, of those that were not given: asked for, or doubtful."""
         return {name: parameter.value for name, parameter in self.parameters.items() if not parameter.fixed}
 
     def plain(self) -> dict[str, Any]:

@@ -89,8 +89,8 @@ def linearise(objective: AnyObjective, space: FitSpace, places: Tensor) -> Linea
     def run(index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         parts = map_threads(lambda one: _over_pose(one, *moved_by(one, space, places[index])), objective.members)
         loss, slope, curvature = mean_terms(parts, paper=paper)
-        weights = space.prior_weights(objective.length_unit_m)
-        off = places[index]  # logarithms of multipliers, where there is a prior
+        weights = space.prior_weights(objective.prior_cost)
+        off = space.off_centre(Axis.of(space).values(places[index]))
         return loss + (weights * off.square()).sum(-1), slope + weights * off, curvature + weights.diag()
 
     with torch.no_grad():

@@ -321,7 +321,8 @@ def _parameters(
         found[name].fixed = True
     for variable in space.variables:
         entry, (low, high) = found[variable.name], (variable.low, variable.high)
-        entry.bounds, entry.prior = (low, high), variable.prior
+        entry.bounds, entry.prior, entry.centre = (low, high), variable.prior, variable.centre
+        entry.doubtful = variable.doubtful
         entry.at_bound = min(entry.value - low, high - entry.value) < _AT_BOUND * (high - low)
     return found
 

@@ -31,7 +31,8 @@ class Scan:
     """Around one place, of k variables."""
 
     directions: Tensor
-    """[a, k] principal axes, in rows, the flattest first."""
+    """[a, k] principal axes of what is asked for, in rows, the flattest first. What is doubtful follows: to where, by the
+    curvature, the loss is lowest."""
     lengths: Tensor
     """[a, n] along each, negative ones first; where a bound cuts one short, its length is what is left."""
     losses: Tensor
@@ -71,7 +72,7 @@ def scan(objective: AnyObjective, space: FitSpace, place: Tensor, curvature: Ten
     """
     axis = Axis.of(space)
     low, high = axis.ends
-    directions = torch.linalg.eigh(curvature)[1].T[:AXES]
+    directions = _axes(space, curvature)
     ways = torch.tensor([-length for length in reversed(LENGTHS)] + list(LENGTHS), dtype=torch.float64)
     lengths = ways.expand(len(directions), -1).clone()
     for row, direction in enumerate(directions):
@@ -84,3 +85,14 @@ def scan(objective: AnyObjective, space: FitSpace, place: Tensor, curvature: Ten
     places = place + lengths[..., None] * directions[:, None]
     losses = batch_losses(objective, space, axis.bounded(places.flatten(0, 1))).reshape(lengths.shape)
     return Scan(directions, lengths, losses), losses.numel() * len(objective.members)
+
+
+def _axes(space: FitSpace, curvature: Tensor) -> Tensor:
+    """[a, k] directions of a scan: of the curvature [k, k] with doubtful variables solved for."""
+    doubtful = torch.tensor([variable.doubtful for variable in space.variables])
+    asked = ~doubtful
+    follow = -torch.linalg.solve(curvature[doubtful][:, doubtful], curvature[doubtful][:, asked])
+    own = torch.linalg.eigh(curvature[asked][:, asked] + curvature[asked][:, doubtful] @ follow)[1].T[:AXES]
+    directions = own.new_zeros(len(own), len(doubtful))
+    directions[:, asked], directions[:, doubtful] = own, own @ follow.T
+    return directions

@@ -12,6 +12,7 @@ from torch import Tensor
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.errors import EpisodeError
 from diffcloud.fit.pose import PoseSpace
+from diffcloud.fit.priors import prior_cost
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import rollout
@@ -48,6 +49,8 @@ class Target:
     space: PoseSpace
     track: Tensor | None
     """[1, S, G, 3] displacement of the grippers."""
+    noise_loss: float
+    """What noise and spacing of the points leave of the loss [squared length unit]; zero in the paper's measure."""
 
     def at(self, chosen: Sequence[int]) -> Target:
         """The same with some of its frames, by their places among these."""
@@ -94,6 +97,7 @@ def read_target(
     )
     clouds = tuple(NeighbourIndex(torch.as_tensor(episode.frame(frame), dtype=torch.float64)) for frame in frames)
     centre = torch.as_tensor(episode.points.mean(0, dtype=np.float64))  # of all frames, so that a pose holds for others too
+    noise_loss = 0.0 if whole else float(np.mean([cloud.from_surface for cloud in clouds]))
     return Target(
         tuple(frames),
         torch.as_tensor(episode.times[frames], dtype=torch.float64),
@@ -101,8 +105,9 @@ def read_target(
         tuple(_sure(episode, frame) for frame in frames),
         height,
         None if whole or not episode.viewpoints else torch.from_numpy(np.stack(list(episode.viewpoints.values()))),
-        PoseSpace.build(nuisance, centre, length_unit_m=unit),
+        PoseSpace.build(nuisance, centre, length_unit_m=unit, prior_cost=prior_cost(noise_loss, unit)),
         track,
+        noise_loss,
     )
 
 

@@ -4,20 +4,20 @@ At the fitted place, let H be half of the loss's curvature over the fitted varia
 and s_i what pair i adds to half of its slope. A disturbance that adds g to the slope moves the fit by -H⁻¹ g. So
 
     noise           H⁻¹ (Σ_c s_c s_cᵀ) H⁻¹,   s_c: the sum over a cluster of pairs (sandwich; Huber 1967, White 1980)
-    prior           H⁻¹ P Σ P H⁻¹,            P: what the priors add to H, Σ: their variances
+    a prior         H⁻¹ P Σ P H⁻¹,            P: what it adds to H, Σ: its variance
     a known doubt   b bᵀ,  b = -H⁻¹ h,        h: the slope's change if what is not fitted is one deviation off
 
 Residuals of one place on the cloth have much in common, over both directions and all frames: an edge that curls, a fold in
-the wrong place. So pairs are clustered by place. Doubts are quantities that the fit takes for known: material that is not
-fitted, where the cameras stand, the lag, and the size of the simulator's step, whose h is the distance to the motion with
-four times the steps. A misfit that the recording's own noise does not explain is inside of the residuals, and widens the
-interval with them.
+the wrong place. So pairs are clustered by place. Doubtful material is fitted along (`fit.doubts`), each of its priors is
+a source. Other doubts are what the fit takes for known: where the cameras stand, the lag, and the size of the simulator's
+step, whose h is the distance to the motion with four times the steps. A misfit that the recording's own noise does not
+explain is inside of the residuals, and widens the interval with them.
 
 Changes of the slope are differences between motions to both sides, each matched with the recording anew, with nodes moved
 along the derivatives of one simulation: as a surface moves, its points find other partners, which Gauss and Newton's
 curvature of fixed pairs knows only roughly.
 
-The pose is eliminated as in `residuals`; recordings of a joint fit add up with the weights of `joint`.
+The pose is solved for as in `residuals`; recordings of a joint fit add up with the weights of `joint`.
 """
 
 from __future__ import annotations
@@ -30,24 +30,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.fit.joint import AnyObjective, loss_weights
 from diffcloud.fit.matching import Motion
 from diffcloud.fit.objective import Objective
-from diffcloud.fit.parameters import FitSpace, Variable
+from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.pose import NUISANCE
 from diffcloud.fit.residuals import Axis, moved_by
 from diffcloud.fit.targets import track_displacement
-from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import Rollout, rollout
 from diffcloud.sim.threads import map_threads
 
 POSE_DOUBTS = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.005, "yaw": 0.005, "lag": 0.002}
 """How far a calibrated set-up may be off where the fit takes it for known [m, rad, s]."""
-MATERIAL_DOUBTS = {"bending": 1.5, "drag": 1.3, "damping": 1.5, "friction_obstacle": 1.3, "friction_cloth": 1.3}
-"""Factors within which what is not fitted is taken to be known."""
 REFINED = 4
 """Times as many steps show what the step size does."""
+_STEP_SIZE = "step size"
 _STEP = 0.05
 """On the axis, by which the slope's change is measured."""
 _ROUGH = 4.0
@@ -55,26 +52,13 @@ _ROUGH = 4.0
 _CHUNK = 16
 """Motions matched together."""
 _PATCHES = 16
-_NO_MATERIAL = 1e-9
 _NOISE_M = 0.002
 """Of recorded points whose own uncertainty is not stated."""
 
 
-def check_doubts(doubts: Mapping[str, float]) -> None:
-    """
-    Raises:
-        ConfigError: an unknown parameter, or what is no factor above 1.
-    """
-    for name, factor in doubts.items():
-        if name not in PARAMETERS:
-            raise ConfigError(f"doubt: {unknown_name('parameter', name, PARAMETERS)}")
-        if not (1 < factor < np.inf):
-            raise ConfigError(f"doubt: {name} takes the factor within which it is known, above 1, got {factor:g}.")
-
-
 @dataclass(frozen=True)
 class Uncertainty:
-    """Of k fitted variables, on the axis of `residuals.Axis`."""
+    """Of k variables that were asked for, on the axis of `residuals.Axis`."""
 
     names: tuple[str, ...]
     places: NDArray[np.float64]
@@ -87,6 +71,17 @@ class Uncertainty:
     """Of residuals, over all recordings."""
     step: NDArray[np.float64]
     """[k] that Gauss and Newton would take next: small against the deviations where the fit has arrived."""
+    curvature: NDArray[np.float64]
+    """Half of the loss's, priors included, by all that is fitted, doubtful material too."""
+
+    doubtful: tuple[str, ...] = ()
+    """Material that was fitted along."""
+
+    @property
+    def of_noise_and_priors(self) -> NDArray[np.float64]:
+        """[k, k] part of the covariance that the loss itself knows of."""
+        names = self.sources.keys() & {"noise", "prior", *self.doubtful}
+        return np.sum([self.sources[name] for name in names], axis=0)
 
     @property
     def covariance(self) -> NDArray[np.float64]:
@@ -94,17 +89,10 @@ class Uncertainty:
         return np.sum(list(self.sources.values()), axis=0)
 
 
-def uncertainty(
-    objective: AnyObjective,
-    space: FitSpace,
-    values: Mapping[str, float],
-    *,
-    doubts: Mapping[str, float] = MATERIAL_DOUBTS,
-) -> Uncertainty:
+def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, float]) -> Uncertainty:
     """
     Args:
-        values: the fitted ones.
-        doubts: of the material that is not fitted: parameter -> factor of one deviation.
+        values: the fitted ones, of doubtful material too.
 
     Raises:
         DivergedError: the motion, or the refined one, diverges.
@@ -112,30 +100,43 @@ def uncertainty(
     axis = Axis.of(space)
     places = axis.places(torch.tensor([[values[name] for name in space.names]], dtype=torch.float64))
     with torch.no_grad():
-        parts = map_threads(lambda member: _Part.of(member, space, places, doubts), objective.members)
+        parts = map_threads(lambda member: _Part.of(member, space, places), objective.members)
     losses = torch.tensor([part.loss for part in parts], dtype=torch.float64)
     weights = loss_weights(losses[:, None], paper=objective.paper)[:, 0].numpy()
-    prior = space.prior_weights(objective.length_unit_m).numpy()
+    prior = space.prior_weights(objective.prior_cost).numpy()
     normal = sum(w * part.normal for w, part in zip(weights, parts, strict=True)) + np.diag(prior)
-    slope = sum(w * part.slope for w, part in zip(weights, parts, strict=True)) + prior * places[0].numpy()
-    inverse = np.linalg.pinv(normal, hermitian=True)
+    off = space.off_centre(axis.values(places))[0].numpy()
+    slope = sum(w * part.slope for w, part in zip(weights, parts, strict=True)) + prior * off
+    asked = np.array([not variable.doubtful for variable in space.variables])
+    inverse = np.linalg.pinv(normal, hermitian=True)[:, asked]
 
     def spread(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[n, k] additions to the slope -> [k, k]."""
+        """[n, all that is fitted] additions to the slope -> [k, k]."""
         moved = rows @ inverse
         return moved.T @ moved
 
     clusters = np.concatenate([w * part.scores for w, part in zip(weights, parts, strict=True)])
     clusters = clusters[np.abs(clusters).max(axis=1) > 0]
     sources = {"noise": spread(clusters) * len(clusters) / max(len(clusters) - 1, 1)}
-    deviations = np.array([0.0 if v.prior is None else np.log(v.prior) for v in space.variables])
-    if prior.any():
-        sources["prior"] = spread(np.diag(prior * deviations))
+    of_priors = np.diag(prior * [0.0 if v.prior is None else np.log(v.prior) for v in space.variables])
+    if prior[asked].any():
+        sources["prior"] = spread(of_priors[asked])
+    for row, variable in zip(of_priors, space.variables, strict=True):
+        if variable.doubtful:
+            sources[variable.name] = spread(row[None])
     for name in dict.fromkeys(key for part in parts for key in part.doubts):
         each = [w * part.doubts[name] for w, part in zip(weights, parts, strict=True) if name in part.doubts]
-        together = name in PARAMETERS or name == "step size"  # of the one cloth, and of the one simulator
-        sources[name] = spread(np.sum(each, axis=0)[None] if together else np.stack(each))
-    return Uncertainty(space.names, places[0].numpy(), losses.numpy(), sources, len(clusters), -inverse @ slope)
+        sources[name] = spread(np.sum(each, axis=0)[None] if name == _STEP_SIZE else np.stack(each))
+    return Uncertainty(
+        names=space.asked.names,
+        places=places[0, asked].numpy(),
+        losses=losses.numpy(),
+        sources=sources,
+        clusters=len(clusters),
+        step=-slope @ inverse,
+        curvature=normal,
+        doubtful=tuple(variable.name for variable in space.variables if variable.doubtful),
+    )
 
 
 def refined_distance_mm(objective: AnyObjective, values: Mapping[str, float]) -> tuple[float, float]:
@@ -181,30 +182,28 @@ class _Part:
     """Name -> [k] the slope's change at one deviation."""
 
     @staticmethod
-    def of(objective: Objective, space: FitSpace, places: Tensor, doubts: Mapping[str, float]) -> _Part:
-        whole, known, deviations = _with_doubts(objective, space, doubts)
-        k, m = len(space.names), len(deviations)
-        run, rates = moved_by(objective, whole, torch.cat([places, known.log()[None]], dim=-1))
+    def of(objective: Objective, space: FitSpace, places: Tensor) -> _Part:
+        k = len(space.names)
+        run, rates = moved_by(objective, space, places)
         refined = _refined(objective, space.parameters(Axis.of(space).values(places)), run)
         fitted_pose = objective.match(run).pose[0]
         free = objective.freed({**POSE_DOUBTS, **objective.nuisance})
         pose_names = free.pose_space.names
         values = free.pose_space.of(objective.pose_space.described(fitted_pose, length_unit_m=1.0), length_unit_m=1.0)
         motion = free.match(run, pose=values[None])
-        # what is tried, to both sides: variables and doubtful material move nodes, pose variables the pose
-        scale = torch.cat([torch.full((k,), _STEP, dtype=torch.float64), deviations])
-        ways = torch.cat([rates * scale[:, None, None, None, None], refined[None]])[:, 0]
+        # what is tried, to both sides: variables move nodes, pose variables the pose
+        ways = torch.cat([rates * _STEP, refined[None]])[:, 0]
         ways = torch.nn.functional.pad(ways, (0, 0, 0, motion.nodes.shape[-2] - ways.shape[-2]))
         small = torch.tensor(
             [POSE_DOUBTS[name] / (objective.length_unit_m if NUISANCE[name] == "m" else 1.0) for name in pose_names]
         )
         still = torch.zeros(len(pose_names), *ways.shape[1:], dtype=torch.float64)
-        ways, turns = torch.cat([ways, still]), torch.cat([torch.zeros(k + m + 1, len(pose_names)), small.diag()]).double()
+        ways, turns = torch.cat([ways, still]), torch.cat([torch.zeros(k + 1, len(pose_names)), small.diag()]).double()
         both = torch.cat([torch.zeros_like(ways[:1]), ways, -ways])
         poses = values + torch.cat([torch.zeros_like(turns[:1]), turns, -turns])
-        loss, slopes, normal = _slopes(free, motion, rates[:k], motion.nodes + both, poses)
+        loss, slopes, normal = _slopes(free, motion, rates, motion.nodes + both, poses)
         change = (slopes[1 : 1 + len(ways)] - slopes[1 + len(ways) :]) / 2
-        names = [*space.names, *whole.names[k:], "step size", *pose_names]
+        names = [*space.names, _STEP_SIZE, *pose_names]
         own = [*range(k), *(names.index(name) for name in objective.pose_space.names)]
         felt = [*range(k), *(k + pose_names.index(name) for name in objective.pose_space.names)]
         steps = np.concatenate([np.full(k, _STEP), small.numpy()[[index - k for index in felt[k:]]]])
@@ -220,7 +219,7 @@ class _Part:
             for index, name in enumerate(names)
             if index not in own and not (name in NUISANCE and objective.paper)
         }
-        scores = _clustered(free, motion, rates[:k])
+        scores = _clustered(free, motion, rates)
         return _Part(loss, onto @ slope, onto @ curved[:, :k], scores[:, felt] @ onto.T, found)
 
 
@@ -254,25 +253,6 @@ def _between(measured: NDArray[np.float64], normal: NDArray[np.float64]) -> NDAr
     factors, axes = np.linalg.eigh(inverse @ ((measured + measured.T) / 2) @ inverse.T)
     clipped = np.clip(factors, 1 / _ROUGH, _ROUGH)
     return np.asarray(root @ (axes * clipped) @ axes.T @ root.T)
-
-
-def _with_doubts(objective: Objective, space: FitSpace, doubts: Mapping[str, float]) -> tuple[FitSpace, Tensor, Tensor]:
-    """The fitted variables and then the doubtful ones; what is known of these, values [m] and deviations [m] of the
-    logarithm."""
-    properties = objective.system.properties
-    variables, values, deviations = [], [], []
-    for name, factor in doubts.items():
-        basis = PARAMETERS[name].basis
-        there = float(getattr(properties, name)[0]) if basis is None else objective.scenario.scene.basis(basis)
-        known = space.fixed.get(name, there if basis is None else 1.0)
-        if name not in space.names and min(there, known) > _NO_MATERIAL:
-            variables.append(Variable(name, known / 10, known * 10))
-            values.append(known)
-            deviations.append(np.log(factor))
-    added = [variable.name for variable in variables]
-    fixed = {name: value for name, value in space.fixed.items() if name not in added}
-    whole = FitSpace((*space.variables, *variables), fixed)
-    return whole, torch.tensor(values, dtype=torch.float64), torch.tensor(deviations, dtype=torch.float64)
 
 
 def _refined(objective: Objective, parameters: Mapping[str, Tensor], run: Rollout) -> Tensor:

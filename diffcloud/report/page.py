@@ -27,6 +27,9 @@ from diffcloud.report.rendering import render
 from diffcloud.report.tables import Cell, Table, number, table
 from diffcloud.report.uncertainty import intervals_table
 
+_CLEARLY = 1.05
+"""Factor by which material fitted along is off what was known of it."""
+
 
 @dataclass(frozen=True)
 class EpisodeEntry:
@@ -145,9 +148,9 @@ def _summary(entries: Sequence[EpisodeEntry]) -> _Summary:
 def _fits_table(entries: Sequence[EpisodeEntry]) -> Table:
     names: dict[str, None] = {}
     for entry in entries:
-        names |= dict.fromkeys(entry.fit.parameters)
+        names |= dict.fromkeys(name for name, one in entry.fit.parameters.items() if not one.doubtful)
     heads = ("episode", "scenario", "fabric", "start mm", "fitted mm", "other frames mm", *names)
-    heads = (*heads, "stretch / mass", "iterations", "seconds")
+    heads = (*heads, "stretch / mass", "fitted along", "iterations", "seconds")
     return table(heads, (_fit_row(index, entry, list(names)) for index, entry in enumerate(entries)))
 
 
@@ -163,9 +166,17 @@ def _fit_row(index: int, entry: EpisodeEntry, names: Sequence[str]) -> list[Cell
         number(row["rms_other_frames_mm"], 1),
         *(_parameter_cell(fit.parameters.get(name), row.get(f"true_{name}")) for name in names),
         number(row.get("fitted_ratio"), 2, note="" if true_ratio is None else f"true {true_ratio:.2f}"),
+        _along_cell(fit),
         number(fit.iterations, 0),
         number(fit.seconds, 1),
     ]
+
+
+def _along_cell(fit: FitRecord) -> Cell:
+    """Doubtful material, where it is clearly off what was known of it, as a multiple of that."""
+    parts = {name: one.value / one.centre for name, one in fit.parameters.items() if one.doubtful}
+    off = [f"{name.replace('_', ' ')} × {part:.2f}" for name, part in parts.items() if not 1 / _CLEARLY < part < _CLEARLY]
+    return Cell(", ".join(off) or ("as known" if parts else ""))
 
 
 def _parameter_cell(fitted: FittedParameter | None, true: float | None) -> Cell:

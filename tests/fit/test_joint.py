@@ -76,7 +76,9 @@ class TestFit:
         assert found.values == pytest.approx(TRUTH, rel=0.03)
         left = leave_each_out(joint, SPACE, found.values)
         for one, member in zip(left, members, strict=True):
-            assert one.parameters == pytest.approx(TRUTH, rel=0.1)
+            # a single motion tells the ratio; how heavy the cloth is, it hardly tells
+            ratio = one.parameters["stretch"] / one.parameters["mass"]
+            assert ratio == pytest.approx(TRUTH["stretch"] / TRUTH["mass"], rel=0.1)
             value = {name: torch.tensor([v]).double() for name, v in one.parameters.items()}
             assert one.loss == pytest.approx(float(member(value)), rel=1e-9)
 

@@ -62,7 +62,7 @@ def test_where_it_is_not_known_what_explains_a_recording_two_equal_ends_are_enou
 
     monkeypatch.setattr(gauss_newton, "linearise", linearised)
     space = FitSpace.build(["stretch"], bounds={"stretch": (0.05, 20.0)})
-    found = fit_gauss_newton(Wells(), space, GaussNewtonSettings(screen=0, scans=0))
+    found = fit_gauss_newton(Wells(), space, GaussNewtonSettings(screen=0, scans=0, starts=3))
     assert int(found.history.losses[-1].isfinite().sum()) == followed
 
 

@@ -72,15 +72,16 @@ def test_fit_then_replay_and_measure(work):
     assert done.result["fits"]["e1"]["loss"] == summary["loss"]
     assert {"loss", "loss_start", "iterations", "seconds", "stop_reason", "parameters"} <= set(summary)
     assert {"value", "unit"} <= set(summary["parameters"]["stretch"])
-    value = summary["parameters"]["stretch"]["value"]
+    values = {name: entry["value"] for name, entry in summary["parameters"].items()}
+    assert values.keys() > {"stretch", "mass", "bending"}  # what is not known exactly was fitted along
     measured = run(
-        "evaluate", "loss", "--scenario", "small.yaml", "--set", f"stretch={value!r}", "--set", "mass=1.0",
-        "e1.npz", cwd=work,
+        "evaluate", "loss", "--scenario", "small.yaml", "e1.npz",
+        *(part for name, value in values.items() for part in ("--set", f"{name}={value!r}")), cwd=work,
     )  # fmt: skip
     assert measured.result["loss"] == pytest.approx(summary["loss"], rel=1e-9)  # same metric, same points
     told = run("evaluate", "loss", "--fit", "fits/e1.json", "e1.npz", cwd=work)  # the scenario's file lies here
     assert told.result["loss"] == measured.result["loss"]
-    assert told.result["parameters"] == {"stretch": value, "mass": 1.0}
+    assert told.result["parameters"] == values
     assert told.result["rms_mm"] > 0
     other = run("evaluate", "loss", "--fit", "fits/e1.json", "--set", "mass=2", "--seed", 3, "e1.npz", cwd=work)
     assert other.result["parameters"]["mass"] == 2.0

@@ -7,7 +7,8 @@ With half of the loss's slope g and of its curvature H on the axis of `residuals
 over the variables that no bound holds (Marquardt 1963; Madsen, Nielsen and Tingleff 2004, section 3.2). Each start keeps
 its own λ: it falls by how much of the predicted decrease a step brings, and grows, faster and faster, where it brings
 none. Starts are the best of a screen of candidates spread over the box, the best one first, and the rest stays where it is
-as soon as one explains the recording; where that cannot be known, as soon as two have ended equally low. Then losses along
+as soon as one explains the recording; where a right motion may have a higher loss, also as soon as two have ended equally
+low. Then losses along
 the principal axes of the best place tell whether another minimum is lower nearby; from there it goes on.
 """
 
@@ -37,11 +38,11 @@ _LARGEST_STEP = 1.0
 """On the axis: a factor e, or the whole range."""
 _SMALLEST_STEP = 1e-3
 """A step below 0.1 % of a value, or a predicted decrease below this part of the loss, means that a start has arrived."""
-_SMALLEST_DECREASE = 1e-3
+_SMALLEST_DECREASE = 1e-4
 _SAME = 0.02
 """A start that comes as close to a better one, on the axis, leaves the rest of the way to it."""
-_MOST, _FEW = 8, 3
-"""Starts where it is known which loss explains the recording, and where not."""
+_MOST = 8
+"""Starts, unless fewer are enough."""
 _EQUALLY = 1.01
 """Losses within this factor are equally low."""
 _GIVE_UP = 6
@@ -61,7 +62,7 @@ class GaussNewtonSettings:
     screen: int = 24
     """Candidates beside the first that are simulated once, without derivatives; 0: the starts are taken unseen."""
     starts: int | None = None
-    """The best of them, followed as far as it takes; by default 8 if it is known what explains the recording, else 3."""
+    """The best of them, followed one after the other as far as it takes; by default 8."""
     seed: int = 0
     """Of the candidates."""
     init: Mapping[str, float] = field(default_factory=dict)
@@ -84,7 +85,8 @@ def fit_gauss_newton(
     began = time.perf_counter()
     axis = Axis.of(space)
     known = objective.explained
-    most, explained = settings.starts or (_MOST if known else _FEW), known or settings.threshold
+    most, explained = settings.starts or _MOST, known or settings.threshold
+    alone = objective.sees_all or (not known and settings.threshold > 0)  # no higher loss can be right, or is asked for
     places, simulations = _starts(objective, space, settings, axis, most)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
@@ -97,7 +99,7 @@ def fit_gauss_newton(
                 found = linearise(objective, space, tried[None])
                 simulations += found.simulations
                 ways.judge(way, tried, found)
-            elif ways.waiting and not ways.enough(explained):
+            elif ways.waiting and not ways.enough(explained, alone):
                 found = linearise(objective, space, ways.waiting[0][None])
                 simulations += found.simulations
                 ways.begin(found)
@@ -220,13 +222,12 @@ class _Ways:
         """The one under way."""
         return next((way for way in self.every if way.end is None), None)
 
-    def enough(self, explained: float) -> bool:
-        """Whether the best one explains the recording; if that is not known (0), whether another one is equally low."""
+    def enough(self, explained: float, alone: bool) -> bool:
+        """Whether the best one explains the recording, or another one is equally low, unless the former alone counts."""
         if not self.every or not math.isfinite(self.best.loss):
             return False
-        if explained:
-            return self.best.loss <= explained
-        return sum(way.loss <= _EQUALLY * self.best.loss for way in self.every) > 1
+        equal = sum(way.loss <= _EQUALLY * self.best.loss for way in self.every) > 1
+        return self.best.loss <= explained or (equal and not alone)
 
     def begin(self, found: Linearisation) -> None:
         """The next start, with what was found there."""

@@ -1,0 +1,83 @@
+"""Material that nobody asked for, and that is known only within a factor.
+
+A fit of stretch and mass takes bending, drag, damping and friction from the scenario. None of them is known exactly, and a
+hinge twice as stiff as stated moves the cloth by more than the cameras' noise: taken for exact, it bends the fitted numbers
+until they make up for it. So they are fitted along, each under a prior about what is known of it. They are no result: what
+a fit says is of the parameters that were asked for, beside any such material.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from diffcloud.errors import ConfigError, unknown_name
+from diffcloud.fit.parameters import FitSpace, Variable
+from diffcloud.fit.priors import parse_factor
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.properties import PARAMETERS
+
+MATERIAL_DOUBTS = {"bending": 1.5, "drag": 1.3, "damping": 1.5, "friction_obstacle": 1.3, "friction_cloth": 1.3}
+"""Factors of one deviation within which material is taken to be known."""
+_NO_MATERIAL = 1e-9
+_FARTHEST = 4.0
+"""Deviations that a doubtful quantity may be off."""
+
+
+def parse_doubts(text: str) -> dict[str, float]:
+    """What `--doubts` says -> parameter -> factor of one deviation.
+
+    Args:
+        text: "none", or parameters with the factor within which each is known, as in "bending=1.5x,drag=1.3x".
+
+    Raises:
+        ConfigError: an unknown or repeated parameter, or what is no factor above 1.
+    """
+    found: dict[str, float] = {}
+    for item in [] if text.strip() == "none" else text.split(","):
+        name, _, value = (part.strip() for part in item.partition("="))
+        if name not in PARAMETERS:
+            raise ConfigError(f"doubts: {unknown_name('parameter', name, PARAMETERS)}")
+        factor = parse_factor(value)
+        if not (factor > 1 and math.isfinite(factor)):
+            raise ConfigError(
+                f"doubts {item.strip()!r}: {name} takes the factor within which it is known, above 1 and with an x, such "
+                f"as {name}=1.5x; or write none."
+            )
+        if name in found:
+            raise ConfigError(f"doubts name {name} twice.")
+        found[name] = factor
+    return found
+
+
+def with_doubts(space: FitSpace, doubts: Mapping[str, float], scenarios: Sequence[Scenario]) -> FitSpace:
+    """The space with doubtful material behind what is asked for. Left as it is: what no scenario has, or what several
+    scenarios of a joint fit state differently.
+
+    Args:
+        doubts: parameter -> factor of one deviation about its given value, or else the scenario's.
+
+    Raises:
+        ConfigError: one that is asked for.
+    """
+    variables, fixed = list(space.variables), dict(space.fixed)
+    for name, factor in doubts.items():
+        if name in space.names:
+            raise ConfigError(f"doubts: {name} is fitted; what is known of it is its prior, or its bounds.")
+        known = {_known(scenario, name, space.fixed) for scenario in scenarios}
+        value = known.pop()
+        if not known and value > _NO_MATERIAL:
+            far = factor**_FARTHEST
+            variables.append(Variable(name, value / far, value * far, factor, value, doubtful=True))
+            fixed.pop(name, None)
+    return FitSpace(tuple(variables), fixed)
+
+
+def _known(scenario: Scenario, name: str, fixed: Mapping[str, float]) -> float:
+    """Of one parameter; zero where the scene has nothing that it acts on."""
+    basis = PARAMETERS[name].basis
+    if basis is None:
+        system, _ = scenario.scene.build()
+        there = float(getattr(system.properties, name)[0])
+        return fixed.get(name, there) if there > _NO_MATERIAL else 0.0
+    return fixed.get(name, 1.0) if scenario.scene.basis(basis) > _NO_MATERIAL else 0.0

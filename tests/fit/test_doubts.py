@@ -1,0 +1,137 @@
+"""Material that nobody asked for: what is known of it, that it is fitted along, and that it is no result."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from diffcloud.errors import ConfigError
+from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton
+from diffcloud.fit.batches import posterior_losses
+from diffcloud.fit.doubts import MATERIAL_DOUBTS, parse_doubts, with_doubts
+from diffcloud.fit.parameters import Variable
+from diffcloud.fit.residuals import Axis, linearise
+from diffcloud.fit.scan import scan
+from diffcloud.scene.scenarios import load_scenario
+from tests.conftest import small_lift
+from tests.evaluation.bowls import Bowl
+from tests.fit.test_fit import GENTLE, clouds_of
+
+SCENARIO = small_lift(**{**GENTLE, "integrator": "implicit", "points": 800})
+ASKED = FitSpace.build(["stretch"], fixed={"mass": 1.7})
+BENT = with_doubts(ASKED, {"bending": 1.5}, [SCENARIO])
+
+
+def test_option():
+    assert parse_doubts("none") == {}
+    assert parse_doubts("bending=1.5x, drag=2x") == {"bending": 1.5, "drag": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("bend=2x", "Unknown parameter 'bend'"),
+        ("bending=2", "above 1 and with an x, such as bending=1.5x"),
+        ("bending=0.5x", "above 1"),
+        ("bending=infx", "above 1"),
+        ("bending", "above 1"),
+        ("drag=2x,drag=3x", "drag twice"),
+        ("", "Unknown parameter"),
+    ],
+)
+def test_what_is_no_doubt_is_refused(text, message):
+    with pytest.raises(ConfigError, match=message):
+        parse_doubts(text)
+
+
+class TestSpace:
+    def test_it_stands_behind_what_is_asked_for(self):
+        assert BENT.names == ("stretch", "bending")
+        assert BENT.asked.names == ("stretch",)
+        assert BENT.asked.fixed == {"mass": 1.7, "bending": 1.0}
+        assert BENT.variables[1] == Variable("bending", 1.5**-4, 1.5**4, 1.5, 1.0, doubtful=True)
+
+    def test_it_is_about_what_is_given_or_else_the_scenarios(self):
+        system, _ = SCENARIO.scene.build()
+        space = with_doubts(
+            FitSpace.build(["stretch"], fixed={"bending": 2.0}), {"bending": 1.2, "friction_obstacle": 1.3}, [SCENARIO]
+        )
+        assert [variable.centre for variable in space.variables] == [
+            1.0,
+            2.0,
+            float(system.properties.friction_obstacle[0]),
+        ]
+        assert space.fixed == {}
+
+    def test_what_no_scene_has_is_no_doubt(self):
+        dry = small_lift(**{**GENTLE, "friction_obstacle": 0.0})
+        assert with_doubts(ASKED, {"friction_obstacle": 1.3, "body_mass": 2.0}, [dry]) == ASKED
+
+    def test_what_scenes_state_differently_is_left_to_each(self):
+        other = small_lift(**{**GENTLE, "integrator": "implicit", "friction_obstacle": 0.9})
+        assert with_doubts(ASKED, {"friction_obstacle": 1.3}, [SCENARIO, other]) == ASKED
+
+    def test_what_is_fitted_is_no_doubt(self):
+        with pytest.raises(ConfigError, match="stretch is fitted"):
+            with_doubts(ASKED, {"stretch": 1.3}, [SCENARIO])
+
+    def test_starts_spread_over_what_is_asked_for_alone(self):
+        values, _ = BENT.starts(5, seed=3)
+        alone, _ = ASKED.starts(5, seed=3)
+        assert values[:, 0].tolist() == alone[:, 0].tolist()
+        assert values[:, 1].tolist() == [1.0] * 5
+        first, _ = BENT.starts(1, seed=3, first={"stretch": 2.0, "bending": 1.2})
+        assert first.tolist() == [[2.0, 1.2]]
+
+    def test_a_start_is_stated_of_what_is_asked_for(self):
+        with pytest.raises(ConfigError, match="fitted parameter 'bending'"):
+            BENT.check_start({"bending": 1.0})
+
+
+@pytest.fixture(scope="module")
+def objective():
+    return Objective(SCENARIO, clouds_of(SCENARIO, points=3000, stretch=0.6, mass=1.7), nuisance={})
+
+
+def test_the_prior_is_about_what_is_known(objective):
+    space = with_doubts(FitSpace.build(["stretch"], fixed={"bending": 2.0}), {"bending": 1.5}, [SCENARIO])
+    added = space.prior_loss(torch.tensor([[7.0, 2.0], [1.0, 3.0], [1.0, 2 / 1.5**2]]).double(), 0.5)
+    assert added.tolist() == pytest.approx([0.0, 0.5, 2.0])
+    places = Axis.of(space).places(torch.tensor([[0.8, 1.2]]).double()).requires_grad_(True)
+    loss = posterior_losses(objective, space, Axis.of(space).values(places))
+    (gradient,) = torch.autograd.grad(loss.sum(), places)
+    found = linearise(objective, space, places.detach())
+    torch.testing.assert_close(found.losses, loss.detach())
+    torch.testing.assert_close(2 * found.slope, gradient, rtol=1e-8, atol=1e-14)
+
+
+def test_a_stiffer_hinge_than_stated_does_not_bend_the_fit():
+    """A band whose bending is 1.8 times what the scenario says."""
+    band = replace(load_scenario("band_stretch"), points=800)
+    objective = Objective(band, clouds_of(band, points=2000, stretch=3.0, mass=2.0, bending=1.8), nuisance={})
+    asked = FitSpace.build(["stretch"], fixed={"mass": 2.0})
+    settings = GaussNewtonSettings(starts=1, screen=0, init={"stretch": 2.5})
+    exact, doubted = (
+        fit_gauss_newton(objective, space, settings) for space in (asked, with_doubts(asked, {"bending": 1.5}, [band]))
+    )
+    off = [abs(math.log(found.values["stretch"] / 3.0)) for found in (exact, doubted)]
+    assert off[0] > 0.1
+    assert off[1] < 0.01
+    assert doubted.loss < 0.1 * exact.loss
+    assert doubted.values["bending"] == pytest.approx(1.8, rel=0.02)
+
+
+def test_a_scan_takes_it_along():
+    """Directions are of what is asked for; along them, what is doubtful is where the loss is lowest to second order."""
+    space = FitSpace((Variable("stretch", 0.1, 10.0), Variable("mass", 0.01, 100.0, 1.5, 1.0, doubtful=True)), {})
+    curvature = torch.tensor([[2.0, -0.6], [-0.6, 0.4]]).double()
+    found, _ = scan(Bowl(), space, torch.zeros(2).double(), curvature)
+    assert found.directions.abs().tolist() == [pytest.approx([1.0, 1.5])]
+    assert float(found.directions @ curvature @ torch.tensor([0.0, 1.0]).double()) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_defaults_are_parameters():
+    assert parse_doubts(",".join(f"{name}={factor}x" for name, factor in MATERIAL_DOUBTS.items())) == MATERIAL_DOUBTS
