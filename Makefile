@@ -108,10 +108,10 @@ moved: venv
 	done
 
 # How often intervals hold the truth: drawn cloths, recorded, fitted, and held against what was drawn.
-COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --out build/coverage --seed 20261124 --workers 2
+COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --out build/coverage --seed 24044214 --workers 2
 coverage: venv
-	$(COVERAGE) --scenario lift --scenario fold --fix mass --recordings 24
-	$(COVERAGE) --scenario band_stretch --scenario vest_hang --recordings 20 --markdown docs/results/coverage.md
+	$(COVERAGE) --recordings 40 --fix mass
+	$(COVERAGE) --recordings 40 --markdown docs/results/coverage.md
 
 # Every damaged file and every fault; a sample of both is part of test-slow.
 robustness: venv

@@ -66,6 +66,27 @@ def test_where_it_is_not_known_what_explains_a_recording_two_equal_ends_are_enou
     assert int(found.history.losses[-1].isfinite().sum()) == followed
 
 
+@pytest.mark.parametrize(("starts", "ended"), [(None, 1.2), (8, 0.0)])
+def test_where_three_starts_explain_nothing_a_search_finds_the_next(monkeypatch, starts, ended):
+    """All candidates lie in a wide well around 0; what explains the recording is a deeper one at 1.2. A stated number of
+    starts is all that is followed."""
+
+    class Hidden(Bowl):
+        def __call__(self, parameters):
+            u = parameters["stretch"].log()
+            return torch.minimum(0.05 + 0.02 * u.square(), 0.5 * (u - 1.2).square() + 0.001)
+
+    monkeypatch.setattr(gauss_newton, "linearise", linearised)
+    monkeypatch.setattr(
+        FitSpace, "starts", lambda self, count, **_: (torch.linspace(0.2, 0.5, count)[:, None].double(), None)
+    )
+    objective = Hidden(explained=0.01, sees_all=True)
+    found = fit_gauss_newton(objective, FitSpace.build(["stretch"]), GaussNewtonSettings(starts=starts, screen=0, scans=0))
+    assert math.log(found.values["stretch"]) == pytest.approx(ended, abs=1e-3)
+    begun = int(found.history.losses[-1].isfinite().sum())
+    assert (begun, found.best_start) == ((4, 3) if starts is None else (8, found.best_start))
+
+
 def test_starts_that_diverge_are_passed_over(monkeypatch):
     """Here the first two of three, from above."""
 

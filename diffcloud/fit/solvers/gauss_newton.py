@@ -8,8 +8,8 @@ over the variables that no bound holds (Marquardt 1963; Madsen, Nielsen and Ting
 its own λ: it falls by how much of the predicted decrease a step brings, and grows, faster and faster, where it brings
 none. Starts are the best of a screen of candidates spread over the box, the best one first, and the rest stays where it is
 as soon as one explains the recording; where a right motion may have a higher loss, also as soon as two have ended equally
-low. Then losses along
-the principal axes of the best place tell whether another minimum is lower nearby; from there it goes on.
+low. If the first three do not, a derivative-free search from the best place over what is asked for finds the next. Then
+losses along the principal axes of the best place tell whether another minimum is lower nearby; from there it goes on.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis, Linearisation, linearise
 from diffcloud.fit.scan import scan
+from diffcloud.fit.solvers.cma_es import CmaEsSettings, fit_cma_es
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
 
 ROUGH_SCREEN, ROUGH_STARTS = 96, 3
@@ -43,6 +44,10 @@ _SAME = 0.02
 """A start that comes as close to a better one, on the axis, leaves the rest of the way to it."""
 _MOST = 8
 """Starts, unless fewer are enough."""
+_BEFORE, _SEARCHED = 3, 64
+"""Starts after which a search is made for the next, and its candidates."""
+_MISFIT = 10.0
+"""Times what explains a recording; above that, it is the model that does not: no start will."""
 _EQUALLY = 1.01
 """Losses within this factor are equally low."""
 _GIVE_UP = 6
@@ -62,7 +67,8 @@ class GaussNewtonSettings:
     screen: int = 24
     """Candidates beside the first that are simulated once, without derivatives; 0: the starts are taken unseen."""
     starts: int | None = None
-    """The best of them, followed one after the other as far as it takes; by default 8."""
+    """The best of them, followed one after the other as far as it takes; by default 8, and one that a
+    search finds."""
     seed: int = 0
     """Of the candidates."""
     init: Mapping[str, float] = field(default_factory=dict)
@@ -86,11 +92,14 @@ def fit_gauss_newton(
     axis = Axis.of(space)
     known = objective.explained
     most, explained = settings.starts or _MOST, known or settings.threshold
-    alone = objective.sees_all or (not known and settings.threshold > 0)  # no higher loss can be right, or is asked for
+    # where a right motion can have no higher loss than what explains the recording, equal ones say nothing
+    wrong = math.inf if not known and settings.threshold else _MISFIT * known if objective.sees_all else 0.0
     places, simulations = _starts(objective, space, settings, axis, most)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
     scans, looked, ways = 0, None, _Ways(places, settings.iterations)
+    if settings.starts is None:
+        ways.waiting.insert(_BEFORE, places[0])  # until the search has found it
     try:
         while True:
             way = ways.going
@@ -99,7 +108,10 @@ def fit_gauss_newton(
                 found = linearise(objective, space, tried[None])
                 simulations += found.simulations
                 ways.judge(way, tried, found)
-            elif ways.waiting and not ways.enough(explained, alone):
+            elif ways.waiting and not ways.enough(explained, wrong):
+                if settings.starts is None and len(ways.every) == _BEFORE:
+                    ways.waiting[0], spent = _searched(objective, space, ways.best, settings.seed, axis)
+                    simulations += spent
                 found = linearise(objective, space, ways.waiting[0][None])
                 simulations += found.simulations
                 ways.begin(found)
@@ -222,12 +234,13 @@ class _Ways:
         """The one under way."""
         return next((way for way in self.every if way.end is None), None)
 
-    def enough(self, explained: float, alone: bool) -> bool:
-        """Whether the best one explains the recording, or another one is equally low, unless the former alone counts."""
+    def enough(self, explained: float, wrong: float) -> bool:
+        """Whether the best one explains the recording, or another one is equally low and it is not known that all are wrong
+        that explain nothing, up to this loss."""
         if not self.every or not math.isfinite(self.best.loss):
             return False
         equal = sum(way.loss <= _EQUALLY * self.best.loss for way in self.every) > 1
-        return self.best.loss <= explained or (equal and not alone)
+        return self.best.loss <= explained or (equal and self.best.loss > wrong)
 
     def begin(self, found: Linearisation) -> None:
         """The next start, with what was found there."""
@@ -259,6 +272,24 @@ def _starts(
     if settings.init:
         order = torch.cat([torch.zeros(1, dtype=torch.long), order[order > 0]])
     return axis.places(values[order[:most]]), count * len(objective.members)
+
+
+def _searched(objective: AnyObjective, space: FitSpace, best: _Way, seed: int, axis: Axis) -> tuple[Tensor, int]:
+    """The place [k] that a search from the best one over what is asked for ends at, doubtful material as it is known; and
+    how many simulations it took.
+
+    Raises:
+        KeyboardInterrupt: interrupted.
+    """
+    asked = space.asked
+    values = dict(zip(space.names, axis.bounded(best.place).tolist(), strict=True))
+    budget = _SEARCHED * len(objective.members)
+    init = {name: values[name] for name in asked.names}
+    found = fit_cma_es(objective, asked, CmaEsSettings(simulations=budget, seed=seed, init=init))
+    if found.stop_reason == "interrupted":
+        raise KeyboardInterrupt
+    whole = {**asked.fixed, **found.values}
+    return axis.places(torch.tensor([whole[name] for name in space.names], dtype=torch.float64)), found.simulations
 
 
 def _remember(history: FitHistory, ways: _Ways, axis: Axis) -> None:
