@@ -325,6 +325,13 @@ class EvaluateConfig(Section):
     workers: Workers = 1
     """Processes, one episode each; they change nothing but the time."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _is_of_now(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "doubts" in data:
+            raise ValueError('evaluate.doubts: now `fit.doubts`, such as "bending=1.5x,drag=1.3x", or none')
+        return data
+
     def comparison(self, episode: str) -> ComparisonSettings:
         """For <scenario>/<episode>."""
 

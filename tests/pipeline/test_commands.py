@@ -457,6 +457,10 @@ class TestBadInput:
             ({"fit": {"solver": "lbfgs"}}, "fit.solver"),
             ({"fit": {"optimizer": "adam"}}, "optimizer: now `solver`"),
             ({"fit": {"smoothing": 0.5}}, "smoothing: of solver adam; not of gauss_newton"),
+            ({"fit": {"doubts": "bend=2x"}}, "Unknown parameter 'bend'"),
+            ({"fit": {"doubts": "stretch=2x"}}, "doubts: stretch is fitted"),
+            ({"fit": {"doubts": "drag=2x", "paper": True}}, "doubts: the published measure takes the rest of the material"),
+            ({"evaluate": {"doubts": {"drag": 2}}}, "evaluate.doubts: now `fit.doubts`"),
             ({"fit": {"simulations": 9}}, "simulations: of solver cma_es or random_search; not of gauss_newton"),
         ],
     )

@@ -9,6 +9,7 @@ import subprocess
 
 import pytest
 
+from diffcloud.fit.record import FittedParameter
 from tests.report.pages import entry, main_of, page_of
 
 NASTY = "<!--<script>alert(1)</script>&amp;\u2028'\""
@@ -40,6 +41,19 @@ def test_the_scripts_data_are_what_was_put_in():
     code = f"const e = {episodes}, t = {trainings}; console.log(JSON.stringify([e[0].name, t.length]))"
     done = subprocess.run(["node", "-e", code], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == [f"lift / {NASTY}", 0]
+
+
+def test_material_that_was_fitted_along_is_no_column_but_is_told_where_it_is_off():
+    one = entry()
+    along = {"unit": "x basis", "physical": 1.0, "physical_unit": "N·m", "meaning": "", "doubtful": True}
+    one.fit.parameters["bending"] = FittedParameter(value=1.95, centre=2.0, **along)
+    one.fit.parameters["friction_cloth"] = FittedParameter(value=0.9, centre=0.6, **along)
+    assert "<td>friction cloth × 1.50</td>" in main_of(page_of(one))
+    one.fit.parameters["friction_cloth"].value = 0.6
+    one.fit.parameters["bending"].value = 2.0
+    page = main_of(page_of(one))
+    assert "<td>as known</td>" in page
+    assert ">bending<" not in page
 
 
 def test_a_number_that_is_not_known_is_a_dash():
