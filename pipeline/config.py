@@ -184,7 +184,7 @@ class FitConfig(Section):
     iterations: Count | None = None
     """Of gauss_newton and adam: steps at most; by default 20 and 50."""
     starts: Count | None = None
-    """Of gauss_newton and adam: descents from as many places, of gauss_newton at most; by default 8 (3
+    """Of gauss_newton (at most) and adam: number of descents, from different places; by default 8 (3
     with the linearised integrator) and 1."""
     screen: CountOrNone | None = None
     """Of gauss_newton and adam: candidates simulated once to choose the starts from; by default 24 of gauss_newton (96 with
@@ -213,8 +213,8 @@ class FitConfig(Section):
     prior: Name | None = None
     """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""
     doubts: Name | None = None
-    """Within which factor material that is neither fitted nor fixed is known: "bending=1.5x,drag=1.3x", or "none". It is
-    fitted along, and is no result (`fit.doubts`). By default `MATERIAL_DOUBTS`, of gauss_newton where derivatives hold."""
+    """The factor within which material that is not asked for is known: "bending=1.5x,drag=1.3x", or "none". It is fitted
+    too, and is not a result (`fit.doubts`). Default: `MATERIAL_DOUBTS` of gauss_newton unless linearised, else none."""
     joint: bool = False
     """One parameter set for all episodes, whatever their scenario: they must be of one cloth."""
     workers: Workers = 1

@@ -111,8 +111,8 @@ def fit(
     doubts: Annotated[
         str | None,
         typer.Option(
-            help="The factor within which material that is neither fitted nor fixed is known; it is fitted along, and is "
-            "no result. none: exactly. Default of gauss_newton: 1.5x of bending and damping, 1.3x of drag and frictions."
+            help="Fit roughly known material too, unreported: bending=1.5x,drag=1.3x (the rest is exact), or none. Default "
+            "of gauss_newton unless linearised: 1.5x of bending and damping, 1.3x of drag and frictions."
         ),
     ] = None,
     prior: Annotated[

@@ -44,7 +44,7 @@ class EpisodeRecord:
     record: dict[str, Any]
     """Plain values, the same for the same inputs: scenario, episode, its fit, labels, `start` (metrics of the fit's start,
     None if that diverges), `methods` (a row each: values, clipped values, metrics, simulations), `gaps`, `transfers`,
-    `intervals`, `landscape`, and `doubtful`: parameters that were fitted along, and are no result."""
+    `intervals`, `landscape`, and `doubtful`: parameters that were fitted too, and are not results."""
     seconds: dict[str, dict[str, float]]
     """Method -> phase -> wall time."""
 

@@ -22,7 +22,7 @@ def fit_of(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """One row per episode: scenario, episode, fabric, category, repeat, loss, and a column per parameter but those fitted
-    along because they are not known exactly, with `ratio` of stretch to mass where both are there."""
+    too because they are not known exactly, with `ratio` of stretch to mass where both are there."""
     rows = []
     for record in records:
         fit = fit_of(record)

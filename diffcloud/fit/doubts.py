@@ -1,9 +1,9 @@
 """Material that nobody asked for, and that is known only within a factor.
 
 A fit of stretch and mass takes bending, drag, damping and friction from the scenario. None of them is known exactly, and a
-hinge twice as stiff as stated moves the cloth by more than the cameras' noise: taken for exact, it bends the fitted numbers
-until they make up for it. So they are fitted along, each under a prior about what is known of it. They are no result: what
-a fit says is of the parameters that were asked for, beside any such material.
+hinge twice as stiff as stated moves the cloth by more than the cameras' noise: the fitted numbers are bent until they make
+up for it. So such material is fitted too, each part under a prior about what is known of it. It is not a result: a fit
+reports only the parameters asked for, with such material allowed for.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS
 
 MATERIAL_DOUBTS = {"bending": 1.5, "drag": 1.3, "damping": 1.5, "friction_obstacle": 1.3, "friction_cloth": 1.3}
-"""Factors of one deviation within which material is taken to be known."""
+"""One standard deviation of each material, as a factor."""
 _NO_MATERIAL = 1e-9
 _FARTHEST = 4.0
-"""Deviations that a doubtful quantity may be off."""
+"""Bounds, in standard deviations."""
 
 
 def parse_doubts(text: str) -> dict[str, float]:
@@ -31,7 +31,7 @@ def parse_doubts(text: str) -> dict[str, float]:
         text: "none", or parameters with the factor within which each is known, as in "bending=1.5x,drag=1.3x".
 
     Raises:
-        ConfigError: an unknown or repeated parameter, or what is no factor above 1.
+        ConfigError: an unknown or repeated parameter, or not a factor above 1.
     """
     found: dict[str, float] = {}
     for item in [] if text.strip() == "none" else text.split(","):
@@ -51,14 +51,14 @@ def parse_doubts(text: str) -> dict[str, float]:
 
 
 def with_doubts(space: FitSpace, doubts: Mapping[str, float], scenarios: Sequence[Scenario]) -> FitSpace:
-    """The space with doubtful material behind what is asked for. Left as it is: what no scenario has, or what several
+    """The space with doubtful material appended. Left as it is: what no scenario has, or what several
     scenarios of a joint fit state differently.
 
     Args:
         doubts: parameter -> factor of one deviation about its given value, or else the scenario's.
 
     Raises:
-        ConfigError: one that is asked for.
+        ConfigError: one is asked for.
     """
     variables, fixed = list(space.variables), dict(space.fixed)
     for name, factor in doubts.items():

@@ -36,7 +36,7 @@ class Variable:
     centre: float = 1.0
     """Of the prior; by default the basis material."""
     doubtful: bool = False
-    """Nobody asked for it: it is fitted along, because it is not known exactly (`fit.doubts`)."""
+    """Nobody asked for it: it is fitted too because it is not known exactly (`fit.doubts`)."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):

@@ -96,7 +96,7 @@ class FittedParameter(_Model):
     centre: Positive = 1.0
     """Of the prior; by default the basis material."""
     doubtful: bool = False
-    """Not asked for, and fitted along because it is not known exactly."""
+    """Not asked for, and fitted too because it is not known exactly."""
     at_bound: bool = False
 
 

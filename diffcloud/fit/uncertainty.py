@@ -8,7 +8,7 @@ and s_i what pair i adds to half of its slope. A disturbance that adds g to the 
     a known doubt   b bᵀ,  b = -H⁻¹ h,        h: the slope's change if what is not fitted is one deviation off
 
 Residuals of one place on the cloth have much in common, over both directions and all frames: an edge that curls, a fold in
-the wrong place. So pairs are clustered by place. Doubtful material is fitted along (`fit.doubts`), each of its priors is
+the wrong place. So pairs are clustered by place. Doubtful material is fitted too (`fit.doubts`), each of its priors is
 a source. Other doubts are what the fit takes for known: where the cameras stand, the lag, and the size of the simulator's
 step, whose h is the distance to the motion with four times the steps. A misfit that the recording's own noise does not
 explain is inside of the residuals, and widens the interval with them.
@@ -75,7 +75,7 @@ class Uncertainty:
     """Half of the loss's, priors included, by all that is fitted, doubtful material too."""
 
     doubtful: tuple[str, ...] = ()
-    """Material that was fitted along."""
+    """Doubtful material that was fitted too."""
 
     @property
     def of_noise_and_priors(self) -> NDArray[np.float64]:

@@ -28,7 +28,7 @@ from diffcloud.report.tables import Cell, Table, number, table
 from diffcloud.report.uncertainty import intervals_table
 
 _CLEARLY = 1.05
-"""Factor by which material fitted along is off what was known of it."""
+"""Factor by which doubtful material is off what was known of it."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def _fits_table(entries: Sequence[EpisodeEntry]) -> Table:
     for entry in entries:
         names |= dict.fromkeys(name for name, one in entry.fit.parameters.items() if not one.doubtful)
     heads = ("episode", "scenario", "fabric", "start mm", "fitted mm", "other frames mm", *names)
-    heads = (*heads, "stretch / mass", "fitted along", "iterations", "seconds")
+    heads = (*heads, "stretch / mass", "also fitted", "iterations", "seconds")
     return table(heads, (_fit_row(index, entry, list(names)) for index, entry in enumerate(entries)))
 
 

@@ -1,4 +1,4 @@
-"""Material that nobody asked for: what is known of it, that it is fitted along, and that it is no result."""
+"""Material that nobody asked for: what is known of it, that it is fitted too, and that it is not a result."""
 
 from __future__ import annotations
 

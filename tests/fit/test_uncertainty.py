@@ -34,7 +34,7 @@ def logarithm(objective, space=SPACE) -> float:
 
 
 def beside(name: str, value: float, factor: float) -> FitSpace:
-    """Material that is known within a factor, fitted along."""
+    """Material that is known within a factor, and fitted too."""
     doubt = Variable(name, value / 10, value * 10, factor, value, doubtful=True)
     return FitSpace((*SPACE.variables, doubt), {key: known for key, known in SPACE.fixed.items() if key != name})
 

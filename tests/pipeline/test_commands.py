@@ -73,7 +73,7 @@ def test_fit_then_replay_and_measure(work):
     assert {"loss", "loss_start", "iterations", "seconds", "stop_reason", "parameters"} <= set(summary)
     assert {"value", "unit"} <= set(summary["parameters"]["stretch"])
     values = {name: entry["value"] for name, entry in summary["parameters"].items()}
-    assert values.keys() > {"stretch", "mass", "bending"}  # what is not known exactly was fitted along
+    assert values.keys() > {"stretch", "mass", "bending"}  # what is not known exactly was fitted too
     measured = run(
         "evaluate", "loss", "--scenario", "small.yaml", "e1.npz",
         *(part for name, value in values.items() for part in ("--set", f"{name}={value!r}")), cwd=work,
