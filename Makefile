@@ -110,8 +110,8 @@ moved: venv
 # How often intervals hold the truth: drawn cloths, recorded, fitted, and held against what was drawn.
 COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --out build/coverage --seed 24044214 --workers 2
 coverage: venv
-	$(COVERAGE) --recordings 40 --fix mass
-	$(COVERAGE) --recordings 40 --markdown docs/results/coverage.md
+	$(COVERAGE) --recordings 24 --fix mass
+	$(COVERAGE) --recordings 24 --markdown docs/results/coverage.md
 
 # Every damaged file and every fault; a sample of both is part of test-slow.
 robustness: venv
