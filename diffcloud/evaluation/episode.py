@@ -32,7 +32,6 @@ class ComparisonSettings:
     """Of intervals; None: state none."""
     within: float = WITHIN
     """Factor within which a parameter counts as identified."""
-    """Of the material that is not fitted, see `fit.uncertainty`."""
     landscape_size: int = 0
     """Places along each axis of the loss landscape; 0: none."""
 

@@ -8,7 +8,6 @@ reports only the parameters asked for, with such material allowed for.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 from diffcloud.errors import ConfigError, unknown_name
@@ -38,15 +37,10 @@ def parse_doubts(text: str) -> dict[str, float]:
         name, _, value = (part.strip() for part in item.partition("="))
         if name not in PARAMETERS:
             raise ConfigError(f"doubts: {unknown_name('parameter', name, PARAMETERS)}")
-        factor = parse_factor(value)
-        if not (factor > 1 and math.isfinite(factor)):
-            raise ConfigError(
-                f"doubts {item.strip()!r}: {name} takes the factor within which it is known, above 1 and with an x, such "
-                f"as {name}=1.5x; or write none."
-            )
         if name in found:
             raise ConfigError(f"doubts name {name} twice.")
-        found[name] = factor
+        told = f"doubts {item.strip()!r}: {name} takes the factor within which it is known"
+        found[name] = parse_factor(value, told, f"{name}=1.5x")
     return found
 
 

@@ -52,12 +52,8 @@ def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str
             raise ConfigError(f"prior: {unknown_name('fitted parameter', name, names)}")
         if PARAMETERS[name].basis is None:
             raise ConfigError(f"prior: {name} is no multiplier; what is known of it are its bounds, {list(bounds[name])}.")
-        factor = parse_factor(value)
-        if not (factor > 1 and math.isfinite(factor)):
-            raise ConfigError(
-                f"prior {item.strip()!r}: {name} takes the factor within which it probably lies, above 1 and with an x, "
-                f"such as {name}=3x; or write none."
-            )
+        told = f"prior {item.strip()!r}: {name} takes the factor within which it probably lies"
+        factor = parse_factor(value, told, f"{name}=3x")
         if not inside[name]:
             raise ConfigError(
                 f"prior {item.strip()!r}: it is about 1, the basis material, and the bounds of {name} are "
@@ -67,10 +63,21 @@ def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str
     return found
 
 
-def parse_factor(text: str) -> float:
-    """Of "1.5x"; NaN if it is none."""
+def parse_factor(text: str, told: str, example: str) -> float:
+    """Of "1.5x".
+
+    Args:
+        told: what it is of, with which the message begins.
+        example: a right one, with its parameter.
+
+    Raises:
+        ConfigError: no factor above 1.
+    """
     match = re.fullmatch(r"([0-9.eE+-]+)\s*x", text)
     try:
-        return float(match[1]) if match else math.nan
+        factor = float(match[1]) if match else math.nan
     except ValueError:
-        return math.nan
+        factor = math.nan
+    if not (factor > 1 and math.isfinite(factor)):
+        raise ConfigError(f"{told}, above 1 and with an x, such as {example}; or write none.")
+    return factor

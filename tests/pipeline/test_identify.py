@@ -224,28 +224,39 @@ OTHER = {"yaw": 0.44, "centre": (0.57, -0.05)}
 """How the towel lies the second time."""
 
 
+def towel_identified(folder, *recordings):
+    with contextlib.chdir(folder):
+        return invoke("identify", *recordings, "--size", "0.40x0.30", "--mass", 0.25, "--out", "found").result
+
+
+@pytest.fixture(scope="module")
+def stiff(tmp_path_factory):
+    """Of two lifts of the stiff one, what is found."""
+    folder = tmp_path_factory.mktemp("stiff")
+    lifted_by_mujoco(folder, "one", stretching=40.0)
+    lifted_by_mujoco(folder, "two", stretching=40.0, **OTHER)
+    return towel_identified(folder, "one", "two")
+
+
 class TestTowelOfAnotherSimulator:
     """MuJoCo lifts it, of 40 or 10 N/m; its weight is known."""
 
-    def identified(self, folder, *recordings):
-        with contextlib.chdir(folder):
-            return invoke("identify", *recordings, "--size", "0.40x0.30", "--mass", 0.25, "--out", "found").result
+    @pytest.mark.slow
+    def test_stiff_in_two_recordings(self, stiff):
+        assert stiff["parameters"]["stretch"]["physical"] == pytest.approx(40, rel=0.1)
+        assert stiff["rms_mm"] < 4
+        assert stiff["findings"][1].startswith("Transfers within this motion")
 
     @pytest.mark.slow
-    def test_stiff_in_two_recordings(self, tmp_path):
-        lifted_by_mujoco(tmp_path, "one", stretching=40.0)
-        lifted_by_mujoco(tmp_path, "two", stretching=40.0, **OTHER)
-        found = self.identified(tmp_path, "one", "two")
-        told = found["parameters"]["stretch"]
-        # MuJoCo's cloth differs from ours by more than noise and doubts, which its interval (41 to 45) does not know of
-        assert told["physical"] == pytest.approx(40, rel=0.1)
-        assert found["rms_mm"] < 4
-        assert found["findings"][1].startswith("Transfers within this motion")
+    @pytest.mark.xfail(strict=True, reason="41 to 45: intervals count no difference between simulators (docs/limits.md)")
+    def test_its_interval_holds_the_truth(self, stiff):
+        told = stiff["parameters"]["stretch"]
+        assert told["low"] < 40 < told["high"]
 
     @pytest.mark.longest
     def test_soft_in_one_recording(self, tmp_path):
         lifted_by_mujoco(tmp_path, "soft", stretching=10.0)
-        found = self.identified(tmp_path, "soft")
+        found = towel_identified(tmp_path, "soft")
         told = found["parameters"]["stretch"]
         assert 10 / 1.5 < told["physical"] < 10 * 1.5
         assert told["low"] < 10 < told["high"]
@@ -255,7 +266,7 @@ class TestTowelOfAnotherSimulator:
     def test_cut_a_little_above_the_table(self, tmp_path):
         lifted_by_mujoco(tmp_path, "one", stretching=40.0, cut_m=0.005)
         lifted_by_mujoco(tmp_path, "two", stretching=40.0, cut_m=0.005, **OTHER)
-        told = self.identified(tmp_path, "one", "two")["parameters"]["stretch"]
+        told = towel_identified(tmp_path, "one", "two")["parameters"]["stretch"]
         assert 40 / 1.5 < told["physical"] < 40 * 1.5
         assert told["low"] < 40 < told["high"]
 
