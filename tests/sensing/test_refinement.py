@@ -36,6 +36,17 @@ def test_an_arm_that_is_shaped_otherwise_does_not_look_late(tmp_path, mask):
     assert abs(np.mean(off)) < 0.001
 
 
+@pytest.mark.slow
+def test_cameras_that_are_millimetres_off_do_not_look_late(tmp_path, mask):
+    """Too little to move them back, and enough for 5 ms where an arm goes up at half a metre a second."""
+    off = []
+    for seed, (name, way) in product(range(2), WAYS.items()):
+        seen, folder = smooth_motion(way), tmp_path / f"{name}_{seed}"
+        write_recorded_episode(folder, seed=seed, seen=seen, size=(212, 120), cameras_moved=(3.0, 0.25))
+        off.append(found_lag(folder, mask) - 0.02)
+    assert np.abs(off).max() < 0.0025
+
+
 @pytest.mark.longest
 def test_the_lag_is_found_without_bias(tmp_path, mask):
     """Eight lifts and eight folds, of four lags and speeds."""
