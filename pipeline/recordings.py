@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from diffcloud.errors import ConfigError, DiffCloudError
@@ -122,13 +123,15 @@ def _ratio(scenario: Scenario, episode: Episode, mass: float, config: FitConfig)
 
 def _of_first_camera(episode: Episode) -> Episode:
     assert episode.camera is not None  # clouds of raw episodes say so
+    assert episode.lost is not None
     frames = [
         episode.frame(index)[episode.camera[episode.offsets[index] : episode.offsets[index + 1]] == 0]
         for index in range(episode.frame_count)
     ]
     first = episode.meta["cameras"][0]
-    seen_from = {"viewpoints": {first: episode.meta["viewpoints"][first]}}
-    return Episode.from_frames(frames, episode.times, gripper=episode.gripper, meta=seen_from)
+    seen_from = {key: {first: episode.meta[key][first]} for key in ("viewpoints", "pinholes")}
+    alone = Episode.from_frames(frames, episode.times, gripper=episode.gripper, meta=seen_from)
+    return replace(alone, lost=np.packbits(episode.lost_pixels(0).reshape(len(frames), 1, -1), axis=-1))
 
 
 def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: list[_Fits], config: FitConfig) -> str:

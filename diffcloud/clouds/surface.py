@@ -213,10 +213,10 @@ def meets_triangle(start: Floats, way: Floats, nodes: Floats, i: int, j: int, k:
 
 
 @kernel
-def find_hidden(points: Floats, eyes: Floats, nodes: Floats, faces: Ints, near: float) -> Ints:
-    """[M, N, 3] points beside M states of a mesh, [M, C, 3] eyes, [M, V, 3] nodes, [F, 3] faces -> [M, N] 1 where a face
-    stands before a point for every eye. What is nearer to a point than `near` [m] does not hide it: its own face, a layer
-    that it lies on."""
+def find_hidden(points: Floats, eyes: Floats, blind: Ints, nodes: Floats, faces: Ints, near: float) -> Ints:
+    """[M, N, 3] points beside M states of a mesh, [M, C, 3] eyes, [M, N, C] 1 where an eye is blind, [M, V, 3] nodes,
+    [F, 3] faces -> [M, N] 1 where a face stands before a point for every eye that is not. What is nearer to a point than
+    `near` [m] does not hide it: its own face, a layer that it lies on."""
     states, count = points.shape[0], points.shape[1]
     found = np.ones((states, count), np.int64)
     groups = grouped(nodes[0], faces)
@@ -229,6 +229,8 @@ def find_hidden(points: Floats, eyes: Floats, nodes: Floats, faces: Ints, near: 
         for index in range(count):
             point = points[state, index]
             for eye in range(eyes.shape[1]):
+                if blind[state, index, eye]:
+                    continue
                 length = 0.0
                 for axis in range(3):
                     way[axis] = eyes[state, eye, axis] - point[axis]
@@ -281,4 +283,4 @@ def compile_surface() -> None:
     """Compile what queries need."""
     points, nodes, faces = np.zeros((1, 1, 3)), np.zeros((1, 3, 3)), np.array([[0, 1, 2]])
     find_on_surface(points, NO_GUESS, nodes, faces)
-    find_hidden(points, points + 1.0, nodes, faces, 0.01)
+    find_hidden(points, points + 1.0, np.zeros((1, 1, 1), np.int64), nodes, faces, 0.01)

@@ -1,8 +1,10 @@
 """What a fit says of the parameters: intervals with a level, a verdict for each, and what to improve first.
 
-Variances come from `fit.uncertainty`. An interval lies symmetrically on the axis of the fit (a factor up and down for
-multipliers) and ends at the bounds. Its half-width is the variance's root times the quantile of Student's t with the
-degrees of freedom of Welch and Satterthwaite: the noise is estimated from few clusters, the stated doubts are not.
+Variances come from `fit.uncertainty`. On the axis of the fit (a factor up and down for multipliers) an interval reaches to
+both sides as far as the variance's root times the quantile of Student's t, with the degrees of freedom of Welch and
+Satterthwaite: the noise is estimated from few clusters, the stated doubts are not. What the size of the simulator's step
+does is known, but for how much of it is in a recording: all of it in one of a cloth, nothing in one of this simulator. So
+to that side the interval reaches further by the whole of it. It ends at the bounds.
 
 Gauss and Newton's next step, which the fit has not taken, is one of its sources. No interval is stated where a fit has not
 arrived: that step is far longer than the deviations, or a loss nearby is clearly lower. `restarts` lets the fit start again
@@ -24,14 +26,14 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from scipy.special import stdtrit
 
 from diffcloud.errors import ConfigError
-from diffcloud.fit.joint import AnyObjective, mean_loss
+from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis
 from diffcloud.fit.result import physical_values
 from diffcloud.fit.scan import Scan, scan
 from diffcloud.fit.solvers import GaussNewtonSettings, solve
-from diffcloud.fit.uncertainty import Uncertainty, noise_mm, uncertainty
+from diffcloud.fit.uncertainty import STEP_SIZE, Uncertainty, noise_mm, uncertainty
 from diffcloud.io.files import read_json
 from diffcloud.scene.scenarios import Scenario
 
@@ -179,14 +181,14 @@ def state_intervals(
             f"{worst_fit[1]:.1f} mm; any interval says only how far this misfit lets the numbers go, and nothing about "
             "the cloth"
         )
-    widths = {name: _half_width(found, row, level) for name, row in zip(space.names, np.eye(len(space.names)), strict=True)}
+    reaches = {name: _reach(found, row, level) for name, row in zip(space.names, np.eye(len(space.names)), strict=True)}
     ratio_row = _ratio_row(space)
-    ratio_width = None if ratio_row is None else _half_width(found, ratio_row, level)
+    ratio_reach = None if ratio_row is None else _reach(found, ratio_row, level)
     combinations = _combinations(found, space, level)
     parameters = {}
     for index, variable in enumerate(space.variables):
         name = variable.name
-        low, high, bounded = _ends(space, index, values[name], widths[name])
+        low, high, bounded = _ends(space, index, values[name], reaches[name])
         factor = _factor(values[name], low, high)
         prior = found.sources.get("prior")
         told: Verdict
@@ -198,7 +200,7 @@ def state_intervals(
             told = "the prior speaks"
         elif factor <= within and not bounded:
             told = "identified"
-        elif name in ("stretch", "mass") and ratio_width is not None and math.exp(ratio_width) <= within:
+        elif name in ("stretch", "mass") and ratio_reach is not None and math.exp(max(ratio_reach)) <= within:
             told = "only the ratio"
         elif any(c.factor <= within and abs(c.powers[name]) > _SHARE for c in combinations if c.factor is not None):
             told = "only a combination"
@@ -219,13 +221,14 @@ def state_intervals(
             verdict=told,
         )
     ratio = None
-    if ratio_width is not None:
-        value, factor = values["stretch"] / values["mass"], math.exp(min(ratio_width, 700.0))
+    if ratio_reach is not None:
+        value = values["stretch"] / values["mass"]
+        below, above = (math.exp(min(reach, 700.0)) for reach in ratio_reach)
         ratio = RatioInterval(
             value=value,
-            low=value / factor if arrived else None,
-            high=value * factor if arrived else None,
-            factor=factor if arrived else None,
+            low=value / below if arrived else None,
+            high=value * above if arrived else None,
+            factor=max(below, above) if arrived else None,
         )
     several = len(space.names) > 1
     return Intervals(
@@ -262,16 +265,14 @@ def _with_scan(
     centre = axis.places(torch.tensor([values[name] for name in space.names], dtype=torch.float64))
     if seen is None:
         seen, _ = scan(objective, space, centre, torch.from_numpy(found.curvature))
-    of_data = mean_loss(torch.from_numpy(found.losses)[:, None], paper=objective.paper)
-    loss = float(of_data + space.prior_loss(axis.values(centre[None]), objective.prior_cost))
-    place = seen.lower(centre, loss)
+    place = seen.lower(centre, found.loss)
     lower = None if place is None else dict(zip(space.names, axis.bounded(place[None])[0].tolist(), strict=True))
     quantile = float(stdtrit(max(found.clusters - 1, 1), 0.95))
     directions = seen.directions[:, [not variable.doubtful for variable in space.variables]]
     known = torch.from_numpy(found.of_noise_and_priors)
     variance = torch.einsum("ai,ij,aj->a", directions, known, directions)
     curvature = torch.einsum("ai,ij,aj->a", seen.directions, torch.from_numpy(found.curvature), seen.directions)
-    hidden = seen.losses <= loss + quantile**2 * (curvature * variance)[:, None]
+    hidden = seen.losses <= found.loss + quantile**2 * (curvature * variance)[:, None]
     reach = torch.where(hidden, seen.lengths.abs(), 0.0).amax(-1) / quantile
     spread = (directions.T * (reach.square() - variance).clamp(min=0.0)) @ directions
     return replace(found, sources={**found.sources, "nearly as low": spread.numpy()}), lower
@@ -338,23 +339,25 @@ def node_set_note(scenario: Scenario) -> str:
     return f"mass multiplies {len(nodes)} of {len(scenario.scene.mesh.nodes)} nodes, so stretch / mass is no exact scale"
 
 
-def _half_width(found: Uncertainty, row: NDArray[np.float64], level: float) -> float:
-    """Of the combination row · places."""
-    total = float(row @ found.covariance @ row)
-    noise = float(row @ found.sources["noise"] @ row)
-    if total <= 0:
-        return 0.0
-    freedom = max(found.clusters - 1, 1) / max(noise / total, 1e-6) ** 2
-    return float(stdtrit(freedom, 0.5 + level / 2) * math.sqrt(total))
+def _reach(found: Uncertainty, row: NDArray[np.float64], level: float) -> tuple[float, float]:
+    """How far the interval of the combination row · places goes below it and above."""
+    total = float(row @ (found.covariance - found.sources[STEP_SIZE]) @ row)
+    noise, refined = float(row @ found.sources["noise"] @ row), float(row @ found.refined)
+    width = 0.0
+    if total > 0:
+        freedom = max(found.clusters - 1, 1) / max(noise / total, 1e-6) ** 2
+        width = float(stdtrit(freedom, 0.5 + level / 2) * math.sqrt(total))
+    return width + max(-refined, 0.0), width + max(refined, 0.0)
 
 
-def _ends(space: FitSpace, index: int, value: float, half_width: float) -> tuple[float, float, list[float]]:
+def _ends(space: FitSpace, index: int, value: float, reach: tuple[float, float]) -> tuple[float, float, list[float]]:
     """The interval of one parameter, and the bounds at which it ends."""
     variable, axis = space.variables[index], Axis.of(space)
     values = torch.tensor([[v.low for v in space.variables]] * 3, dtype=torch.float64)
     values[:, index] = value
     places = axis.places(values)
-    places[:, index] += torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64) * min(half_width, 700.0)
+    below, above = (min(one, 700.0) for one in reach)
+    places[:, index] += torch.tensor([-below, 0.0, above], dtype=torch.float64)
     low, _, high = axis.values(places)[:, index].tolist()
     bounded = [bound for bound, out in ((variable.low, low <= variable.low), (variable.high, high >= variable.high)) if out]
     return max(low, variable.low), min(high, variable.high), bounded
@@ -377,7 +380,7 @@ def _combinations(found: Uncertainty, space: FitSpace, level: float) -> list[Com
     told = []
     for direction in np.linalg.eigh(found.covariance)[1].T:
         powers = direction / direction[np.abs(direction).argmax()]
-        factor = math.exp(min(_half_width(found, powers, level), 700.0))
+        factor = math.exp(min(max(_reach(found, powers, level)), 700.0))
         told.append(
             Combination(
                 powers=dict(zip(space.names, powers.tolist(), strict=True)), factor=factor if factor < 1e100 else None

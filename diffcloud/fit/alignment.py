@@ -12,10 +12,8 @@ from diffcloud.fit.pose import PoseSpace
 Terms = Callable[[Tensor, float, Tensor | None], tuple[Tensor, Tensor, Tensor]]
 """Poses [b, d], a factor of the cap, and which entries [b] of the batch they belong to (None: all) -> loss [b], half of its
 slope [b, d] and of its curvature [b, d, d]."""
-_ARRIVED = 1e-2
-"""A step smaller than this part of the priors' deviations is the last one; what is left changes little."""
-_LARGEST = 1.0
-"""Step, in deviations."""
+_LARGEST = 300.0
+"""Times as long as the last step, the first one may be."""
 _DAMPING = 1e-6
 
 
@@ -27,15 +25,16 @@ def aligned(space: PoseSpace, start: Tensor, terms: Terms, caps: Sequence[float]
     poses, going = start.clone(), torch.arange(len(start))
     eye = torch.eye(len(space.names), dtype=torch.float64)
     for cap in caps:
-        _, slope, curvature = terms(poses[going], cap, None if len(going) == len(start) else going)
-        slope, curvature = slope + space.prior_weights * poses[going], curvature + space.prior_weights.diag()
-        scaled = curvature * space.deviations[:, None] * space.deviations
+        loss, slope, curvature = terms(poses[going], cap, None if len(going) == len(start) else going)
+        prior = loss[:, None] * space.prior_weights
+        slope, curvature = slope + prior * poses[going], curvature + torch.diag_embed(prior)
+        scaled = curvature * space.resolved[:, None] * space.resolved
         damping = _DAMPING * scaled.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1e-300)
-        step = -torch.linalg.solve(scaled + damping[:, None, None] * eye, slope * space.deviations)
+        step = -torch.linalg.solve(scaled + damping[:, None, None] * eye, slope * space.resolved)
         step = step * (_LARGEST / step.abs().amax(-1, keepdim=True).clamp(min=_LARGEST))
-        poses[going] += step * space.deviations
+        poses[going] += step * space.resolved
         if cap == 1.0:
-            going = going[step.abs().amax(-1) >= _ARRIVED]
+            going = going[step.abs().amax(-1) >= 1.0]
             if not len(going):
                 break
     return poses

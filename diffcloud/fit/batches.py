@@ -39,12 +39,12 @@ def without_diverged(count: int, run: Callable[[Tensor], T]) -> tuple[T | None, 
 
 
 def posterior_losses(objective: AnyObjective, space: FitSpace, values: Tensor) -> Tensor:
-    """[B, k] values -> [B] losses with what the priors add; differentiable.
+    """[B, k] values -> [B] losses with the priors; differentiable.
 
     Raises:
         DivergedError: names step and batch entries.
     """
-    return objective(space.parameters(values)) + space.prior_loss(values, objective.prior_cost)
+    return objective(space.parameters(values)) * space.prior_factor(values, len(objective.members))
 
 
 def batch_losses(objective: AnyObjective, space: FitSpace, values: Tensor) -> Tensor:

@@ -57,12 +57,6 @@ class JointObjective:
         levels = torch.tensor([[one.explained] for one in self.members], dtype=torch.float64)
         return float(mean_loss(levels, paper=self.paper))
 
-    @property
-    def prior_cost(self) -> float:
-        """As of `Objective`. The loss is a mean over recordings, which say the more, the more there are."""
-        costs = torch.tensor([[one.prior_cost] for one in self.members], dtype=torch.float64)
-        return float(mean_loss(costs, paper=self.paper)) / len(self.members)
-
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Losses [B], as of `Objective`."""
         return mean_loss(torch.stack(map_threads(lambda one: one(parameters), self.members)), paper=self.paper)

@@ -158,11 +158,12 @@ class Matcher:
         velocities = self._of(self._velocities, entries)
         shown = _shown(nodes, velocities, pose, target.space)
         points = places.of(shown)
+        moved = target.space.moved(points, pose)
         if self._seen is None and target.viewpoints is not None:
             eyes = target.space.back(target.viewpoints, pose)
-            self._seen = seen_places(shown, self._faces, points, eyes, near=self._near)
-        share = 1.0 if self._recorded is None else 0.5
-        moved, seen = target.space.moved(points, pose), self._of(self._seen, entries)
+            blind = torch.stack([one.blind(moved) for one in target.lost], dim=-1) if target.lost else None
+            self._seen = seen_places(shown, self._faces, points, eyes, near=self._near, blind=blind)
+        share, seen = 1.0 if self._recorded is None else 0.5, self._of(self._seen, entries)
         last = [self._of(found, entries) for found in self._found]
         forth, found = pairs_forth(places, moved, target.clouds, cut=target.cut, share=share, seen=seen, guesses=last[0])
         self._keep(0, found, entries)
@@ -269,19 +270,24 @@ def pairs_back(
     return Pairs(places, recorded.expand(batch, -1, -1, -1), normals, spacing, shares, share / len(recorded)), found
 
 
-def seen_places(positions: Tensor, faces: Tensor, points: Tensor, viewpoints: Tensor, *, near: float) -> Tensor:
+def seen_places(
+    positions: Tensor, faces: Tensor, points: Tensor, viewpoints: Tensor, *, near: float, blind: Tensor | None = None
+) -> Tensor:
     """bool [B, L, N] which points [B, L, N, 3] no face [F, 3] hides from all viewpoints [B, C, 3].
 
     Args:
         positions: [B, L, V, 3] nodes of the meshes.
         near: what is nearer to a point hides nothing.
+        blind: bool [B, L, N, C] which viewpoints cannot see a point anyway; None for none.
     """
     from diffcloud.clouds.surface import find_hidden  # numba takes a moment to import
 
     states = positions.shape[0] * positions.shape[1]
     eyes = viewpoints[:, None].expand(-1, positions.shape[1], -1, -1)
     nodes, places, eyes = (part.detach().reshape(states, -1, 3).contiguous() for part in (positions, points, eyes))
-    hidden = find_hidden(places.numpy(), eyes.numpy(), nodes.numpy(), faces.numpy(), near)
+    shape = (states, places.shape[1], eyes.shape[1])
+    unable = torch.zeros(shape, dtype=torch.int64) if blind is None else blind.long().reshape(shape)
+    hidden = find_hidden(places.numpy(), eyes.numpy(), unable.numpy(), nodes.numpy(), faces.numpy(), near)
     return torch.from_numpy(hidden == 0).reshape(points.shape[:-1])
 
 

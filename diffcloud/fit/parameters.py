@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from diffcloud.errors import ConfigError, unknown_name
+from diffcloud.fit.priors import INDEPENDENT
 from diffcloud.sim.properties import PARAMETERS, check_values
 
 _EDGE = 1e-6
@@ -174,18 +175,19 @@ class FitSpace:
         columns = dict(zip(self.names, values.unbind(-1), strict=True))
         return columns | {name: torch.full_like(values[:, 0], value) for name, value in self.fixed.items()}
 
-    def prior_weights(self, cost: float) -> Tensor:
-        """[k] what the loss gains by the square of each variable's `off_centre` [squared length unit].
+    def prior_weights(self, recordings: int) -> Tensor:
+        """[k] what the logarithm of the loss gains by the square of each variable's `off_centre` (`fit.priors`).
 
         Args:
-            cost: what it gains at one deviation: the objective's `prior_cost`.
+            recordings: over which the loss is a mean; they say the more, the more there are.
         """
-        weights = [0.0 if v.prior is None else cost / math.log(v.prior) ** 2 for v in self.variables]
+        count = INDEPENDENT * recordings
+        weights = [0.0 if v.prior is None else 1 / (count * math.log(v.prior) ** 2) for v in self.variables]
         return torch.tensor(weights, dtype=torch.float64)
 
-    def prior_loss(self, values: Tensor, cost: float) -> Tensor:
-        """[B] what the priors add to the loss of values [B, k]; `cost` as of `prior_weights`."""
-        return (self.prior_weights(cost) * self.off_centre(values).square()).sum(-1)
+    def prior_factor(self, values: Tensor, recordings: int) -> Tensor:
+        """[B] by which the priors multiply the loss of values [B, k]."""
+        return (self.prior_weights(recordings) * self.off_centre(values).square()).sum(-1).exp()
 
     def off_centre(self, values: Tensor) -> Tensor:
         """[..., k] logarithms of values over the centres of their priors; zero for those without one."""

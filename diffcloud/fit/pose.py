@@ -7,7 +7,8 @@ t = (x, y, z), and looked at later by `lag`, as far as its velocity v tells:
 
 On a level table, x and y, and yaw of cloth, gripper and bodies together, are symmetries of the motion: they need no new
 simulation. A cloth that lies turned under a gripper which does not turn is another motion; yaw only approximates it. z and
-the tilts are those of the cameras against the robot. A cloud stamped t shows the motion at t + lag.
+the tilts are those of the cameras against the robot, which a calibration knows to millimetres. A cloud stamped t shows the
+motion at t + lag.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import torch
 from torch import Tensor
 
 from diffcloud.errors import ConfigError, unknown_name
+from diffcloud.fit.priors import INDEPENDENT
 from diffcloud.fit.record import NuisanceValue
 
 NUISANCE: dict[str, Literal["m", "rad", "s"]] = {
@@ -34,8 +36,12 @@ NUISANCE: dict[str, Literal["m", "rad", "s"]] = {
     "lag": "s",
 }
 """Name -> unit."""
-DEFAULT_PRIORS = {"x": 0.1, "y": 0.1, "yaw": math.radians(30)}
-"""Of a cloth laid down by hand where the scene says [m, rad]."""
+SET_UP = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.005, "yaw": 0.005, "lag": 0.002}
+"""How far a calibrated set-up may be off [m, rad, s]: its cameras against the robot, its clock."""
+DEFAULT_PRIORS = {**SET_UP, "x": 0.1, "y": 0.1, "yaw": math.radians(30)}
+"""Of a cloth laid down by hand where the scene says, before such a set-up [m, rad, s]."""
+_RESOLVED = {"m": 3e-4, "rad": 1.5e-3, "s": 3e-4}
+"""A step as small as this is the last one to a pose; what is left changes little."""
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180, "s": 1.0, "ms": 1e-3}
 _QUANTITY = {"m": "m", "cm": "m", "mm": "m", "rad": "rad", "deg": "rad", "s": "s", "ms": "s"}
 _EXAMPLES = {"m": "2cm", "rad": "5deg", "s": "50ms"}
@@ -83,17 +89,18 @@ class PoseSpace:
     """d of them."""
     deviations: Tensor
     """[d] of their priors about zero, in the scene's length unit, rad and s."""
+    resolved: Tensor
+    """[d] the last step to a pose is as small as this."""
     prior_weights: Tensor
-    """[d] what the loss gains by the square of each variable."""
+    """[d] what the logarithm of the loss gains by the square of each variable (`fit.priors`)."""
     centre: Tensor
     """[3] of the recording."""
 
     @staticmethod
-    def build(priors: Mapping[str, float], centre: Tensor, *, length_unit_m: float, prior_cost: float = 0.0) -> PoseSpace:
+    def build(priors: Mapping[str, float], centre: Tensor, *, length_unit_m: float) -> PoseSpace:
         """
         Args:
             priors: name -> standard deviation [m, rad, s].
-            prior_cost: what they add to the loss at one deviation; only fits need it.
 
         Raises:
             ConfigError: an unknown name, or what is no positive number.
@@ -104,9 +111,10 @@ class PoseSpace:
             if not (value > 0 and math.isfinite(value)):
                 raise ConfigError(f"The prior of {name} must be a positive number of {NUISANCE[name]}, got {value!r}.")
         names = tuple(name for name in NUISANCE if name in priors)
-        scale = [priors[name] / (length_unit_m if NUISANCE[name] == "m" else 1.0) for name in names]
-        deviations = torch.tensor(scale, dtype=torch.float64)
-        return PoseSpace(names, deviations, prior_cost / deviations**2, centre)
+        units = torch.tensor([length_unit_m if NUISANCE[name] == "m" else 1.0 for name in names], dtype=torch.float64)
+        deviations = torch.tensor([priors[name] for name in names], dtype=torch.float64) / units
+        resolved = torch.tensor([_RESOLVED[NUISANCE[name]] for name in names], dtype=torch.float64) / units
+        return PoseSpace(names, deviations, resolved, 1 / (INDEPENDENT * deviations**2), centre)
 
     def described(self, values: Tensor, *, length_unit_m: float) -> dict[str, NuisanceValue]:
         """[d] values as records keep them: name -> value and its prior, in SI."""
@@ -126,6 +134,10 @@ class PoseSpace:
             for name in self.names
         ]
         return torch.tensor(values, dtype=torch.float64)
+
+    def prior_factor(self, values: Tensor) -> Tensor:
+        """[B] by which the priors multiply the loss at values [B, d]."""
+        return (self.prior_weights * values.square()).sum(-1).exp()
 
     def lag(self, values: Tensor) -> Tensor | None:
         """[B] of values [B, d]; None where it is not free."""

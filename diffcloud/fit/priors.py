@@ -1,8 +1,10 @@
 """How much a prior says, of the pose and of the parameters, beside a recording; and the priors of parameters.
 
-A multiplier has a log-normal prior about the basis material: one deviation off is a factor. At one deviation a prior adds
-as much to the loss as one of a hundred independent residuals of the recording's own noise: far less than a recording says
-of what it shows. It decides where nothing is shown.
+A multiplier has a log-normal prior about the basis material: one deviation off is a factor. How noisy a recording is, and
+how well the simulator can explain it, nobody knows beforehand: of N independent residuals with a variance of their own, the
+posterior is highest where N log L + Σ d² is lowest, L the loss and d what is off by, in deviations of its prior. So priors
+multiply the loss by exp(Σ d² / N): at one deviation by one hundredth, far less than a recording says of what it shows. They
+decide where nothing is shown, and hold where the simulator explains little.
 """
 
 from __future__ import annotations
@@ -16,18 +18,8 @@ from diffcloud.sim.properties import PARAMETERS
 
 DEFAULT_FACTOR = 10.0
 """One deviation of a multiplier."""
-_INDEPENDENT = 100
-_LEAST_M = 0.0005
-"""Of a recording's noise: points of a simulation without any have a spacing at least."""
-
-
-def prior_cost(noise_loss: float, length_unit_m: float) -> float:
-    """What a prior adds to the loss at one deviation [squared length unit].
-
-    Args:
-        noise_loss: what noise and spacing of the recorded points leave of the loss [squared length unit].
-    """
-    return max(noise_loss, (_LEAST_M / length_unit_m) ** 2) / _INDEPENDENT
+INDEPENDENT = 100
+"""Residuals of a recording that count as independent."""
 
 
 def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str, tuple[float, float]]) -> dict[str, float]:

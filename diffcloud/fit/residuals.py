@@ -89,9 +89,10 @@ def linearise(objective: AnyObjective, space: FitSpace, places: Tensor) -> Linea
     def run(index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         parts = map_threads(lambda one: _over_pose(one, *moved_by(one, space, places[index])), objective.members)
         loss, slope, curvature = mean_terms(parts, paper=paper)
-        weights = space.prior_weights(objective.prior_cost)
-        off = space.off_centre(Axis.of(space).values(places[index]))
-        return loss + (weights * off.square()).sum(-1), slope + weights * off, curvature + weights.diag()
+        values, count = Axis.of(space).values(places[index]), len(objective.members)
+        prior, factor = loss[:, None] * space.prior_weights(count), space.prior_factor(values, count)
+        slope, curvature = slope + prior * space.off_centre(values), curvature + torch.diag_embed(prior)
+        return factor * loss, factor[:, None] * slope, factor[:, None, None] * curvature
 
     with torch.no_grad():
         found, kept, _ = without_diverged(len(places), run)
@@ -152,12 +153,14 @@ def _over_pose(objective: Objective, run: Rollout, rates: Tensor) -> tuple[Tenso
     loss, slope, curvature = objective.terms(motion, rates)
     if motion.pose.shape[1] == 0:
         return loss, slope, curvature
-    prior = objective.pose_space.prior_weights
+    space = objective.pose_space
+    prior, factor = loss[:, None] * space.prior_weights, space.prior_factor(motion.pose)
     of_pose = slope[:, count:] + prior * motion.pose
-    along, mixed = curvature[:, count:, count:] + prior.diag(), curvature[:, :count, count:]
+    along, mixed = curvature[:, count:, count:] + torch.diag_embed(prior), curvature[:, :count, count:]
     solved = torch.linalg.solve(along, torch.cat([of_pose[..., None], mixed.mT], dim=-1))
     slope = slope[:, :count] - (mixed @ solved[..., :1]).squeeze(-1)
-    return loss, slope, curvature[:, :count, :count] - mixed @ solved[..., 1:]
+    curvature = curvature[:, :count, :count] - mixed @ solved[..., 1:]
+    return factor * loss, factor[:, None] * slope, factor[:, None, None] * curvature
 
 
 def _ways(places: Tensor) -> Tensor:

@@ -12,7 +12,6 @@ from torch import Tensor
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.errors import EpisodeError
 from diffcloud.fit.pose import PoseSpace
-from diffcloud.fit.priors import prior_cost
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import rollout
@@ -32,6 +31,31 @@ _UNSURE_M = 0.005
 
 
 @dataclass(frozen=True)
+class LostPixels:
+    """Where one camera could not have seen the cloth: in lost pixels, and in those beside them, which show a place that is
+    half lost. (Half of the loss of a right lift came from one point in eighty, there.)"""
+
+    T_camera_scene: Tensor
+    """[3, 4]"""
+    lens: Tensor
+    """[2, 2] (fx, fy) and (cx, cy)."""
+    pixels: Tensor
+    """bool [L, H, W]"""
+
+    def blind(self, points: Tensor) -> Tensor:
+        """bool [B, L, N] of points [B, L, N, 3] in the recording's frame: behind the camera, beside its image, or in a lost
+        pixel."""
+        frames, height, width = self.pixels.shape
+        x, y, z = (points @ self.T_camera_scene[:, :3].T + self.T_camera_scene[:, 3]).unbind(-1)
+        (fx, fy), (cx, cy) = self.lens.tolist()
+        depth = z.clamp(min=1e-9)
+        column, row = (fx * x / depth + cx).round(), (fy * y / depth + cy).round()
+        beside = (z <= 0) | (column < 0) | (column >= width) | (row < 0) | (row >= height)
+        place = torch.where(beside, 0.0, row * width + column).long() + torch.arange(frames)[:, None] * height * width
+        return beside | self.pixels.flatten()[place]
+
+
+@dataclass(frozen=True)
 class Target:
     """One episode in the loss; L frames."""
 
@@ -46,6 +70,8 @@ class Target:
     """Height below which nothing was recorded."""
     viewpoints: Tensor | None
     """[C, 3] of the cameras, in the recording's frame; None where they are not known."""
+    lost: tuple[LostPixels, ...]
+    """[C] what these cameras lost; empty where that is not known."""
     space: PoseSpace
     track: Tensor | None
     """[1, S, G, 3] displacement of the grippers."""
@@ -60,6 +86,7 @@ class Target:
             times=self.times[list(chosen)],
             clouds=tuple(self.clouds[index] for index in chosen),
             sure=tuple(self.sure[index] for index in chosen),
+            lost=tuple(replace(one, pixels=one.pixels[list(chosen)]) for one in self.lost),
         )
 
 
@@ -105,10 +132,39 @@ def read_target(
         tuple(_sure(episode, frame) for frame in frames),
         height,
         None if whole or not episode.viewpoints else torch.from_numpy(np.stack(list(episode.viewpoints.values()))),
-        PoseSpace.build(nuisance, centre, length_unit_m=unit, prior_cost=prior_cost(noise_loss, unit)),
+        () if whole else _lost(episode, frames),
+        PoseSpace.build(nuisance, centre, length_unit_m=unit),
         track,
         noise_loss,
     )
+
+
+def _lost(episode: Episode, frames: Sequence[int]) -> tuple[LostPixels, ...]:
+    """
+    Raises:
+        EpisodeError: the cameras that lost something are not those whose places are known.
+    """
+    if episode.lost is None:
+        return ()
+    if list(episode.meta["pinholes"]) != list(episode.viewpoints):
+        raise EpisodeError(
+            f"The meta names the pinholes {', '.join(episode.meta['pinholes'])} and the viewpoints "
+            f"{', '.join(episode.viewpoints) or 'of no camera'}; they must be of the same cameras, in the same order."
+        )
+    found = enumerate(episode.pinholes)
+    return tuple(
+        LostPixels(
+            torch.from_numpy(pinhole.T_camera_scene),
+            torch.tensor([pinhole.focal, pinhole.centre], dtype=torch.float64),
+            _widened(torch.from_numpy(episode.lost_pixels(camera)[list(frames)])),
+        )
+        for camera, pinhole in found
+    )
+
+
+def _widened(pixels: Tensor) -> Tensor:
+    """bool [L, H, W] by one pixel to all sides."""
+    return torch.nn.functional.max_pool2d(pixels[:, None].float(), 3, stride=1, padding=1)[:, 0] > 0
 
 
 def _spread(frames: list[int]) -> list[int]:

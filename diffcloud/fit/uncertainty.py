@@ -8,10 +8,10 @@ and s_i what pair i adds to half of its slope. A disturbance that adds g to the 
     a known doubt   b bᵀ,  b = -H⁻¹ h,        h: the slope's change if what is not fitted is one deviation off
 
 Residuals of one place on the cloth have much in common, over both directions and all frames: an edge that curls, a fold in
-the wrong place. So pairs are clustered by place. Doubtful material is fitted too (`fit.doubts`), each of its priors is
-a source. Other doubts are what the fit takes for known: where the cameras stand, the lag, and the size of the simulator's
-step, whose h is the distance to the motion with four times the steps. A misfit that the recording's own noise does not
-explain is inside of the residuals, and widens the interval with them.
+the wrong place. So pairs are clustered by place. Doubtful material (`fit.doubts`) and the pose (`fit.pose`) are fitted too,
+and the prior of each is a source. Other doubts are what the fit takes for known: what of the pose is not free. The size of
+the simulator's step moves the fit to one side; of it, h is the distance to the motion with four times the steps. A misfit
+that the recording's own noise does not explain is inside of the residuals, and widens the interval with them.
 
 Changes of the slope are differences between motions to both sides, each matched with the recording anew, with nodes moved
 along the derivatives of one simulation: as a surface moves, its points find other partners, which Gauss and Newton's
@@ -30,21 +30,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloud.fit.joint import AnyObjective, loss_weights
+from diffcloud.fit.joint import AnyObjective, loss_weights, mean_loss
 from diffcloud.fit.matching import Motion
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
-from diffcloud.fit.pose import NUISANCE
+from diffcloud.fit.pose import NUISANCE, SET_UP
 from diffcloud.fit.residuals import Axis, moved_by
 from diffcloud.fit.targets import track_displacement
 from diffcloud.sim.simulate import Rollout, rollout
 from diffcloud.sim.threads import map_threads
 
-POSE_DOUBTS = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.005, "yaw": 0.005, "lag": 0.002}
-"""How far a calibrated set-up may be off where the fit takes it for known [m, rad, s]."""
 REFINED = 4
 """Times as many steps show what the step size does."""
-_STEP_SIZE = "step size"
+STEP_SIZE = "step size"
+"""Name of that source."""
 _STEP = 0.05
 """On the axis, by which the slope's change is measured."""
 _ROUGH = 4.0
@@ -65,22 +64,25 @@ class Uncertainty:
     """[k] fitted."""
     losses: NDArray[np.float64]
     """[n] of the recordings, without priors."""
+    loss: float
+    """Of all, with the priors of parameters and poses."""
     sources: Mapping[str, NDArray[np.float64]]
     """Name -> [k, k] covariance."""
+    refined: NDArray[np.float64]
+    """[k] how far the fit moves where the simulator takes four times the steps."""
     clusters: int
     """Of residuals, over all recordings."""
     step: NDArray[np.float64]
     """[k] that Gauss and Newton would take next: small against the deviations where the fit has arrived."""
     curvature: NDArray[np.float64]
     """Half of the loss's, priors included, by all that is fitted, doubtful material too."""
-
-    doubtful: tuple[str, ...] = ()
-    """Doubtful material that was fitted too."""
+    besides: frozenset[str] = frozenset()
+    """What was fitted too, under priors: doubtful material and the pose."""
 
     @property
     def of_noise_and_priors(self) -> NDArray[np.float64]:
         """[k, k] part of the covariance that the loss itself knows of."""
-        names = self.sources.keys() & {"noise", "prior", *self.doubtful}
+        names = self.sources.keys() & {"noise", "prior", *self.besides}
         return np.sum([self.sources[name] for name in names], axis=0)
 
     @property
@@ -101,11 +103,13 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
     places = axis.places(torch.tensor([[values[name] for name in space.names]], dtype=torch.float64))
     with torch.no_grad():
         parts = map_threads(lambda member: _Part.of(member, space, places), objective.members)
-    losses = torch.tensor([part.loss for part in parts], dtype=torch.float64)
-    weights = loss_weights(losses[:, None], paper=objective.paper)[:, 0].numpy()
-    prior = space.prior_weights(objective.prior_cost).numpy()
+    losses, factors = torch.tensor([[part.loss, part.factor] for part in parts], dtype=torch.float64).T[:, :, None]
+    weights = loss_weights(losses, paper=objective.paper)[:, 0].numpy()
+    loss = float(mean_loss(losses, paper=objective.paper))
+    prior = loss * space.prior_weights(len(parts)).numpy()
     normal = sum(w * part.normal for w, part in zip(weights, parts, strict=True)) + np.diag(prior)
     off = space.off_centre(axis.values(places))[0].numpy()
+    whole = float(mean_loss(losses * factors, paper=objective.paper) * space.prior_factor(axis.values(places), len(parts)))
     slope = sum(w * part.slope for w, part in zip(weights, parts, strict=True)) + prior * off
     asked = np.array([not variable.doubtful for variable in space.variables])
     inverse = np.linalg.pinv(normal, hermitian=True)[:, asked]
@@ -126,16 +130,21 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
             sources[variable.name] = spread(row[None])
     for name in dict.fromkeys(key for part in parts for key in part.doubts):
         each = [w * part.doubts[name] for w, part in zip(weights, parts, strict=True) if name in part.doubts]
-        sources[name] = spread(np.sum(each, axis=0)[None] if name == _STEP_SIZE else np.stack(each))
+        if name != STEP_SIZE:
+            sources[name] = spread(np.stack(each))
+    refined = -np.sum([w * part.doubts[STEP_SIZE] for w, part in zip(weights, parts, strict=True)], axis=0) @ inverse
+    sources[STEP_SIZE] = np.outer(refined, refined) / 3  # of what lies anywhere between here and there
     return Uncertainty(
         names=space.asked.names,
         places=places[0, asked].numpy(),
-        losses=losses.numpy(),
+        losses=losses[:, 0].numpy(),
+        loss=whole,
         sources=sources,
+        refined=refined,
         clusters=len(clusters),
         step=-slope @ inverse,
-        curvature=normal,
-        doubtful=tuple(variable.name for variable in space.variables if variable.doubtful),
+        curvature=normal * whole / max(loss, 1e-300),
+        besides=frozenset(v.name for v in space.variables if v.doubtful).union(*(m.nuisance for m in objective.members)),
     )
 
 
@@ -172,6 +181,8 @@ class _Part:
     """One recording's share, the pose eliminated."""
 
     loss: float
+    factor: float
+    """By which the prior of the pose multiplies it."""
     slope: NDArray[np.float64]
     """[k]"""
     normal: NDArray[np.float64]
@@ -187,7 +198,7 @@ class _Part:
         run, rates = moved_by(objective, space, places)
         refined = _refined(objective, space.parameters(Axis.of(space).values(places)), run)
         fitted_pose = objective.match(run).pose[0]
-        free = objective.freed({**POSE_DOUBTS, **objective.nuisance})
+        free = objective.freed({**SET_UP, **objective.nuisance})
         pose_names = free.pose_space.names
         values = free.pose_space.of(objective.pose_space.described(fitted_pose, length_unit_m=1.0), length_unit_m=1.0)
         motion = free.match(run, pose=values[None])
@@ -195,7 +206,7 @@ class _Part:
         ways = torch.cat([rates * _STEP, refined[None]])[:, 0]
         ways = torch.nn.functional.pad(ways, (0, 0, 0, motion.nodes.shape[-2] - ways.shape[-2]))
         small = torch.tensor(
-            [POSE_DOUBTS[name] / (objective.length_unit_m if NUISANCE[name] == "m" else 1.0) for name in pose_names]
+            [SET_UP[name] / (objective.length_unit_m if NUISANCE[name] == "m" else 1.0) for name in pose_names]
         )
         still = torch.zeros(len(pose_names), *ways.shape[1:], dtype=torch.float64)
         ways, turns = torch.cat([ways, still]), torch.cat([torch.zeros(k + 1, len(pose_names)), small.diag()]).double()
@@ -203,11 +214,11 @@ class _Part:
         poses = values + torch.cat([torch.zeros_like(turns[:1]), turns, -turns])
         loss, slopes, normal = _slopes(free, motion, rates, motion.nodes + both, poses)
         change = (slopes[1 : 1 + len(ways)] - slopes[1 + len(ways) :]) / 2
-        names = [*space.names, _STEP_SIZE, *pose_names]
+        names = [*space.names, STEP_SIZE, *pose_names]
         own = [*range(k), *(names.index(name) for name in objective.pose_space.names)]
         felt = [*range(k), *(k + pose_names.index(name) for name in objective.pose_space.names)]
         steps = np.concatenate([np.full(k, _STEP), small.numpy()[[index - k for index in felt[k:]]]])
-        prior = np.concatenate([np.zeros(k), objective.pose_space.prior_weights.numpy()])
+        prior = loss * np.concatenate([np.zeros(k), objective.pose_space.prior_weights.numpy()])
         measured = change[np.ix_(own, felt)] / steps[:, None]
         curved = _between(measured, normal[np.ix_(felt, felt)]) + np.diag(prior)
         slope = slopes[0, felt] + prior * np.concatenate([np.zeros(k), fitted_pose.numpy()])
@@ -219,8 +230,11 @@ class _Part:
             for index, name in enumerate(names)
             if index not in own and not (name in NUISANCE and objective.paper)
         }
+        for index, name in enumerate(objective.pose_space.names, k):  # what a prior about another centre would add
+            found[name] = onto[:, index] * prior[index] * float(objective.pose_space.deviations[index - k])
         scores = _clustered(free, motion, rates)
-        return _Part(loss, onto @ slope, onto @ curved[:, :k], scores[:, felt] @ onto.T, found)
+        factor = float(objective.pose_space.prior_factor(fitted_pose[None]))
+        return _Part(loss, factor, onto @ slope, onto @ curved[:, :k], scores[:, felt] @ onto.T, found)
 
 
 def _slopes(

@@ -2,7 +2,8 @@
 
 Fields: `points` float32 [P, 3] of all frames joined, `offsets` int64 [T+1], `times` [T] since the start [s], optional
 `gripper` [T, G, 3] of the `grippers` [G] (names), optional per-point `camera` uint8, `pixel` uint16 [P, 2], `sigma`
-float32 [P] [m], and `meta`, a JSON string. All in the frame and length unit of the scenario's scene.
+float32 [P] [m], optional `lost` uint8 [T, C, bytes], and `meta`, a JSON string. All in the frame and length unit of the
+scenario's scene.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +22,48 @@ from diffcloud.errors import EpisodeError
 from diffcloud.io.arrays import read_npz
 from diffcloud.io.files import write_npz
 
-_OPTIONAL = {"gripper", "grippers", "camera", "pixel", "sigma"}
+_OPTIONAL = {"gripper", "grippers", "camera", "pixel", "sigma", "lost"}
 _REQUIRED = {"points", "offsets", "times", "meta"}
 ONLY_GRIPPER = ("gripper",)
 """The name of a single one."""
 _FARTHEST = 1e6
 """[m, s] Of a point, and of a time."""
 _LARGEST_BYTES = 4 * 2**30
+_MOST_PIXELS = 2**26
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A camera without distortion, pixel centres at whole numbers."""
+
+    width: int
+    height: int
+    focal: tuple[float, float]
+    """(fx, fy) in pixels."""
+    centre: tuple[float, float]
+    """(cx, cy)"""
+    T_camera_scene: NDArray[np.float64]
+    """[3, 4] maps points of the scene to the camera's frame: x right, y down, z forward; in the scene's length unit."""
+
+    @staticmethod
+    def of(told: Mapping[str, Any]) -> Pinhole:
+        """The inverse of `described`.
+
+        Raises:
+            KeyError, TypeError, ValueError: no such camera.
+        """
+        width, height = (int(side) for side in told["size"])
+        (fx, fy), (cx, cy) = (tuple(map(float, told[name])) for name in ("focal", "centre"))
+        pose = np.array(told["T_camera_scene"], dtype=np.float64)
+        sound = pose.shape == (3, 4) and np.isfinite([*pose.ravel(), fx, fy, cx, cy]).all() and min(fx, fy) > 0
+        if not sound or min(width, height) < 1 or width * height > _MOST_PIXELS:
+            raise ValueError("not a camera")
+        return Pinhole(width, height, (fx, fy), (cx, cy), pose)
+
+    def described(self) -> dict[str, Any]:
+        """As an episode's meta has it."""
+        pose = self.T_camera_scene.tolist()
+        return {"size": [self.width, self.height], "focal": self.focal, "centre": self.centre, "T_camera_scene": pose}
 
 
 @dataclass(frozen=True)
@@ -53,6 +90,9 @@ class Episode:
     """[P, 2] (column, row)."""
     sigma: NDArray[np.float32] | None = None
     """[P] standard deviation of the depth [m]."""
+    lost: NDArray[np.uint8] | None = None
+    """[T, C, bytes] pixels in which none of the C `pinholes` could show the cloth: without depth, of the robot or in its
+    shadow, at a border. Rows one after the other, a bit for each pixel."""
     meta: Mapping[str, Any] = field(default_factory=dict)
     """scenario, fabric, category, repeat, truth, published predictions, quality figures."""
 
@@ -83,6 +123,14 @@ class Episode:
                 raise EpisodeError(f"{name} must have shape {[len(points), *width]}, got {list(value.shape)}.")
         if self.sigma is not None and not ((self.sigma >= 0) & (self.sigma < _FARTHEST)).all():
             raise EpisodeError("sigma must be standard deviations [m], finite and not negative.")
+        if self.lost is not None:
+            most = max((pinhole.width * pinhole.height for pinhole in self.pinholes), default=0)
+            shape = (count, len(self.pinholes), (most + 7) // 8)
+            if self.lost.shape != shape or not most:
+                raise EpisodeError(
+                    f"lost must be {list(shape)} bytes (frames, `pinholes` of the meta, bits of their pixels), got "
+                    f"{list(self.lost.shape)}."
+                )
         if max(float(np.abs(points).max()), float(times[-1])) > _FARTHEST:
             raise EpisodeError(f"Points or times lie beyond {_FARTHEST:g} m or s; they are in the wrong unit, or damaged.")
         if self.gripper is not None:
@@ -114,6 +162,29 @@ class Episode:
         if not all(place.shape == (3,) and np.isfinite(place).all() for place in found.values()):
             raise EpisodeError(f"viewpoints of an episode's meta are camera -> [x, y, z], finite, got {told!r}.")
         return found
+
+    @cached_property
+    def pinholes(self) -> tuple[Pinhole, ...]:
+        """[C] the cameras whose lost pixels are known; empty where none is.
+
+        Raises:
+            EpisodeError: `pinholes` of the meta are no cameras.
+        """
+        told = self.meta.get("pinholes") or {}
+        try:
+            return tuple(Pinhole.of(one) for one in told.values())
+        except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
+            raise EpisodeError(
+                "pinholes of an episode's meta are camera -> size [width, height], focal [fx, fy] and centre [cx, cy] in "
+                f"pixels, and T_camera_scene, 3 rows of 4; got {told!r}."
+            ) from error
+
+    def lost_pixels(self, camera: int) -> NDArray[np.bool_]:
+        """[T, H, W] of one of the `pinholes`."""
+        assert self.lost is not None
+        pinhole = self.pinholes[camera]
+        bits = np.unpackbits(self.lost[:, camera], axis=-1, count=pinhole.width * pinhole.height)
+        return bits.astype(bool).reshape(-1, pinhole.height, pinhole.width)
 
     def frame(self, index: int) -> NDArray[np.float32]:
         """[N, 3] points of one frame; negative indices count from the end.
@@ -183,7 +254,7 @@ def read_episode(path: Path) -> Episode:
     except (ValueError, RecursionError) as error:
         raise EpisodeError(f"{path}: meta is not readable JSON: {error}.") from error
     kinds = {"points": np.float32, "offsets": np.int64, "times": np.float64, "gripper": np.float64}
-    kinds |= {"grippers": np.str_, "camera": np.uint8, "pixel": np.uint16, "sigma": np.float32}
+    kinds |= {"grippers": np.str_, "camera": np.uint8, "pixel": np.uint16, "sigma": np.float32, "lost": np.uint8}
     try:
         converted = {name: array.astype(kinds[name], casting="same_kind") for name, array in arrays.items()}
         if not isinstance(meta, dict):

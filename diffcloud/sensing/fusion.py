@@ -8,7 +8,7 @@ is found by its colour.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,10 @@ from scipy.spatial import cKDTree
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.calibrations import Calibration, read_calibration
-from diffcloud.io.episodes import Episode
+from diffcloud.io.camera_models import Intrinsics
+from diffcloud.io.episodes import Episode, Pinhole
 from diffcloud.io.raw_episodes import CameraInfo, RawCamera, RawEpisode, ScenePlacement
-from diffcloud.sensing.cameras import inverse, transform
+from diffcloud.sensing.cameras import inverse, project, transform
 from diffcloud.sensing.filters import in_large_clusters
 from diffcloud.sensing.masking import RobotMask, Spoilt, View, joints_at, spoilt_pixels
 from diffcloud.sensing.refinement import Sight, refine_extrinsics
@@ -96,6 +97,8 @@ class Seen:
     spoilt: Spoilt
     measured: int
     """Valid pixels in the workspace."""
+    lost: NDArray[np.bool_]
+    """[H, W] pixels in which cloth could not have been seen."""
 
     def select(self, kept: NDArray[np.bool_]) -> Seen:
         """The points [P] that are kept."""
@@ -325,14 +328,15 @@ def _cloud(
         flying_m=settings.flying_m,
         sigma_per_m=settings.sigma_per_m,
     )
-    kept = within & ~spoilt.any
+    kept, measured_m = within & ~spoilt.any, depth_m
     if settings.smoothing_px > 0:
         depth_m = smooth_depth(depth_m, kept, settings.smoothing_px, settings.sigma_per_m)
     world = transform(view.T_world_camera, view.directions[kept] * depth_m[kept][:, None])
     row, column = np.nonzero(kept)
     color = camera.color(index)
     colors = None if color is None or color.shape[:2] != depth_m.shape else color[kept]
-    return Seen(index, world, np.column_stack([column, row]), colors, depth_m[kept], spoilt, int(within.sum()))
+    lost = (measured_m == 0) | spoilt.any
+    return Seen(index, world, np.column_stack([column, row]), colors, depth_m[kept], spoilt, int(within.sum()), lost)
 
 
 def _spread(count: int, wanted: int) -> list[int]:
@@ -427,14 +431,51 @@ def _episode(
         camera=np.concatenate([np.full(len(part.points), index, dtype=np.uint8) for index, part in parts]),
         pixel=np.concatenate([part.pixels for _, part in parts]).astype(np.uint16),
         sigma=np.concatenate([part.depth_m**2 * settings.sigma_per_m for _, part in parts]).astype(np.float32),
+        lost=_lost(names, views, frames),
         meta={
             **labels,
             "source": "raw episode",
             "cameras": names,
             "viewpoints": {name: placement.to_scene(views[name].T_world_camera[:3, 3]).tolist() for name in names},
+            "pinholes": {name: _pinhole(views[name], placement).described() for name in names},
             "quality": quality.figures,
         },
     )
+
+
+def _lost(names: Sequence[str], views: Mapping[str, View], frames: Sequence[Mapping[str, Seen]]) -> NDArray[np.uint8]:
+    """[T, C, bytes] as of an episode; of a frame without an image, all."""
+    most = max(view.intrinsics.width * view.intrinsics.height for view in views.values())
+    lost = np.ones((len(frames), len(names), most), dtype=bool)
+    for camera, name in enumerate(names):
+        column, row = _ideal_pixels(views[name].intrinsics)
+        for index, frame in enumerate(frames):  # images came one after the other
+            if name in frame:
+                seen = np.pad(frame[name].lost, 1, constant_values=True)  # what lies beyond the image is lost
+                lost[index, camera, : row.size] = seen[row + 1, column + 1]
+    return np.packbits(lost, axis=-1)
+
+
+def _ideal_pixels(intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(column, row) [H W] of the pixels that look where those of a camera without distortion would; -1 or the image's
+    size beyond its rims."""
+    row, column = np.mgrid[: intrinsics.height, : intrinsics.width].reshape(2, -1)
+    plane = (np.column_stack([column, row]) - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy]
+    found = project(np.column_stack([plane, np.ones(len(plane))]), intrinsics).round()
+    column, row = np.clip(found, -1, [intrinsics.width, intrinsics.height]).astype(np.int64).T
+    return column, row
+
+
+def _pinhole(view: View, placement: ScenePlacement) -> Pinhole:
+    """A camera in the scene's frame, its distortion left out."""
+    told = view.intrinsics
+    origin, *ends = placement.to_scene(np.vstack([np.zeros(3), np.eye(3)]))  # a rotation, a shift and a length unit
+    turn = (np.array(ends) - origin).T
+    turn /= np.cbrt(np.linalg.det(turn))
+    eye = placement.to_scene(view.T_world_camera[:3, 3])
+    axes = view.T_world_camera[:3, :3].T @ turn.T
+    pose = np.column_stack([axes, -axes @ eye])
+    return Pinhole(told.width, told.height, (told.fx, told.fy), (told.cx, told.cy), pose)
 
 
 def _tool(raw: RawEpisode, times: Floats, mask: RobotMask | None, settings: FusionSettings) -> Floats | None:

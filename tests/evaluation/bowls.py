@@ -26,7 +26,6 @@ class Bowl:
     paper: bool = False
     explained: float = 0.0
     sees_all: bool = False
-    prior_cost: float = 2.5e-7
     calls: int = 0
 
     def __post_init__(self) -> None:

@@ -15,7 +15,7 @@ from diffcloud.evaluation.intervals import RESTARTS, significant, state_interval
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitSpace, Objective
 from diffcloud.fit.scan import scan
-from diffcloud.fit.uncertainty import Uncertainty, uncertainty
+from diffcloud.fit.uncertainty import STEP_SIZE, Uncertainty, uncertainty
 from tests.conftest import small_lift
 from tests.evaluation.bowls import Bowl
 from tests.fit.test_fit import clouds_of
@@ -34,11 +34,15 @@ def objective():
 def told(objective, monkeypatch):
     """Intervals of stated variances."""
 
-    def tell(sources, *, space=SPACE, values=VALUES, step=0.0, clusters=16, misfit=(3.0, 3.0), lower=None, **options):
+    def tell(
+        sources, *, space=SPACE, values=VALUES, step=0.0, refined=0.0, clusters=16, misfit=(3.0, 3.0), lower=None, **options
+    ):
         k = len(space.names)
+        moves = np.broadcast_to(refined, k)
         places = np.log([values[name] for name in space.names])
         covariances = {name: np.array(value, dtype=float).reshape(k, k) for name, value in sources.items()}
-        found = Uncertainty(space.names, places, np.ones(1), covariances, clusters, np.full(k, step), np.eye(k))
+        covariances[STEP_SIZE] = np.outer(moves, moves) / 3
+        found = Uncertainty(space.names, places, np.ones(1), 1.0, covariances, moves, clusters, np.full(k, step), np.eye(k))
         monkeypatch.setattr(module, "uncertainty", lambda *arguments, **given: found)
         monkeypatch.setattr(module, "_misfit", lambda *arguments: misfit)
         monkeypatch.setattr(module, "_with_scan", lambda objective, space, values, found, seen: (found, lower))
@@ -65,6 +69,16 @@ class TestEnds:
         found = told({"noise": np.diag([0.04, 0.01])}, clusters=5)
         entry = found.parameters["stretch"]
         assert math.log(entry.high / entry.value) == pytest.approx(0.2 * t.ppf(0.95, 4), rel=1e-6)
+
+    def test_they_reach_further_to_where_finer_steps_have_it(self, told):
+        found = told({"noise": np.zeros((2, 2)), "z": np.diag([0.04, 0.01])}, refined=[-0.3, 0.1])
+        width, entry, other = 0.2 * norm.ppf(0.95), found.parameters["stretch"], found.parameters["mass"]
+        assert math.log(entry.high / entry.value) == pytest.approx(width, rel=1e-6)
+        assert math.log(entry.value / entry.low) == pytest.approx(width + 0.3, rel=1e-6)
+        assert entry.factor == pytest.approx(entry.value / entry.low)
+        assert math.log(other.high / other.value) == pytest.approx(width / 2 + 0.1, rel=1e-6)
+        assert math.log(found.ratio.value / found.ratio.low) == pytest.approx(math.hypot(width, width / 2) + 0.4, rel=1e-6)
+        assert math.log(found.ratio.high / found.ratio.value) == pytest.approx(math.hypot(width, width / 2), rel=1e-6)
 
     def test_they_stop_at_the_bounds(self, told):
         entry = told({"noise": np.diag([25.0, 25.0])}).parameters["stretch"]
@@ -174,7 +188,7 @@ class TestScan:
         well = Wells()
         well.depth = depth
         sources, curvature = {"noise": np.array([[self.VARIANCE]])}, np.array([[1 / 0.3**2]])
-        found = Uncertainty(("stretch",), np.zeros(1), np.ones(1), sources, 16, np.zeros(1), curvature)
+        found = Uncertainty(("stretch",), np.zeros(1), np.ones(1), 1.0, sources, np.zeros(1), 16, np.zeros(1), curvature)
         return module._with_scan(well, self.SPACE, {"stretch": 1.0}, found, seen)
 
     def test_another_minimum_that_noise_hides_widens_the_interval(self):

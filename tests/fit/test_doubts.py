@@ -98,8 +98,8 @@ def objective():
 
 def test_the_prior_is_about_what_is_known(objective):
     space = with_doubts(FitSpace.build(["stretch"], fixed={"bending": 2.0}), {"bending": 1.5}, [SCENARIO])
-    added = space.prior_loss(torch.tensor([[7.0, 2.0], [1.0, 3.0], [1.0, 2 / 1.5**2]]).double(), 0.5)
-    assert added.tolist() == pytest.approx([0.0, 0.5, 2.0])
+    factor = space.prior_factor(torch.tensor([[7.0, 2.0], [1.0, 3.0], [1.0, 2 / 1.5**2]]).double(), 1)
+    assert factor.log().tolist() == pytest.approx([0.0, 0.01, 0.04])
     places = Axis.of(space).places(torch.tensor([[0.8, 1.2]]).double()).requires_grad_(True)
     loss = posterior_losses(objective, space, Axis.of(space).values(places))
     (gradient,) = torch.autograd.grad(loss.sum(), places)

@@ -346,7 +346,6 @@ class Rough:
     """The squared logarithmic distance to a place, in ripples that are a sixth of a unit wide."""
 
     length_unit_m = 1.0
-    prior_cost = 2.5e-7
     members = (None,)
 
     def __init__(self, height: float = 0.05) -> None:

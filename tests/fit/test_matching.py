@@ -10,6 +10,7 @@ import trimesh
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfacePoints, SurfaceSampler
 from diffcloud.fit.matching import Pairs, nearest_places, pairs_forth, seen_places
+from diffcloud.fit.targets import LostPixels
 from diffcloud.mesh.shapes import grid_cloth
 
 
@@ -187,6 +188,24 @@ class TestSeen:
         points = [[0.02, 0.03, 0.097]]
         assert self.seen(screens, points, [[0.0, 0.0, 1.0]], near=0.005) == [True]
         assert self.seen(screens, points, [[0.0, 0.0, 1.0]], near=0.001) == [False]
+
+    def test_a_blind_camera_sees_nothing(self, screens):
+        nodes, faces = screens
+        points, eyes = torch.tensor([[[[0.02, 0.03, 0.0], [0.02, 0.03, 0.1]]]]), torch.tensor([[[0.0, 0, 1], [0.0, 0, -1]]])
+        for blind, expected in (([1, 0], [True, False]), ([0, 1], [False, True]), ([1, 1], [False, False])):
+            unable = torch.tensor(blind, dtype=torch.bool).expand(1, 1, 2, 2)
+            found = seen_places(nodes, faces, points.double(), eyes.double(), near=0.005, blind=unable)
+            assert found[0, 0].tolist() == expected
+
+    def test_lost_pixels_blind_a_camera(self):
+        """It looks down from a metre; one column of its three is lost, in the second frame alone."""
+        pose = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1]], dtype=torch.float64)
+        pixels = torch.zeros(2, 3, 3, dtype=torch.bool)
+        pixels[1, :, 2] = True
+        lost = LostPixels(pose, torch.tensor([[10.0, 10.0], [1.0, 1.0]], dtype=torch.float64), pixels)
+        points = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0.2, 0, 0], [0.0, 0, 2.0], [-0.14, 0.14, 0]])
+        found = lost.blind(points.double().expand(1, 2, -1, -1))
+        assert found[0].tolist() == [[False, False, False, True, True, False], [False, True, True, True, True, False]]
 
     def test_by_brute_force(self, sheet, generator):
         nodes, faces = sheet

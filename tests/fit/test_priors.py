@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 from diffcloud.errors import ConfigError
-from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton
+from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton
 from diffcloud.fit.batches import posterior_losses
-from diffcloud.fit.priors import DEFAULT_FACTOR, parameter_priors, prior_cost
+from diffcloud.fit.priors import DEFAULT_FACTOR, parameter_priors
 from diffcloud.fit.residuals import Axis, linearise
 from tests.conftest import small_lift
 from tests.fit.test_fit import GENTLE, clouds_of
@@ -47,24 +45,12 @@ class TestOption:
             parameter_priors(text, ["stretch", "mass", "damping", "bending"], BOUNDS)
 
 
-def test_the_prior_adds_its_cost_at_one_deviation():
-    space = FitSpace.build(["stretch", "mass"], priors={"mass": 3.0})
-    added = space.prior_loss(torch.tensor([[7.0, 3.0], [7.0, 1.0], [7.0, 1 / 9]]).double(), 0.5)
-    assert added.tolist() == pytest.approx([0.5, 0.0, 2.0])
-
-
-def test_its_cost_goes_with_the_noise_of_the_recording(objective):
-    """One of a hundred independent residuals; of two recordings together, one of two hundred."""
-    scenario = objective.scenario
-    rough = clouds_of(scenario, points=800, stretch=0.6, mass=1.7)
-    rough = replace(rough, points=rough.points + np.random.default_rng(1).normal(0, 0.002, rough.points.shape).astype("f4"))
-    other = Objective(scenario, rough, nuisance={})
-    least = float(other({"stretch": torch.tensor([0.6]).double(), "mass": torch.tensor([1.7]).double()}))
-    assert 100 * other.prior_cost == pytest.approx(least, rel=0.15)
-    assert objective.prior_cost < 0.2 * other.prior_cost
-    both = JointObjective([objective, other]).prior_cost
-    assert both == pytest.approx(math.sqrt(objective.prior_cost * other.prior_cost) / 2)
-    assert prior_cost(0.0, 1e-3) == prior_cost(0.25, 1e-3) == 0.25 / 100  # no less than half a millimetre
+def test_the_prior_raises_the_loss_by_a_hundredth_at_one_deviation():
+    """Of two recordings together, by one of two hundred."""
+    space, values = FitSpace.build(["stretch", "mass"], priors={"mass": 3.0}), [[7.0, 3.0], [7.0, 1.0], [7.0, 1 / 9]]
+    for recordings in (1, 2):
+        factor = space.prior_factor(torch.tensor(values).double(), recordings)
+        assert factor.log().tolist() == pytest.approx([0.01 / recordings, 0.0, 0.04 / recordings])
 
 
 @pytest.fixture(scope="module")
@@ -81,8 +67,11 @@ def test_the_linearisation_has_it(objective):
     found, without = (linearise(objective, one, places.detach()) for one in (space, FitSpace.build(["stretch", "mass"])))
     torch.testing.assert_close(found.losses, loss.detach())
     torch.testing.assert_close(2 * found.slope, gradient, rtol=1e-8, atol=1e-14)
-    expected = [objective.prior_cost / math.log(factor) ** 2 for factor in (1.2, 3.0)]
-    assert (found.curvature - without.curvature)[0].diagonal().tolist() == pytest.approx(expected)
+    factor = float(found.losses / without.losses)
+    off = [math.log(value) / math.log(known) for value, known in ((0.8, 1.2), (1.2, 3.0))]
+    assert factor == pytest.approx(math.exp((off[0] ** 2 + off[1] ** 2) / 100))
+    expected = [0.01 * float(without.losses) / math.log(f) ** 2 for f in (1.2, 3.0)]
+    assert (found.curvature / factor - without.curvature)[0].diagonal().tolist() == pytest.approx(expected)
 
 
 def test_it_decides_only_what_the_recording_does_not_show(objective):

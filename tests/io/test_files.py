@@ -374,7 +374,19 @@ def episode(**changes):
     return replace(made, **changes) if changes else made
 
 
+PINHOLE: dict = {"size": [4, 2], "focal": [3, 3], "centre": [2, 1], "T_camera_scene": np.eye(4)[:3].tolist()}
+LOST = np.zeros((4, 1, 1), np.uint8)
+
+
 class TestEpisodes:
+    def test_lost_pixels_come_back(self, tmp_path):
+        lost = np.random.default_rng(0).random((4, 2, 4)) < 0.5
+        made = episode(lost=np.packbits(lost[:, None].reshape(4, 1, 8), axis=-1), meta={"pinholes": {"side": PINHOLE}})
+        write_episode(tmp_path / "a.npz", made)
+        again = read_episode(tmp_path / "a.npz")
+        np.testing.assert_array_equal(again.lost_pixels(0), lost)
+        assert again.pinholes[0].described() == {**PINHOLE, "focal": (3.0, 3.0), "centre": (2.0, 1.0)}
+
     def test_round_trip_and_same_bytes(self, tmp_path):
         made = episode(camera=np.zeros(12, np.uint8), pixel=np.ones((12, 2), np.uint16), sigma=np.ones(12, np.float32))
         write_episode(tmp_path / "a.npz", made)
@@ -398,6 +410,18 @@ class TestEpisodes:
             ({"gripper": np.zeros((4, 2, 3))}, "gripper"),
             ({"grippers": ("a", "a"), "gripper": np.zeros((4, 2, 3))}, "a name of its own"),
             ({"sigma": np.zeros(5, np.float32)}, "sigma"),
+            ({"lost": LOST}, "lost"),
+            ({"lost": np.zeros((4, 1, 2), np.uint8), "meta": {"pinholes": {"side": PINHOLE}}}, r"lost must be \[4, 1, 1\]"),
+            ({"lost": np.zeros((4, 1, 1), np.uint8), "meta": {"pinholes": {"side": {}}}}, "pinholes"),
+            (
+                {"lost": np.zeros((4, 1, 1), np.uint8), "meta": {"pinholes": {"side": PINHOLE | {"size": [0, 2]}}}},
+                "pinholes",
+            ),
+            (
+                {"lost": np.zeros((4, 1, 1), np.uint8), "meta": {"pinholes": {"side": PINHOLE | {"focal": [0, 1]}}}},
+                "pinholes",
+            ),
+            ({"lost": np.zeros((4, 1, 1), np.uint8), "meta": {"pinholes": [1]}}, "pinholes"),
         ],
     )
     def test_bad_content_is_named(self, changes, message):

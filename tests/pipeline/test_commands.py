@@ -17,6 +17,7 @@ import pytest
 import yaml
 
 from diffcloud.fit import Objective
+from diffcloud.fit.pose import NUISANCE
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.obj import read_cloth, read_surface
 from diffcloud.scene.scenarios import load_scenario
@@ -150,7 +151,7 @@ class TestJointFitOverMotions:
         losses = [one["loss"] for one in joint["episodes"]]
         assert joint["loss"] == pytest.approx(math.sqrt(losses[0] * losses[1]), rel=1e-9)
         for one in joint["episodes"]:
-            assert {"x", "y", "yaw"} == set(one["nuisance"])
+            assert set(NUISANCE) == set(one["nuisance"])
             assert one["left_out"]["loss"] >= 0.5 * one["loss"]
         assert "with the parameters of the others" in done.errors
         assert done.result["fits"]["joint"]["loss"] == joint["loss"]

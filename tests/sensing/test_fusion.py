@@ -13,9 +13,9 @@ from diffcloud.io.calibrations import Calibration, CameraCalibration
 from diffcloud.io.episodes import Episode
 from diffcloud.io.images import write_depth
 from diffcloud.io.raw_episodes import ScenePlacement, read_raw_episode
-from diffcloud.sensing.cameras import inverse, project, transform
+from diffcloud.sensing.cameras import inverse, project, rays, transform
 from diffcloud.sensing.filters import clean_frame, thin
-from diffcloud.sensing.fusion import FusionSettings, fit_table, fuse
+from diffcloud.sensing.fusion import FusionSettings, _ideal_pixels, fit_table, fuse
 from diffcloud.sensing.masking import RobotMask
 from diffcloud.sensing.robot import gen3
 from tests.sensing.cloth_scene import (
@@ -54,6 +54,36 @@ def labels_of(episode: Episode, scene: ClothScene) -> np.ndarray:
     frame = np.repeat(np.arange(episode.frame_count), np.diff(episode.offsets))
     images = np.array([scene.labels[name] for name in scene.labels])  # [camera, frame, H, W]
     return images[episode.camera, frame, episode.pixel[:, 1], episode.pixel[:, 0]]
+
+
+def test_lost_pixels_are_all_that_show_no_cloth_and_could_not(scene, fused):
+    """Where the robot stands, but nowhere that a point of the cloth was kept; told in the scene's frame."""
+    assert list(fused.meta["pinholes"]) == list(fused.meta["viewpoints"])
+    frame = np.repeat(np.arange(fused.frame_count), np.diff(fused.offsets))
+    for camera, (pinhole, name) in enumerate(zip(fused.pinholes, fused.meta["pinholes"], strict=True)):
+        mine, lost = fused.camera == camera, fused.lost_pixels(camera)
+        there = fused.points[mine] @ pinhole.T_camera_scene[:, :3].T + pinhole.T_camera_scene[:, 3]
+        pixels = there[:, :2] / there[:, 2:] * pinhole.focal + pinhole.centre
+        np.testing.assert_allclose(pixels, fused.pixel[mine], atol=1e-3)
+        column, row = fused.pixel[mine].T
+        assert not lost[frame[mine], row, column].any()
+        robot = np.array(scene.labels[name]) == ROBOT
+        assert lost[robot].mean() > 0.99
+        assert 0.0 < lost.mean() < 0.5
+        eye = -pinhole.T_camera_scene[:, :3].T @ pinhole.T_camera_scene[:, 3]
+        np.testing.assert_allclose(eye, fused.viewpoints[name], atol=1e-9)
+
+
+def test_lost_pixels_of_a_camera_with_distortion_are_where_its_rays_go():
+    bent = replace(INTRINSICS, distortion="brown_conrady", coefficients=(0.1, -0.05, 0.001, -0.002, 0.0))
+    column, row = _ideal_pixels(bent)
+    inside = (column >= 0) & (column < bent.width) & (row >= 0) & (row < bent.height)
+    assert 0.8 < inside.mean() < 1.0
+    ideal = np.stack(np.mgrid[: bent.height, : bent.width][::-1], axis=-1).reshape(-1, 2)[inside]
+    ray = rays(np.column_stack([column, row])[inside].astype(float), bent)
+    met = ray[:, :2] * [bent.fx, bent.fy] + [bent.cx, bent.cy]
+    assert np.abs(met - ideal).max() < 1.0
+    assert np.abs(np.column_stack([column, row])[inside] - ideal).max() > 2.0
 
 
 def test_only_cloth_is_left_and_nearly_all_of_it(scene, fused):

@@ -46,7 +46,7 @@ _MOST = 8
 """Starts, unless fewer are enough."""
 _BEFORE, _SEARCHED = 3, 64
 """Starts after which a search is made for the next, and its candidates."""
-_MISFIT = 10.0
+_MISFIT = 30.0
 """Times what explains a recording; above that, it is the model that does not: no start will."""
 _EQUALLY = 1.01
 """Losses within this factor are equally low."""
