@@ -378,18 +378,24 @@ def summary_rows(out: Path) -> list[list[str]]:
 
 
 def coverage_page(rows: Sequence[Sequence[str]]) -> str:
+    """
+    Args:
+        rows: under `HEAD`.
+    """
+    networks = any(row[1].split()[-1] not in ("free", "known", "refined") for row in rows)
     lines = [
         "# How often intervals hold the truth",
         "",
-        "Cloths of drawn parameters are simulated, recorded (`lift` and `fold` by two depth cameras through `preprocess`,"
-        " the others by their whole surface), fitted, and the 90 % interval is held against the truth. Material that is "
-        "not asked for is off by the factors that fits state (`fit.doubts`), cameras and clock by the 2 mm, 0.3° and 2 ms"
-        " that they assume of a calibrated set-up, and the cloth lies about a centimetre beside its place. Errors and "
-        "half-widths are of the natural logarithm: 0.1 is about 10 %. A fit that fails or states no interval is a miss. "
-        "*Identified*: of the recordings with that verdict, how many are within its factor of the truth. *Refined*: the "
-        "truth has four times the steps that fits take. A row named after a network is what that predicts of these "
-        "recordings (`--checkpoint`); it was trained on cloths whose other material is as the scenario has it. Command: "
-        "`make coverage`.",
+        "Cloths of drawn parameters are simulated, recorded (`lift` and `fold` by two depth cameras through "
+        "`preprocess`, the others by their whole surface), fitted, and the 90 % interval is held against the truth. "
+        "Material that is not asked for is off by the factors that fits state (`fit.doubts`); cameras and clock are "
+        "off by what they assume of a calibrated set-up (2 mm and 0.3° along and about each axis, and 2 ms, as "
+        "standard deviations), and the cloth is displaced by about a centimetre. Errors and half-widths are of the "
+        "natural logarithm: 0.1 is about 10 %. A fit that fails or states no interval is a miss. *Identified*: of the"
+        " recordings with that verdict, how many are within its factor of the truth. *Refined*: the truth has four "
+        "times the steps that fits take. "
+        + "A row named after a network gives its predictions of these recordings (`--checkpoint`); it was trained on "
+        "cloths whose other material is as the scenario has it. " * networks + "Command: `make coverage`.",
         "",
         *markdown_table(HEAD, rows),
         "",

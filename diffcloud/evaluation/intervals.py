@@ -2,9 +2,10 @@
 
 Variances come from `fit.uncertainty`. On the axis of the fit (a factor up and down for multipliers) an interval reaches to
 both sides as far as the variance's root times the quantile of Student's t, with the degrees of freedom of Welch and
-Satterthwaite: the noise is estimated from few clusters, the stated doubts are not. What the size of the simulator's step
-does is known, but for how much of it is in a recording: all of it in one of a cloth, nothing in one of this simulator. So
-to that side the interval reaches further by the whole of it. It ends at the bounds.
+Satterthwaite: the noise is estimated from few clusters, the stated doubts are not. The effect of the simulator's step size
+is known; how much of it a recording contains is not: all of it for a real cloth, none for a motion of this simulator. So
+the interval reaches further by the whole effect, to the side to which finer steps would move the fit. Intervals end at the
+bounds.
 
 Gauss and Newton's next step, which the fit has not taken, is one of its sources. No interval is stated where a fit has not
 arrived: that step is far longer than the deviations, or a loss nearby is clearly lower. `restarts` lets the fit start again

@@ -37,9 +37,9 @@ NUISANCE: dict[str, Literal["m", "rad", "s"]] = {
 }
 """Name -> unit."""
 SET_UP = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.005, "yaw": 0.005, "lag": 0.002}
-"""How far a calibrated set-up may be off [m, rad, s]: its cameras against the robot, its clock."""
+"""Standard deviations of a calibrated set-up [m, rad, s]: of its cameras against the robot, and of its clock."""
 DEFAULT_PRIORS = {**SET_UP, "x": 0.1, "y": 0.1, "yaw": math.radians(30)}
-"""Of a cloth laid down by hand where the scene says, before such a set-up [m, rad, s]."""
+"""Of a cloth laid by hand where the scene places it, in front of such a set-up [m, rad, s]."""
 _RESOLVED = {"m": 3e-4, "rad": 1.5e-3, "s": 3e-4}
 """A step as small as this is the last one to a pose; what is left changes little."""
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180, "s": 1.0, "ms": 1e-3}
@@ -90,7 +90,7 @@ class PoseSpace:
     deviations: Tensor
     """[d] of their priors about zero, in the scene's length unit, rad and s."""
     resolved: Tensor
-    """[d] the last step to a pose is as small as this."""
+    """[d] a step no larger than this ends the search for a pose."""
     prior_weights: Tensor
     """[d] what the logarithm of the loss gains by the square of each variable (`fit.priors`)."""
     centre: Tensor

@@ -1,10 +1,11 @@
 """How much a prior says, of the pose and of the parameters, beside a recording; and the priors of parameters.
 
-A multiplier has a log-normal prior about the basis material: one deviation off is a factor. How noisy a recording is, and
-how well the simulator can explain it, nobody knows beforehand: of N independent residuals with a variance of their own, the
-posterior is highest where N log L + Σ d² is lowest, L the loss and d what is off by, in deviations of its prior. So priors
-multiply the loss by exp(Σ d² / N): at one deviation by one hundredth, far less than a recording says of what it shows. They
-decide where nothing is shown, and hold where the simulator explains little.
+A multiplier has a log-normal prior about the basis material: one deviation off is a factor. Nobody knows beforehand how
+noisy a recording is, or how well the simulator can explain it. With N independent residuals of one unknown variance, the
+posterior is highest where N log L + Σ d² is lowest; L is the loss, and d how far each variable is from its centre, in
+standard deviations of its prior. So priors multiply the loss by exp(Σ d² / N): at one deviation by one hundredth more, far
+less than a recording says of what it shows. They decide where nothing is shown, and hold where the simulator explains
+little.
 """
 
 from __future__ import annotations

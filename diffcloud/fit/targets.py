@@ -33,7 +33,7 @@ _UNSURE_M = 0.005
 @dataclass(frozen=True)
 class LostPixels:
     """Where one camera could not have seen the cloth: in lost pixels, and in those beside them, which show a place that is
-    half lost. (Half of the loss of a right lift came from one point in eighty, there.)"""
+    half lost. (In a lift with the right parameters, the one point in eighty that lay there made up half of the loss.)"""
 
     T_camera_scene: Tensor
     """[3, 4]"""
@@ -148,8 +148,8 @@ def _lost(episode: Episode, frames: Sequence[int]) -> tuple[LostPixels, ...]:
         return ()
     if list(episode.meta["pinholes"]) != list(episode.viewpoints):
         raise EpisodeError(
-            f"The meta names the pinholes {', '.join(episode.meta['pinholes'])} and the viewpoints "
-            f"{', '.join(episode.viewpoints) or 'of no camera'}; they must be of the same cameras, in the same order."
+            f"The episode's meta has pinholes of {', '.join(episode.meta['pinholes'])} and viewpoints of "
+            f"{', '.join(episode.viewpoints) or 'no camera'}; both must name the same cameras, in the same order."
         )
     found = enumerate(episode.pinholes)
     return tuple(

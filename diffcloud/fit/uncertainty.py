@@ -10,8 +10,9 @@ and s_i what pair i adds to half of its slope. A disturbance that adds g to the 
 Residuals of one place on the cloth have much in common, over both directions and all frames: an edge that curls, a fold in
 the wrong place. So pairs are clustered by place. Doubtful material (`fit.doubts`) and the pose (`fit.pose`) are fitted too,
 and the prior of each is a source. Other doubts are what the fit takes for known: what of the pose is not free. The size of
-the simulator's step moves the fit to one side; of it, h is the distance to the motion with four times the steps. A misfit
-that the recording's own noise does not explain is inside of the residuals, and widens the interval with them.
+the simulator's step moves the fit to one side; for it, h is the slope's change between this motion and the one with four
+times the steps. A misfit that the recording's own noise does not explain is inside of the residuals, and widens the
+interval with them.
 
 Changes of the slope are differences between motions to both sides, each matched with the recording anew, with nodes moved
 along the derivatives of one simulation: as a surface moves, its points find other partners, which Gauss and Newton's
@@ -133,7 +134,7 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
         if name != STEP_SIZE:
             sources[name] = spread(np.stack(each))
     refined = -np.sum([w * part.doubts[STEP_SIZE] for w, part in zip(weights, parts, strict=True)], axis=0) @ inverse
-    sources[STEP_SIZE] = np.outer(refined, refined) / 3  # of what lies anywhere between here and there
+    sources[STEP_SIZE] = np.outer(refined, refined) / 3  # mean square of a uniform share of it
     return Uncertainty(
         names=space.asked.names,
         places=places[0, asked].numpy(),

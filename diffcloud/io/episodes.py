@@ -91,8 +91,8 @@ class Episode:
     sigma: NDArray[np.float32] | None = None
     """[P] standard deviation of the depth [m]."""
     lost: NDArray[np.uint8] | None = None
-    """[T, C, bytes] pixels in which none of the C `pinholes` could show the cloth: without depth, of the robot or in its
-    shadow, at a border. Rows one after the other, a bit for each pixel."""
+    """[T, C, bytes] for each of the C `pinholes`, the pixels in which it could not show the cloth: without depth, on the
+    robot or in its shadow, at a border. Rows one after the other, a bit for each pixel."""
     meta: Mapping[str, Any] = field(default_factory=dict)
     """scenario, fabric, category, repeat, truth, published predictions, quality figures."""
 

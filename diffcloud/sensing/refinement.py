@@ -14,10 +14,11 @@ off by the same amount in every image of every camera. Taken for noise they beco
 shows other places when it is fast than when it is slow. So each patch of a link has an offset of its own, which is
 eliminated, and the lag is read off how the same patches move.
 
-Only the arm tells where all cameras together are. It is rounder and thicker than described, so its answer is no
-better than a usable calibration: a shift larger than that error is applied; otherwise the first camera stays where it is.
-But the shift is an unknown until the lag is found: cameras that are 3 mm off would make the log seem 5 ms late. A shift no
-larger than what it is found with is then taken for none, and the others' places are found anew.
+Only the arm tells where all cameras together are. It is rounder and thicker than described, so its answer is no better than
+a usable calibration: a shift larger than that error (`_USABLE_M`) is applied; otherwise the first camera stays where it is.
+The shift is nevertheless estimated until the lag is found: cameras that are 3 mm off would make the log seem 5 ms late. If
+it is then within the accuracy with which it can be found (`_FOUND_M`), it is set to zero and the others' places are
+estimated again.
 
 Weights come from the depth's own noise, and fall off for outliers by Tukey's function of the residuals' median deviation.
 Neighbouring points of table and cloth share their surface's errors, so they count as few. The calibration is the prior:

@@ -192,7 +192,7 @@ class TestWhatCounts:
         pinhole = {"size": [2, 2], "focal": [1, 1], "centre": [0, 0], "T_camera_scene": np.eye(4)[:3].tolist()}
         meta = {"viewpoints": {"side": [1.5, 0.3, 0.3]}, "pinholes": {"above": pinhole}}
         lost = np.zeros((episode.frame_count, 1, 1), np.uint8)
-        with pytest.raises(EpisodeError, match="the pinholes above and the viewpoints side"):
+        with pytest.raises(EpisodeError, match="pinholes of above and viewpoints of side"):
             Objective(scenario, replace(episode, meta=meta, lost=lost))
 
     @pytest.mark.parametrize("told", [{"a": [0, 1]}, {"a": "here"}, {"a": [0, 1, math.nan]}, [1, 2], {"a": None}])
