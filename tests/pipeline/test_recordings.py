@@ -124,7 +124,8 @@ def test_a_look_with_what_does_not_belong_to_it(work):
 )
 def test_a_look_at_an_episode_whose_meta_is_damaged(work, meta, says):
     """What only names something is left out; positions that are none are refused."""
-    write_episode(work / "damaged.npz", replace(read_episode(work / "episodes" / "small" / "small_hidden1.npz"), meta=meta))
+    episode = read_episode(work / "episodes" / "small" / "small_hidden1.npz")
+    write_episode(work / "damaged.npz", replace(episode, meta=meta, lost=None))
     done = invoke("view", "damaged.npz", "--out", "damaged.html", code=0 if says is None else 1)
     if says is None:
         page = (work / "damaged.html").read_text(encoding="utf-8")
