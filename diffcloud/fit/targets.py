@@ -50,9 +50,9 @@ class LostPixels:
         (fx, fy), (cx, cy) = self.lens.tolist()
         depth = z.clamp(min=1e-9)
         column, row = (fx * x / depth + cx).round(), (fy * y / depth + cy).round()
-        beside = (z <= 0) | (column < 0) | (column >= width) | (row < 0) | (row >= height)
-        place = torch.where(beside, 0.0, row * width + column).long() + torch.arange(frames)[:, None] * height * width
-        return beside | self.pixels.flatten()[place]
+        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)  # no number is not inside
+        place = torch.where(inside, row * width + column, 0.0).long() + torch.arange(frames)[:, None] * height * width
+        return ~inside | self.pixels.flatten()[place]
 
 
 @dataclass(frozen=True)

@@ -204,8 +204,9 @@ class TestSeen:
         pixels[1, :, 2] = True
         lost = LostPixels(pose, torch.tensor([[10.0, 10.0], [1.0, 1.0]], dtype=torch.float64), pixels)
         points = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0.2, 0, 0], [0.0, 0, 2.0], [-0.14, 0.14, 0]])
+        points = torch.cat([points, torch.full((1, 3), torch.nan)])  # of a motion that diverged
         found = lost.blind(points.double().expand(1, 2, -1, -1))
-        assert found[0].tolist() == [[False, False, False, True, True, False], [False, True, True, True, True, False]]
+        assert found[0].tolist() == [[False] * 3 + [True, True, False, True], [False, True, True, True, True, False, True]]
 
     def test_by_brute_force(self, sheet, generator):
         nodes, faces = sheet
