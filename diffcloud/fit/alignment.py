@@ -26,7 +26,8 @@ def aligned(space: PoseSpace, start: Tensor, terms: Terms, caps: Sequence[float]
     eye = torch.eye(len(space.names), dtype=torch.float64)
     for cap in caps:
         loss, slope, curvature = terms(poses[going], cap, None if len(going) == len(start) else going)
-        prior = loss[:, None] * space.prior_weights
+        # without a cap, a frame in which no place counts has an infinite loss; there, no prior holds the pose
+        prior = torch.where(loss.isfinite(), loss, 0.0)[:, None] * space.prior_weights
         slope, curvature = slope + prior * poses[going], curvature + torch.diag_embed(prior)
         scaled = curvature * space.resolved[:, None] * space.resolved
         damping = _DAMPING * scaled.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1e-300)

@@ -188,6 +188,14 @@ class TestWhatCounts:
         assert min(with_["counted"]) < 0.9
         assert with_["rms_to_recording_mm"] < 0.5 * without["rms_to_recording_mm"]
 
+    def test_a_frame_that_the_camera_lost_altogether_leaves_a_pose(self, scenario, episode):
+        eye = {"size": [8, 1], "focal": [1, 1], "centre": [4, 0], "T_camera_scene": np.eye(4)[:3].tolist()}
+        lost = np.full((episode.frame_count, 1, 1), 255, np.uint8)
+        meta = {"viewpoints": {"side": [0, 0, 0]}, "pinholes": {"side": eye}}
+        objective = Objective(scenario, replace(episode, meta=meta, lost=lost))
+        with torch.no_grad():
+            assert torch.isfinite(objective(at(TRUTH))).all()
+
     def test_lost_pixels_are_of_the_cameras_whose_places_are_known(self, scenario, episode):
         pinhole = {"size": [2, 2], "focal": [1, 1], "centre": [0, 0], "T_camera_scene": np.eye(4)[:3].tolist()}
         meta = {"viewpoints": {"side": [1.5, 0.3, 0.3]}, "pinholes": {"above": pinhole}}
