@@ -13,7 +13,7 @@ Terms = Callable[[Tensor, float, Tensor | None], tuple[Tensor, Tensor, Tensor]]
 """Poses [b, d], a factor of the cap, and which entries [b] of the batch they belong to (None: all) -> loss [b], half of its
 slope [b, d] and of its curvature [b, d, d]."""
 _LARGEST = 300.0
-"""Times as long as the last step, the first one may be."""
+"""Step, in what is resolved (`PoseSpace.resolved`)."""
 _DAMPING = 1e-6
 
 

@@ -129,10 +129,9 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
     for row, variable in zip(of_priors, space.variables, strict=True):
         if variable.doubtful:
             sources[variable.name] = spread(row[None])
-    for name in dict.fromkeys(key for part in parts for key in part.doubts):
+    for name in dict.fromkeys(key for part in parts for key in part.doubts if key != STEP_SIZE):
         each = [w * part.doubts[name] for w, part in zip(weights, parts, strict=True) if name in part.doubts]
-        if name != STEP_SIZE:
-            sources[name] = spread(np.stack(each))
+        sources[name] = spread(np.stack(each))
     refined = -np.sum([w * part.doubts[STEP_SIZE] for w, part in zip(weights, parts, strict=True)], axis=0) @ inverse
     sources[STEP_SIZE] = np.outer(refined, refined) / 3  # mean square of a uniform share of it
     return Uncertainty(

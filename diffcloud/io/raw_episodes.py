@@ -227,14 +227,15 @@ class ScenePlacement:
 
     def to_scene(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Base-frame points [..., 3] [m] in the scene's frame and length unit."""
-        return (points - np.array(self.origin_m)) @ self._turn.T / self.length_unit_m
+        return (points - np.array(self.origin_m)) @ self.rotation.T / self.length_unit_m
 
     def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Scene points [..., 3] in the base frame [m]."""
-        return self.length_unit_m * points @ self._turn + np.array(self.origin_m)
+        return self.length_unit_m * points @ self.rotation + np.array(self.origin_m)
 
     @property
-    def _turn(self) -> NDArray[np.float64]:
+    def rotation(self) -> NDArray[np.float64]:
+        """[3, 3] turns directions of the base frame into the scene's."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 

@@ -22,7 +22,7 @@ from diffcloud.io.calibrations import Calibration, read_calibration
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.episodes import Episode, Pinhole
 from diffcloud.io.raw_episodes import CameraInfo, RawCamera, RawEpisode, ScenePlacement
-from diffcloud.sensing.cameras import inverse, project, transform
+from diffcloud.sensing.cameras import inverse, project, rays, transform
 from diffcloud.sensing.filters import in_large_clusters
 from diffcloud.sensing.masking import RobotMask, Spoilt, View, joints_at, spoilt_pixels
 from diffcloud.sensing.refinement import Sight, refine_extrinsics
@@ -328,14 +328,13 @@ def _cloud(
         flying_m=settings.flying_m,
         sigma_per_m=settings.sigma_per_m,
     )
-    kept, measured_m = within & ~spoilt.any, depth_m
+    kept, lost = within & ~spoilt.any, (depth_m == 0) | spoilt.any
     if settings.smoothing_px > 0:
         depth_m = smooth_depth(depth_m, kept, settings.smoothing_px, settings.sigma_per_m)
     world = transform(view.T_world_camera, view.directions[kept] * depth_m[kept][:, None])
     row, column = np.nonzero(kept)
     color = camera.color(index)
     colors = None if color is None or color.shape[:2] != depth_m.shape else color[kept]
-    lost = (measured_m == 0) | spoilt.any
     return Seen(index, world, np.column_stack([column, row]), colors, depth_m[kept], spoilt, int(within.sum()), lost)
 
 
@@ -460,8 +459,8 @@ def _ideal_pixels(intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np
     """(column, row) [H W] of the pixels that look where those of a camera without distortion would; -1 or the image's
     size beyond its rims."""
     row, column = np.mgrid[: intrinsics.height, : intrinsics.width].reshape(2, -1)
-    plane = (np.column_stack([column, row]) - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy]
-    found = project(np.column_stack([plane, np.ones(len(plane))]), intrinsics).round()
+    straight = rays(np.column_stack([column, row]), replace(intrinsics, distortion="none", coefficients=()))
+    found = project(straight, intrinsics).round()
     column, row = np.clip(found, -1, [intrinsics.width, intrinsics.height]).astype(np.int64).T
     return column, row
 
@@ -469,11 +468,8 @@ def _ideal_pixels(intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np
 def _pinhole(view: View, placement: ScenePlacement) -> Pinhole:
     """A camera in the scene's frame, its distortion left out."""
     told = view.intrinsics
-    origin, *ends = placement.to_scene(np.vstack([np.zeros(3), np.eye(3)]))  # a rotation, a shift and a length unit
-    turn = (np.array(ends) - origin).T
-    turn /= np.cbrt(np.linalg.det(turn))
     eye = placement.to_scene(view.T_world_camera[:3, 3])
-    axes = view.T_world_camera[:3, :3].T @ turn.T
+    axes = view.T_world_camera[:3, :3].T @ placement.rotation.T
     pose = np.column_stack([axes, -axes @ eye])
     return Pinhole(told.width, told.height, (told.fx, told.fy), (told.cx, told.cy), pose)
 
