@@ -47,9 +47,9 @@ class JointObjective:
         return self.members[0].length_unit_m
 
     @property
-    def sees_all(self) -> bool:
+    def knows_gaps(self) -> bool:
         """As of `Objective`, of every one."""
-        return all(one.sees_all for one in self.members)
+        return all(one.knows_gaps for one in self.members)
 
     @property
     def explained(self) -> float:

@@ -126,17 +126,17 @@ class Objective:
         return self._target.cut
 
     @property
-    def sees_all(self) -> bool:
-        """Whether all of the cloth counts as recorded: there is no camera that may have missed a part of it."""
-        return not (self.paper or self.episode.viewpoints or self.episode.camera is not None)
+    def knows_gaps(self) -> bool:
+        """Whether it is known what of the cloth the recording misses: there is no camera, or it says where it saw none."""
+        seen_by_cameras = self.episode.viewpoints or self.episode.camera is not None
+        return not self.paper and (bool(self._target.lost) or not seen_by_cameras)
 
     @property
     def explained(self) -> float:
         """A loss that a motion explains the recording with: hardly above what noise and spacing of its points leave of the
         right one. Where nobody knows what cameras missed of the cloth, a right motion may have more. Zero in the paper's
         measure."""
-        known = self.sees_all or self._target.lost
-        return (_EXPLAINED if known else _EXPLAINED_BY_CAMERAS) * self._target.noise_loss
+        return (_EXPLAINED if self.knows_gaps else _EXPLAINED_BY_CAMERAS) * self._target.noise_loss
 
     @property
     def pose_space(self) -> PoseSpace:

@@ -25,7 +25,7 @@ class Bowl:
     members: tuple[None, ...] = (None,)
     paper: bool = False
     explained: float = 0.0
-    sees_all: bool = False
+    knows_gaps: bool = False
     calls: int = 0
 
     def __post_init__(self) -> None:

@@ -194,7 +194,7 @@ class TestFits:
 
     def test_starts_are_followed_one_after_the_other_until_one_explains_the_recording(self, monkeypatch):
         settings, fits = GaussNewtonSettings(starts=3, screen=7), []
-        monkeypatch.setattr(Objective, "sees_all", True)
+        monkeypatch.setattr(Objective, "knows_gaps", True)
         for explained in (1e-12, 1.0):  # never, at once
             monkeypatch.setattr(Objective, "explained", explained)
             fits.append(fit_gauss_newton(lifted(), SPACE, settings))
@@ -215,7 +215,7 @@ class TestFits:
         assert lifted().explained == 0.0  # the paper's measure
         whole = objective.explained
         objective.episode = replace(objective.episode, camera=np.zeros(len(objective.episode.points), np.uint8))
-        assert not objective.sees_all  # a camera may have missed a part of it
+        assert not objective.knows_gaps  # a camera may have missed a part of it
         assert objective.explained == pytest.approx(2.0 / 1.1 * whole)
 
     def test_when_all_diverge(self, monkeypatch):

@@ -80,7 +80,7 @@ def test_where_three_starts_explain_nothing_a_search_finds_the_next(monkeypatch,
     monkeypatch.setattr(
         FitSpace, "starts", lambda self, count, **_: (torch.linspace(0.2, 0.5, count)[:, None].double(), None)
     )
-    objective = Hidden(explained=0.01, sees_all=True)
+    objective = Hidden(explained=0.01, knows_gaps=True)
     found = fit_gauss_newton(objective, FitSpace.build(["stretch"]), GaussNewtonSettings(starts=starts, screen=0, scans=0))
     assert math.log(found.values["stretch"]) == pytest.approx(ended, abs=1e-3)
     begun = int(found.history.losses[-1].isfinite().sum())

@@ -93,7 +93,7 @@ def fit_gauss_newton(
     known = objective.explained
     most, explained = settings.starts or _MOST, known or settings.threshold
     # where a right motion can have no higher loss than what explains the recording, equal ones say nothing
-    wrong = math.inf if not known and settings.threshold else _MISFIT * known if objective.sees_all else 0.0
+    wrong = math.inf if not known and settings.threshold else _MISFIT * known if objective.knows_gaps else 0.0
     places, simulations = _starts(objective, space, settings, axis, most)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
