@@ -107,12 +107,18 @@ moved: venv
 	        --out docs/results/moved-$$kind.md --workers 2 $(NUISANCE); \
 	done
 
-# How often intervals hold the truth: drawn cloths, recorded, fitted, and held against what was drawn.
+# How often intervals hold the truth: drawn cloths, recorded, fitted, and held against what was drawn; and a posterior that
+# learned what the same cameras see of lifts whose other material is off.
+POSTERIOR := build/coverage-posterior
 COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --out build/coverage --seed 37020117 --workers 2
 coverage: venv
 	$(COVERAGE) --recordings 24 --fix mass
 	$(COVERAGE) --recordings 16 --fix mass --refined --scenario lift --scenario fold
-	$(COVERAGE) --recordings 24 --markdown docs/results/coverage.md
+	diffcloud simulate --scenario lift --draws logarithmic --train 1500 --test 375 --seed 5 --out $(POSTERIOR)/lift \
+	    --doubts bending=1.5x,drag=1.3x,damping=1.5x,friction_obstacle=1.3x,friction_cloth=1.3x
+	diffcloud train --scenario lift --model posterior --profile quick --target logarithmic --data $(POSTERIOR)/lift \
+	    --like build/coverage/lift/episodes/0000.npz --out $(POSTERIOR)/regressors
+	$(COVERAGE) --recordings 24 --checkpoint $(POSTERIOR)/regressors/posterior.safetensors --markdown docs/results/coverage.md
 
 # Every damaged file and every fault; a sample of both is part of test-slow.
 robustness: venv

@@ -162,6 +162,8 @@ class SimulateConfig(Section):
     draws: Literal["uniform", "sobol", "logarithmic", "modes"] = "uniform"
     """Over the bounds: `uniform`, `sobol`, or `logarithmic` (uniform in the logarithms where the lower bound is
     positive); or `modes`: the published code's mixture of soft, medium and stiff cloths."""
+    doubts: Name | None = None
+    """How far other material differs from run to run, as of fits. Default: not at all."""
     train: CountOrNone = 1500
     test: CountOrNone = 375
     seed: Seed = 0
@@ -289,6 +291,8 @@ class TrainConfig(Section):
     loss: Loss | None = None
     target: Target | None = None
     augment: bool | None = None
+    viewpoints: dict[Name, tuple[Component, Component, Component]] | None = None
+    """Camera -> its place in the scene [m]: clouds show what cameras there see."""
     subtract_background: bool | None = None
     heteroscedastic: bool | None = None
     patience: Count | None = None
@@ -301,9 +305,9 @@ class TrainConfig(Section):
 
     def changes(self) -> dict[str, object]:
         """What differs from the profile."""
-        return self.model_dump(
-            exclude={"scenarios", "models", "profile", "device", "loaders", "workers"}, exclude_none=True
-        )
+        apart = {"scenarios", "models", "profile", "device", "loaders", "workers"}
+        told = self.model_dump(exclude=apart, exclude_none=True)
+        return told if self.viewpoints is None else {**told, "viewpoints": tuple(self.viewpoints.values())}
 
 
 class EvaluateConfig(Section):

@@ -24,7 +24,6 @@ from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import files_in, read_json, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint, kept_record
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim.properties import PARAMETERS
 from pipeline.config import Config, EpisodesConfig, load_config
 from pipeline.console import JsonFlag, ParamsFile, errors, finish, show, writes
 from pipeline.episodes import hidden_parameters, record_motion, simulated_frames
@@ -167,12 +166,10 @@ class CoverageJob:
         rng = np.random.default_rng([self.seed, self.index])
         drawn = hidden_parameters(self.scenario, self.config.episodes.model_copy(update={"per_scenario": 1}), rng)
         found = {name: float(value[0]) for name, value in drawn.items()}
-        system, _ = self.scenario.scene.build()
         for name, factor in self.config.fit.known_within([self.scenario]).items():
-            off = math.exp(rng.standard_normal() * math.log(factor))
-            base = 1.0 if PARAMETERS[name].basis else float(getattr(system.properties, name)[0])
-            if name not in found and base > 0:
-                found[name] = base * off
+            off, value = math.exp(rng.standard_normal() * math.log(factor)), self.scenario.value(name)
+            if name not in found and value:
+                found[name] = value * off
         return found
 
     def set_up(self) -> dict[str, float]:
@@ -394,8 +391,8 @@ def coverage_page(rows: Sequence[Sequence[str]]) -> str:
         "natural logarithm: 0.1 is about 10 %. A fit that fails or states no interval is a miss. *Identified*: of the"
         " recordings with that verdict, how many are within its factor of the truth. *Refined*: the truth has four "
         "times the steps that fits take. "
-        + "A row named after a network gives its predictions of these recordings (`--checkpoint`); it was trained on "
-        "cloths whose other material is as the scenario has it. " * networks + "Command: `make coverage`.",
+        + "A row named after a network gives its predictions of these recordings (`--checkpoint`), by the law that it was "
+        "trained with. " * networks + "Command: `make coverage`.",
         "",
         *markdown_table(HEAD, rows),
         "",

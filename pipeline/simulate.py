@@ -9,6 +9,7 @@ import typer
 from rich.table import Table
 
 from diffcloud.datasets import ParameterBox, ParameterDraws, SimulationPlan, simulate_set
+from diffcloud.fit.doubts import parse_doubts
 from diffcloud.sim.threads import use_threads
 from pipeline.config import load_config, updated
 from pipeline.console import JsonFlag, ParamsFile, Threads, errors, finish, progress_bar, show, warn, writes
@@ -27,6 +28,10 @@ def simulate(
     test: Annotated[int | None, typer.Option(help="Runs to test on.")] = None,
     draws: Annotated[str | None, typer.Option(help="uniform, sobol, logarithmic, or modes (as published).")] = None,
     parameters: Annotated[str | None, typer.Option(help="Comma-separated, e.g. stretch,mass.")] = None,
+    doubts: Annotated[
+        str | None,
+        typer.Option(help='Other material differs from run to run, by factors such as "bending=1.5x,drag=1.3x".'),
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of the draws and of exported clouds.")] = None,
     threads: Threads = None,
     workers: Annotated[
@@ -44,6 +49,7 @@ def simulate(
         load_config(params).simulate,
         parameters=None if parameters is None else [name.strip() for name in parameters.split(",")],
         draws=draws,
+        doubts=doubts,
         train=train,
         test=test,
         seed=seed,
@@ -52,7 +58,7 @@ def simulate(
     box = ParameterBox.build(settings.parameters, chosen.bounds)
     plan = SimulationPlan(
         chosen,
-        ParameterDraws(box, settings.draws, chosen.name, settings.seed),
+        ParameterDraws(box, settings.draws, chosen.name, settings.seed, parse_doubts(settings.doubts or "none")),
         {"train": settings.train, "test": settings.test},
     )
     with progress_bar(f"simulating {chosen.name}", settings.train + settings.test) as update:

@@ -8,10 +8,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, cast
 
+import numpy as np
 import typer
 from rich.table import Table
 
-from diffcloud.errors import CheckpointError, ConfigError, DatasetError, DiffCloudError
+from diffcloud.errors import CheckpointError, ConfigError, DatasetError, DiffCloudError, EpisodeError
+from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import read_json
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.regressors import (
@@ -55,6 +57,12 @@ def train(
     loss: Annotated[str | None, typer.Option(help="normalised: L1 of fractions of the bounds; raw: in own units.")] = None,
     target: Annotated[str | None, typer.Option(help="linear, or logarithmic: errors count by their ratio.")] = None,
     augment: Annotated[bool | None, typer.Option(help="Hide parts of the clouds and add noise.")] = None,
+    like: Annotated[
+        Path | None,
+        typer.Option(
+            help="A preprocessed episode: clouds show what its cameras would see, instead of hiding parts at random."
+        ),
+    ] = None,
     subtract_background: Annotated[bool | None, typer.Option(help="Leave the known obstacle out of the clouds.")] = None,
     heteroscedastic: Annotated[
         bool | None, typer.Option("--heteroscedastic", help="Learn a width of each prediction along.")
@@ -79,6 +87,7 @@ def train(
         loss=loss,
         target=target,
         augment=augment,
+        viewpoints=None if like is None else _viewpoints(like),
         subtract_background=subtract_background,
         heteroscedastic=heteroscedastic,
         patience=patience,
@@ -130,6 +139,18 @@ def train(
     finish({"out": str(out), "models": results}, json)
     if failures:
         raise DiffCloudError("\n".join(failures))
+
+
+def _viewpoints(path: Path) -> dict[str, list[float]]:
+    """Of an episode's cameras.
+
+    Raises:
+        EpisodeError: damaged, or its cameras are not known.
+    """
+    found = read_episode(path).viewpoints
+    if not found:
+        raise EpisodeError(f"{path} does not say where its cameras stood; take one that `diffcloud preprocess` wrote.")
+    return {name: np.asarray(place).tolist() for name, place in found.items()}
 
 
 @dataclass(frozen=True)

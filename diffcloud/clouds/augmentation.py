@@ -8,6 +8,7 @@ functions of a run's key (`keyed_random`): a cloud does not depend on the batch 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,12 +18,17 @@ from torch import Tensor
 from diffcloud.clouds.background import Background
 from diffcloud.clouds.keyed_random import normal, stream_keys, uniform
 from diffcloud.clouds.sampling import points_on_faces, uniform_barycentric
+from diffcloud.clouds.visibility import seen_places
 from diffcloud.errors import ConfigError
 from diffcloud.io.simulated import SimulatedSet
 from diffcloud.mesh.topology import SurfaceMesh
 
-_SETTINGS, _NODES, _FACES, _POINTS = range(4)
+_SETTINGS, _NODES, _FACES, _POINTS, _PLACE = range(5)
 """Streams of a run."""
+_CAMERAS_M, _LAID_M = 0.004, 0.01
+"""Noise of depth cameras at their largest, and how far beside its place a cloth is laid [m]."""
+_BEHIND_M = 0.01
+"""What is nearer to a place hides nothing of it [m]: its own face, a layer that it lies on."""
 _SPARE = 1.5
 """Points drawn for each one needed where some may be the background's; where that is too few, points are repeated."""
 
@@ -43,6 +49,10 @@ class Augmentation:
     """Each run's node noise has a standard deviation drawn from [0, this] along each axis [m]."""
     loss_faces_only: bool = True
     """Whether only the faces of the loss are sampled where a scenario names them (the upper half of the fold)."""
+    viewpoints: tuple[tuple[float, float, float], ...] = ()
+    """Of cameras, in the scene [m]: only faces whose middle one of them sees are sampled. Without, all may be."""
+    shift_m: float = 0.0
+    """Each run lies beside its place, by this standard deviation along x and along y [m]."""
 
     def __post_init__(self) -> None:
         low, high = self.keep
@@ -50,11 +60,19 @@ class Augmentation:
             raise ConfigError(f"keep must be two fractions in order (0 < low <= high <= 1), got {list(self.keep)}.")
         if not 0 <= self.jitter_m < float("inf"):
             raise ConfigError(f"jitter_m must be a length of zero or more, got {self.jitter_m}.")
+        if not 0 <= self.shift_m < float("inf"):
+            raise ConfigError(f"shift_m must be a length of zero or more, got {self.shift_m}.")
 
     @staticmethod
     def none() -> Augmentation:
         """Whole surfaces without noise, but for the choice of the loss's faces."""
         return Augmentation(keep=(1.0, 1.0), jitter_m=0.0)
+
+    @staticmethod
+    def recorded(viewpoints: Sequence[Sequence[float]]) -> Augmentation:
+        """What depth cameras see of a cloth that was laid by hand, merged: see `viewpoints`."""
+        places = tuple((float(x), float(y), float(z)) for x, y, z in viewpoints)
+        return Augmentation((1.0, 1.0), jitter_m=_CAMERAS_M, loss_faces_only=False, viewpoints=places, shift_m=_LAID_M)
 
 
 @dataclass(frozen=True)
@@ -69,8 +87,7 @@ class CloudMaker:
     """[W, 3] the obstacle's points, numbered after the cloth's nodes."""
     points: int
     augmentation: Augmentation
-    jitter: float
-    """Largest standard deviation of the node noise, in the scene's length unit."""
+    length_unit_m: float
     background: Background | None
     """Left out of the clouds; then the obstacle is not sampled at all."""
 
@@ -105,25 +122,40 @@ class CloudMaker:
             torch.as_tensor(body.nodes, dtype=torch.float32, device=device),
             points,
             augmentation,
-            augmentation.jitter_m / simulated.length_unit_m,
+            simulated.length_unit_m,
             background,
         )
 
-    def clouds(self, nodes: Tensor, keys: Tensor) -> Tensor:
+    def seen(self, nodes: Tensor) -> Tensor | None:
+        """bool [B, T, F] which of the cloth's faces the viewpoints of the augmentation see of motions [B, T, V, 3]; None
+        without viewpoints."""
+        if not self.augmentation.viewpoints:
+            return None
+        eyes = torch.tensor(self.augmentation.viewpoints, dtype=torch.float64)[None] / self.length_unit_m
+        cloth, positions = self.faces[: self.cloth_faces].cpu(), nodes.double().cpu()
+        middles = positions[:, :, cloth].mean(-2)
+        found = seen_places(positions, cloth, middles, eyes.expand(len(nodes), -1, -1), near=_BEHIND_M / self.length_unit_m)
+        return found.to(nodes.device)
+
+    def clouds(self, nodes: Tensor, keys: Tensor, seen: Tensor | None = None) -> Tensor:
         """Clouds of a batch of motions.
 
         Args:
             nodes: float32 [B, T, V, 3].
             keys: int64 [B], one for each run (and epoch).
+            seen: what `seen` gives of them.
 
         Returns:
             [B, T, points, 3], the points in random order.
         """
         batch, frames, count, _ = nodes.shape
         deviation, fraction, _ = uniform(stream_keys(_SETTINGS, keys), 1).unbind(-1)  # [B, 1]
-        if self.jitter:
+        if jitter := self.augmentation.jitter_m / self.length_unit_m:
             noise = normal(stream_keys(_NODES, keys), frames * count).view_as(nodes)
-            nodes = nodes + (self.jitter * deviation)[..., None, None] * noise
+            nodes = nodes + (jitter * deviation)[..., None, None] * noise
+        if self.augmentation.shift_m:
+            beside = normal(stream_keys(_PLACE, keys), 1).view(batch, 1, 1, 3)
+            nodes = nodes + self.augmentation.shift_m / self.length_unit_m * beside * beside.new_tensor([1.0, 1.0, 0.0])
         body = self.obstacle.expand(batch, frames, -1, -1)
         flat = torch.cat([nodes, body], dim=2).flatten(0, 1)
         drawn = self.points if self.background is None else math.ceil(_SPARE * self.points)
@@ -131,6 +163,9 @@ class CloudMaker:
         place = uniform_barycentric(first, second).view(batch * frames, drawn, 3)
         choice = face_number.view(batch * frames, drawn)
         weights = self._sampled_faces(fraction, keys, frames)
+        if seen is not None:
+            some = seen.any(-1, keepdim=True)  # else nothing could be sampled
+            weights[..., : self.cloth_faces] *= torch.where(some, seen, True)
         found = points_on_faces(flat, self.faces, choice, place, weights=weights.flatten(0, 1))
         if self.background is not None:
             found = self.background.first_free(found, self.points)

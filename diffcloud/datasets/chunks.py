@@ -78,7 +78,11 @@ def simulate_chunk(scenario: Scenario, draws: ParameterDraws, chunk: Chunk) -> S
     missing, replaced = np.arange(len(parameters)), list[Replaced]()
     for attempt in range(_ATTEMPTS):
         try:
-            nodes[missing], diverged = _nodes(scenario, draws.box.names, parameters[missing])
+            values = dict(zip(draws.box.names, parameters[missing].T, strict=True))
+            runs = [chunk.start + int(entry) for entry in missing]
+            factors = [draws.doubtful(chunk.split, run, attempt) for run in runs]
+            values |= {name: scenario.value(name) * np.array([one[name] for one in factors]) for name in draws.doubts}
+            nodes[missing], diverged = _nodes(scenario, values)
         except DivergedError as error:
             raise DatasetError(f"Runs from {chunk.start} of {chunk.split}: {error}") from error
         missing = missing[sorted(diverged)]
@@ -95,11 +99,11 @@ def simulate_chunk(scenario: Scenario, draws: ParameterDraws, chunk: Chunk) -> S
 
 
 def _nodes(
-    scenario: Scenario, names: tuple[str, ...], parameters: NDArray[np.float64]
+    scenario: Scenario, values: Mapping[str, NDArray[np.float64]]
 ) -> tuple[NDArray[np.float32], Mapping[int, DivergedError]]:
-    """Nodes [b, T+1, V, 3] of runs with parameters [b, k], and those that diverged."""
+    """Nodes [b, T+1, V, 3] of runs with parameters name -> [b], and those that diverged."""
     system, _ = scenario.scene.build()
-    values = {name: torch.as_tensor(parameters[:, column]) for column, name in enumerate(names)}
+    properties = scenario.properties(system, {name: torch.as_tensor(value) for name, value in values.items()})
     with torch.no_grad():
-        run = rollout(system, scenario.steps, properties=scenario.properties(system, values), drop_diverged=True)
+        run = rollout(system, scenario.steps, properties=properties, drop_diverged=True)
     return run.positions[:, :: scenario.scene.frame_steps].to(torch.float32).numpy(), run.diverged

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -134,13 +134,15 @@ class ParameterDraws:
     """Which parameters the runs of a set get.
 
     Raises:
-        ConfigError: modes for a scenario or for parameters that the published code has none for.
+        ConfigError: modes for a scenario or for parameters that the published code has none for; doubts of what is drawn.
     """
 
     box: ParameterBox
     kind: Draws
     scenario: str
     seed: int
+    doubts: Mapping[str, float] = field(default_factory=dict)
+    """Other material that differs from run to run, known within a factor of one deviation (`fit.doubts`)."""
 
     def __post_init__(self) -> None:
         if self.kind == "modes" and self.scenario not in MODES:
@@ -150,6 +152,8 @@ class ParameterDraws:
             )
         if self.kind == "modes" and set(self.box.names) != set(_MIXED):
             raise ConfigError(f"The published modes draw {' and '.join(_MIXED)}, not {', '.join(self.box.names)}.")
+        if twice := [name for name in self.doubts if name in self.box.names]:
+            raise ConfigError(f"Doubts are of other material than what is drawn; leave out {', '.join(twice)}.")
 
     def first(self, split: Split, count: int) -> NDArray[np.float64]:
         """[count, k] parameters of a split's runs."""
@@ -159,6 +163,11 @@ class ParameterDraws:
         """[k] instead of those that diverged at attempts 0 to attempt - 1. A replaced Sobol point is drawn uniformly."""
         kind: Draws = "uniform" if self.kind == "sobol" else self.kind
         return self._draw(np.random.default_rng([self.seed, SPLITS.index(split), run, attempt]), 1, kind)[0]
+
+    def doubtful(self, split: Split, run: int, attempt: int) -> dict[str, float]:
+        """Factors of a run's other material, log-normal about one."""
+        rng = np.random.default_rng([self.seed, SPLITS.index(split), run, attempt, 1])
+        return {name: math.exp(rng.standard_normal() * math.log(factor)) for name, factor in self.doubts.items()}
 
     def _draw(self, rng: np.random.Generator, count: int, kind: Draws) -> NDArray[np.float64]:
         match kind:

@@ -18,7 +18,6 @@ from diffcloud.sim.properties import PARAMETERS
 
 MATERIAL_DOUBTS = {"bending": 1.5, "drag": 1.3, "damping": 1.5, "friction_obstacle": 1.3, "friction_cloth": 1.3}
 """One standard deviation of each material, as a factor."""
-_NO_MATERIAL = 1e-9
 _FARTHEST = 4.0
 """Bounds, in standard deviations."""
 
@@ -58,20 +57,10 @@ def with_doubts(space: FitSpace, doubts: Mapping[str, float], scenarios: Sequenc
     for name, factor in doubts.items():
         if name in space.names:
             raise ConfigError(f"doubts: {name} is fitted; what is known of it is its prior, or its bounds.")
-        known = {_known(scenario, name, space.fixed) for scenario in scenarios}
+        known = {space.fixed.get(name, value) if (value := one.value(name)) else 0.0 for one in scenarios}
         value = known.pop()
-        if not known and value > _NO_MATERIAL:
+        if not known and value > 0:
             far = factor**_FARTHEST
             variables.append(Variable(name, value / far, value * far, factor, value, doubtful=True))
             fixed.pop(name, None)
     return FitSpace(tuple(variables), fixed)
-
-
-def _known(scenario: Scenario, name: str, fixed: Mapping[str, float]) -> float:
-    """Of one parameter; zero where the scene has nothing that it acts on."""
-    basis = PARAMETERS[name].basis
-    if basis is None:
-        system, _ = scenario.scene.build()
-        there = float(getattr(system.properties, name)[0])
-        return fixed.get(name, there) if there > _NO_MATERIAL else 0.0
-    return fixed.get(name, 1.0) if scenario.scene.basis(basis) > _NO_MATERIAL else 0.0

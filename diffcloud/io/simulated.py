@@ -61,6 +61,8 @@ class SetFile(BaseModel):
     length_unit_m: Annotated[float, Field(gt=0, le=1e3)]
     draws: Name | None = None
     seed: Annotated[int, Field(ge=0)] | None = None
+    doubts: dict[Name, Component] = {}
+    """Other material that differs from run to run -> factor of one deviation."""
     integrator: Name | None = None
     replaced: Count = 0
     clouds: Count = 0

@@ -59,6 +59,7 @@ class CloudDataset(Dataset[tuple[Tensor, Tensor]]):
         augmentation = Augmentation() if augmentation is None else augmentation
         self._maker = CloudMaker.build(simulated, augmentation, points=points, background=background, device=device)
         self._nodes = torch.as_tensor(simulated.nodes[:, chosen], device=device)
+        self._seen = self._maker.seen(self._nodes)
         low, high = torch.as_tensor(simulated.bounds).T
         scaled = (torch.as_tensor(simulated.parameters) - low) / (high - low)
         self._parameters = scaled.to(device=device, dtype=torch.float32)
@@ -73,7 +74,8 @@ class CloudDataset(Dataset[tuple[Tensor, Tensor]]):
     def batch(self, runs: Sequence[int] | Tensor) -> tuple[Tensor, Tensor]:
         """(clouds [B, T', points, 3], parameters [B, k]) of runs [B]."""
         index = torch.as_tensor(runs, dtype=torch.int64, device=self._nodes.device)
-        return self._maker.clouds(self._nodes[index], run_keys(self.seed, self.epoch, index)), self._parameters[index]
+        seen = None if self._seen is None else self._seen[index]
+        return self._maker.clouds(self._nodes[index], run_keys(self.seed, self.epoch, index), seen), self._parameters[index]
 
     def __getitem__(self, run: int) -> tuple[Tensor, Tensor]:
         clouds, parameters = self.batch([run])

@@ -40,6 +40,9 @@ class TrainingSettings:
     points: int = 3500
     """Per frame."""
     augment: bool = True
+    viewpoints: tuple[tuple[float, float, float], ...] = ()
+    """Of the cameras that will record, in the scene [m]: clouds show what they see, in place of the paper's random faces,
+    of a cloth that lies about a centimetre beside its place."""
     patience: int | None = None
     """Stop after so many epochs without a better validation; None: never."""
     subtract_background: bool = False

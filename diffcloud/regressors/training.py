@@ -201,6 +201,8 @@ class _Clouds:
     @staticmethod
     def build(model: ModelName, train: SimulatedSet, test: SimulatedSet, settings: TrainingSettings) -> _Clouds:
         augmentation = Augmentation() if settings.augment else Augmentation.none()
+        if settings.viewpoints:
+            augmentation = Augmentation.recorded(settings.viewpoints)
         frames = frames_seen(model)
         body = train.obstacle if settings.subtract_background else None
         described = None if body is None else BackgroundBody.of(body, BACKGROUND_REACH_M / train.length_unit_m)

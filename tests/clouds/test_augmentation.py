@@ -19,6 +19,11 @@ from tests.conftest import flat_set
 
 POLE = SurfaceMesh(np.array([[5.0, 0, 0], [6, 0, 0], [5, 0, 1]]), np.array([[0, 1, 2]]))
 
+# two squares, one above the other, and a third beside them
+_CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
+SQUARES = [[x + at, y, z] for at, z in ((0, 0.0), (0, 0.1), (3, 0.0)) for x, y in _CORNERS]
+SQUARE_FACES = [[4 * k + a, 4 * k + b, 4 * k + c] for k in range(3) for a, b, c in ((0, 1, 2), (1, 3, 2))]
+
 
 def clouds_of(simulated: SimulatedSet, augmentation: Augmentation, *, points=2000, epoch=0, runs=(0, 1, 2)) -> torch.Tensor:
     maker = CloudMaker.build(simulated, augmentation, points=points)
@@ -116,6 +121,46 @@ class TestOcclusion:
         assert (seen[:, 1:] <= seen[:, :-1]).all()
 
 
+class TestViewpoints:
+    @pytest.mark.parametrize(
+        ("viewpoints", "layers"),
+        [
+            (((0.5, 0.5, 9.0),), {0.1, 3.0}),
+            (((0.5, 0.5, -9.0),), {0.0, 3.0}),
+            (((0.5, 0.5, 9.0), (0.5, 0.5, -9.0)), {0.0, 0.1, 3.0}),
+            ((), {0.0, 0.1, 3.0}),
+        ],
+    )
+    @pytest.mark.parametrize("unit", [1.0, 0.35])
+    def test_what_a_layer_hides_is_not_sampled(self, viewpoints, layers, unit):
+        nodes = np.array(SQUARES) / unit
+        simulated = replace(flat_set(nodes_of=nodes.tolist(), faces=SQUARE_FACES), length_unit_m=unit)
+        maker = CloudMaker.build(simulated, replace(Augmentation.none(), viewpoints=viewpoints), points=500)
+        motion = torch.as_tensor(simulated.nodes)
+        cloud = unit * maker.clouds(motion, run_keys(7, 0, torch.arange(len(motion))), maker.seen(motion))
+        height = torch.where(cloud[..., 0] > 2, 3.0, cloud[..., 2])
+        assert {round(one, 4) for one in height.flatten().tolist()} == layers
+
+    def test_where_nothing_is_seen_anything_may_be(self):
+        simulated = flat_set(nodes_of=SQUARES[:8], faces=SQUARE_FACES[:4])
+        maker = CloudMaker.build(simulated, Augmentation.none(), points=50)
+        motion = torch.as_tensor(simulated.nodes)
+        keys = run_keys(7, 0, torch.arange(len(motion)))
+        nothing = torch.zeros(*motion.shape[:2], 4, dtype=torch.bool)
+        torch.testing.assert_close(maker.clouds(motion, keys, nothing), maker.clouds(motion, keys), rtol=0, atol=0)
+
+    def test_runs_lie_beside_their_place_and_stay_there(self):
+        simulated = replace(flat_set(runs=300, frames=2), length_unit_m=0.5)
+        runs = tuple(range(300))
+        plain, moved = (
+            clouds_of(simulated, replace(Augmentation.none(), shift_m=shift), points=4, runs=runs) for shift in (0.0, 0.01)
+        )
+        shift = moved - plain
+        torch.testing.assert_close(shift, shift[:, :1, :1].expand_as(shift), rtol=0, atol=1e-6)
+        assert float(shift[..., 2].abs().max()) == 0.0
+        np.testing.assert_allclose(shift[:, 0, 0, :2].std(0), 0.01 / 0.5, rtol=0.15)
+
+
 class TestNoise:
     def test_deviations_fill_their_range_and_scale_with_the_unit(self):
         one = replace(flat_set(runs=60), length_unit_m=1.0)
@@ -151,7 +196,12 @@ class TestSeeds:
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"keep": (0.9, 0.7)}, "in order"), ({"keep": (0.0, 1.0)}, "0 < low"), ({"jitter_m": -1.0}, "zero or more")],
+    [
+        ({"keep": (0.9, 0.7)}, "in order"),
+        ({"keep": (0.0, 1.0)}, "0 < low"),
+        ({"jitter_m": -1.0}, "zero or more"),
+        ({"shift_m": -1.0}, "shift_m must be a length"),
+    ],
 )
 def test_bad_settings_are_refused(options, message):
     with pytest.raises(ConfigError, match=message):

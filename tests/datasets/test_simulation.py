@@ -65,6 +65,22 @@ def test_runs_are_those_of_a_plain_rollout(whole):
     assert read.obstacle is None  # the table is not rendered
 
 
+def test_doubtful_material_of_a_run_is_simulated():
+    doubts = {"bending": 2.0, "friction_obstacle": 1.5}
+    scenario = small_lift()
+    draws = ParameterDraws(ParameterBox.build(["stretch", "mass"]), "uniform", scenario.name, 0, doubts)
+    (chunk,) = chunks.chunks_of(draws, "test", 3)
+    found = chunks.simulate_chunk(scenario, draws, chunk)
+    system, _ = scenario.scene.build()
+    factors = [draws.doubtful("test", run, 0) for run in range(3)]
+    values = dict(zip(("stretch", "mass"), torch.as_tensor(found.parameters.T), strict=True))
+    for name in doubts:
+        values[name] = torch.tensor([scenario.value(name) * one[name] for one in factors], dtype=torch.float64)
+    run = rollout(system, scenario.steps, properties=scenario.properties(system, values))
+    expected = run.positions[:, :: scenario.scene.frame_steps].to(torch.float32)
+    np.testing.assert_array_equal(found.nodes, expected.numpy())
+
+
 def test_a_chunk_keeps_no_derivatives(monkeypatch):
     runs = []
     monkeypatch.setattr(chunks, "rollout", lambda *a, **k: runs.append(rollout(*a, **k)) or runs[-1])

@@ -9,7 +9,8 @@ import trimesh
 
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfacePoints, SurfaceSampler
-from diffcloud.fit.matching import Pairs, nearest_places, pairs_forth, seen_places
+from diffcloud.clouds.visibility import seen_places
+from diffcloud.fit.matching import Pairs, nearest_places, pairs_forth
 from diffcloud.fit.targets import LostPixels
 from diffcloud.mesh.shapes import grid_cloth
 

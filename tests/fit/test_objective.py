@@ -11,9 +11,10 @@ import torch
 
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfacePoints
+from diffcloud.clouds.visibility import seen_places
 from diffcloud.errors import ConfigError, DivergedError, EpisodeError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton
-from diffcloud.fit.matching import pairs_forth, seen_places
+from diffcloud.fit.matching import pairs_forth
 from diffcloud.fit.residuals import Axis, linearise
 from diffcloud.fit.result import describe_recording
 from diffcloud.io.episodes import Episode

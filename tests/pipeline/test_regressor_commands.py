@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import time
+from dataclasses import replace
 
 import pandas as pd
 import pytest
@@ -16,7 +17,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from diffcloud.errors import DiffCloudError, TrainingError
-from diffcloud.io.episodes import write_episode
+from diffcloud.io.episodes import read_episode, write_episode
 from diffcloud.io.simulated import write_simulated
 from diffcloud.regressors import Regressor
 from diffcloud.regressors.training import train_regressor
@@ -94,6 +95,18 @@ def test_train_then_predict(work):
         assert low < values["mass"] < high
         assert 0.1 <= values["clipped"]["stretch"] <= 10
         assert values["outside"] == [name for name in ("stretch", "mass") if not 0.1 <= values[name] <= 10]
+
+
+def test_clouds_show_what_the_cameras_of_a_recording_see(work):
+    plain = read_episode(work / "data/episodes/small/e1.npz")
+    assert "does not say where its cameras stood" in str(
+        run(*TRAIN, "--like", "data/episodes/small/e1.npz", code=1).exception
+    )
+    seen = replace(plain, meta={**plain.meta, "viewpoints": {"side": [0.5, -1.0, 0.7], "top": [0.0, 0.0, 2.0]}})
+    write_episode(work / "seen.npz", seen)
+    run(*TRAIN, "--like", "seen.npz")
+    told = Regressor.read(work / CHECKPOINT).description.training["settings"]
+    assert told["viewpoints"] == [[0.5, -1.0, 0.7], [0.0, 0.0, 2.0]]
 
 
 def test_values_outside_the_bounds_are_shown_and_told(work):

@@ -94,8 +94,9 @@ def test_settings_come_from_the_parameter_file_and_options_win(work):
     (work / "params.yaml").write_text(yaml.safe_dump({"simulate": section}))
     done = run_process(
         "simulate", "--params", "params.yaml", "--scenario", "small.yaml", "--test", 0, "--export-clouds",
-        "--out", "few", cwd=work,
+        "--doubts", "drag=1.3x", "--out", "few", cwd=work,
     )  # fmt: skip
+    assert json.loads((work / "few" / "set.json").read_text())["doubts"] == {"drag": 1.3}
     assert {key: done[key] for key in ("train", "test", "draws", "parameters")} == {
         "train": 2, "test": 0, "draws": "sobol", "parameters": ["mass", "bending"],
     }  # fmt: skip
@@ -109,6 +110,8 @@ def test_settings_come_from_the_parameter_file_and_options_win(work):
         (("--parameters", "weight"), "Unknown parameter 'weight'"),
         (("--draws", "gauss"), "draws: Input should be 'uniform', 'sobol', 'logarithmic' or 'modes'"),
         (("--draws", "modes"), "not for 'small'"),
+        (("--doubts", "stretch=1.5x"), "leave out stretch"),
+        (("--doubts", "drag=0.5x"), "drag takes the factor within which it is known"),
         (("--train", "-1"), "train: "),
         (("--train", "0", "--test", "0"), "at least one run"),
         (("--out", "."), "holds something else than a simulated set"),

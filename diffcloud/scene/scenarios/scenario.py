@@ -13,9 +13,10 @@ from torch import Tensor
 
 from diffcloud.errors import ConfigError
 from diffcloud.scene.description import Scene
-from diffcloud.sim.properties import Properties, check_values, scaled_properties
+from diffcloud.sim.properties import PARAMETERS, Properties, check_values, scaled_properties
 from diffcloud.sim.system import System
 
+_NO_MATERIAL = 1e-9
 Recorder = Literal["depth_cameras", "whole_surface"]
 """How synthetic episodes are made: seen by depth cameras with their noise, or points all over the cloth and the first
 obstacle, without noise."""
@@ -105,6 +106,15 @@ class Scenario:
             mass_material=None if scene.mass_material is None else scene.mass_material.scaled(density=weight),
             surrounding=around,
         )
+
+    def value(self, name: str) -> float:
+        """Of a parameter in this scenario; zero where the scene has nothing that it acts on."""
+        basis = PARAMETERS[name].basis
+        if basis is not None:
+            return 1.0 if self.scene.basis(basis) > _NO_MATERIAL else 0.0
+        system, _ = self.scene.build()
+        found = float(getattr(system.properties, name)[0])
+        return found if found > _NO_MATERIAL else 0.0
 
     def properties(self, system: System, values: Mapping[str, Tensor]) -> Properties:
         """Physical quantities of parameter sets, name -> [B], with the scenario's node sets applied.
