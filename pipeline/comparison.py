@@ -196,8 +196,7 @@ class _Network:
         values = dict(zip(prediction.names, prediction.values[0].tolist(), strict=True))
         seconds, intervals = {**self.seconds, "inference": time.perf_counter() - began}, None
         if prediction.samples is not None and self.level is not None:
-            low, high = (end[0].tolist() for end in prediction.interval(self.level))
-            intervals = dict(zip(prediction.names, zip(low, high, strict=True), strict=True))
+            intervals = prediction.intervals(self.level)
         return predicted(self.model, values, seconds, intervals)
 
 

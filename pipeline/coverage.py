@@ -289,9 +289,8 @@ def _predict(regressor: Regressor, jobs: Sequence[CoverageJob]) -> None:
         except DiffCloudError as error:
             record: dict[str, Any] = {"error": str(error)}
         else:
-            low, high = (end[0].tolist() for end in found.interval(job.level))
-            ends = zip(told.names, found.values[0].tolist(), low, high, strict=True)
-            parameters = {name: {"value": value, "low": a, "high": b} for name, value, a, b in ends}
+            ends = zip(found.values[0].tolist(), found.intervals(job.level).items(), strict=True)
+            parameters = {name: {"value": value, "low": low, "high": high} for value, (name, (low, high)) in ends}
             record = {"intervals": {"parameters": parameters, "within": job.config.evaluate.within}}
             if found.samples is not None and {"stretch", "mass"} <= set(told.names):
                 stretch, mass = (found.samples[0, :, told.names.index(name)] for name in ("stretch", "mass"))

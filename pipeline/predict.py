@@ -53,14 +53,13 @@ def predict(
             told.insert(0, "episode", path.stem)
             drawn.append(told)
         values = dict(zip(names, prediction.values[0].tolist(), strict=True))
-        low, high = (end[0].tolist() for end in prediction.interval(level))
         inside = dict(zip(names, prediction.inside[0].tolist(), strict=True))
         beyond = [name for name in names if not inside[name]]
         outside += [f"{path.stem}: {name} {values[name]:.3g}" for name in beyond]
         clipped = dict(zip(names, prediction.clipped[0].tolist(), strict=True))
-        interval = {name: [low[i], high[i]] for i, name in enumerate(names)}
+        interval = prediction.intervals(level)
         found[path.stem] = {**values, "outside": beyond, "clipped": clipped, "interval": interval}
-        ranges = ", ".join(f"{name} {a:.2f} to {b:.2f}" for name, a, b in zip(names, low, high, strict=True))
+        ranges = ", ".join(f"{name} {low:.2f} to {high:.2f}" for name, (low, high) in interval.items())
         table.add_row(path.stem, *(f"{value:.3f}{'' if inside[name] else ' !'}" for name, value in values.items()), ranges)
     if samples is not None:
         write_text(with_suffix(samples, ".csv"), pd.concat(drawn).to_csv(index=False))

@@ -49,6 +49,11 @@ _ANGLES = ("tilt_x", "tilt_y", "yaw")
 _SHIFTS = ("x", "y", "z")
 
 
+def unit_of(name: str, length_unit_m: float) -> float:
+    """What one unit of a variable in a scene is in SI."""
+    return length_unit_m if NUISANCE[name] == "m" else 1.0
+
+
 def parse_priors(text: str) -> dict[str, float]:
     """What `--nuisance` says -> name -> standard deviation of its prior [m, rad, s].
 
@@ -111,7 +116,7 @@ class PoseSpace:
             if not (value > 0 and math.isfinite(value)):
                 raise ConfigError(f"The prior of {name} must be a positive number of {NUISANCE[name]}, got {value!r}.")
         names = tuple(name for name in NUISANCE if name in priors)
-        units = torch.tensor([length_unit_m if NUISANCE[name] == "m" else 1.0 for name in names], dtype=torch.float64)
+        units = torch.tensor([unit_of(name, length_unit_m) for name in names], dtype=torch.float64)
         deviations = torch.tensor([priors[name] for name in names], dtype=torch.float64) / units
         resolved = torch.tensor([_RESOLVED[NUISANCE[name]] for name in names], dtype=torch.float64) / units
         return PoseSpace(names, deviations, resolved, 1 / (INDEPENDENT * deviations**2), centre)
@@ -120,8 +125,8 @@ class PoseSpace:
         """[d] values as records keep them: name -> value and its prior, in SI."""
         return {
             name: NuisanceValue(
-                value=float(value) * (length_unit_m if NUISANCE[name] == "m" else 1.0),
-                prior=float(prior) * (length_unit_m if NUISANCE[name] == "m" else 1.0),
+                value=float(value) * unit_of(name, length_unit_m),
+                prior=float(prior) * unit_of(name, length_unit_m),
                 unit=NUISANCE[name],
             )
             for name, value, prior in zip(self.names, values, self.deviations, strict=True)
@@ -129,10 +134,7 @@ class PoseSpace:
 
     def of(self, described: Mapping[str, NuisanceValue], *, length_unit_m: float) -> Tensor:
         """The inverse of `described`; what is missing there is zero."""
-        values = [
-            described[name].value / (length_unit_m if NUISANCE[name] == "m" else 1.0) if name in described else 0.0
-            for name in self.names
-        ]
+        values = [described[name].value / unit_of(name, length_unit_m) if name in described else 0.0 for name in self.names]
         return torch.tensor(values, dtype=torch.float64)
 
     def prior_factor(self, values: Tensor) -> Tensor:

@@ -35,7 +35,7 @@ from diffcloud.fit.joint import AnyObjective, loss_weights, mean_loss
 from diffcloud.fit.matching import Motion
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
-from diffcloud.fit.pose import NUISANCE, SET_UP
+from diffcloud.fit.pose import NUISANCE, SET_UP, unit_of
 from diffcloud.fit.residuals import Axis, moved_by
 from diffcloud.fit.targets import track_displacement
 from diffcloud.sim.simulate import Rollout, rollout
@@ -205,9 +205,7 @@ class _Part:
         # what is tried, to both sides: variables move nodes, pose variables the pose
         ways = torch.cat([rates * _STEP, refined[None]])[:, 0]
         ways = torch.nn.functional.pad(ways, (0, 0, 0, motion.nodes.shape[-2] - ways.shape[-2]))
-        small = torch.tensor(
-            [SET_UP[name] / (objective.length_unit_m if NUISANCE[name] == "m" else 1.0) for name in pose_names]
-        )
+        small = torch.tensor([SET_UP[name] / unit_of(name, objective.length_unit_m) for name in pose_names])
         still = torch.zeros(len(pose_names), *ways.shape[1:], dtype=torch.float64)
         ways, turns = torch.cat([ways, still]), torch.cat([torch.zeros(k + 1, len(pose_names)), small.diag()]).double()
         both = torch.cat([torch.zeros_like(ways[:1]), ways, -ways])
