@@ -194,6 +194,7 @@ class TestWhatCounts:
         lost = np.full((episode.frame_count, 1, 1), 255, np.uint8)
         meta = {"viewpoints": {"side": [0, 0, 0]}, "pinholes": {"side": eye}}
         objective = Objective(scenario, replace(episode, meta=meta, lost=lost))
+        assert objective.knows_gaps
         with torch.no_grad():
             assert torch.isfinite(objective(at(TRUTH))).all()
 

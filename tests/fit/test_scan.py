@@ -50,9 +50,14 @@ def test_a_fit_goes_on_where_a_scan_meets_a_lower_loss(monkeypatch):
     )
 
 
-@pytest.mark.parametrize(("apart", "followed"), [(0.0, 2), (0.1, 3)])
-def test_where_it_is_not_known_what_explains_a_recording_two_equal_ends_are_enough(monkeypatch, apart, followed):
-    """Of three starts, each in a well of its own, as deep as stated."""
+@pytest.mark.parametrize(
+    ("apart", "explained", "knows_gaps", "followed"),
+    [(0.0, 0.0, False, 2), (0.1, 0.0, False, 3), (0.0, 0.001, True, 3), (0.0, 0.0001, True, 2)],
+)
+def test_where_it_is_not_known_what_explains_a_recording_two_equal_ends_are_enough(
+    monkeypatch, apart, explained, knows_gaps, followed
+):
+    """Of three starts, each in a well of its own, as deep as stated; and where it is known, above thirty times that."""
 
     class Wells(Bowl):
         def __call__(self, parameters):
@@ -62,7 +67,8 @@ def test_where_it_is_not_known_what_explains_a_recording_two_equal_ends_are_enou
 
     monkeypatch.setattr(gauss_newton, "linearise", linearised)
     space = FitSpace.build(["stretch"], bounds={"stretch": (0.05, 20.0)})
-    found = fit_gauss_newton(Wells(), space, GaussNewtonSettings(screen=0, scans=0, starts=3))
+    wells = Wells(explained=explained, knows_gaps=knows_gaps)
+    found = fit_gauss_newton(wells, space, GaussNewtonSettings(screen=0, scans=0, starts=3))
     assert int(found.history.losses[-1].isfinite().sum()) == followed
 
 
