@@ -107,8 +107,8 @@ moved: venv
 	        --out docs/results/moved-$$kind.md --workers 2 $(NUISANCE); \
 	done
 
-# How often intervals hold the truth: drawn cloths, recorded, fitted, and held against what was drawn; and a posterior that
-# learned what the same cameras see of lifts whose other material is off.
+# How often intervals hold the truth: drawn cloths, recorded, fitted, and held against what was drawn. The same for a posterior
+# trained on simulated lifts of uncertain material, as those cameras see them.
 POSTERIOR := build/coverage-posterior
 COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --out build/coverage --seed 37020117 --workers 2
 coverage: venv

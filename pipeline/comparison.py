@@ -196,7 +196,7 @@ class _Network:
         values = dict(zip(prediction.names, prediction.values[0].tolist(), strict=True))
         seconds, intervals = {**self.seconds, "inference": time.perf_counter() - began}, None
         if prediction.samples is not None and self.level is not None:
-            intervals = prediction.intervals(self.level)
+            intervals = prediction.first_intervals(self.level)
         return predicted(self.model, values, seconds, intervals)
 
 

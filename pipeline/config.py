@@ -163,10 +163,14 @@ class SimulateConfig(Section):
     """Over the bounds: `uniform`, `sobol`, or `logarithmic` (uniform in the logarithms where the lower bound is
     positive); or `modes`: the published code's mixture of soft, medium and stiff cloths."""
     doubts: Name | None = None
-    """How far other material differs from run to run, as of fits. Default: not at all."""
+    """Material that is not drawn differs from run to run by these factors, as those of fits. Default: not at all."""
     train: CountOrNone = 1500
     test: CountOrNone = 375
     seed: Seed = 0
+
+    def known_within(self) -> dict[str, float]:
+        """Material that is not drawn -> factor of one deviation."""
+        return parse_doubts(self.doubts or "none")
 
 
 SMOOTHING = 0.5
@@ -292,7 +296,7 @@ class TrainConfig(Section):
     target: Target | None = None
     augment: bool | None = None
     viewpoints: dict[Name, tuple[Component, Component, Component]] | None = None
-    """Camera -> its place in the scene [m]: clouds show what cameras there see."""
+    """Camera -> its place in the scene, in its length unit: clouds show what cameras there see."""
     subtract_background: bool | None = None
     heteroscedastic: bool | None = None
     patience: Count | None = None

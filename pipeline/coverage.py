@@ -289,7 +289,7 @@ def _predict(regressor: Regressor, jobs: Sequence[CoverageJob]) -> None:
         except DiffCloudError as error:
             record: dict[str, Any] = {"error": str(error)}
         else:
-            ends = zip(found.values[0].tolist(), found.intervals(job.level).items(), strict=True)
+            ends = zip(found.values[0].tolist(), found.first_intervals(job.level).items(), strict=True)
             parameters = {name: {"value": value, "low": low, "high": high} for value, (name, (low, high)) in ends}
             record = {"intervals": {"parameters": parameters, "within": job.config.evaluate.within}}
             if found.samples is not None and {"stretch", "mass"} <= set(told.names):
@@ -390,8 +390,10 @@ def coverage_page(rows: Sequence[Sequence[str]]) -> str:
         "natural logarithm: 0.1 is about 10 %. A fit that fails or states no interval is a miss. *Identified*: of the"
         " recordings with that verdict, how many are within its factor of the truth. *Refined*: the truth has four "
         "times the steps that fits take. "
-        + "A row named after a network gives its predictions of these recordings (`--checkpoint`), by the law that it was "
-        "trained with. " * networks + "Command: `make coverage`.",
+        + "Rows named after a network are its predictions of the same recordings (`--checkpoint`); the prior of a "
+        "posterior is the distribution that its training draws had, which may be wider than that of these truths. "
+        * networks
+        + "Command: `make coverage`.",
         "",
         *markdown_table(HEAD, rows),
         "",

@@ -57,7 +57,7 @@ def predict(
         beyond = [name for name in names if not inside[name]]
         outside += [f"{path.stem}: {name} {values[name]:.3g}" for name in beyond]
         clipped = dict(zip(names, prediction.clipped[0].tolist(), strict=True))
-        interval = prediction.intervals(level)
+        interval = prediction.first_intervals(level)
         found[path.stem] = {**values, "outside": beyond, "clipped": clipped, "interval": interval}
         ranges = ", ".join(f"{name} {low:.2f} to {high:.2f}" for name, (low, high) in interval.items())
         table.add_row(path.stem, *(f"{value:.3f}{'' if inside[name] else ' !'}" for name, value in values.items()), ranges)

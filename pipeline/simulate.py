@@ -9,7 +9,6 @@ import typer
 from rich.table import Table
 
 from diffcloud.datasets import ParameterBox, ParameterDraws, SimulationPlan, simulate_set
-from diffcloud.fit.doubts import parse_doubts
 from diffcloud.sim.threads import use_threads
 from pipeline.config import load_config, updated
 from pipeline.console import JsonFlag, ParamsFile, Threads, errors, finish, progress_bar, show, warn, writes
@@ -30,7 +29,7 @@ def simulate(
     parameters: Annotated[str | None, typer.Option(help="Comma-separated, e.g. stretch,mass.")] = None,
     doubts: Annotated[
         str | None,
-        typer.Option(help='Other material differs from run to run, by factors such as "bending=1.5x,drag=1.3x".'),
+        typer.Option(help="Vary other material from run to run, by such factors: bending=1.5x,drag=1.3x. Default: none."),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of the draws and of exported clouds.")] = None,
     threads: Threads = None,
@@ -58,7 +57,7 @@ def simulate(
     box = ParameterBox.build(settings.parameters, chosen.bounds)
     plan = SimulationPlan(
         chosen,
-        ParameterDraws(box, settings.draws, chosen.name, settings.seed, parse_doubts(settings.doubts or "none")),
+        ParameterDraws(box, settings.draws, chosen.name, settings.seed, settings.known_within()),
         {"train": settings.train, "test": settings.test},
     )
     with progress_bar(f"simulating {chosen.name}", settings.train + settings.test) as update:

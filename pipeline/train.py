@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-import numpy as np
 import typer
 from rich.table import Table
 
@@ -59,9 +58,7 @@ def train(
     augment: Annotated[bool | None, typer.Option(help="Hide parts of the clouds and add noise.")] = None,
     like: Annotated[
         Path | None,
-        typer.Option(
-            help="A preprocessed episode: clouds show what its cameras would see, instead of hiding parts at random."
-        ),
+        typer.Option(help="A preprocessed episode: clouds show the faces that its cameras see, instead of random ones."),
     ] = None,
     subtract_background: Annotated[bool | None, typer.Option(help="Leave the known obstacle out of the clouds.")] = None,
     heteroscedastic: Annotated[
@@ -75,8 +72,10 @@ def train(
     json: JsonFlag = False,
 ) -> None:
     """Train networks. After Ctrl-C or a kill the same command keeps finished ones and goes on from the last saved epoch."""
+    told = load_config(params).train
+    scenarios = told.scenarios if scenario is None else [scenario]
     config = updated(
-        load_config(params).train,
+        told,
         models=None if not model else list(dict.fromkeys(model)),
         profile=profile,
         epochs=epochs,
@@ -87,7 +86,7 @@ def train(
         loss=loss,
         target=target,
         augment=augment,
-        viewpoints=None if like is None else _viewpoints(like),
+        viewpoints=None if like is None else _viewpoints(like, scenarios),
         subtract_background=subtract_background,
         heteroscedastic=heteroscedastic,
         patience=patience,
@@ -99,7 +98,7 @@ def train(
     settings = {name: profile_settings(config.profile, name, **config.changes()) for name in config.models}
     every = scenario is None
     jobs: list[TrainJob] = []
-    for name in config.scenarios if scenario is None else [scenario]:
+    for name in scenarios:
         source, folder = (data / name, out / name) if every else (data, out)
         train_set, test_set = SimulatedSet.read(source, "train"), SimulatedSet.read(source, "test")
         if train_set.scenario != name:
@@ -141,16 +140,20 @@ def train(
         raise DiffCloudError("\n".join(failures))
 
 
-def _viewpoints(path: Path) -> dict[str, list[float]]:
+def _viewpoints(path: Path, scenarios: Sequence[str]) -> dict[str, list[float]]:
     """Of an episode's cameras.
 
     Raises:
+        ConfigError: it is of another scenario than these.
         EpisodeError: damaged, or its cameras are not known.
     """
-    found = read_episode(path).viewpoints
-    if not found:
+    episode = read_episode(path)
+    own = episode.meta.get("scenario")
+    if own is not None and any(name != own for name in scenarios):
+        raise ConfigError(f"--like {path} is a recording of {own}, not of {', '.join(scenarios)}; add --scenario {own}.")
+    if not episode.viewpoints:
         raise EpisodeError(f"{path} does not say where its cameras stood; take one that `diffcloud preprocess` wrote.")
-    return {name: np.asarray(place).tolist() for name, place in found.items()}
+    return {name: place.tolist() for name, place in episode.viewpoints.items()}
 
 
 @dataclass(frozen=True)

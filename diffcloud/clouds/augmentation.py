@@ -26,9 +26,9 @@ from diffcloud.mesh.topology import SurfaceMesh
 _SETTINGS, _NODES, _FACES, _POINTS, _PLACE = range(5)
 """Streams of a run."""
 _CAMERAS_M, _LAID_M = 0.004, 0.01
-"""Noise of depth cameras at their largest, and how far beside its place a cloth is laid [m]."""
+"""Largest standard deviation of depth noise, and that of where a cloth is laid [m]."""
 _BEHIND_M = 0.01
-"""What is nearer to a place hides nothing of it [m]: its own face, a layer that it lies on."""
+"""What is nearer to the middle of a face does not hide it [m]: the face itself, a layer that it lies on."""
 _SPARE = 1.5
 """Points drawn for each one needed where some may be the background's; where that is too few, points are repeated."""
 
@@ -50,9 +50,10 @@ class Augmentation:
     loss_faces_only: bool = True
     """Whether only the faces of the loss are sampled where a scenario names them (the upper half of the fold)."""
     viewpoints: tuple[tuple[float, float, float], ...] = ()
-    """Of cameras, in the scene [m]: only faces whose middle one of them sees are sampled. Without, all may be."""
+    """Of cameras, in the scene: only faces whose middle at least one of them sees are sampled; nothing but the cloth hides
+    it. Without, all may be."""
     shift_m: float = 0.0
-    """Each run lies beside its place, by this standard deviation along x and along y [m]."""
+    """Standard deviation of each run's offset along x and along y [m]."""
 
     def __post_init__(self) -> None:
         low, high = self.keep
@@ -60,6 +61,8 @@ class Augmentation:
             raise ConfigError(f"keep must be two fractions in order (0 < low <= high <= 1), got {list(self.keep)}.")
         if not 0 <= self.jitter_m < float("inf"):
             raise ConfigError(f"jitter_m must be a length of zero or more, got {self.jitter_m}.")
+        if self.viewpoints and self.loss_faces_only:
+            raise ConfigError("Cameras see more than the faces of the loss: viewpoints need loss_faces_only=False.")
         if not 0 <= self.shift_m < float("inf"):
             raise ConfigError(f"shift_m must be a length of zero or more, got {self.shift_m}.")
 
@@ -70,7 +73,7 @@ class Augmentation:
 
     @staticmethod
     def recorded(viewpoints: Sequence[Sequence[float]]) -> Augmentation:
-        """What depth cameras see of a cloth that was laid by hand, merged: see `viewpoints`."""
+        """What depth cameras see together of a cloth that was laid by hand."""
         places = tuple((float(x), float(y), float(z)) for x, y, z in viewpoints)
         return Augmentation((1.0, 1.0), jitter_m=_CAMERAS_M, loss_faces_only=False, viewpoints=places, shift_m=_LAID_M)
 
@@ -131,7 +134,7 @@ class CloudMaker:
         without viewpoints."""
         if not self.augmentation.viewpoints:
             return None
-        eyes = torch.tensor(self.augmentation.viewpoints, dtype=torch.float64)[None] / self.length_unit_m
+        eyes = torch.tensor(self.augmentation.viewpoints, dtype=torch.float64)[None]
         cloth, positions = self.faces[: self.cloth_faces].cpu(), nodes.double().cpu()
         middles = positions[:, :, cloth].mean(-2)
         found = seen_places(positions, cloth, middles, eyes.expand(len(nodes), -1, -1), near=_BEHIND_M / self.length_unit_m)
@@ -143,29 +146,32 @@ class CloudMaker:
         Args:
             nodes: float32 [B, T, V, 3].
             keys: int64 [B], one for each run (and epoch).
-            seen: what `seen` gives of them.
+            seen: what `seen` gives of them, where that is known already.
 
         Returns:
             [B, T, points, 3], the points in random order.
         """
         batch, frames, count, _ = nodes.shape
+        still = nodes
         deviation, fraction, _ = uniform(stream_keys(_SETTINGS, keys), 1).unbind(-1)  # [B, 1]
         if jitter := self.augmentation.jitter_m / self.length_unit_m:
             noise = normal(stream_keys(_NODES, keys), frames * count).view_as(nodes)
             nodes = nodes + (jitter * deviation)[..., None, None] * noise
-        if self.augmentation.shift_m:
-            beside = normal(stream_keys(_PLACE, keys), 1).view(batch, 1, 1, 3)
-            nodes = nodes + self.augmentation.shift_m / self.length_unit_m * beside * beside.new_tensor([1.0, 1.0, 0.0])
         body = self.obstacle.expand(batch, frames, -1, -1)
-        flat = torch.cat([nodes, body], dim=2).flatten(0, 1)
+        shown = torch.cat([nodes, body], dim=2)
+        if self.augmentation.shift_m:
+            offset = normal(stream_keys(_PLACE, keys), 1).view(batch, 1, 1, 3) * shown.new_tensor([1.0, 1.0, 0.0])
+            shown = shown + self.augmentation.shift_m / self.length_unit_m * offset
+        flat = shown.flatten(0, 1)
         drawn = self.points if self.background is None else math.ceil(_SPARE * self.points)
         face_number, first, second = uniform(stream_keys(_POINTS, keys), frames * drawn).unbind(-1)
         place = uniform_barycentric(first, second).view(batch * frames, drawn, 3)
         choice = face_number.view(batch * frames, drawn)
         weights = self._sampled_faces(fraction, keys, frames)
+        seen = self.seen(still) if seen is None else seen
         if seen is not None:
-            some = seen.any(-1, keepdim=True)  # else nothing could be sampled
-            weights[..., : self.cloth_faces] *= torch.where(some, seen, True)
+            kept = weights[..., : self.cloth_faces] * seen
+            weights[..., : self.cloth_faces] = torch.where(kept.any(-1, keepdim=True), kept, 1.0)  # something must be
         found = points_on_faces(flat, self.faces, choice, place, weights=weights.flatten(0, 1))
         if self.background is not None:
             found = self.background.first_free(found, self.points)

@@ -81,7 +81,9 @@ def simulate_chunk(scenario: Scenario, draws: ParameterDraws, chunk: Chunk) -> S
             values = dict(zip(draws.box.names, parameters[missing].T, strict=True))
             runs = [chunk.start + int(entry) for entry in missing]
             factors = [draws.doubtful(chunk.split, run, attempt) for run in runs]
-            values |= {name: scenario.value(name) * np.array([one[name] for one in factors]) for name in draws.doubts}
+            for name in draws.doubts:
+                if value := scenario.value(name):
+                    values[name] = value * np.array([one[name] for one in factors])
             nodes[missing], diverged = _nodes(scenario, values)
         except DivergedError as error:
             raise DatasetError(f"Runs from {chunk.start} of {chunk.split}: {error}") from error

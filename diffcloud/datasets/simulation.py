@@ -200,7 +200,7 @@ def _write(
     about = {
         "draws": plan.draws.kind,
         "seed": plan.draws.seed,
-        "doubts": dict(plan.draws.doubts),
+        "doubts": {name: factor for name, factor in plan.draws.doubts.items() if plan.scenario.value(name)},
         "integrator": plan.scenario.scene.integrator,
         "replaced": sum(len(part.replaced) for parts in results.values() for part in parts),
         "clouds": clouds or 0,

@@ -57,10 +57,16 @@ def with_doubts(space: FitSpace, doubts: Mapping[str, float], scenarios: Sequenc
     for name, factor in doubts.items():
         if name in space.names:
             raise ConfigError(f"doubts: {name} is fitted; what is known of it is its prior, or its bounds.")
-        known = {space.fixed.get(name, value) if (value := one.value(name)) else 0.0 for one in scenarios}
+        known = {_stated(one, name, space.fixed) for one in scenarios}
         value = known.pop()
         if not known and value > 0:
             far = factor**_FARTHEST
             variables.append(Variable(name, value / far, value * far, factor, value, doubtful=True))
             fixed.pop(name, None)
     return FitSpace(tuple(variables), fixed)
+
+
+def _stated(scenario: Scenario, name: str, fixed: Mapping[str, float]) -> float:
+    """Of one parameter; zero where the scene has nothing that it acts on."""
+    value = scenario.value(name)
+    return fixed.get(name, value) if value else 0.0

@@ -127,7 +127,7 @@ class Objective:
 
     @property
     def knows_gaps(self) -> bool:
-        """Whether it is known what of the cloth the recording misses: there is no camera, or it says where it saw none."""
+        """Whether it is known what of the cloth the recording misses: there is no camera, or lost pixels are recorded."""
         seen_by_cameras = self.episode.viewpoints or self.episode.camera is not None
         return not self.paper and (bool(self._target.lost) or not seen_by_cameras)
 

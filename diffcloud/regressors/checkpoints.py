@@ -184,7 +184,7 @@ class Prediction:
         reach = laplace_reach(level) * self.width
         return self.scale.values(self.fractions - reach), self.scale.values(self.fractions + reach)
 
-    def intervals(self, level: float) -> dict[str, tuple[float, float]]:
+    def first_intervals(self, level: float) -> dict[str, tuple[float, float]]:
         """The same of the first cloud, by name."""
         low, high = (end[0].tolist() for end in self.interval(level))
         return dict(zip(self.names, zip(low, high, strict=True), strict=True))

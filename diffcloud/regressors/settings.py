@@ -41,8 +41,8 @@ class TrainingSettings:
     """Per frame."""
     augment: bool = True
     viewpoints: tuple[tuple[float, float, float], ...] = ()
-    """Of the cameras that will record, in the scene [m]: clouds show what they see, in place of the paper's random faces,
-    of a cloth that lies about a centimetre beside its place."""
+    """Of the cameras that will record, in the scene: clouds show faces whose middle one of them sees, not the paper's random
+    ones, of a cloth that lies about a centimetre beside its place."""
     patience: int | None = None
     """Stop after so many epochs without a better validation; None: never."""
     subtract_background: bool = False
@@ -66,6 +66,8 @@ class TrainingSettings:
                 raise ConfigError(f"{name} must be at least 1, got {value}.")
         if self.batch_size < 2:
             raise ConfigError("batch_size must be at least 2: batch normalisation needs more than one sample.")
+        if self.viewpoints and not self.augment:
+            raise ConfigError("Clouds that cameras see are augmented: leave out either the viewpoints or augment: false.")
         if not 0 < self.density <= 1:
             raise ConfigError(f"density must be above 0 and at most 1, got {self.density}.")
         if self.dropout is not None and not 0 <= self.dropout < 1:

@@ -15,6 +15,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.io.simulated import SimulatedSet
 from diffcloud.mesh import grid_cloth
 from diffcloud.mesh.topology import SurfaceMesh
+from diffcloud.regressors.dataset import CloudDataset
 from tests.conftest import flat_set
 
 POLE = SurfaceMesh(np.array([[5.0, 0, 0], [6, 0, 0], [5, 0, 1]]), np.array([[0, 1, 2]]))
@@ -135,11 +136,19 @@ class TestViewpoints:
     def test_what_a_layer_hides_is_not_sampled(self, viewpoints, layers, unit):
         nodes = np.array(SQUARES) / unit
         simulated = replace(flat_set(nodes_of=nodes.tolist(), faces=SQUARE_FACES), length_unit_m=unit)
-        maker = CloudMaker.build(simulated, replace(Augmentation.none(), viewpoints=viewpoints), points=500)
-        motion = torch.as_tensor(simulated.nodes)
-        cloud = unit * maker.clouds(motion, run_keys(7, 0, torch.arange(len(motion))), maker.seen(motion))
+        places = tuple((x / unit, y / unit, z / unit) for x, y, z in viewpoints)
+        seen = replace(Augmentation.none(), viewpoints=places, loss_faces_only=False)
+        cloud = unit * clouds_of(simulated, seen, points=500)
         height = torch.where(cloud[..., 0] > 2, 3.0, cloud[..., 2])
         assert {round(one, 4) for one in height.flatten().tolist()} == layers
+
+    def test_a_data_set_shows_it_too(self):
+        simulated = flat_set(nodes_of=SQUARES, faces=SQUARE_FACES)
+        data = CloudDataset(simulated, Augmentation.recorded([[0.5, 0.5, 9.0]]), frames="all", points=300)
+        clouds, _ = data.batch([2, 0])
+        assert float(clouds[clouds[..., 0] < 2][:, 2].min()) > 0.05  # noise of 4 mm, and a layer at 0.1 m
+        everything, _ = CloudDataset(simulated, Augmentation(), frames="all", points=300).batch([2, 0])
+        assert float(everything[everything[..., 0] < 2][:, 2].min()) < 0.05
 
     def test_where_nothing_is_seen_anything_may_be(self):
         simulated = flat_set(nodes_of=SQUARES[:8], faces=SQUARE_FACES[:4])
@@ -200,6 +209,7 @@ class TestSeeds:
         ({"keep": (0.9, 0.7)}, "in order"),
         ({"keep": (0.0, 1.0)}, "0 < low"),
         ({"jitter_m": -1.0}, "zero or more"),
+        ({"viewpoints": ((0.0, 0.0, 1.0),)}, "need loss_faces_only=False"),
         ({"shift_m": -1.0}, "shift_m must be a length"),
     ],
 )

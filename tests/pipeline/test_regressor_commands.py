@@ -16,6 +16,7 @@ import yaml
 from click.testing import Result
 from typer.testing import CliRunner
 
+from diffcloud.clouds import CloudMaker
 from diffcloud.errors import DiffCloudError, TrainingError
 from diffcloud.io.episodes import read_episode, write_episode
 from diffcloud.io.simulated import write_simulated
@@ -97,14 +98,22 @@ def test_train_then_predict(work):
         assert values["outside"] == [name for name in ("stretch", "mass") if not 0.1 <= values[name] <= 10]
 
 
-def test_clouds_show_what_the_cameras_of_a_recording_see(work):
+def test_clouds_show_what_the_cameras_of_a_recording_see(work, monkeypatch):
     plain = read_episode(work / "data/episodes/small/e1.npz")
     assert "does not say where its cameras stood" in str(
         run(*TRAIN, "--like", "data/episodes/small/e1.npz", code=1).exception
     )
-    seen = replace(plain, meta={**plain.meta, "viewpoints": {"side": [0.5, -1.0, 0.7], "top": [0.0, 0.0, 2.0]}})
-    write_episode(work / "seen.npz", seen)
+    viewpoints = {"side": [0.5, -1.0, 0.7], "top": [0.0, 0.0, 2.0]}
+    write_episode(work / "other.npz", replace(plain, meta={"scenario": "lift", "viewpoints": viewpoints}))
+    assert "a recording of lift, not of small; add --scenario lift" in str(
+        run(*TRAIN, "--like", "other.npz", code=1).exception
+    )
+    write_episode(work / "seen.npz", replace(plain, meta={"scenario": "small", "viewpoints": viewpoints}))
+    assert "leave out either" in str(run(*TRAIN, "--like", "seen.npz", "--no-augment", code=1).exception)
+    shown = []
+    monkeypatch.setattr(CloudMaker, "seen", lambda maker, nodes: shown.append(maker.augmentation.viewpoints))
     run(*TRAIN, "--like", "seen.npz")
+    assert set(shown) == {tuple(map(tuple, viewpoints.values()))}
     told = Regressor.read(work / CHECKPOINT).description.training["settings"]
     assert told["viewpoints"] == [[0.5, -1.0, 0.7], [0.0, 0.0, 2.0]]
 

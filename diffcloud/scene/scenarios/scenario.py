@@ -17,6 +17,7 @@ from diffcloud.sim.properties import PARAMETERS, Properties, check_values, scale
 from diffcloud.sim.system import System
 
 _NO_MATERIAL = 1e-9
+"""What is no more counts as nothing."""
 Recorder = Literal["depth_cameras", "whole_surface"]
 """How synthetic episodes are made: seen by depth cameras with their noise, or points all over the cloth and the first
 obstacle, without noise."""
@@ -108,7 +109,7 @@ class Scenario:
         )
 
     def value(self, name: str) -> float:
-        """Of a parameter in this scenario; zero where the scene has nothing that it acts on."""
+        """Of a parameter in this scenario, 1 where it is a factor; zero where the scene has nothing that it acts on."""
         basis = PARAMETERS[name].basis
         if basis is not None:
             return 1.0 if self.scene.basis(basis) > _NO_MATERIAL else 0.0
