@@ -41,7 +41,7 @@ class TrainingSettings:
     """Per frame."""
     augment: bool = True
     viewpoints: tuple[tuple[float, float, float], ...] = ()
-    """Of the cameras that will record, in the scene: clouds show faces whose middle one of them sees, instead of random ones
+    """Of cameras that will record, in the scene: clouds show faces whose middle one of them sees, instead of random ones
     as in the paper, of a cloth that lies about a centimetre beside its place."""
     patience: int | None = None
     """Stop after so many epochs without a better validation; None: never."""
