@@ -72,10 +72,10 @@ def train(
     json: JsonFlag = False,
 ) -> None:
     """Train networks. After Ctrl-C or a kill the same command keeps finished ones and goes on from the last saved epoch."""
-    told = load_config(params).train
-    scenarios = told.scenarios if scenario is None else [scenario]
+    section = load_config(params).train
+    scenarios = section.scenarios if scenario is None else [scenario]
     config = updated(
-        told,
+        section,
         models=None if not model else list(dict.fromkeys(model)),
         profile=profile,
         epochs=epochs,
