@@ -55,11 +55,12 @@ def own_clouds(folder: Path) -> None:
 
 
 def lift_episode(folder: Path) -> None:
-    """my_episode.npz of a lift that takes a moment."""
+    """my_episode.npz of a lift that takes a moment, before a camera."""
     quick(folder)
     invoke("rollout", "--scenario", "quick", "--out", "run.npz")
+    meta = {"viewpoints": {"side": [0.8, 0.2, 0.5]}}
     with np.load("run.npz") as run:
-        write_episode(folder / "my_episode.npz", Episode.from_frames(list(run["nodes"]), run["times"]))
+        write_episode(folder / "my_episode.npz", Episode.from_frames(list(run["nodes"]), run["times"], meta=meta))
 
 
 def motions(folder: Path) -> None:
