@@ -295,8 +295,8 @@ class TrainConfig(Section):
     loss: Loss | None = None
     target: Target | None = None
     augment: bool | None = None
-    viewpoints: dict[Name, tuple[Component, Component, Component]] | None = None
-    """Camera -> its place in the scene, in its length unit: clouds show what cameras there see."""
+    viewpoints: tuple[tuple[Component, Component, Component], ...] | None = None
+    """Places in the scene, in its length unit: clouds show what cameras there see."""
     subtract_background: bool | None = None
     heteroscedastic: bool | None = None
     patience: Count | None = None
@@ -309,9 +309,9 @@ class TrainConfig(Section):
 
     def changes(self) -> dict[str, object]:
         """What differs from the profile."""
-        apart = {"scenarios", "models", "profile", "device", "loaders", "workers"}
-        told = self.model_dump(exclude=apart, exclude_none=True)
-        return told if self.viewpoints is None else {**told, "viewpoints": tuple(self.viewpoints.values())}
+        return self.model_dump(
+            exclude={"scenarios", "models", "profile", "device", "loaders", "workers"}, exclude_none=True
+        )
 
 
 class EvaluateConfig(Section):

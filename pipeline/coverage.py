@@ -167,7 +167,7 @@ class CoverageJob:
         drawn = hidden_parameters(self.scenario, self.config.episodes.model_copy(update={"per_scenario": 1}), rng)
         found = {name: float(value[0]) for name, value in drawn.items()}
         for name, factor in self.config.fit.known_within([self.scenario]).items():
-            off, value = math.exp(rng.standard_normal() * math.log(factor)), self.scenario.value(name)
+            off, value = rng.lognormal(0.0, math.log(factor)), self.scenario.value(name)
             if name not in found and value:
                 found[name] = value * off
         return found

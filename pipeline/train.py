@@ -140,7 +140,7 @@ def train(
         raise DiffCloudError("\n".join(failures))
 
 
-def _viewpoints(path: Path, scenarios: Sequence[str]) -> dict[str, list[float]]:
+def _viewpoints(path: Path, scenarios: Sequence[str]) -> list[list[float]]:
     """Of an episode's cameras.
 
     Raises:
@@ -153,7 +153,7 @@ def _viewpoints(path: Path, scenarios: Sequence[str]) -> dict[str, list[float]]:
         raise ConfigError(f"--like {path} is a recording of {own}, not of {', '.join(scenarios)}; add --scenario {own}.")
     if not episode.viewpoints:
         raise EpisodeError(f"{path} does not say where its cameras stood; take one that `diffcloud preprocess` wrote.")
-    return {name: place.tolist() for name, place in episode.viewpoints.items()}
+    return [place.tolist() for place in episode.viewpoints.values()]
 
 
 @dataclass(frozen=True)

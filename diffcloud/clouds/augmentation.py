@@ -8,7 +8,6 @@ functions of a run's key (`keyed_random`): a cloud does not depend on the batch 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,10 +71,9 @@ class Augmentation:
         return Augmentation(keep=(1.0, 1.0), jitter_m=0.0)
 
     @staticmethod
-    def recorded(viewpoints: Sequence[Sequence[float]]) -> Augmentation:
+    def recorded(viewpoints: tuple[tuple[float, float, float], ...]) -> Augmentation:
         """What depth cameras see together of a cloth that was laid by hand."""
-        places = tuple((float(x), float(y), float(z)) for x, y, z in viewpoints)
-        return Augmentation((1.0, 1.0), jitter_m=_CAMERAS_M, loss_faces_only=False, viewpoints=places, shift_m=_LAID_M)
+        return Augmentation((1.0, 1.0), jitter_m=_CAMERAS_M, loss_faces_only=False, viewpoints=viewpoints, shift_m=_LAID_M)
 
 
 @dataclass(frozen=True)
@@ -152,7 +150,7 @@ class CloudMaker:
             [B, T, points, 3], the points in random order.
         """
         batch, frames, count, _ = nodes.shape
-        still = nodes
+        seen = self.seen(nodes) if seen is None else seen
         deviation, fraction, _ = uniform(stream_keys(_SETTINGS, keys), 1).unbind(-1)  # [B, 1]
         if jitter := self.augmentation.jitter_m / self.length_unit_m:
             noise = normal(stream_keys(_NODES, keys), frames * count).view_as(nodes)
@@ -168,7 +166,6 @@ class CloudMaker:
         place = uniform_barycentric(first, second).view(batch * frames, drawn, 3)
         choice = face_number.view(batch * frames, drawn)
         weights = self._sampled_faces(fraction, keys, frames)
-        seen = self.seen(still) if seen is None else seen
         if seen is not None:
             kept = weights[..., : self.cloth_faces] * seen
             weights[..., : self.cloth_faces] = torch.where(kept.any(-1, keepdim=True), kept, 1.0)  # something must be

@@ -167,7 +167,7 @@ class ParameterDraws:
     def doubtful(self, split: Split, run: int, attempt: int) -> dict[str, float]:
         """Factors of a run's other material, log-normal about one."""
         rng = np.random.default_rng([self.seed, SPLITS.index(split), run, attempt, 1])
-        return {name: math.exp(rng.standard_normal() * math.log(factor)) for name, factor in self.doubts.items()}
+        return {name: rng.lognormal(0.0, math.log(factor)) for name, factor in self.doubts.items()}
 
     def _draw(self, rng: np.random.Generator, count: int, kind: Draws) -> NDArray[np.float64]:
         match kind:

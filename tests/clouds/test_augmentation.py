@@ -144,7 +144,7 @@ class TestViewpoints:
 
     def test_a_data_set_shows_it_too(self):
         simulated = flat_set(nodes_of=SQUARES, faces=SQUARE_FACES)
-        data = CloudDataset(simulated, Augmentation.recorded([[0.5, 0.5, 9.0]]), frames="all", points=300)
+        data = CloudDataset(simulated, Augmentation.recorded(((0.5, 0.5, 9.0),)), frames="all", points=300)
         clouds, _ = data.batch([2, 0])
         assert float(clouds[clouds[..., 0] < 2][:, 2].min()) > 0.05  # noise of 4 mm, and a layer at 0.1 m
         everything, _ = CloudDataset(simulated, Augmentation(), frames="all", points=300).batch([2, 0])
