@@ -215,7 +215,7 @@ class FitConfig(Section):
     """The published measure: one-sided, squared, at the scenario's loss frames, without a pose, down to its threshold."""
     nuisance: Name | None = None
     """Which parts of the pose are fitted too, and how far off each may well be: "x=0.1m,y=0.1m,yaw=30deg", or "none". If
-    not given, all of them, as `fit.pose.DEFAULT_PRIORS` says."""
+    not given, all of them, as `fit.pose.default_priors` says."""
     prior: Name | None = None
     """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""
     doubts: Name | None = None

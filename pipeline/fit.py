@@ -105,7 +105,7 @@ def fit(
         typer.Option(
             help="What of the recording's pose is found too, each with how far it may be off (a weak prior, no bound), "
             "such as x=2cm,yaw=5deg,lag=50ms. Of x, y, z, tilt_x, tilt_y, yaw, lag; none keeps the scene's pose. "
-            "Default: x and y 0.1m, yaw 30deg, z 2mm, tilt_x and tilt_y 0.29deg, lag 2ms."
+            "Default: x and y 0.1m, yaw 30deg, z 2mm, tilt_x and tilt_y 0.29deg, lag 2ms or as preprocess measured it."
         ),
     ] = None,
     doubts: Annotated[

@@ -23,7 +23,7 @@ from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.alignment import aligned
 from diffcloud.fit.matching import Matcher, Motion, Pairs
-from diffcloud.fit.pose import DEFAULT_PRIORS, PoseSpace
+from diffcloud.fit.pose import PoseSpace, default_priors
 from diffcloud.fit.targets import read_target
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
@@ -66,19 +66,22 @@ class Objective:
         Args:
             paper: the published measure.
             nuisance: free variables of the pose, with the standard deviations of their priors [m, rad, s]; by default
-                `DEFAULT_PRIORS`, in the paper's measure none.
+                the episode's `default_priors`, in the paper's measure none.
             frames: to compare; negative ones count from the end. By default every usable one, unless the scenario names
                 some.
             points: sampled per frame; by default the scenario's, which all frames share in the default measure.
             seed: of the common random numbers.
 
         Raises:
-            EpisodeError: a loss frame that an episode lacks, one after the end of the simulation, or none that is usable.
+            EpisodeError: a loss frame that an episode lacks, one after the end of the simulation, none that is usable, or
+                a damaged meta.
             ConfigError: an unknown variable of the pose, or any in the paper's measure.
         """
         self.scenario, self.episode, self.paper = scenario, episode, paper
         self.system, _ = scenario.scene.build()
-        self.nuisance = dict(({} if paper else DEFAULT_PRIORS) if nuisance is None else nuisance)
+        if nuisance is None:
+            nuisance = {} if paper else default_priors(episode)
+        self.nuisance = dict(nuisance)
         if paper and self.nuisance:
             raise ConfigError(f"The paper's measure knows no pose; leave out the nuisance {', '.join(self.nuisance)}.")
         self._unit = scenario.length_unit_m

@@ -25,6 +25,7 @@ from torch import Tensor
 from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.fit.priors import INDEPENDENT
 from diffcloud.fit.record import NuisanceValue
+from diffcloud.io.episodes import Episode
 
 NUISANCE: dict[str, Literal["m", "rad", "s"]] = {
     "x": "m",
@@ -38,8 +39,8 @@ NUISANCE: dict[str, Literal["m", "rad", "s"]] = {
 """Name -> unit."""
 SET_UP = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.005, "yaw": 0.005, "lag": 0.002}
 """Standard deviations of a calibrated set-up [m, rad, s]: of its cameras against the robot, and of its clock."""
-DEFAULT_PRIORS = {**SET_UP, "x": 0.1, "y": 0.1, "yaw": math.radians(30)}
-"""Of a cloth laid by hand where the scene places it, in front of such a set-up [m, rad, s]."""
+LAID = {"x": 0.1, "y": 0.1, "yaw": math.radians(30)}
+"""Of where a hand lays a cloth that the scene places [m, rad]."""
 _RESOLVED = {"m": 3e-4, "rad": 1.5e-3, "s": 3e-4}
 """A step as small as this is the last one to a pose; what is left changes little."""
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180, "s": 1.0, "ms": 1e-3}
@@ -52,6 +53,25 @@ _SHIFTS = ("x", "y", "z")
 def unit_of(name: str, length_unit_m: float) -> float:
     """What one unit of a variable in a scene is in SI."""
     return length_unit_m if NUISANCE[name] == "m" else 1.0
+
+
+def set_up_of(episode: Episode) -> dict[str, float]:
+    """`SET_UP` with the clock of an episode: as far as preprocessing has measured it.
+
+    Raises:
+        EpisodeError: the episode's meta is damaged.
+    """
+    measured = episode.lag_sigma_s
+    return SET_UP if measured is None else {**SET_UP, "lag": measured}
+
+
+def default_priors(episode: Episode) -> dict[str, float]:
+    """Name -> standard deviation [m, rad, s], of a cloth laid by hand in front of the episode's set-up.
+
+    Raises:
+        EpisodeError: the episode's meta is damaged.
+    """
+    return {**set_up_of(episode), **LAID}
 
 
 def parse_priors(text: str) -> dict[str, float]:

@@ -35,7 +35,7 @@ from diffcloud.fit.joint import AnyObjective, loss_weights, mean_loss
 from diffcloud.fit.matching import Motion
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
-from diffcloud.fit.pose import NUISANCE, SET_UP, unit_of
+from diffcloud.fit.pose import NUISANCE, SET_UP, set_up_of, unit_of
 from diffcloud.fit.residuals import Axis, moved_by
 from diffcloud.fit.targets import track_displacement
 from diffcloud.sim.simulate import Rollout, rollout
@@ -198,7 +198,8 @@ class _Part:
         run, rates = moved_by(objective, space, places)
         refined = _refined(objective, space.parameters(Axis.of(space).values(places)), run)
         fitted_pose = objective.match(run).pose[0]
-        free = objective.freed({**SET_UP, **objective.nuisance})
+        set_up = set_up_of(objective.episode)
+        free = objective.freed({**set_up, **objective.nuisance})
         pose_names = free.pose_space.names
         values = free.pose_space.of(objective.pose_space.described(fitted_pose, length_unit_m=1.0), length_unit_m=1.0)
         motion = free.match(run, pose=values[None])
@@ -224,7 +225,7 @@ class _Part:
         if len(felt) > k:
             onto[:, k:] = -np.linalg.solve(curved[k:, k:], curved[k:, :k]).T
         found = {
-            name: onto @ change[index, felt]
+            name: onto @ change[index, felt] * (set_up[name] / SET_UP[name] if name in NUISANCE else 1.0)
             for index, name in enumerate(names)
             if index not in own and not (name in NUISANCE and objective.paper)
         }

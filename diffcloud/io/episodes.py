@@ -163,6 +163,22 @@ class Episode:
             raise EpisodeError(f"viewpoints of an episode's meta are camera -> [x, y, z], finite, got {told!r}.")
         return found
 
+    @property
+    def lag_sigma_s(self) -> float | None:
+        """Standard deviation with which preprocessing has measured how late the joint log is; None where it has not.
+
+        Raises:
+            EpisodeError: the meta's is no positive number.
+        """
+        quality = self.meta.get("quality") or {}
+        refinement = quality.get("refinement") or {} if isinstance(quality, Mapping) else {}
+        told = refinement.get("lag_sigma_s") if isinstance(refinement, Mapping) else None
+        if told in (None, 0):  # no arm showed it
+            return None
+        if isinstance(told, bool) or not isinstance(told, int | float) or not 0 < told < _FARTHEST:
+            raise EpisodeError(f"lag_sigma_s of an episode's refinement is a positive number of seconds, got {told!r}.")
+        return float(told)
+
     @cached_property
     def pinholes(self) -> tuple[Pinhole, ...]:
         """[C] the cameras whose lost pixels are known; empty where none is.

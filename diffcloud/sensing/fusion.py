@@ -172,6 +172,7 @@ def fuse(
             "T_world_camera": {name: pose.tolist() for name, pose in found.T_world_camera.items()},
             "skin_m": round(found.skin_m, 6),
             "lag_s": round(found.lag_s, 6),
+            "lag_sigma_s": round(found.lag_sigma_s, 6),
         }
         settings = replace(settings, lag_s=found.lag_s)
         views = {name: replace(view, T_world_camera=found.T_world_camera[name]) for name, view in views.items()}

@@ -104,6 +104,8 @@ class Refinement:
     """By which the arm is thicker than described, as the median over the links that were seen; 0 without an arm."""
     lag_s: float
     """By which the joint log's times are late."""
+    lag_sigma_s: float
+    """Standard deviation that it is known with; 0 without an arm."""
     shift_m: Mapping[str, float]
     """How far each camera's picture of the middle of what was seen has moved."""
 
@@ -150,7 +152,7 @@ def refine_extrinsics(
         if len(points)
     ]
     if not seen:
-        return Refinement(poses, 0.0, lag_s, dict.fromkeys(names, 0.0))
+        return Refinement(poses, 0.0, lag_s, 0.0, dict.fromkeys(names, 0.0))
     centre = np.concatenate(seen).mean(axis=0)
     plane, surfaces = _plane(sight.table[first]), [_with_normals(points) for points in sight.cloth[first]]
     images = {} if arm is None else {name: _thinned(raw, name, views[name], sight.frames[name]) for name in names}
@@ -164,7 +166,7 @@ def refine_extrinsics(
     )
     found = np.zeros(len(prior))
     """Corrections of the poses (the first camera's also moves all others) and of the lag, then the skins."""
-    free, together = np.arange(len(prior)), np.eye(4)
+    free, together, lag_variance = np.arange(len(prior)), np.eye(4), 0.0
     surface, thickened = arm, np.zeros(links)
     for iteration in range(_ITERATIONS):
         if arm is not None and iteration == _THICKENED_AT:
@@ -194,6 +196,8 @@ def refine_extrinsics(
             added, pulled = _normal_equations(rows)
             information += added
             right += pulled
+        if len(free) == len(prior):
+            lag_variance = float(np.linalg.inv(information)[poses_end, poses_end])
         step = np.zeros(len(prior))
         step[free] = np.linalg.solve(information[np.ix_(free, free)], right[free])
         found += step
@@ -217,7 +221,8 @@ def refine_extrinsics(
         name: float(np.linalg.norm(transform(poses[name] @ inverse(views[name].T_world_camera), centre[None])[0] - centre))
         for name in names
     }
-    return Refinement(poses, skin_m, lag_s + float(found[poses_end]), shift)
+    sigma = 0.0 if arm is None or log is None else float(np.sqrt(lag_variance))
+    return Refinement(poses, skin_m, lag_s + float(found[poses_end]), sigma, shift)
 
 
 def _within(found: Floats, metres: float, radians: float) -> bool:

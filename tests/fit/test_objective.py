@@ -15,6 +15,7 @@ from diffcloud.clouds.visibility import seen_places
 from diffcloud.errors import ConfigError, DivergedError, EpisodeError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton
 from diffcloud.fit.matching import pairs_forth
+from diffcloud.fit.pose import SET_UP
 from diffcloud.fit.residuals import Axis, linearise
 from diffcloud.fit.result import describe_recording
 from diffcloud.io.episodes import Episode
@@ -209,6 +210,18 @@ class TestWhatCounts:
     def test_viewpoints_that_are_none(self, scenario, episode, told):
         with pytest.raises(EpisodeError, match="viewpoints of an episode's meta"):
             Objective(scenario, replace(episode, meta={"viewpoints": told}))
+
+    def test_the_prior_of_the_lag_is_what_preprocessing_measured(self, scenario, episode):
+        def prior(told: object) -> float:
+            return Objective(scenario, replace(episode, meta={"quality": {"refinement": told}})).nuisance["lag"]
+
+        assert prior({"lag_sigma_s": 0.0007}) == 0.0007
+        assert prior({"lag_sigma_s": 0.0}) == prior({}) == prior(None) == prior([]) == SET_UP["lag"]
+
+    @pytest.mark.parametrize("told", [-0.001, math.nan, math.inf, True, "0.001", [0.001]])
+    def test_measures_of_the_lag_that_are_none(self, scenario, episode, told):
+        with pytest.raises(EpisodeError, match="lag_sigma_s of an episode's refinement"):
+            Objective(scenario, replace(episode, meta={"quality": {"refinement": {"lag_sigma_s": told}}}))
 
     def test_points_that_are_sure_count_more(self, scenario, episode):
         """Half of the recorded points are 2 cm too high; said to be uncertain, they move the loss less."""

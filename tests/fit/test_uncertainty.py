@@ -63,6 +63,13 @@ class TestDoubts:
         found = uncertainty(one, SPACE, TRUTH)
         assert 5 * deviation(found, "lag") == pytest.approx(abs(moved), rel=0.4)
 
+    def test_a_clock_that_was_measured_is_doubted_as_little_as_that(self, scenario):
+        episode = recorded(scenario, gripper=False)
+        measured = replace(episode, meta={"quality": {"refinement": {"lag_sigma_s": SET_UP["lag"] / 4}}})
+        one, other = (uncertainty(Objective(scenario, each, nuisance={}), SPACE, TRUTH) for each in (episode, measured))
+        assert deviation(other, "lag") == pytest.approx(deviation(one, "lag") / 4, rel=0.1)
+        assert deviation(other, "noise") == pytest.approx(deviation(one, "noise"), rel=1e-6)
+
     def test_finer_steps_move_the_fit_as_far_as_it_says(self, scenario):
         episode = recorded(scenario)
         fine = replace(scenario, scene=replace(scenario.scene, frame_steps=4 * scenario.scene.frame_steps))

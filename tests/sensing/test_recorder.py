@@ -185,6 +185,7 @@ class TestFoundBack:
         found = fuse(raw, mask, SETTINGS).meta["quality"]["refinement"]
         assert max(off_by(truth, np.array(pose), name) for name, pose in found["T_world_camera"].items()) < 0.005
         assert found["lag_s"] == pytest.approx(0.02, abs=0.004)
+        assert abs(found["lag_s"] - 0.02) < 3 * found["lag_sigma_s"] < 0.01
 
     def test_right_extrinsics_are_not_made_worse(self, folder, mask):
         raw, truth = read_raw_episode(folder), read_truth(folder)
