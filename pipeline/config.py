@@ -14,6 +14,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
 from diffcloud.evaluation.intervals import LEVEL, WITHIN
 from diffcloud.fit.doubts import MATERIAL_DOUBTS, parse_doubts
+from diffcloud.fit.laid import parse_laid
 from diffcloud.fit.pose import parse_priors
 from diffcloud.fit.solvers import SOLVERS, Settings
 from diffcloud.fit.solvers.gauss_newton import ROUGH_SCREEN, ROUGH_STARTS
@@ -216,6 +217,9 @@ class FitConfig(Section):
     nuisance: Name | None = None
     """Which parts of the pose are fitted too, and how far off each may well be: "x=0.1m,y=0.1m,yaw=30deg", or "none". If
     not given, all of them, as `fit.pose.default_priors` says."""
+    laid: Name = "none"
+    """How a cloth may lie at the start, other than its scenario has it, and how far off: "turn=5deg,shape=5mm", or "none"
+    (`fit.laid`)."""
     prior: Name | None = None
     """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""
     doubts: Name | None = None
@@ -240,6 +244,8 @@ class FitConfig(Section):
         for name, pair in self.bounds.items():
             _check_bounds(f"bounds.{name}", pair)
         parse_priors(self.nuisance or "none")
+        if parse_laid(self.laid) and self.paper:
+            raise ValueError("laid: the published measure takes the cloth to lie as the scene has it; leave it out")
         if self.paper and parse_doubts(self.doubts or "none"):
             raise ValueError("doubts: the published measure takes the rest of the material for known; leave them out")
         if foreign := [name for name in self._solver_options() if self.solver not in _solvers_with(name)]:

@@ -61,11 +61,14 @@ def loss(
     use_threads(threads)
     measure: dict[str, Any] = {}
     values: dict[str, float] = {}
+    laid: dict[str, float] = {}
     if fit is not None:
         record = read_fit(fit)
         if scenario is None and scene is None:
             scenario = fitted_scenario(fit, _scenario_of(record, episode.stem))
         measure, values = record.measure.model_dump(), dict(record.values)
+        if episode.stem in {one.name for one in record.episodes}:
+            laid = record.laid
     chosen = choose_scenario(scenario, scene)
     given = {"points": points, "frames": frame, "seed": seed, "paper": paper or None}
     measure |= {name: value for name, value in given.items() if value is not None}
@@ -76,7 +79,7 @@ def loss(
     values |= assignments(set_, "--set")
     check_values(values, "--set")
     chosen.check_parameters(values)
-    tensors = {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
+    tensors = {name: torch.tensor([value], dtype=torch.float64) for name, value in {**values, **laid}.items()}
     with torch.no_grad():
         found = describe_recording(objective, objective.simulate_to_loss(tensors), episode.stem)
     if not json:

@@ -108,6 +108,14 @@ def fit(
             "Default: x and y 0.1m, yaw 30deg, z 2mm, tilt_x and tilt_y 0.29deg, lag 2ms or as preprocess measured it."
         ),
     ] = None,
+    laid: Annotated[
+        str | None,
+        typer.Option(
+            help="Also find how the cloth lay before the motion, and how far off that may be: turn=5deg (askew under the "
+            "gripper), shape=5mm (not flat; of each of nine waves). Of a cloth that lies level; not in joint fits. "
+            "Default: none, as the scenario has it."
+        ),
+    ] = None,
     doubts: Annotated[
         str | None,
         typer.Option(
@@ -152,6 +160,7 @@ def fit(
         resample=resample,
         paper=paper,
         nuisance=nuisance,
+        laid=laid,
         prior=prior,
         doubts=doubts,
         joint=joint,

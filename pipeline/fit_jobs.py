@@ -11,6 +11,7 @@ from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit import FitSpace, JointObjective, Objective, Progress, read_fit, solve, write_fit
 from diffcloud.fit.doubts import with_doubts
 from diffcloud.fit.joint import AnyObjective
+from diffcloud.fit.laid import parse_laid, with_laid
 from diffcloud.fit.left_out import leave_each_out
 from diffcloud.fit.priors import parameter_priors
 from diffcloud.fit.record import FitRecord
@@ -128,7 +129,8 @@ class FitJob:
     def space(self) -> FitSpace:
         """
         Raises:
-            ConfigError: bounds, priors, doubts or fixed values that do not fit the parameters.
+            ConfigError: bounds, priors, doubts or fixed values that do not fit the parameters, or a start that the
+                recordings have none of.
         """
         settings = self.settings
         for recording in self.recordings:
@@ -139,7 +141,8 @@ class FitJob:
         priors = parameter_priors("none" if settings.paper else settings.prior, space.names, ranges)
         space = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed, priors=priors)
         scenarios = [recording.scenario for recording in self.recordings]
-        return with_doubts(space, settings.known_within(scenarios), scenarios)
+        space = with_doubts(space, settings.known_within(scenarios), scenarios)
+        return with_laid(space, parse_laid(settings.laid), scenarios)
 
     def objective(self) -> AnyObjective:
         """

@@ -339,7 +339,7 @@ def _fitted(
         with progress_bar("identify", 1) as update:
             record = job.run(partial(_tell, update, steps))
         objective = job.objective()
-        apart, noise = refined_distance_mm(objective, record.values)
+        apart, noise = refined_distance_mm(objective, record.simulated)
         errors.print(
             f"{steps} steps a frame: {record.rms_mm:.1f} mm RMS; four times the steps move the cloth by {apart:.1f} mm, "
             f"the points' noise is {noise:.1f} mm.",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +11,7 @@ import torch
 import typer
 
 from diffcloud.errors import ConfigError, DivergedError
+from diffcloud.fit.laid import laid_nodes
 from diffcloud.fit.record import RecordingFit, read_fit
 from diffcloud.fit.result import recorded_pose
 from diffcloud.fit.targets import track_displacement
@@ -21,6 +22,7 @@ from diffcloud.io.obj import write_cloth, write_surface
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.sim.moved import moved_surfaces
 from diffcloud.sim.properties import check_values
+from diffcloud.sim.simulate import init
 from diffcloud.sim.simulate import rollout as simulate
 from pipeline.console import JsonFlag, assignments, errors, finish, progress_bar, warn, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario, limits
@@ -61,9 +63,10 @@ def rollout(
     frames = frames or chosen.frames
     steps = frames * chosen.scene.frame_steps
     system, _ = chosen.scene.build()
-    properties = chosen.properties(
-        system, {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
-    )
+    properties = chosen.properties(system, _tensors(values))
+    recording = None if fitted is None else _recording(fitted.episodes, chosen.name, episode)
+    laid = None if fitted is None or recording is None else laid_nodes(system.mesh, _tensors(fitted.laid))
+    start = None if laid is None else init(system, positions=laid)
     track, warnings = None, limits(chosen)
     if episode is not None:
         recorded = read_episode(episode)
@@ -73,7 +76,9 @@ def rollout(
         track = torch.as_tensor(track_displacement(recorded, system.handles.grippers, steps, system.time_step))[None]
     with progress_bar("simulating", steps) as update, torch.no_grad():
         try:
-            run = simulate(system, steps, properties=properties, track=track, progress=lambda done: update(done, ""))
+            run = simulate(
+                system, steps, properties=properties, state=start, track=track, progress=lambda done: update(done, "")
+            )
         except DivergedError as error:
             shown = ", ".join(f"{name}={value:g}" for name, value in values.items()) or "the basis material"
             raise DivergedError(error.step, error.entries, error.reason, shown) from error
@@ -82,7 +87,6 @@ def rollout(
     moved, moved_faces = moved_surfaces(system, run)
     moved = moved[0, per_frame]
     bodies = chosen.scene.bodies
-    recording = None if fitted is None else _recording(fitted.episodes, chosen.name, episode)
     if recording is not None:
         space, pose = recorded_pose(recording, length_unit_m=chosen.length_unit_m)
         nodes = space.moved_motion(run.at, run.times[per_frame], pose).numpy()
@@ -133,6 +137,11 @@ def _not_simulated(recorded: Episode, end_s: float, frame_s: float) -> list[str]
     )
     warn(message)
     return [message]
+
+
+def _tensors(values: Mapping[str, float]) -> dict[str, torch.Tensor]:
+    """Of one parameter set."""
+    return {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
 
 
 def _recording(known: Sequence[RecordingFit], scenario: str, episode: Path | None) -> RecordingFit | None:

@@ -72,13 +72,15 @@ def compare_episode(
     space = methods.space_of(fit)
     objective = Objective(scenario, episode, **measure, seed=fit.measure.seed)
     told: list[Estimate | Gap] = [methods.fitted(fit)]
-    told += [_run(rival, objective, space.asked, fit, settings.seed) for rival in settings.rivals]
+    laid = FitSpace(space.asked.variables, {**space.asked.fixed, **fit.laid})  # as the pose, for all methods
+    told += [_run(rival, objective, laid, fit, settings.seed) for rival in settings.rivals]
     told += [*predictions, *methods.published(episode.meta)]
     estimates = [entry for entry in told if isinstance(entry, Estimate)]
     gaps = [entry for entry in told if isinstance(entry, Gap)]
     meter = EpisodeMeter(objective, draws=settings.draws, seed=settings.seed)
     sources = dict(transfers or {})
-    sets = [methods.clipped(values, space) for values in (*(e.values for e in estimates), *sources.values())]
+    every = (*(e.values for e in estimates), *sources.values())
+    sets = [methods.clipped({**fit.laid, **values}, space) for values in every]
     measured = meter.measure([*sets, fit.start])
     rows, transferred = [], []
     for index, estimate in enumerate(estimates):

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from diffcloud.fit import AdamSettings, CmaEsSettings, FitRecord, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
+from diffcloud.fit.laid import variables_of
 from diffcloud.fit.parameters import Variable
 from diffcloud.fit.scan import Scan
 from diffcloud.fit.solvers import SOLVER_NAMES, SOLVERS, FitOutcome, SearchSettings
@@ -58,7 +59,8 @@ def space_of(fit: FitRecord) -> FitSpace:
             fixed[name] = entry.value
         else:
             variables.append(Variable(name, *entry.bounds, entry.prior, entry.centre, entry.doubtful))
-    return FitSpace(tuple(variables), fixed)
+    laid = {name: entry for name, entry in fit.nuisance.items() if entry.of == "cloth"}
+    return FitSpace((*variables, *variables_of(laid, length_unit_m=fit.length_unit_m)), fixed)
 
 
 def scan_of(fit: FitRecord) -> Scan | None:
@@ -70,7 +72,7 @@ def fitted(fit: FitRecord) -> Estimate:
     """The fit itself."""
     return Estimate(
         "diffcloud",
-        fit.values,
+        fit.simulated,
         simulations=fit.simulations,
         gradients=not issubclass(SOLVERS[fit.solver], SearchSettings),
         seconds={"optimisation": fit.seconds},

@@ -22,12 +22,15 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.alignment import aligned
+from diffcloud.fit.laid import laid_nodes, material_of
 from diffcloud.fit.matching import Matcher, Motion, Pairs
 from diffcloud.fit.pose import PoseSpace, default_priors
 from diffcloud.fit.targets import read_target
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim.simulate import Rollout, rollout
+from diffcloud.sim.properties import Properties
+from diffcloud.sim.simulate import Rollout, init, rollout
+from diffcloud.sim.system import State
 
 CAP_M = 0.05
 """A larger distance counts as this one."""
@@ -94,7 +97,12 @@ class Objective:
         self._bodies = torch.as_tensor(scenario.scene.bodies.nodes, dtype=torch.float64)
         named = scenario.loss_frames if paper or not scenario.every_frame else None
         self._target = read_target(
-            scenario, self.system, episode, named if frames is None else frames, whole=paper, nuisance=self.nuisance
+            scenario,
+            self.system,
+            episode,
+            named if frames is None else frames,
+            whole=paper,
+            nuisance=self.nuisance,
         )
         self.reseed(seed)
         last = float(self._target.times.max())
@@ -206,10 +214,16 @@ class Objective:
     def simulate(self, parameters: Mapping[str, Tensor], *, steps: int | None = None) -> Rollout:
         """The rollout of parameter sets with an episode's gripper track, by default over the whole scenario."""
         steps = self.scenario.steps if steps is None else steps
-        properties = self.scenario.properties(self.system, parameters)
+        properties, start = self.inputs(parameters)
         track = self._target.track
         track = None if track is None else track[:, :steps]
-        return rollout(self.system, steps, properties=properties, track=track)
+        return rollout(self.system, steps, properties=properties, state=start, track=track)
+
+    def inputs(self, parameters: Mapping[str, Tensor]) -> tuple[Properties, State | None]:
+        """What parameter sets are to the simulator: properties, and a start (None: that of the scene)."""
+        nodes = laid_nodes(self.system.mesh, parameters)
+        start = None if nodes is None else init(self.system, len(nodes), positions=nodes)
+        return self.scenario.properties(self.system, material_of(parameters)), start
 
     def frame_losses(self, run: Rollout, *, pose: Tensor | None = None) -> Tensor:
         """[B, L] losses of a rollout at each compared frame, at its pose or at poses [B, d]."""

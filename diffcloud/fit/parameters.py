@@ -37,7 +37,9 @@ class Variable:
     centre: float = 1.0
     """Of the prior; by default the basis material."""
     doubtful: bool = False
-    """Nobody asked for it: it is fitted too because it is not known exactly (`fit.doubts`)."""
+    """Nobody asked for it: it is fitted too because it is not known exactly (`fit.doubts`, `fit.laid`)."""
+    deviation: float | None = None
+    """One standard deviation of a normal prior about zero, instead of the log-normal one, of what may be negative."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
@@ -182,18 +184,26 @@ class FitSpace:
             recordings: over which the loss is a mean; they say the more, the more there are.
         """
         count = INDEPENDENT * recordings
-        weights = [0.0 if v.prior is None else 1 / (count * math.log(v.prior) ** 2) for v in self.variables]
-        return torch.tensor(weights, dtype=torch.float64)
+        steps = self.prior_steps()
+        return torch.where(steps > 0, 1 / (count * steps.square()), 0.0)
+
+    def prior_steps(self) -> Tensor:
+        """[k] one standard deviation of each prior, as `off_centre` measures; zero where there is none."""
+        logs = [0.0 if v.prior is None else math.log(v.prior) for v in self.variables]
+        steps = [log if v.deviation is None else 1.0 for log, v in zip(logs, self.variables, strict=True)]
+        return torch.tensor(steps, dtype=torch.float64)
 
     def prior_factor(self, values: Tensor, recordings: int) -> Tensor:
         """[B] by which the priors multiply the loss of values [B, k]."""
         return (self.prior_weights(recordings) * self.off_centre(values).square()).sum(-1).exp()
 
     def off_centre(self, values: Tensor) -> Tensor:
-        """[..., k] logarithms of values over the centres of their priors; zero for those without one."""
-        centres = values.new_tensor([variable.centre for variable in self.variables])
+        """[..., k] logarithms of values over the centres of their priors, of normal ones the values in deviations; zero for
+        those without one."""
+        normal = torch.tensor([variable.deviation is not None for variable in self.variables])
+        scales = values.new_tensor([v.centre if v.deviation is None else v.deviation for v in self.variables])
         known = torch.tensor([variable.prior is not None for variable in self.variables])
-        return torch.where(known, values / centres, 1.0).log()
+        return torch.where(normal, values / scales, torch.where(known, values / scales, 1.0).log())
 
     def _bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
         low = [variable.low for variable in self.variables]

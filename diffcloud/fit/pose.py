@@ -14,7 +14,6 @@ motion at t + lag.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -23,7 +22,7 @@ import torch
 from torch import Tensor
 
 from diffcloud.errors import ConfigError, unknown_name
-from diffcloud.fit.priors import INDEPENDENT
+from diffcloud.fit.priors import INDEPENDENT, parse_deviations
 from diffcloud.fit.record import NuisanceValue
 from diffcloud.io.episodes import Episode
 
@@ -43,9 +42,6 @@ LAID = {"x": 0.1, "y": 0.1, "yaw": math.radians(30)}
 """Of where a hand lays a cloth that the scene places [m, rad]."""
 _RESOLVED = {"m": 3e-4, "rad": 1.5e-3, "s": 3e-4}
 """A step as small as this is the last one to a pose; what is left changes little."""
-_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180, "s": 1.0, "ms": 1e-3}
-_QUANTITY = {"m": "m", "cm": "m", "mm": "m", "rad": "rad", "deg": "rad", "s": "s", "ms": "s"}
-_EXAMPLES = {"m": "2cm", "rad": "5deg", "s": "50ms"}
 _ANGLES = ("tilt_x", "tilt_y", "yaw")
 _SHIFTS = ("x", "y", "z")
 
@@ -75,35 +71,12 @@ def default_priors(episode: Episode) -> dict[str, float]:
 
 
 def parse_priors(text: str) -> dict[str, float]:
-    """What `--nuisance` says -> name -> standard deviation of its prior [m, rad, s].
-
-    Args:
-        text: "none", or names with how far each may well be off zero, as in "x=10cm,y=0.1,yaw=30deg"; a length without a
-            unit in m, a time in s. An angle names its unit: 30 may be meant in degrees, and 0.5 in radians.
+    """What `--nuisance` says -> name -> standard deviation of its prior [m, rad, s], as of `parse_deviations`.
 
     Raises:
         ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.
     """
-    if text.strip() == "none":
-        return {}
-    priors: dict[str, float] = {}
-    for item in text.split(","):
-        name, _, value = (part.strip() for part in item.partition("="))
-        if name not in NUISANCE:
-            raise ConfigError(f"nuisance: {unknown_name('nuisance variable', name, NUISANCE)}")
-        match = re.fullmatch(r"([0-9.eE+-]+?)\s*([a-z]*)", value)
-        number = _number(match[1]) if match else math.nan
-        unit = (match[2] if match else "") or {"rad": ""}.get(NUISANCE[name], NUISANCE[name])
-        if not (number > 0 and math.isfinite(number)) or _QUANTITY.get(unit) != NUISANCE[name]:
-            allowed = ", ".join(one for one, quantity in _QUANTITY.items() if quantity == NUISANCE[name])
-            raise ConfigError(
-                f"nuisance {item.strip()!r}: {name} takes how far it may well be off, a positive number in one of "
-                f"{allowed}, such as {name}={_EXAMPLES[NUISANCE[name]]}."
-            )
-        if name in priors:
-            raise ConfigError(f"nuisance names {name} twice.")
-        priors[name] = number * _UNITS[unit]
-    return priors
+    return parse_deviations(text, "nuisance", NUISANCE)
 
 
 @dataclass(frozen=True)
@@ -243,10 +216,3 @@ def _cross(vector: Tensor) -> Tensor:
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan

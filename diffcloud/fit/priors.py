@@ -21,6 +21,9 @@ DEFAULT_FACTOR = 10.0
 """One deviation of a multiplier."""
 INDEPENDENT = 100
 """Residuals of a recording that count as independent."""
+_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180, "s": 1.0, "ms": 1e-3}
+_QUANTITY = {"m": "m", "cm": "m", "mm": "m", "rad": "rad", "deg": "rad", "s": "s", "ms": "s"}
+_EXAMPLES = {"m": "2cm", "rad": "5deg", "s": "50ms"}
 
 
 def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str, tuple[float, float]]) -> dict[str, float]:
@@ -74,3 +77,44 @@ def parse_factor(text: str, told: str, example: str) -> float:
     if not (factor > 1 and math.isfinite(factor)):
         raise ConfigError(f"{told}, above 1 and with an x, such as {example}; or write none.")
     return factor
+
+
+def parse_deviations(text: str, option: str, units: Mapping[str, str]) -> dict[str, float]:
+    """What an option says of how far each variable may well be off zero -> name -> standard deviation [m, rad, s].
+
+    Args:
+        text: "none", or as in "x=10cm,y=0.1,yaw=30deg"; a length without a unit in m, a time in s. An angle names its
+            unit: 30 may be meant in degrees, and 0.5 in radians.
+        option: its name, for messages.
+        units: of each variable, m, rad or s.
+
+    Raises:
+        ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.
+    """
+    if text.strip() == "none":
+        return {}
+    priors: dict[str, float] = {}
+    for item in text.split(","):
+        name, _, value = (part.strip() for part in item.partition("="))
+        if name not in units:
+            raise ConfigError(f"{option}: {unknown_name(f'{option} variable', name, units)}")
+        match = re.fullmatch(r"([0-9.eE+-]+?)\s*([a-z]*)", value)
+        number = _number(match[1]) if match else math.nan
+        unit = (match[2] if match else "") or {"rad": ""}.get(units[name], units[name])
+        if not (number > 0 and math.isfinite(number)) or _QUANTITY.get(unit) != units[name]:
+            allowed = ", ".join(one for one, quantity in _QUANTITY.items() if quantity == units[name])
+            raise ConfigError(
+                f"{option} {item.strip()!r}: {name} takes how far it may well be off, a positive number in one of "
+                f"{allowed}, such as {name}={_EXAMPLES[units[name]]}."
+            )
+        if name in priors:
+            raise ConfigError(f"{option} names {name} twice.")
+        priors[name] = number * _UNITS[unit]
+    return priors
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

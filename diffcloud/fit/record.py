@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from diffcloud.errors import ConfigError
 from diffcloud.io.files import read_json
@@ -28,13 +28,15 @@ class _Model(BaseModel):
 
 
 class NuisanceValue(_Model):
-    """One variable of a recording's pose."""
+    """One variable of how a recording lies."""
 
     value: Pose
     prior: Annotated[float, Field(gt=0, le=1e3)]
     """Standard deviation of its prior about zero."""
     unit: Literal["m", "rad", "s"]
     """Of both."""
+    of: Literal["pose", "cloth"] = "pose"
+    """Of the scene against the recording (`fit.pose`), or of the cloth when its motion begins (`fit.laid`)."""
 
 
 class LeftOut(_Model):
@@ -71,6 +73,13 @@ class RecordingFit(_Model):
     """[3] of the recording, about which the scene is turned [length unit]."""
     left_out: LeftOut | None = None
     """In a joint fit of several recordings."""
+
+    @field_validator("nuisance")
+    @classmethod
+    def _lies_at_a_place(cls, told: dict[str, NuisanceValue]) -> dict[str, NuisanceValue]:
+        if any(entry.of == "cloth" and entry.unit == "s" for entry in told.values()):
+            raise ValueError("how a cloth lies is in m or rad")
+        return told
 
     @model_validator(mode="after")
     def _of_each_frame(self) -> Self:
@@ -141,8 +150,8 @@ class History(_Model):
     """[k]"""
     loss: list[list[NonNegative | None]]
     """[N][B]"""
-    values: list[list[list[NonNegative | None]]]
-    """[N][B][k]"""
+    values: list[list[list[Annotated[float, Field(ge=-LARGEST, le=LARGEST)] | None]]]
+    """[N][B][k]; those of how the cloth lies may be negative."""
     gradient_norm: list[list[NonNegative | None]]
     """[N][B]; empty of a search."""
 
@@ -205,7 +214,7 @@ class FitRecord(_Model):
     seconds: NonNegative
     stop_reason: Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
     start: dict[str, NonNegative]
-    """Parameters of the first start, the given ones too."""
+    """Parameters of the first start, the given ones too, and how the cloth lies (`fit.laid`)."""
     best_start: Annotated[int, Field(ge=0, le=1_000_000)]
     measure: Measure
     settings: dict[str, Annotated[int, Field(ge=0)] | bool | NonNegative | None]
@@ -233,12 +242,24 @@ class FitRecord(_Model):
     @property
     def fitted(self) -> dict[str, float]:
         """Parameter -> value, of those that were asked for."""
-        return {name: value for name, value in self.free.items() if not self.parameters[name].doubtful}
+        return {name: one.value for name, one in self.parameters.items() if not (one.fixed or one.doubtful)}
 
     @property
     def free(self) -> dict[str, float]:
-        """Parameter -> value, of those that were not given: asked for, or doubtful."""
-        return {name: parameter.value for name, parameter in self.parameters.items() if not parameter.fixed}
+        """Name -> value, of all that was fitted: asked for, doubtful, or of how the cloth lies."""
+        material = {name: parameter.value for name, parameter in self.parameters.items() if not parameter.fixed}
+        return {**material, **self.laid}
+
+    @property
+    def laid(self) -> dict[str, float]:
+        """Name -> value, of how the cloth lies when its motion begins (`fit.laid`), as the simulator takes it."""
+        unit = {"m": self.length_unit_m, "rad": 1.0}
+        return {name: entry.value / unit[entry.unit] for name, entry in self.nuisance.items() if entry.of == "cloth"}
+
+    @property
+    def simulated(self) -> dict[str, float]:
+        """Name -> value, of all that the fitted motion was simulated with."""
+        return {**self.values, **self.laid}
 
     def plain(self) -> dict[str, Any]:
         """As the file has it."""

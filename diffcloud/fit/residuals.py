@@ -1,9 +1,9 @@
 """How the loss changes with what is fitted, to first and second order.
 
-Variables are fitted on an axis of their own: the logarithm of a value whose lower bound is positive, else the part of its
-range. Where the integrator's derivatives hold over finite distances (the implicit one: docs/results/gradients.md), the
-motion is linearised by forward tangents, in one simulation. The linearised integrator's contact is rough: there, motions
-a finite step to both sides give the differences.
+Variables are fitted on an axis of their own: the logarithm of a value whose lower bound is positive, the standard
+deviations off zero of one with a normal prior, else the part of its range. Where the integrator's derivatives hold over
+finite distances (the implicit one: docs/results/gradients.md), the motion is linearised by forward tangents, in one
+simulation. The linearised integrator's contact is rough: there, motions a finite step to both sides give the differences.
 
 What a motion says at a pose stands in `matching`. The pose is not among the variables: it follows them, to where the loss
 is lowest. Of the whole system over variables p and pose q, what is left when q is solved for is (variable projection;
@@ -25,7 +25,7 @@ from diffcloud.fit.joint import AnyObjective, mean_terms
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.sim.properties import Properties
-from diffcloud.sim.simulate import Rollout, rollout_tangents
+from diffcloud.sim.simulate import Rollout, rollout_tangents, still
 from diffcloud.sim.threads import map_threads
 
 STEP = 0.05
@@ -41,6 +41,10 @@ class Axis:
     high: Tensor
     logarithmic: Tensor
     """bool [k]"""
+    zero: Tensor
+    """[k] value at place zero of those that are not."""
+    scale: Tensor
+    """[k] from there to place one."""
 
     @staticmethod
     def of(space: FitSpace) -> Axis:
@@ -48,7 +52,9 @@ class Axis:
             torch.tensor([getattr(variable, end) for variable in space.variables], dtype=torch.float64)
             for end in ("low", "high")
         )
-        return Axis(low, high, low > 0)
+        deviations = torch.tensor([variable.deviation or 0.0 for variable in space.variables], dtype=torch.float64)
+        normal = deviations > 0
+        return Axis(low, high, low > 0, torch.where(normal, 0.0, low), torch.where(normal, deviations, high - low))
 
     @property
     def ends(self) -> tuple[Tensor, Tensor]:
@@ -58,11 +64,11 @@ class Axis:
     def places(self, values: Tensor) -> Tensor:
         """[..., k] values -> places on the axis."""
         safe = torch.where(self.logarithmic, values, 1.0)
-        return torch.where(self.logarithmic, safe.log(), (values - self.low) / (self.high - self.low))
+        return torch.where(self.logarithmic, safe.log(), (values - self.zero) / self.scale)
 
     def values(self, places: Tensor) -> Tensor:
         """The inverse of `places`. A place on a bound may be off it by rounding."""
-        return torch.where(self.logarithmic, places.exp(), self.low + (self.high - self.low) * places)
+        return torch.where(self.logarithmic, places.exp(), self.zero + self.scale * places)
 
     def bounded(self, places: Tensor) -> Tensor:
         """The same, no digit beyond a bound; a derivative would end there."""
@@ -118,15 +124,19 @@ def moved_by(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rol
 def _by_tangents(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rollout, Tensor]:
     axis = Axis.of(space)
 
-    def properties(at: Tensor) -> tuple[Tensor, ...]:
-        return objective.scenario.properties(objective.system, space.parameters(axis.values(at))).tensors()
+    def inputs(at: Tensor) -> tuple[Tensor, ...]:
+        properties, start = objective.inputs(space.parameters(axis.values(at)))
+        return *properties.tensors(), *(() if start is None else (start.positions,))
 
-    rates = _along(properties, places, _ways(places))
+    rates = [torch.cat(parts) for parts in zip(*_along(inputs, places, _ways(places)), strict=True)]
+    properties, start = objective.inputs(space.parameters(axis.values(places)))
     run, moves = rollout_tangents(
         objective.system,
         objective.loss_steps,
-        properties=Properties(*properties(places)),
-        tangents=Properties(*(torch.cat(parts) for parts in zip(*rates, strict=True))),
+        properties=properties,
+        tangents=Properties(*rates[: len(properties.tensors())]),
+        state=start,
+        state_tangents=None if start is None else still(objective.system, rates[-1]),
         track=objective.track,
     )
     times = objective.times

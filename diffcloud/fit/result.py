@@ -16,6 +16,7 @@ from torch import Tensor
 import diffcloud
 from diffcloud.errors import ConfigError
 from diffcloud.fit.joint import AnyObjective, mean_loss
+from diffcloud.fit.laid import described_laid, is_laid
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.pose import PoseSpace
@@ -122,6 +123,7 @@ def describe_fit(
     members, paper = objective.members, objective.paper
     first = members[0]
     values = {**outcome.values, **space.fixed}
+    material = {name: value for name, value in values.items() if not is_laid(name)}
     start_values = outcome.start | dict(space.fixed)
     unit = first.scenario.length_unit_m
     with torch.no_grad():
@@ -129,6 +131,8 @@ def describe_fit(
         recordings = [
             describe_recording(member, run, name) for member, run, name in zip(members, runs, episodes, strict=True)
         ]
+        for recording in recordings:  # a joint fit has no variables of a start
+            recording.nuisance |= described_laid(space, values, length_unit_m=unit)
         poses = [recorded_pose(recording, length_unit_m=unit)[1] for recording in recordings]
         motions = [
             _fitted_motion(member, run, pose, start_values) for member, run, pose in zip(members, runs, poses, strict=True)
@@ -148,8 +152,8 @@ def describe_fit(
         episodes=recordings,
         nuisance=recordings[0].nuisance if len(recordings) == 1 else {},
         solver=SOLVER_NAMES[type(settings)],
-        parameters=_parameters(first.scenario, space, outcome, values),
-        material=whole_material(first.scenario, values),
+        parameters=_parameters(first.scenario, space, material),
+        material=whole_material(first.scenario, material),
         loss=loss,
         loss_start=outcome.loss_start,
         loss_resampled=float(np.mean(resampled)),
@@ -206,7 +210,7 @@ def describe_recording(objective: Objective, run: Rollout, name: str) -> Recordi
 
 def recorded_pose(recording: RecordingFit, *, length_unit_m: float) -> tuple[PoseSpace, Tensor]:
     """The pose that a fit found for a recording, and its values [1, d]."""
-    priors = {name: entry.prior for name, entry in recording.nuisance.items()}
+    priors = {name: entry.prior for name, entry in recording.nuisance.items() if entry.of == "pose"}
     centre = torch.tensor(recording.centre, dtype=torch.float64)
     space = PoseSpace.build(priors, centre, length_unit_m=length_unit_m)
     return space, space.of(recording.nuisance, length_unit_m=length_unit_m)[None]
@@ -313,13 +317,11 @@ def _motion(objective: Objective, values: Mapping[str, float]) -> Rollout:
     return objective.simulate({name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()})
 
 
-def _parameters(
-    scenario: Scenario, space: FitSpace, outcome: FitOutcome, values: Mapping[str, float]
-) -> dict[str, FittedParameter]:
+def _parameters(scenario: Scenario, space: FitSpace, values: Mapping[str, float]) -> dict[str, FittedParameter]:
     found = physical_values(scenario, values)
     for name in space.fixed:
         found[name].fixed = True
-    for variable in space.variables:
+    for variable in (one for one in space.variables if one.name in values):
         entry, (low, high) = found[variable.name], (variable.low, variable.high)
         entry.bounds, entry.prior, entry.centre = (low, high), variable.prior, variable.centre
         entry.doubtful = variable.doubtful

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloud.fit.joint import AnyObjective, loss_weights, mean_loss
+from diffcloud.fit.laid import asked_as
 from diffcloud.fit.matching import Motion
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
@@ -123,12 +124,14 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
     clusters = np.concatenate([w * part.scores for w, part in zip(weights, parts, strict=True)])
     clusters = clusters[np.abs(clusters).max(axis=1) > 0]
     sources = {"noise": spread(clusters) * len(clusters) / max(len(clusters) - 1, 1)}
-    of_priors = np.diag(prior * [0.0 if v.prior is None else np.log(v.prior) for v in space.variables])
+    of_priors = np.diag(prior * space.prior_steps().numpy())
     if prior[asked].any():
         sources["prior"] = spread(of_priors[asked])
+    doubts: dict[str, list[NDArray[np.float64]]] = {}
     for row, variable in zip(of_priors, space.variables, strict=True):
         if variable.doubtful:
-            sources[variable.name] = spread(row[None])
+            doubts.setdefault(asked_as(variable.name), []).append(row)
+    sources |= {name: spread(np.stack(rows)) for name, rows in doubts.items()}
     for name in dict.fromkeys(key for part in parts for key in part.doubts if key != STEP_SIZE):
         each = [w * part.doubts[name] for w, part in zip(weights, parts, strict=True) if name in part.doubts]
         sources[name] = spread(np.stack(each))
@@ -144,7 +147,7 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
         clusters=len(clusters),
         step=-slope @ inverse,
         curvature=normal * whole / max(loss, 1e-300),
-        besides=frozenset(v.name for v in space.variables if v.doubtful).union(*(m.nuisance for m in objective.members)),
+        besides=frozenset(doubts).union(*(m.nuisance for m in objective.members)),
     )
 
 
@@ -281,7 +284,8 @@ def _refined(objective: Objective, parameters: Mapping[str, Tensor], run: Rollou
     if objective.episode.gripper is not None:
         moved = track_displacement(objective.episode, system.handles.grippers, steps, system.time_step)
         track = torch.as_tensor(moved)[None]
-    fine = rollout(system, steps, properties=scenario.properties(system, parameters), track=track)
+    properties, start = objective.inputs(parameters)
+    fine = rollout(system, steps, properties=properties, state=start, track=track)
     return fine.at(objective.times) - run.at(objective.times)
 
 

@@ -61,6 +61,13 @@ def init(system: System, batch: int = 1, *, positions: Tensor | None = None, vel
     return State(positions, velocities, bodies)
 
 
+def still(system: System, positions: Tensor) -> State:
+    """A direction of the state at time zero, in which nothing but the cloth's positions [B, V, 3] changes."""
+    start = init(system, len(positions))
+    bodies = None if start.bodies is None else BodyState(*(torch.zeros_like(part) for part in start.bodies.tensors()))
+    return State(positions, torch.zeros_like(positions), bodies)
+
+
 def rollout(
     system: System,
     steps: int,
