@@ -178,3 +178,17 @@ def test_intervals_know_what_it_leaves_open(objective, fits):
     assert {"turn", "shape"} <= set(found.sources)
     assert not WAVES & set(found.sources)
     assert {"turn", "shape"} <= found.besides
+
+
+def test_one_start_has_it_wait_and_others_do_not(objective, fits):
+    """Else more minima are wrong; and a cloth that lies askew would always be taken for another material first."""
+    (stretch, turn), (_, _, outcome) = (SPACE.names.index(name) for name in ("stretch", "turn")), fits[1]
+    first = torch.stack([values[0] for values in outcome.history.values])
+    waiting = int((first[:, turn] == 0).sum())
+    assert 2 < waiting < len(first)
+    assert not first[:waiting, turn].any()
+    assert first[waiting:, turn].all()
+    assert first[0, stretch] != first[waiting - 1, stretch]
+    settings = GaussNewtonSettings(starts=2, screen=0, scans=0, iterations=3)
+    second = torch.stack([values[1] for values in fit_gauss_newton(objective, SPACE, settings).history.values])
+    assert second[-1, turn] != 0

@@ -97,7 +97,7 @@ def fit_gauss_newton(
     places, simulations = _starts(objective, space, settings, axis, most)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
-    scans, looked, ways = 0, None, _Ways(places, settings.iterations)
+    scans, looked, ways = 0, None, _Ways(places, settings.iterations, _laid(space))
     if settings.starts is None:
         ways.waiting.insert(_BEFORE, places[0])  # until the search has found it
     try:
@@ -159,15 +159,20 @@ def fit_gauss_newton(
 class _Way:
     """From one start, at its lowest place so far."""
 
-    def __init__(self, place: Tensor, found: Linearisation, steps: int) -> None:
+    def __init__(self, place: Tensor, found: Linearisation, steps: int, held: Tensor | None = None) -> None:
         """
         Args:
             place: [k]
             found: there.
             steps: it may take.
+            held: bool [k] what stays until it has arrived; then it goes on with all free, and as many steps again.
         """
         self._take(place, found)
-        self._steps, self._damping, self._growth, self._in_vain = steps, _FIRST_DAMPING, 2.0, 0
+        self._most, self._held = steps, held
+        self._begin()
+
+    def _begin(self) -> None:
+        self._steps, self._damping, self._growth, self._in_vain = self._most, _FIRST_DAMPING, 2.0, 0
         self._predicted = 0.0
         self.arrived = False
 
@@ -188,6 +193,8 @@ class _Way:
         """[k] the next place, between the bounds [k]."""
         place, slope, normal = self.place, self.slope, self.normal
         free = ~(((place <= low) & (slope > 0)) | ((place >= high) & (slope < 0))) & (normal.diagonal() > 0)
+        if self._held is not None:
+            free &= ~self._held
         step = torch.zeros_like(place)
         if bool(free.any()):
             inner = normal[free][:, free]
@@ -211,18 +218,23 @@ class _Way:
             self._damping *= self._growth
             self._growth *= 2
             self._in_vain += 1
+        if self._held is not None and self.end is not None and math.isfinite(self.loss):
+            self._held = None
+            self._begin()
 
 
 class _Ways:
     """From B starts, one after the other."""
 
-    def __init__(self, places: Tensor, steps: int) -> None:
+    def __init__(self, places: Tensor, steps: int, held: Tensor) -> None:
         """
         Args:
             places: [B, k] starts, in their order.
             steps: each may take.
+            held: bool [k] what the first one leaves as it is at first.
         """
         self.waiting, self.every, self._steps = list(places), list[_Way](), steps
+        self._held = held if bool(held.any()) else None
 
     @property
     def best(self) -> _Way:
@@ -244,7 +256,7 @@ class _Ways:
 
     def begin(self, found: Linearisation) -> None:
         """The next start, with what was found there."""
-        self.every.append(_Way(self.waiting.pop(0), found, self._steps))
+        self.every.append(_Way(self.waiting.pop(0), found, self._steps, None if self.every else self._held))
 
     def judge(self, way: _Way, tried: Tensor, found: Linearisation) -> None:
         """As of the way; one that comes close to a better one leaves it the rest."""
@@ -290,6 +302,13 @@ def _searched(objective: AnyObjective, space: FitSpace, best: _Way, seed: int, a
         raise KeyboardInterrupt
     whole = {**asked.fixed, **found.values}
     return axis.places(torch.tensor([whole[name] for name in space.names], dtype=torch.float64)), found.simulations
+
+
+def _laid(space: FitSpace) -> Tensor:
+    """bool [k] which variables tell how a cloth lies. With all of them free from the beginning, a motion that may go in
+    several ways finds more wrong minima; without them, a cloth that lies askew leads to wrong places. So one start has them
+    wait, the others do not."""
+    return torch.tensor([variable.deviation is not None for variable in space.variables])
 
 
 def _remember(history: FitHistory, ways: _Ways, axis: Axis) -> None:
