@@ -28,7 +28,7 @@ from diffcloud.mesh.topology import ClothMesh
 from diffcloud.scene.scenarios import Scenario
 
 LAID: dict[str, Literal["m", "rad"]] = {"turn": "rad", "shape": "m"}
-"""Name -> unit; of `shape`, it is of each wave."""
+"""Name -> unit. `shape` stands for the height of each wave."""
 _WAVES = [(i, j) for i in range(4) for j in range(4) if 0 < i + j <= 3]
 _SHAPES = {f"shape_{i}_{j}": (i, j) for i, j in _WAVES}
 _FLAT = 1e-6
@@ -93,17 +93,17 @@ def _variable(name: str, deviation: float, length_unit_m: float) -> Variable:
 
 
 def is_laid(name: str) -> bool:
-    """Whether a variable is one of the start."""
-    return asked_as(name) in LAID
+    """Whether a variable tells how a cloth lies."""
+    return name == "turn" or name in _SHAPES
 
 
 def asked_as(name: str) -> str:
-    """Under which a variable of the start is asked for; another's own name."""
+    """The name in `LAID` under which a variable is asked for; of any other, its own."""
     return "shape" if name in _SHAPES else name
 
 
 def material_of(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Those that are no variables of the start."""
+    """Those that do not tell how a cloth lies."""
     return {name: value for name, value in values.items() if not is_laid(name)}
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from diffcloud.fit.laid import asked_as
 from diffcloud.fit.record import FitRecord, NuisanceValue, RecordingFit
 from diffcloud.report.tables import UNKNOWN, Cell, Table, number, table
 
@@ -23,7 +24,7 @@ def poses_table(fits: Sequence[tuple[str, FitRecord]]) -> Table:
         fits: name shown, and record.
     """
     rows = [(name, recording) for name, fit in fits for recording in fit.episodes]
-    units = {key: entry.unit for _, recording in rows for key, entry in recording.nuisance.items()}
+    units = {asked_as(key): entry.unit for _, recording in rows for key, entry in recording.nuisance.items()}
     variables = list(units)
     heads = [
         "fit",
@@ -53,7 +54,7 @@ def _row(name: str, recording: RecordingFit, variables: Sequence[str]) -> list[C
         Cell(f"{len(frames)}", sort=len(frames), note=f"{frames[0]} to {frames[-1]}"),
         number(float(np.mean(recording.counted)), 0, factor=100, unit=" %"),
         number(recording.cut_m, 0, factor=1e3),
-        *(_pose_cell(recording.nuisance.get(key)) for key in variables),
+        *(_pose_cell([one for own, one in recording.nuisance.items() if asked_as(own) == key]) for key in variables),
     ]
 
 
@@ -62,9 +63,11 @@ def _left_out_cell(recording: RecordingFit) -> Cell:
     return UNKNOWN if recording.left_out is None else number(recording.left_out.rms_mm, 1)
 
 
-def _pose_cell(entry: NuisanceValue | None) -> Cell:
-    if entry is None:
+def _pose_cell(entries: Sequence[NuisanceValue]) -> Cell:
+    """Of one variable, or the RMS of several that were asked for as one."""
+    if not entries:
         return UNKNOWN
-    factor, _, digits = _SHOWN[entry.unit]
-    far = abs(entry.value) > _WIDE * entry.prior
-    return number(entry.value, digits, factor=factor, note="beyond its prior" if far else "")
+    factor, _, digits = _SHOWN[entries[0].unit]
+    far = any(abs(entry.value) > _WIDE * entry.prior for entry in entries)
+    value = entries[0].value if len(entries) == 1 else math.hypot(*(entry.value for entry in entries)) / len(entries) ** 0.5
+    return number(value, digits, factor=factor, note="beyond its prior" if far else "")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from diffcloud.fit.record import LeftOut
+from diffcloud.fit.record import LeftOut, NuisanceValue
 from diffcloud.report.poses import poses_table
 from tests.report.pages import entry
 
@@ -34,3 +34,17 @@ def test_what_a_fit_did_not_free_is_a_dash():
     found = poses_table([("a", one), ("b", other)])
     row = dict(zip(found.heads, found.rows[1], strict=True))
     assert row["x mm"].text == row["cloud to cloth mm"].text == "–"
+
+
+def test_waves_of_an_uneven_cloth_are_one_number():
+    one = entry("a").fit
+    waves = {f"shape_{i}_{j}": height for (i, j), height in {(0, 1): 0.003, (1, 0): -0.004}.items()}
+    one.episodes[0].nuisance = {
+        "turn": NuisanceValue(value=0.1, prior=0.04, unit="rad", of="cloth"),
+        **{name: NuisanceValue(value=value, prior=0.005, unit="m", of="cloth") for name, value in waves.items()},
+    }
+    found = poses_table([("a", one)])
+    row = dict(zip(found.heads, found.rows[0], strict=True))
+    assert (row["turn °"].text, row["turn °"].note) == ("5.7", "beyond its prior")
+    assert (row["shape mm"].text, row["shape mm"].note) == ("3.5", "")  # their RMS
+    assert not waves.keys() & {head.split()[0] for head in found.heads}
