@@ -178,12 +178,13 @@ def test_poses_found_are_held_against_the_true_ones(work, tmp_path):
         ("as the", "x=1cm,yaw=2deg,lag=5ms"),
     ]
     assert fits[0]["shift_mm"] < 0.5  # stated exactly
-    assert fits[2]["shift_mm"] < 5  # found from a noisy cloud
+    assert fits[2]["start"].endswith("its turn fitted")
+    assert fits[4]["shift_mm"] < 5  # found from a noisy cloud
     assert fits[0]["lag_ms"] is None
     assert fits[1]["lag_ms"] is not None
     page = (tmp_path / "poses.md").read_text()
     assert "off by 0 mm and 0° together" in page
-    assert page.count("as the first frame shows it") == 2
+    assert page.count("| as the first frame shows it") == page.count("| as the scenario says, its turn fitted") == 2
     broken = invoke("recordings", "--recorded", "recorded", "--episodes", "episodes", "--params", "params.yaml",
                     "--out", tmp_path / "poses2.md", "--nuisance", "sideways=2", code=1)  # fmt: skip
     assert "sideways" in broken.errors
