@@ -61,11 +61,11 @@ def with_laid(space: FitSpace, laid: Mapping[str, float], scenarios: Sequence[Sc
     told = f"laid {', '.join(laid)}: "
     if len(scenarios) > 1:
         raise ConfigError(
-            f"{told}in each recording a cloth lies otherwise, which joint fits do not know; fit them one by one."
+            f"{told}the cloth lies differently in each recording, which joint fits do not support; fit them one by one."
         )
     nodes = scenarios[0].scene.mesh.nodes
     if np.ptp(nodes[:, 2]) > _FLAT * np.ptp(nodes, axis=0).max():
-        raise ConfigError(f"{told}only of a cloth that lies level at the start, and that of {scenarios[0].name} does not.")
+        raise ConfigError(f"{told}this needs a cloth that lies level at the start; that of {scenarios[0].name} does not.")
     names = [own for name in LAID if name in laid for own in (_SHAPES if name == "shape" else (name,))]
     own = [_variable(name, laid[asked_as(name)], scenarios[0].length_unit_m) for name in names]
     return FitSpace((*space.variables, *own), space.fixed)

@@ -88,11 +88,11 @@ class TestSpace:
             parse_laid(text)
 
     def test_a_cloth_that_hangs_does_not_lie(self):
-        with pytest.raises(ConfigError, match="lies level at the start, and that of vest_hang does not"):
+        with pytest.raises(ConfigError, match="lies level at the start; that of vest_hang does not"):
             with_laid(ASKED, {"turn": 0.1}, [load_scenario("vest_hang")])
 
     def test_several_recordings_lie_in_several_ways(self):
-        with pytest.raises(ConfigError, match="joint fits do not know"):
+        with pytest.raises(ConfigError, match="joint fits do not support"):
             with_laid(ASKED, {"shape": 0.005}, [SCENARIO, SCENARIO])
 
     def test_it_stands_behind_what_is_asked_for_in_the_scenes_unit(self):
