@@ -11,7 +11,7 @@ import torch
 import typer
 
 from diffcloud.errors import ConfigError, DivergedError
-from diffcloud.fit.laid import laid_nodes
+from diffcloud.fit.laid import start_of
 from diffcloud.fit.record import RecordingFit, read_fit
 from diffcloud.fit.result import recorded_pose
 from diffcloud.fit.targets import track_displacement
@@ -22,7 +22,6 @@ from diffcloud.io.obj import write_cloth, write_surface
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.sim.moved import moved_surfaces
 from diffcloud.sim.properties import check_values
-from diffcloud.sim.simulate import init
 from diffcloud.sim.simulate import rollout as simulate
 from pipeline.console import JsonFlag, assignments, errors, finish, progress_bar, warn, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario, limits
@@ -65,8 +64,7 @@ def rollout(
     system, _ = chosen.scene.build()
     properties = chosen.properties(system, _tensors(values))
     recording = None if fitted is None else _recording(fitted.episodes, chosen.name, episode)
-    laid = None if fitted is None or recording is None else laid_nodes(system.mesh, _tensors(fitted.laid))
-    start = None if laid is None else init(system, positions=laid)
+    start = None if fitted is None or recording is None else start_of(system, _tensors(fitted.laid))
     track, warnings = None, limits(chosen)
     if episode is not None:
         recorded = read_episode(episode)

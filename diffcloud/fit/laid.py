@@ -26,11 +26,12 @@ from diffcloud.fit.priors import parse_deviations
 from diffcloud.fit.record import NuisanceValue
 from diffcloud.mesh.topology import ClothMesh
 from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.simulate import init
+from diffcloud.sim.system import State, System
 
 LAID: dict[str, Literal["m", "rad"]] = {"turn": "rad", "shape": "m"}
 """Name -> unit. `shape` stands for the height of each wave."""
-_WAVES = [(i, j) for i in range(4) for j in range(4) if 0 < i + j <= 3]
-_SHAPES = {f"shape_{i}_{j}": (i, j) for i, j in _WAVES}
+_SHAPES = {f"shape_{i}_{j}": (i, j) for i in range(4) for j in range(4) if 0 < i + j <= 3}
 _FLAT = 1e-6
 """Part of its size by which a level cloth may be off."""
 _FARTHEST = 4.0
@@ -137,11 +138,17 @@ def laid_nodes(mesh: ClothMesh, values: Mapping[str, Tensor]) -> Tensor | None:
     )
 
 
+def start_of(system: System, values: Mapping[str, Tensor]) -> State | None:
+    """The state in which motions of these values begin; arguments as of `laid_nodes`. None: that of the scene."""
+    nodes = laid_nodes(system.mesh, values)
+    return None if nodes is None else init(system, len(nodes), positions=nodes)
+
+
 def described_laid(space: FitSpace, values: Mapping[str, float], *, length_unit_m: float) -> dict[str, NuisanceValue]:
     """Values as records keep them: name -> value and its prior, in SI."""
     found = {}
     for variable in space.variables:
-        if is_laid(variable.name) and variable.deviation is not None:
+        if variable.deviation is not None:
             unit = LAID[asked_as(variable.name)]
             factor = length_unit_m if unit == "m" else 1.0
             value, prior = values[variable.name] * factor, variable.deviation * factor

@@ -22,14 +22,14 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.alignment import aligned
-from diffcloud.fit.laid import laid_nodes, material_of
+from diffcloud.fit.laid import material_of, start_of
 from diffcloud.fit.matching import Matcher, Motion, Pairs
 from diffcloud.fit.pose import PoseSpace, default_priors
 from diffcloud.fit.targets import read_target
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import Properties
-from diffcloud.sim.simulate import Rollout, init, rollout
+from diffcloud.sim.simulate import Rollout, rollout
 from diffcloud.sim.system import State
 
 CAP_M = 0.05
@@ -221,9 +221,7 @@ class Objective:
 
     def inputs(self, parameters: Mapping[str, Tensor]) -> tuple[Properties, State | None]:
         """What parameter sets are to the simulator: properties, and a start (None: that of the scene)."""
-        nodes = laid_nodes(self.system.mesh, parameters)
-        start = None if nodes is None else init(self.system, len(nodes), positions=nodes)
-        return self.scenario.properties(self.system, material_of(parameters)), start
+        return self.scenario.properties(self.system, material_of(parameters)), start_of(self.system, parameters)
 
     def frame_losses(self, run: Rollout, *, pose: Tensor | None = None) -> Tensor:
         """[B, L] losses of a rollout at each compared frame, at its pose or at poses [B, d]."""

@@ -14,14 +14,14 @@ from diffcloud.errors import ConfigError, DivergedError, EpisodeError
 from diffcloud.fit import AdamSettings, FitSpace, JointObjective, Objective, fit_adam
 from diffcloud.fit.agreement import Agreement, gradient_agreement, random_parameters
 from diffcloud.fit.benchmark import time_contact
-from diffcloud.fit.laid import laid_nodes, material_of
+from diffcloud.fit.laid import material_of, start_of
 from diffcloud.fit.record import FittedParameter, read_fit
 from diffcloud.fit.result import describe_fit, write_fit
 from diffcloud.fit.targets import track_displacement
 from diffcloud.fit.visibility import visibility_map
 from diffcloud.io.episodes import Episode
 from diffcloud.scene import load_scenario
-from diffcloud.sim import init, rollout
+from diffcloud.sim import rollout
 from tests.conftest import paper_objective, small_lift
 
 
@@ -31,9 +31,8 @@ def clouds_of(scenario, *, points=800, seed=5, gripper=True, shift=(0, 0, 0), ya
 
     system, _ = scenario.scene.build()
     values = {name: torch.tensor([value], dtype=torch.float64) for name, value in truth.items()}
-    laid = laid_nodes(system.mesh, values)
-    start = None if laid is None else init(system, positions=laid)
-    run = rollout(system, scenario.steps, properties=scenario.properties(system, material_of(values)), state=start)
+    properties, start = scenario.properties(system, material_of(values)), start_of(system, values)
+    run = rollout(system, scenario.steps, properties=properties, state=start)
     nodes = run.positions[0, :: scenario.scene.frame_steps]
     generator = torch.Generator().manual_seed(seed)
     sampler = SurfaceSampler.build(torch.as_tensor(system.mesh.faces), points, generator=generator)
