@@ -73,7 +73,8 @@ def test_a_cloth_that_lies_askew_is_replayed_as_it_lay(work):
     measured = run("evaluate", "loss", "--fit", "fits/askew.json", "--scenario", "small.yaml", "askew.npz", cwd=work).result
     assert measured["loss"] == pytest.approx(record.loss, rel=1e-6)
     run(
-        "rollout", "--fit", "fits/askew.json", "--scenario", "small.yaml", "--episode", "askew.npz", "--out", "r.npz", cwd=work
+        "rollout", "--fit", "fits/askew.json", "--scenario", "small.yaml", "--episode", "askew.npz", "--out", "r.npz",
+        cwd=work,
     )  # fmt: skip
     with np.load(work / "r.npz") as found, np.load(work / "fits" / "askew.npz") as fitted:
         np.testing.assert_allclose(found["nodes"][0], fitted["nodes"][0], atol=1e-12)
