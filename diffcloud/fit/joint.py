@@ -61,6 +61,10 @@ class JointObjective:
         """Losses [B], as of `Objective`."""
         return mean_loss(torch.stack(map_threads(lambda one: one(parameters), self.members)), paper=self.paper)
 
+    def until(self, part: float) -> JointObjective:
+        """As of `Objective`, of every one."""
+        return JointObjective([one.until(part) for one in self.members])
+
     def reseed(self, seed: int) -> None:
         """Draw the common random numbers anew."""
         for one in self.members:

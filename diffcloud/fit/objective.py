@@ -8,6 +8,7 @@ pose.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from copy import copy
@@ -105,9 +106,7 @@ class Objective:
             nuisance=self.nuisance,
         )
         self.reseed(seed)
-        last = float(self._target.times.max())
-        steps = int(np.ceil(last / self.system.time_step - 1e-6)) + ("lag" in self.nuisance)  # a velocity has two sides
-        self.loss_steps = min(steps, scenario.steps)
+        self.loss_steps = self._steps_to_loss()
 
     @property
     def members(self) -> tuple[Objective, ...]:
@@ -369,11 +368,27 @@ class Objective:
         other.loss_steps = min(self.loss_steps + 1, self.scenario.steps)  # a velocity has two sides
         return other
 
+    def until(self, part: float) -> Objective:
+        """The same on this part of its compared frames, from the first one on, but a few at least."""
+        other = copy(self)
+        kept = max(math.ceil(part * len(self.frames)), min(_FEW, len(self.frames)))
+        other._target = self._target.at(range(kept))
+        if not self.paper:
+            points, sure = self._recorded
+            other._recorded = points[:kept], sure[:kept]
+        other.loss_steps = other._steps_to_loss()
+        return other
+
     def with_bodies(self, positions: Tensor) -> Tensor:
         """[..., V, 3] nodes of the cloth -> with those of the bodies beside it, in the default measure."""
         if self.paper or not len(self._bodies):
             return positions
         return torch.cat([positions, self._bodies.expand(*positions.shape[:-2], -1, -1)], dim=-2)
+
+    def _steps_to_loss(self) -> int:
+        last = float(self._target.times.max())
+        steps = int(np.ceil(last / self.system.time_step - 1e-6)) + ("lag" in self.nuisance)  # a velocity has two sides
+        return min(steps, self.scenario.steps)
 
     def _moved(self, motion: Motion, pairs: Pairs) -> Tensor:
         space = self._target.space

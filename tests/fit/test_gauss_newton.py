@@ -205,6 +205,25 @@ class TestFits:
         assert enough.simulations < every.simulations
         assert enough.stop_reason == every.stop_reason == "converged"
 
+    @pytest.mark.parametrize("measure", [{"nuisance": {}}, {"paper": True}], ids=["all frames", "one frame"])
+    def test_where_the_first_start_explains_too_little_the_next_two_begin_with_the_first_frames(self, monkeypatch, measure):
+        """A recording of one frame has no beginning."""
+        monkeypatch.setattr(Objective, "knows_gaps", True)
+        monkeypatch.setattr("diffcloud.fit.solvers.gauss_newton._MOST", 1)
+        objective, parts = lifted(**measure), []
+        monkeypatch.setattr(Objective, "explained", 0.5 * objective.explained)
+        until = Objective.until
+        monkeypatch.setattr(Objective, "until", lambda self, part: parts.append(part) or until(self, part))
+        found = fit_gauss_newton(objective, SPACE, GaussNewtonSettings(screen=7, iterations=8, scans=0))
+        starts = torch.stack(found.history.losses).isfinite().any(0)
+        if "paper" in measure:
+            assert len(starts) == 2  # the best candidate, and the one that a search finds
+            return
+        assert len(starts) == 4
+        assert bool(starts.all())
+        assert parts[-5:] == [0.5, 0.75, 0.4, 0.6, 0.8]
+        assert found.values["stretch"] / found.values["mass"] == pytest.approx(TRUTH["stretch"] / TRUTH["mass"], rel=0.05)
+
     def test_the_truth_explains_a_recording_and_others_do_not(self):
         objective = lifted(nuisance={})
         told = {name: torch.tensor([TRUTH[name], 1.3 * TRUTH[name]]).double() for name in TRUTH} | {

@@ -13,7 +13,7 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfacePoints
 from diffcloud.clouds.visibility import seen_places
 from diffcloud.errors import ConfigError, DivergedError, EpisodeError
-from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton
+from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton
 from diffcloud.fit.matching import pairs_forth
 from diffcloud.fit.pose import SET_UP
 from diffcloud.fit.residuals import Axis, linearise
@@ -150,6 +150,21 @@ class TestWhatCounts:
         recording = found_at(objective, TRUTH)
         assert min(recording["counted"]) > 0.3
         assert recording["rms_mm"] < 6.0
+
+    def test_its_first_frames_alone(self, scenario, episode):
+        """They have the losses that they have among all, of a motion that ends sooner."""
+        whole = Objective(scenario, episode, nuisance={})
+        early = whole.until(0.5)
+        kept = math.ceil(len(whole.frames) / 2)
+        assert early.frames == whole.frames[:kept]
+        assert early.loss_steps < whole.loss_steps
+        with torch.no_grad():
+            part, full = (one.frame_losses(one.simulate_to_loss(at({"stretch": 2.0}))) for one in (early, whole))
+        torch.testing.assert_close(part, full[:, :kept])
+        assert len(whole.until(0.01).frames) == 5  # fewer do not tell how a cloth lies
+        assert whole.until(1.0).frames == whole.frames
+        both = JointObjective([whole, whole]).until(0.5)
+        assert [one.frames for one in both.members] == [early.frames] * 2
 
     def test_a_whole_recording_has_no_cut(self, scenario, episode):
         assert Objective(scenario, episode).cut is None

@@ -8,7 +8,8 @@ over the variables that no bound holds (Marquardt 1963; Madsen, Nielsen and Ting
 its own λ: it falls by how much of the predicted decrease a step brings, and grows, faster and faster, where it brings
 none. Starts are the best of a screen of candidates spread over the box, the best one first, and the rest stays where it is
 as soon as one explains the recording; where a right motion may have a higher loss, also as soon as two have ended equally
-low. If the first three do not, a derivative-free search from the best place over what is asked for finds the next. Then
+low. If the first one does not, the next two are found by fitting the recording's beginning, then more and more of it. If
+the first three candidates do not, a derivative-free search from the best place over what is asked for finds the next. Then
 losses along the principal axes of the best place tell whether another minimum is lower nearby; from there it goes on.
 """
 
@@ -16,8 +17,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -26,6 +29,7 @@ from diffcloud.errors import DivergedError
 from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
+from diffcloud.fit.priors import INDEPENDENT
 from diffcloud.fit.residuals import Axis, Linearisation, linearise
 from diffcloud.fit.scan import scan
 from diffcloud.fit.solvers.cma_es import CmaEsSettings, fit_cma_es
@@ -45,7 +49,10 @@ _SAME = 0.02
 _MOST = 8
 """Starts, unless fewer are enough."""
 _BEFORE, _SEARCHED = 3, 64
-"""Starts after which a search is made for the next, and its candidates."""
+"""The best candidates that are starts before a search is made for the next, and its candidates."""
+_GROWING, _DRAWN = ((0.5, 0.75), (0.4, 0.6, 0.8)), 16
+"""Parts of the frames over which a recording grows, for each start that is found so, and places drawn before each next one:
+where one of them goes astray at the end, another seldom does."""
 _MISFIT = 30.0
 """Times what explains a recording; above that, it is the model that does not: no start will."""
 _EQUALLY = 1.01
@@ -97,9 +104,14 @@ def fit_gauss_newton(
     places, simulations = _starts(objective, space, settings, axis, most)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
-    scans, looked, ways = 0, None, _Ways(places, settings.iterations, _laid(space))
+    waiting = [_Start(place) for place in places]
     if settings.starts is None:
-        ways.waiting.insert(_BEFORE, places[0])  # until the search has found it
+        waiting.insert(_BEFORE, _Start(places[0], lambda: _searched(objective, space, ways.best, settings.seed, axis)))
+        for parts in reversed(_GROWING):
+            if _frames(objective.until(parts[0])) < _frames(objective):
+                grown = partial(_grown, objective, space, places[0], parts, settings, axis)
+                waiting.insert(1, _Start(places[0], grown))
+    scans, looked, ways = 0, None, _Ways(waiting, settings.iterations, _laid(space))
     try:
         while True:
             way = ways.going
@@ -109,12 +121,10 @@ def fit_gauss_newton(
                 simulations += found.simulations
                 ways.judge(way, tried, found)
             elif ways.waiting and not ways.enough(explained, wrong):
-                if settings.starts is None and len(ways.every) == _BEFORE:
-                    ways.waiting[0], spent = _searched(objective, space, ways.best, settings.seed, axis)
-                    simulations += spent
-                found = linearise(objective, space, ways.waiting[0][None])
-                simulations += found.simulations
-                ways.begin(found)
+                place, spent = ways.waiting.pop(0).found()
+                found = linearise(objective, space, place[None])
+                simulations += spent + found.simulations
+                ways.begin(place, found)
             else:
                 reason = ways.best.end or reason
                 if scans == settings.scans or reason == "iterations":
@@ -154,6 +164,19 @@ def fit_gauss_newton(
         history=history,
         scan=looked,
     )
+
+
+@dataclass(frozen=True)
+class _Start:
+    """One that waits for its turn."""
+
+    place: Tensor
+    """[k]; of one that is looked for when its turn comes, where that begins."""
+    look: Callable[[], tuple[Tensor, int]] | None = None
+
+    def found(self) -> tuple[Tensor, int]:
+        """The start [k], and how many simulations it took to find it."""
+        return (self.place, 0) if self.look is None else self.look()
 
 
 class _Way:
@@ -226,14 +249,14 @@ class _Way:
 class _Ways:
     """From B starts, one after the other."""
 
-    def __init__(self, places: Tensor, steps: int, held: Tensor) -> None:
+    def __init__(self, starts: Sequence[_Start], steps: int, held: Tensor) -> None:
         """
         Args:
-            places: [B, k] starts, in their order.
+            starts: B, in their order.
             steps: each may take.
             held: bool [k] what the first one leaves as it is at first.
         """
-        self.waiting, self.every, self._steps = list(places), list[_Way](), steps
+        self.waiting, self.every, self._steps = list(starts), list[_Way](), steps
         self._held = held if bool(held.any()) else None
 
     @property
@@ -254,9 +277,9 @@ class _Ways:
         equal = sum(way.loss <= _EQUALLY * self.best.loss for way in self.every) > 1
         return self.best.loss <= explained or (equal and self.best.loss > wrong)
 
-    def begin(self, found: Linearisation) -> None:
-        """The next start, with what was found there."""
-        self.every.append(_Way(self.waiting.pop(0), found, self._steps, None if self.every else self._held))
+    def begin(self, place: Tensor, found: Linearisation) -> None:
+        """A start, with what was found there."""
+        self.every.append(_Way(place, found, self._steps, None if self.every else self._held))
 
     def judge(self, way: _Way, tried: Tensor, found: Linearisation) -> None:
         """As of the way; one that comes close to a better one leaves it the rest."""
@@ -304,6 +327,54 @@ def _searched(objective: AnyObjective, space: FitSpace, best: _Way, seed: int, a
     return axis.places(torch.tensor([whole[name] for name in space.names], dtype=torch.float64)), found.simulations
 
 
+def _grown(
+    objective: AnyObjective,
+    space: FitSpace,
+    place: Tensor,
+    parts: Sequence[float],
+    settings: GaussNewtonSettings,
+    axis: Axis,
+) -> tuple[Tensor, int]:
+    """The place [k] that a descent from this one comes to on the first frames alone, then on more of them; and how many
+    simulations it took. What a cloth does early, before it has folded over or touched something, depends on the parameters
+    in a simple way: there, far fewer minima are wrong. Between two parts, it goes on from the best of some places drawn
+    from what the frames so far leave open: the next ones may tell between them.
+
+    Args:
+        place: [k]
+        parts: of the frames, the first one first.
+    """
+    generator, simulations = torch.Generator().manual_seed(settings.seed), 0
+    for early, later in pairwise((*(objective.until(part) for part in parts), objective)):
+        found = linearise(early, space, place[None])
+        way, simulations = _Way(place, found, settings.iterations), simulations + found.simulations
+        while way.end is None:
+            tried = way.propose(*axis.ends)
+            found = linearise(early, space, tried[None])
+            simulations += found.simulations
+            way.judge(tried, found)
+        if not math.isfinite(way.loss):
+            break
+        places = torch.cat([way.place[None], _drawn(way, len(objective.members), axis, generator)])
+        losses = batch_losses(later, space, axis.bounded(places))
+        place, simulations = places[losses.argmin()], simulations + len(places) * len(objective.members)
+    return place, simulations
+
+
+def _drawn(way: _Way, recordings: int, axis: Axis, generator: torch.Generator) -> Tensor:
+    """[n, k] places drawn from what a way's end says of all variables (`fit.priors`: the logarithm of the loss)."""
+    spread, axes = torch.linalg.eigh(way.normal)
+    reach = (way.loss / (INDEPENDENT * recordings * spread.clamp(min=1e-9 * float(spread[-1])))).sqrt()
+    normal = torch.randn(_DRAWN, len(reach), generator=generator, dtype=torch.float64)
+    low, high = axis.ends
+    return torch.minimum(torch.maximum(way.place + normal * reach @ axes.T, low), high)
+
+
+def _frames(objective: AnyObjective) -> int:
+    """Compared, of all recordings."""
+    return sum(len(one.frames) for one in objective.members)
+
+
 def _laid(space: FitSpace) -> Tensor:
     """bool [k] which variables tell how a cloth lies. With all of them free from the beginning, a motion that may go in
     several ways finds more wrong minima; without them, a cloth that lies askew leads to wrong places. So one start has them
@@ -315,6 +386,8 @@ def _remember(history: FitHistory, ways: _Ways, axis: Axis) -> None:
     """A row of all starts; those that have not begun have no loss yet."""
     begun, waiting = ways.every, len(ways.waiting)
     history.losses.append(torch.tensor([way.loss for way in begun] + [math.inf] * waiting, dtype=torch.float64))
-    history.values.append(axis.bounded(torch.stack([*(way.place for way in begun), *ways.waiting])))
+    history.values.append(
+        axis.bounded(torch.stack([*(way.place for way in begun), *(start.place for start in ways.waiting)]))
+    )
     slopes = torch.stack([way.slope for way in begun])
     history.gradients.append(2 * torch.nn.functional.pad(slopes, (0, 0, 0, waiting)))
