@@ -217,9 +217,9 @@ class FitConfig(Section):
     nuisance: Name | None = None
     """Which parts of the pose are fitted too, and how far off each may well be: "x=0.1m,y=0.1m,yaw=30deg", or "none". If
     not given, all of them, as `fit.pose.default_priors` says."""
-    laid: Name = "none"
+    laid: Name | None = None
     """How a cloth may lie at the start, other than its scenario has it, and how far off: "turn=5deg,shape=5mm", or "none"
-    (`fit.laid`)."""
+    (`fit.laid`). Default: what the scenario says, in fits of one recording by gauss_newton; else none."""
     prior: Name | None = None
     """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""
     doubts: Name | None = None
@@ -244,7 +244,7 @@ class FitConfig(Section):
         for name, pair in self.bounds.items():
             _check_bounds(f"bounds.{name}", pair)
         parse_priors(self.nuisance or "none")
-        if parse_laid(self.laid) and self.paper:
+        if parse_laid(self.laid or "none") and self.paper:
             raise ValueError("laid: the published measure takes the cloth to lie as the scene has it; leave it out")
         if self.paper and parse_doubts(self.doubts or "none"):
             raise ValueError("doubts: the published measure takes the rest of the material for known; leave them out")
@@ -265,6 +265,13 @@ class FitConfig(Section):
         if self.paper or self.solver != "gauss_newton" or any(one.scene.integrator != "implicit" for one in scenarios):
             return {}
         return {name: factor for name, factor in MATERIAL_DOUBTS.items() if name not in {*self.parameters, *self.fixed}}
+
+    def laid_within(self, scenarios: Sequence[Scenario]) -> dict[str, float]:
+        """How the cloth may lie otherwise at the start, in fits of recordings in these scenarios -> standard deviation."""
+        if self.laid is not None:
+            return parse_laid(self.laid)
+        alone = len(scenarios) == 1 and self.solver == "gauss_newton" and not self.paper
+        return dict(scenarios[0].laid) if alone else {}
 
     def solver_settings(self, scenario: Scenario) -> Settings:
         """Of the solver, with what the scenario says where nothing is given."""

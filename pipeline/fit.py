@@ -113,7 +113,7 @@ def fit(
         typer.Option(
             help="Also find how the cloth lay before the motion, and how far off that may be: turn=5deg (askew under the "
             "gripper), shape=5mm (not flat; of each of nine waves). Only if the cloth starts level; not with --joint. "
-            "Default: none, as the scenario has it."
+            "Default: what the scenario says, mostly none."
         ),
     ] = None,
     doubts: Annotated[

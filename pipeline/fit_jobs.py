@@ -11,7 +11,7 @@ from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit import FitSpace, JointObjective, Objective, Progress, read_fit, solve, write_fit
 from diffcloud.fit.doubts import with_doubts
 from diffcloud.fit.joint import AnyObjective
-from diffcloud.fit.laid import parse_laid, with_laid
+from diffcloud.fit.laid import with_laid
 from diffcloud.fit.left_out import leave_each_out
 from diffcloud.fit.priors import parameter_priors
 from diffcloud.fit.record import FitRecord
@@ -142,7 +142,7 @@ class FitJob:
         space = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed, priors=priors)
         scenarios = [recording.scenario for recording in self.recordings]
         space = with_doubts(space, settings.known_within(scenarios), scenarios)
-        return with_laid(space, parse_laid(settings.laid), scenarios)
+        return with_laid(space, settings.laid_within(scenarios), scenarios)
 
     def objective(self) -> AnyObjective:
         """

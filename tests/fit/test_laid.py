@@ -19,6 +19,7 @@ from diffcloud.fit.residuals import Axis, linearise
 from diffcloud.fit.result import describe_fit
 from diffcloud.fit.uncertainty import uncertainty
 from diffcloud.scene.scenarios import load_scenario
+from pipeline.config import FitConfig
 from tests.conftest import small_lift
 from tests.fit.test_fit import GENTLE, clouds_of
 
@@ -94,6 +95,19 @@ class TestSpace:
     def test_several_recordings_lie_in_several_ways(self):
         with pytest.raises(ConfigError, match="joint fits do not support"):
             with_laid(ASKED, {"shape": 0.005}, [SCENARIO, SCENARIO])
+
+    def test_a_scenario_says_how_its_cloths_may_lie(self):
+        """For fits of one recording by derivatives; what the option says comes first."""
+        recorded = load_scenario("recorded_lift")
+        said = {"turn": pytest.approx(math.radians(10)), "shape": 0.01}
+        assert recorded.laid == said
+        assert FitConfig().laid_within([recorded]) == said
+        assert FitConfig().laid_within([load_scenario("lift")]) == {}
+        assert FitConfig().laid_within([recorded, load_scenario("recorded_fold")]) == {}
+        assert FitConfig(paper=True).laid_within([recorded]) == {}
+        assert FitConfig(solver="cma_es").laid_within([recorded]) == {}
+        assert FitConfig(laid="none").laid_within([recorded]) == {}
+        assert FitConfig(laid="turn=5deg").laid_within([recorded]) == {"turn": pytest.approx(math.radians(5))}
 
     def test_it_stands_behind_what_is_asked_for_in_the_scenes_unit(self):
         space = with_laid(ASKED, {"shape": 0.007, "turn": 0.1}, [replace(SCENARIO, length_unit_m=0.35)])

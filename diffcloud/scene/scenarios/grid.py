@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -51,6 +52,10 @@ class GridScenario(ScenarioOptions):
     held: Names = ()
     """Nodes that stay where they are."""
     loss_surface: Literal["all", "grasped_half"] = "all"
+    laid_turn_deg: Annotated[float, Field(ge=0, le=45)] = 0.0
+    """How far askew the cloth may lie at the start, one standard deviation; 0: not at all. Fits find it."""
+    laid_shape_m: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """How uneven: of the height of each of nine waves."""
 
     @model_validator(mode="after")
     def _is_grasped_once(self) -> GridScenario:
@@ -114,7 +119,7 @@ def grid_scenario(options: GridScenario) -> Scenario:
     grippers = {name: _named_nodes(options, nodes) for name, nodes in named.items()}
     grasped = [*chain.from_iterable(grippers.values())]
     extent = 2.0 * max(options.size_m) + options.reach
-    return assemble(
+    scenario = assemble(
         options,
         mesh,
         (rectangle_surface(options.center_m, (extent, extent), options.table_height_m),),
@@ -122,6 +127,8 @@ def grid_scenario(options: GridScenario) -> Scenario:
         held=_named_nodes(options, options.held),
         loss_faces=_half(mesh, grasped) if options.loss_surface == "grasped_half" else None,
     )
+    laid = {"turn": math.radians(options.laid_turn_deg), "shape": options.laid_shape_m}
+    return replace(scenario, laid={name: deviation for name, deviation in laid.items() if deviation})
 
 
 def _named_nodes(options: GridScenario, names: Sequence[str | int]) -> list[int]:

@@ -51,6 +51,9 @@ class Scenario:
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Overrides of the parameters' own bounds."""
     recorder: Recorder = "depth_cameras"
+    laid: Mapping[str, float] = field(default_factory=dict)
+    """How far the cloth may lie off where the scene has it at the start, for fits to find: `turn` [rad] and `shape` [m]
+    (`fit.laid`) -> standard deviation."""
 
     @property
     def steps(self) -> int:
