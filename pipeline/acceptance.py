@@ -21,6 +21,7 @@ from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
 from diffcloud.io.files import files_in, write_bytes, write_text
 from diffcloud.io.imports import release_episodes
 from diffcloud.scene.scenarios import PAPER_THRESHOLD, load_scenario
+from diffcloud.sim.properties import one_set
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.threads import use_threads
 from pipeline.bench import (
@@ -182,7 +183,7 @@ def _simulated_clouds(release: Path) -> str:
         scenario = load_scenario(name, _scene(release, name))
         system, _ = scenario.scene.build()
         truth = episode.meta["truth"]
-        tensors = {key: torch.tensor([value], dtype=torch.float64) for key, value in truth.items()}
+        tensors = one_set(truth)
         # file j is the state after j steps (PHYSICS: experiments)
         steps = min(episode.frame_count - 1, scenario.steps)
         sampler = SurfaceSampler.build(
@@ -254,7 +255,7 @@ def _trajectories(release: Path, reference: Path) -> str:
         with np.load(path, allow_pickle=False) as run:
             nodes = run["verts"]
             values = {"stretch": float(run["stretch_mult"]), "mass": float(run["mass_mult"])}
-        tensors = {key: torch.tensor([value], dtype=torch.float64) for key, value in values.items()}
+        tensors = one_set(values)
         with torch.no_grad():
             found = rollout(system, len(nodes) - 1, properties=scenario.properties(system, tensors))
         distance = np.linalg.norm(found.positions[0].numpy() - nodes, axis=-1)

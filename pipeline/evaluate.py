@@ -24,7 +24,7 @@ from diffcloud.fit.record import FitRecord
 from diffcloud.fit.result import describe_recording
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import claimed, files_in, together, write_json, write_text
-from diffcloud.sim.properties import check_values
+from diffcloud.sim.properties import check_values, one_set
 from diffcloud.sim.threads import use_threads
 from pipeline.comparison import Comparison, compare, comparison_jobs, write_tables
 from pipeline.config import Config, load_config
@@ -79,7 +79,7 @@ def loss(
     values |= assignments(set_, "--set")
     check_values(values, "--set")
     chosen.check_parameters(values)
-    tensors = {name: torch.tensor([value], dtype=torch.float64) for name, value in {**values, **laid}.items()}
+    tensors = one_set({**values, **laid})
     with torch.no_grad():
         found = describe_recording(objective, objective.simulate_to_loss(tensors), episode.stem)
     if not json:

@@ -25,6 +25,7 @@ from diffcloud.scene.scenarios.layout import find_layout
 from diffcloud.sensing.calibration.checkerboard import rigid_motion
 from diffcloud.sensing.cameras import inverse, transform
 from diffcloud.sensing.recorder import Truth, read_truth
+from diffcloud.sim.properties import one_set
 from pipeline.config import EpisodesConfig, FitConfig
 from pipeline.fit_jobs import FitJob, Recording
 from pipeline.scenario_options import scenario_options
@@ -81,9 +82,8 @@ class PoseJob:
             outcome = solve(objective, job.space, config.solver_settings(scenario))
             if outcome.stop_reason == "interrupted":
                 raise KeyboardInterrupt
-            values = {name: torch.tensor([value], dtype=torch.float64) for name, value in outcome.values.items()}
             with torch.no_grad():
-                run = objective.simulate_to_loss(values)
+                run = objective.simulate_to_loss(one_set(outcome.values))
             recording = describe_recording(objective, run, self.label)
             space, pose = recorded_pose(recording, length_unit_m=scenario.length_unit_m)
             moved = space.moved(run.positions[:, 0], pose)[0].numpy()

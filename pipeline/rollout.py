@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +21,7 @@ from diffcloud.io.files import together, write_npz
 from diffcloud.io.obj import write_cloth, write_surface
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.sim.moved import moved_surfaces
-from diffcloud.sim.properties import check_values
+from diffcloud.sim.properties import check_values, one_set
 from diffcloud.sim.simulate import rollout as simulate
 from pipeline.console import JsonFlag, assignments, errors, finish, progress_bar, warn, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario, limits
@@ -62,9 +62,9 @@ def rollout(
     frames = frames or chosen.frames
     steps = frames * chosen.scene.frame_steps
     system, _ = chosen.scene.build()
-    properties = chosen.properties(system, _tensors(values))
+    properties = chosen.properties(system, one_set(values))
     recording = None if fitted is None else _recording(fitted.episodes, chosen.name, episode)
-    start = None if fitted is None or recording is None else start_of(system, _tensors(fitted.laid))
+    start = None if fitted is None or recording is None else start_of(system, one_set(fitted.laid))
     track, warnings = None, limits(chosen)
     if episode is not None:
         recorded = read_episode(episode)
@@ -135,11 +135,6 @@ def _not_simulated(recorded: Episode, end_s: float, frame_s: float) -> list[str]
     )
     warn(message)
     return [message]
-
-
-def _tensors(values: Mapping[str, float]) -> dict[str, torch.Tensor]:
-    """Of one parameter set."""
-    return {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
 
 
 def _recording(known: Sequence[RecordingFit], scenario: str, episode: Path | None) -> RecordingFit | None:

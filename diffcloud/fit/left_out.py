@@ -10,6 +10,7 @@ from diffcloud.fit.joint import JointObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.record import LeftOut
 from diffcloud.fit.solvers import GaussNewtonSettings, Progress, fit_gauss_newton
+from diffcloud.sim.properties import one_set
 
 _STEPS = 10
 
@@ -39,6 +40,6 @@ def leave_each_out(
             raise KeyboardInterrupt
         parameters = found.values | dict(space.fixed)
         with torch.no_grad():
-            loss = float(member({name: torch.tensor([value]).double() for name, value in parameters.items()}))
+            loss = float(member(one_set(parameters)))
         told.append(LeftOut(loss=loss, rms_mm=1e3 * member.scenario.length_unit_m * loss**0.5, parameters=parameters))
     return told

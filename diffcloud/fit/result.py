@@ -26,7 +26,7 @@ from diffcloud.io.arrays import read_npz
 from diffcloud.io.files import together, write_json, write_npz
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim.properties import PARAMETERS
+from diffcloud.sim.properties import PARAMETERS, one_set
 from diffcloud.sim.simulate import Rollout
 
 _AT_BOUND = 0.01
@@ -89,9 +89,7 @@ def whole_material(scenario: Scenario, values: Mapping[str, float]) -> WholeMate
     """The material of the scenario with parameters of these values; what they leave out is the basis material's."""
     material = scenario.scene.material
     system, _ = scenario.scene.build()
-    changed = scenario.properties(
-        system, {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
-    )
+    changed = scenario.properties(system, one_set(values))
     stretching, bending = float(changed.stretching.mean()), float(changed.bending.mean())
     return WholeMaterial(
         density=float(changed.node_mass.sum()) / float(scenario.scene.mesh.face_area.sum()),
@@ -314,7 +312,7 @@ def _fitted_motion(objective: Objective, run: Rollout, pose: Tensor, start_value
 
 
 def _motion(objective: Objective, values: Mapping[str, float]) -> Rollout:
-    return objective.simulate({name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()})
+    return objective.simulate(one_set(values))
 
 
 def _parameters(scenario: Scenario, space: FitSpace, values: Mapping[str, float]) -> dict[str, FittedParameter]:

@@ -39,6 +39,7 @@ from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.pose import NUISANCE, SET_UP, set_up_of, unit_of
 from diffcloud.fit.residuals import Axis, moved_by
 from diffcloud.fit.targets import track_displacement
+from diffcloud.sim.properties import one_set
 from diffcloud.sim.simulate import Rollout, rollout
 from diffcloud.sim.threads import map_threads
 
@@ -161,7 +162,7 @@ def refined_distance_mm(objective: AnyObjective, values: Mapping[str, float]) ->
     Raises:
         DivergedError: a motion diverges.
     """
-    parameters = {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
+    parameters = one_set(values)
 
     def told(member: Objective) -> tuple[float, float]:
         apart = _refined(member, parameters, member.simulate_to_loss(parameters)).square().sum(-1).mean().sqrt()

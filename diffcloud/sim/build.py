@@ -9,7 +9,7 @@ from diffcloud.errors import SceneError
 from diffcloud.mesh.topology import ClothMesh
 from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import Material
-from diffcloud.sim.properties import Properties
+from diffcloud.sim.properties import Properties, one_set
 from diffcloud.sim.rigid.bodies import Bodies
 from diffcloud.sim.surrounding import Integrator, Order, Surrounding
 from diffcloud.sim.system import System
@@ -58,15 +58,14 @@ def build_system(
         stretching=torch.ones(1, len(mesh.faces), dtype=torch.float64),
         bending=torch.ones(1, len(mesh.hinges.length), dtype=torch.float64),
         body_mass=torch.as_tensor(np.asarray(bodies.mass, dtype=np.float64))[None],
-        **{
-            name: torch.tensor([value], dtype=torch.float64)
-            for name, value in (
-                ("damping", material.damping),
-                ("air_density", surrounding.air_density),
-                ("air_drag", surrounding.air_drag),
-                ("friction_obstacle", surrounding.friction_obstacle),
-                ("friction_cloth", surrounding.friction_cloth),
-            )
-        },
+        **one_set(
+            {
+                "damping": material.damping,
+                "air_density": surrounding.air_density,
+                "air_drag": surrounding.air_drag,
+                "friction_obstacle": surrounding.friction_obstacle,
+                "friction_cloth": surrounding.friction_cloth,
+            }
+        ),
     )
     return System(Setup(mesh, material, surrounding, handles, bodies, integrator, order, shaped), time_step, properties)

@@ -134,6 +134,11 @@ def check_values(values: Mapping[str, float], option: str) -> None:
         PARAMETERS[name].check(value, f"{option} {name}")
 
 
+def one_set(values: Mapping[str, float]) -> dict[str, Tensor]:
+    """Values of one parameter set as a batch takes them: name -> [1]."""
+    return {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
+
+
 def scaled_properties(
     base: Properties,
     values: Mapping[str, Tensor],

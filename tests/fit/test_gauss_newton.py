@@ -13,7 +13,9 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.errors import DivergedError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton, residuals
 from diffcloud.fit.batches import batch_losses
+from diffcloud.fit.doubts import MATERIAL_DOUBTS, with_doubts
 from diffcloud.fit.residuals import Axis, linearise
+from diffcloud.scene import load_scenario
 from tests.conftest import paper_objective, small_lift
 from tests.fit.test_fit import GENTLE, clouds_of
 
@@ -223,6 +225,20 @@ class TestFits:
         assert bool(starts.all())
         assert parts[-5:] == [0.5, 0.75, 0.4, 0.6, 0.8]
         assert found.values["stretch"] / found.values["mass"] == pytest.approx(TRUTH["stretch"] / TRUTH["mass"], rel=0.05)
+
+    @pytest.mark.slow
+    def test_a_fold_that_goes_astray_is_found_from_its_beginning(self):
+        """A heavy cloth folds over in another way than the nearest minimum has it."""
+        scenario, truth = load_scenario("fold"), {"stretch": 1.0, "mass": 2.5}
+        objective = Objective(scenario, clouds_of(scenario, points=1500, **truth), nuisance={})
+        space = FitSpace.build(["stretch"], bounds=scenario.bounds, fixed={"mass": truth["mass"]})
+        space = with_doubts(space, MATERIAL_DOUBTS, [scenario])
+        direct = fit_gauss_newton(objective, space, GaussNewtonSettings(starts=1))
+        assert direct.loss > 2 * objective.explained
+        found = fit_gauss_newton(objective, space, GaussNewtonSettings())
+        assert found.best_start == 1
+        assert found.loss < objective.explained
+        assert found.values["stretch"] == pytest.approx(truth["stretch"], rel=0.01)
 
     def test_the_truth_explains_a_recording_and_others_do_not(self):
         objective = lifted(nuisance={})
