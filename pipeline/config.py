@@ -191,8 +191,8 @@ class FitConfig(Section):
     iterations: Count | None = None
     """Of gauss_newton and adam: steps at most; by default 20 and 50."""
     starts: Count | None = None
-    """Of gauss_newton (at most) and adam: number of descents, from different places; by default 8 (3
-    with the linearised integrator) and 1."""
+    """Of gauss_newton (at most) and adam: number of descents, from different places; by default 8 (3 with the linearised
+    integrator) and 1. Only by default does gauss_newton also let the recording grow, and search."""
     screen: CountOrNone | None = None
     """Of gauss_newton and adam: candidates simulated once to choose the starts from; by default 24 of gauss_newton (96 with
     the linearised integrator), none of adam, whose further starts are then spread over the box."""
@@ -218,8 +218,8 @@ class FitConfig(Section):
     """Which parts of the pose are fitted too, and how far off each may well be: "x=0.1m,y=0.1m,yaw=30deg", or "none". If
     not given, all of them, as `fit.pose.default_priors` says."""
     laid: Name | None = None
-    """How a cloth may lie at the start, other than its scenario has it, and how far off: "turn=5deg,shape=5mm", or "none"
-    (`fit.laid`). Default: what the scenario says, in fits of one recording by gauss_newton; else none."""
+    """How the cloth may lie at the start, other than as its scenario has it, and how far off: "turn=5deg,shape=5mm", or
+    "none" (`fit.laid`). Default: what the scenario says, in implicit fits of one recording by gauss_newton; else none."""
     prior: Name | None = None
     """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""
     doubts: Name | None = None
@@ -262,7 +262,7 @@ class FitConfig(Section):
         """Material that is not known exactly in a fit of recordings in these scenarios -> factor of one deviation."""
         if self.doubts is not None:
             return parse_doubts(self.doubts)
-        if self.paper or self.solver != "gauss_newton" or any(one.scene.integrator != "implicit" for one in scenarios):
+        if not self._knows_little(scenarios):
             return {}
         return {name: factor for name, factor in MATERIAL_DOUBTS.items() if name not in {*self.parameters, *self.fixed}}
 
@@ -270,8 +270,13 @@ class FitConfig(Section):
         """How the cloth may lie otherwise at the start, in fits of recordings in these scenarios -> standard deviation."""
         if self.laid is not None:
             return parse_laid(self.laid)
-        alone = len(scenarios) == 1 and self.solver == "gauss_newton" and not self.paper
+        alone = len(scenarios) == 1 and self._knows_little(scenarios)
         return dict(scenarios[0].laid) if alone else {}
+
+    def _knows_little(self, scenarios: Sequence[Scenario]) -> bool:
+        """Whether more than what is asked for is fitted by default: where derivatives make that cheap."""
+        implicit = all(one.scene.integrator == "implicit" for one in scenarios)
+        return not self.paper and self.solver == "gauss_newton" and implicit
 
     def solver_settings(self, scenario: Scenario) -> Settings:
         """Of the solver, with what the scenario says where nothing is given."""

@@ -73,8 +73,8 @@ class PoseJob:
         for place, (start, nuisance) in enumerate(every):
             tell(place / len(every), f"{start}, {nuisance}")
             scenario = laid(self.scenario, episode) if start == STARTS[2] else self.scenario
-            turned = {"laid": _TURN} if start == STARTS[1] else {}
-            told = {"parameters": ["stretch"], "fixed": {"mass": hidden["mass"]}, "nuisance": nuisance, **turned}
+            turned = _TURN if start == STARTS[1] else "none"
+            told = {"parameters": ["stretch"], "fixed": {"mass": hidden["mass"]}, "nuisance": nuisance, "laid": turned}
             config = self.config.model_copy(update=told)
             job = FitJob(self.label, [Recording(scenario, self.label, episode)], config, self.folder)
             objective = job.objective()

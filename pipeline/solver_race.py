@@ -79,7 +79,7 @@ class RaceJob:
             return kept
         truth = self.truth()
         recording = Recording(self.scenario, self.label, self._episode(truth))
-        job = FitJob(self.label, [recording], FitConfig(parameters=self.names, doubts="none"), self.out)
+        job = FitJob(self.label, [recording], FitConfig(parameters=self.names, doubts="none", laid="none"), self.out)
         objective, space = job.objective(), job.space
         tell(0.0, "reference")
         wide = GaussNewtonSettings(starts=6, screen=96, scans=3, seed=self.seed)

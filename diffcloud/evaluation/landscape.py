@@ -37,6 +37,9 @@ def loss_landscape(
     losses = batch_losses(objective, space, torch.as_tensor(places).double()).reshape(size, size)
     columns = [history.names.index(variable.name) for variable in (first, second)]
     paths = np.array(history.values, dtype=np.float64)[:, :, columns]  # [N, B, 2]; None is NaN
+    paths[np.isnan(np.array(history.loss, dtype=np.float64))] = (
+        np.nan
+    )  # of a start that waits for its turn, or has diverged
     return {
         "names": [first.name, second.name],
         "x": axes[0].tolist(),

@@ -369,13 +369,14 @@ class Objective:
         return other
 
     def until(self, part: float) -> Objective:
-        """The same on this part of its compared frames, from the first one on, but a few at least."""
+        """The same on this part of its compared frames, the earliest ones, but a few at least."""
         other = copy(self)
         kept = max(math.ceil(part * len(self.frames)), min(_FEW, len(self.frames)))
-        other._target = self._target.at(range(kept))
+        chosen = sorted(self.times.argsort(stable=True)[:kept].tolist())
+        other._target = self._target.at(chosen)
         if not self.paper:
             points, sure = self._recorded
-            other._recorded = points[:kept], sure[:kept]
+            other._recorded = points[chosen], sure[chosen]
         other.loss_steps = other._steps_to_loss()
         return other
 

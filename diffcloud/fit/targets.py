@@ -80,15 +80,16 @@ class Target:
 
     def at(self, chosen: Sequence[int]) -> Target:
         """The same with some of its frames, by their places among these."""
-        if list(chosen) == list(range(len(self.frames))):  # lost pixels are many to copy
-            return self
+        chosen = list(chosen)
+        first = chosen == list(range(len(chosen)))
+        index = slice(len(chosen)) if first else chosen  # a slice is a view: lost pixels are many to copy
         return replace(
             self,
-            frames=tuple(self.frames[index] for index in chosen),
-            times=self.times[list(chosen)],
-            clouds=tuple(self.clouds[index] for index in chosen),
-            sure=tuple(self.sure[index] for index in chosen),
-            lost=tuple(replace(one, pixels=one.pixels[list(chosen)]) for one in self.lost),
+            frames=tuple(self.frames[one] for one in chosen),
+            times=self.times[index],
+            clouds=tuple(self.clouds[one] for one in chosen),
+            sure=tuple(self.sure[one] for one in chosen),
+            lost=tuple(replace(one, pixels=one.pixels[index]) for one in self.lost),
         )
 
 

@@ -22,7 +22,7 @@ class Bowl:
     target: dict[str, float] = field(default_factory=lambda: {"stretch": 0.7, "mass": 2.0})
     diverges_above: float = float("inf")
     length_unit_m: float = 1.0
-    members: tuple[None, ...] = (None,)
+    members: tuple[SimpleNamespace, ...] = (SimpleNamespace(frames=(0,)),)
     paper: bool = False
     explained: float = 0.0
     knows_gaps: bool = False
@@ -30,6 +30,9 @@ class Bowl:
 
     def __post_init__(self) -> None:
         self.system = SimpleNamespace(gravity=torch.zeros(3).double(), device=torch.device("cpu"), dtype=torch.float64)
+
+    def until(self, part: float) -> Bowl:
+        return self  # a single frame
 
     def reseed(self, seed: int) -> None:
         pass

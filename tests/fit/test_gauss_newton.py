@@ -14,7 +14,8 @@ from diffcloud.errors import DivergedError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton, residuals
 from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.doubts import MATERIAL_DOUBTS, with_doubts
-from diffcloud.fit.residuals import Axis, linearise
+from diffcloud.fit.residuals import Axis, Linearisation, linearise
+from diffcloud.fit.solvers import gauss_newton
 from diffcloud.scene import load_scenario
 from tests.conftest import paper_objective, small_lift
 from tests.fit.test_fit import GENTLE, clouds_of
@@ -223,8 +224,41 @@ class TestFits:
             return
         assert len(starts) == 4
         assert bool(starts.all())
-        assert parts[-5:] == [0.5, 0.75, 0.4, 0.6, 0.8]
+        assert parts == [0.5, 0.75, 0.4, 0.6, 0.8]
         assert found.values["stretch"] / found.values["mass"] == pytest.approx(TRUTH["stretch"] / TRUTH["mass"], rel=0.05)
+
+    @pytest.mark.parametrize(("count", "stages"), [(6, [[5, 6]]), (7, [[5, 6, 7]]), (12, [[6, 9, 12], [5, 8, 10, 12]])])
+    def test_a_recording_of_few_frames_grows_in_fewer_steps(self, count, stages):
+        objective = lifted(nuisance={}, frames=range(1, count + 1))
+        assert [[len(one.frames) for one in growth] for growth in gauss_newton._growths(objective)] == stages
+
+    def test_ends_are_equal_only_if_they_come_from_different_candidates(self):
+        """One candidate's own two descents, from the whole recording and from its beginning, are no two witnesses."""
+        place = torch.zeros(1, dtype=torch.float64)
+        found = Linearisation(torch.ones(1).double(), torch.zeros(1, 1).double(), torch.eye(1).double()[None], 1)
+        ways = gauss_newton._Ways([], 3, torch.zeros(1, dtype=torch.bool))
+        for origin in (0, 0):
+            ways.begin(gauss_newton._Start(place, origin), place, found)
+        assert not ways.enough(0.5, 0.0)
+        ways.begin(gauss_newton._Start(place, 1), place, found)
+        assert ways.enough(0.5, 0.0)
+        assert not ways.enough(0.5, 2.0)  # where it is known that so high a loss is wrong
+
+    def test_a_start_that_grows_tells_of_its_progress(self, monkeypatch):
+        """So that Ctrl-C ends it, also in a worker."""
+        monkeypatch.setattr(Objective, "knows_gaps", True)
+        objective = lifted(nuisance={})
+        monkeypatch.setattr(Objective, "explained", 0.5 * objective.explained)
+        told = []
+
+        def interrupt(progress):
+            told.append(progress.iteration)
+            if told.count(progress.iteration) == 3:
+                raise KeyboardInterrupt
+
+        found = fit_gauss_newton(objective, SPACE, GaussNewtonSettings(screen=7), progress=interrupt)
+        assert found.stop_reason == "interrupted"
+        assert found.loss == float(found.history.losses[-1].min())
 
     @pytest.mark.slow
     def test_a_fold_that_goes_astray_is_found_from_its_beginning(self):

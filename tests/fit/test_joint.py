@@ -16,6 +16,7 @@ from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objecti
 from diffcloud.fit.joint import mean_loss, mean_terms
 from diffcloud.fit.left_out import leave_each_out
 from diffcloud.fit.residuals import Axis, linearise
+from diffcloud.sim.properties import one_set
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.threads import map_threads, use_threads
 from tests.conftest import paper_objective, small_lift
@@ -79,8 +80,7 @@ class TestFit:
             # a single motion tells the ratio; how heavy the cloth is, it hardly tells
             ratio = one.parameters["stretch"] / one.parameters["mass"]
             assert ratio == pytest.approx(TRUTH["stretch"] / TRUTH["mass"], rel=0.1)
-            value = {name: torch.tensor([v]).double() for name, v in one.parameters.items()}
-            assert one.loss == pytest.approx(float(member(value)), rel=1e-9)
+            assert one.loss == pytest.approx(float(member(one_set(one.parameters))), rel=1e-9)
 
     def test_what_is_left_out_has_no_say(self):
         """Recordings of two cloths: each is predicted with the parameters of the other."""

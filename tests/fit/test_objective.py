@@ -163,6 +163,8 @@ class TestWhatCounts:
         torch.testing.assert_close(part, full[:, :kept])
         assert len(whole.until(0.01).frames) == 5  # fewer do not tell how a cloth lies
         assert whole.until(1.0).frames == whole.frames
+        backwards = Objective(scenario, episode, nuisance={}, frames=[-1, 5, 4, 3, 2, 1]).until(0.5)
+        assert backwards.frames == (5, 4, 3, 2, 1)  # as they were named
         both = JointObjective([whole, whole]).until(0.5)
         assert [one.frames for one in both.members] == [early.frames] * 2
 

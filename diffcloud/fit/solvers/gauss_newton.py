@@ -47,12 +47,12 @@ _SMALLEST_DECREASE = 1e-4
 _SAME = 0.02
 """A start that comes as close to a better one, on the axis, leaves the rest of the way to it."""
 _MOST = 8
-"""Starts, unless fewer are enough."""
+"""Candidates that are followed, unless fewer are enough."""
 _BEFORE, _SEARCHED = 3, 64
-"""The best candidates that are starts before a search is made for the next, and its candidates."""
+"""Candidates that are followed before a search looks for one more start, and how many places that search simulates."""
 _GROWING, _DRAWN = ((0.5, 0.75), (0.4, 0.6, 0.8)), 16
-"""Parts of the frames over which a recording grows, for each start that is found so, and places drawn before each next one:
-where one of them goes astray at the end, another seldom does."""
+"""For each start that is found so, the parts of the frames over which the recording grows; and how many places are drawn
+before each next part. Where one of them goes astray at the end, the other seldom does."""
 _MISFIT = 30.0
 """Times what explains a recording; above that, it is the model that does not: no start will."""
 _EQUALLY = 1.01
@@ -74,8 +74,8 @@ class GaussNewtonSettings:
     screen: int = 24
     """Candidates beside the first that are simulated once, without derivatives; 0: the starts are taken unseen."""
     starts: int | None = None
-    """The best of them, followed one after the other as far as it takes; by default 8, and one that a
-    search finds."""
+    """The best of them, followed one after the other as far as it takes; by default 8, two found by letting the recording
+    grow, and one that a search finds."""
     seed: int = 0
     """Of the candidates."""
     init: Mapping[str, float] = field(default_factory=dict)
@@ -104,13 +104,20 @@ def fit_gauss_newton(
     places, simulations = _starts(objective, space, settings, axis, most)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
-    waiting = [_Start(place) for place in places]
+    waiting = [_Start(place, origin) for origin, place in enumerate(places)]
+
+    def tell() -> None:
+        if progress is not None:
+            values = dict(zip(space.names, axis.bounded(ways.best.place).tolist(), strict=True))
+            progress(Progress(len(history.losses) - 1, ways.best.loss, ways.best.loss, values))
+
     if settings.starts is None:
-        waiting.insert(_BEFORE, _Start(places[0], lambda: _searched(objective, space, ways.best, settings.seed, axis)))
-        for parts in reversed(_GROWING):
-            if _frames(objective.until(parts[0])) < _frames(objective):
-                grown = partial(_grown, objective, space, places[0], parts, settings, axis)
-                waiting.insert(1, _Start(places[0], grown))
+        search = _Start(places[0], -1, lambda: _searched(objective, space, ways.best, settings.seed, axis, tell))
+        waiting.insert(_BEFORE, search)
+        best = 1 if settings.init else 0  # of the screen; a first start that was given says little
+        for stages in reversed(_growths(objective)):
+            grown = partial(_grown, stages, space, places[best], settings, axis, tell)
+            waiting.insert(best + 1, _Start(places[best], best, grown))
     scans, looked, ways = 0, None, _Ways(waiting, settings.iterations, _laid(space))
     try:
         while True:
@@ -121,10 +128,11 @@ def fit_gauss_newton(
                 simulations += found.simulations
                 ways.judge(way, tried, found)
             elif ways.waiting and not ways.enough(explained, wrong):
-                place, spent = ways.waiting.pop(0).found()
+                start = ways.waiting.pop(0)
+                place, spent = start.found()
                 found = linearise(objective, space, place[None])
                 simulations += spent + found.simulations
-                ways.begin(place, found)
+                ways.begin(start, place, found)
             else:
                 reason = ways.best.end or reason
                 if scans == settings.scans or reason == "iterations":
@@ -142,11 +150,9 @@ def fit_gauss_newton(
             if not math.isfinite(ways.best.loss):
                 if ways.waiting:
                     continue
-                raise DivergedError(0, [], f"all {len(places)} starts diverged")
+                raise DivergedError(0, [], f"all {len(ways.every)} starts diverged")
             _remember(history, ways, axis)
-            if progress is not None:
-                values = dict(zip(space.names, axis.bounded(ways.best.place).tolist(), strict=True))
-                progress(Progress(len(history.losses) - 1, ways.best.loss, ways.best.loss, values))
+            tell()
             if ways.best.loss < settings.threshold:
                 reason = "threshold"
                 break
@@ -172,6 +178,8 @@ class _Start:
 
     place: Tensor
     """[k]; of one that is looked for when its turn comes, where that begins."""
+    origin: int
+    """The candidate that it comes from; -1: none."""
     look: Callable[[], tuple[Tensor, int]] | None = None
 
     def found(self) -> tuple[Tensor, int]:
@@ -182,14 +190,18 @@ class _Start:
 class _Way:
     """From one start, at its lowest place so far."""
 
-    def __init__(self, place: Tensor, found: Linearisation, steps: int, held: Tensor | None = None) -> None:
+    def __init__(
+        self, place: Tensor, found: Linearisation, steps: int, origin: int = -1, held: Tensor | None = None
+    ) -> None:
         """
         Args:
             place: [k]
             found: there.
             steps: it may take.
+            origin: of its start.
             held: bool [k] what stays until it has arrived; then it goes on with all free, and as many steps again.
         """
+        self.origin = origin
         self._take(place, found)
         self._most, self._held = steps, held
         self._begin()
@@ -274,12 +286,12 @@ class _Ways:
         that explain nothing, up to this loss."""
         if not self.every or not math.isfinite(self.best.loss):
             return False
-        equal = sum(way.loss <= _EQUALLY * self.best.loss for way in self.every) > 1
+        equal = len({way.origin for way in self.every if way.loss <= _EQUALLY * self.best.loss}) > 1
         return self.best.loss <= explained or (equal and self.best.loss > wrong)
 
-    def begin(self, place: Tensor, found: Linearisation) -> None:
-        """A start, with what was found there."""
-        self.every.append(_Way(place, found, self._steps, None if self.every else self._held))
+    def begin(self, start: _Start, place: Tensor, found: Linearisation) -> None:
+        """A start, at its place [k], with what was found there."""
+        self.every.append(_Way(place, found, self._steps, start.origin, None if self.every else self._held))
 
     def judge(self, way: _Way, tried: Tensor, found: Linearisation) -> None:
         """As of the way; one that comes close to a better one leaves it the rest."""
@@ -289,7 +301,7 @@ class _Ways:
 
     def go_on(self, place: Tensor, found: Linearisation) -> None:
         """From a lower place [k] than the best one's."""
-        self.every[self.every.index(self.best)] = _Way(place, found, self._steps)
+        self.every[self.every.index(self.best)] = _Way(place, found, self._steps, self.best.origin)
 
 
 def _starts(
@@ -309,7 +321,9 @@ def _starts(
     return axis.places(values[order[:most]]), count * len(objective.members)
 
 
-def _searched(objective: AnyObjective, space: FitSpace, best: _Way, seed: int, axis: Axis) -> tuple[Tensor, int]:
+def _searched(
+    objective: AnyObjective, space: FitSpace, best: _Way, seed: int, axis: Axis, tell: Callable[[], None]
+) -> tuple[Tensor, int]:
     """The place [k] that a search from the best one over what is asked for ends at, doubtful material as it is known; and
     how many simulations it took.
 
@@ -320,44 +334,56 @@ def _searched(objective: AnyObjective, space: FitSpace, best: _Way, seed: int, a
     values = dict(zip(space.names, axis.bounded(best.place).tolist(), strict=True))
     budget = _SEARCHED * len(objective.members)
     init = {name: values[name] for name in asked.names}
-    found = fit_cma_es(objective, asked, CmaEsSettings(simulations=budget, seed=seed, init=init))
+    settings = CmaEsSettings(simulations=budget, seed=seed, init=init)
+    found = fit_cma_es(objective, asked, settings, progress=lambda _: tell())
     if found.stop_reason == "interrupted":
         raise KeyboardInterrupt
     whole = {**asked.fixed, **found.values}
     return axis.places(torch.tensor([whole[name] for name in space.names], dtype=torch.float64)), found.simulations
 
 
+def _growths(objective: AnyObjective) -> list[list[AnyObjective]]:
+    """For each of `_GROWING`, the recordings as they grow, up to the whole; none where there are too few frames."""
+    growths = dict[tuple[int, ...], list[AnyObjective]]()
+    for parts in _GROWING:
+        stages = {_frames(one): one for one in (*(objective.until(part) for part in parts), objective)}
+        if len(stages) > 1:
+            growths.setdefault(tuple(stages), list(stages.values()))
+    return list(growths.values())
+
+
 def _grown(
-    objective: AnyObjective,
+    stages: Sequence[AnyObjective],
     space: FitSpace,
     place: Tensor,
-    parts: Sequence[float],
     settings: GaussNewtonSettings,
     axis: Axis,
+    tell: Callable[[], None],
 ) -> tuple[Tensor, int]:
     """The place [k] that a descent from this one comes to on the first frames alone, then on more of them; and how many
     simulations it took. What a cloth does early, before it has folded over or touched something, depends on the parameters
-    in a simple way: there, far fewer minima are wrong. Between two parts, it goes on from the best of some places drawn
+    in a simple way: there, far fewer minima are wrong. Between two stages, it goes on from the best of some places drawn
     from what the frames so far leave open: the next ones may tell between them.
 
     Args:
+        stages: the recordings as they grow; on the last one, the whole, the descent is the caller's.
         place: [k]
-        parts: of the frames, the first one first.
     """
     generator, simulations = torch.Generator().manual_seed(settings.seed), 0
-    for early, later in pairwise((*(objective.until(part) for part in parts), objective)):
+    for early, later in pairwise(stages):
         found = linearise(early, space, place[None])
         way, simulations = _Way(place, found, settings.iterations), simulations + found.simulations
         while way.end is None:
+            tell()
             tried = way.propose(*axis.ends)
             found = linearise(early, space, tried[None])
             simulations += found.simulations
             way.judge(tried, found)
         if not math.isfinite(way.loss):
             break
-        places = torch.cat([way.place[None], _drawn(way, len(objective.members), axis, generator)])
+        places = torch.cat([way.place[None], _drawn(way, len(early.members), axis, generator)])
         losses = batch_losses(later, space, axis.bounded(places))
-        place, simulations = places[losses.argmin()], simulations + len(places) * len(objective.members)
+        place, simulations = places[losses.argmin()], simulations + len(places) * len(early.members)
     return place, simulations
 
 

@@ -55,7 +55,7 @@ class GridScenario(ScenarioOptions):
     laid_turn_deg: Annotated[float, Field(ge=0, le=45)] = 0.0
     """How far askew the cloth may lie at the start, one standard deviation; 0: not at all. Fits find it."""
     laid_shape_m: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """How uneven: of the height of each of nine waves."""
+    """How uneven: one standard deviation of the height of each of nine waves."""
 
     @model_validator(mode="after")
     def _is_grasped_once(self) -> GridScenario:

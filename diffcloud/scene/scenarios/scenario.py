@@ -52,7 +52,7 @@ class Scenario:
     """Overrides of the parameters' own bounds."""
     recorder: Recorder = "depth_cameras"
     laid: Mapping[str, float] = field(default_factory=dict)
-    """How far the cloth may lie off where the scene has it at the start, for fits to find: `turn` [rad] and `shape` [m]
+    """How far from its place in the scene the cloth may lie at the start, which fits find: `turn` [rad] and `shape` [m]
     (`fit.laid`) -> standard deviation."""
 
     @property
