@@ -390,7 +390,7 @@ def _grown(
 def _drawn(way: _Way, recordings: int, axis: Axis, generator: torch.Generator) -> Tensor:
     """[n, k] places drawn from what a way's end says of all variables (`fit.priors`: the logarithm of the loss)."""
     spread, axes = torch.linalg.eigh(way.normal)
-    reach = (way.loss / (INDEPENDENT * recordings * spread.clamp(min=1e-9 * float(spread[-1])))).sqrt()
+    reach = (way.loss / (INDEPENDENT * recordings * spread.clamp(min=max(1e-9 * float(spread[-1]), 1e-300)))).sqrt()
     normal = torch.randn(_DRAWN, len(reach), generator=generator, dtype=torch.float64)
     low, high = axis.ends
     return torch.minimum(torch.maximum(way.place + normal * reach @ axes.T, low), high)
