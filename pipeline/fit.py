@@ -68,8 +68,8 @@ def fit(
     starts: Annotated[
         int | None,
         typer.Option(
-            help="Descents from as many places. Default of gauss_newton: up to 8, two more that grow with the recording "
-            "and one from a search; a given number follows only the best candidates. Of adam: 1."
+            help="Descents from as many places; of gauss_newton at most, from the best candidates only. Default of "
+            "gauss_newton: 8, two that grow with the recording, and one from a search (linearised: 3, and no others); of adam: 1."
         ),
     ] = None,
     screen: Annotated[
