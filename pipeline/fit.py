@@ -69,7 +69,8 @@ def fit(
         int | None,
         typer.Option(
             help="Descents from as many places; of gauss_newton at most, from the best candidates only. Default of "
-            "gauss_newton: 8, two that grow with the recording, and one from a search (linearised: 3, and no others); of adam: 1."
+            "gauss_newton: 8, two that grow with the recording, and one from a search (linearised: 3, and no others); of "
+            "adam: 1."
         ),
     ] = None,
     screen: Annotated[
