@@ -25,7 +25,7 @@ def loss_landscape(
 
     Returns:
         names; x, y: [n] of the first and the second parameter; loss: [n][n], rows of y, None where a run diverged; paths:
-        for each start [iterations][2]; fitted: [2]. None if fewer than two were asked for.
+        for each start that was followed [iterations][2]; fitted: [2]. None if fewer than two were asked for.
     """
     if len(space.asked.variables) < 2:
         return None
@@ -36,15 +36,13 @@ def loss_landscape(
     places[:, 0], places[:, 1] = x.ravel(), y.ravel()
     losses = batch_losses(objective, space, torch.as_tensor(places).double()).reshape(size, size)
     columns = [history.names.index(variable.name) for variable in (first, second)]
-    paths = np.array(history.values, dtype=np.float64)[:, :, columns]  # [N, B, 2]; None is NaN
-    paths[np.isnan(np.array(history.loss, dtype=np.float64))] = (
-        np.nan
-    )  # of a start that waits for its turn, or has diverged
+    paths = np.array(history.values, dtype=np.float64)[:, :, columns].swapaxes(0, 1)  # [B, N, 2]; None is NaN
+    begun = np.isfinite(np.array(history.loss, dtype=np.float64)).T & np.isfinite(paths).all(-1)
     return {
         "names": [first.name, second.name],
         "x": axes[0].tolist(),
         "y": axes[1].tolist(),
         "loss": [[value if np.isfinite(value) else None for value in row] for row in losses.tolist()],
-        "paths": [path[np.isfinite(path).all(axis=1)].tolist() for path in paths.swapaxes(0, 1)],
+        "paths": [path[there].tolist() for path, there in zip(paths, begun, strict=True) if there.any()],
         "fitted": [values[first.name], values[second.name]],
     }

@@ -89,8 +89,10 @@ class TestMeter:
 
 def test_landscape_is_the_loss_on_a_grid(scenario, episode):
     objective, space = paper_objective(scenario, episode), FitSpace.build(["stretch", "mass"])
-    values = [[[1.0, 2.0], [None, None]], [[1.1, 2.1], [3.0, 3.0]]]
-    history = History(names=["stretch", "mass"], loss=[[1.0, None], [0.9, 0.8]], values=values, gradient_norm=[])
+    waiting = [5.0, 5.0]  # of a start that nobody followed
+    values = [[[1.0, 2.0], [None, None], waiting], [[1.1, 2.1], [3.0, 3.0], waiting]]
+    losses = [[1.0, None, None], [0.9, 0.8, None]]
+    history = History(names=["stretch", "mass"], loss=losses, values=values, gradient_norm=[])
     found = loss_landscape(objective, space, TRUTH, history, size=3)
     assert found["x"] == pytest.approx([0.1, 1.0, 10.0])
     with torch.no_grad():
