@@ -7,10 +7,10 @@ With half of the loss's slope g and of its curvature H on the axis of `residuals
 over the variables that no bound holds (Marquardt 1963; Madsen, Nielsen and Tingleff 2004, section 3.2). Each start keeps
 its own λ: it falls by how much of the predicted decrease a step brings, and grows, faster and faster, where it brings
 none. Starts are the best of a screen of candidates spread over the box, the best one first, and the rest stays where it is
-as soon as one explains the recording; where a right motion may have a higher loss, also as soon as two have ended equally
-low. If the first one does not, the next two are found by fitting the recording's beginning, then more and more of it. If
-the first three candidates do not, a derivative-free search from the best place over what is asked for finds the next. Then
-losses along the principal axes of the best place tell whether another minimum is lower nearby; from there it goes on.
+as soon as one explains the recording; where a right motion may have a higher loss, also as soon as two from different
+candidates have ended equally low. If the first one does not, the next two are found by fitting the recording's beginning,
+then more and more of it. If the first three candidates do not, a derivative-free search from the best place over what is
+asked for finds the next. Then losses along the principal axes of the best place tell whether another minimum is lower nearby; from there it goes on.
 """
 
 from __future__ import annotations
