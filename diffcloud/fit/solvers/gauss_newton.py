@@ -10,7 +10,8 @@ none. Starts are the best of a screen of candidates spread over the box, the bes
 as soon as one explains the recording; where a right motion may have a higher loss, also as soon as two from different
 candidates have ended equally low. If the first one does not, the next two are found by fitting the recording's beginning,
 then more and more of it. If the first three candidates do not, a derivative-free search from the best place over what is
-asked for finds the next. Then losses along the principal axes of the best place tell whether another minimum is lower nearby; from there it goes on.
+asked for finds the next. Then losses along the principal axes of the best place tell whether another minimum is lower
+nearby; from there it goes on.
 """
 
 from __future__ import annotations
