@@ -23,12 +23,13 @@ from diffcloud.fit.batches import batch_losses, without_diverged
 from diffcloud.fit.parameters import Variable
 from diffcloud.fit.record import History
 from diffcloud.fit.solvers import SOLVER_NAMES
+from diffcloud.sim.properties import one_set
 from tests.evaluation.bowls import SPACE, Bowl
 from tests.fit.records import parameter_of, record_of
 
 
 def loss_of(bowl, values):
-    return float(bowl({name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}))
+    return float(bowl(one_set(values)))
 
 
 def summary_of(outcome):

@@ -22,6 +22,7 @@ from diffcloud.fit.visibility import visibility_map
 from diffcloud.io.episodes import Episode
 from diffcloud.scene import load_scenario
 from diffcloud.sim import rollout
+from diffcloud.sim.properties import one_set
 from tests.conftest import paper_objective, small_lift
 
 
@@ -30,7 +31,7 @@ def clouds_of(scenario, *, points=800, seed=5, gripper=True, shift=(0, 0, 0), ya
     from diffcloud.clouds import SurfaceSampler
 
     system, _ = scenario.scene.build()
-    values = {name: torch.tensor([value], dtype=torch.float64) for name, value in truth.items()}
+    values = one_set(truth)
     properties, start = scenario.properties(system, material_of(values)), start_of(system, values)
     run = rollout(system, scenario.steps, properties=properties, state=start)
     nodes = run.positions[0, :: scenario.scene.frame_steps]

@@ -19,6 +19,7 @@ from diffcloud.fit.residuals import Axis, linearise
 from diffcloud.fit.result import describe_fit
 from diffcloud.fit.uncertainty import uncertainty
 from diffcloud.scene.scenarios import load_scenario
+from diffcloud.sim.properties import one_set
 from pipeline.config import FitConfig
 from tests.conftest import small_lift
 from tests.fit.test_fit import GENTLE, clouds_of
@@ -30,7 +31,7 @@ LAID = {"turn": 0.15, "shape_1_1": 0.012, "shape_2_0": -0.008}
 
 
 def column(**values: float) -> dict[str, torch.Tensor]:
-    return {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
+    return one_set(values)
 
 
 @pytest.fixture(scope="module")

@@ -21,6 +21,7 @@ from diffcloud.fit.result import describe_recording
 from diffcloud.io.episodes import Episode
 from diffcloud.scene import load_scenario
 from diffcloud.sensing.whole_surface import sample_surface
+from diffcloud.sim.properties import one_set
 from tests.conftest import small_lift
 from tests.fit.test_fit import GENTLE, clouds_of
 
@@ -32,10 +33,6 @@ def scenario_of(**changes):
     return small_lift(**{**GENTLE, "integrator": "implicit", "points": 2400, **changes})
 
 
-def at(values):
-    return {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
-
-
 def moved(episode, *, shift=(0.0, 0.0, 0.0), yaw=0.0):
     """The recording turned about the vertical through the origin, and shifted."""
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -45,7 +42,7 @@ def moved(episode, *, shift=(0.0, 0.0, 0.0), yaw=0.0):
 
 def found_at(objective, values):
     with torch.no_grad():
-        return describe_recording(objective, objective.simulate_to_loss(at(values)), "e").model_dump()
+        return describe_recording(objective, objective.simulate_to_loss(one_set(values)), "e").model_dump()
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +156,7 @@ class TestWhatCounts:
         assert early.frames == whole.frames[:kept]
         assert early.loss_steps < whole.loss_steps
         with torch.no_grad():
-            part, full = (one.frame_losses(one.simulate_to_loss(at({"stretch": 2.0}))) for one in (early, whole))
+            part, full = (one.frame_losses(one.simulate_to_loss(one_set({"stretch": 2.0}))) for one in (early, whole))
         torch.testing.assert_close(part, full[:, :kept])
         assert len(whole.until(0.01).frames) == 5  # fewer do not tell how a cloth lies
         assert whole.until(1.0).frames == whole.frames
@@ -193,7 +190,7 @@ class TestWhatCounts:
         eye = [1.5, 0.3, 0.3]
         faces = torch.as_tensor(scenario.scene.mesh.faces)
         with torch.no_grad():
-            run = Objective(scenario, episode).simulate_to_loss(at(TRUTH))
+            run = Objective(scenario, episode).simulate_to_loss(one_set(TRUTH))
         motion = run.at(torch.as_tensor(episode.times))
         frames = []
         for index in range(episode.frame_count):
@@ -214,7 +211,7 @@ class TestWhatCounts:
         objective = Objective(scenario, replace(episode, meta=meta, lost=lost))
         assert objective.knows_gaps
         with torch.no_grad():
-            assert torch.isfinite(objective(at(TRUTH))).all()
+            assert torch.isfinite(objective(one_set(TRUTH))).all()
 
     def test_lost_pixels_are_of_the_cameras_whose_places_are_known(self, scenario, episode):
         pinhole = {"size": [2, 2], "focal": [1, 1], "centre": [0, 0], "T_camera_scene": np.eye(4)[:3].tolist()}
@@ -279,7 +276,7 @@ def test_with_a_lag_the_loss_does_not_depend_on_how_far_is_simulated(scenario, e
     """A velocity at the last compared frame needs what comes after it."""
     objective = Objective(scenario, episode, nuisance={"lag": 0.05}, frames=[4, 8])
     with torch.no_grad():
-        short, whole = objective.simulate_to_loss(at(TRUTH)), objective.simulate(at(TRUTH))
+        short, whole = objective.simulate_to_loss(one_set(TRUTH)), objective.simulate(one_set(TRUTH))
         assert len(short.times) < len(whole.times)
         torch.testing.assert_close(objective.frame_losses(short), objective.frame_losses(whole))
 
@@ -296,4 +293,4 @@ def test_a_basis_that_diverges_costs_no_parameter_set(scenario, episode, monkeyp
 
     monkeypatch.setattr(Objective, "simulate", fragile)
     with torch.no_grad():
-        assert bool(torch.isfinite(objective(at(TRUTH))).all())
+        assert bool(torch.isfinite(objective(one_set(TRUTH))).all())

@@ -14,6 +14,7 @@ from diffcloud.sim import init, rollout
 from diffcloud.sim.build import build_system
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import isotropic
+from diffcloud.sim.properties import one_set
 from diffcloud.sim.surrounding import Surrounding
 from tests.sim.twins.forces import Forces
 
@@ -155,7 +156,7 @@ def test_scale_degeneracy(factor):
     def run(parameters, contact):
         scenario = grid_scenario(options.model_copy(update={"contact_stiffness": 1e5 * contact}))
         system, _ = scenario.scene.build()
-        values = {name: torch.tensor([value], dtype=torch.float64) for name, value in parameters.items()}
+        values = one_set(parameters)
         return rollout(system, scenario.steps, properties=scenario.properties(system, values)).positions
 
     with torch.no_grad():

@@ -17,6 +17,7 @@ from diffcloud.mesh.shapes import grid_cloth
 from diffcloud.scene.load import load_scene
 from diffcloud.scene.scenarios import built_in, load_scenario, make_scenario
 from diffcloud.sim.materials import TABLE_ENTRY_TO_STRETCHING, isotropic, preset
+from diffcloud.sim.properties import one_set
 from diffcloud.sim.simulate import rollout
 from diffcloud.simulators import mujoco
 from diffcloud.simulators.export.cloth import fitted_cloth, isotropic_sheet, start_strain
@@ -38,7 +39,7 @@ def towel(**changes):
 
 def simulated(scenario, values, every=None):
     system, _ = scenario.scene.build()
-    tensors = {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
+    tensors = one_set(values)
     with torch.no_grad():
         run = rollout(system, scenario.steps, properties=scenario.properties(system, tensors))
     every = every or scenario.scene.frame_steps
