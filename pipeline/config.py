@@ -262,18 +262,19 @@ class FitConfig(Section):
         """Material that is not known exactly in a fit of recordings in these scenarios -> factor of one deviation."""
         if self.doubts is not None:
             return parse_doubts(self.doubts)
-        if not self._knows_little(scenarios):
+        if not self._fits_more(scenarios):
             return {}
         return {name: factor for name, factor in MATERIAL_DOUBTS.items() if name not in {*self.parameters, *self.fixed}}
 
     def laid_within(self, scenarios: Sequence[Scenario]) -> dict[str, float]:
-        """How the cloth may lie otherwise at the start, in fits of recordings in these scenarios -> standard deviation."""
+        """How the cloth may lie otherwise at the start, in one fit of recordings in these scenarios: name of `fit.laid` ->
+        standard deviation [rad, m]."""
         if self.laid is not None:
             return parse_laid(self.laid)
-        alone = len(scenarios) == 1 and self._knows_little(scenarios)
+        alone = len(scenarios) == 1 and self._fits_more(scenarios)
         return dict(scenarios[0].laid) if alone else {}
 
-    def _knows_little(self, scenarios: Sequence[Scenario]) -> bool:
+    def _fits_more(self, scenarios: Sequence[Scenario]) -> bool:
         """Whether more than what is asked for is fitted by default: where derivatives make that cheap."""
         implicit = all(one.scene.integrator == "implicit" for one in scenarios)
         return not self.paper and self.solver == "gauss_newton" and implicit

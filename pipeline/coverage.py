@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,10 +13,12 @@ import numpy as np
 import torch
 import typer
 from rich.table import Table
+from scipy.special import stdtrit
 
 from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, state_intervals
 from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import solve
 from diffcloud.fit.pose import NUISANCE, SET_UP, PoseSpace
 from diffcloud.fit.uncertainty import REFINED
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 _RECORDS = ("mesh", "io", "sim", "scene", "clouds", "sensing")
 """Packages whose source decides what is recorded."""
 _CODE = (*_RECORDS, "fit", "evaluation")
+_RATIO = "stretch / mass"
 _LAID_M = 0.01
 """Deviation by which a cloth is laid beside its place."""
 HEAD = (
@@ -52,6 +55,7 @@ HEAD = (
     "median half-width",
     "identified",
 )
+SOURCE_HEAD = ("scenario", "known", "parameter", "noise alone would hold", "largest sources")
 
 
 @writes()
@@ -110,7 +114,7 @@ def coverage(
         table.add_row(*map(str, row))
     show(table, json)
     if markdown is not None:
-        write_text(markdown, coverage_page(rows))
+        write_text(markdown, coverage_page(out))
     asked = {f"{job.scenario.name}/{job.folder.name}": job.folder for job in jobs}
     counts = {name: counted(folder) for name, folder in asked.items()}
     result = next(iter(counts.values())) if len(counts) == 1 else {"scenarios": counts}
@@ -306,7 +310,8 @@ def counted(folder: Path) -> dict[str, Any]:
     Returns:
         parameters: name -> n, stated: with an interval, covered: those that hold the truth, median_factor: of the
         intervals, rms_error: of the logarithm, verdicts, identified_within: of those called identified, how many are within
-        the factor; ratio: the same of stretch to mass, if both are fitted.
+        the factor, noise_alone: how many intervals of the noise of residuals alone would hold the truth, sources: source ->
+        median deviation; ratio: the same of stretch to mass, if both are fitted.
     """
     records = [read_json(path) for path in files_in(folder, ".json")]
     fitted = next((list(one["intervals"]["parameters"]) for one in records if "intervals" in one), [])
@@ -318,7 +323,8 @@ def counted(folder: Path) -> dict[str, Any]:
 
 
 def _count(records: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
-    offs, widths, covered, verdicts, right = [], [], 0, dict[str, int](), 0
+    offs, widths, covered, verdicts, right, alone = [], [], 0, dict[str, int](), 0, 0
+    sources: dict[str, list[float]] = {}
     for record in records:
         if "intervals" not in record:
             continue
@@ -333,6 +339,10 @@ def _count(records: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
         if (verdict := entry.get("verdict")) is not None:
             verdicts[verdict] = verdicts.get(verdict, 0) + 1
             right += verdict == "identified" and off <= math.log(told["within"])
+        for source, deviations in told.get("sources", {}).items():
+            sources.setdefault(source, []).append(deviations[name])
+        if "noise" in told.get("sources", {}) and entry["low"] is not None:
+            alone += off <= stdtrit(told["clusters"] - 1, 0.5 + told["level"] / 2) * told["sources"]["noise"][name]
     return {
         "n": len(records),
         "stated": len(widths),
@@ -343,41 +353,54 @@ def _count(records: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
         "median_error": float(np.median(offs)) if offs else None,
         "verdicts": verdicts,
         "identified_within": right,
+        "noise_alone": int(alone),
+        "sources": {source: float(np.median(deviations)) for source, deviations in sources.items()},
     }
 
 
 def summary_rows(out: Path) -> list[list[str]]:
-    """A row for each parameter of each folder of records."""
-    rows = []
+    """Under `HEAD`, a row for each parameter of each folder of records."""
+    return [
+        [
+            *labels,
+            str(count["n"]),
+            str(count["stated"]),
+            _share(count["covered"], count["n"]),
+            _number(count["rms_error"]),
+            _number(count["median_error"]),
+            _number(count["median_half_width"]),
+            f"{count['identified_within']} of {count['verdicts'].get('identified', 0)}" if labels[2] != _RATIO else "",
+        ]
+        for labels, count in _cells(out)
+    ]
+
+
+def source_rows(out: Path) -> list[list[str]]:
+    """Under `SOURCE_HEAD`, a row for each of these whose intervals name their sources."""
+    return [
+        [
+            *labels,
+            _share(count["noise_alone"], count["n"]),
+            largest_sources({source: {"": deviation} for source, deviation in count["sources"].items()}, "", 4),
+        ]
+        for labels, count in _cells(out)
+        if count["sources"]
+    ]
+
+
+def _cells(out: Path) -> Iterator[tuple[tuple[str, str, str], dict[str, Any]]]:
+    """(scenario, known, parameter), and what the records of that folder say of it."""
     for scenario in sorted(path for path in out.iterdir() if path.is_dir()):
         for folder in sorted(path for path in scenario.iterdir() if path.is_dir() and files_in(path, ".json")):
             told = counted(folder)
-            ratio = {"stretch / mass": told["ratio"]} if "ratio" in told else {}
+            ratio = {_RATIO: told["ratio"]} if "ratio" in told else {}
             for name, count in (told["parameters"] | ratio).items():
-                share = f"{count['covered']} ({100 * count['covered'] / count['n']:.0f} %)"
-                called = count["verdicts"].get("identified", 0)
-                rows.append(
-                    [
-                        scenario.name,
-                        folder.name.replace("_", " "),
-                        name,
-                        str(count["n"]),
-                        str(count["stated"]),
-                        share,
-                        _number(count["rms_error"]),
-                        _number(count["median_error"]),
-                        _number(count["median_half_width"]),
-                        "" if name == "stretch / mass" else f"{count['identified_within']} of {called}",
-                    ]
-                )
-    return rows
+                yield (scenario.name, folder.name.replace("_", " "), name), count
 
 
-def coverage_page(rows: Sequence[Sequence[str]]) -> str:
-    """
-    Args:
-        rows: under `HEAD`.
-    """
+def coverage_page(out: Path) -> str:
+    """Of a folder of records."""
+    rows = summary_rows(out)
     networks = any({"free", "known"}.isdisjoint(row[1].split()) for row in rows)
     lines = [
         "# How often intervals hold the truth",
@@ -397,8 +420,18 @@ def coverage_page(rows: Sequence[Sequence[str]]) -> str:
         "",
         *markdown_table(HEAD, rows),
         "",
+        "Where the uncertainty comes from: the largest sources' parts of the variance, from the medians of their "
+        "deviations over the recordings (`docs/concepts.md` says what each is). Beside them, how many intervals would hold "
+        "the truth if they counted the noise of the residuals alone, as statistics that know no other source do.",
+        "",
+        *markdown_table(SOURCE_HEAD, source_rows(out)),
+        "",
     ]
     return "\n".join(lines)
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{part} ({100 * part / whole:.0f} %)"
 
 
 def _number(value: float | None) -> str:

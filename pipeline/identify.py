@@ -395,8 +395,8 @@ def _findings(record: FitRecord, objective: AnyObjective, found: Intervals) -> l
             f"{worst.frames[frame]}, with {worst.frame_rms_mm[frame]:.1f} mm."
         ]
     lines.append(_validation(record, objective))
-    if found.explains and not found.arrived:
-        lines.append(found.reason[0].upper() + found.reason[1:] + ".")
+    if doubt := found.remark or (found.reason if found.explains else ""):
+        lines.append(doubt[0].upper() + doubt[1:] + ".")
     for name, entry in found.parameters.items():
         digits = significant(entry.low, entry.high)
         ends = (

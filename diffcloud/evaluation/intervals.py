@@ -56,6 +56,9 @@ RESTARTS = 2
 """Of a fit that has not arrived, from a lower loss beside it."""
 _UNEXPLAINED = 2.0
 """RMS over what noise and spacing of the points account for, from which the model does not explain the recording."""
+_DOUBTED = 1.3
+"""Times what noise and spacing leave of a loss, from which a fit is doubted whose recording knows what it misses: of drawn
+cloths, right fits have at most 1.1 of it, wrong minima 1.4 or more (docs/results/coverage.md)."""
 _STEP = 2.0
 """The largest next step of a fit that has arrived, in standard deviations."""
 _PRIOR = 0.5
@@ -124,6 +127,8 @@ class Intervals(_Model):
     """Whether the recordings' noise accounts for the misfit."""
     reason: str
     """Why there is no interval, or the verdict is not of the parameters; else empty."""
+    remark: str = ""
+    """What makes intervals doubtful that are stated all the same; else empty."""
     lower: dict[str, float] | None = None
     """Where a clearly lower loss was met, from which a fit may start again."""
     restarts: int = 0
@@ -181,6 +186,17 @@ def state_intervals(
             f"the misfit is {worst_fit[0]:.1f} mm RMS, but noise and spacing of the points account for only "
             f"{worst_fit[1]:.1f} mm; any interval says only how far this misfit lets the numbers go, and nothing about "
             "the cloth"
+        )
+    excess = [
+        loss / member.noise_loss
+        for member, loss in zip(objective.members, found.losses.tolist(), strict=True)
+        if member.knows_gaps
+    ]
+    remark = ""
+    if not reason and max(excess, default=0.0) >= _DOUBTED:
+        remark = (
+            f"the loss is {max(excess):.1f} times what noise and spacing of the points leave, and right fits have at "
+            "most 1.1 of it: the fit may have ended in a wrong minimum, or the model lacks something"
         )
     reaches = {name: _reach(found, row, level) for name, row in zip(space.names, np.eye(len(space.names)), strict=True)}
     ratio_row = _ratio_row(space)
@@ -245,6 +261,7 @@ def state_intervals(
         arrived=arrived,
         explains=explains,
         reason=reason,
+        remark=remark,
         lower=lower,
     )
 

@@ -142,11 +142,15 @@ class Objective:
         return not self.paper and (bool(self._target.lost) or not seen_by_cameras)
 
     @property
+    def noise_loss(self) -> float:
+        """What noise and spacing of its points leave of the right motion's loss, about; zero in the paper's measure."""
+        return self._target.noise_loss
+
+    @property
     def explained(self) -> float:
-        """A loss that a motion explains the recording with: hardly above what noise and spacing of its points leave of the
-        right one. Where nobody knows what cameras missed of the cloth, a right motion may have more. Zero in the paper's
-        measure."""
-        return (_EXPLAINED if self.knows_gaps else _EXPLAINED_BY_CAMERAS) * self._target.noise_loss
+        """A loss that a motion explains the recording with, hardly above `noise_loss`. Where nobody knows what cameras
+        missed of the cloth, a right motion may have more. Zero in the paper's measure."""
+        return (_EXPLAINED if self.knows_gaps else _EXPLAINED_BY_CAMERAS) * self.noise_loss
 
     @property
     def pose_space(self) -> PoseSpace:

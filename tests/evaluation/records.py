@@ -104,7 +104,7 @@ def _intervals(stretch: float, reason: str) -> dict[str, Any]:
         "restarts": 0,
         "explains": not reason,
         "reason": reason,
-        "note": "",
+        "remark": "",
     }
 
 

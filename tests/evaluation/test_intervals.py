@@ -35,14 +35,16 @@ def told(objective, monkeypatch):
     """Intervals of stated variances."""
 
     def tell(
-        sources, *, space=SPACE, values=VALUES, step=0.0, refined=0.0, clusters=16, misfit=(3.0, 3.0), lower=None, **options
-    ):
+        sources, *, space=SPACE, values=VALUES, step=0.0, refined=0.0, clusters=16, misfit=(3.0, 3.0), lower=None, loss=1.0,
+        **options,
+    ):  # fmt: skip
         k = len(space.names)
         moves = np.broadcast_to(refined, k)
         places = np.log([values[name] for name in space.names])
         covariances = {name: np.array(value, dtype=float).reshape(k, k) for name, value in sources.items()}
         covariances[STEP_SIZE] = np.outer(moves, moves) / 3
-        found = Uncertainty(space.names, places, np.ones(1), 1.0, covariances, moves, clusters, np.full(k, step), np.eye(k))
+        losses = np.array([loss * objective.noise_loss])
+        found = Uncertainty(space.names, places, losses, 1.0, covariances, moves, clusters, np.full(k, step), np.eye(k))
         monkeypatch.setattr(module, "uncertainty", lambda *arguments, **given: found)
         monkeypatch.setattr(module, "_misfit", lambda *arguments: misfit)
         monkeypatch.setattr(module, "_with_scan", lambda objective, space, values, found, seen: (found, lower))
@@ -167,6 +169,12 @@ class TestVerdicts:
         assert found.parameters["stretch"].verdict == "the model does not explain the recording"
         assert found.parameters["stretch"].low is not None
         assert "9.0 mm RMS" in found.reason
+
+    def test_a_loss_somewhat_above_what_noise_leaves_is_remarked_on(self, told):
+        right, doubted = (told({"noise": np.diag([0.01, 0.01])}, loss=loss) for loss in (1.1, 1.7))
+        assert right.remark == ""
+        assert "the loss is 1.7 times what noise" in doubted.remark
+        assert doubted.parameters["stretch"] == right.parameters["stretch"]
 
 
 class Wells(Bowl):

@@ -14,6 +14,7 @@ from diffcloud.errors import DivergedError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton, residuals
 from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.doubts import MATERIAL_DOUBTS, with_doubts
+from diffcloud.fit.priors import INDEPENDENT
 from diffcloud.fit.residuals import Axis, Linearisation, linearise
 from diffcloud.fit.solvers import gauss_newton
 from diffcloud.scene import load_scenario
@@ -149,11 +150,12 @@ class TestFits:
         )
         assert found.start == {"stretch": pytest.approx(9.0), "mass": pytest.approx(9.0)}
 
-    def test_a_single_start_is_the_best_of_the_screen(self):
-        objective = lifted()
+    def test_a_single_start_is_the_best_of_the_screen_on_the_first_half(self):
+        objective, values = lifted(nuisance={}), SPACE.starts(8, seed=0)[0].double()
         found = fit_gauss_newton(objective, SPACE, GaussNewtonSettings(starts=1, screen=7, iterations=1))
-        candidates = batch_losses(objective, SPACE, SPACE.starts(8, seed=0)[0].double())
-        assert found.loss_start == pytest.approx(float(candidates.min()), rel=1e-9)
+        best = values[batch_losses(objective.until(0.5), SPACE, values).argmin()]
+        assert found.start == {name: pytest.approx(float(value)) for name, value in zip(SPACE.names, best, strict=True)}
+        assert found.loss_start == pytest.approx(float(batch_losses(objective, SPACE, best[None])), rel=1e-9)
         assert found.simulations == 8 + 2
 
     def test_without_a_screen_starts_are_spread(self):
@@ -224,13 +226,50 @@ class TestFits:
             return
         assert len(starts) == 4
         assert bool(starts.all())
-        assert parts == [0.5, 0.75, 0.4, 0.6, 0.8]
+        assert parts == [0.5, 0.5, 0.75, 0.4, 0.6, 0.8]  # the screen's first
         assert found.values["stretch"] / found.values["mass"] == pytest.approx(TRUTH["stretch"] / TRUTH["mass"], rel=0.05)
 
     @pytest.mark.parametrize(("count", "stages"), [(6, [[5, 6]]), (7, [[5, 6, 7]]), (12, [[6, 9, 12], [5, 8, 10, 12]])])
     def test_a_recording_of_few_frames_grows_in_fewer_steps(self, count, stages):
         objective = lifted(nuisance={}, frames=range(1, count + 1))
         assert [[len(one.frames) for one in growth] for growth in gauss_newton._growths(objective)] == stages
+
+    @pytest.mark.parametrize("height", [0.0, -2.0, 2.0], ids=["inside", "at the lower corner", "at the upper corner"])
+    def test_draws_stay_in_the_valley_between_the_bounds(self, height):
+        """Of two variables, the difference is known within 1 % and the sum hardly; the box cuts the valley off."""
+        bounds = (math.exp(-2.0), math.exp(2.0))
+        axis = Axis.of(FitSpace.build(["stretch", "mass"], bounds={"stretch": bounds, "mass": bounds}))
+        known, wide = torch.tensor([1.0, -1.0]).double(), torch.tensor([1.0, 1.0]).double()
+        curvature = (known[:, None] * known / 2 / 0.01**2 + wide[:, None] * wide / 2 / 3.0**2) / INDEPENDENT
+        found = Linearisation(torch.ones(1).double(), torch.zeros(1, 2).double(), curvature[None], 1)
+        way = gauss_newton._Way(torch.full((2,), height, dtype=torch.float64), found, 3)
+        near, far = (
+            gauss_newton._drawn(way, 1, axis, widening, torch.Generator().manual_seed(0)) for widening in (1.0, 4.0)
+        )
+        for drawn, deviation in ((near, 0.01), (far, 0.04)):
+            assert bool(((drawn > -2 - 1e-12) & (drawn < 2 + 1e-12)).all())
+            assert float((drawn @ known).abs().max()) < 3.5 * deviation
+        sums = near @ wide
+        assert float(sums.max() - sums.min()) > 1.0
+
+    def test_while_none_goes_on_draws_reach_farther(self, monkeypatch):
+        monkeypatch.setattr(Objective, "knows_gaps", True)
+        objective, widths = lifted(nuisance={}), []
+        stages = [objective.until(0.5), objective]
+        drawn = gauss_newton._drawn
+
+        def watched(way, recordings, axis, widening, generator):
+            widths.append(widening)
+            return drawn(way, recordings, axis, widening, generator)
+
+        monkeypatch.setattr(gauss_newton, "_drawn", watched)
+        place = Axis.of(SPACE).places(torch.tensor([list(TRUTH.values())], dtype=torch.float64))[0]
+        settings, spent = GaussNewtonSettings(iterations=1), []
+        for explained in (objective.explained, 0.01 * objective.explained):
+            monkeypatch.setattr(Objective, "explained", explained)
+            spent.append(gauss_newton._grown(stages, SPACE, place, settings, 0, Axis.of(SPACE), lambda: None)[1])
+        assert widths == [1.0, 1.0, 2.0, 4.0]
+        assert spent[1] - spent[0] == 2 * 16
 
     def test_ends_are_equal_only_if_they_come_from_different_candidates(self):
         """One candidate's own two descents, from the whole recording and from its beginning, are no two witnesses."""

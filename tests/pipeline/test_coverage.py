@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from diffcloud.io.episodes import read_episode, write_episode
-from pipeline.coverage import counted, coverage_page, summary_rows
+from pipeline.coverage import counted, coverage_page
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
 from tests.pipeline.invoke import invoke
@@ -119,7 +119,24 @@ def test_refusals_and_failures_count_as_misses(tmp_path):
     assert told["verdicts"] == {"identified": 3, "the fit has not arrived": 1}
     assert told["identified_within"] == 2
     assert told["rms_error"] == pytest.approx(math.sqrt((math.log(1.1) ** 2 + math.log(1.2) ** 2 + math.log(2) ** 2) / 4))
-    assert "| lift | mass known | stretch | 5 | 3 | 1 (20 %) |" in coverage_page(summary_rows(tmp_path))
+    assert told["sources"] == {}
+    assert "| lift | mass known | stretch | 5 | 3 | 1 (20 %) |" in coverage_page(tmp_path)
+
+
+def test_sources_are_told_beside_what_noise_alone_would_hold(tmp_path):
+    """Of two recordings off by 20 %, the noise of one accounts for that, with the quantile of its few clusters."""
+    folder = tmp_path / "lift" / "mass_known"
+    folder.mkdir(parents=True)
+    for index, noise in enumerate((0.09, 0.11)):
+        entry = {"value": math.exp(0.2), "low": 1.0, "high": 2.0, "verdict": "identified"}
+        sources = {"noise": {"stretch": noise}, "step size": {"stretch": 0.3}, "prior": {"stretch": 0.0}}
+        told = {"parameters": {"stretch": entry}, "within": 1.5, "level": 0.9, "clusters": 9, "sources": sources}
+        record = {"truth": {"stretch": 1.0, "mass": 1.0}, "intervals": told}
+        (folder / f"{index:04d}.json").write_text(json.dumps(record))
+    told = counted(folder)["parameters"]["stretch"]
+    assert told["noise_alone"] == 1  # the quantile is 1.86
+    assert told["sources"] == pytest.approx({"noise": 0.1, "step size": 0.3, "prior": 0.0})
+    assert "| lift | mass known | stretch | 1 (50 %) | step size 90 %, noise 10 % |" in coverage_page(tmp_path)
 
 
 class TestIntervals:

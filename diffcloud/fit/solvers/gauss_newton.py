@@ -51,13 +51,19 @@ _MOST = 8
 """Candidates that are followed, unless fewer are enough."""
 _BEFORE, _SEARCHED = 3, 64
 """Candidates that are followed before a search looks for one more start, and how many places that search simulates."""
-_GROWING, _DRAWN = ((0.5, 0.75), (0.4, 0.6, 0.8)), 16
-"""For each start that is found so, the parts of the frames over which the recording grows; and how many places are drawn
-before each next part. Where one of them goes astray at the end, the other seldom does."""
+_GROWING = (0.5, 0.75), (0.4, 0.6, 0.8)
+"""For each start that is found so, the parts of the frames over which the recording grows. Where one of them goes astray at
+the end, the other seldom does."""
+_DRAWN, _WIDENING, _GOES_ON = 16, (1.0, 2.0, 4.0), 1.3
+"""So many places are drawn before each next part, with the deviations of what is known so far; and again with larger ones,
+until a loss comes within this factor of one that explains the frames, or, where that is not known, of what the part before
+ended at. Where a motion may go on in two ways, the right one may be rare, and a beginning may have gone astray itself."""
 _MISFIT = 30.0
 """Times what explains a recording; above that, it is the model that does not: no start will."""
 _EQUALLY = 1.01
 """Losses within this factor are equally low."""
+_SCREENED = 0.5
+"""Part of the frames on which candidates are compared: the rest costs as much again, and has more wrong minima."""
 _GIVE_UP = 6
 """Steps in vain, one after the other: the loss is rougher than its slope."""
 
@@ -116,8 +122,8 @@ def fit_gauss_newton(
         search = _Start(places[0], -1, lambda: _searched(objective, space, ways.best, settings.seed, axis, tell))
         waiting.insert(_BEFORE, search)
         best = 1 if settings.init else 0  # of the screen; a first start that was given says little
-        for stages in reversed(_growths(objective)):
-            grown = partial(_grown, stages, space, places[best], settings, axis, tell)
+        for index, stages in reversed(list(enumerate(_growths(objective)))):
+            grown = partial(_grown, stages, space, places[best], settings, index, axis, tell)
             waiting.insert(best + 1, _Start(places[best], best, grown))
     scans, looked, ways = 0, None, _Ways(waiting, settings.iterations, _laid(space))
     try:
@@ -313,7 +319,7 @@ def _starts(
     values = space.starts(count, seed=settings.seed, first=settings.init)[0].double()
     if not settings.screen:
         return axis.places(values), 0
-    losses = batch_losses(objective, space, values)
+    losses = batch_losses(objective.until(_SCREENED), space, values)
     if not math.isfinite(float(losses.min())):
         raise DivergedError(0, [], f"all {count} candidates diverged")
     order = losses.argsort()
@@ -358,19 +364,21 @@ def _grown(
     space: FitSpace,
     place: Tensor,
     settings: GaussNewtonSettings,
+    stream: int,
     axis: Axis,
     tell: Callable[[], None],
 ) -> tuple[Tensor, int]:
     """The place [k] that a descent from this one comes to on the first frames alone, then on more of them; and how many
     simulations it took. What a cloth does early, before it has folded over or touched something, depends on the parameters
     in a simple way: there, far fewer minima are wrong. Between two stages, it goes on from the best of some places drawn
-    from what the frames so far leave open: the next ones may tell between them.
+    from what the frames so far leave open, which the next ones may tell apart.
 
     Args:
         stages: the recordings as they grow; on the last one, the whole, the descent is the caller's.
         place: [k]
+        stream: of random numbers.
     """
-    generator, simulations = torch.Generator().manual_seed(settings.seed), 0
+    generator, simulations = torch.Generator().manual_seed(settings.seed + stream), 0
     for early, later in pairwise(stages):
         found = linearise(early, space, place[None])
         way, simulations = _Way(place, found, settings.iterations), simulations + found.simulations
@@ -382,19 +390,49 @@ def _grown(
             way.judge(tried, found)
         if not math.isfinite(way.loss):
             break
-        places = torch.cat([way.place[None], _drawn(way, len(early.members), axis, generator)])
-        losses = batch_losses(later, space, axis.bounded(places))
-        place, simulations = places[losses.argmin()], simulations + len(places) * len(early.members)
+        place, spent = _goes_on(way, early, later, space, axis, generator, tell)
+        simulations += spent
     return place, simulations
 
 
-def _drawn(way: _Way, recordings: int, axis: Axis, generator: torch.Generator) -> Tensor:
-    """[n, k] places drawn from what a way's end says of all variables (`fit.priors`: the logarithm of the loss)."""
+def _goes_on(
+    way: _Way,
+    early: AnyObjective,
+    later: AnyObjective,
+    space: FitSpace,
+    axis: Axis,
+    generator: torch.Generator,
+    tell: Callable[[], None],
+) -> tuple[Tensor, int]:
+    """From where a way's end on early frames goes on with later ones [k]: the lowest of it and of places drawn around it;
+    and how many simulations it took to choose."""
+    enough = _GOES_ON * (later.explained if later.knows_gaps else way.loss)
+    place, lowest, simulations, tried = way.place, math.inf, 0, way.place[None]
+    for widening in _WIDENING:
+        tell()
+        tried = torch.cat([tried, _drawn(way, len(early.members), axis, widening, generator)])
+        losses = batch_losses(later, space, axis.bounded(tried))
+        simulations += len(tried) * len(early.members)
+        if float(losses.min()) < lowest:
+            place, lowest = tried[losses.argmin()], float(losses.min())
+        if lowest <= enough:
+            break
+        tried = tried[:0]
+    return place, simulations
+
+
+def _drawn(way: _Way, recordings: int, axis: Axis, widening: float, generator: torch.Generator) -> Tensor:
+    """[n, k] places drawn from what a way's end says of all variables (`fit.priors`: the logarithm of the loss), with so
+    many times its deviations. To the side where it goes farther, each goes as far as the bounds allow: if these cut single
+    variables, it would leave the valley in which a combination of them is known well."""
     spread, axes = torch.linalg.eigh(way.normal)
     reach = (way.loss / (INDEPENDENT * recordings * spread.clamp(min=max(1e-9 * float(spread[-1]), 1e-300)))).sqrt()
-    normal = torch.randn(_DRAWN, len(reach), generator=generator, dtype=torch.float64)
+    steps = widening * torch.randn(_DRAWN, len(reach), generator=generator, dtype=torch.float64) * reach @ axes.T
     low, high = axis.ends
-    return torch.minimum(torch.maximum(way.place + normal * reach @ axes.T, low), high)
+    both = torch.stack([steps, -steps])
+    free = torch.where(both > 0, high - way.place, low - way.place) / both
+    parts = free.nan_to_num(nan=1.0).amin(-1).clamp(0.0, 1.0)
+    return way.place + torch.where(parts[0] < parts[1], -parts[1], parts[0])[:, None] * steps
 
 
 def _frames(objective: AnyObjective) -> int:
