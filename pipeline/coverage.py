@@ -13,10 +13,9 @@ import numpy as np
 import torch
 import typer
 from rich.table import Table
-from scipy.special import stdtrit
 
 from diffcloud.errors import ConfigError, DiffCloudError
-from diffcloud.evaluation.intervals import LEVEL, RESTARTS, state_intervals
+from diffcloud.evaluation.intervals import LEVEL, RESTARTS, noise_quantile, state_intervals
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import solve
@@ -41,6 +40,8 @@ _RECORDS = ("mesh", "io", "sim", "scene", "clouds", "sensing")
 """Packages whose source decides what is recorded."""
 _CODE = (*_RECORDS, "fit", "evaluation")
 _RATIO = "stretch / mass"
+Cell = tuple[tuple[str, str, str], dict[str, Any]]
+"""(scenario, known, parameter), and what the records of that folder say of it, as of `counted`."""
 _LAID_M = 0.01
 """Deviation by which a cloth is laid beside its place."""
 HEAD = (
@@ -108,13 +109,13 @@ def coverage(
             errors.print(failures[-1], soft_wrap=True)
     for regressor in readers:
         _predict(regressor, jobs)
-    rows = summary_rows(out)
+    cells = list(cells_of(out))
     table = Table(*HEAD)
-    for row in rows:
-        table.add_row(*map(str, row))
+    for row in _summary(cells):
+        table.add_row(*row)
     show(table, json)
     if markdown is not None:
-        write_text(markdown, coverage_page(out))
+        write_text(markdown, coverage_page(cells))
     asked = {f"{job.scenario.name}/{job.folder.name}": job.folder for job in jobs}
     counts = {name: counted(folder) for name, folder in asked.items()}
     result = next(iter(counts.values())) if len(counts) == 1 else {"scenarios": counts}
@@ -339,10 +340,12 @@ def _count(records: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
         if (verdict := entry.get("verdict")) is not None:
             verdicts[verdict] = verdicts.get(verdict, 0) + 1
             right += verdict == "identified" and off <= math.log(told["within"])
-        for source, deviations in told.get("sources", {}).items():
+        if entry["low"] is None or "sources" not in told:
+            continue
+        for source, deviations in told["sources"].items():
             sources.setdefault(source, []).append(deviations[name])
-        if "noise" in told.get("sources", {}) and entry["low"] is not None:
-            alone += off <= stdtrit(told["clusters"] - 1, 0.5 + told["level"] / 2) * told["sources"]["noise"][name]
+        if "noise" in told["sources"]:
+            alone += off <= noise_quantile(told["clusters"], told["level"]) * told["sources"]["noise"][name]
     return {
         "n": len(records),
         "stated": len(widths),
@@ -358,8 +361,8 @@ def _count(records: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
     }
 
 
-def summary_rows(out: Path) -> list[list[str]]:
-    """Under `HEAD`, a row for each parameter of each folder of records."""
+def _summary(cells: Sequence[Cell]) -> list[list[str]]:
+    """Rows under `HEAD`."""
     return [
         [
             *labels,
@@ -371,25 +374,25 @@ def summary_rows(out: Path) -> list[list[str]]:
             _number(count["median_half_width"]),
             f"{count['identified_within']} of {count['verdicts'].get('identified', 0)}" if labels[2] != _RATIO else "",
         ]
-        for labels, count in _cells(out)
+        for labels, count in cells
     ]
 
 
-def source_rows(out: Path) -> list[list[str]]:
-    """Under `SOURCE_HEAD`, a row for each of these whose intervals name their sources."""
+def _sources(cells: Sequence[Cell]) -> list[list[str]]:
+    """Rows under `SOURCE_HEAD`, of cells whose intervals name their sources."""
     return [
         [
             *labels,
             _share(count["noise_alone"], count["n"]),
             largest_sources({source: {"": deviation} for source, deviation in count["sources"].items()}, "", 4),
         ]
-        for labels, count in _cells(out)
+        for labels, count in cells
         if count["sources"]
     ]
 
 
-def _cells(out: Path) -> Iterator[tuple[tuple[str, str, str], dict[str, Any]]]:
-    """(scenario, known, parameter), and what the records of that folder say of it."""
+def cells_of(out: Path) -> Iterator[Cell]:
+    """Of all folders of records."""
     for scenario in sorted(path for path in out.iterdir() if path.is_dir()):
         for folder in sorted(path for path in scenario.iterdir() if path.is_dir() and files_in(path, ".json")):
             told = counted(folder)
@@ -398,9 +401,9 @@ def _cells(out: Path) -> Iterator[tuple[tuple[str, str, str], dict[str, Any]]]:
                 yield (scenario.name, folder.name.replace("_", " "), name), count
 
 
-def coverage_page(out: Path) -> str:
-    """Of a folder of records."""
-    rows = summary_rows(out)
+def coverage_page(cells: Sequence[Cell]) -> str:
+    """Markdown of docs/results/coverage.md."""
+    rows, sources = _summary(cells), _sources(cells)
     networks = any({"free", "known"}.isdisjoint(row[1].split()) for row in rows)
     lines = [
         "# How often intervals hold the truth",
@@ -420,13 +423,16 @@ def coverage_page(out: Path) -> str:
         "",
         *markdown_table(HEAD, rows),
         "",
-        "Where the uncertainty comes from: the largest sources' parts of the variance, from the medians of their "
-        "deviations over the recordings (`docs/concepts.md` says what each is). Beside them, how many intervals would hold "
-        "the truth if they counted the noise of the residuals alone, as statistics that know no other source do.",
-        "",
-        *markdown_table(SOURCE_HEAD, source_rows(out)),
-        "",
     ]
+    if sources:
+        lines += [
+            "Where the uncertainty comes from: the largest sources' parts of the variance, from the medians of their "
+            "deviations over the recordings (what each is: [evaluation.md](../evaluation.md#what-is-identified)). Beside "
+            "them, how many of the same intervals would hold the truth if they counted the noise of the residuals alone.",
+            "",
+            *markdown_table(SOURCE_HEAD, sources),
+            "",
+        ]
     return "\n".join(lines)
 
 

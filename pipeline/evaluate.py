@@ -150,8 +150,8 @@ def _show_intervals(found: Intervals) -> None:
         output.print(
             "The fit had not arrived: it was started again from a lower loss, and the table is for where it ended."
         )
-    for told in filter(None, (found.reason, found.remark)):
-        output.print(told[0].upper() + told[1:] + ".", soft_wrap=True)
+    for sentence in found.sentences:
+        output.print(sentence, soft_wrap=True)
 
 
 @app.callback(invoke_without_command=True)

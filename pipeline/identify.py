@@ -386,7 +386,8 @@ def _motion_of(objective: Objective) -> str:
 def _findings(record: FitRecord, objective: AnyObjective, found: Intervals) -> list[str]:
     """The report's first lines: does the model explain the recordings, do parameters carry over, what are they."""
     if found.explains:
-        lines = [f"The model explains the recordings: misfit {record.rms_mm:.1f} mm RMS."]
+        verdict = "There is a doubt whether the model explains" if found.remark else "The model explains"
+        lines = [f"{verdict} the recordings: misfit {record.rms_mm:.1f} mm RMS."]
     else:
         worst = max(record.episodes, key=lambda one: one.rms_mm)
         frame = int(np.argmax(worst.frame_rms_mm))
@@ -395,8 +396,8 @@ def _findings(record: FitRecord, objective: AnyObjective, found: Intervals) -> l
             f"{worst.frames[frame]}, with {worst.frame_rms_mm[frame]:.1f} mm."
         ]
     lines.append(_validation(record, objective))
-    if doubt := found.remark or (found.reason if found.explains else ""):
-        lines.append(doubt[0].upper() + doubt[1:] + ".")
+    if found.explains:
+        lines += found.sentences
     for name, entry in found.parameters.items():
         digits = significant(entry.low, entry.high)
         ends = (
@@ -427,6 +428,7 @@ def _result(record: FitRecord, found: Intervals, findings: Sequence[str]) -> dic
         "rms_mm": record.rms_mm,
         "explains": found.explains and found.arrived,
         "reason": found.reason,
+        "remark": found.remark,
         "findings": list(findings),
         "episodes": {one.name: one.rms_mm for one in record.episodes},
     }

@@ -57,8 +57,8 @@ RESTARTS = 2
 _UNEXPLAINED = 2.0
 """RMS over what noise and spacing of the points account for, from which the model does not explain the recording."""
 _DOUBTED = 1.3
-"""Times what noise and spacing leave of a loss, from which a fit is doubted whose recording knows what it misses: of drawn
-cloths, right fits have at most 1.1 of it, wrong minima 1.4 or more (docs/results/coverage.md)."""
+"""Times what noise and spacing leave of a loss, from which a fit is doubted whose recording knows what it misses: of random
+cloths, right fits have at most 1.1 times that, wrong minima 1.4 or more (docs/evaluation.md)."""
 _STEP = 2.0
 """The largest next step of a fit that has arrived, in standard deviations."""
 _PRIOR = 0.5
@@ -128,11 +128,16 @@ class Intervals(_Model):
     reason: str
     """Why there is no interval, or the verdict is not of the parameters; else empty."""
     remark: str = ""
-    """What makes intervals doubtful that are stated all the same; else empty."""
+    """Why intervals that are stated are doubtful all the same; else empty."""
     lower: dict[str, float] | None = None
     """Where a clearly lower loss was met, from which a fit may start again."""
     restarts: int = 0
     """How often the fit was started again there; the values are those that it ended at."""
+
+    @property
+    def sentences(self) -> list[str]:
+        """Reason and remark, for people."""
+        return [text[0].upper() + text[1:] + "." for text in (self.reason, self.remark) if text]
 
 
 def state_intervals(
@@ -187,17 +192,7 @@ def state_intervals(
             f"{worst_fit[1]:.1f} mm; any interval says only how far this misfit lets the numbers go, and nothing about "
             "the cloth"
         )
-    excess = [
-        loss / member.noise_loss
-        for member, loss in zip(objective.members, found.losses.tolist(), strict=True)
-        if member.knows_gaps
-    ]
-    remark = ""
-    if not reason and max(excess, default=0.0) >= _DOUBTED:
-        remark = (
-            f"the loss is {max(excess):.1f} times what noise and spacing of the points leave, and right fits have at "
-            "most 1.1 of it: the fit may have ended in a wrong minimum, or the model lacks something"
-        )
+    remark = "" if reason else _remark(objective, found)
     reaches = {name: _reach(found, row, level) for name, row in zip(space.names, np.eye(len(space.names)), strict=True)}
     ratio_row = _ratio_row(space)
     ratio_reach = None if ratio_row is None else _reach(found, ratio_row, level)
@@ -266,6 +261,21 @@ def state_intervals(
     )
 
 
+def _remark(objective: AnyObjective, found: Uncertainty) -> str:
+    """On a loss that a right fit seldom has; else empty."""
+    excess = [
+        loss / member.noise_loss
+        for member, loss in zip(objective.members, found.losses.tolist(), strict=True)
+        if member.knows_gaps and member.noise_loss > 0
+    ]
+    if max(excess, default=0.0) < _DOUBTED:
+        return ""
+    return (
+        f"the loss is {max(excess):.1f} times what noise and spacing of the points leave (of simulated cloths, right fits "
+        "have at most 1.1 times that): the fit may have ended in a wrong minimum, or the model lacks something"
+    )
+
+
 def _with_scan(
     objective: AnyObjective, space: FitSpace, values: Mapping[str, float], found: Uncertainty, seen: Scan | None
 ) -> tuple[Uncertainty, dict[str, float] | None]:
@@ -285,7 +295,7 @@ def _with_scan(
         seen, _ = scan(objective, space, centre, torch.from_numpy(found.curvature))
     place = seen.lower(centre, found.loss)
     lower = None if place is None else dict(zip(space.names, axis.bounded(place[None])[0].tolist(), strict=True))
-    quantile = float(stdtrit(max(found.clusters - 1, 1), 0.95))
+    quantile = noise_quantile(found.clusters, 0.9)
     directions = seen.directions[:, [not variable.doubtful for variable in space.variables]]
     known = torch.from_numpy(found.of_noise_and_priors)
     variance = torch.einsum("ai,ij,aj->a", directions, known, directions)
@@ -331,6 +341,11 @@ def draws(found: Intervals, space: FitSpace, count: int, seed: int) -> list[dict
     spread = np.random.default_rng(seed).multivariate_normal(np.zeros(len(space.names)), found.covariance, count)
     drawn = axis.bounded(axis.places(values) + torch.from_numpy(spread))
     return [dict(zip(space.names, row, strict=True)) for row in drawn.tolist()]
+
+
+def noise_quantile(clusters: int, level: float) -> float:
+    """Deviations that an interval of this level reaches to both sides, if its variance is that of so many clusters."""
+    return float(stdtrit(max(clusters - 1, 1), 0.5 + level / 2))
 
 
 def significant(low: float | None, high: float | None) -> Callable[[float | None], str]:

@@ -69,10 +69,12 @@ class LandscapeRecord(Checked):
 
 
 class StatedIntervals(Intervals):
-    """With a remark."""
+    """With a note on a mass that acts on a part of the cloth."""
 
     level: Annotated[float, Field(gt=0, lt=1)]
     within: Annotated[float, Field(gt=1, le=1e6)]
+    remark: Text
+    restarts: int
     note: Text
 
 

@@ -26,7 +26,7 @@ from diffcloud.fit.alignment import aligned
 from diffcloud.fit.laid import material_of, start_of
 from diffcloud.fit.matching import Matcher, Motion, Pairs
 from diffcloud.fit.pose import PoseSpace, default_priors
-from diffcloud.fit.targets import read_target
+from diffcloud.fit.targets import mean_noise, read_target
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import Properties
@@ -143,13 +143,13 @@ class Objective:
 
     @property
     def noise_loss(self) -> float:
-        """What noise and spacing of its points leave of the right motion's loss, about; zero in the paper's measure."""
+        """About the loss that noise and spacing of its points leave of the right motion; zero in the paper's measure."""
         return self._target.noise_loss
 
     @property
     def explained(self) -> float:
-        """A loss that a motion explains the recording with, hardly above `noise_loss`. Where nobody knows what cameras
-        missed of the cloth, a right motion may have more. Zero in the paper's measure."""
+        """Up to this loss, a motion explains the recording; it is hardly above `noise_loss`. Where nobody knows what
+        cameras missed of the cloth, a right motion may have more. Zero in the paper's measure."""
         return (_EXPLAINED if self.knows_gaps else _EXPLAINED_BY_CAMERAS) * self.noise_loss
 
     @property
@@ -379,6 +379,7 @@ class Objective:
         chosen = sorted(self.times.argsort(stable=True)[:kept].tolist())
         other._target = self._target.at(chosen)
         if not self.paper:
+            other._target = replace(other._target, noise_loss=mean_noise(other.clouds))
             points, sure = self._recorded
             other._recorded = points[chosen], sure[chosen]
         other.loss_steps = other._steps_to_loss()

@@ -79,7 +79,7 @@ class Target:
     """What noise and spacing of the points leave of the loss [squared length unit]; zero in the paper's measure."""
 
     def at(self, chosen: Sequence[int]) -> Target:
-        """The same with some of its frames, by their places among these."""
+        """The same with some of its frames, by their places among these; `noise_loss` stays that of all."""
         chosen = list(chosen)
         first = chosen == list(range(len(chosen)))
         index = slice(len(chosen)) if first else chosen  # a slice is a view: lost pixels are many to copy
@@ -91,6 +91,11 @@ class Target:
             sure=tuple(self.sure[one] for one in chosen),
             lost=tuple(replace(one, pixels=one.pixels[index]) for one in self.lost),
         )
+
+
+def mean_noise(clouds: Sequence[NeighbourIndex]) -> float:
+    """What noise and spacing of the points of these frames leave of the loss [squared length unit]."""
+    return float(np.mean([cloud.from_surface for cloud in clouds]))
 
 
 def read_target(
@@ -127,7 +132,7 @@ def read_target(
     )
     clouds = tuple(NeighbourIndex(torch.as_tensor(episode.frame(frame), dtype=torch.float64)) for frame in frames)
     centre = torch.as_tensor(episode.points.mean(0, dtype=np.float64))  # of all frames, so that a pose holds for others too
-    noise_loss = 0.0 if whole else float(np.mean([cloud.from_surface for cloud in clouds]))
+    noise_loss = 0.0 if whole else mean_noise(clouds)
     return Target(
         tuple(frames),
         torch.as_tensor(episode.times[frames], dtype=torch.float64),

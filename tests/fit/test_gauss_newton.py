@@ -151,9 +151,11 @@ class TestFits:
         assert found.start == {"stretch": pytest.approx(9.0), "mass": pytest.approx(9.0)}
 
     def test_a_single_start_is_the_best_of_the_screen_on_the_first_half(self):
-        objective, values = lifted(nuisance={}), SPACE.starts(8, seed=0)[0].double()
-        found = fit_gauss_newton(objective, SPACE, GaussNewtonSettings(starts=1, screen=7, iterations=1))
-        best = values[batch_losses(objective.until(0.5), SPACE, values).argmin()]
+        objective, values = lifted(nuisance={}), SPACE.starts(8, seed=2)[0].double()
+        found = fit_gauss_newton(objective, SPACE, GaussNewtonSettings(starts=1, screen=7, iterations=1, seed=2))
+        early, late = (batch_losses(one, SPACE, values).argmin() for one in (objective.until(0.5), objective))
+        best = values[early]
+        assert early != late  # else this shows nothing
         assert found.start == {name: pytest.approx(float(value)) for name, value in zip(SPACE.names, best, strict=True)}
         assert found.loss_start == pytest.approx(float(batch_losses(objective, SPACE, best[None])), rel=1e-9)
         assert found.simulations == 8 + 2
@@ -162,6 +164,19 @@ class TestFits:
         found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=3, screen=0, iterations=1))
         assert found.simulations == 6
         torch.testing.assert_close(found.history.values[0], SPACE.starts(3, seed=0)[0].double())
+
+    def test_where_the_chosen_start_diverges_later_the_next_candidate_is_taken(self, monkeypatch):
+        objective, values = lifted(nuisance={}), SPACE.starts(8, seed=0)[0].double()
+        order = batch_losses(objective.until(0.5), SPACE, values).argsort()
+
+        def failing(objective, space, places):
+            found = linearise(objective, space, places)
+            diverges = torch.allclose(Axis.of(space).values(places)[0], values[order[0]])
+            return replace(found, losses=torch.full_like(found.losses, math.inf)) if diverges else found
+
+        monkeypatch.setattr(gauss_newton, "linearise", failing)
+        found = fit_gauss_newton(objective, SPACE, GaussNewtonSettings(starts=1, screen=7, iterations=1))
+        assert found.start == pytest.approx(dict(zip(SPACE.names, values[order[1]].tolist(), strict=True)))
 
     def test_bounds_hold_and_the_rest_goes_on(self):
         space = FitSpace.build(["stretch", "mass"], bounds={"stretch": (1.5, 10.0)})
@@ -200,14 +215,14 @@ class TestFits:
     def test_starts_are_followed_one_after_the_other_until_one_explains_the_recording(self, monkeypatch):
         settings, fits = GaussNewtonSettings(starts=3, screen=7), []
         monkeypatch.setattr(Objective, "knows_gaps", True)
-        for explained in (1e-12, 1.0):  # never, at once
+        for explained, threshold in ((1e-12, 0.0), (1.0, 0.0), (1.0, 1e-30)):  # never, at once, not low enough
             monkeypatch.setattr(Objective, "explained", explained)
-            fits.append(fit_gauss_newton(lifted(), SPACE, settings))
-        every, enough = fits
+            fits.append(fit_gauss_newton(lifted(), SPACE, replace(settings, threshold=threshold)))
+        every, enough, lower = fits
         begun = [torch.stack(found.history.losses).isfinite().sum(0).tolist() for found in (every, enough)]
         assert begun[1][1:] == [0, 0]
         assert begun[0][0] > begun[0][1] > begun[0][2] > 0
-        assert enough.simulations < every.simulations
+        assert enough.simulations < every.simulations == lower.simulations
         assert enough.stop_reason == every.stop_reason == "converged"
 
     @pytest.mark.parametrize("measure", [{"nuisance": {}}, {"paper": True}], ids=["all frames", "one frame"])
@@ -234,23 +249,31 @@ class TestFits:
         objective = lifted(nuisance={}, frames=range(1, count + 1))
         assert [[len(one.frames) for one in growth] for growth in gauss_newton._growths(objective)] == stages
 
-    @pytest.mark.parametrize("height", [0.0, -2.0, 2.0], ids=["inside", "at the lower corner", "at the upper corner"])
-    def test_draws_stay_in_the_valley_between_the_bounds(self, height):
+    @pytest.mark.parametrize(
+        "corner", [(0.0, 0.0), (-2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)], ids=["none", "lower", "upper", "across"]
+    )
+    def test_draws_stay_in_the_valley_between_the_bounds(self, corner):
         """Of two variables, the difference is known within 1 % and the sum hardly; the box cuts the valley off."""
         bounds = (math.exp(-2.0), math.exp(2.0))
         axis = Axis.of(FitSpace.build(["stretch", "mass"], bounds={"stretch": bounds, "mass": bounds}))
         known, wide = torch.tensor([1.0, -1.0]).double(), torch.tensor([1.0, 1.0]).double()
-        curvature = (known[:, None] * known / 2 / 0.01**2 + wide[:, None] * wide / 2 / 3.0**2) / INDEPENDENT
+        curvature = (known[:, None] * known / 0.01**2 + wide[:, None] * wide / 3.0**2) / INDEPENDENT
         found = Linearisation(torch.ones(1).double(), torch.zeros(1, 2).double(), curvature[None], 1)
-        way = gauss_newton._Way(torch.full((2,), height, dtype=torch.float64), found, 3)
+        way = gauss_newton._Way(torch.tensor(corner, dtype=torch.float64), found, 3)
         near, far = (
             gauss_newton._drawn(way, 1, axis, widening, torch.Generator().manual_seed(0)) for widening in (1.0, 4.0)
         )
-        for drawn, deviation in ((near, 0.01), (far, 0.04)):
-            assert bool(((drawn > -2 - 1e-12) & (drawn < 2 + 1e-12)).all())
-            assert float((drawn @ known).abs().max()) < 3.5 * deviation
-        sums = near @ wide
-        assert float(sums.max() - sums.min()) > 1.0
+        for drawn in (near, far):
+            assert bool(((drawn >= -2 - 1e-12) & (drawn <= 2 + 1e-12)).all())
+        off, farther = ((drawn - way.place) @ known for drawn in (near, far))
+        inside = corner[0] == corner[1] == 0.0
+        if inside:
+            torch.testing.assert_close(farther, 4 * off)  # though the box cuts the valley off
+        assert float(off.abs().max()) < 3.5 * 0.01
+        if corner != (-2.0, 2.0):  # there, the valley ends
+            along = near @ wide
+            assert float(along.max() - along.min()) > 1.0
+        assert len(near.unique(dim=0)) > 8
 
     def test_while_none_goes_on_draws_reach_farther(self, monkeypatch):
         monkeypatch.setattr(Objective, "knows_gaps", True)

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from diffcloud.io.episodes import read_episode, write_episode
-from pipeline.coverage import counted, coverage_page
+from pipeline.coverage import cells_of, counted, coverage_page
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
 from tests.pipeline.invoke import invoke
@@ -120,7 +120,7 @@ def test_refusals_and_failures_count_as_misses(tmp_path):
     assert told["identified_within"] == 2
     assert told["rms_error"] == pytest.approx(math.sqrt((math.log(1.1) ** 2 + math.log(1.2) ** 2 + math.log(2) ** 2) / 4))
     assert told["sources"] == {}
-    assert "| lift | mass known | stretch | 5 | 3 | 1 (20 %) |" in coverage_page(tmp_path)
+    assert "| lift | mass known | stretch | 5 | 3 | 1 (20 %) |" in coverage_page(list(cells_of(tmp_path)))
 
 
 def test_sources_are_told_beside_what_noise_alone_would_hold(tmp_path):
@@ -136,7 +136,9 @@ def test_sources_are_told_beside_what_noise_alone_would_hold(tmp_path):
     told = counted(folder)["parameters"]["stretch"]
     assert told["noise_alone"] == 1  # the quantile is 1.86
     assert told["sources"] == pytest.approx({"noise": 0.1, "step size": 0.3, "prior": 0.0})
-    assert "| lift | mass known | stretch | 1 (50 %) | step size 90 %, noise 10 % |" in coverage_page(tmp_path)
+    assert "| lift | mass known | stretch | 1 (50 %) | step size 90 %, noise 10 % |" in coverage_page(
+        list(cells_of(tmp_path))
+    )
 
 
 class TestIntervals:

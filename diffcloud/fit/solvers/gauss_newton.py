@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -54,10 +55,13 @@ _BEFORE, _SEARCHED = 3, 64
 _GROWING = (0.5, 0.75), (0.4, 0.6, 0.8)
 """For each start that is found so, the parts of the frames over which the recording grows. Where one of them goes astray at
 the end, the other seldom does."""
-_DRAWN, _WIDENING, _GOES_ON = 16, (1.0, 2.0, 4.0), 1.3
-"""So many places are drawn before each next part, with the deviations of what is known so far; and again with larger ones,
-until a loss comes within this factor of one that explains the frames, or, where that is not known, of what the part before
-ended at. Where a motion may go on in two ways, the right one may be rare, and a beginning may have gone astray itself."""
+_DRAWS = 16
+"""Places that are drawn before each next part, around where the part before ended."""
+_WIDENING = (1.0, 2.0, 4.0)
+"""Times the deviations of what is known so far, one after the other, while no draw is low enough: where a motion may go on
+in two ways, the right one may be rare, and a beginning may have gone astray itself."""
+_LOW_ENOUGH, _AS_LOW = 1.1, 1.3
+"""Times what explains the frames; where that is not known, times what the part before ended at."""
 _MISFIT = 30.0
 """Times what explains a recording; above that, it is the model that does not: no start will."""
 _EQUALLY = 1.01
@@ -105,13 +109,14 @@ def fit_gauss_newton(
     began = time.perf_counter()
     axis = Axis.of(space)
     known = objective.explained
-    most, explained = settings.starts or _MOST, known or settings.threshold
+    most, explained = settings.starts or _MOST, settings.threshold or known
     # where a right motion can have no higher loss than what explains the recording, equal ones say nothing
     wrong = math.inf if not known and settings.threshold else _MISFIT * known if objective.knows_gaps else 0.0
     places, simulations = _starts(objective, space, settings, axis, most)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
-    waiting = [_Start(place, origin) for origin, place in enumerate(places)]
+    candidates = [_Start(place, origin) for origin, place in enumerate(places)]
+    waiting, others = candidates[:most], candidates[most:]
 
     def tell() -> None:
         if progress is not None:
@@ -155,6 +160,8 @@ def fit_gauss_newton(
                 simulations += found.simulations
                 ways.go_on(lower, found)
             if not math.isfinite(ways.best.loss):
+                if others and not ways.waiting:  # they diverge after the frames that they were chosen by
+                    ways.waiting.append(others.pop(0))
                 if ways.waiting:
                     continue
                 raise DivergedError(0, [], f"all {len(ways.every)} starts diverged")
@@ -314,7 +321,7 @@ class _Ways:
 def _starts(
     objective: AnyObjective, space: FitSpace, settings: GaussNewtonSettings, axis: Axis, most: int
 ) -> tuple[Tensor, int]:
-    """Places [B, k] to start at, of which there are at most so many, and how many simulations it took to choose them."""
+    """Places [B, k] to start at, at least so many, the best ones first; and how many simulations it took to tell."""
     count = max(1 + settings.screen, most)
     values = space.starts(count, seed=settings.seed, first=settings.init)[0].double()
     if not settings.screen:
@@ -325,7 +332,7 @@ def _starts(
     order = losses.argsort()
     if settings.init:
         order = torch.cat([torch.zeros(1, dtype=torch.long), order[order > 0]])
-    return axis.places(values[order[:most]]), count * len(objective.members)
+    return axis.places(values[order]), count * len(objective.members)
 
 
 def _searched(
@@ -376,9 +383,10 @@ def _grown(
     Args:
         stages: the recordings as they grow; on the last one, the whole, the descent is the caller's.
         place: [k]
-        stream: of random numbers.
+        stream: number of the random stream.
     """
-    generator, simulations = torch.Generator().manual_seed(settings.seed + stream), 0
+    seed = int(np.random.default_rng([settings.seed, stream]).integers(2**31))
+    generator, simulations = torch.Generator().manual_seed(seed), 0
     for early, later in pairwise(stages):
         found = linearise(early, space, place[None])
         way, simulations = _Way(place, found, settings.iterations), simulations + found.simulations
@@ -404,9 +412,9 @@ def _goes_on(
     generator: torch.Generator,
     tell: Callable[[], None],
 ) -> tuple[Tensor, int]:
-    """From where a way's end on early frames goes on with later ones [k]: the lowest of it and of places drawn around it;
-    and how many simulations it took to choose."""
-    enough = _GOES_ON * (later.explained if later.knows_gaps else way.loss)
+    """The place [k] at which to continue with the later frames, the lowest of the way's end and of places drawn around it,
+    ever farther from it while none is low enough; and how many simulations that took."""
+    enough = _LOW_ENOUGH * later.explained if later.knows_gaps else _AS_LOW * way.loss
     place, lowest, simulations, tried = way.place, math.inf, 0, way.place[None]
     for widening in _WIDENING:
         tell()
@@ -423,16 +431,27 @@ def _goes_on(
 
 def _drawn(way: _Way, recordings: int, axis: Axis, widening: float, generator: torch.Generator) -> Tensor:
     """[n, k] places drawn from what a way's end says of all variables (`fit.priors`: the logarithm of the loss), with so
-    many times its deviations. To the side where it goes farther, each goes as far as the bounds allow: if these cut single
-    variables, it would leave the valley in which a combination of them is known well."""
+    many times its deviations.
+
+    Each is a sum of steps along principal axes, the best known one first. A step that would leave the box goes to the side
+    with more room, as far as the bound; the steps along better known axes stay, and with them a combination that is known.
+    """
     spread, axes = torch.linalg.eigh(way.normal)
     reach = (way.loss / (INDEPENDENT * recordings * spread.clamp(min=max(1e-9 * float(spread[-1]), 1e-300)))).sqrt()
-    steps = widening * torch.randn(_DRAWN, len(reach), generator=generator, dtype=torch.float64) * reach @ axes.T
+    lengths = widening * reach * torch.randn(_DRAWS, len(reach), generator=generator, dtype=torch.float64)
+    places = way.place.expand(_DRAWS, -1)
+    for along, direction in zip(lengths.T.flip(0), axes.T.flip(0), strict=True):
+        step = along[:, None] * direction
+        forth, back = _room(places, step, axis), _room(places, -step, axis)
+        places = places + torch.where(forth < back, -back, forth)[:, None] * step
+    return places
+
+
+def _room(places: Tensor, steps: Tensor, axis: Axis) -> Tensor:
+    """[n] how much of steps [n, k] from places [n, k] the bounds leave; 1: all."""
     low, high = axis.ends
-    both = torch.stack([steps, -steps])
-    free = torch.where(both > 0, high - way.place, low - way.place) / both
-    parts = free.nan_to_num(nan=1.0).amin(-1).clamp(0.0, 1.0)
-    return way.place + torch.where(parts[0] < parts[1], -parts[1], parts[0])[:, None] * steps
+    free = torch.where(steps > 0, high - places, low - places) / steps
+    return free.nan_to_num(nan=1.0).amin(-1).clamp(0.0, 1.0)
 
 
 def _frames(objective: AnyObjective) -> int:
