@@ -173,8 +173,18 @@ class TestVerdicts:
     def test_a_loss_somewhat_above_what_noise_leaves_is_remarked_on(self, told):
         right, doubted = (told({"noise": np.diag([0.01, 0.01])}, loss=loss) for loss in (1.1, 1.7))
         assert right.remark == ""
+        assert doubted.sentences == [doubted.remark[0].upper() + doubted.remark[1:] + "."]
         assert "the loss is 1.7 times what noise" in doubted.remark
         assert doubted.parameters["stretch"] == right.parameters["stretch"]
+
+    @pytest.mark.parametrize("why", ["not explained", "gaps unknown", "no noise"])
+    def test_nothing_is_remarked_where_a_reason_is_given_or_the_noise_is_not_known(self, told, monkeypatch, why):
+        if why != "not explained":
+            monkeypatch.setattr(Objective, *{"gaps unknown": ("knows_gaps", False), "no noise": ("noise_loss", 0.0)}[why])
+        found = told(
+            {"noise": np.diag([0.01, 0.01])}, loss=1.7, misfit=(9.0, 4.0) if why == "not explained" else (3.0, 3.0)
+        )
+        assert found.remark == ""
 
 
 class Wells(Bowl):

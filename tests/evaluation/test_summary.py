@@ -113,6 +113,7 @@ class TestWords:
         assert "verdict on stretch: only the ratio in 2 of 2 episodes; 90% intervals end within a factor of 2" in told_of
         assert "lift: stretch / mass is known within a factor of 1.07 (median)." in told_of
         assert "lift / tan2: the misfit is 14.2 mm." in told_of
+        assert "lift / tan1: the loss is 1.7 times what noise leaves." in told_of
         assert any("stretch a factor of 2" in line for line in said["repeats"])
 
     @pytest.mark.parametrize(("ends", "disagree"), [((3.0, 4.0), True), ((0.1, 0.2), True), ((0.1, 9.0), False)])
