@@ -109,7 +109,7 @@ moved: venv
 # How often intervals hold the truth: drawn cloths, recorded, fitted, and held against what was drawn. The same for a posterior
 # trained on simulated lifts of uncertain material, as those cameras see them.
 POSTERIOR := build/coverage-posterior
-COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --out build/coverage --seed 35023699 --workers 2
+COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --out build/coverage --seed 16210837 --workers 2
 coverage: venv
 	$(COVERAGE) --recordings 24 --fix mass
 	$(COVERAGE) --recordings 16 --fix mass --refined --scenario lift --scenario fold
