@@ -271,8 +271,8 @@ def _remark(objective: AnyObjective, found: Uncertainty) -> str:
     if max(excess, default=0.0) < _DOUBTED:
         return ""
     return (
-        f"the loss is {max(excess):.1f} times what noise and spacing of the points leave (1.1 times that at most, where the "
-        "model is exact and the fit right): the fit may have ended in a wrong minimum, or the model lacks something"
+        f"the loss is {max(excess):.1f} times what noise and spacing of the points leave (1.1 times that at most, where "
+        "the model is exact and the fit right): the fit may have ended in a wrong minimum, or the model lacks something"
     )
 
 
