@@ -56,7 +56,7 @@ HEAD = (
     "median half-width",
     "identified",
 )
-SOURCE_HEAD = ("scenario", "known", "parameter", "noise alone would hold", "largest sources")
+SOURCE_HEAD = ("scenario", "known", "parameter", "hold the truth with noise alone", "largest sources")
 
 
 @writes()
@@ -426,9 +426,10 @@ def coverage_page(cells: Sequence[Cell]) -> str:
     ]
     if sources:
         lines += [
-            "Where the uncertainty comes from: the largest sources' parts of the variance, from the medians of their "
-            "deviations over the recordings (what each is: [evaluation.md](../evaluation.md#what-is-identified)). Beside "
-            "them, how many of the same intervals would hold the truth if they counted the noise of the residuals alone.",
+            "Where the uncertainty comes from: each source's share of the variance, from its median standard deviation "
+            "over the recordings. At most the four largest are listed, and none of 1 % or less; "
+            "[evaluation.md](../evaluation.md#what-is-identified) explains each. The fourth column counts the intervals "
+            "that would still hold the truth if they counted the source `noise` alone.",
             "",
             *markdown_table(SOURCE_HEAD, sources),
             "",

@@ -386,7 +386,7 @@ def _motion_of(objective: Objective) -> str:
 def _findings(record: FitRecord, objective: AnyObjective, found: Intervals) -> list[str]:
     """The report's first lines: does the model explain the recordings, do parameters carry over, what are they."""
     if found.explains:
-        verdict = "There is a doubt whether the model explains" if found.remark else "The model explains"
+        verdict = "It is doubtful whether the model explains" if found.remark else "The model explains"
         lines = [f"{verdict} the recordings: misfit {record.rms_mm:.1f} mm RMS."]
     else:
         worst = max(record.episodes, key=lambda one: one.rms_mm)

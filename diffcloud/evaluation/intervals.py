@@ -58,7 +58,8 @@ _UNEXPLAINED = 2.0
 """RMS over what noise and spacing of the points account for, from which the model does not explain the recording."""
 _DOUBTED = 1.3
 """Times what noise and spacing leave of a loss, from which a fit is doubted whose recording knows what it misses: of random
-cloths that this simulator moved, right fits have at most 1.1 times that, wrong minima 1.4 or more (docs/evaluation.md)."""
+cloths that this simulator moved, right fits have had 1.14 times that at most, wrong minima 1.4 at least
+(docs/evaluation.md)."""
 _STEP = 2.0
 """The largest next step of a fit that has arrived, in standard deviations."""
 _PRIOR = 0.5
@@ -271,8 +272,8 @@ def _remark(objective: AnyObjective, found: Uncertainty) -> str:
     if max(excess, default=0.0) < _DOUBTED:
         return ""
     return (
-        f"the loss is {max(excess):.1f} times what noise and spacing of the points leave (1.1 times that at most, where "
-        "the model is exact and the fit right): the fit may have ended in a wrong minimum, or the model lacks something"
+        f"the loss is {max(excess):.1f} times what noise and spacing of the points leave, and a right fit of an exact "
+        "model stays below about 1.15 times: the fit may have ended in a wrong minimum, or the model lacks something"
     )
 
 
