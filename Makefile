@@ -40,8 +40,10 @@ test: venv
 tests: venv
 	$(TESTS)
 
+# how soon an arm stands still is no question for a machine that runs three tests at once
 test-slow: venv
-	$(TESTS) -m slow
+	$(TESTS) -m "slow and not realtime"
+	python -m pytest -m realtime tests/hardware
 
 # minutes each on a slow machine: the lag in sixteen recordings, and identifying two more MuJoCo towels
 test-longest: venv

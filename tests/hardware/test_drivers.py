@@ -88,12 +88,14 @@ class TestNames:
 
 class TestArm:
     @pytest.mark.slow
+    @pytest.mark.realtime
     def test_the_example_does_all_that_a_capture_relies_on(self, controller):
         before = controller.tool_position
         assert wrong_arm(controller, move=True) == set()
         np.testing.assert_allclose(controller.tool_position, before, atol=3e-3)
 
     @pytest.mark.slow
+    @pytest.mark.realtime
     def test_so_does_the_gen3s(self):
         with FakeArm() as server:
             checker = ArmChecker(gen3(), Limits(), ArmLimits())
@@ -116,6 +118,7 @@ class TestArm:
         assert {"joints", "tool frame"} <= wrong_arm(controller, robot=gen3())
 
     @pytest.mark.slow
+    @pytest.mark.realtime
     @pytest.mark.parametrize(
         ("driver", "wrong"),
         [("InTheToolsFrame", "velocity"), ("HardlyStopping", "stands still after Stop")],
@@ -124,6 +127,7 @@ class TestArm:
         assert wrong in wrong_arm(controller, f"tests.hardware.drivers:{driver}", move=True)
 
     @pytest.mark.slow
+    @pytest.mark.realtime
     def test_an_arm_that_moves_on_without_its_link(self, controller, monkeypatch):
         monkeypatch.setattr("diffcloud.hardware.examples.simulated_ur5e._SILENCE_S", 60.0)
         assert wrong_arm(controller, move=True) == {"stops by itself when its process is lost"}
@@ -135,6 +139,7 @@ class TestArm:
         np.testing.assert_array_equal(controller.tool_position, before)
 
     @pytest.mark.slow
+    @pytest.mark.realtime
     def test_a_cable_that_a_person_pulls(self):
         with FakeArm() as server:
 
@@ -238,6 +243,7 @@ class TestCommand:
         np.testing.assert_array_equal(controller.tool_position, before)
 
     @pytest.mark.slow
+    @pytest.mark.realtime
     def test_a_trajectory_beyond_the_arms_reach_is_wrong(self, tmp_path, controller):
         rows = "t_s,x,y,z\n0,0.49,0.13,0.36\n9,0.94,0.35,0.9\n"
         (tmp_path / "far.csv").write_text(rows)
