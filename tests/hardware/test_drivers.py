@@ -150,12 +150,9 @@ class TestArm:
                     threading.Timer(1.0, server.pull_cable).start()
 
             checker = ArmChecker(gen3(), Limits(), ArmLimits())
-            found = {
-                one.name: (one.state, one.detail)
-                for one in conformance.check_arm(lambda: in_process(server), checker, move=True, ask=ask)
-            }
-        state, detail = found["stops by itself when its cable is pulled"]
-        assert state == "ok", detail
+            found = list(conformance.check_arm(lambda: in_process(server), checker, move=True, ask=ask))
+        assert {one.name: one.detail for one in found if one.state != "ok"} == {}
+        assert "stops by itself when its cable is pulled" in {one.name for one in found}
 
 
 class TestCamera:
