@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -15,18 +15,18 @@ import typer
 from rich.table import Table
 
 from diffcloud.errors import ConfigError, DiffCloudError
-from diffcloud.evaluation.intervals import LEVEL, RESTARTS, noise_quantile, state_intervals
-from diffcloud.evaluation.markdown import markdown_table
-from diffcloud.evaluation.summary import largest_sources
+from diffcloud.evaluation.intervals import LEVEL, RESTARTS, state_intervals
 from diffcloud.fit import solve
 from diffcloud.fit.pose import NUISANCE, SET_UP, PoseSpace
 from diffcloud.fit.uncertainty import REFINED
 from diffcloud.io.episodes import Episode, read_episode, write_episode
-from diffcloud.io.files import files_in, read_json, write_json, write_text
+from diffcloud.io.files import write_json, write_text
 from diffcloud.io.fingerprints import fingerprint, kept_record
 from diffcloud.scene.scenarios import Scenario
+from diffcloud.sensing.depth_camera import DepthNoise
 from pipeline.config import Config, EpisodesConfig, load_config
 from pipeline.console import JsonFlag, ParamsFile, errors, finish, show, writes
+from pipeline.coverage_page import HEAD, REFITS, cells_of, counted, coverage_page, summary
 from pipeline.episodes import hidden_parameters, record_motion, simulated_frames
 from pipeline.fit_jobs import FitJob, Recording
 from pipeline.preprocess import PreprocessJob
@@ -39,24 +39,14 @@ if TYPE_CHECKING:
 _RECORDS = ("mesh", "io", "sim", "scene", "clouds", "sensing")
 """Packages whose source decides what is recorded."""
 _CODE = (*_RECORDS, "fit", "evaluation")
-_RATIO = "stretch / mass"
-Cell = tuple[tuple[str, str, str], dict[str, Any]]
-"""(scenario, known, parameter), and what the records of that folder say of it, as of `counted`."""
 _LAID_M = 0.01
 """Deviation by which a cloth is laid beside its place."""
-HEAD = (
-    "scenario",
-    "known",
-    "parameter",
-    "recordings",
-    "stated",
-    "hold the truth",
-    "RMS error",
-    "median error",
-    "median half-width",
-    "identified",
-)
-SOURCE_HEAD = ("scenario", "known", "parameter", "hold the truth with noise alone", "largest sources")
+Truth = Literal["same", "refined", "finer"]
+_OTHER_NOISE = DepthNoise(subpixel_px=0.1, correlation_px=1.5, step_px=1 / 16, edge_dropout=0.5, flying=0.2, holes=0.01)
+"""Of cameras that are worse than the noise model says: errors of more pixels go together, disparity has coarser steps, and
+more of the borders is lost or lands in between."""
+_OTHER_NOISE_M = 0.001
+"""And of whole surfaces, which else have none: a deviation along each axis."""
 
 
 @writes()
@@ -69,9 +59,17 @@ def coverage(
     seed: Annotated[int, typer.Option(min=0, help="Of truths and noise.")] = 0,
     fix: Annotated[list[str] | None, typer.Option(help="Parameter whose true value fits are given, repeatable.")] = None,
     level: Annotated[float | None, typer.Option(min=0.01, max=0.999, help="Of the intervals. Default: 0.9.")] = None,
-    refined: Annotated[
-        bool, typer.Option("--refined", help="Simulate the truth with four times the steps that fits take.")
-    ] = False,
+    refits: Annotated[
+        int | None,
+        typer.Option(min=2, help="Record and fit each cloth so many times; only what is fitted stays the same."),
+    ] = None,
+    truth: Annotated[
+        Truth,
+        typer.Option(
+            help="Simulated as fits do (same), with four times their steps and recorded with noise that they do not expect "
+            "(refined), or like that and on a mesh with half the edge length (finer)."
+        ),
+    ] = "same",
     checkpoint: Annotated[
         list[Path] | None,
         typer.Option(help="Written by `diffcloud train`, repeatable: what it predicts of the same recordings."),
@@ -94,12 +92,15 @@ def coverage(
             raise ConfigError(f"--fix names a fitted parameter, one of {', '.join(config.fit.parameters)}, not {name!r}.")
     if set(known) >= set(config.fit.parameters):
         raise ConfigError("Nothing is left to fit: leave out a --fix.")
+    if refits and checkpoint:
+        raise ConfigError("Networks predict recordings of different cloths; leave out --checkpoint, or --refits.")
     jobs = [
         CoverageJob(
-            choose_scenario(name), index, seed, known, level or config.evaluate.level or LEVEL, refined, config, out
+            choose_scenario(name), index, seed, known, level or config.evaluate.level or LEVEL, truth, config, out, refit
         )
         for name in scenario or config.scenarios
         for index in range(recordings)
+        for refit in (range(refits) if refits else (None,))
     ]
     readers = _regressors(checkpoint or (), jobs)
     failures = []
@@ -111,11 +112,11 @@ def coverage(
         _predict(regressor, jobs)
     cells = list(cells_of(out))
     table = Table(*HEAD)
-    for row in _summary(cells):
+    for row in summary(cells):
         table.add_row(*row)
     show(table, json)
     if markdown is not None:
-        write_text(markdown, coverage_page(cells))
+        write_text(markdown, coverage_page(out))
     asked = {f"{job.scenario.name}/{job.folder.name}": job.folder for job in jobs}
     counts = {name: counted(folder) for name, folder in asked.items()}
     result = next(iter(counts.values())) if len(counts) == 1 else {"scenarios": counts}
@@ -131,18 +132,30 @@ class CoverageJob:
     seed: int
     known: tuple[str, ...]
     level: float
-    refined: bool
+    how: Truth
+    """The truth is simulated and recorded."""
     config: Config
     out: Path
+    refit: int | None = None
+    """Number of the recording of this cloth; None: its only one."""
+
+    @property
+    def name(self) -> str:
+        return f"{self.index:04d}" if self.refit is None else f"{self.index:04d}_{self.refit:02d}"
 
     @property
     def label(self) -> str:
-        return f"{self.scenario.name}/{self.index}"
+        return f"{self.scenario.name}/{self.name}"
 
     @property
     def folder(self) -> Path:
-        told = "_".join((*self.known, "known")) if self.known else "free"
-        return self.out / self.scenario.name / (f"{told}_refined" if self.refined else told)
+        told = [*self.known, "known"] if self.known else ["free"]
+        return self.out / self.scenario.name / "_".join([*told, *self.kind])
+
+    @property
+    def kind(self) -> list[str]:
+        """Of recordings, as names of folders say it."""
+        return [self.how] * (self.how != "same") + [REFITS] * (self.refit is not None)
 
     def run(self, tell: Tell) -> dict[str, Any]:
         """The finished record.
@@ -150,8 +163,8 @@ class CoverageJob:
         Raises:
             DiffCloudError: the cloth cannot be simulated, recorded or fitted; the record says so.
         """
-        path = self.folder / f"{self.index:04d}.json"
-        plan = [self.scenario, self.index, self.seed, self.known, self.level, self.refined]
+        path = self.folder / f"{self.name}.json"
+        plan = [self.scenario, self.index, self.refit, self.seed, self.known, self.level, self.how]
         sections = [self.config.episodes, self.config.preprocess, self.config.fit]
         mark = fingerprint([*plan, [str(section) for section in sections]], packages=_CODE)
         if (kept := kept_record(path, mark)) is not None:
@@ -170,6 +183,8 @@ class CoverageJob:
         """All that is drawn, name -> value."""
         rng = np.random.default_rng([self.seed, self.index])
         drawn = hidden_parameters(self.scenario, self.config.episodes.model_copy(update={"per_scenario": 1}), rng)
+        if self.refit is not None:
+            rng = self._random(3)
         found = {name: float(value[0]) for name, value in drawn.items()}
         for name, factor in self.config.fit.known_within([self.scenario]).items():
             off, value = rng.lognormal(0.0, math.log(factor)), self.scenario.value(name)
@@ -180,9 +195,13 @@ class CoverageJob:
     def set_up(self) -> dict[str, float]:
         """Errors of the set-up, drawn as fits doubt it, name of `fit.pose` -> value [m, rad, s]; and how far beside its
         place the cloth is laid with its gripper, `laid_x` and `laid_y` [m]."""
-        rng = np.random.default_rng([self.seed, self.index, 2])
+        rng = self._random(2)
         deviations = {**SET_UP, "laid_x": _LAID_M, "laid_y": _LAID_M}
         return {name: deviation * float(rng.standard_normal()) for name, deviation in deviations.items()}
+
+    def _random(self, *stream: int) -> np.random.Generator:
+        """Of this recording of the cloth."""
+        return np.random.default_rng([self.seed, self.index, *stream, *([] if self.refit is None else [self.refit])])
 
     def _measured(self, truth: Mapping[str, float], tell: Tell) -> dict[str, Any]:
         episode = self.episode(truth, tell)
@@ -208,9 +227,9 @@ class CoverageJob:
 
     def episode(self, truth: Mapping[str, float], tell: Tell) -> Episode:
         """Recorded and preprocessed; fits with other known parameters share it."""
-        place = self.out / self.scenario.name / ("episodes_refined" if self.refined else "episodes")
-        path = place / f"{self.index:04d}.npz"
-        told = [self.scenario, self.index, self.seed, self.refined, str(self.config.episodes), str(self.config.preprocess)]
+        path = self.out / self.scenario.name / "_".join(["episodes", *self.kind]) / f"{self.name}.npz"
+        told = [self.scenario, self.index, self.refit, self.seed, self.how]
+        told += [str(self.config.episodes), str(self.config.preprocess)]
         set_up = self.set_up()
         made = fingerprint([*told, dict(truth), set_up], packages=_RECORDS)
         if path.is_file() and (kept := read_episode(path)).meta.get("made") == made:
@@ -224,21 +243,28 @@ class CoverageJob:
         }
         tell(0.0, "recording")
         scene = self.scenario.scene
-        if self.refined:
+        if self.how != "same":
             scene = replace(scene, frame_steps=REFINED * scene.frame_steps)
+        if self.how == "finer":
+            scene = scene.finer()
         sets = {name: np.array([value]) for name, value in truth.items()}
         system, (nodes,), times = simulated_frames(replace(self.scenario, scene=scene), sets)
-        seed = int(np.random.default_rng([self.seed, self.index, 1]).integers(2**31))
+        rng = self._random(1)
+        seed = int(rng.integers(2**31))
         with TemporaryDirectory(prefix="diffcloud-") as folder:
             work = Path(folder)
             config = _misplaced(self.config.episodes, set_up)
-            record_motion(self.scenario, system, nodes, times, work, path.stem, config, seed=seed, meta=meta)
+            noise = None if self.how == "same" else _OTHER_NOISE
+            record_motion(self.scenario, system, nodes, times, work, path.stem, config, seed=seed, meta=meta, noise=noise)
             source = work / path.stem if (work / path.stem).is_dir() else work / path.name
             tell(0.25, "preprocessing")
             PreprocessJob("clean", source, work, self.config.preprocess, None).run(lambda done, text: None)
             episode = read_episode(work / "clean" / path.name)
         if self.scenario.recorder == "whole_surface":
             episode = _displaced(episode, set_up)
+            if self.how != "same":
+                shaken = episode.points + _OTHER_NOISE_M * rng.standard_normal(episode.points.shape)
+                episode = replace(episode, points=shaken.astype(np.float32))
         write_episode(path, episode)
         return episode
 
@@ -301,145 +327,5 @@ def _predict(regressor: Regressor, jobs: Sequence[CoverageJob]) -> None:
                 stretch, mass = (found.samples[0, :, told.names.index(name)] for name in ("stretch", "mass"))
                 ends = np.quantile((stretch / mass).numpy(), [0.5, 0.5 - job.level / 2, 0.5 + job.level / 2])
                 record["intervals"]["ratio"] = dict(zip(("value", "low", "high"), ends.tolist(), strict=True))
-        folder = job.out / job.scenario.name / (f"{told.model}_refined" if job.refined else told.model)
+        folder = job.out / job.scenario.name / "_".join([told.model, *job.kind])
         write_json(folder / f"{job.index:04d}.json", {"truth": truth, **record})
-
-
-def counted(folder: Path) -> dict[str, Any]:
-    """What the records of one folder say.
-
-    Returns:
-        parameters: name -> n, stated: with an interval, covered: those that hold the truth, median_factor: of the
-        intervals, rms_error: of the logarithm, verdicts, identified_within: of those called identified, how many are within
-        the factor, noise_alone: how many intervals of the noise of residuals alone would hold the truth, sources: source ->
-        median deviation; ratio: the same of stretch to mass, if both are fitted.
-    """
-    records = [read_json(path) for path in files_in(folder, ".json")]
-    fitted = next((list(one["intervals"]["parameters"]) for one in records if "intervals" in one), [])
-    parameters = {name: _count(records, name) for name in fitted}
-    told: dict[str, Any] = {"parameters": parameters}
-    if any("ratio" in one.get("intervals", {}) for one in records) and {"stretch", "mass"} <= set(fitted):
-        told["ratio"] = _count(records, "ratio")
-    return told
-
-
-def _count(records: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
-    offs, widths, covered, verdicts, right, alone = [], [], 0, dict[str, int](), 0, 0
-    sources: dict[str, list[float]] = {}
-    for record in records:
-        if "intervals" not in record:
-            continue
-        truth, told = record["truth"], record["intervals"]
-        entry = told["ratio"] if name == "ratio" else told["parameters"][name]
-        true = truth["stretch"] / truth["mass"] if name == "ratio" else truth[name]
-        off = abs(math.log(entry["value"] / true))
-        offs.append(off)
-        if entry["low"] is not None:
-            covered += entry["low"] <= true <= entry["high"]
-            widths.append(math.log(entry["high"] / entry["low"]) / 2)
-        if (verdict := entry.get("verdict")) is not None:
-            verdicts[verdict] = verdicts.get(verdict, 0) + 1
-            right += verdict == "identified" and off <= math.log(told["within"])
-        if entry["low"] is None or "sources" not in told:
-            continue
-        for source, deviations in told["sources"].items():
-            sources.setdefault(source, []).append(deviations[name])
-        if "noise" in told["sources"]:
-            alone += off <= noise_quantile(told["clusters"], told["level"]) * told["sources"]["noise"][name]
-    return {
-        "n": len(records),
-        "stated": len(widths),
-        "covered": covered,
-        "median_factor": math.exp(float(np.median(widths))) if widths else None,
-        "median_half_width": float(np.median(widths)) if widths else None,
-        "rms_error": float(np.sqrt(np.mean(np.square(offs)))) if offs else None,
-        "median_error": float(np.median(offs)) if offs else None,
-        "verdicts": verdicts,
-        "identified_within": right,
-        "noise_alone": int(alone),
-        "sources": {source: float(np.median(deviations)) for source, deviations in sources.items()},
-    }
-
-
-def _summary(cells: Sequence[Cell]) -> list[list[str]]:
-    """Rows under `HEAD`."""
-    return [
-        [
-            *labels,
-            str(count["n"]),
-            str(count["stated"]),
-            _share(count["covered"], count["n"]),
-            _number(count["rms_error"]),
-            _number(count["median_error"]),
-            _number(count["median_half_width"]),
-            f"{count['identified_within']} of {count['verdicts'].get('identified', 0)}" if labels[2] != _RATIO else "",
-        ]
-        for labels, count in cells
-    ]
-
-
-def _sources(cells: Sequence[Cell]) -> list[list[str]]:
-    """Rows under `SOURCE_HEAD`, of cells whose intervals name their sources."""
-    return [
-        [
-            *labels,
-            _share(count["noise_alone"], count["n"]),
-            largest_sources({source: {"": deviation} for source, deviation in count["sources"].items()}, "", 4),
-        ]
-        for labels, count in cells
-        if count["sources"]
-    ]
-
-
-def cells_of(out: Path) -> Iterator[Cell]:
-    """Of all folders of records."""
-    for scenario in sorted(path for path in out.iterdir() if path.is_dir()):
-        for folder in sorted(path for path in scenario.iterdir() if path.is_dir() and files_in(path, ".json")):
-            told = counted(folder)
-            ratio = {_RATIO: told["ratio"]} if "ratio" in told else {}
-            for name, count in (told["parameters"] | ratio).items():
-                yield (scenario.name, folder.name.replace("_", " "), name), count
-
-
-def coverage_page(cells: Sequence[Cell]) -> str:
-    """Markdown of docs/results/coverage.md."""
-    rows, sources = _summary(cells), _sources(cells)
-    networks = any({"free", "known"}.isdisjoint(row[1].split()) for row in rows)
-    lines = [
-        "# How often intervals hold the truth",
-        "",
-        "Cloths of drawn parameters are simulated, recorded (`lift` and `fold` by two depth cameras through "
-        "`preprocess`, the others by their whole surface), fitted, and the 90 % interval is held against the truth. "
-        "Material that is not asked for is off by the factors that fits state (`fit.doubts`); cameras and clock are "
-        "off by what they assume of a calibrated set-up (2 mm and 0.3° along and about each axis, and 2 ms, as "
-        "standard deviations; `preprocess` measures the clock anew), and the cloth is displaced by about a centimetre. "
-        "Errors and half-widths are of the natural logarithm: 0.1 is about 10 %. A fit that fails or states no "
-        "interval is a miss. *Identified*: of the recordings with that verdict, how many are within its factor of the "
-        "truth. *Refined*: the truth has four times the steps that fits take. "
-        + "Rows named after a network are its predictions of the same recordings (`--checkpoint`); the prior of a "
-        "posterior is the distribution that its training draws had, which may be wider than that of these truths. "
-        * networks
-        + "Command: `make coverage`.",
-        "",
-        *markdown_table(HEAD, rows),
-        "",
-    ]
-    if sources:
-        lines += [
-            "Where the uncertainty comes from: each source's share of the variance, from its median standard deviation "
-            "over the recordings. At most the four largest are listed, and none of 1 % or less; "
-            "[evaluation.md](../evaluation.md#what-is-identified) explains each. The fourth column counts the intervals "
-            "that would still hold the truth if they counted the source `noise` alone.",
-            "",
-            *markdown_table(SOURCE_HEAD, sources),
-            "",
-        ]
-    return "\n".join(lines)
-
-
-def _share(part: int, whole: int) -> str:
-    return f"{part} ({100 * part / whole:.0f} %)"
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f}"

@@ -124,6 +124,7 @@ def record_motion(
     *,
     seed: int,
     meta: Mapping[str, Any],
+    noise: DepthNoise | None = None,
     tell: Callable[[int, str], None] = lambda done, text: None,
 ) -> None:
     """Record one simulated motion as the scenario says: its whole surface in OUT/NAME.npz, or by depth cameras in the raw
@@ -132,6 +133,7 @@ def record_motion(
     Args:
         nodes: [T, V, 3] of the cloth at times [T].
         seed: of the recorder's noise.
+        noise: of depth cameras; by default what `config` says.
         tell: called with (frames done, text).
 
     Raises:
@@ -152,7 +154,7 @@ def record_motion(
     _replaceable(out / name, "synthetic")  # refused before it is recorded
     height = float(obstacles[0].nodes[:, 2].max()) if obstacles else float(nodes[0, :, 2].min())
     motion = ClothMotion(nodes, faces, times, scenario.grasped, height)
-    cameras = published_cameras(*config.image_size, noise=DepthNoise(subpixel_px=config.subpixel_px))
+    cameras = published_cameras(*config.image_size, noise=noise or DepthNoise(subpixel_px=config.subpixel_px))
     with staged(out / name) as folder:
         record(folder, motion, cameras, settings=config.recorder(), seed=seed, meta=meta, tell=tell)
         _clear(out / name, "synthetic")

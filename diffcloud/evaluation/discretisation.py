@@ -10,10 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from diffcloud.mesh.refinement import refined
 from diffcloud.scene.description import Scene
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim.handles import Handles
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import init, rollout
 
@@ -126,25 +124,13 @@ def mesh_study(scenario: Scenario, cuts: int) -> list[MeshRow]:
     scene, nodes = scenario.scene, len(scenario.scene.mesh.nodes)
     runs, sizes = [simulate(scenario, scene)], [nodes]
     for _ in range(cuts):
-        scene = _finer(scene)
+        scene = scene.finer()
         runs.append(simulate(scenario, scene))
         sizes.append(len(scene.mesh.nodes))
     return [
         MeshRow(scenario.name, cut, sizes[cut], _distance(coarse.nodes[:, :nodes], fine.nodes[:, :nodes]), coarse.seconds)
         for cut, (coarse, fine) in enumerate(itertools.pairwise(runs))
     ]
-
-
-def _finer(scene: Scene) -> Scene:
-    """The scene with its mesh cut once; what lies between two held nodes of one motion is held like them."""
-    mesh, edges = refined(scene.mesh)
-    of_node = {handle.node: handle for handle in scene.handles.handles}
-    more = []
-    for place, (a, b) in enumerate(edges.tolist()):
-        if a in of_node and b in of_node and replace(of_node[a], node=b) == of_node[b]:
-            more.append(replace(of_node[a], node=len(scene.mesh.nodes) + place))
-    handles = Handles((*scene.handles.handles, *more), scene.handles.stiffness, scene.handles.hard)
-    return replace(scene, mesh=mesh, handles=handles)
 
 
 def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -26,7 +26,7 @@ from diffcloud.fit.alignment import aligned
 from diffcloud.fit.laid import material_of, start_of
 from diffcloud.fit.matching import Matcher, Motion, Pairs
 from diffcloud.fit.pose import PoseSpace, default_priors
-from diffcloud.fit.targets import mean_noise, read_target
+from diffcloud.fit.targets import read_target
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import Properties
@@ -144,7 +144,7 @@ class Objective:
     @property
     def noise_loss(self) -> float:
         """About the loss that noise and spacing of its points leave of the right motion; zero in the paper's measure."""
-        return self._target.noise_loss
+        return 0.0 if self.paper else self._target.noise_loss
 
     @property
     def explained(self) -> float:
@@ -379,7 +379,6 @@ class Objective:
         chosen = sorted(self.times.argsort(stable=True)[:kept].tolist())
         other._target = self._target.at(chosen)
         if not self.paper:
-            other._target = replace(other._target, noise_loss=mean_noise(other.clouds))
             points, sure = self._recorded
             other._recorded = points[chosen], sure[chosen]
         other.loss_steps = other._steps_to_loss()

@@ -71,17 +71,11 @@ def scan(objective: AnyObjective, space: FitSpace, place: Tensor, curvature: Ten
         The scan, and how many simulations it took.
     """
     axis = Axis.of(space)
-    low, high = axis.ends
     directions = _axes(space, curvature)
     ways = torch.tensor([-length for length in reversed(LENGTHS)] + list(LENGTHS), dtype=torch.float64)
-    lengths = ways.expand(len(directions), -1).clone()
-    for row, direction in enumerate(directions):
-        for sign in (-1, 1):
-            moving = direction.abs() > 1e-9
-            ends = torch.where(sign * direction > 0, high - place, low - place)[moving] / direction[moving]
-            reach = float(ends.abs().min()) if len(ends) else 0.0
-            side = lengths[row] * sign > 0
-            lengths[row, side] = lengths[row, side].clamp(-reach, reach)
+    moving = torch.where(directions.abs() > 1e-9, directions, 0.0)
+    back, forth = (axis.room(place.expand_as(moving), sign * moving)[:, None] for sign in (-1, 1))
+    lengths = ways.clamp(-back, forth)
     places = place + lengths[..., None] * directions[:, None]
     losses = batch_losses(objective, space, axis.bounded(places.flatten(0, 1))).reshape(lengths.shape)
     return Scan(directions, lengths, losses), losses.numel() * len(objective.members)

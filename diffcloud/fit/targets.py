@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -75,11 +76,14 @@ class Target:
     space: PoseSpace
     track: Tensor | None
     """[1, S, G, 3] displacement of the grippers."""
-    noise_loss: float
-    """What noise and spacing of the points leave of the loss [squared length unit]; zero in the paper's measure."""
+
+    @cached_property
+    def noise_loss(self) -> float:
+        """What noise and spacing of the points leave of the default loss [squared length unit]."""
+        return float(np.mean([cloud.from_surface for cloud in self.clouds]))
 
     def at(self, chosen: Sequence[int]) -> Target:
-        """The same with some of its frames, by their places among these; `noise_loss` stays that of all."""
+        """The same with some of its frames, by their places among these."""
         chosen = list(chosen)
         first = chosen == list(range(len(chosen)))
         index = slice(len(chosen)) if first else chosen  # a slice is a view: lost pixels are many to copy
@@ -91,11 +95,6 @@ class Target:
             sure=tuple(self.sure[one] for one in chosen),
             lost=tuple(replace(one, pixels=one.pixels[index]) for one in self.lost),
         )
-
-
-def mean_noise(clouds: Sequence[NeighbourIndex]) -> float:
-    """What noise and spacing of the points of these frames leave of the loss [squared length unit]."""
-    return float(np.mean([cloud.from_surface for cloud in clouds]))
 
 
 def read_target(
@@ -132,7 +131,6 @@ def read_target(
     )
     clouds = tuple(NeighbourIndex(torch.as_tensor(episode.frame(frame), dtype=torch.float64)) for frame in frames)
     centre = torch.as_tensor(episode.points.mean(0, dtype=np.float64))  # of all frames, so that a pose holds for others too
-    noise_loss = 0.0 if whole else mean_noise(clouds)
     return Target(
         tuple(frames),
         torch.as_tensor(episode.times[frames], dtype=torch.float64),
@@ -143,7 +141,6 @@ def read_target(
         () if whole else _lost(episode, frames),
         PoseSpace.build(nuisance, centre, length_unit_m=unit),
         track,
-        noise_loss,
     )
 
 

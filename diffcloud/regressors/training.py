@@ -100,7 +100,7 @@ def train_regressor(
     it up.
 
     Args:
-        workers: processes that sample clouds; 0 for none. They change nothing but the time.
+        workers: processes that sample clouds, on the CPU; 0 for none: then clouds are made where the network is trained.
         mark: fingerprint of what is trained, kept with the timings.
 
     Raises:
@@ -116,7 +116,9 @@ def train_regressor(
     _check_sets(train, test, settings)
     if model == "posterior" and (settings.heteroscedastic or settings.loss != "normalised"):
         raise ConfigError("A posterior has a loss and widths of its own; leave out heteroscedastic, and loss: raw.")
-    clouds = _Clouds.build(model, train, test, settings)
+    on_gpu = device == "gpu" or (device == "auto" and torch.cuda.is_available())
+    place = torch.device("cuda" if on_gpu and torch.cuda.is_available() else "cpu")
+    clouds = _Clouds.build(model, train, test, settings, device=torch.device("cpu") if workers else place)
     centre, length = _centre_and_length(clouds.train)
     told = Description(
         model=model,
@@ -143,7 +145,7 @@ def train_regressor(
     live = out.with_suffix("")
     recorder = _Recorder(live, progress)
     try:
-        resumed_from = _fit(module, clouds, recorder, settings, state, device=device, workers=workers)
+        resumed_from = _fit(module, clouds, recorder, settings, state, on_gpu=on_gpu, workers=workers)
     except OSError as error:
         raise TrainingError(
             f"Cannot write the metrics of {live}: {error.strerror or error}. Free the disk and run the command again; it "
@@ -151,7 +153,7 @@ def train_regressor(
         ) from error
     assert recorder.weights is not None
     module.network.load_state_dict(recorder.weights)
-    network = module.network.cpu()
+    network = module.network.to(place)
     regressor = Regressor(told, network)
     if not isinstance(network, Posterior):  # whose widths are its own
         spread = _measured(regressor, clouds.test, clouds.validation).in_widths.mean(0)
@@ -162,6 +164,7 @@ def train_regressor(
         "history": recorder.history,
         "held_out": _held_out(regressor, clouds),
     }
+    network.cpu()
     seconds = time.perf_counter() - began
     with together():
         write_json(live / "training.json", summary)
@@ -199,17 +202,27 @@ class _Clouds:
     held_out: list[int]
 
     @staticmethod
-    def build(model: ModelName, train: SimulatedSet, test: SimulatedSet, settings: TrainingSettings) -> _Clouds:
+    def build(
+        model: ModelName, train: SimulatedSet, test: SimulatedSet, settings: TrainingSettings, *, device: torch.device
+    ) -> _Clouds:
         augmentation = Augmentation() if settings.augment else Augmentation.none()
         if settings.viewpoints:
             augmentation = Augmentation.recorded(settings.viewpoints)
         frames = frames_seen(model)
         body = train.obstacle if settings.subtract_background else None
         described = None if body is None else BackgroundBody.of(body, BACKGROUND_REACH_M / train.length_unit_m)
-        background = None if described is None else described.build()
+        background = None if described is None else described.build(device=device)
         # the test clouds stay the same in all epochs, and have random numbers of their own
         sets = [
-            CloudDataset(simulated, augmentation, frames=frames, points=settings.points, background=background, seed=seed)
+            CloudDataset(
+                simulated,
+                augmentation,
+                frames=frames,
+                points=settings.points,
+                background=background,
+                seed=seed,
+                device=device,
+            )
             for simulated, seed in ((train, settings.seed), (test, settings.seed + 1))
         ]
         split = max(1, round(_VALIDATION * len(sets[1])))
@@ -414,7 +427,7 @@ def _fit(
     settings: TrainingSettings,
     state: Path,
     *,
-    device: Device,
+    on_gpu: bool,
     workers: int,
 ) -> int:
     """Run the epochs; returns how many an earlier run had done."""
@@ -427,7 +440,6 @@ def _fit(
         DataLoader(_Batches(dataset), sampler=order, batch_size=None, num_workers=workers, generator=torch.Generator())
         for dataset, order in ((clouds.train, shuffled), (clouds.test, in_order))
     )
-    on_gpu = device == "gpu" or (device == "auto" and torch.cuda.is_available())
     callbacks: list[lightning.Callback] = [recorder]
     if settings.patience is not None:
         callbacks.append(EarlyStopping("validation_loss", patience=settings.patience))
@@ -510,7 +522,7 @@ def _measured(regressor: Regressor, dataset: CloudDataset, indices: Sequence[int
     step, network = regressor.description.training["settings"]["batch_size"], regressor.network
     for begin in range(0, len(indices), step):
         clouds, parameters = dataset.batch(indices[begin : begin + step])
-        found = regressor.predict(clouds)
+        found, parameters = regressor.predict(clouds), parameters.cpu()
         fractions, (low, high) = found.scale.from_linear(parameters), found.scale.bounds.unbind(-1)
         true = low + (high - low) * parameters
         ends = [found.interval(level) for level in LEVELS]
@@ -519,7 +531,8 @@ def _measured(regressor: Regressor, dataset: CloudDataset, indices: Sequence[int
         if isinstance(network, Posterior) and found.samples is not None:
             drawn = torch.cat([fractions[:, None], found.scale.fractions(found.samples)], dim=1)
             with torch.no_grad():
-                density = network.log_density(regressor.scaled(clouds), drawn)
+                seen = regressor.scaled(clouds.to(next(network.parameters())))
+                density = network.log_density(seen, drawn.to(seen.device)).cpu()
             denser = (density[:, 1:] > density[:, :1]).float().mean(1)
             ranks = torch.cat([(found.samples < true[:, None]).float().mean(1), denser[:, None]], dim=1)
         parts.append(((found.fractions - fractions).abs() / found.width, found.values - true, inside, ranks))

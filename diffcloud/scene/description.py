@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+from diffcloud.mesh.refinement import refined
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.sim.build import build_system
 from diffcloud.sim.handles import Handles
@@ -74,6 +75,18 @@ class Scene:
         contact = (self.surrounding.reference_contact or ReferenceContact()) if integrator == "linearised" else None
         surrounding = replace(self.surrounding, reference_contact=contact)
         return replace(self, integrator=integrator, order=order, surrounding=surrounding)
+
+    def finer(self) -> Scene:
+        """The same scene, each face of the cloth cut into four; its first nodes are those of this one. What lies between
+        two held nodes of one motion is held like them."""
+        mesh, edges = refined(self.mesh)
+        of_node = {handle.node: handle for handle in self.handles.handles}
+        more = []
+        for place, (a, b) in enumerate(edges.tolist(), len(self.mesh.nodes)):
+            if a in of_node and b in of_node and replace(of_node[a], node=b) == of_node[b]:
+                more.append(replace(of_node[a], node=place))
+        handles = Handles((*self.handles.handles, *more), self.handles.stiffness, self.handles.hard)
+        return replace(self, mesh=mesh, handles=handles)
 
     def build(self) -> tuple[System, State]:
         """(System, State at time zero with batch 1)."""

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from diffcloud.evaluation.discretisation import _finer, mesh_study, pairs, step_study
-from diffcloud.scene.scenarios import load_scenario
+from diffcloud.evaluation.discretisation import mesh_study, pairs, step_study
 from tests.conftest import small_lift
 
 
@@ -32,13 +29,3 @@ def test_a_finer_mesh_is_compared_at_the_nodes_of_the_scenario():
     assert row.nodes == len(scenario.scene.mesh.nodes)
     assert row.errors.shape == (9,)
     assert (row.errors > 0).all()
-
-
-def test_what_lies_between_held_nodes_is_held():
-    scene = load_scenario("band_stretch").scene  # a gripper holds three by two nodes
-    finer = _finer(scene)
-    held = finer.mesh.nodes[finer.handles.nodes]
-    low, high = scene.mesh.nodes[scene.handles.nodes].min(0), scene.mesh.nodes[scene.handles.nodes].max(0)
-    inside = ((finer.mesh.nodes >= low - 1e-9) & (finer.mesh.nodes <= high + 1e-9)).all(1)
-    assert len(held) == inside.sum() == 15
-    assert replace(finer.handles, handles=finer.handles.handles[: len(scene.handles.handles)]) == scene.handles

@@ -35,6 +35,27 @@ def at(objective, space, places):
     return objective(space.parameters(Axis.of(space).values(places)))
 
 
+class TestAxis:
+    def test_the_room_ahead_ends_at_the_nearest_bound(self):
+        """Along random steps, a little less is inside and a little more is not; along an axis, the others do not count."""
+        axis = Axis.of(SPACE)
+        low, high = axis.ends
+        generator = torch.Generator().manual_seed(2)
+        places = low + (high - low) * torch.rand(40, 2, generator=generator, dtype=torch.float64)
+        steps = torch.randn(40, 2, generator=generator, dtype=torch.float64)
+        steps[:10, 0] = 0.0
+        room = axis.room(places, steps)[:, None]
+
+        def inside(part):
+            reached = places + part * room * steps
+            return ((reached >= low) & (reached <= high)).all(-1)
+
+        assert inside(0.999).all()
+        assert not inside(1.001).any()
+        assert axis.room(places, torch.zeros_like(steps)).isinf().all()
+        assert axis.room(high[None], torch.ones(1, 2)) == 0.0
+
+
 class TestLinearisation:
     @pytest.mark.parametrize("measure", [{"paper": True}, {"nuisance": {}}], ids=["paper", "both ways"])
     def test_the_slope_is_that_of_the_loss(self, measure):

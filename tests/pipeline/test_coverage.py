@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from diffcloud.io.episodes import read_episode, write_episode
-from pipeline.coverage import cells_of, counted, coverage_page
+from pipeline.coverage_page import counted, coverage_page, held_by_refits
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
 from tests.pipeline.invoke import invoke
@@ -67,9 +67,37 @@ class TestCoverage:
         assert first.meta["made"] != second.meta["made"]
         assert episode.stat().st_mtime_ns != written
 
-    def test_a_refined_truth_has_a_folder_of_its_own(self, work):
-        invoke(*COVERAGE, "--recordings", 1, "--refined")
-        assert (work / "out/small/free_refined/0000.json").is_file()
+    @pytest.mark.parametrize("truth", ["refined", "finer"])
+    def test_another_truth_has_a_folder_of_its_own(self, work, truth):
+        """The same cloth, recorded with noise, as other steps and another mesh move it."""
+        invoke(*COVERAGE, "--recordings", 1)
+        invoke(*COVERAGE, "--recordings", 1, "--truth", truth)
+        record, same = (
+            json.loads((work / f"out/small/{name}/0000.json").read_text()) for name in (f"free_{truth}", "free")
+        )
+        assert record["truth"] == same["truth"]
+        assert record["set_up"] == same["set_up"]
+
+    def test_another_truth_is_recorded_with_noise(self, work):
+        """1 mm along each axis; a frame that shows the start alone, which other steps leave where it was."""
+        for truth in ("same", "refined"):
+            invoke(*COVERAGE, "--recordings", 1, "--truth", truth)
+        clouds = [read_episode(work / f"out/small/{name}/0000.npz").frame(0) for name in ("episodes", "episodes_refined")]
+        assert abs(clouds[0] - clouds[1]).mean() == pytest.approx(1e-3 * math.sqrt(2 / math.pi), rel=0.15)
+
+    def test_refits_share_what_is_fitted_and_nothing_else(self, work):
+        done = invoke(*COVERAGE, "--recordings", 1, "--refits", 2, "--markdown", "page.md")
+        first, second = (json.loads((work / f"out/small/free_refits/0000_0{n}.json").read_text()) for n in (0, 1))
+        assert [first["truth"][name] == second["truth"][name] for name in ("stretch", "mass", "bending")] == [
+            True,
+            True,
+            False,
+        ]
+        assert all(first["set_up"][name] != second["set_up"][name] for name in first["set_up"])
+        assert done.result["parameters"]["stretch"]["n"] == 2
+        page = (work / "page.md").read_text()
+        assert "| small | free | stretch | 1 |" in page
+        assert "| small | free refits |" not in page
 
     def test_a_network_predicts_the_same_recordings(self, work):
         """The ratio's interval is that of the ratio of what is drawn together."""
@@ -88,6 +116,7 @@ class TestCoverage:
         ("options", "message"),
         [
             (("--checkpoint", "of_lift.safetensors"), "was trained for lift, which is not among the scenarios"),
+            (("--refits", 2, "--checkpoint", "of_lift.safetensors"), "leave out --checkpoint, or --refits"),
             (("--fix", "drag"), "--fix names a fitted parameter"),
             (("--fix", "mass", "--fix", "stretch"), "Nothing is left to fit"),
         ],
@@ -120,7 +149,25 @@ def test_refusals_and_failures_count_as_misses(tmp_path):
     assert told["identified_within"] == 2
     assert told["rms_error"] == pytest.approx(math.sqrt((math.log(1.1) ** 2 + math.log(1.2) ** 2 + math.log(2) ** 2) / 4))
     assert told["sources"] == {}
-    assert "| lift | mass known | stretch | 5 | 3 | 1 (20 %) |" in coverage_page(list(cells_of(tmp_path)))
+    assert "| lift | mass known | stretch | 5 | 3 | 1 (20 %) |" in coverage_page(tmp_path)
+
+
+def test_refits_hold_what_nine_of_ten_find_within_the_factor(tmp_path):
+    """Of ten refits of each of three cloths: one has one beside, one has two, and the third's fits fail twice."""
+    folder = tmp_path / "lift" / "free_refits"
+    folder.mkdir(parents=True)
+    for cloth, beside in enumerate((1, 2, 0)):
+        for refit in range(10):
+            value, verdict = (2.0, "not identified") if refit < beside else (1.2, "identified")
+            entry = {"value": value, "low": 1.0, "high": 2.0, "verdict": verdict}
+            told = {"intervals": {"parameters": {"stretch": entry}, "within": 1.5, "level": 0.9}}
+            record = {"truth": {"stretch": 1.0, "mass": 1.0}, **told}
+            if cloth == 2 and refit > 7:
+                record = {"truth": record["truth"], "error": "diverged"}
+            (folder / f"{cloth:04d}_{refit:02d}.json").write_text(json.dumps(record))
+    told = held_by_refits(folder)["stretch"]
+    assert told == {"cloths": 3, "held": 1, "identified": (9, 10), "others": (16, 20)}
+    assert "| lift | free | stretch | 3 | 1 | 9 of 10 (90 %) | 16 of 20 (80 %) |" in coverage_page(tmp_path)
 
 
 def test_sources_are_told_beside_what_noise_alone_would_hold(tmp_path):
@@ -136,9 +183,7 @@ def test_sources_are_told_beside_what_noise_alone_would_hold(tmp_path):
     told = counted(folder)["parameters"]["stretch"]
     assert told["noise_alone"] == 1  # the quantile is 1.86
     assert told["sources"] == pytest.approx({"noise": 0.1, "step size": 0.3, "prior": 0.0})
-    assert "| lift | mass known | stretch | 1 (50 %) | step size 90 %, noise 10 % |" in coverage_page(
-        list(cells_of(tmp_path))
-    )
+    assert "| lift | mass known | stretch | 1 (50 %) | step size 90 %, noise 10 % |" in coverage_page(tmp_path)
 
 
 class TestIntervals:

@@ -403,3 +403,13 @@ class TestScenarios:
         (tmp_path / "t.yaml").write_text("material: wood\n")
         with pytest.raises(ConfigError, match=r"Unknown material 'wood'. Allowed: .*silk"):
             load_scenario(tmp_path / "t.yaml")
+
+
+def test_what_lies_between_held_nodes_is_held():
+    scene = load_scenario("band_stretch").scene  # a gripper holds three by two nodes
+    finer = scene.finer()
+    held = finer.mesh.nodes[finer.handles.nodes]
+    low, high = scene.mesh.nodes[scene.handles.nodes].min(0), scene.mesh.nodes[scene.handles.nodes].max(0)
+    inside = ((finer.mesh.nodes >= low - 1e-9) & (finer.mesh.nodes <= high + 1e-9)).all(1)
+    assert len(held) == inside.sum() == 15
+    assert replace(finer.handles, handles=finer.handles.handles[: len(scene.handles.handles)]) == scene.handles

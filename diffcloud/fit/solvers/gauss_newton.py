@@ -442,16 +442,9 @@ def _drawn(way: _Way, recordings: int, axis: Axis, widening: float, generator: t
     places = way.place.expand(_DRAWS, -1)
     for along, direction in zip(lengths.T.flip(0), axes.T.flip(0), strict=True):
         step = along[:, None] * direction
-        forth, back = _room(places, step, axis), _room(places, -step, axis)
+        forth, back = (axis.room(places, sign * step).clamp(max=1.0) for sign in (1, -1))
         places = places + torch.where(forth < back, -back, forth)[:, None] * step
     return places
-
-
-def _room(places: Tensor, steps: Tensor, axis: Axis) -> Tensor:
-    """[n] how much of steps [n, k] from places [n, k] the bounds leave; 1: all."""
-    low, high = axis.ends
-    free = torch.where(steps > 0, high - places, low - places) / steps
-    return free.nan_to_num(nan=1.0).amin(-1).clamp(0.0, 1.0)
 
 
 def _frames(objective: AnyObjective) -> int:

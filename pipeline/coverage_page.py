@@ -1,0 +1,244 @@
+"""What the records of `diffcloud coverage` say, and the page that they make."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from diffcloud.evaluation.intervals import noise_quantile
+from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.evaluation.summary import largest_sources
+from diffcloud.io.files import files_in, read_json
+
+REFITS = "refits"
+"""Last part of the name of a folder whose records are of few cloths, each recorded several times."""
+_RATIO = "stretch / mass"
+Cell = tuple[tuple[str, str, str], dict[str, Any]]
+"""(scenario, known, parameter), and what the records of that folder say of it, as of `counted`."""
+HEAD = (
+    "scenario",
+    "known",
+    "parameter",
+    "recordings",
+    "stated",
+    "hold the truth",
+    "RMS error",
+    "median error",
+    "median half-width",
+    "identified",
+)
+REFIT_HEAD = (
+    "scenario",
+    "known",
+    "parameter",
+    "cloths",
+    "held by refits",
+    "these called identified",
+    "others called identified",
+)
+SOURCE_HEAD = ("scenario", "known", "parameter", "hold the truth with noise alone", "largest sources")
+
+
+def counted(folder: Path) -> dict[str, Any]:
+    """What the records of one folder say.
+
+    Returns:
+        parameters: name -> n, stated: with an interval, covered: those that hold the truth, median_factor: of the
+        intervals, rms_error: of the logarithm, verdicts, identified_within: of those called identified, how many are within
+        the factor, noise_alone: how many intervals of the noise of residuals alone would hold the truth, sources: source ->
+        median deviation; ratio: the same of stretch to mass, if both are fitted.
+    """
+    records = [read_json(path) for path in files_in(folder, ".json")]
+    fitted = next((list(one["intervals"]["parameters"]) for one in records if "intervals" in one), [])
+    parameters = {name: _count(records, name) for name in fitted}
+    told: dict[str, Any] = {"parameters": parameters}
+    if any("ratio" in one.get("intervals", {}) for one in records) and {"stretch", "mass"} <= set(fitted):
+        told["ratio"] = _count(records, "ratio")
+    return told
+
+
+def _count(records: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
+    offs, widths, covered, verdicts, right, alone = [], [], 0, dict[str, int](), 0, 0
+    sources: dict[str, list[float]] = {}
+    for record in records:
+        if "intervals" not in record:
+            continue
+        truth, told = record["truth"], record["intervals"]
+        entry = told["ratio"] if name == "ratio" else told["parameters"][name]
+        true = truth["stretch"] / truth["mass"] if name == "ratio" else truth[name]
+        off = abs(math.log(entry["value"] / true))
+        offs.append(off)
+        if entry["low"] is not None:
+            covered += entry["low"] <= true <= entry["high"]
+            widths.append(math.log(entry["high"] / entry["low"]) / 2)
+        if (verdict := entry.get("verdict")) is not None:
+            verdicts[verdict] = verdicts.get(verdict, 0) + 1
+            right += verdict == "identified" and off <= math.log(told["within"])
+        if entry["low"] is None or "sources" not in told:
+            continue
+        for source, deviations in told["sources"].items():
+            sources.setdefault(source, []).append(deviations[name])
+        if "noise" in told["sources"]:
+            alone += off <= noise_quantile(told["clusters"], told["level"]) * told["sources"]["noise"][name]
+    return {
+        "n": len(records),
+        "stated": len(widths),
+        "covered": covered,
+        "median_factor": math.exp(float(np.median(widths))) if widths else None,
+        "median_half_width": float(np.median(widths)) if widths else None,
+        "rms_error": float(np.sqrt(np.mean(np.square(offs)))) if offs else None,
+        "median_error": float(np.median(offs)) if offs else None,
+        "verdicts": verdicts,
+        "identified_within": right,
+        "noise_alone": int(alone),
+        "sources": {source: float(np.median(deviations)) for source, deviations in sources.items()},
+    }
+
+
+def summary(cells: Sequence[Cell]) -> list[list[str]]:
+    """Rows under `HEAD`."""
+    return [
+        [
+            *labels,
+            str(count["n"]),
+            str(count["stated"]),
+            _share(count["covered"], count["n"]),
+            _number(count["rms_error"]),
+            _number(count["median_error"]),
+            _number(count["median_half_width"]),
+            f"{count['identified_within']} of {count['verdicts'].get('identified', 0)}" if labels[2] != _RATIO else "",
+        ]
+        for labels, count in cells
+    ]
+
+
+def _sources(cells: Sequence[Cell]) -> list[list[str]]:
+    """Rows under `SOURCE_HEAD`, of cells whose intervals name their sources."""
+    return [
+        [
+            *labels,
+            _share(count["noise_alone"], count["n"]),
+            largest_sources({source: {"": deviation} for source, deviation in count["sources"].items()}, "", 4),
+        ]
+        for labels, count in cells
+        if count["sources"]
+    ]
+
+
+def cells_of(out: Path) -> Iterator[Cell]:
+    """Of all folders of records, but those of refits."""
+    for scenario, folder in _folders(out):
+        if folder.name.endswith(REFITS):
+            continue
+        told = counted(folder)
+        ratio = {_RATIO: told["ratio"]} if "ratio" in told else {}
+        for name, count in (told["parameters"] | ratio).items():
+            yield (scenario, folder.name.replace("_", " "), name), count
+
+
+def refit_rows(out: Path) -> Iterator[list[str]]:
+    """Rows under `REFIT_HEAD`: of parameters that refits hold, and of others, how often refits call them identified."""
+    for scenario, folder in _folders(out):
+        if not folder.name.endswith(REFITS):
+            continue
+        told = held_by_refits(folder)
+        for name, of in told.items():
+            named = [
+                f"{part} of {whole} ({100 * part / whole:.0f} %)" if whole else ""
+                for part, whole in (of["identified"], of["others"])
+            ]
+            known = folder.name.removesuffix(f"_{REFITS}").replace("_", " ")
+            yield [scenario, known, name, str(of["cloths"]), str(of["held"]), *named]
+
+
+def held_by_refits(folder: Path) -> dict[str, dict[str, Any]]:
+    """What the refits of one folder say.
+
+    Returns:
+        parameter -> cloths, held: of how many at least the share `level` of all refits is within the verdict's factor of
+        the truth, identified: (refits of these with that verdict, refits of these), others: the same of other cloths.
+    """
+    cloths: dict[str, list[dict[str, Any]]] = {}
+    for path in files_in(folder, ".json"):
+        cloths.setdefault(path.stem.partition("_")[0], []).append(read_json(path))
+    found: dict[str, dict[str, Any]] = {}
+    for records in cloths.values():
+        fits = [record["intervals"] | {"truth": record["truth"]} for record in records if "intervals" in record]
+        for name in fits[0]["parameters"] if fits else ():
+            entries = [(fit["parameters"][name], fit["truth"][name], fit["within"]) for fit in fits]
+            near = sum(abs(math.log(entry["value"] / true)) <= math.log(within) for entry, true, within in entries)
+            held = near >= fits[0]["level"] * len(records)
+            named = sum(entry["verdict"] == "identified" for entry, _, _ in entries)
+            told = found.setdefault(name, {"cloths": 0, "held": 0, "identified": (0, 0), "others": (0, 0)})
+            told["cloths"] += 1
+            told["held"] += held
+            key = "identified" if held else "others"
+            told[key] = (told[key][0] + named, told[key][1] + len(records))
+    return found
+
+
+def _folders(out: Path) -> Iterator[tuple[str, Path]]:
+    """(scenario, folder of records)"""
+    for scenario in sorted(path for path in out.iterdir() if path.is_dir()):
+        for folder in sorted(path for path in scenario.iterdir() if path.is_dir() and files_in(path, ".json")):
+            yield scenario.name, folder
+
+
+def coverage_page(out: Path) -> str:
+    """Markdown of docs/results/coverage.md, of all records in the folder that `coverage` has filled."""
+    cells = list(cells_of(out))
+    rows, sources, refits = summary(cells), _sources(cells), list(refit_rows(out))
+    networks = any({"free", "known"}.isdisjoint(row[1].split()) for row in rows)
+    lines = [
+        "# How often intervals hold the truth",
+        "",
+        "Cloths of drawn parameters are simulated, recorded (`lift` and `fold` by two depth cameras through "
+        "`preprocess`, the others by their whole surface), fitted, and the 90 % interval is held against the truth. "
+        "Material that is not asked for is off by the factors that fits state (`fit.doubts`); cameras and clock are "
+        "off by what they assume of a calibrated set-up (2 mm and 0.3° along and about each axis, and 2 ms, as "
+        "standard deviations; `preprocess` measures the clock anew), and the cloth is displaced by about a centimetre. "
+        "Errors and half-widths are of the natural logarithm: 0.1 is about 10 %. A fit that fails or states no "
+        "interval is a miss. *Identified*: of the recordings with that verdict, how many are within its factor of the "
+        "truth. *Refined*: the truth has four times the steps that fits take, and was recorded with noise that they do not "
+        "expect (`lift` and `fold` by worse cameras, the others with 1 mm along each axis). *Finer*: like that, and its "
+        "mesh has half the edge length. "
+        + "Rows named after a network are its predictions of the same recordings (`--checkpoint`); the prior of a "
+        "posterior is the distribution that its training draws had, which may be wider than that of these truths. "
+        * networks
+        + "Command: `make coverage`.",
+        "",
+        *markdown_table(HEAD, rows),
+        "",
+    ]
+    if sources:
+        lines += [
+            "Where the uncertainty comes from: each source's share of the variance, from its median standard deviation "
+            "over the recordings. At most the four largest are listed, and none of 1 % or less; "
+            "[evaluation.md](../evaluation.md#what-is-identified) explains each. The fourth column counts the intervals "
+            "that would still hold the truth if they counted the source `noise` alone.",
+            "",
+            *markdown_table(SOURCE_HEAD, sources),
+            "",
+        ]
+    if refits:
+        lines += [
+            "Fresh recordings of the same cloths, everything else drawn anew. A parameter is *held* where nine of ten "
+            "(the level of the intervals) find it within the verdict's factor of the truth; the last two columns count "
+            "recordings with the verdict *identified*.",
+            "",
+            *markdown_table(REFIT_HEAD, refits),
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{part} ({100 * part / whole:.0f} %)"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"
