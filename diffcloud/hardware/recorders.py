@@ -2,6 +2,10 @@
 
 Each camera has a thread that takes its frames and one that writes them; the arm's readings have a queue and a thread that
 writes them, many rows at a time when the disk is slow. So neither a slow disk nor a slow camera holds up the arm.
+
+A signal's KeyboardInterrupt may come between almost any two instructions of the control loop's thread. `queue.Queue` and
+`threading.Event` take their locks in Python code. If it came there they would stay locked, and the capture would wait for
+them for ever. So that thread uses a `SimpleQueue`, whose `put` is one instruction, and plain flags.
 """
 
 from __future__ import annotations
@@ -97,7 +101,7 @@ class Recorders:
     def wait(self, seconds: float) -> None:
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
-            self._failed.wait(min(left, _WATCH_S))
+            time.sleep(min(left, _WATCH_S))
             self.raise_failure()
 
     def raise_failure(self) -> None:
@@ -133,7 +137,7 @@ class _CameraRecorder:
         self.error: DiffCloudError | None = None
         self._camera, self._writer, self._clock = camera, writer, clock
         self._keep_every, self._timeout_s = keep_every, timeout_s
-        self._failed, self._ending = failed, threading.Event()
+        self._failed, self._ending = failed, False
         self._frames: queue.Queue[CameraFrame | None] = queue.Queue(_QUEUED_FRAMES)
         self._asked: float | None = None
         """time.monotonic() when the driver was asked for a frame; None while it is not being asked."""
@@ -147,7 +151,7 @@ class _CameraRecorder:
         self._writing.start()
 
     def end(self) -> None:
-        self._ending.set()
+        self._ending = True
 
     def join(self) -> None:
         """What is queued is written. A driver that hangs is left behind: its thread ends with the process."""
@@ -175,7 +179,7 @@ class _CameraRecorder:
     def _take(self) -> None:
         count, last = 0, 0.0
         try:
-            while not self._ending.is_set():
+            while not self._ending:
                 self._asked = time.monotonic()
                 frame = self._camera.read(self._timeout_s)
                 self._asked = None
@@ -199,7 +203,7 @@ class _CameraRecorder:
         except queue.Full:
             self._fail(HardwareError(f"Camera {self._camera.name}: the disk cannot keep up; lower the frame rate."))
         except Exception as error:  # whatever a driver raises must end the capture, not only this thread
-            if not self._ending.is_set():
+            if not self._ending:
                 self._fail(_named(f"Camera {self._camera.name}", error))
         finally:
             self._asked = None
@@ -228,19 +232,18 @@ class _ArmRecorder:
     def __init__(self, writer: RawEpisodeWriter, failed: threading.Event) -> None:
         self.error: DiffCloudError | None = None
         self._writer, self._failed = writer, failed
-        self._rows: queue.Queue[RobotSample | None] = queue.Queue(_QUEUED_ROWS)
+        self._rows: queue.SimpleQueue[RobotSample | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write, name="robot_write", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
 
     def add(self, sample: RobotSample) -> None:
-        try:
-            self._rows.put_nowait(sample)
-        except queue.Full as error:
+        if self._rows.qsize() >= _QUEUED_ROWS:
             raise HardwareError(
                 f"{_QUEUED_ROWS} rows of robot.csv are waiting for the disk: it has stopped, or is far too slow."
-            ) from error
+            )
+        self._rows.put(sample)
 
     def end(self) -> None:
         self._rows.put(None)
