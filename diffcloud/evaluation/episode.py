@@ -8,7 +8,7 @@ from typing import Any
 
 from diffcloud.errors import DiffCloudError
 from diffcloud.evaluation import methods
-from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, node_set_note, state_intervals
+from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, state_intervals
 from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
@@ -135,7 +135,7 @@ def compare_episode(
             objective, space, best,
             level=settings.level, within=settings.within, restarts=RESTARTS, seen=methods.scan_of(fit),
         )  # fmt: skip
-        record["intervals"] = told_intervals.model_dump(mode="json") | {"note": node_set_note(scenario)}
+        record["intervals"] = told_intervals.model_dump(mode="json")
     objective.reseed(fit.measure.seed)
     if settings.landscape_size:
         record["landscape"] = loss_landscape(objective, space, best, fit.history, size=settings.landscape_size)

@@ -130,6 +130,8 @@ class Intervals(_Model):
     """Why there is no interval, or the verdict is not of the parameters; else empty."""
     remark: str = ""
     """Why intervals that are stated are doubtful all the same; else empty."""
+    note: str = ""
+    """Why the ratio is not what a motion identifies where the mass multiplier acts on a part of the cloth; else empty."""
     lower: dict[str, float] | None = None
     """Where a clearly lower loss was met, from which a fit may start again."""
     restarts: int = 0
@@ -137,8 +139,8 @@ class Intervals(_Model):
 
     @property
     def sentences(self) -> list[str]:
-        """Reason and remark, for people."""
-        return [text[0].upper() + text[1:] + "." for text in (self.reason, self.remark) if text]
+        """Reason, remark and note, for people."""
+        return [text[0].upper() + text[1:] + "." for text in (self.reason, self.remark, self.note) if text]
 
 
 def state_intervals(
@@ -258,6 +260,7 @@ def state_intervals(
         explains=explains,
         reason=reason,
         remark=remark,
+        note="" if ratio is None else _node_set_note(objective.members[0].scenario),
         lower=lower,
     )
 
@@ -365,8 +368,8 @@ def significant(low: float | None, high: float | None) -> Callable[[float | None
     return shown
 
 
-def node_set_note(scenario: Scenario) -> str:
-    """Why the ratio is not what a motion identifies where the mass multiplier acts on a part of the cloth; else empty."""
+def _node_set_note(scenario: Scenario) -> str:
+    """See `Intervals.note`."""
     nodes = scenario.node_sets.get("mass")
     if nodes is None:
         return ""

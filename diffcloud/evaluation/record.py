@@ -69,7 +69,7 @@ class LandscapeRecord(Checked):
 
 
 class StatedIntervals(Intervals):
-    """With a note on a mass that acts on a part of the cloth."""
+    """With nothing left out."""
 
     level: Annotated[float, Field(gt=0, lt=1)]
     within: Annotated[float, Field(gt=1, le=1e6)]

@@ -165,7 +165,7 @@ def interval_table(records: Records) -> pd.DataFrame:
             row |= {"ratio": ratio.get("value"), "ratio_factor": ratio.get("factor")}
             row |= {"combination": None if told["best"] is None else str(Combination.model_validate(told["best"]))}
             row |= {"sources": largest_sources(told["sources"], name), "level": told["level"], "reason": told["reason"]}
-            row |= {"restarts": told["restarts"], "remark": told["remark"]}
+            row |= {"restarts": told["restarts"], "remark": told["remark"], "note": told["note"]}
             row |= dict(zip(("posterior_low", "posterior_high"), _posterior(record, name), strict=True))
             rows.append(row)
     return pd.DataFrame(rows)
@@ -356,7 +356,7 @@ def _identified(table: pd.DataFrame) -> list[str]:
     for scenario, group in table.drop_duplicates(["scenario", "episode"]).groupby("scenario", sort=False):
         if group["ratio_factor"].notna().any():
             found.append(f"{scenario!s}: stretch / mass is known within {_times(group['ratio_factor'].median())} (median).")
-    for kind in ("reason", "remark"):
+    for kind in ("reason", "remark", "note"):
         for row in table[table[kind] != ""].drop_duplicates(["scenario", "episode"]).to_dict("records"):
             found.append(f"{row['scenario']} / {row['episode']}: {row[kind]}.")
     for row in table[table["low"].notna() & table["posterior_low"].notna()].to_dict("records"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -263,7 +263,10 @@ def test_numbers_of_everyday_size_are_written_out():
     assert [shown(value) for value in (107.0, 2345.6, 0.00001234, 3.2e7)] == ["110", "2300", "1.2e-05", "3.2e+07"]
 
 
-def test_a_note_where_mass_multiplies_a_part_of_the_cloth():
-    scene = SimpleNamespace(mesh=SimpleNamespace(nodes=np.zeros((49, 3))))
-    assert module.node_set_note(SimpleNamespace(node_sets={}, scene=scene)) == ""
-    assert "5 of 49 nodes" in module.node_set_note(SimpleNamespace(node_sets={"mass": range(5)}, scene=scene))
+def test_a_note_where_mass_multiplies_a_part_of_the_cloth(told, objective, monkeypatch):
+    sources = {"noise": np.diag([0.01, 0.01])}
+    assert told(sources).sentences == []
+    scenario = objective.scenario
+    monkeypatch.setattr(objective, "scenario", replace(scenario, node_sets={"mass": np.arange(5)}))
+    (sentence,) = told(sources).sentences
+    assert f"5 of {len(scenario.scene.mesh.nodes)} nodes" in sentence
