@@ -13,14 +13,14 @@ import torch
 import typer
 import yaml
 
-from diffcloud.errors import ConfigError, DiffCloudError, EpisodeError
+from diffcloud.errors import ConfigError, DiffCloudError, DivergedError, EpisodeError
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, Intervals, significant, state_intervals
 from diffcloud.evaluation.methods import scan_of, space_of
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitRecord, JointObjective, Objective
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.result import read_motion
-from diffcloud.fit.uncertainty import refined_distance_mm
+from diffcloud.fit.uncertainty import finer_mesh_mm, noise_mm, refined_distance_mm
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import claimed, read_yaml, together, write_json, write_text
 from diffcloud.io.imports import cloud_folder
@@ -90,14 +90,15 @@ def identify(
         fit = partial(_fitted, out, episodes, cloth, layouts)
         steps = int(cloth.get("steps_per_frame", _STEPS))
         record, objective, job, found = _stated(fit, chosen, steps, level=level, within=within)
-        findings = _findings(record, objective, found)
+        mesh_mm = _finer_mesh_mm(objective, record)
+        findings = _findings(record, objective, found, mesh_mm)
         with together():
             write_text(out / "report.html", _page(record, found, findings, episodes, job))
             write_json(out / "intervals.json", found.model_dump(mode="json"))
     for line in findings:
         errors.print(line, soft_wrap=True)
     errors.print(f"Wrote {out / 'report.html'}, {out / 'fit.json'}.")
-    finish(_result(record, found, findings), json)
+    finish(_result(record, found, findings, mesh_mm), json)
 
 
 def find_scene(
@@ -383,7 +384,25 @@ def _motion_of(objective: Objective) -> str:
     return str(np.round(end / max(float(np.abs(end).max()), 1e-9), 0).tolist())
 
 
-def _findings(record: FitRecord, objective: AnyObjective, found: Intervals) -> list[str]:
+def _finer_mesh_mm(objective: AnyObjective, record: FitRecord) -> float | None:
+    """See `finer_mesh_mm`; None where the finer cloth diverges."""
+    try:
+        return finer_mesh_mm(objective, record.simulated)
+    except DivergedError:
+        return None
+
+
+def _mesh_told(objective: AnyObjective, mesh_mm: float | None) -> str:
+    """Whether numbers found with this mesh are those of any."""
+    if mesh_mm is None:
+        return "A mesh of half the edge length diverges with these parameters: they are those of this mesh."
+    told = f"A mesh of half the edge length would move the cloth by {mesh_mm:.1f} mm RMS"
+    if mesh_mm <= _NOISE_PART * min(noise_mm(member) for member in objective.members):
+        return f"{told}: this one is fine enough."
+    return f"{told}: the parameters are those of a cloth of this mesh, and no interval counts that."
+
+
+def _findings(record: FitRecord, objective: AnyObjective, found: Intervals, mesh_mm: float | None) -> list[str]:
     """The report's first lines: does the model explain the recordings, do parameters carry over, what are they."""
     if found.explains:
         verdict = "It is doubtful whether the model explains" if found.remark else "The model explains"
@@ -398,6 +417,7 @@ def _findings(record: FitRecord, objective: AnyObjective, found: Intervals) -> l
     lines.append(_validation(record, objective))
     if found.explains:
         lines += found.sentences
+    lines.append(_mesh_told(objective, mesh_mm))
     for name, entry in found.parameters.items():
         digits = significant(entry.low, entry.high)
         ends = (
@@ -411,7 +431,7 @@ def _findings(record: FitRecord, objective: AnyObjective, found: Intervals) -> l
     return lines
 
 
-def _result(record: FitRecord, found: Intervals, findings: Sequence[str]) -> dict[str, Any]:
+def _result(record: FitRecord, found: Intervals, findings: Sequence[str], mesh_mm: float | None) -> dict[str, Any]:
     parameters = {
         name: {
             "value": entry.value,
@@ -429,6 +449,7 @@ def _result(record: FitRecord, found: Intervals, findings: Sequence[str]) -> dic
         "explains": found.explains and found.arrived,
         "reason": found.reason,
         "remark": found.remark,
+        "finer_mesh_mm": mesh_mm,
         "findings": list(findings),
         "episodes": {one.name: one.rms_mm for one in record.episodes},
     }

@@ -32,13 +32,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloud.fit.joint import AnyObjective, loss_weights, mean_loss
-from diffcloud.fit.laid import asked_as
+from diffcloud.fit.laid import asked_as, material_of, start_of
 from diffcloud.fit.matching import Motion
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.pose import NUISANCE, SET_UP, set_up_of, unit_of
 from diffcloud.fit.residuals import Axis, moved_by
 from diffcloud.fit.targets import track_displacement
+from diffcloud.scene.description import Scene
 from diffcloud.sim.properties import one_set
 from diffcloud.sim.simulate import Rollout, rollout
 from diffcloud.sim.threads import map_threads
@@ -172,6 +173,27 @@ def refined_distance_mm(objective: AnyObjective, values: Mapping[str, float]) ->
         return max(map_threads(told, objective.members), key=lambda pair: pair[0] / pair[1])
 
 
+def finer_mesh_mm(objective: AnyObjective, values: Mapping[str, float]) -> float:
+    """How far the motion of a mesh with half the edge length is away at the nodes of this one, RMS over nodes and compared
+    frames [mm]; the largest of all recordings.
+
+    Args:
+        values: all parameters, the given ones too.
+
+    Raises:
+        DivergedError: a motion diverges.
+    """
+    parameters = one_set(values)
+
+    def told(member: Objective) -> float:
+        run = member.simulate_to_loss(parameters)
+        apart = _to(member.scenario.scene.finer(), member, parameters, run)
+        return 1e3 * member.length_unit_m * float(apart.square().sum(-1).mean().sqrt())
+
+    with torch.no_grad():
+        return max(map_threads(told, objective.members))
+
+
 def noise_mm(objective: Objective) -> float:
     """RMS distance that noise and spacing of the recorded points account for [mm]."""
     to_mm = 1e3 * objective.length_unit_m
@@ -275,19 +297,25 @@ def _between(measured: NDArray[np.float64], normal: NDArray[np.float64]) -> NDAr
 def _refined(objective: Objective, parameters: Mapping[str, Tensor], run: Rollout) -> Tensor:
     """[1, L, V, 3] from the motion to that with finer steps, at the compared frames; zero for the paper's measure, which
     takes the published step as it is."""
-    scenario = objective.scenario
     if objective.paper:
         return torch.zeros_like(run.at(objective.times))
-    scene = replace(scenario.scene, frame_steps=scenario.scene.frame_steps * REFINED)
+    scene = objective.scenario.scene
+    return _to(replace(scene, frame_steps=scene.frame_steps * REFINED), objective, parameters, run)
+
+
+def _to(scene: Scene, objective: Objective, parameters: Mapping[str, Tensor], run: Rollout) -> Tensor:
+    """[1, L, V, 3] from a motion to that in a finer variant of its scene, at its own nodes and the compared frames."""
+    scenario = objective.scenario
     system, _ = scene.build()
-    steps = objective.loss_steps * REFINED
+    steps = objective.loss_steps * scene.frame_steps // scenario.scene.frame_steps
     track = None
     if objective.episode.gripper is not None:
         moved = track_displacement(objective.episode, system.handles.grippers, steps, system.time_step)
         track = torch.as_tensor(moved)[None]
-    properties, start = objective.inputs(parameters)
+    properties, start = scenario.properties(system, material_of(parameters)), start_of(system, parameters)
     fine = rollout(system, steps, properties=properties, state=start, track=track)
-    return fine.at(objective.times) - run.at(objective.times)
+    own = run.at(objective.times)
+    return fine.at(objective.times)[..., : own.shape[-2], :] - own
 
 
 def _clustered(objective: Objective, motion: Motion, rates: Tensor) -> NDArray[np.float64]:

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from diffcloud.evaluation.discretisation import mesh_study, pairs
 from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton
 from diffcloud.fit.parameters import Variable
 from diffcloud.fit.pose import SET_UP
-from diffcloud.fit.uncertainty import patches, uncertainty
+from diffcloud.fit.uncertainty import finer_mesh_mm, patches, uncertainty
 from diffcloud.io.episodes import Episode
 from tests.conftest import small_lift
 from tests.fit.test_fit import GENTLE, clouds_of
@@ -78,6 +79,23 @@ class TestDoubts:
         found = uncertainty(one, SPACE, TRUTH)
         assert found.refined[0] == pytest.approx(moved, rel=0.3)
         assert deviation(found, "step size") == pytest.approx(abs(found.refined[0]) / np.sqrt(3))
+
+    def test_a_finer_mesh_is_as_far_away_as_simulating_it_says(self, scenario):
+        """Compared with the study of discretisation, which knows no recordings; and the largest of several recordings."""
+        frame = scenario.loss_frames[0]
+        stretch, mass = (column[3] for column in pairs(scenario).values())
+        values = {"stretch": float(stretch), "mass": float(mass)}
+        late, early = (Objective(scenario, recorded(scenario), nuisance={}, frames=[one]) for one in (frame, 1))
+        (row,) = mesh_study(scenario, 1)
+        found = finer_mesh_mm(late, values)
+        assert found == pytest.approx(1e3 * row.errors[3], rel=1e-4)  # episodes hold the gripper in single precision
+        assert finer_mesh_mm(early, values) < found
+        assert finer_mesh_mm(JointObjective([early, late]), values) == found
+
+    def test_a_finer_mesh_lies_as_the_fitted_one_does(self, scenario):
+        objective = Objective(scenario, recorded(scenario), nuisance={}, frames=[1])
+        straight, turned = (finer_mesh_mm(objective, {**TRUTH, "turn": angle}) for angle in (0.0, 0.3))
+        assert turned < straight + 0.5
 
     def test_where_all_is_known_of_a_pose_its_doubts_are_sources(self, scenario):
         found = uncertainty(Objective(scenario, recorded(scenario), nuisance={}), SPACE, TRUTH)

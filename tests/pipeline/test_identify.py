@@ -111,6 +111,9 @@ class TestNewUser:
         assert summary.index("Transfers within this motion") < summary.index("stretch: ")
         assert "fetch(" not in page[: page.index("<main>")]
         assert done.result["findings"][0].startswith("The model explains")
+        assert (
+            f"A mesh of half the edge length would move the cloth by {done.result['finer_mesh_mm']:.1f} mm RMS" in summary
+        )
 
     def test_other_commands_take_what_it_wrote(self, found):
         folder, _ = found
