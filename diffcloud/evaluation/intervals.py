@@ -54,12 +54,12 @@ _PLAIN = 1e6
 """Below it numbers are written out."""
 RESTARTS = 2
 """Of a fit that has not arrived, from a lower loss beside it."""
-_UNEXPLAINED = 2.0
-"""RMS over what noise and spacing of the points account for, from which the model does not explain the recording."""
-_DOUBTED = 1.3
-"""Times what noise and spacing leave of a loss, from which a fit is doubted whose recording knows what it misses: of random
-cloths that this simulator moved, right fits have had 1.14 times that at most, wrong minima 1.4 at least
-(docs/evaluation.md)."""
+_DOUBTED, _UNEXPLAINED = 1.3, 2.0
+"""Times what noise and spacing leave of a loss, from which a fit is doubted whose recording knows what it misses, and from
+which the model does not explain it. Of random cloths that this simulator moved, right fits have had 1.14 times that at most
+(folds with four times the steps 1.9), wrong minima 1.4 at least (docs/evaluation.md)."""
+_UNEXPLAINED_RMS = 2.0
+"""RMS over a coarse allowance for noise and spacing, from which the model does not explain another recording."""
 _STEP = 2.0
 """The largest next step of a fit that has arrived, in standard deviations."""
 _PRIOR = 0.5
@@ -181,8 +181,8 @@ def state_intervals(
     found = replace(found, sources={**found.sources, "next step": np.outer(found.step, found.step)})
     total = found.covariance
     misfit = [_misfit(member, loss) for member, loss in zip(objective.members, found.losses.tolist(), strict=True)]
-    worst_fit = max(misfit, key=lambda pair: pair[0] / pair[1])
-    explains = objective.paper or worst_fit[0] <= _UNEXPLAINED * worst_fit[1]
+    rms, accounted, excess = max(misfit, key=lambda each: each[2])
+    explains = objective.paper or excess <= 1
     reason = ""
     if explains and lower is not None:
         near = ",".join(f"{name}={lower[name]:.3g}" for name in space.names)
@@ -191,9 +191,8 @@ def state_intervals(
         reason = "the fit has not arrived: its next step is longer than the interval; fit again with more iterations"
     elif not explains:
         reason = (
-            f"the misfit is {worst_fit[0]:.1f} mm RMS, but noise and spacing of the points account for only "
-            f"{worst_fit[1]:.1f} mm; any interval says only how far this misfit lets the numbers go, and nothing about "
-            "the cloth"
+            f"the misfit is {rms:.1f} mm RMS, but noise and spacing of the points account for only {accounted:.1f} mm; any "
+            "interval says only how far this misfit lets the numbers go, and nothing about the cloth"
         )
     remark = "" if reason else _remark(objective, found)
     reaches = {name: _reach(found, row, level) for name, row in zip(space.names, np.eye(len(space.names)), strict=True)}
@@ -436,6 +435,11 @@ def _sources(found: Uncertainty, space: FitSpace, ratio: NDArray[np.float64] | N
     return told
 
 
-def _misfit(objective: Objective, loss: float) -> tuple[float, float]:
-    """RMS of one recording beside the fitted motion, and what noise and spacing of its points account for [mm]."""
-    return 1e3 * objective.length_unit_m * loss**0.5, noise_mm(objective)
+def _misfit(objective: Objective, loss: float) -> tuple[float, float, float]:
+    """RMS of one recording beside the fitted motion, what noise and spacing of its points account for [mm], and how many
+    times the largest misfit of a model that explains it this is."""
+    to_mm, noise = 1e3 * objective.length_unit_m, objective.noise_loss
+    if objective.knows_gaps and noise > 0:
+        return to_mm * loss**0.5, to_mm * noise**0.5, loss / (_UNEXPLAINED * noise)
+    rms, accounted = to_mm * loss**0.5, noise_mm(objective)
+    return rms, accounted, rms / (_UNEXPLAINED_RMS * accounted)

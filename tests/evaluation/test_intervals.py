@@ -15,7 +15,7 @@ from diffcloud.evaluation.intervals import RESTARTS, significant, state_interval
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitSpace, Objective
 from diffcloud.fit.scan import scan
-from diffcloud.fit.uncertainty import STEP_SIZE, Uncertainty, uncertainty
+from diffcloud.fit.uncertainty import STEP_SIZE, Uncertainty, noise_mm, uncertainty
 from tests.conftest import small_lift
 from tests.evaluation.bowls import Bowl
 from tests.fit.test_fit import clouds_of
@@ -35,8 +35,7 @@ def told(objective, monkeypatch):
     """Intervals of stated variances."""
 
     def tell(
-        sources, *, space=SPACE, values=VALUES, step=0.0, refined=0.0, clusters=16, misfit=(3.0, 3.0), lower=None, loss=1.0,
-        **options,
+        sources, *, space=SPACE, values=VALUES, step=0.0, refined=0.0, clusters=16, lower=None, loss=1.0, **options,
     ):  # fmt: skip
         k = len(space.names)
         moves = np.broadcast_to(refined, k)
@@ -46,7 +45,6 @@ def told(objective, monkeypatch):
         losses = np.array([loss * objective.noise_loss])
         found = Uncertainty(space.names, places, losses, 1.0, covariances, moves, clusters, np.full(k, step), np.eye(k))
         monkeypatch.setattr(module, "uncertainty", lambda *arguments, **given: found)
-        monkeypatch.setattr(module, "_misfit", lambda *arguments: misfit)
         monkeypatch.setattr(module, "_with_scan", lambda objective, space, values, found, seen: (found, lower))
         return state_intervals(objective, space, values, **options)
 
@@ -163,12 +161,20 @@ class TestVerdicts:
         assert found.restarts == 0
         assert found.parameters["stretch"].value == VALUES["stretch"]
 
-    def test_a_misfit_far_above_the_noise_is_no_statement_on_the_cloth(self, told):
-        found = told({"noise": np.diag([0.01, 0.01])}, misfit=(9.0, 4.0))
+    def test_a_misfit_far_above_the_noise_is_no_statement_on_the_cloth(self, told, objective):
+        found = told({"noise": np.diag([0.01, 0.01])}, loss=2.1)
         assert not found.explains
         assert found.parameters["stretch"].verdict == "the model does not explain the recording"
         assert found.parameters["stretch"].low is not None
-        assert "9.0 mm RMS" in found.reason
+        rms = 1e3 * (2.1 * objective.noise_loss) ** 0.5
+        assert f"{rms:.1f} mm RMS" in found.reason
+
+    def test_where_nobody_knows_what_cameras_missed_the_allowance_is_coarse(self, told, objective, monkeypatch):
+        monkeypatch.setattr(Objective, "knows_gaps", False)
+        coarse = 1e-6 * (2 * noise_mm(objective)) ** 2 / objective.noise_loss
+        assert coarse > 2.1
+        assert told({"noise": np.diag([0.01, 0.01])}, loss=0.99 * coarse).explains
+        assert not told({"noise": np.diag([0.01, 0.01])}, loss=1.01 * coarse).explains
 
     def test_a_loss_somewhat_above_what_noise_leaves_is_remarked_on(self, told):
         right, doubted = (told({"noise": np.diag([0.01, 0.01])}, loss=loss) for loss in (1.1, 1.7))
@@ -181,10 +187,9 @@ class TestVerdicts:
     def test_nothing_is_remarked_where_a_reason_is_given_or_the_noise_is_not_known(self, told, monkeypatch, why):
         if why != "not explained":
             monkeypatch.setattr(Objective, *{"gaps unknown": ("knows_gaps", False), "no noise": ("noise_loss", 0.0)}[why])
-        found = told(
-            {"noise": np.diag([0.01, 0.01])}, loss=1.7, misfit=(9.0, 4.0) if why == "not explained" else (3.0, 3.0)
-        )
+        found = told({"noise": np.diag([0.01, 0.01])}, loss=2.1 if why == "not explained" else 1.7)
         assert found.remark == ""
+        assert found.explains == (why != "not explained")
 
 
 class Wells(Bowl):
@@ -238,10 +243,10 @@ def test_the_misfit_is_the_fits_own(objective):
         space = FitSpace.build(["stretch"], fixed={"mass": 1.0})
         return float(uncertainty(objective, space, {"stretch": stretch}).losses[0])
 
-    rms, accounted = module._misfit(objective, loss_at(0.7))
-    assert rms < 1.5 * accounted
-    far, _ = module._misfit(objective, loss_at(0.1))
-    assert far > 1.2 * rms
+    rms, accounted, excess = module._misfit(objective, loss_at(0.7))
+    assert excess == pytest.approx((rms / accounted) ** 2 / 2)
+    assert excess < 0.6
+    assert module._misfit(objective, loss_at(0.1))[2] > 1.5 * excess
 
 
 def test_what_to_improve_first():
