@@ -18,7 +18,7 @@ from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, state_intervals
 from diffcloud.fit import solve
 from diffcloud.fit.pose import NUISANCE, SET_UP, PoseSpace
-from diffcloud.fit.uncertainty import REFINED
+from diffcloud.fit.uncertainty import finer_steps
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import write_json, write_text
 from diffcloud.io.fingerprints import fingerprint, kept_record
@@ -26,7 +26,17 @@ from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.depth_camera import DepthNoise
 from pipeline.config import Config, EpisodesConfig, load_config
 from pipeline.console import JsonFlag, ParamsFile, errors, finish, show, writes
-from pipeline.coverage_page import HEAD, REFITS, cells_of, counted, coverage_page, summary
+from pipeline.coverage_page import (
+    HEAD,
+    REFIT_HEAD,
+    REFITS,
+    cells_of,
+    counted,
+    coverage_page,
+    held_by_refits,
+    refit_rows,
+    summary,
+)
 from pipeline.episodes import hidden_parameters, record_motion, simulated_frames
 from pipeline.fit_jobs import FitJob, Recording
 from pipeline.preprocess import PreprocessJob
@@ -46,7 +56,7 @@ _OTHER_NOISE = DepthNoise(subpixel_px=0.1, correlation_px=1.5, step_px=1 / 16, e
 """Of cameras that are worse than the noise model says: errors of more pixels go together, disparity has coarser steps, and
 more of the borders is lost or lands in between."""
 _OTHER_NOISE_M = 0.001
-"""And of whole surfaces, which else have none: a deviation along each axis."""
+"""And of whole surfaces, which otherwise have none: a deviation along each axis."""
 
 
 @writes()
@@ -55,19 +65,21 @@ def coverage(
         Path, typer.Option(help="Folder for episodes and <scenario>/<known>/<number>.json, which a later call reuses.")
     ],
     scenario: Annotated[list[str] | None, typer.Option(help="Repeatable; by default those of the parameters file.")] = None,
-    recordings: Annotated[int, typer.Option(min=1, help="Of each scenario.")] = 200,
+    recordings: Annotated[int, typer.Option(min=1, help="Cloths drawn for each scenario.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Of truths and noise.")] = 0,
     fix: Annotated[list[str] | None, typer.Option(help="Parameter whose true value fits are given, repeatable.")] = None,
     level: Annotated[float | None, typer.Option(min=0.01, max=0.999, help="Of the intervals. Default: 0.9.")] = None,
     refits: Annotated[
         int | None,
-        typer.Option(min=2, help="Record and fit each cloth so many times; only what is fitted stays the same."),
+        typer.Option(
+            min=2, help="Recordings of each cloth, each fitted by itself; what is not fitted is drawn anew for each."
+        ),
     ] = None,
     truth: Annotated[
         Truth,
         typer.Option(
-            help="Simulated as fits do (same), with four times their steps and recorded with noise that they do not expect "
-            "(refined), or like that and on a mesh with half the edge length (finer)."
+            help="How the truth is simulated: as fits do it (same); with four times their steps, and recorded with noise "
+            "that they do not expect (refined); or also on a mesh of half the edge length (finer)."
         ),
     ] = "same",
     checkpoint: Annotated[
@@ -111,14 +123,18 @@ def coverage(
     for regressor in readers:
         _predict(regressor, jobs)
     cells = list(cells_of(out))
-    table = Table(*HEAD)
-    for row in summary(cells):
-        table.add_row(*row)
-    show(table, json)
+    for head, rows in ((HEAD, summary(cells)), (REFIT_HEAD, list(refit_rows(out)))):
+        if rows:
+            table = Table(*head)
+            for row in rows:
+                table.add_row(*row)
+            show(table, json)
     if markdown is not None:
         write_text(markdown, coverage_page(out))
     asked = {f"{job.scenario.name}/{job.folder.name}": job.folder for job in jobs}
     counts = {name: counted(folder) for name, folder in asked.items()}
+    if refits:
+        counts = {name: told | {"refits": held_by_refits(asked[name])} for name, told in counts.items()}
     result = next(iter(counts.values())) if len(counts) == 1 else {"scenarios": counts}
     finish({"out": str(out), "level": jobs[0].level, **result, "failures": failures}, json)
 
@@ -132,8 +148,8 @@ class CoverageJob:
     seed: int
     known: tuple[str, ...]
     level: float
-    how: Truth
-    """The truth is simulated and recorded."""
+    kind: Truth
+    """How the truth is simulated and recorded."""
     config: Config
     out: Path
     refit: int | None = None
@@ -150,12 +166,12 @@ class CoverageJob:
     @property
     def folder(self) -> Path:
         told = [*self.known, "known"] if self.known else ["free"]
-        return self.out / self.scenario.name / "_".join([*told, *self.kind])
+        return self.out / self.scenario.name / "_".join([*told, *self.marks])
 
     @property
-    def kind(self) -> list[str]:
-        """Of recordings, as names of folders say it."""
-        return [self.how] * (self.how != "same") + [REFITS] * (self.refit is not None)
+    def marks(self) -> list[str]:
+        """What distinguishes the recordings, as names of folders have it."""
+        return [self.kind] * (self.kind != "same") + [REFITS] * (self.refit is not None)
 
     def run(self, tell: Tell) -> dict[str, Any]:
         """The finished record.
@@ -164,7 +180,7 @@ class CoverageJob:
             DiffCloudError: the cloth cannot be simulated, recorded or fitted; the record says so.
         """
         path = self.folder / f"{self.name}.json"
-        plan = [self.scenario, self.index, self.refit, self.seed, self.known, self.level, self.how]
+        plan = [self.scenario, self.index, self.refit, self.seed, self.known, self.level, self.kind]
         sections = [self.config.episodes, self.config.preprocess, self.config.fit]
         mark = fingerprint([*plan, [str(section) for section in sections]], packages=_CODE)
         if (kept := kept_record(path, mark)) is not None:
@@ -225,10 +241,15 @@ class CoverageJob:
         told = {"loss": outcome.loss, "stop_reason": outcome.stop_reason, "simulations": outcome.simulations}
         return told | {"seconds": outcome.seconds, "intervals": found.model_dump(mode="json")}
 
+    def _true_scenario(self) -> Scenario:
+        """With the steps and the mesh of the truth."""
+        true = self.scenario if self.kind == "same" else finer_steps(self.scenario)
+        return true.finer() if self.kind == "finer" else true
+
     def episode(self, truth: Mapping[str, float], tell: Tell) -> Episode:
         """Recorded and preprocessed; fits with other known parameters share it."""
-        path = self.out / self.scenario.name / "_".join(["episodes", *self.kind]) / f"{self.name}.npz"
-        told = [self.scenario, self.index, self.refit, self.seed, self.how]
+        path = self.out / self.scenario.name / "_".join(["episodes", *self.marks]) / f"{self.name}.npz"
+        told = [self.scenario, self.index, self.refit, self.seed, self.kind]
         told += [str(self.config.episodes), str(self.config.preprocess)]
         set_up = self.set_up()
         made = fingerprint([*told, dict(truth), set_up], packages=_RECORDS)
@@ -242,19 +263,14 @@ class CoverageJob:
             "made": made,
         }
         tell(0.0, "recording")
-        scene = self.scenario.scene
-        if self.how != "same":
-            scene = replace(scene, frame_steps=REFINED * scene.frame_steps)
-        if self.how == "finer":
-            scene = scene.finer()
         sets = {name: np.array([value]) for name, value in truth.items()}
-        system, (nodes,), times = simulated_frames(replace(self.scenario, scene=scene), sets)
+        system, (nodes,), times = simulated_frames(self._true_scenario(), sets)
         rng = self._random(1)
         seed = int(rng.integers(2**31))
         with TemporaryDirectory(prefix="diffcloud-") as folder:
             work = Path(folder)
             config = _misplaced(self.config.episodes, set_up)
-            noise = None if self.how == "same" else _OTHER_NOISE
+            noise = None if self.kind == "same" else _OTHER_NOISE
             record_motion(self.scenario, system, nodes, times, work, path.stem, config, seed=seed, meta=meta, noise=noise)
             source = work / path.stem if (work / path.stem).is_dir() else work / path.name
             tell(0.25, "preprocessing")
@@ -262,7 +278,7 @@ class CoverageJob:
             episode = read_episode(work / "clean" / path.name)
         if self.scenario.recorder == "whole_surface":
             episode = _displaced(episode, set_up)
-            if self.how != "same":
+            if self.kind != "same":
                 shaken = episode.points + _OTHER_NOISE_M * rng.standard_normal(episode.points.shape)
                 episode = replace(episode, points=shaken.astype(np.float32))
         write_episode(path, episode)
@@ -327,5 +343,5 @@ def _predict(regressor: Regressor, jobs: Sequence[CoverageJob]) -> None:
                 stretch, mass = (found.samples[0, :, told.names.index(name)] for name in ("stretch", "mass"))
                 ends = np.quantile((stretch / mass).numpy(), [0.5, 0.5 - job.level / 2, 0.5 + job.level / 2])
                 record["intervals"]["ratio"] = dict(zip(("value", "low", "high"), ends.tolist(), strict=True))
-        folder = job.out / job.scenario.name / "_".join([told.model, *job.kind])
+        folder = job.out / job.scenario.name / "_".join([told.model, *job.marks])
         write_json(folder / f"{job.index:04d}.json", {"truth": truth, **record})

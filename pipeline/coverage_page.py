@@ -31,15 +31,7 @@ HEAD = (
     "median half-width",
     "identified",
 )
-REFIT_HEAD = (
-    "scenario",
-    "known",
-    "parameter",
-    "cloths",
-    "held by refits",
-    "these called identified",
-    "others called identified",
-)
+REFIT_HEAD = ("scenario", "known", "parameter", "cloths", "held", "of held: identified", "of others: identified")
 SOURCE_HEAD = ("scenario", "known", "parameter", "hold the truth with noise alone", "largest sources")
 
 
@@ -160,18 +152,20 @@ def held_by_refits(folder: Path) -> dict[str, dict[str, Any]]:
 
     Returns:
         parameter -> cloths, held: of how many at least the share `level` of all refits is within the verdict's factor of
-        the truth, identified: (refits of these with that verdict, refits of these), others: the same of other cloths.
+        the truth, identified: (refits of these with the verdict identified, all refits of these), others: the same of other
+        cloths.
     """
     cloths: dict[str, list[dict[str, Any]]] = {}
     for path in files_in(folder, ".json"):
         cloths.setdefault(path.stem.partition("_")[0], []).append(read_json(path))
     found: dict[str, dict[str, Any]] = {}
-    for records in cloths.values():
+    stated = [record["intervals"] for records in cloths.values() for record in records if "intervals" in record]
+    for records in cloths.values() if stated else ():
         fits = [record["intervals"] | {"truth": record["truth"]} for record in records if "intervals" in record]
-        for name in fits[0]["parameters"] if fits else ():
+        for name in stated[0]["parameters"]:
             entries = [(fit["parameters"][name], fit["truth"][name], fit["within"]) for fit in fits]
             near = sum(abs(math.log(entry["value"] / true)) <= math.log(within) for entry, true, within in entries)
-            held = near >= fits[0]["level"] * len(records)
+            held = near >= stated[0]["level"] * len(records)
             named = sum(entry["verdict"] == "identified" for entry, _, _ in entries)
             told = found.setdefault(name, {"cloths": 0, "held": 0, "identified": (0, 0), "others": (0, 0)})
             told["cloths"] += 1
@@ -227,8 +221,8 @@ def coverage_page(out: Path) -> str:
     if refits:
         lines += [
             "Fresh recordings of the same cloths, everything else drawn anew. A parameter is *held* where nine of ten "
-            "(the level of the intervals) find it within the verdict's factor of the truth; the last two columns count "
-            "recordings with the verdict *identified*.",
+            "recordings (the level of the intervals) find it within the verdict's factor of the truth; the last two "
+            "columns count recordings with the verdict *identified*.",
             "",
             *markdown_table(REFIT_HEAD, refits),
             "",

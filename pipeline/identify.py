@@ -20,7 +20,7 @@ from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitRecord, JointObjective, Objective
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.result import read_motion
-from diffcloud.fit.uncertainty import finer_mesh_mm, noise_mm, refined_distance_mm
+from diffcloud.fit.uncertainty import distance_to_finer_mm, finer_steps
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import claimed, read_yaml, together, write_json, write_text
 from diffcloud.io.imports import cloud_folder
@@ -44,7 +44,8 @@ _CLOTH_FIELDS = ("base", "size_m", "nodes", "material", "steps_per_frame")
 _STEPS = 8
 _MOST_STEPS = 64
 _NOISE_PART = 0.5
-"""Largest distance to the motion with finer steps, as a part of the misfit that noise accounts for."""
+"""Largest distance to the motion with finer steps or a finer mesh that does not matter, as a part of the misfit that
+noise accounts for."""
 _TRANSFERS, _GAIN = 1.25, 0.5
 _Fitted = tuple[FitRecord, AnyObjective, FitJob, int]
 """A fit, what it minimised, the job, and the steps a frame that it ended with."""
@@ -90,15 +91,15 @@ def identify(
         fit = partial(_fitted, out, episodes, cloth, layouts)
         steps = int(cloth.get("steps_per_frame", _STEPS))
         record, objective, job, found = _stated(fit, chosen, steps, level=level, within=within)
-        mesh_mm = _finer_mesh_mm(objective, record)
-        findings = _findings(record, objective, found, mesh_mm)
+        mesh = _finer_mesh(objective, record)
+        findings = _findings(record, objective, found, mesh)
         with together():
             write_text(out / "report.html", _page(record, found, findings, episodes, job))
             write_json(out / "intervals.json", found.model_dump(mode="json"))
     for line in findings:
         errors.print(line, soft_wrap=True)
     errors.print(f"Wrote {out / 'report.html'}, {out / 'fit.json'}.")
-    finish(_result(record, found, findings, mesh_mm), json)
+    finish(_result(record, found, findings, None if mesh is None else mesh[0]), json)
 
 
 def find_scene(
@@ -340,7 +341,7 @@ def _fitted(
         with progress_bar("identify", 1) as update:
             record = job.run(partial(_tell, update, steps))
         objective = job.objective()
-        apart, noise = refined_distance_mm(objective, record.simulated)
+        apart, noise = distance_to_finer_mm(objective, record.simulated, finer_steps)
         errors.print(
             f"{steps} steps a frame: {record.rms_mm:.1f} mm RMS; four times the steps move the cloth by {apart:.1f} mm, "
             f"the points' noise is {noise:.1f} mm.",
@@ -384,25 +385,29 @@ def _motion_of(objective: Objective) -> str:
     return str(np.round(end / max(float(np.abs(end).max()), 1e-9), 0).tolist())
 
 
-def _finer_mesh_mm(objective: AnyObjective, record: FitRecord) -> float | None:
-    """See `finer_mesh_mm`; None where the finer cloth diverges."""
+def _finer_mesh(objective: AnyObjective, record: FitRecord) -> tuple[float, float] | None:
+    """See `distance_to_finer_mm`; None where the finer cloth diverges."""
     try:
-        return finer_mesh_mm(objective, record.simulated)
+        return distance_to_finer_mm(objective, record.simulated, Scenario.finer)
     except DivergedError:
         return None
 
 
-def _mesh_told(objective: AnyObjective, mesh_mm: float | None) -> str:
-    """Whether numbers found with this mesh are those of any."""
-    if mesh_mm is None:
-        return "A mesh of half the edge length diverges with these parameters: they are those of this mesh."
-    told = f"A mesh of half the edge length would move the cloth by {mesh_mm:.1f} mm RMS"
-    if mesh_mm <= _NOISE_PART * min(noise_mm(member) for member in objective.members):
-        return f"{told}: this one is fine enough."
-    return f"{told}: the parameters are those of a cloth of this mesh, and no interval counts that."
+def mesh_sentence(mesh: tuple[float, float] | None) -> str:
+    """Whether the parameters depend on the mesh, by what `_finer_mesh` has found."""
+    if mesh is None:
+        return (
+            "With a mesh of half the edge length, the simulation diverges: whether the parameters depend on the mesh "
+            "is not known."
+        )
+    apart, noise = mesh
+    told = f"With a mesh of half the edge length and the same parameters, the cloth would be {apart:.1f} mm (RMS) elsewhere"
+    if apart <= _NOISE_PART * noise:
+        return f"{told}: this mesh is fine enough."
+    return f"{told}: the parameters hold for this mesh only, and no interval accounts for that."
 
 
-def _findings(record: FitRecord, objective: AnyObjective, found: Intervals, mesh_mm: float | None) -> list[str]:
+def _findings(record: FitRecord, objective: AnyObjective, found: Intervals, mesh: tuple[float, float] | None) -> list[str]:
     """The report's first lines: does the model explain the recordings, do parameters carry over, what are they."""
     if found.explains:
         verdict = "It is doubtful whether the model explains" if found.remark else "The model explains"
@@ -417,7 +422,7 @@ def _findings(record: FitRecord, objective: AnyObjective, found: Intervals, mesh
     lines.append(_validation(record, objective))
     if found.explains:
         lines += found.sentences
-    lines.append(_mesh_told(objective, mesh_mm))
+    lines.append(mesh_sentence(mesh))
     for name, entry in found.parameters.items():
         digits = significant(entry.low, entry.high)
         ends = (

@@ -67,7 +67,10 @@ def train(
     patience: Annotated[int | None, typer.Option(help="Stop after so many epochs without a better validation.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of all random numbers.")] = None,
     device: Annotated[str | None, typer.Option(help="auto, cpu or gpu (mixed precision).")] = None,
-    loaders: Annotated[int | None, typer.Option(help="Processes that sample clouds.")] = None,
+    loaders: Annotated[
+        int | None,
+        typer.Option(help="Processes that sample clouds, on the CPU. 0: the training does, on the GPU if it has one."),
+    ] = None,
     workers: Annotated[int | None, typer.Option(help="Trainings at once, each in a process with one thread.")] = None,
     json: JsonFlag = False,
 ) -> None:

@@ -121,12 +121,12 @@ def step_study(scenario: Scenario, scene: Scene, sizes: list[int]) -> list[StepR
 
 def mesh_study(scenario: Scenario, cuts: int) -> list[MeshRow]:
     """What the mesh costs in accuracy: the scenario's own, and meshes whose edges are halved so many times."""
-    scene, nodes = scenario.scene, len(scenario.scene.mesh.nodes)
-    runs, sizes = [simulate(scenario, scene)], [nodes]
+    nodes, finer = len(scenario.scene.mesh.nodes), scenario
+    runs, sizes = [simulate(scenario, scenario.scene)], [nodes]
     for _ in range(cuts):
-        scene = scene.finer()
-        runs.append(simulate(scenario, scene))
-        sizes.append(len(scene.mesh.nodes))
+        finer = finer.finer()
+        runs.append(simulate(finer, finer.scene))
+        sizes.append(len(finer.scene.mesh.nodes))
     return [
         MeshRow(scenario.name, cut, sizes[cut], _distance(coarse.nodes[:, :nodes], fine.nodes[:, :nodes]), coarse.seconds)
         for cut, (coarse, fine) in enumerate(itertools.pairwise(runs))

@@ -55,9 +55,9 @@ _PLAIN = 1e6
 RESTARTS = 2
 """Of a fit that has not arrived, from a lower loss beside it."""
 _DOUBTED, _UNEXPLAINED = 1.3, 2.0
-"""Times what noise and spacing leave of a loss, from which a fit is doubted whose recording knows what it misses, and from
-which the model does not explain it. Of random cloths that this simulator moved, right fits have had 1.14 times that at most
-(folds with four times the steps 1.9), wrong minima 1.4 at least (docs/evaluation.md)."""
+"""Multiples of the loss that noise and spacing of the points leave, where it is known what the recording misses: from the
+first on a fit gets a remark, above the second the model does not explain the recording. Of random cloths that this
+simulator moved, right fits have had 1.14 times that loss at most (folds of finer steps 1.9), wrong minima 1.4 at least."""
 _UNEXPLAINED_RMS = 2.0
 """RMS over a coarse allowance for noise and spacing, from which the model does not explain another recording."""
 _STEP = 2.0
@@ -194,6 +194,8 @@ def state_intervals(
             f"the misfit is {rms:.1f} mm RMS, but noise and spacing of the points account for only {accounted:.1f} mm; any "
             "interval says only how far this misfit lets the numbers go, and nothing about the cloth"
         )
+        if not all(member.episode.viewpoints for member in objective.members):
+            reason += "; if cameras saw only a part of it, import the clouds with `--camera NAME=x,y,z`"
     remark = "" if reason else _remark(objective, found)
     reaches = {name: _reach(found, row, level) for name, row in zip(space.names, np.eye(len(space.names)), strict=True)}
     ratio_row = _ratio_row(space)
@@ -436,10 +438,12 @@ def _sources(found: Uncertainty, space: FitSpace, ratio: NDArray[np.float64] | N
 
 
 def _misfit(objective: Objective, loss: float) -> tuple[float, float, float]:
-    """RMS of one recording beside the fitted motion, what noise and spacing of its points account for [mm], and how many
-    times the largest misfit of a model that explains it this is."""
+    """RMS of one recording beside the fitted motion, what noise and spacing of its points account for [mm], and the RMS as
+    a multiple of the largest one at which the model still explains the recording."""
     to_mm, noise = 1e3 * objective.length_unit_m, objective.noise_loss
+    rms = to_mm * loss**0.5
     if objective.knows_gaps and noise > 0:
-        return to_mm * loss**0.5, to_mm * noise**0.5, loss / (_UNEXPLAINED * noise)
-    rms, accounted = to_mm * loss**0.5, noise_mm(objective)
+        accounted = to_mm * noise**0.5
+        return rms, accounted, rms / (_UNEXPLAINED**0.5 * accounted)
+    accounted = noise_mm(objective)
     return rms, accounted, rms / (_UNEXPLAINED_RMS * accounted)

@@ -69,7 +69,7 @@ class LandscapeRecord(Checked):
 
 
 class StatedIntervals(Intervals):
-    """With nothing left out."""
+    """As this version writes them: no field may be missing."""
 
     level: Annotated[float, Field(gt=0, lt=1)]
     within: Annotated[float, Field(gt=1, le=1e6)]

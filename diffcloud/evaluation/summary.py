@@ -356,9 +356,11 @@ def _identified(table: pd.DataFrame) -> list[str]:
     for scenario, group in table.drop_duplicates(["scenario", "episode"]).groupby("scenario", sort=False):
         if group["ratio_factor"].notna().any():
             found.append(f"{scenario!s}: stretch / mass is known within {_times(group['ratio_factor'].median())} (median).")
-    for kind in ("reason", "remark", "note"):
+    for kind in ("reason", "remark"):
         for row in table[table[kind] != ""].drop_duplicates(["scenario", "episode"]).to_dict("records"):
             found.append(f"{row['scenario']} / {row['episode']}: {row[kind]}.")
+    for row in table[table["note"] != ""].drop_duplicates(["scenario", "note"]).to_dict("records"):
+        found.append(f"{row['scenario']}: {row['note']}.")
     for row in table[table["low"].notna() & table["posterior_low"].notna()].to_dict("records"):
         if row["posterior_low"] > row["high"] or row["posterior_high"] < row["low"]:
             digits = significant(row["low"], row["high"])

@@ -23,7 +23,7 @@ The pose is solved for as in `residuals`; recordings of a joint fit add up with 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,7 +39,7 @@ from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.pose import NUISANCE, SET_UP, set_up_of, unit_of
 from diffcloud.fit.residuals import Axis, moved_by
 from diffcloud.fit.targets import track_displacement
-from diffcloud.scene.description import Scene
+from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import one_set
 from diffcloud.sim.simulate import Rollout, rollout
 from diffcloud.sim.threads import map_threads
@@ -153,12 +153,21 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
     )
 
 
-def refined_distance_mm(objective: AnyObjective, values: Mapping[str, float]) -> tuple[float, float]:
-    """How far the motion with four times the steps is away, RMS over nodes and compared frames, and what noise and spacing
-    of the recorded points account for [mm]; of the recording in which the first is the larger part of the second.
+def finer_steps(scenario: Scenario) -> Scenario:
+    """With `REFINED` times the steps."""
+    scene = scenario.scene
+    return replace(scenario, scene=replace(scene, frame_steps=REFINED * scene.frame_steps))
+
+
+def distance_to_finer_mm(
+    objective: AnyObjective, values: Mapping[str, float], finer: Callable[[Scenario], Scenario]
+) -> tuple[float, float]:
+    """How far the motion of a finer variant of the scenario is away, RMS over nodes and compared frames, and what noise and
+    spacing of the recorded points account for [mm]; of the recording in which the first is the larger part of the second.
 
     Args:
         values: all parameters, the given ones too.
+        finer: `finer_steps` or `Scenario.finer`.
 
     Raises:
         DivergedError: a motion diverges.
@@ -166,32 +175,11 @@ def refined_distance_mm(objective: AnyObjective, values: Mapping[str, float]) ->
     parameters = one_set(values)
 
     def told(member: Objective) -> tuple[float, float]:
-        apart = _refined(member, parameters, member.simulate_to_loss(parameters)).square().sum(-1).mean().sqrt()
-        return 1e3 * member.length_unit_m * float(apart), noise_mm(member)
+        way = _way_to(finer(member.scenario), member, parameters, member.simulate_to_loss(parameters))
+        return 1e3 * member.length_unit_m * float(way.square().sum(-1).mean().sqrt()), noise_mm(member)
 
     with torch.no_grad():
         return max(map_threads(told, objective.members), key=lambda pair: pair[0] / pair[1])
-
-
-def finer_mesh_mm(objective: AnyObjective, values: Mapping[str, float]) -> float:
-    """How far the motion of a mesh with half the edge length is away at the nodes of this one, RMS over nodes and compared
-    frames [mm]; the largest of all recordings.
-
-    Args:
-        values: all parameters, the given ones too.
-
-    Raises:
-        DivergedError: a motion diverges.
-    """
-    parameters = one_set(values)
-
-    def told(member: Objective) -> float:
-        run = member.simulate_to_loss(parameters)
-        apart = _to(member.scenario.scene.finer(), member, parameters, run)
-        return 1e3 * member.length_unit_m * float(apart.square().sum(-1).mean().sqrt())
-
-    with torch.no_grad():
-        return max(map_threads(told, objective.members))
 
 
 def noise_mm(objective: Objective) -> float:
@@ -299,20 +287,18 @@ def _refined(objective: Objective, parameters: Mapping[str, Tensor], run: Rollou
     takes the published step as it is."""
     if objective.paper:
         return torch.zeros_like(run.at(objective.times))
-    scene = objective.scenario.scene
-    return _to(replace(scene, frame_steps=scene.frame_steps * REFINED), objective, parameters, run)
+    return _way_to(finer_steps(objective.scenario), objective, parameters, run)
 
 
-def _to(scene: Scene, objective: Objective, parameters: Mapping[str, Tensor], run: Rollout) -> Tensor:
-    """[1, L, V, 3] from a motion to that in a finer variant of its scene, at its own nodes and the compared frames."""
-    scenario = objective.scenario
-    system, _ = scene.build()
-    steps = objective.loss_steps * scene.frame_steps // scenario.scene.frame_steps
+def _way_to(finer: Scenario, objective: Objective, parameters: Mapping[str, Tensor], run: Rollout) -> Tensor:
+    """[1, L, V, 3] from a motion to that of a finer variant of its scenario, at its own nodes and the compared frames."""
+    system, _ = finer.scene.build()
+    steps = objective.loss_steps * finer.scene.frame_steps // objective.scenario.scene.frame_steps
     track = None
     if objective.episode.gripper is not None:
         moved = track_displacement(objective.episode, system.handles.grippers, steps, system.time_step)
         track = torch.as_tensor(moved)[None]
-    properties, start = scenario.properties(system, material_of(parameters)), start_of(system, parameters)
+    properties, start = finer.properties(system, material_of(parameters)), start_of(system, parameters)
     fine = rollout(system, steps, properties=properties, state=start, track=track)
     own = run.at(objective.times)
     return fine.at(objective.times)[..., : own.shape[-2], :] - own

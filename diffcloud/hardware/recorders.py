@@ -5,7 +5,7 @@ writes them, many rows at a time when the disk is slow. So neither a slow disk n
 
 A signal's KeyboardInterrupt may come between almost any two instructions of the control loop's thread. `queue.Queue` and
 `threading.Event` take their locks in Python code. If it came there they would stay locked, and the capture would wait for
-them for ever. So that thread uses a `SimpleQueue`, whose `put` is one instruction, and plain flags.
+them for ever. So that thread uses `SimpleQueue`, whose `put` is one instruction, and plain attributes.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ _QUEUED_ROWS = 1500
 _OVERDUE_S = 0.5
 """A driver that takes this much longer than its timeout hangs."""
 _WATCH_S = 0.1
+_FULL_S = 0.005
+"""Between two looks at a queue that is full."""
 _AHEAD_S = 1.0
 """No frame was taken later than now; clocks that are tied to each other differ by milliseconds."""
 
@@ -60,12 +62,10 @@ class Recorders:
         camera_timeout_s: float,
         with_arm: bool,
     ) -> None:
-        self._failed = threading.Event()
         self._cameras = [
-            _CameraRecorder(camera, writer, clock, self._failed, keep_every=keep_every, timeout_s=camera_timeout_s)
-            for camera in cameras
+            _CameraRecorder(camera, writer, clock, keep_every=keep_every, timeout_s=camera_timeout_s) for camera in cameras
         ]
-        self._arm = _ArmRecorder(writer, self._failed) if with_arm else None
+        self._arm = _ArmRecorder(writer) if with_arm else None
 
     def start(self) -> None:
         for recorder in self._all():
@@ -112,10 +112,9 @@ class Recorders:
         """
         for camera in self._cameras:
             camera.check_driver()
-        if self._failed.is_set():
-            for recorder in self._all():
-                if recorder.error is not None:
-                    raise recorder.error
+        for recorder in self._all():
+            if recorder.error is not None:
+                raise recorder.error
 
     def _all(self) -> list[_CameraRecorder | _ArmRecorder]:
         return [*self._cameras, *([] if self._arm is None else [self._arm])]
@@ -129,7 +128,6 @@ class _CameraRecorder:
         camera: Camera,
         writer: RawEpisodeWriter,
         clock: Clock,
-        failed: threading.Event,
         *,
         keep_every: int,
         timeout_s: float,
@@ -137,8 +135,8 @@ class _CameraRecorder:
         self.error: DiffCloudError | None = None
         self._camera, self._writer, self._clock = camera, writer, clock
         self._keep_every, self._timeout_s = keep_every, timeout_s
-        self._failed, self._ending = failed, False
-        self._frames: queue.Queue[CameraFrame | None] = queue.Queue(_QUEUED_FRAMES)
+        self._ending = False
+        self._frames: queue.SimpleQueue[CameraFrame | None] = queue.SimpleQueue()
         self._asked: float | None = None
         """time.monotonic() when the driver was asked for a frame; None while it is not being asked."""
         self._taker, self._writing = (
@@ -197,17 +195,26 @@ class _CameraRecorder:
                         "be placed in time."
                     )
                 last = t
-                if count % self._keep_every == 0:
-                    self._frames.put(frame, timeout=self._timeout_s)
+                if count % self._keep_every == 0 and not self._queued(frame):
+                    self._fail(HardwareError(f"Camera {self._camera.name}: the disk cannot keep up; lower the frame rate."))
+                    break
                 count += 1
-        except queue.Full:
-            self._fail(HardwareError(f"Camera {self._camera.name}: the disk cannot keep up; lower the frame rate."))
         except Exception as error:  # whatever a driver raises must end the capture, not only this thread
             if not self._ending:
                 self._fail(_named(f"Camera {self._camera.name}", error))
         finally:
             self._asked = None
             self._frames.put(None)
+
+    def _queued(self, frame: CameraFrame) -> bool:
+        """Wait for the disk, but not longer than for the camera; whether there was room."""
+        end = time.monotonic() + self._timeout_s
+        while self._frames.qsize() >= _QUEUED_FRAMES:
+            if time.monotonic() > end:
+                return False
+            time.sleep(_FULL_S)
+        self._frames.put(frame)
+        return True
 
     def _write(self) -> None:
         refused = False
@@ -223,15 +230,14 @@ class _CameraRecorder:
     def _fail(self, error: DiffCloudError) -> None:
         if self.error is None:
             self.error = error
-        self._failed.set()
 
 
 class _ArmRecorder:
     """Writes the arm's readings in a thread."""
 
-    def __init__(self, writer: RawEpisodeWriter, failed: threading.Event) -> None:
+    def __init__(self, writer: RawEpisodeWriter) -> None:
         self.error: DiffCloudError | None = None
-        self._writer, self._failed = writer, failed
+        self._writer = writer
         self._rows: queue.SimpleQueue[RobotSample | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write, name="robot_write", daemon=True)
 
@@ -265,7 +271,6 @@ class _ArmRecorder:
                 self._writer.add_robot(*(row for row in rows if row is not None))
             except Exception as error:
                 refused, self.error = True, _named("Writing robot.csv", error)
-                self._failed.set()
 
 
 def _named(where: str, error: Exception) -> DiffCloudError:

@@ -100,7 +100,7 @@ def train_regressor(
     it up.
 
     Args:
-        workers: processes that sample clouds, on the CPU; 0 for none: then clouds are made where the network is trained.
+        workers: processes that sample clouds, on the CPU; 0 for none: then CUDA does, if the network is trained there.
         mark: fingerprint of what is trained, kept with the timings.
 
     Raises:

@@ -78,13 +78,15 @@ class Scene:
 
     def finer(self) -> Scene:
         """The same scene, each face of the cloth cut into four; its first nodes are those of this one. What lies between
-        two held nodes of one motion is held like them."""
+        two nodes that are held alike is held like them."""
         mesh, edges = refined(self.mesh)
-        of_node = {handle.node: handle for handle in self.handles.handles}
-        more = []
-        for place, (a, b) in enumerate(edges.tolist(), len(self.mesh.nodes)):
-            if a in of_node and b in of_node and replace(of_node[a], node=b) == of_node[b]:
-                more.append(replace(of_node[a], node=place))
+        held = set(self.handles.handles)
+        more = [
+            replace(handle, node=place)
+            for place, (a, b) in enumerate(edges.tolist(), len(self.mesh.nodes))
+            for handle in self.handles.handles
+            if handle.node == a and replace(handle, node=b) in held
+        ]
         handles = Handles((*self.handles.handles, *more), self.handles.stiffness, self.handles.hard)
         return replace(self, mesh=mesh, handles=handles)
 

@@ -12,8 +12,9 @@ from diffcloud.evaluation.discretisation import mesh_study, pairs
 from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton
 from diffcloud.fit.parameters import Variable
 from diffcloud.fit.pose import SET_UP
-from diffcloud.fit.uncertainty import finer_mesh_mm, patches, uncertainty
+from diffcloud.fit.uncertainty import distance_to_finer_mm, patches, uncertainty
 from diffcloud.io.episodes import Episode
+from diffcloud.scene.scenarios import Scenario
 from tests.conftest import small_lift
 from tests.fit.test_fit import GENTLE, clouds_of
 
@@ -87,14 +88,16 @@ class TestDoubts:
         values = {"stretch": float(stretch), "mass": float(mass)}
         late, early = (Objective(scenario, recorded(scenario), nuisance={}, frames=[one]) for one in (frame, 1))
         (row,) = mesh_study(scenario, 1)
-        found = finer_mesh_mm(late, values)
+        found = distance_to_finer_mm(late, values, Scenario.finer)[0]
         assert found == pytest.approx(1e3 * row.errors[3], rel=1e-4)  # episodes hold the gripper in single precision
-        assert finer_mesh_mm(early, values) < found
-        assert finer_mesh_mm(JointObjective([early, late]), values) == found
+        assert distance_to_finer_mm(early, values, Scenario.finer)[0] < found
+        assert distance_to_finer_mm(JointObjective([early, late]), values, Scenario.finer)[0] == found
 
     def test_a_finer_mesh_lies_as_the_fitted_one_does(self, scenario):
         objective = Objective(scenario, recorded(scenario), nuisance={}, frames=[1])
-        straight, turned = (finer_mesh_mm(objective, {**TRUTH, "turn": angle}) for angle in (0.0, 0.3))
+        straight, turned = (
+            distance_to_finer_mm(objective, {**TRUTH, "turn": angle}, Scenario.finer)[0] for angle in (0.0, 0.3)
+        )
         assert turned < straight + 0.5
 
     def test_where_all_is_known_of_a_pose_its_doubts_are_sources(self, scenario):

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
+from contextlib import suppress
 
 import numpy as np
+import pytest
 
+from diffcloud.errors import HardwareError
 from diffcloud.hardware import ArmReading
 from diffcloud.hardware.recorders import Clock, Recorders
 from tests.hardware.simulated import TestCard
@@ -52,6 +56,18 @@ class InterruptedAt:
         return self._trace
 
 
+class StuckCard(TestCard):
+    """Its driver does not come back until it is let go."""
+
+    def __init__(self):
+        super().__init__()
+        self.go = threading.Event()
+
+    def read(self, timeout_s):
+        self.go.wait()
+        raise HardwareError("unplugged")
+
+
 def finished(recorders):
     """Whether everything queued gets written: not where a lock is still held that the interrupted call had taken."""
     ending = threading.Thread(target=recorders.finish, daemon=True)
@@ -60,9 +76,9 @@ def finished(recorders):
     return not ending.is_alive()
 
 
-def recording(cameras=()):
+def recording(*cameras, timeout_s=1.0):
     writer = Rows()
-    recorders = Recorders(cameras, writer, Clock(), keep_every=1, camera_timeout_s=1.0, with_arm=True)
+    recorders = Recorders(cameras, writer, Clock(), keep_every=1, camera_timeout_s=timeout_s, with_arm=True)
     recorders.start()
     return recorders, writer
 
@@ -83,26 +99,41 @@ def test_an_interrupt_while_a_row_is_queued_loses_that_row_at_most():
     assert number > 10
 
 
-def test_an_interrupt_while_cameras_are_ended_leaves_them_to_be_ended_again():
-    """A signal at the end of the trajectory; they are ended again after Stop."""
+def test_an_interrupt_while_cameras_are_told_to_end_leaves_them_to_be_told_again():
+    """A signal at the end of the trajectory; they are told again after Stop."""
     number = 0
     while True:
-        recorders, _ = recording([TestCard(fps=1000)])
+        recorders, _ = recording(TestCard(fps=1000))
+        camera = recorders._cameras[0]
         with InterruptedAt(number) as interrupt:
-            recorders.end_cameras()
+            camera.end()
         assert finished(recorders), f"hangs when interrupted before instruction {number}"
         if not interrupt.reached:
             break
-        number += 7  # one in seven: each takes a start and an end of threads
-    assert number > 10
+        number += 1
+    assert number > 1
 
 
-def test_an_interrupt_while_waiting_leaves_nothing_locked():
-    """A capture of cameras alone, one of which fails afterwards."""
-    for number in range(0, 60, 3):
-        card = TestCard(fps=1000)
-        recorders, _ = recording([card])
-        with InterruptedAt(number):
-            recorders.wait(0.01)
-        card._dies_after = 0
+@pytest.mark.parametrize("call", ["raise_failure", "wait"])
+def test_an_interrupt_while_failures_are_looked_for_leaves_later_ones_to_be_told(call):
+    """A driver has hung, which is noticed in the control loop's thread; then its camera, and the disk, fail in theirs."""
+    number = 0
+    while True:
+        card = StuckCard()
+        recorders, writer = recording(card, timeout_s=0.0)
+        camera = recorders._cameras[0]
+        camera._asked = time.monotonic() - 10.0
+        with InterruptedAt(number) as interrupt, suppress(HardwareError):
+            recorders.raise_failure() if call == "raise_failure" else recorders.wait(0.001)
+        card.go.set()
+        camera._taker.join(5.0)
+        assert not camera._taker.is_alive(), f"hangs when interrupted before instruction {number}"
+        writer.add_robot = None  # calling it raises
+        recorders.add_reading(0.0, READING)
         assert finished(recorders), f"hangs when interrupted before instruction {number}"
+        with pytest.raises(HardwareError):
+            recorders.raise_failure()
+        if not interrupt.reached:
+            break
+        number += 1
+    assert number > 10

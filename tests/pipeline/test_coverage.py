@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from diffcloud.io.episodes import read_episode, write_episode
+from pipeline import coverage
 from pipeline.coverage_page import counted, coverage_page, held_by_refits
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
@@ -68,8 +69,13 @@ class TestCoverage:
         assert episode.stat().st_mtime_ns != written
 
     @pytest.mark.parametrize("truth", ["refined", "finer"])
-    def test_another_truth_has_a_folder_of_its_own(self, work, truth):
-        """The same cloth, recorded with noise, as other steps and another mesh move it."""
+    def test_another_truth_has_a_folder_of_its_own(self, work, truth, monkeypatch):
+        """The same cloth, as other steps and another mesh move it."""
+        scenes = []
+        frames = coverage.simulated_frames
+        monkeypatch.setattr(
+            coverage, "simulated_frames", lambda scenario, sets: scenes.append(scenario.scene) or frames(scenario, sets)
+        )
         invoke(*COVERAGE, "--recordings", 1)
         invoke(*COVERAGE, "--recordings", 1, "--truth", truth)
         record, same = (
@@ -77,6 +83,8 @@ class TestCoverage:
         )
         assert record["truth"] == same["truth"]
         assert record["set_up"] == same["set_up"]
+        assert scenes[1].frame_steps == 4 * scenes[0].frame_steps
+        assert len(scenes[1].mesh.faces) == len(scenes[0].mesh.faces) * (4 if truth == "finer" else 1)
 
     def test_another_truth_is_recorded_with_noise(self, work):
         """1 mm along each axis; a frame that shows the start alone, which other steps leave where it was."""
@@ -95,6 +103,7 @@ class TestCoverage:
         ]
         assert all(first["set_up"][name] != second["set_up"][name] for name in first["set_up"])
         assert done.result["parameters"]["stretch"]["n"] == 2
+        assert done.result["refits"]["stretch"]["cloths"] == 1
         page = (work / "page.md").read_text()
         assert "| small | free | stretch | 1 |" in page
         assert "| small | free refits |" not in page
@@ -153,21 +162,22 @@ def test_refusals_and_failures_count_as_misses(tmp_path):
 
 
 def test_refits_hold_what_nine_of_ten_find_within_the_factor(tmp_path):
-    """Of ten refits of each of three cloths: one has one beside, one has two, and the third's fits fail twice."""
+    """Of ten refits of each of four cloths: the first has one beside, the second two; the third's fits fail twice, the
+    fourth's always. Verdicts have nothing to do with it."""
     folder = tmp_path / "lift" / "free_refits"
     folder.mkdir(parents=True)
-    for cloth, beside in enumerate((1, 2, 0)):
+    for cloth, beside in enumerate((1, 2, 0, 0)):
         for refit in range(10):
-            value, verdict = (2.0, "not identified") if refit < beside else (1.2, "identified")
+            value, verdict = 2.0 if refit < beside else 1.2, "identified" if refit < 6 else "not identified"
             entry = {"value": value, "low": 1.0, "high": 2.0, "verdict": verdict}
             told = {"intervals": {"parameters": {"stretch": entry}, "within": 1.5, "level": 0.9}}
             record = {"truth": {"stretch": 1.0, "mass": 1.0}, **told}
-            if cloth == 2 and refit > 7:
+            if cloth == 3 or (cloth == 2 and refit > 7):
                 record = {"truth": record["truth"], "error": "diverged"}
             (folder / f"{cloth:04d}_{refit:02d}.json").write_text(json.dumps(record))
     told = held_by_refits(folder)["stretch"]
-    assert told == {"cloths": 3, "held": 1, "identified": (9, 10), "others": (16, 20)}
-    assert "| lift | free | stretch | 3 | 1 | 9 of 10 (90 %) | 16 of 20 (80 %) |" in coverage_page(tmp_path)
+    assert told == {"cloths": 4, "held": 1, "identified": (6, 10), "others": (12, 30)}
+    assert "| lift | free | stretch | 4 | 1 | 6 of 10 (60 %) | 12 of 30 (40 %) |" in coverage_page(tmp_path)
 
 
 def test_sources_are_told_beside_what_noise_alone_would_hold(tmp_path):

@@ -22,6 +22,7 @@ from diffcloud.io.clouds import write_ply
 from diffcloud.io.raw_episodes import read_raw_episode
 from diffcloud.scene.scenarios import built_in, make_scenario
 from diffcloud.sim.simulate import rollout
+from pipeline.identify import mesh_sentence
 from tests.io.ros_bag import bag
 from tests.pipeline.invoke import invoke
 from tests.test_architecture import check_commands
@@ -111,9 +112,7 @@ class TestNewUser:
         assert summary.index("Transfers within this motion") < summary.index("stretch: ")
         assert "fetch(" not in page[: page.index("<main>")]
         assert done.result["findings"][0].startswith("The model explains")
-        assert (
-            f"A mesh of half the edge length would move the cloth by {done.result['finer_mesh_mm']:.1f} mm RMS" in summary
-        )
+        assert f"the cloth would be {done.result['finer_mesh_mm']:.1f} mm (RMS) elsewhere" in summary
 
     def test_other_commands_take_what_it_wrote(self, found):
         folder, _ = found
@@ -375,3 +374,10 @@ class TestProject:
         (project / name).write_text(text)
         assert told in invoke("init", project, code=1).errors
         assert not (project / "dvc.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("mesh", "told"), [((1.0, 3.0), "fine enough"), ((2.0, 3.0), "hold for this mesh only"), (None, "is not known")]
+)
+def test_the_mesh_matters_where_it_moves_the_cloth_by_more_than_half_of_the_noise(mesh, told):
+    assert told in mesh_sentence(mesh)

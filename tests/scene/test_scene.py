@@ -413,3 +413,32 @@ def test_what_lies_between_held_nodes_is_held():
     inside = ((finer.mesh.nodes >= low - 1e-9) & (finer.mesh.nodes <= high + 1e-9)).all(1)
     assert len(held) == inside.sum() == 15
     assert replace(finer.handles, handles=finer.handles.handles[: len(scene.handles.handles)]) == scene.handles
+
+
+def test_a_finer_scenario_acts_on_what_lies_between_its_nodes():
+    scenario = load_scenario("lift")
+    corner = np.array([0, 1, 7, 8])  # a cell of 7 by 7 nodes
+    scenario = replace(scenario, node_sets={"mass": corner}, loss_faces=np.array([3]))
+    finer = scenario.finer()
+    system, _ = finer.scene.build()
+    heavy = finer.properties(system, {"mass": torch.full((1,), 2.0, dtype=torch.float64)})
+    usual = finer.properties(system, {})
+    factor = (heavy.node_mass / usual.node_mass)[0].numpy()
+    ends = scenario.scene.mesh.nodes[corner]
+    between = 0.5 * (ends[:, None] + ends).reshape(-1, 3)  # and the nodes themselves
+    inside = (np.linalg.norm(finer.scene.mesh.nodes[:, None] - between, axis=-1) < 1e-9).any(1)
+    assert inside.sum() == 9
+    np.testing.assert_allclose(factor, np.where(inside, 2.0, 1.0))
+    own, cut = scenario.scene.mesh, finer.scene.mesh
+    assert cut.face_area[finer.loss_faces].sum() == pytest.approx(own.face_area[3])
+
+
+def test_two_handles_of_a_node_are_both_passed_on():
+    """As the published scenes have them: one that stays, and one that moves."""
+    scene = load_scenario("lift").scene
+    moving = [handle for handle in scene.handles.handles if handle.motion is not None][:1]
+    face = scene.mesh.faces[(scene.mesh.faces == moving[0].node).any(1)][0]
+    held = [replace(handle, node=int(node)) for node in face for handle in (moving[0], replace(moving[0], motion=None))]
+    finer = replace(scene, handles=replace(scene.handles, handles=tuple(held), hard=False)).finer()
+    assert len(finer.handles.handles) == 2 * (3 + 3)
+    assert len({handle.node for handle in finer.handles.handles}) == 6
