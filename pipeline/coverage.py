@@ -65,21 +65,23 @@ def coverage(
         Path, typer.Option(help="Folder for episodes and <scenario>/<known>/<number>.json, which a later call reuses.")
     ],
     scenario: Annotated[list[str] | None, typer.Option(help="Repeatable; by default those of the parameters file.")] = None,
-    recordings: Annotated[int, typer.Option(min=1, help="Cloths drawn for each scenario.")] = 200,
+    recordings: Annotated[
+        int, typer.Option(min=1, help="Cloths of each scenario, each recorded once (more often with --refits).")
+    ] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Of truths and noise.")] = 0,
     fix: Annotated[list[str] | None, typer.Option(help="Parameter whose true value fits are given, repeatable.")] = None,
     level: Annotated[float | None, typer.Option(min=0.01, max=0.999, help="Of the intervals. Default: 0.9.")] = None,
     refits: Annotated[
         int | None,
         typer.Option(
-            min=2, help="Recordings of each cloth, each fitted by itself; what is not fitted is drawn anew for each."
+            min=2, help="Recordings of each cloth, each fitted on its own: stretch and mass stay, all else is drawn anew."
         ),
     ] = None,
     truth: Annotated[
         Truth,
         typer.Option(
-            help="How the truth is simulated: as fits do it (same); with four times their steps, and recorded with noise "
-            "that they do not expect (refined); or also on a mesh of half the edge length (finer)."
+            help="How the truth is simulated and recorded. same: as fits do it; refined: with four times their steps and "
+            "noise that they do not expect; finer: like refined, and on a mesh of half the edge length."
         ),
     ] = "same",
     checkpoint: Annotated[
@@ -105,7 +107,7 @@ def coverage(
     if set(known) >= set(config.fit.parameters):
         raise ConfigError("Nothing is left to fit: leave out a --fix.")
     if refits and checkpoint:
-        raise ConfigError("Networks predict recordings of different cloths; leave out --checkpoint, or --refits.")
+        raise ConfigError("--checkpoint takes one recording of each cloth; leave out --checkpoint or --refits.")
     jobs = [
         CoverageJob(
             choose_scenario(name), index, seed, known, level or config.evaluate.level or LEVEL, truth, config, out, refit

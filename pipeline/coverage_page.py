@@ -198,8 +198,8 @@ def coverage_page(out: Path) -> str:
         "Errors and half-widths are of the natural logarithm: 0.1 is about 10 %. A fit that fails or states no "
         "interval is a miss. *Identified*: of the recordings with that verdict, how many are within its factor of the "
         "truth. *Refined*: the truth has four times the steps that fits take, and was recorded with noise that they do not "
-        "expect (`lift` and `fold` by worse cameras, the others with 1 mm along each axis). *Finer*: like that, and its "
-        "mesh has half the edge length. "
+        "expect (`lift` and `fold` by worse cameras, the others with noise of 1 mm along each axis). *Finer*: like that, "
+        "and its mesh has half the edge length. "
         + "Rows named after a network are its predictions of the same recordings (`--checkpoint`); the prior of a "
         "posterior is the distribution that its training draws had, which may be wider than that of these truths. "
         * networks
@@ -220,8 +220,8 @@ def coverage_page(out: Path) -> str:
         ]
     if refits:
         lines += [
-            "Fresh recordings of the same cloths, everything else drawn anew. A parameter is *held* where nine of ten "
-            "recordings (the level of the intervals) find it within the verdict's factor of the truth; the last two "
+            "Fresh recordings of the same cloths, everything else drawn anew. A parameter is *held* where at least nine of "
+            "ten recordings (the level of the intervals) find it within the verdict's factor of the truth; the last two "
             "columns count recordings with the verdict *identified*.",
             "",
             *markdown_table(REFIT_HEAD, refits),

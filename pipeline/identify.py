@@ -401,7 +401,10 @@ def mesh_sentence(mesh: tuple[float, float] | None) -> str:
             "is not known."
         )
     apart, noise = mesh
-    told = f"With a mesh of half the edge length and the same parameters, the cloth would be {apart:.1f} mm (RMS) elsewhere"
+    told = (
+        "With a mesh of half the edge length and the same parameters, the simulated cloth would lie "
+        f"{apart:.1f} mm (RMS) away from the fitted one"
+    )
     if apart <= _NOISE_PART * noise:
         return f"{told}: this mesh is fine enough."
     return f"{told}: the parameters hold for this mesh only, and no interval accounts for that."

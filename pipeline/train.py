@@ -69,7 +69,9 @@ def train(
     device: Annotated[str | None, typer.Option(help="auto, cpu or gpu (mixed precision).")] = None,
     loaders: Annotated[
         int | None,
-        typer.Option(help="Processes that sample clouds, on the CPU. 0: the training does, on the GPU if it has one."),
+        typer.Option(
+            help="Processes that sample clouds, on the CPU. 0: the training process does, on the GPU if it trains there."
+        ),
     ] = None,
     workers: Annotated[int | None, typer.Option(help="Trainings at once, each in a process with one thread.")] = None,
     json: JsonFlag = False,

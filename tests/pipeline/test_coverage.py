@@ -125,7 +125,7 @@ class TestCoverage:
         ("options", "message"),
         [
             (("--checkpoint", "of_lift.safetensors"), "was trained for lift, which is not among the scenarios"),
-            (("--refits", 2, "--checkpoint", "of_lift.safetensors"), "leave out --checkpoint, or --refits"),
+            (("--refits", 2, "--checkpoint", "of_lift.safetensors"), "leave out --checkpoint or --refits"),
             (("--fix", "drag"), "--fix names a fitted parameter"),
             (("--fix", "mass", "--fix", "stretch"), "Nothing is left to fit"),
         ],

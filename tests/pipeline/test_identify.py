@@ -112,7 +112,7 @@ class TestNewUser:
         assert summary.index("Transfers within this motion") < summary.index("stretch: ")
         assert "fetch(" not in page[: page.index("<main>")]
         assert done.result["findings"][0].startswith("The model explains")
-        assert f"the cloth would be {done.result['finer_mesh_mm']:.1f} mm (RMS) elsewhere" in summary
+        assert f"would lie {done.result['finer_mesh_mm']:.1f} mm (RMS) away from the fitted one" in summary
 
     def test_other_commands_take_what_it_wrote(self, found):
         folder, _ = found
