@@ -250,7 +250,7 @@ class TestTowelOfAnotherSimulator:
         assert stiff["findings"][1].startswith("Transfers within this motion")
 
     @pytest.mark.slow
-    @pytest.mark.xfail(strict=True, reason="41 to 45: intervals count no difference between simulators (docs/limits.md)")
+    @pytest.mark.xfail(strict=True, reason="41 to 44: intervals count no difference between simulators (docs/limits.md)")
     def test_its_interval_holds_the_truth(self, stiff):
         told = stiff["parameters"]["stretch"]
         assert told["low"] < 40 < told["high"]
