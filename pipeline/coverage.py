@@ -31,9 +31,8 @@ from pipeline.coverage_page import (
     REFIT_HEAD,
     REFITS,
     cells_of,
-    counted,
+    counts_of,
     coverage_page,
-    held_by_refits,
     refit_rows,
     summary,
 )
@@ -124,20 +123,20 @@ def coverage(
             errors.print(failures[-1], soft_wrap=True)
     for regressor in readers:
         _predict(regressor, jobs)
-    cells = list(cells_of(out))
-    for head, rows in ((HEAD, summary(cells)), (REFIT_HEAD, list(refit_rows(out)))):
+    counts = counts_of(out)
+    for head, rows in ((HEAD, summary(list(cells_of(counts)))), (REFIT_HEAD, list(refit_rows(counts)))):
         if rows:
             table = Table(*head)
             for row in rows:
                 table.add_row(*row)
             show(table, json)
     if markdown is not None:
-        write_text(markdown, coverage_page(out))
-    asked = {f"{job.scenario.name}/{job.folder.name}": job.folder for job in jobs}
-    counts = {name: counted(folder) for name, folder in asked.items()}
-    if refits:
-        counts = {name: told | {"refits": held_by_refits(asked[name])} for name, told in counts.items()}
-    result = next(iter(counts.values())) if len(counts) == 1 else {"scenarios": counts}
+        write_text(markdown, coverage_page(counts))
+    asked = {
+        f"{job.scenario.name}/{job.folder.name}": counts.get((job.scenario.name, job.folder.name), {"parameters": {}})
+        for job in jobs
+    }
+    result = next(iter(asked.values())) if len(asked) == 1 else {"scenarios": asked}
     finish({"out": str(out), "level": jobs[0].level, **result, "failures": failures}, json)
 
 

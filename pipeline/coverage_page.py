@@ -17,8 +17,10 @@ from diffcloud.io.files import files_in, read_json
 REFITS = "refits"
 """Last part of the name of a folder whose records are of few cloths, each recorded several times."""
 _RATIO = "stretch / mass"
+Counts = dict[tuple[str, str], dict[str, Any]]
+"""(scenario, name of a folder of records) -> what these say, as of `counted`."""
 Cell = tuple[tuple[str, str, str], dict[str, Any]]
-"""(scenario, known, parameter), and what the records of that folder say of it, as of `counted`."""
+"""(scenario, known, parameter), and what the records of that folder say of it."""
 HEAD = (
     "scenario",
     "known",
@@ -35,6 +37,15 @@ REFIT_HEAD = ("scenario", "known", "parameter", "cloths", "held", "of held: iden
 SOURCE_HEAD = ("scenario", "known", "parameter", "hold the truth with noise alone", "largest sources")
 
 
+def counts_of(out: Path) -> Counts:
+    """Of all folders of records that `coverage` has filled."""
+    return {
+        (scenario.name, folder.name): counted(folder)
+        for scenario in sorted(path for path in out.iterdir() if path.is_dir())
+        for folder in sorted(path for path in scenario.iterdir() if path.is_dir() and files_in(path, ".json"))
+    }
+
+
 def counted(folder: Path) -> dict[str, Any]:
     """What the records of one folder say.
 
@@ -42,14 +53,18 @@ def counted(folder: Path) -> dict[str, Any]:
         parameters: name -> n, stated: with an interval, covered: those that hold the truth, median_factor: of the
         intervals, rms_error: of the logarithm, verdicts, identified_within: of those called identified, how many are within
         the factor, noise_alone: how many intervals of the noise of residuals alone would hold the truth, sources: source ->
-        median deviation; ratio: the same of stretch to mass, if both are fitted.
+        median deviation; ratio: the same of stretch to mass, if both are fitted; refits: as of `_held_by_refits`, where
+        each cloth was recorded several times.
     """
-    records = [read_json(path) for path in files_in(folder, ".json")]
+    named = {path.stem: read_json(path) for path in files_in(folder, ".json")}
+    records = list(named.values())
     fitted = next((list(one["intervals"]["parameters"]) for one in records if "intervals" in one), [])
     parameters = {name: _count(records, name) for name in fitted}
     told: dict[str, Any] = {"parameters": parameters}
     if any("ratio" in one.get("intervals", {}) for one in records) and {"stretch", "mass"} <= set(fitted):
         told["ratio"] = _count(records, "ratio")
+    if folder.name.endswith(REFITS):
+        told["refits"] = _held_by_refits(named)
     return told
 
 
@@ -121,34 +136,31 @@ def _sources(cells: Sequence[Cell]) -> list[list[str]]:
     ]
 
 
-def cells_of(out: Path) -> Iterator[Cell]:
+def cells_of(counts: Counts) -> Iterator[Cell]:
     """Of all folders of records, but those of refits."""
-    for scenario, folder in _folders(out):
-        if folder.name.endswith(REFITS):
-            continue
-        told = counted(folder)
-        ratio = {_RATIO: told["ratio"]} if "ratio" in told else {}
-        for name, count in (told["parameters"] | ratio).items():
-            yield (scenario, folder.name.replace("_", " "), name), count
+    for (scenario, folder), told in counts.items():
+        if "refits" not in told:
+            ratio = {_RATIO: told["ratio"]} if "ratio" in told else {}
+            for name, count in (told["parameters"] | ratio).items():
+                yield (scenario, folder.replace("_", " "), name), count
 
 
-def refit_rows(out: Path) -> Iterator[list[str]]:
+def refit_rows(counts: Counts) -> Iterator[list[str]]:
     """Rows under `REFIT_HEAD`: of parameters that refits hold, and of others, how often refits call them identified."""
-    for scenario, folder in _folders(out):
-        if not folder.name.endswith(REFITS):
-            continue
-        told = held_by_refits(folder)
-        for name, of in told.items():
+    for (scenario, folder), told in counts.items():
+        for name, of in told.get("refits", {}).items():
             named = [
                 f"{part} of {whole} ({100 * part / whole:.0f} %)" if whole else ""
                 for part, whole in (of["identified"], of["others"])
             ]
-            known = folder.name.removesuffix(f"_{REFITS}").replace("_", " ")
+            known = folder.removesuffix(f"_{REFITS}").replace("_", " ")
             yield [scenario, known, name, str(of["cloths"]), str(of["held"]), *named]
 
 
-def held_by_refits(folder: Path) -> dict[str, dict[str, Any]]:
-    """What the refits of one folder say.
+def _held_by_refits(named: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """
+    Args:
+        named: name of a file, <cloth>_<refit>, -> its record.
 
     Returns:
         parameter -> cloths, held: of how many at least the share `level` of all refits is within the verdict's factor of
@@ -156,10 +168,10 @@ def held_by_refits(folder: Path) -> dict[str, dict[str, Any]]:
         cloths.
     """
     cloths: dict[str, list[dict[str, Any]]] = {}
-    for path in files_in(folder, ".json"):
-        cloths.setdefault(path.stem.partition("_")[0], []).append(read_json(path))
+    for name, record in named.items():
+        cloths.setdefault(name.partition("_")[0], []).append(record)
     found: dict[str, dict[str, Any]] = {}
-    stated = [record["intervals"] for records in cloths.values() for record in records if "intervals" in record]
+    stated = [record["intervals"] for record in named.values() if "intervals" in record]
     for records in cloths.values() if stated else ():
         fits = [record["intervals"] | {"truth": record["truth"]} for record in records if "intervals" in record]
         for name in stated[0]["parameters"]:
@@ -175,17 +187,10 @@ def held_by_refits(folder: Path) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _folders(out: Path) -> Iterator[tuple[str, Path]]:
-    """(scenario, folder of records)"""
-    for scenario in sorted(path for path in out.iterdir() if path.is_dir()):
-        for folder in sorted(path for path in scenario.iterdir() if path.is_dir() and files_in(path, ".json")):
-            yield scenario.name, folder
-
-
-def coverage_page(out: Path) -> str:
-    """Markdown of docs/results/coverage.md, of all records in the folder that `coverage` has filled."""
-    cells = list(cells_of(out))
-    rows, sources, refits = summary(cells), _sources(cells), list(refit_rows(out))
+def coverage_page(counts: Counts) -> str:
+    """Markdown of docs/results/coverage.md."""
+    cells = list(cells_of(counts))
+    rows, sources, refits = summary(cells), _sources(cells), list(refit_rows(counts))
     networks = any({"free", "known"}.isdisjoint(row[1].split()) for row in rows)
     lines = [
         "# How often intervals hold the truth",

@@ -268,15 +268,13 @@ def state_intervals(
 
 def _remark(objective: AnyObjective, found: Uncertainty) -> str:
     """On a loss that a right fit seldom has; else empty."""
-    excess = [
-        loss / member.noise_loss
-        for member, loss in zip(objective.members, found.losses.tolist(), strict=True)
-        if member.knows_gaps and member.noise_loss > 0
-    ]
-    if max(excess, default=0.0) < _DOUBTED:
+    excess = max(
+        _over_noise(member, loss) or 0.0 for member, loss in zip(objective.members, found.losses.tolist(), strict=True)
+    )
+    if excess < _DOUBTED:
         return ""
     return (
-        f"the loss is {max(excess):.1f} times what noise and spacing of the points leave, and a right fit of an exact "
+        f"the loss is {excess:.1f} times what noise and spacing of the points leave, and a right fit of an exact "
         "model stays below about 1.15 times: the fit may have ended in a wrong minimum, or the model lacks something"
     )
 
@@ -440,10 +438,15 @@ def _sources(found: Uncertainty, space: FitSpace, ratio: NDArray[np.float64] | N
 def _misfit(objective: Objective, loss: float) -> tuple[float, float, float]:
     """RMS of one recording beside the fitted motion, what noise and spacing of its points account for [mm], and the RMS as
     a multiple of the largest one at which the model still explains the recording."""
-    to_mm, noise = 1e3 * objective.length_unit_m, objective.noise_loss
-    rms = to_mm * loss**0.5
-    if objective.knows_gaps and noise > 0:
-        accounted = to_mm * noise**0.5
-        return rms, accounted, rms / (_UNEXPLAINED**0.5 * accounted)
-    accounted = noise_mm(objective)
-    return rms, accounted, rms / (_UNEXPLAINED_RMS * accounted)
+    to_mm = 1e3 * objective.length_unit_m
+    rms, over = to_mm * loss**0.5, _over_noise(objective, loss)
+    if over is None:
+        accounted = noise_mm(objective)
+        return rms, accounted, rms / (_UNEXPLAINED_RMS * accounted)
+    return rms, to_mm * objective.noise_loss**0.5, (over / _UNEXPLAINED) ** 0.5
+
+
+def _over_noise(objective: Objective, loss: float) -> float | None:
+    """A loss over what noise and spacing of the points leave; None where it is not known what the recording misses."""
+    known = objective.knows_gaps and objective.noise_loss > 0
+    return loss / objective.noise_loss if known else None

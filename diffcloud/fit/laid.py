@@ -26,6 +26,7 @@ from diffcloud.fit.priors import parse_deviations
 from diffcloud.fit.record import NuisanceValue
 from diffcloud.mesh.topology import ClothMesh
 from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.properties import Properties
 from diffcloud.sim.simulate import init
 from diffcloud.sim.system import State, System
 
@@ -103,7 +104,7 @@ def asked_as(name: str) -> str:
     return "shape" if name in _SHAPES else name
 
 
-def material_of(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def _material_of(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Those that do not tell how a cloth lies."""
     return {name: value for name, value in values.items() if not is_laid(name)}
 
@@ -142,6 +143,16 @@ def start_of(system: System, values: Mapping[str, Tensor]) -> State | None:
     """The state in which motions of these values begin; arguments as of `laid_nodes`. None: that of the scene."""
     nodes = laid_nodes(system.mesh, values)
     return None if nodes is None else init(system, len(nodes), positions=nodes)
+
+
+def inputs_of(scenario: Scenario, system: System, values: Mapping[str, Tensor]) -> tuple[Properties, State | None]:
+    """What parameter sets are to the simulator: properties, and a start (None: that of the scene).
+
+    Args:
+        system: of the scenario's scene.
+        values: name -> [B].
+    """
+    return scenario.properties(system, _material_of(values)), start_of(system, values)
 
 
 def described_laid(space: FitSpace, values: Mapping[str, float], *, length_unit_m: float) -> dict[str, NuisanceValue]:

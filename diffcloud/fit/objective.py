@@ -23,7 +23,7 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.alignment import aligned
-from diffcloud.fit.laid import material_of, start_of
+from diffcloud.fit.laid import inputs_of
 from diffcloud.fit.matching import Matcher, Motion, Pairs
 from diffcloud.fit.pose import PoseSpace, default_priors
 from diffcloud.fit.targets import read_target
@@ -223,8 +223,8 @@ class Objective:
         return rollout(self.system, steps, properties=properties, state=start, track=track)
 
     def inputs(self, parameters: Mapping[str, Tensor]) -> tuple[Properties, State | None]:
-        """What parameter sets are to the simulator: properties, and a start (None: that of the scene)."""
-        return self.scenario.properties(self.system, material_of(parameters)), start_of(self.system, parameters)
+        """See `laid.inputs_of`."""
+        return inputs_of(self.scenario, self.system, parameters)
 
     def frame_losses(self, run: Rollout, *, pose: Tensor | None = None) -> Tensor:
         """[B, L] losses of a rollout at each compared frame, at its pose or at poses [B, d]."""

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloud.fit.joint import AnyObjective, loss_weights, mean_loss
-from diffcloud.fit.laid import asked_as, material_of, start_of
+from diffcloud.fit.laid import asked_as, inputs_of
 from diffcloud.fit.matching import Motion
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
@@ -298,7 +298,7 @@ def _way_to(finer: Scenario, objective: Objective, parameters: Mapping[str, Tens
     if objective.episode.gripper is not None:
         moved = track_displacement(objective.episode, system.handles.grippers, steps, system.time_step)
         track = torch.as_tensor(moved)[None]
-    properties, start = finer.properties(system, material_of(parameters)), start_of(system, parameters)
+    properties, start = inputs_of(finer, system, parameters)
     fine = rollout(system, steps, properties=properties, state=start, track=track)
     own = run.at(objective.times)
     return fine.at(objective.times)[..., : own.shape[-2], :] - own

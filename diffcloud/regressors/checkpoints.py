@@ -222,8 +222,6 @@ class Regressor:
             clouds: [B, T, P, 3] in the frame and length unit of the scenario's scene; T frames as the model sees them.
         """
         told = self.description
-        parameter = next(self.network.parameters())
-        clouds = clouds.to(parameter)
         self.network.eval()
         scaled, scale = self.scaled(clouds), self.scale
         if isinstance(self.network, Posterior):
@@ -237,7 +235,8 @@ class Regressor:
         return Prediction(told.names, scale.values(fractions), fractions, width, scale)
 
     def scaled(self, clouds: Tensor) -> Tensor:
-        """[B, T, P, 3] clouds as the network sees them."""
+        """[B, T, P, 3] clouds as the network sees them, and where it lies."""
+        clouds = clouds.to(next(self.network.parameters()))
         return (clouds - clouds.new_tensor(self.description.centre)) / self.description.length
 
     def write(self, path: Path) -> None:

@@ -531,7 +531,7 @@ def _measured(regressor: Regressor, dataset: CloudDataset, indices: Sequence[int
         if isinstance(network, Posterior) and found.samples is not None:
             drawn = torch.cat([fractions[:, None], found.scale.fractions(found.samples)], dim=1)
             with torch.no_grad():
-                seen = regressor.scaled(clouds.to(next(network.parameters())))
+                seen = regressor.scaled(clouds)
                 density = network.log_density(seen, drawn.to(seen.device)).cpu()
             denser = (density[:, 1:] > density[:, :1]).float().mean(1)
             ranks = torch.cat([(found.samples < true[:, None]).float().mean(1), denser[:, None]], dim=1)

@@ -14,7 +14,7 @@ from diffcloud.errors import ConfigError, DivergedError, EpisodeError
 from diffcloud.fit import AdamSettings, FitSpace, JointObjective, Objective, fit_adam
 from diffcloud.fit.agreement import Agreement, gradient_agreement, random_parameters
 from diffcloud.fit.benchmark import time_contact
-from diffcloud.fit.laid import material_of, start_of
+from diffcloud.fit.laid import inputs_of
 from diffcloud.fit.record import FittedParameter, read_fit
 from diffcloud.fit.result import describe_fit, write_fit
 from diffcloud.fit.targets import track_displacement
@@ -32,7 +32,7 @@ def clouds_of(scenario, *, points=800, seed=5, gripper=True, shift=(0, 0, 0), ya
 
     system, _ = scenario.scene.build()
     values = one_set(truth)
-    properties, start = scenario.properties(system, material_of(values)), start_of(system, values)
+    properties, start = inputs_of(scenario, system, values)
     run = rollout(system, scenario.steps, properties=properties, state=start)
     nodes = run.positions[0, :: scenario.scene.frame_steps]
     generator = torch.Generator().manual_seed(seed)

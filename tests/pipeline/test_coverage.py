@@ -11,7 +11,7 @@ import yaml
 
 from diffcloud.io.episodes import read_episode, write_episode
 from pipeline import coverage
-from pipeline.coverage_page import counted, coverage_page, held_by_refits
+from pipeline.coverage_page import counted, counts_of, coverage_page
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
 from tests.pipeline.invoke import invoke
@@ -158,7 +158,7 @@ def test_refusals_and_failures_count_as_misses(tmp_path):
     assert told["identified_within"] == 2
     assert told["rms_error"] == pytest.approx(math.sqrt((math.log(1.1) ** 2 + math.log(1.2) ** 2 + math.log(2) ** 2) / 4))
     assert told["sources"] == {}
-    assert "| lift | mass known | stretch | 5 | 3 | 1 (20 %) |" in coverage_page(tmp_path)
+    assert "| lift | mass known | stretch | 5 | 3 | 1 (20 %) |" in coverage_page(counts_of(tmp_path))
 
 
 def test_refits_hold_what_nine_of_ten_find_within_the_factor(tmp_path):
@@ -175,9 +175,9 @@ def test_refits_hold_what_nine_of_ten_find_within_the_factor(tmp_path):
             if cloth == 3 or (cloth == 2 and refit > 7):
                 record = {"truth": record["truth"], "error": "diverged"}
             (folder / f"{cloth:04d}_{refit:02d}.json").write_text(json.dumps(record))
-    told = held_by_refits(folder)["stretch"]
+    told = counted(folder)["refits"]["stretch"]
     assert told == {"cloths": 4, "held": 1, "identified": (6, 10), "others": (12, 30)}
-    assert "| lift | free | stretch | 4 | 1 | 6 of 10 (60 %) | 12 of 30 (40 %) |" in coverage_page(tmp_path)
+    assert "| lift | free | stretch | 4 | 1 | 6 of 10 (60 %) | 12 of 30 (40 %) |" in coverage_page(counts_of(tmp_path))
 
 
 def test_sources_are_told_beside_what_noise_alone_would_hold(tmp_path):
@@ -193,7 +193,7 @@ def test_sources_are_told_beside_what_noise_alone_would_hold(tmp_path):
     told = counted(folder)["parameters"]["stretch"]
     assert told["noise_alone"] == 1  # the quantile is 1.86
     assert told["sources"] == pytest.approx({"noise": 0.1, "step size": 0.3, "prior": 0.0})
-    assert "| lift | mass known | stretch | 1 (50 %) | step size 90 %, noise 10 % |" in coverage_page(tmp_path)
+    assert "| lift | mass known | stretch | 1 (50 %) | step size 90 %, noise 10 % |" in coverage_page(counts_of(tmp_path))
 
 
 class TestIntervals:
