@@ -1,9 +1,9 @@
 """Material that nobody asked for, and that is known only within a factor.
 
-A fit of stretch and mass takes bending, drag, damping and friction from the scenario. None of them is known exactly, and a
-hinge twice as stiff as stated moves the cloth by more than the cameras' noise: the fitted numbers are bent until they make
-up for it. So such material is fitted too, each part under a prior about what is known of it. It is not a result: a fit
-reports only the parameters asked for, with such material allowed for.
+A fit of stretch and mass takes compression, bending, drag, damping and friction from the scenario. None of them is known
+exactly, and a hinge twice as stiff as stated moves the cloth by more than the cameras' noise: the fitted numbers are bent
+until they make up for it. So such material is fitted too, each part under a prior about what is known of it. It is not a
+result: a fit reports only the parameters asked for, with such material allowed for.
 """
 
 from __future__ import annotations
@@ -16,7 +16,14 @@ from diffcloud.fit.priors import parse_factor
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS
 
-MATERIAL_DOUBTS = {"bending": 1.5, "drag": 1.3, "damping": 1.5, "friction_obstacle": 1.3, "friction_cloth": 1.3}
+MATERIAL_DOUBTS = {
+    "compression": 3.0,
+    "bending": 1.5,
+    "drag": 1.3,
+    "damping": 1.5,
+    "friction_obstacle": 1.3,
+    "friction_cloth": 1.3,
+}
 """One standard deviation of each material, as a factor."""
 _FARTHEST = 4.0
 """Bounds, in standard deviations."""
@@ -61,7 +68,8 @@ def with_doubts(space: FitSpace, doubts: Mapping[str, float], scenarios: Sequenc
         value = known.pop()
         if not known and value > 0:
             far = factor**_FARTHEST
-            variables.append(Variable(name, value / far, value * far, factor, value, doubtful=True))
+            high = min(value * far, PARAMETERS[name].most)
+            variables.append(Variable(name, value / far, high, factor, value, doubtful=True))
             fixed.pop(name, None)
     return FitSpace(tuple(variables), fixed)
 

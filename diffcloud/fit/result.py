@@ -96,6 +96,7 @@ def whole_material(scenario: Scenario, values: Mapping[str, float]) -> WholeMate
         stretching=stretching * material.resting_stretching_stiffness,
         poisson=material.resting_poisson_ratio,
         shear=stretching * material.resting_shear_stiffness,
+        compression=float(changed.compression),
         bending=bending * material.resting_bending_stiffness,
         damping=float(changed.damping),
         friction_obstacle=float(changed.friction_obstacle),

@@ -55,7 +55,7 @@ def load_scene(path: Path, *, reload_materials: bool = False) -> Scene:
     block = cloth.materials[0]
     raw = read_material(_inside(root, block.data, path))
     damping = block.damping if scene.diffcloud.damping is None else scene.diffcloud.damping
-    raw = replace(raw, damping=damping)
+    raw = replace(raw, damping=damping, compression=scene.diffcloud.compression)
     scaled = raw.scaled(
         density=block.thicken * block.density_mult,
         stretching=block.thicken * block.stretching_mult,

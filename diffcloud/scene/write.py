@@ -82,6 +82,7 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
             "integrator": scene.integrator,
             "shaped": scene.shaped,
             "contact": _contact_name(scene.surrounding.reference_contact),
+            "compression": scene.material.compression,
         },
     }
     if math.isfinite(scene.end_time):

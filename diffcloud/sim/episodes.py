@@ -28,7 +28,7 @@ FACTOR_MEMORY = 256 * 2**20
 """[bytes] of factors that a batch keeps for its derivatives; beyond, the steps' factors are made again."""
 _BLOCK = 9 * 8
 
-_PROPERTIES = Parameters._fields[:1] + Parameters._fields[2:10]
+_PROPERTIES = Parameters._fields[:1] + Parameters._fields[2:11]
 """Fields that `Properties` has too, in its order."""
 
 

@@ -25,6 +25,9 @@ class Properties:
     """[B, V] [kg]"""
     stretching: Tensor
     """[B, F] multiplier on the stretching table of each face [-]."""
+    compression: Tensor
+    """[B] part of the stretching stiffness that resists compression [-]; without effect in a material that resists in
+    full."""
     bending: Tensor
     """[B, H] multiplier on the bending table of each hinge [-]."""
     damping: Tensor
@@ -69,6 +72,8 @@ class Parameter:
     """Of a fit, unless others are given."""
     basis: Basis | None = None
     """What it multiplies; None: it is the physical value itself."""
+    most: float = math.inf
+    """Beyond it means nothing."""
 
     def check(self, value: float, what: str) -> None:
         """
@@ -91,6 +96,8 @@ class Parameter:
             )
         if value < 0:
             raise ConfigError(f"{what} must not be negative, got {value:g}; the nearest allowed value is 0.")
+        if value > self.most:
+            raise ConfigError(f"{what} is at most {self.most:g}, got {value:g}.")
 
 
 _LARGEST = 1e6
@@ -108,6 +115,7 @@ PARAMETERS: dict[str, Parameter] = {
             "density",
         ),
         Parameter("density", "multiplier on all node masses", "kg/m²", _MULTIPLIED, "density"),
+        Parameter("compression", "part of the stretching stiffness that resists compression", "–", (0.001, 1.0), most=1.0),
         Parameter("bending", "multiplier on the bending table", "N·m", _MULTIPLIED, "bending"),
         Parameter("drag", "multiplier on the air density and the tangential drag", "kg/m³", _MULTIPLIED, "air_density"),
         Parameter("damping", "stiffness-proportional damping", "s", (0.0, 0.1)),
@@ -186,6 +194,7 @@ def scaled_properties(
         base,
         node_mass=base.node_mass * over_nodes("mass") * get("density")[:, None],
         stretching=base.stretching * stretch,
+        compression=values.get("compression", base.compression),
         bending=base.bending * get("bending")[:, None],
         damping=values.get("damping", base.damping),
         air_density=base.air_density * get("drag"),

@@ -152,6 +152,7 @@ EFFECTS = [
     Effect("diffcloud.shaped", True, lambda scene: scene.shaped, True),
     Effect("diffcloud.contact", "planes", around("reference_contact"), None),
     Effect("diffcloud.contact", "published", around("reference_contact"), ReferenceContact.as_published()),
+    Effect("diffcloud.compression", 0.1, lambda scene: scene.material.compression, 0.1),
     Effect("diffcloud.damping", 0.01, lambda scene: scene.material.damping, 0.01),
 ]
 REFUSED = [

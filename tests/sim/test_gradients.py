@@ -154,5 +154,6 @@ def test_gradients_stay_finite_where_formulas_degenerate():
 def test_scalars_cover_every_parameter():
     from diffcloud.sim import PARAMETERS
 
-    # these act only in scenes with contact of the cloth with itself, and with bodies (test_contact_gradients)
-    assert set(SCALARS) | {"friction_cloth", "body_mass"} == set(PARAMETERS)
+    # these act only in scenes with contact of the cloth with itself, with bodies (test_contact_gradients), and with cloth
+    # that gives way to compression (test_implicit)
+    assert set(SCALARS) | {"friction_cloth", "body_mass", "compression"} == set(PARAMETERS)

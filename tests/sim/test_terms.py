@@ -42,8 +42,11 @@ CAMEL = Material(
             [37.157593, 34.107452, 33.229435, 34.685535, 10.439938],
         ]
     ),
+    compression=0.1,
 )
-CONSTANT = isotropic("constant", density=0.2, stretching=40.0, bending=1e-4, shear=7.5)
+CONSTANT = replace(
+    isotropic("constant", density=0.2, stretching=40.0, bending=1e-4, poisson=0.2, shear=7.5), compression=0.1
+)
 TABLE = SurfaceMesh(np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0.3], [-1, 1, 0.3]]), np.array([[0, 1, 2], [0, 2, 3]]))
 AROUND = {
     name: Surrounding(
@@ -111,7 +114,8 @@ def test_kernels_are_as_their_twins_say(name, state, around, mesh, rng):
     bent = replace(mesh, nodes=crumpled(mesh, rng, 0.01))
     forces = Forces(bent, CAMEL, AROUND[around], shaped=True, rng=rng)
     moves = [0.5 * rng.normal(size=mesh.nodes.shape) for _ in range(3)]
-    motion = forces.motion(states(mesh, rng)[state], *moves)
+    press = 0.98 if name == "wrinkling" else 1.0  # at rest, rounding would decide what is compressed
+    motion = forces.motion(press * states(mesh, rng)[state], *moves)
     extra, twin = sampled(name, _sampled(CAMEL.stretching)), getattr(twins, name)
     inputs = {
         key: torch.as_tensor(value).requires_grad_()
@@ -183,7 +187,7 @@ def test_settings_of_an_unknown_force_are_refused(mesh):
         Forces(mesh, CAMEL, Surrounding(forces={"no_such_force": {}}))
 
 
-KINDS = pytest.mark.parametrize("name", ["stretching", "bending"])
+KINDS = pytest.mark.parametrize("name", ["stretching", "wrinkling", "bending"])
 MATERIALS = pytest.mark.parametrize("material", [CAMEL, CONSTANT], ids=lambda m: m.name)
 
 
@@ -200,7 +204,11 @@ class TestEnergies:
 
     def test_stiffness_is_symmetric_and_positive_where_coefficients_are_constant(self, name, mesh, rng):
         forces = Forces(mesh, CONSTANT, rng=rng)
-        dense = forces.stiffness(name, forces.motion(crumpled(mesh, rng)), 1.0, 0.0)
+        motion = forces.motion(crumpled(mesh, rng))
+        dense = forces.stiffness(name, motion, 1.0, 0.0)
+        if name == "wrinkling":  # takes off a part of stretching's
+            assert dense.min() < 0
+            dense = dense + forces.stiffness("stretching", motion, 1.0, 0.0)
         assert np.abs(dense - dense.T).max() <= 1e-12 * np.abs(dense).max()
         assert np.linalg.eigvalsh(dense).min() >= -1e-10 * np.abs(dense).max()
 
@@ -225,6 +233,52 @@ class TestEnergies:
         scale = np.abs(found).max()
         assert np.abs(found.sum(0)).max() < 1e-12 * scale
         assert np.abs(np.cross(at, found).sum(0)).max() < 1e-12 * scale
+
+
+class TestWrinkling:
+    """What of the energy of compression is left: the sum of both terms against stretching alone."""
+
+    SHEETS = pytest.mark.parametrize(
+        "sheet",
+        [CONSTANT, replace(CONSTANT, stretching=CONSTANT.stretching * [1, 0, 3, 1])],
+        ids=["isotropic", "orthotropic"],
+    )
+
+    @staticmethod
+    def stored(sheet: Material, mesh, at: np.ndarray) -> tuple[float, float]:
+        """(energy of both terms, of stretching alone)"""
+        forces = Forces(mesh, sheet)
+        alone = forces.energy("stretching", forces.motion(at))
+        return alone + forces.energy("wrinkling", forces.motion(at)), alone
+
+    @SHEETS
+    @pytest.mark.parametrize(("along", "across"), [(1.1, 1.0), (1.0, 1.2), (1.1, 1.05)])
+    def test_nothing_in_a_sheet_that_is_taut(self, sheet, along, across, mesh):
+        both, alone = self.stored(sheet, mesh, mesh.nodes * [along, across, 1.0])
+        assert both == alone > 0
+
+    @SHEETS
+    @pytest.mark.parametrize(("along", "across"), [(0.9, 1.0), (1.0, 0.8), (0.9, 0.95)])
+    def test_a_tenth_of_the_energy_in_a_sheet_that_is_compressed(self, sheet, along, across, mesh):
+        both, alone = self.stored(sheet, mesh, mesh.nodes * [along, across, 1.0])
+        assert 0.1 * alone < both < 0.14 * alone  # the rest is what easing takes
+
+    @pytest.mark.parametrize("degrees", [0.0, 20.0, 45.0, 77.0])
+    def test_a_sheet_pulled_along_and_pressed_across_keeps_the_pull_in_every_direction(self, degrees, mesh):
+        """Isotropic without coupling: the principal strains have energies of their own."""
+        sheet = replace(isotropic("sheet", density=0.2, stretching=40.0, bending=1e-4), compression=0.1)
+        angle = np.deg2rad(degrees)
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        pulled = np.diag([1.1, 0.9, 1.0])
+        both, alone = self.stored(sheet, mesh, mesh.nodes @ turn @ pulled @ turn.T)
+        area, pull, press = 0.3 * 0.4, 0.5 * (1.1**2 - 1), 0.5 * (0.9**2 - 1)
+        assert alone == pytest.approx(0.5 * 40 * area * (pull**2 + press**2))
+        assert both == pytest.approx(0.5 * 40 * area * (pull**2 + 0.1 * press**2), rel=0.02)
+
+    @pytest.mark.parametrize("compression", [0.0, -0.1, 1.5, float("nan")])
+    def test_a_part_that_is_none_is_refused(self, compression):
+        with pytest.raises(SceneError, match="compression is above 0 and at most 1"):
+            replace(CONSTANT, compression=compression)
 
 
 def test_constant_stretching_stiffness_is_the_jacobian_under_tension(mesh):

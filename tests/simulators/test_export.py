@@ -67,6 +67,10 @@ def moved(scenario, values):
 
 
 class TestFittedScene:
+    def test_has_the_fitted_compression(self):
+        scene = load_scenario("recorded_lift").fitted_scene({"compression": 0.02})
+        assert scene.material.compression == 0.02
+
     @pytest.mark.parametrize("name", ["lift", "fold"])
     def test_moves_as_the_scenario_does_with_these_parameters(self, name):
         scenario = load_scenario(name)
@@ -119,6 +123,11 @@ class TestIsotropicSheet:
         told = " ".join(isotropic_sheet(preset("basis-knit"))[1])
         assert "at 45°" in told
         assert "3 times that at rest. The exported stiffness is the one at rest." in told
+        assert "wrinkles" not in told
+        wrinkling = replace(preset("basis-knit"), compression=0.25)
+        assert "wrinkles finer than its mesh instead, and 25.0% of the stiffness stays" in " ".join(
+            isotropic_sheet(wrinkling)[1]
+        )
 
 
 def test_a_strained_start_is_measured():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -37,6 +38,9 @@ class ScenarioOptions(Checked):
     name: str
     material: str | Sheet = "basis-knit"
     """A preset, the path of an ARCSim material JSON, or an isotropic sheet in SI units."""
+    compression: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """The part of its stretching stiffness with which the cloth resists compression in its plane. Fabric wrinkles instead,
+    finer than most meshes: there 0.003 says so (docs/physics.md, wrinkles)."""
     path: Keyframes
     """The gripper's displacement."""
     frames: Annotated[int, Field(ge=1, le=100_000)] = 25
@@ -124,7 +128,7 @@ def assemble(
     thickness = options.contact_thickness_m
     scene = Scene(
         mesh=mesh,
-        material=_material(options),
+        material=replace(_material(options), compression=options.compression),
         handles=Handles(tuple(handles), hard=not options.soft_handles),
         frame_time=1 / options.rate_hz,
         frame_steps=options.steps_per_frame,

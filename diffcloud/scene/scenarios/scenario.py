@@ -84,6 +84,11 @@ class Scenario:
         """
         if "body_mass" in names and not self.scene.surrounding.bodies:
             raise ConfigError(f"body_mass has no effect in {self.name}, whose scene has no rigid bodies; leave it out.")
+        if "compression" in names and self.scene.material.compression == 1:
+            raise ConfigError(
+                f"compression has no effect in {self.name}, whose cloth resists it in full; leave it out, or give the "
+                "scenario a compression below 1."
+            )
 
     def fitted_scene(self, values: Mapping[str, float]) -> Scene:
         """The scene with parameters written into its material, its air, its friction and its bodies.
@@ -119,7 +124,11 @@ class Scenario:
         )
         return replace(
             scene,
-            material=replace(material, damping=values.get("damping", material.damping)),
+            material=replace(
+                material,
+                compression=values.get("compression", material.compression),
+                damping=values.get("damping", material.damping),
+            ),
             mass_material=None if scene.mass_material is None else scene.mass_material.scaled(density=weight),
             surrounding=around,
         )
@@ -129,6 +138,8 @@ class Scenario:
         basis = PARAMETERS[name].basis
         if basis is not None:
             return 1.0 if self.scene.basis(basis) > _NO_MATERIAL else 0.0
+        if name == "compression" and self.scene.material.compression == 1:
+            return 0.0
         system, _ = self.scene.build()
         found = float(getattr(system.properties, name)[0])
         return found if found > _NO_MATERIAL else 0.0

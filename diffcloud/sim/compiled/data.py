@@ -21,6 +21,8 @@ class Parameters(NamedTuple):
     """[N] of all points, zero for those of obstacles and bodies; follows from the node masses [1/kg]."""
     stretching: Floats
     """[F] multiplier on the stretching table of each face [-]."""
+    compression: Floats
+    """[1] part of the stretching stiffness that resists compression [-]."""
     bending: Floats
     """[H] multiplier on the bending table of each hinge [-]."""
     damping: Floats

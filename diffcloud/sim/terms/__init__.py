@@ -23,6 +23,7 @@ TERMS: tuple[Term, ...] = tuple(
     for file in (
         "gravity",
         "stretching",
+        "wrinkling",
         "bending",
         "air",
         "handles",

@@ -29,11 +29,11 @@ _SCALE = 900.0 / 29.0
 
 def force(face: Element) -> Sequence[Vector]:
     """-∂W/∂x - H d on the three corners."""
-    xu, xv = _along_material(face, face.positions)
-    du, dv = _along_material(face, face.displacement)
-    along_u, along_v = _along_material(face, [face.ahead * velocity for velocity in face.after])
+    xu, xv = along_material(face, face.positions)
+    du, dv = along_material(face, face.displacement)
+    along_u, along_v = along_material(face, [face.ahead * velocity for velocity in face.after])
     e00, e11, e01 = 0.5 * (dot(xu, xu) - 1), 0.5 * (dot(xv, xv) - 1), 0.5 * dot(xu, xv)
-    k0, k1, k2, k3 = (k * face.parameter("stretching") for k in _coefficients(face, e00, e11, e01))
+    k0, k1, k2, k3 = (k * face.parameter("stretching") for k in coefficients(face, e00, e11, e01))
     # strains after the displacement, to first order
     p00, p11 = e00 + dot(xu, du), e11 + dot(xv, dv)
     p01 = e01 + 0.5 * (dot(xu, dv) + dot(xv, du))
@@ -52,9 +52,9 @@ def force(face: Element) -> Sequence[Vector]:
 
 def energy(face: Element) -> Scalar:
     """W"""
-    xu, xv = _along_material(face, face.positions)
+    xu, xv = along_material(face, face.positions)
     e00, e11, e01 = 0.5 * (dot(xu, xu) - 1), 0.5 * (dot(xv, xv) - 1), 0.5 * dot(xu, xv)
-    k0, k1, k2, k3 = (k * face.parameter("stretching") for k in _coefficients(face, e00, e11, e01))
+    k0, k1, k2, k3 = (k * face.parameter("stretching") for k in coefficients(face, e00, e11, e01))
     axial = 0.5 * (k0 * e00 * e00 + k2 * e11 * e11) + k1 * e00 * e11
     return face.constant("area") * (axial + k3 * e01 * e01)
 
@@ -83,7 +83,7 @@ TERM = Term(
 Tables: [29³, 8, 4] trilinear polynomial (x, y, z, xy, xz, yz, xyz, 1) of (k0, k1, k2, k3) in each cell [N/m]."""
 
 
-def _along_material(face: Element, field: Sequence[Vector]) -> tuple[Vector, Vector]:
+def along_material(face: Element, field: Sequence[Vector]) -> tuple[Vector, Vector]:
     """Derivatives of a field of the corners along u and v."""
     first, second = field[1] - field[0], field[2] - field[0]
     u, v = (
@@ -92,7 +92,7 @@ def _along_material(face: Element, field: Sequence[Vector]) -> tuple[Vector, Vec
     return u, v
 
 
-def _coefficients(face: Element, e00: Scalar, e11: Scalar, e01: Scalar) -> list[Scalar]:
+def coefficients(face: Element, e00: Scalar, e11: Scalar, e01: Scalar) -> list[Scalar]:
     """k0, k1, k2, k3 at a strain [N/m]."""
     places = [clamped((e + 0.25) * _SCALE - 0.5, 0.0, _SAMPLES - 1.0) for e in (e00, e11)]
     places.append(clamped(absolute(e01) * _SCALE - 0.5, 0.0, _SAMPLES - 1.0))

@@ -184,6 +184,11 @@ def isotropic_sheet(material: Material, strained: float = 0.0) -> tuple[Sheet, l
             f"Stretching is linear; in the fit, its stiffness at 12.5 % strain is {stiffening:.3g} times that at rest. The "
             f"exported stiffness is the one {where}."
         )
+    if material.compression < 1 - _WORTH_SAYING:
+        said.append(
+            "Compression in the plane is resisted as stretching is; in the fit, the cloth wrinkles finer than its mesh "
+            f"instead, and {material.compression:.1%} of the stiffness stays."
+        )
     flat = TABLE_ENTRY_TO_BENDING * material.bending
     bending = material.resting_bending_stiffness
     apart = float(np.abs(flat / bending - 1).max())

@@ -33,7 +33,7 @@ class Forces:
         shaped: bool = False,
         rng: np.random.Generator | None = None,
     ) -> None:
-        """Args: rng: draws parameters; without, they are one and air is still."""
+        """Args: rng: draws parameters; without, they are one, compression is the material's, and air is still."""
         handles = Handles((Handle(0), Handle(1)))
         self.mesh = mesh
         self.system = build_system(mesh, material, time_step=STEP, handles=handles, surrounding=surrounding, shaped=shaped)
@@ -44,11 +44,14 @@ class Forces:
             shape = np.atleast_1d(np.asarray(array)[0]).shape
             return np.ones(shape) if rng is None else rng.uniform(0.3, 2.0, shape)
 
-        mass = given.node_mass[0].numpy() * drawn(given.node_mass)
         fields = {name: drawn(getattr(given, name)) for name in Parameters._fields if hasattr(given, name)}
+        mass, pressed = (fields[name] * getattr(given, name)[0].numpy() for name in ("node_mass", "compression"))
         hold, target = np.ones(2), np.zeros((2, 3)) if rng is None else rng.normal(size=(2, 3))
         self.parameters = Parameters(
-            **(fields | {"node_mass": mass, "inverse_mass": 1 / mass, "hold": 50 * hold, "target": target})
+            **(
+                fields
+                | {"node_mass": mass, "inverse_mass": 1 / mass, "compression": pressed, "hold": 50 * hold, "target": target}
+            )
         )
         self.timing = Timing(STEP, STEP)
 

@@ -59,6 +59,40 @@ def stretching(constants: Numbers, parameters: Numbers, motion: SimpleNamespace)
     return torch.stack([-pull.sum(1), pull[:, 0], pull[:, 1]])
 
 
+def wrinkling(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
+    """(1 - c) a of the stress √C : Φ'(√C : E) and of its change by the displacement."""
+
+    def along_material(field: Tensor) -> Tensor:
+        return torch.stack([field[1] - field[0], field[2] - field[0]], dim=1) @ constants["inverse_rest"]  # [3, 2]
+
+    gradient, moved = along_material(motion.positions), along_material(motion.displacement)
+    strain = 0.5 * (gradient.T @ gradient - torch.eye(2, dtype=gradient.dtype))
+    k0, k1, k2, k3 = parameters["stretching"] * coefficients(constants["samples"], strain[0, 0], strain[1, 1], strain[0, 1])
+    between = ((k0 * k2 - k1**2).clamp(min=0) + 1e-24).sqrt()
+    root = torch.stack([k0 + between, k1, k1, k2 + between]).view(2, 2) / (k0 + k2 + 2 * between).sqrt()
+    width = 1e-3 * (0.5 * (k0 + k2)).sqrt()
+
+    def rooted(tensor: Tensor) -> Tensor:
+        return (root @ tensor.diagonal()).diag() + (1 - torch.eye(2)) * tensor * (k3 + 1e-24).sqrt()
+
+    def slope(value: Tensor) -> Tensor:  # Φ'
+        eased = torch.where(value > -width, -0.5 * value**2 / width, value + 0.5 * width)
+        return torch.where(value < 0, eased, 0.0)
+
+    def compressed(tensor: Tensor) -> Tensor:  # Φ'(T) = f(λ₁) n₁n₁ᵀ + f(λ₂) n₂n₂ᵀ, by the tensor's deviator
+        mean = 0.5 * tensor.trace()
+        deviator = tensor - mean * torch.eye(2, dtype=tensor.dtype)
+        radius = (0.5 * deviator.square().sum() + 1e-24).sqrt()
+        first, second = slope(mean + radius), slope(mean - radius)
+        return 0.5 * (first + second) * torch.eye(2, dtype=tensor.dtype) + 0.5 * (first - second) * deviator / radius
+
+    by = rooted(0.5 * (gradient.T @ moved + moved.T @ gradient))
+    held, change = torch.autograd.functional.jvp(compressed, rooted(strain), by, create_graph=True)
+    stress = (parameters["compression"] - 1) * rooted(held + change)
+    pull = -constants["area"] * (gradient @ stress) @ constants["inverse_rest"].T
+    return torch.stack([-pull.sum(1), pull[:, 0], pull[:, 1]])
+
+
 def dihedral(nodes: Tensor) -> tuple[Tensor, Tensor]:
     """(angle, its gradient as it is used in forces [4, 3]) of a hinge: edge 0-1, opposite nodes 2 and 3."""
     edge = nodes[1] - nodes[0]
@@ -122,4 +156,4 @@ def planes(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> 
 
 def sampled(name: str, samples: np.ndarray) -> dict[str, Tensor]:
     """What a twin needs beside its element's constants."""
-    return {"samples": torch.as_tensor(samples)} if name == "stretching" else {}
+    return {"samples": torch.as_tensor(samples)} if name in ("stretching", "wrinkling") else {}
