@@ -41,6 +41,11 @@ _TABLE_FRAMES = 5
 _ON_TABLE_M = 0.005
 _REFINED_FRAMES = 10
 _REFINED_POINTS = 1000
+_DEEPEST_M = 0.03
+_TO_DEVIATION = 1.4826
+"""From the median of absolute errors to the standard deviation of normal ones."""
+_CLEAR_DEVIATIONS = 4.0
+"""Of the table's heights: of its points, thousands an image, 3 in 100,000 rise above."""
 _LEAST_TABLE = 0.15
 """A plane with a smaller part of the points is no table."""
 
@@ -59,7 +64,8 @@ class FusionSettings:
     table: bool = True
     """Fit a plane and take it out."""
     clearance_m: float = 0.006
-    """Above the plane by this much a point stays, whatever its colour; so much below, it goes."""
+    """Above the plane by this much a point stays, whatever its colour; so much below, it goes. Where the table's heights
+    spread more, the clearance is four of their standard deviations."""
     color_difference: float = 30.0
     """Of 255, in any channel: a point within the clearance that differs more from the table's colour stays."""
     smoothing_px: int = 2
@@ -121,6 +127,8 @@ class Table:
     """normal · p = offset on the plane [m]."""
     color: Floats | None
     """[3] median, 0..255; None without colour images."""
+    spread: float = 0.0
+    """One standard deviation of its points' heights [m]: what noise smoothing left, and how uneven it is."""
 
     def height(self, points: Floats) -> Floats:
         """[...] of points [..., 3] above the plane [m]."""
@@ -297,8 +305,12 @@ def fit_table(samples: list[tuple[Floats, NDArray[np.uint8] | None]]) -> Table |
         up = np.linalg.svd(held - centre, full_matrices=False)[2][2]
         offset = float(centre @ up)
     up, offset = (up, offset) if up[2] > 0 else (-up, -offset)
+    heights = points @ up - offset
+    under = heights[(heights < 0) & (heights > -_DEEPEST_M)]  # where no cloth is
+    spread = _TO_DEVIATION * float(np.median(-under)) if len(under) else 0.0
     colors = [color[np.abs(sample @ up - offset) < _ON_TABLE_M] for sample, color in samples if color is not None]
-    return Table(up, offset, np.median(np.concatenate(colors), axis=0) if colors and sum(map(len, colors)) else None)
+    color = np.median(np.concatenate(colors), axis=0) if colors and sum(map(len, colors)) else None
+    return Table(up, offset, color, spread)
 
 
 def _cloud(
@@ -359,10 +371,11 @@ def _without_table(cloud: Seen, table: Table | None, settings: FusionSettings) -
     if table is None:
         return cloud
     height = table.height(cloud.points)
-    kept = height > settings.clearance_m
+    clearance = max(settings.clearance_m, _CLEAR_DEVIATIONS * table.spread)
+    kept = height > clearance
     if cloud.colors is not None and table.color is not None:
         other = np.abs(cloud.colors - table.color).max(axis=1) > settings.color_difference
-        kept |= other & (height > -settings.clearance_m)
+        kept |= other & (height > -clearance)
     return cloud.select(kept)
 
 

@@ -14,9 +14,12 @@ from diffcloud.io.episodes import Episode
 from diffcloud.io.images import write_depth
 from diffcloud.io.raw_episodes import ScenePlacement, read_raw_episode
 from diffcloud.sensing.cameras import inverse, project, rays, transform
+from diffcloud.sensing.depth_camera import DepthNoise, published_cameras
+from diffcloud.sensing.evaluation import evaluate_clouds
 from diffcloud.sensing.filters import clean_frame, thin
 from diffcloud.sensing.fusion import FusionSettings, _ideal_pixels, fit_table, fuse
 from diffcloud.sensing.masking import RobotMask
+from diffcloud.sensing.recorder import RecorderSettings, read_truth, record
 from diffcloud.sensing.robot import gen3
 from tests.sensing.cloth_scene import (
     CLOTH,
@@ -30,6 +33,7 @@ from tests.sensing.cloth_scene import (
     cloth_height,
     write_cloth_episode,
 )
+from tests.sensing.recorded_scene import META, motion
 
 PLAIN = FusionSettings(**SETTINGS, refine=False)
 
@@ -166,6 +170,26 @@ def test_a_plane_is_found_under_clutter(rng):
     np.testing.assert_allclose(
         found.height(table[:, :3] * [1, 1, 0] + [0, 0, 0.02] + table[:, :1] * [0, 0, 0.05]), 0, atol=1e-3
     )
+
+
+@pytest.mark.parametrize("spread", [0.001, 0.004])
+def test_how_uneven_a_table_is_does_not_depend_on_what_lies_on_it(spread, rng):
+    table = np.column_stack([rng.uniform(-0.3, 0.3, (5000, 2)), spread * rng.normal(size=5000)])
+    cloth = np.column_stack([rng.uniform(-0.1, 0.1, (2000, 2)), np.full(2000, 0.002)])
+    hill = rng.uniform([-0.1, -0.1, 0.01], [0.1, 0.1, 0.3], (2000, 3))
+    found = fit_table([(table, None), (np.concatenate([cloth, hill]), None)])
+    assert found.spread == pytest.approx(spread, rel=0.3, abs=0.0006)  # the sheet draws the plane up
+
+
+def test_a_table_that_noise_lifts_is_no_cloth(tmp_path):
+    """Errors that reach over several pixels, which smoothing does not take: whole patches of table rise together."""
+    seen, noise = motion(), DepthNoise(subpixel_px=0.15, correlation_px=2.0)
+    cameras = [replace(camera, noise=noise) for camera in published_cameras(424, 240)]
+    record(tmp_path / "raw", seen, cameras, settings=RecorderSettings(), seed=3, meta=META)
+    raw = read_raw_episode(tmp_path / "raw")
+    found = evaluate_clouds(fuse(raw, None, FusionSettings(refine=False)), raw, read_truth(tmp_path / "raw"), noise)
+    raised = found.table[~found.flat] / found.points[~found.flat]
+    assert raised.max() < 0.005
 
 
 def test_no_plane_where_there_is_none(rng):
