@@ -120,7 +120,7 @@ class ExtensionBlock(Checked):
     """Of the linearised integrator: with all meshes and the cloth itself; the same with ARCSim's quirks, which the
     published experiments need; or with planes only."""
     damping: NonNegative | None = None
-    compression: Annotated[float, Field(gt=0, le=1)] = 1.0
+    compression: Annotated[float, Field(ge=0, le=1)] = 1.0
     """The part of its stretching stiffness with which the cloth resists compression in its plane."""
 
 

@@ -127,7 +127,7 @@ class Table:
     """normal · p = offset on the plane [m]."""
     color: Floats | None
     """[3] median, 0..255; None without colour images."""
-    spread: float = 0.0
+    spread: float
     """One standard deviation of its points' heights [m]: what noise smoothing left, and how uneven it is."""
 
     def height(self, points: Floats) -> Floats:

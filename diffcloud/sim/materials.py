@@ -50,7 +50,7 @@ class Material:
     damping: float = 0.0
     """Stiffness-proportional damping [s]."""
     compression: float = 1.0
-    """In (0, 1]: the part of its stretching stiffness with which it resists compression in its plane. Below 1 it wrinkles
+    """In [0, 1]: the part of its stretching stiffness with which it resists compression in its plane. Below 1 it wrinkles
     finer than its mesh (`terms/wrinkling.py`)."""
     source: str = ""
 
@@ -66,9 +66,9 @@ class Material:
                 f"Material {self.name!r}: k0 and k2 of the stretching table and the bending table must not be negative; "
                 f"the lowest are {self.stretching[:, [0, 2]].min():g} N/m and {self.bending.min():g} N·m."
             )
-        if not 0 < self.compression <= 1:
+        if not 0 <= self.compression <= 1:
             raise SceneError(
-                f"Material {self.name!r}: compression is above 0 and at most 1 (resists in full), got {self.compression}."
+                f"Material {self.name!r}: compression is from 0 to 1 (resists in full), got {self.compression}."
             )
         if not self.density > 0 or not self.damping >= 0:
             raise SceneError(

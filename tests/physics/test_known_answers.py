@@ -28,6 +28,24 @@ def relaxed(system, steps):
     return positions[-1], float(np.abs(positions[-1] - positions[-2]).max() / system.time_step)
 
 
+def test_a_coarse_mesh_gathers_as_a_fine_one_does_where_it_wrinkles():
+    """The lift, against the same on a mesh of half the edge length: where compression is resisted in full, faces stand
+    like plates."""
+
+    def apart(compression: float) -> float:
+        scenario = grid_scenario(built_in("lift").model_copy(update={"compression": compression}))
+        ends = []
+        for one in (scenario, scenario.finer()):
+            system, _ = one.scene.build()
+            with torch.no_grad():
+                ends.append(rollout(system, one.steps).positions[0, -1, : len(scenario.scene.mesh.nodes)])
+        return float((ends[0] - ends[1]).square().sum(-1).mean().sqrt())
+
+    locked, wrinkled = apart(1.0), apart(0.003)
+    assert locked > 0.02
+    assert wrinkled < 0.5 * locked
+
+
 def test_uniaxial_patch_pulls_with_stiffness_times_strain():
     """A uniformly stretched patch: force per width K E (1 + ε) exactly, inner nodes in balance."""
     stiffness, epsilon = 80.0, 0.03

@@ -55,6 +55,7 @@ def test_every_parameter_changes_the_properties_it_is_named_for(name):
         ({"stretch": 0.0}, "--set stretch is a multiplier: above 0, got 0; the lowest usual value is 0.1"),
         ({"body_mass": -1.0}, "--set body_mass is a multiplier"),
         ({"damping": -0.1}, "--set damping must not be negative, got -0.1; the nearest allowed value is 0"),
+        ({"compression": 1.1}, "--set compression is at most 1, got 1.1"),
         ({"mass": float("nan")}, "--set mass must be a finite number"),
         ({"mass": float("inf")}, "--set mass must be a finite number"),
     ],

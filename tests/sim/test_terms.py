@@ -275,9 +275,9 @@ class TestWrinkling:
         assert alone == pytest.approx(0.5 * 40 * area * (pull**2 + press**2))
         assert both == pytest.approx(0.5 * 40 * area * (pull**2 + 0.1 * press**2), rel=0.02)
 
-    @pytest.mark.parametrize("compression", [0.0, -0.1, 1.5, float("nan")])
+    @pytest.mark.parametrize("compression", [-0.1, 1.5, float("nan")])
     def test_a_part_that_is_none_is_refused(self, compression):
-        with pytest.raises(SceneError, match="compression is above 0 and at most 1"):
+        with pytest.raises(SceneError, match="compression is from 0 to 1"):
             replace(CONSTANT, compression=compression)
 
 

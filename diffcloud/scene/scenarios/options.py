@@ -38,9 +38,9 @@ class ScenarioOptions(Checked):
     name: str
     material: str | Sheet = "basis-knit"
     """A preset, the path of an ARCSim material JSON, or an isotropic sheet in SI units."""
-    compression: Annotated[float, Field(gt=0, le=1)] = 1.0
+    compression: Annotated[float, Field(ge=0, le=1)] = 1.0
     """The part of its stretching stiffness with which the cloth resists compression in its plane. Fabric wrinkles instead,
-    finer than most meshes: there 0.003 says so (docs/physics.md, wrinkles)."""
+    finer than most meshes (docs/physics.md, wrinkles)."""
     path: Keyframes
     """The gripper's displacement."""
     frames: Annotated[int, Field(ge=1, le=100_000)] = 25

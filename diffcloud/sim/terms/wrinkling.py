@@ -2,7 +2,7 @@
 
     energy per face = -(1 - c) a [Φ(λ₁) + Φ(λ₂)],   Φ(λ) = λ²/2 where λ < 0, else 0
 
-with λ the principal values of the symmetric tensor T = √C : E, a the material-space area and c in (0, 1] the part of the
+with λ the principal values of the symmetric tensor T = √C : E, a the material-space area and c in [0, 1] the part of the
 compressive stiffness that stays (`Material.compression`). E is the Green strain and C the stiffness as `stretching` has
 them, whose energy is a |T|²/2 = a (λ₁² + λ₂²)/2: what a principal value below zero adds to it is scaled by c. Where C is
 isotropic and without coupling, T has the principal directions of the strain.
