@@ -103,6 +103,7 @@ def check_same_cloth(first: Scenario, other: Scenario) -> None:
     for told, one, two in (
         ("are in length units of", first.length_unit_m, other.length_unit_m),
         ("move mass and stiffness of nodes", _sets(first), _sets(other)),
+        ("have a compression of", first.scene.material.compression, other.scene.material.compression),
     ):
         if one != two:
             raise ConfigError(f"A joint fit is of one cloth: {first.name} and {other.name} {told} {one} and {two}.")

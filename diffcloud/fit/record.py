@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from diffcloud.errors import ConfigError
 from diffcloud.io.files import read_json
 
-SCHEMA = 7
+SCHEMA = 8
 """Of the file. Another one is refused, by name."""
 
 

@@ -42,10 +42,13 @@ _ON_TABLE_M = 0.005
 _REFINED_FRAMES = 10
 _REFINED_POINTS = 1000
 _DEEPEST_M = 0.03
+"""Points farther below the table are not of it."""
 _TO_DEVIATION = 1.4826
 """From the median of absolute errors to the standard deviation of normal ones."""
 _CLEAR_DEVIATIONS = 4.0
-"""Of the table's heights: of its points, thousands an image, 3 in 100,000 rise above."""
+"""In deviations of the table's heights: 3 in 100,000 of its points lie higher."""
+_MOST_CLEARANCE_M = 0.02
+"""However much the heights deviate: something lower may lie beside the table."""
 _LEAST_TABLE = 0.15
 """A plane with a smaller part of the points is no table."""
 
@@ -64,8 +67,8 @@ class FusionSettings:
     table: bool = True
     """Fit a plane and take it out."""
     clearance_m: float = 0.006
-    """Above the plane by this much a point stays, whatever its colour; so much below, it goes. Where the table's heights
-    spread more, the clearance is four of their standard deviations."""
+    """Above the plane by this much a point stays, whatever its colour; so much below, it goes. If four standard deviations
+    of the table's heights are more, it is that, up to 2 cm."""
     color_difference: float = 30.0
     """Of 255, in any channel: a point within the clearance that differs more from the table's colour stays."""
     smoothing_px: int = 2
@@ -127,8 +130,8 @@ class Table:
     """normal · p = offset on the plane [m]."""
     color: Floats | None
     """[3] median, 0..255; None without colour images."""
-    spread: float
-    """One standard deviation of its points' heights [m]: what noise smoothing left, and how uneven it is."""
+    deviation: float
+    """One standard deviation of its points' heights [m]: noise that smoothing left, and how uneven the table is."""
 
     def height(self, points: Floats) -> Floats:
         """[...] of points [..., 3] above the plane [m]."""
@@ -195,7 +198,7 @@ def fuse(
             )
             raise EpisodeError(
                 f"Frame {index}: no point is left ({seen}; the rest was table). Check the workspace box "
-                f"{settings.workspace_m}, the calibration, and the table's clearance of {settings.clearance_m:g} m."
+                f"{settings.workspace_m}, the calibration, and the table's clearance, at least {settings.clearance_m:g} m."
             )
         quality.add(parts)
         watch(index, parts)
@@ -307,10 +310,10 @@ def fit_table(samples: list[tuple[Floats, NDArray[np.uint8] | None]]) -> Table |
     up, offset = (up, offset) if up[2] > 0 else (-up, -offset)
     heights = points @ up - offset
     under = heights[(heights < 0) & (heights > -_DEEPEST_M)]  # where no cloth is
-    spread = _TO_DEVIATION * float(np.median(-under)) if len(under) else 0.0
+    deviation = _TO_DEVIATION * float(np.median(-under)) if len(under) else 0.0
     colors = [color[np.abs(sample @ up - offset) < _ON_TABLE_M] for sample, color in samples if color is not None]
     color = np.median(np.concatenate(colors), axis=0) if colors and sum(map(len, colors)) else None
-    return Table(up, offset, color, spread)
+    return Table(up, offset, color, deviation)
 
 
 def _cloud(
@@ -371,7 +374,7 @@ def _without_table(cloud: Seen, table: Table | None, settings: FusionSettings) -
     if table is None:
         return cloud
     height = table.height(cloud.points)
-    clearance = max(settings.clearance_m, _CLEAR_DEVIATIONS * table.spread)
+    clearance = max(settings.clearance_m, min(_CLEAR_DEVIATIONS * table.deviation, _MOST_CLEARANCE_M))
     kept = height > clearance
     if cloud.colors is not None and table.color is not None:
         other = np.abs(cloud.colors - table.color).max(axis=1) > settings.color_difference

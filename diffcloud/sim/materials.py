@@ -68,7 +68,7 @@ class Material:
             )
         if not 0 <= self.compression <= 1:
             raise SceneError(
-                f"Material {self.name!r}: compression is from 0 to 1 (resists in full), got {self.compression}."
+                f"Material {self.name!r}: compression must be between 0 and 1 (full resistance), got {self.compression}."
             )
         if not self.density > 0 or not self.damping >= 0:
             raise SceneError(

@@ -73,7 +73,7 @@ class Parameter:
     basis: Basis | None = None
     """What it multiplies; None: it is the physical value itself."""
     most: float = math.inf
-    """Beyond it means nothing."""
+    """Largest value that means something."""
 
     def check(self, value: float, what: str) -> None:
         """

@@ -70,7 +70,7 @@ class TestSpace:
         dry = small_lift(**{**GENTLE, "friction_obstacle": 0.0})
         assert with_doubts(ASKED, {"friction_obstacle": 1.3, "body_mass": 2.0}, [dry]) == ASKED
 
-    def test_compression_is_one_where_the_cloth_gives_way_to_it(self):
+    def test_compression_is_doubtful_only_where_the_cloth_gives_way_to_it(self):
         wrinkling = small_lift(**{**GENTLE, "compression": 0.1})
         assert with_doubts(ASKED, {"compression": 3.0}, [SCENARIO]) == ASKED
         added = with_doubts(ASKED, {"compression": 3.0}, [wrinkling]).variables[1]

@@ -123,7 +123,7 @@ def assert_same(a, b, path="system"):
         assert a == b, path
 
 
-@pytest.mark.parametrize("source", ["file", "lift", "fold", "band_stretch", "vest_hang"])
+@pytest.mark.parametrize("source", ["file", "lift", "fold", "band_stretch", "vest_hang", "recorded_lift"])
 def test_a_written_scene_loads_to_the_same_system(folder, tmp_path, source):
     scene = load_scene(write(folder, scene_data())) if source == "file" else load_scenario(source).scene
     again = load_scene(write_scene(scene, tmp_path / "written"))

@@ -172,17 +172,17 @@ def test_a_plane_is_found_under_clutter(rng):
     )
 
 
-@pytest.mark.parametrize("spread", [0.001, 0.004])
-def test_how_uneven_a_table_is_does_not_depend_on_what_lies_on_it(spread, rng):
-    table = np.column_stack([rng.uniform(-0.3, 0.3, (5000, 2)), spread * rng.normal(size=5000)])
+@pytest.mark.parametrize("deviation", [0.0015, 0.004])
+def test_how_uneven_a_table_is_does_not_depend_on_what_lies_on_it(deviation, rng):
+    table = np.column_stack([rng.uniform(-0.3, 0.3, (5000, 2)), deviation * rng.normal(size=5000)])
     cloth = np.column_stack([rng.uniform(-0.1, 0.1, (2000, 2)), np.full(2000, 0.002)])
     hill = rng.uniform([-0.1, -0.1, 0.01], [0.1, 0.1, 0.3], (2000, 3))
     found = fit_table([(table, None), (np.concatenate([cloth, hill]), None)])
-    assert found.spread == pytest.approx(spread, rel=0.3, abs=0.0006)  # the sheet draws the plane up
+    assert found.deviation == pytest.approx(deviation, rel=0.35)  # the sheet draws the plane up
 
 
 def test_a_table_that_noise_lifts_is_no_cloth(tmp_path):
-    """Errors that reach over several pixels, which smoothing does not take: whole patches of table rise together."""
+    """Errors that reach over several pixels, which smoothing does not remove: whole patches of table rise together."""
     seen, noise = motion(), DepthNoise(subpixel_px=0.15, correlation_px=2.0)
     cameras = [replace(camera, noise=noise) for camera in published_cameras(424, 240)]
     record(tmp_path / "raw", seen, cameras, settings=RecorderSettings(), seed=3, meta=META)

@@ -68,6 +68,6 @@ def test_values_that_a_parameter_cannot_have(values, message):
 def test_a_parameter_without_effect_is_refused():
     with pytest.raises(ConfigError, match="body_mass has no effect in lift, whose scene has no rigid bodies"):
         load_scenario("lift").check_parameters(["stretch", "body_mass"])
-    with pytest.raises(ConfigError, match="compression has no effect in lift, whose cloth resists it in full"):
+    with pytest.raises(ConfigError, match="compression has no effect in lift, whose cloth resists compression in full"):
         load_scenario("lift").check_parameters(["compression"])
     load_scenario("recorded_lift").check_parameters(["compression"])

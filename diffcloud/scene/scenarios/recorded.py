@@ -10,7 +10,7 @@ from __future__ import annotations
 from diffcloud.scene.scenarios.grid import FOLD, LIFT, GridScenario
 
 _COMPRESSION = 0.1
-"""Fabric wrinkles finer than 33 mm, which fits find out about each."""
+"""Fabric has wrinkles shorter than edges of 33 mm. Where fits start; they find it for each recording."""
 _LAID = {"laid_turn_deg": 10.0, "laid_shape_m": 0.01}
 """The first frames show cloths askew, with rims that stand up by 2 to 4 cm."""
 

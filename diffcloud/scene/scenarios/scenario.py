@@ -86,8 +86,8 @@ class Scenario:
             raise ConfigError(f"body_mass has no effect in {self.name}, whose scene has no rigid bodies; leave it out.")
         if "compression" in names and self.scene.material.compression == 1:
             raise ConfigError(
-                f"compression has no effect in {self.name}, whose cloth resists it in full; leave it out, or give the "
-                "scenario a compression below 1."
+                f"compression has no effect in {self.name}, whose cloth resists compression in full; leave it out, or give "
+                "the scenario a compression below 1."
             )
 
     def fitted_scene(self, values: Mapping[str, float]) -> Scene:

@@ -1,4 +1,4 @@
-"""What compression stores less in a sheet that wrinkles finer than its mesh.
+"""Energy that a sheet does not store in compression because it wrinkles finer than its mesh.
 
     energy per face = -(1 - c) a [Φ(λ₁) + Φ(λ₂)],   Φ(λ) = λ²/2 where λ < 0, else 0
 
@@ -11,8 +11,13 @@ A sheet hardly resists bending: compressed in its plane it buckles, and carries 
 1929; Pipkin, The relaxed energy density for isotropic elastic membranes, IMA J. Appl. Math. 36, 1986). Wrinkles shorter
 than an edge are not in the mesh. Without this term its faces resist compression as a plate would, and a coarse mesh locks.
 
-The split by √C keeps the energy a convex function of the strain for any orthotropic C, so that the sum with `stretching`
-keeps its positive matrix. To make forces differentiable, Φ'' grows from zero to one over strains of `_WIDTH`.
+The split by √C keeps the energy a convex function of the strain for any positive C (k1² ≤ k0 k2), so that the sum with
+`stretching` keeps its positive matrix. But a sheet under tension in one direction alone has a negative λ where C couples
+the axes, or on the bias where k3 is not k0 - k1: there the term softens tension too, the more, the smaller c. A material
+with k3 half of k0, as the knits have, keeps 80 % of its stiffness on the bias at c = 0.1, and 26 % at 0.01. Exact is what
+minimises the energy over all slack that wrinkles can take up.
+
+To make forces differentiable, Φ'' grows from zero to one over strains of `_WIDTH`; half of that is always resisted.
 """
 
 from __future__ import annotations
@@ -25,8 +30,9 @@ from diffcloud.sim.terms.stretching import along_material, coefficients
 from diffcloud.sim.terms.term import Element, Elements, Setup, Term
 
 _WIDTH = 1e-3
+"""Strain over which compression begins to be relieved."""
 _TINY = 1e-24
-"""Under square roots [N/m], so that they have derivatives at zero."""
+"""Under square roots, so that they have derivatives at zero."""
 
 Symmetric = tuple[Scalar, Scalar, Scalar]
 """Components 00, 11 and 01 of a symmetric tensor."""
@@ -99,7 +105,8 @@ class _Root:
 
 
 class _Compressed:
-    """What of a symmetric tensor is compression: Φ'(T), by its principal values."""
+    """The compressive part of a symmetric tensor, by its principal values. Where these are equal, `change` leaves out what
+    would tell them apart."""
 
     def __init__(self, tensor: Symmetric, width: Scalar) -> None:
         self._width = width
