@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from diffcloud.mesh import SurfaceMesh, box_surface, grid_cloth, rectangle_surface, sphere_surface
-from diffcloud.sim import Properties, rollout
+from diffcloud.sim import rollout
 from diffcloud.sim.build import build_system
 from diffcloud.sim.compiled.data import Motion as Moving
 from diffcloud.sim.compiled.data import Parameters, Timing
@@ -98,16 +98,15 @@ def contact_forces(system: System, friction: float = 0.0, velocities: torch.Tens
     """[V, 3] on the cloth where it stands: from the change of momentum in a step so short that nothing moves."""
     zero = torch.zeros_like
     given = system.properties
-    properties = Properties(
-        given.node_mass,
-        1e-12 * given.stretching,
-        1e-12 * given.bending,
-        zero(given.damping),
-        zero(given.air_density),
-        zero(given.air_drag),
-        friction + zero(given.friction_obstacle),
-        friction + zero(given.friction_cloth),
-        given.body_mass,
+    properties = replace(
+        given,
+        stretching=1e-12 * given.stretching,
+        bending=1e-12 * given.bending,
+        damping=zero(given.damping),
+        air_density=zero(given.air_density),
+        air_drag=zero(given.air_drag),
+        friction_obstacle=friction + zero(given.friction_obstacle),
+        friction_cloth=friction + zero(given.friction_cloth),
     )
     run = rollout(system, 1, properties=properties, state=init(system, velocities=velocities))
     change = run.velocities[0, 1] - run.velocities[0, 0]
