@@ -120,7 +120,7 @@ class WholeMaterial(_Model):
     poisson: Annotated[float, Field(gt=-1, lt=1)]
     shear: Positive
     """[N/m] Force per width per shear angle."""
-    compression: Annotated[float, Field(ge=0, le=1)] = 1.0
+    compression: Annotated[float, Field(ge=0, le=1)]
     """Part of the stretching stiffness that resists compression."""
     bending: NonNegative
     """[N·m] Bending stiffness per width."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
@@ -18,6 +19,7 @@ from diffcloud.sim.handles import HandleSchedule
 from diffcloud.sim.held import Held
 from diffcloud.sim.plausibility import Motion as Course
 from diffcloud.sim.plausibility import implausible
+from diffcloud.sim.properties import Properties
 from diffcloud.sim.reference.impact_zones import PASSES
 from diffcloud.sim.scenery import Scenery
 from diffcloud.sim.system import System
@@ -28,8 +30,8 @@ FACTOR_MEMORY = 256 * 2**20
 """[bytes] of factors that a batch keeps for its derivatives; beyond, the steps' factors are made again."""
 _BLOCK = 9 * 8
 
-_PROPERTIES = Parameters._fields[:1] + Parameters._fields[2:11]
-"""Fields that `Properties` has too, in its order."""
+_PROPERTIES = tuple(field.name for field in fields(Properties))
+"""Fields of `Parameters` that are of the cloth and not of a step."""
 
 
 class Batch:

@@ -76,6 +76,11 @@ class Material:
                 f"got {self.density} kg/m² and {self.damping} s."
             )
 
+    @property
+    def wrinkles(self) -> bool:
+        """Whether it gives way to compression."""
+        return self.compression < 1
+
     def scaled(self, *, density: float = 1.0, stretching: float = 1.0, bending: float = 1.0) -> Material:
         """The same material with its tables multiplied."""
         return replace(

@@ -38,8 +38,8 @@ def record_of(*recordings: RecordingFit, **changes: Any) -> FitRecord:
         "solver": "adam",
         "parameters": {"stretch": parameter_of()},
         "material": {
-            "density": 0.2, "stretching": 6.0, "poisson": 0.0, "shear": 1.5, "bending": 4e-6, "damping": 0.005,
-            "friction_obstacle": 0.3, "friction_cloth": 0.6, "air_density": 1.2,
+            "density": 0.2, "stretching": 6.0, "poisson": 0.0, "shear": 1.5, "compression": 1.0, "bending": 4e-6,
+            "damping": 0.005, "friction_obstacle": 0.3, "friction_cloth": 0.6, "air_density": 1.2,
         },
         "loss": 1e-4,
         "loss_start": 2e-4,

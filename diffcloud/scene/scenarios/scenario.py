@@ -84,7 +84,7 @@ class Scenario:
         """
         if "body_mass" in names and not self.scene.surrounding.bodies:
             raise ConfigError(f"body_mass has no effect in {self.name}, whose scene has no rigid bodies; leave it out.")
-        if "compression" in names and self.scene.material.compression == 1:
+        if "compression" in names and not self.scene.material.wrinkles:
             raise ConfigError(
                 f"compression has no effect in {self.name}, whose cloth resists compression in full; leave it out, or give "
                 "the scenario a compression below 1."
@@ -138,7 +138,7 @@ class Scenario:
         basis = PARAMETERS[name].basis
         if basis is not None:
             return 1.0 if self.scene.basis(basis) > _NO_MATERIAL else 0.0
-        if name == "compression" and self.scene.material.compression == 1:
+        if name == "compression" and not self.scene.material.wrinkles:
             return 0.0
         system, _ = self.scene.build()
         found = float(getattr(system.properties, name)[0])

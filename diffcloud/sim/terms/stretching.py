@@ -26,35 +26,31 @@ _SAMPLES = 30
 _SCALE = 900.0 / 29.0
 """Grid cells per unit of strain: a range factor 60/29 in grid_sample's coordinates."""
 
+Symmetric = tuple[Scalar, Scalar, Scalar]
+"""Components 00, 11 and 01 of a symmetric tensor."""
+
 
 def force(face: Element) -> Sequence[Vector]:
     """-∂W/∂x - H d on the three corners."""
     xu, xv = along_material(face, face.positions)
     du, dv = along_material(face, face.displacement)
     along_u, along_v = along_material(face, [face.ahead * velocity for velocity in face.after])
-    e00, e11, e01 = 0.5 * (dot(xu, xu) - 1), 0.5 * (dot(xv, xv) - 1), 0.5 * dot(xu, xv)
-    k0, k1, k2, k3 = (k * face.parameter("stretching") for k in coefficients(face, e00, e11, e01))
-    # strains after the displacement, to first order
-    p00, p11 = e00 + dot(xu, du), e11 + dot(xv, dv)
-    p01 = e01 + 0.5 * (dot(xu, dv) + dot(xv, du))
+    e00, e11, e01 = strain(xu, xv)
+    k0, k1, k2, k3 = coefficients(face, e00, e11, e01)
+    d00, d11, d01 = strain_change(xu, xv, du, dv)
+    p00, p11, p01 = e00 + d00, e11 + d11, e01 + d01
     stress_u, stress_v, shear = k0 * p00 + k1 * p11, k1 * p00 + k2 * p11, k3 * p01
     stretched_u, stretched_v = maximum(e00, 0.0), maximum(e11, 0.0)
     tension_u, tension_v = k0 * stretched_u + k1 * stretched_v, k1 * stretched_u + k2 * stretched_v
     row_u = stress_u * xu + shear * xv + tension_u * along_u
     row_v = shear * xu + stress_v * xv + tension_v * along_v
-    area = face.constant("area")
-    pulls = [
-        -area * (face.constant("inverse_rest", side, 0) * row_u + face.constant("inverse_rest", side, 1) * row_v)
-        for side in (0, 1)
-    ]
-    return [-(pulls[0] + pulls[1]), *pulls]
+    return on_corners(face, row_u, row_v)
 
 
 def energy(face: Element) -> Scalar:
     """W"""
-    xu, xv = along_material(face, face.positions)
-    e00, e11, e01 = 0.5 * (dot(xu, xu) - 1), 0.5 * (dot(xv, xv) - 1), 0.5 * dot(xu, xv)
-    k0, k1, k2, k3 = (k * face.parameter("stretching") for k in coefficients(face, e00, e11, e01))
+    e00, e11, e01 = strain(*along_material(face, face.positions))
+    k0, k1, k2, k3 = coefficients(face, e00, e11, e01)
     axial = 0.5 * (k0 * e00 * e00 + k2 * e11 * e11) + k1 * e00 * e11
     return face.constant("area") * (axial + k3 * e01 * e01)
 
@@ -92,8 +88,28 @@ def along_material(face: Element, field: Sequence[Vector]) -> tuple[Vector, Vect
     return u, v
 
 
+def strain(xu: Vector, xv: Vector) -> Symmetric:
+    """E"""
+    return 0.5 * (dot(xu, xu) - 1), 0.5 * (dot(xv, xv) - 1), 0.5 * dot(xu, xv)
+
+
+def strain_change(xu: Vector, xv: Vector, du: Vector, dv: Vector) -> Symmetric:
+    """Of E by a displacement with these derivatives, to first order."""
+    return dot(xu, du), dot(xv, dv), 0.5 * (dot(xu, dv) + dot(xv, du))
+
+
+def on_corners(face: Element, row_u: Vector, row_v: Vector) -> Sequence[Vector]:
+    """Forces [N] on the three corners of what pulls along u and v in the face [N/m]."""
+    area = face.constant("area")
+    pulls = [
+        -area * (face.constant("inverse_rest", side, 0) * row_u + face.constant("inverse_rest", side, 1) * row_v)
+        for side in (0, 1)
+    ]
+    return [-(pulls[0] + pulls[1]), *pulls]
+
+
 def coefficients(face: Element, e00: Scalar, e11: Scalar, e01: Scalar) -> list[Scalar]:
-    """k0, k1, k2, k3 at a strain [N/m]."""
+    """k0, k1, k2, k3 at a strain [N/m], times the face's multiplier."""
     places = [clamped((e + 0.25) * _SCALE - 0.5, 0.0, _SAMPLES - 1.0) for e in (e00, e11)]
     places.append(clamped(absolute(e01) * _SCALE - 0.5, 0.0, _SAMPLES - 1.0))
     last = _SAMPLES - 2.0
@@ -107,7 +123,7 @@ def coefficients(face: Element, e00: Scalar, e11: Scalar, e01: Scalar) -> list[S
         for power, monomial in enumerate(monomials):
             value = value + monomial * face.look_up("cells", cell, power, number)
         found.append(value)
-    return found
+    return [value * face.parameter("stretching") for value in found]
 
 
 def _sampled(stretching: NDArray[np.float64]) -> NDArray[np.float64]:

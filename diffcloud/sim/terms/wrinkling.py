@@ -24,9 +24,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from diffcloud.sim.compiled.trace import Scalar, Vector, clamped, dot, maximum, squareroot
+from diffcloud.sim.compiled.trace import Scalar, Vector, clamped, maximum, squareroot
 from diffcloud.sim.terms import stretching
-from diffcloud.sim.terms.stretching import along_material, coefficients
+from diffcloud.sim.terms.stretching import (
+    Symmetric,
+    along_material,
+    coefficients,
+    on_corners,
+    strain,
+    strain_change,
+)
 from diffcloud.sim.terms.term import Element, Elements, Setup, Term
 
 _WIDTH = 1e-3
@@ -34,27 +41,17 @@ _WIDTH = 1e-3
 _TINY = 1e-24
 """Under square roots, so that they have derivatives at zero."""
 
-Symmetric = tuple[Scalar, Scalar, Scalar]
-"""Components 00, 11 and 01 of a symmetric tensor."""
-
 
 def force(face: Element) -> Sequence[Vector]:
     """-∂W/∂x - H d on the three corners."""
     xu, xv = along_material(face, face.positions)
     du, dv = along_material(face, face.displacement)
     root = _Root(face, xu, xv)
-    changed = (dot(xu, du), dot(xv, dv), 0.5 * (dot(xu, dv) + dot(xv, du)))  # strain by the displacement, to first order
     compressed = _Compressed(root.times(root.strain), root.width)
-    held, more = compressed.part(), compressed.change(root.times(changed))
+    held, more = compressed.part(), compressed.change(root.times(strain_change(xu, xv, du, dv)))
     off = face.parameter("compression") - 1.0
     stress_u, stress_v, shear = (off * one for one in root.times((held[0] + more[0], held[1] + more[1], held[2] + more[2])))
-    row_u, row_v = stress_u * xu + shear * xv, shear * xu + stress_v * xv
-    area = face.constant("area")
-    pulls = [
-        -area * (face.constant("inverse_rest", side, 0) * row_u + face.constant("inverse_rest", side, 1) * row_v)
-        for side in (0, 1)
-    ]
-    return [-(pulls[0] + pulls[1]), *pulls]
+    return on_corners(face, stress_u * xu + shear * xv, shear * xu + stress_v * xv)
 
 
 def energy(face: Element) -> Scalar:
@@ -66,7 +63,7 @@ def energy(face: Element) -> Scalar:
 
 def build(setup: Setup) -> Elements | None:
     """The faces, where compression is not resisted in full."""
-    return stretching.build(setup) if setup.material.compression < 1 else None
+    return stretching.build(setup) if setup.material.wrinkles else None
 
 
 TERM = Term(
@@ -86,8 +83,8 @@ class _Root:
     """√C at a strain: of [[k0, k1], [k1, k2]] in closed form, and of the shear k3 E01² per area."""
 
     def __init__(self, face: Element, xu: Vector, xv: Vector) -> None:
-        self.strain: Symmetric = (0.5 * (dot(xu, xu) - 1), 0.5 * (dot(xv, xv) - 1), 0.5 * dot(xu, xv))
-        k0, k1, k2, k3 = (k * face.parameter("stretching") for k in coefficients(face, *self.strain))
+        self.strain = strain(xu, xv)
+        k0, k1, k2, k3 = coefficients(face, *self.strain)
         between = squareroot(maximum(k0 * k2 - k1 * k1, 0.0) + _TINY)
         trace = squareroot(k0 + k2 + 2.0 * between + _TINY)
         self._u, self._uv, self._v, self._shear = (

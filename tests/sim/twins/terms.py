@@ -40,34 +40,41 @@ def coefficients(samples: Tensor, e00: Tensor, e11: Tensor, e01: Tensor) -> Tens
     return found.flatten()
 
 
+def along_material(constants: Numbers, field: Tensor) -> Tensor:
+    """[3, 2] derivatives of a field of the corners along u and v."""
+    return torch.stack([field[1] - field[0], field[2] - field[0]], dim=1) @ constants["inverse_rest"]
+
+
+def strained(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(deformation gradient [3, 2], E [2, 2], its change by the displacement [2, 2], (k0, k1, k2, k3)) of a face."""
+    gradient, moved = along_material(constants, motion.positions), along_material(constants, motion.displacement)
+    strain = 0.5 * (gradient.T @ gradient - torch.eye(2, dtype=gradient.dtype))
+    change = 0.5 * (gradient.T @ moved + moved.T @ gradient)
+    found = parameters["stretching"] * coefficients(constants["samples"], strain[0, 0], strain[1, 1], strain[0, 1])
+    return gradient, strain, change, found
+
+
+def on_corners(constants: Numbers, rows: Tensor) -> Tensor:
+    """[3, 3] forces on the corners of what pulls along u and v [3, 2]."""
+    pull = -constants["area"] * rows @ constants["inverse_rest"].T  # [3, 2] on 1 and 2
+    return torch.stack([-pull.sum(1), pull[:, 0], pull[:, 1]])
+
+
 def stretching(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
     """-∂W/∂x - H d with W = a (k0 E00²/2 + k1 E00 E11 + k2 E11²/2 + k3 E01²)."""
-
-    def along_material(field: Tensor) -> Tensor:
-        return torch.stack([field[1] - field[0], field[2] - field[0]], dim=1) @ constants["inverse_rest"]  # [3, 2]
-
-    gradient, moved = along_material(motion.positions), along_material(motion.displacement)
-    strain = 0.5 * (gradient.T @ gradient - torch.eye(2, dtype=gradient.dtype))
-    k0, k1, k2, k3 = parameters["stretching"] * coefficients(constants["samples"], strain[0, 0], strain[1, 1], strain[0, 1])
+    gradient, strain, change, (k0, k1, k2, k3) = strained(constants, parameters, motion)
     stiffness = torch.stack([torch.stack([k0, k1]), torch.stack([k1, k2])])
-    after = strain + 0.5 * (gradient.T @ moved + moved.T @ gradient)
+    after = strain + change
     axial, shear = stiffness @ after.diagonal(), k3 * after[0, 1]
     stress = torch.stack([torch.stack([axial[0], shear]), torch.stack([shear, axial[1]])])
     tension = stiffness @ strain.diagonal().clamp(min=0)
-    onward = motion.ahead * along_material(motion.after)
-    pull = -constants["area"] * (gradient @ stress + onward * tension) @ constants["inverse_rest"].T  # [3, 2] on 1 and 2
-    return torch.stack([-pull.sum(1), pull[:, 0], pull[:, 1]])
+    onward = motion.ahead * along_material(constants, motion.after)
+    return on_corners(constants, gradient @ stress + onward * tension)
 
 
 def wrinkling(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
     """(1 - c) a of the stress √C : Φ'(√C : E) and of its change by the displacement."""
-
-    def along_material(field: Tensor) -> Tensor:
-        return torch.stack([field[1] - field[0], field[2] - field[0]], dim=1) @ constants["inverse_rest"]  # [3, 2]
-
-    gradient, moved = along_material(motion.positions), along_material(motion.displacement)
-    strain = 0.5 * (gradient.T @ gradient - torch.eye(2, dtype=gradient.dtype))
-    k0, k1, k2, k3 = parameters["stretching"] * coefficients(constants["samples"], strain[0, 0], strain[1, 1], strain[0, 1])
+    gradient, strain, change, (k0, k1, k2, k3) = strained(constants, parameters, motion)
     between = ((k0 * k2 - k1**2).clamp(min=0) + 1e-24).sqrt()
     root = torch.stack([k0 + between, k1, k1, k2 + between]).view(2, 2) / (k0 + k2 + 2 * between).sqrt()
     width = 1e-3 * (0.5 * (k0 + k2)).sqrt()
@@ -86,11 +93,9 @@ def wrinkling(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) 
         first, second = slope(mean + radius), slope(mean - radius)
         return 0.5 * (first + second) * torch.eye(2, dtype=tensor.dtype) + 0.5 * (first - second) * deviator / radius
 
-    by = rooted(0.5 * (gradient.T @ moved + moved.T @ gradient))
-    held, change = torch.autograd.functional.jvp(compressed, rooted(strain), by, create_graph=True)
-    stress = (parameters["compression"] - 1) * rooted(held + change)
-    pull = -constants["area"] * (gradient @ stress) @ constants["inverse_rest"].T
-    return torch.stack([-pull.sum(1), pull[:, 0], pull[:, 1]])
+    held, more = torch.autograd.functional.jvp(compressed, rooted(strain), rooted(change), create_graph=True)
+    stress = (parameters["compression"] - 1) * rooted(held + more)
+    return on_corners(constants, gradient @ stress)
 
 
 def dihedral(nodes: Tensor) -> tuple[Tensor, Tensor]:
