@@ -224,7 +224,8 @@ class FitConfig(Section):
     """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""
     doubts: Name | None = None
     """The factor within which material that is not asked for is known: "bending=1.5x,drag=1.3x", or "none". It is fitted
-    too, and is not a result (`fit.doubts`). Default: `MATERIAL_DOUBTS` of gauss_newton unless linearised, else none."""
+    too, and is not a result (`fit.doubts`). Default: `MATERIAL_DOUBTS` and what the scenario says, of gauss_newton unless
+    linearised, else none."""
     joint: bool = False
     """One parameter set for all episodes, whatever their scenario: they must be of one cloth."""
     workers: Workers = 1
@@ -264,7 +265,14 @@ class FitConfig(Section):
             return parse_doubts(self.doubts)
         if not self._fits_more(scenarios):
             return {}
-        return {name: factor for name, factor in MATERIAL_DOUBTS.items() if name not in {*self.parameters, *self.fixed}}
+        own: dict[str, float] = {}
+        for one in scenarios:
+            own |= {name: max(factor, own.get(name, 1.0)) for name, factor in one.doubts.items()}
+        return {
+            name: factor
+            for name, factor in {**MATERIAL_DOUBTS, **own}.items()
+            if name not in {*self.parameters, *self.fixed}
+        }
 
     def laid_within(self, scenarios: Sequence[Scenario]) -> dict[str, float]:
         """How the cloth may lie otherwise at the start, in one fit of recordings in these scenarios: name of `fit.laid` ->

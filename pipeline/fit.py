@@ -124,7 +124,8 @@ def fit(
         str | None,
         typer.Option(
             help="Fit roughly known material too, unreported: bending=1.5x,drag=1.3x (the rest is exact), or none. Default "
-            "of gauss_newton unless linearised: 1.5x of bending and damping, 1.3x of drag and frictions."
+            "of gauss_newton unless linearised: 1.5x of bending and damping, 1.3x of drag and frictions, 3x of "
+            "compression, unless the scenario's doubts say otherwise."
         ),
     ] = None,
     prior: Annotated[

@@ -1,9 +1,9 @@
 """Material that nobody asked for, and that is known only within a factor.
 
-A fit of stretch and mass takes compression, bending, drag, damping and friction from the scenario. None of them is known
-exactly, and a hinge twice as stiff as stated moves the cloth by more than the cameras' noise: the fitted numbers are bent
-until they make up for it. So such material is fitted too, each part under a prior about what is known of it. It is not a
-result: a fit reports only the parameters asked for, with such material allowed for.
+A fit of stretch and mass takes shear, compression, bending, drag, damping and friction from the scenario. None of them
+is known exactly, and a hinge twice as stiff as stated moves the cloth by more than the cameras' noise: the fitted
+numbers are bent until they make up for it. So such material is fitted too, each part under a prior about what is known
+of it. It is not a result: a fit reports only the parameters asked for, with such material allowed for.
 """
 
 from __future__ import annotations

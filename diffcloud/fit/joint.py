@@ -108,11 +108,12 @@ def check_same_cloth(first: Scenario, other: Scenario) -> None:
         if one != two:
             raise ConfigError(f"A joint fit is of one cloth: {first.name} and {other.name} {told} {one} and {two}.")
     for parameter in PARAMETERS.values():
-        if parameter.basis in ("stretching", "bending", "density"):
+        if parameter.basis in ("stretching", "shear", "bending", "density"):
             values = first.scene.basis(parameter.basis), other.scene.basis(parameter.basis)
+            unit = "" if parameter.unit == "–" else f" {parameter.unit}"
             if abs(values[0] - values[1]) > _SAME * max(values):
                 raise ConfigError(
-                    f"A joint fit is of one cloth, whose {parameter.name} = 1 means {values[0]:g} {parameter.unit} in "
+                    f"A joint fit is of one cloth, whose {parameter.name} = 1 means {values[0]:g}{unit} in "
                     f"{first.name} and {values[1]:g} in {other.name}. Give both scenarios the same material."
                 )
 

@@ -95,7 +95,7 @@ def whole_material(scenario: Scenario, values: Mapping[str, float]) -> WholeMate
         density=float(changed.node_mass.sum()) / float(scenario.scene.mesh.face_area.sum()),
         stretching=stretching * material.resting_stretching_stiffness,
         poisson=material.resting_poisson_ratio,
-        shear=stretching * material.resting_shear_stiffness,
+        shear=stretching * float(changed.shear) * material.resting_shear_stiffness,
         compression=float(changed.compression),
         bending=bending * material.resting_bending_stiffness,
         damping=float(changed.damping),

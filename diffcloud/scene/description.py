@@ -56,11 +56,13 @@ class Scene:
         return SurfaceMesh.joined([obstacle for obstacle in self.surrounding.obstacles if obstacle.plane() is None])
 
     def basis(self, name: Basis) -> float:
-        """What multipliers act on, in the scene's units: stiffness at rest in stretching [N/m] or in bending [N·m], density
-        of the cloth [kg/m²] or of the air [kg/m³], mass of all rigid bodies [kg]."""
+        """What multipliers act on, in the scene's units: stiffness at rest in stretching [N/m], in shear divided by
+        that, or in bending [N·m]; density of the cloth [kg/m²] or of the air [kg/m³], mass of all rigid bodies [kg]."""
         match name:
             case "stretching":
                 return self.material.resting_stretching_stiffness
+            case "shear":
+                return self.material.resting_shear_part
             case "bending":
                 return self.material.resting_bending_stiffness
             case "density":

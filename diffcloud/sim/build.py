@@ -60,6 +60,7 @@ def build_system(
         body_mass=torch.as_tensor(np.asarray(bodies.mass, dtype=np.float64))[None],
         **one_set(
             {
+                "shear": 1.0,
                 "compression": material.compression,
                 "damping": material.damping,
                 "air_density": surrounding.air_density,

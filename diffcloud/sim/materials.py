@@ -81,12 +81,14 @@ class Material:
         """Whether it gives way to compression."""
         return self.compression < 1
 
-    def scaled(self, *, density: float = 1.0, stretching: float = 1.0, bending: float = 1.0) -> Material:
-        """The same material with its tables multiplied."""
+    def scaled(
+        self, *, density: float = 1.0, stretching: float = 1.0, shear: float = 1.0, bending: float = 1.0
+    ) -> Material:
+        """The same material with its tables multiplied, and the shear of the stretching table once more."""
         return replace(
             self,
             density=self.density * density,
-            stretching=self.stretching * stretching,
+            stretching=self.stretching * stretching * [1.0, 1.0, 1.0, shear],
             bending=self.bending * bending,
         )
 
@@ -107,6 +109,11 @@ class Material:
     def resting_shear_stiffness(self) -> float:
         """Shear force per width per shear angle at rest [N/m]."""
         return TABLE_ENTRY_TO_STRETCHING * 0.5 * float(self.stretching[0, 3])
+
+    @property
+    def resting_shear_part(self) -> float:
+        """Shear stiffness divided by stretching stiffness, at rest: 0.5 of an isotropic sheet without coupling [-]."""
+        return self.resting_shear_stiffness / max(self.resting_stretching_stiffness, _LEAST)
 
     @property
     def resting_poisson_ratio(self) -> float:

@@ -25,6 +25,8 @@ class Properties:
     """[B, V] [kg]"""
     stretching: Tensor
     """[B, F] multiplier on the stretching table of each face [-]."""
+    shear: Tensor
+    """[B] multiplier on the shear stiffness of the stretching table, beside `stretching` [-]."""
     compression: Tensor
     """[B] part of the stretching stiffness that resists compression [-]; without effect in a material that resists in
     full."""
@@ -56,7 +58,7 @@ class Properties:
         return Properties(*(tensor.repeat(count, *[1] * (tensor.dim() - 1)) for tensor in self.tensors()))
 
 
-Basis = Literal["stretching", "bending", "density", "air_density", "body_mass"]
+Basis = Literal["stretching", "shear", "bending", "density", "air_density", "body_mass"]
 """What of the basis material, the air and the bodies a multiplier acts on."""
 
 
@@ -115,6 +117,7 @@ PARAMETERS: dict[str, Parameter] = {
             "density",
         ),
         Parameter("density", "multiplier on all node masses", "kg/m²", _MULTIPLIED, "density"),
+        Parameter("shear", "multiplier on the ratio of shear to stretching stiffness", "–", _MULTIPLIED, "shear"),
         Parameter("compression", "part of the stretching stiffness that resists compression", "–", (0.001, 1.0), most=1.0),
         Parameter("bending", "multiplier on the bending table", "N·m", _MULTIPLIED, "bending"),
         Parameter("drag", "multiplier on the air density and the tangential drag", "kg/m³", _MULTIPLIED, "air_density"),
@@ -194,6 +197,7 @@ def scaled_properties(
         base,
         node_mass=base.node_mass * over_nodes("mass") * get("density")[:, None],
         stretching=base.stretching * stretch,
+        shear=base.shear * get("shear"),
         compression=values.get("compression", base.compression),
         bending=base.bending * get("bending")[:, None],
         damping=values.get("damping", base.damping),

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import pytest
 import torch
+import yaml
 
-from diffcloud.errors import ConfigError
+from diffcloud.errors import ConfigError, SceneError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton
 from diffcloud.fit.batches import posterior_losses
 from diffcloud.fit.doubts import MATERIAL_DOUBTS, parse_doubts, with_doubts
@@ -16,6 +17,7 @@ from diffcloud.fit.parameters import Variable
 from diffcloud.fit.residuals import Axis, linearise
 from diffcloud.fit.scan import scan
 from diffcloud.scene.scenarios import load_scenario
+from pipeline.config import FitConfig
 from tests.conftest import small_lift
 from tests.evaluation.bowls import Bowl
 from tests.fit.test_fit import GENTLE, clouds_of
@@ -75,6 +77,22 @@ class TestSpace:
         assert with_doubts(ASKED, {"compression": 3.0}, [SCENARIO]) == ASKED
         added = with_doubts(ASKED, {"compression": 3.0}, [wrinkling]).variables[1]
         assert added == Variable("compression", 0.1 / 3.0**4, 1.0, 3.0, 0.1, doubtful=True)
+
+    def test_a_scenario_says_what_is_known_less_well(self):
+        own, usual = (FitConfig().known_within([load_scenario(name)]) for name in ("recorded_lift", "lift"))
+        assert usual == MATERIAL_DOUBTS
+        assert own == {**MATERIAL_DOUBTS, "shear": 3.0, "bending": 3.0}
+        assert "shear" not in FitConfig(parameters=["stretch", "shear"]).known_within([load_scenario("recorded_lift")])
+        assert FitConfig(doubts="none").known_within([load_scenario("recorded_lift")]) == {}
+
+    @pytest.mark.parametrize(
+        ("doubts", "message"), [({"sheer": 3.0}, "parameter 'sheer'"), ({"shear": 0.5}, "greater than 1")]
+    )
+    def test_a_scenario_that_doubts_what_it_cannot(self, doubts, message, tmp_path):
+        path = tmp_path / "own.yaml"
+        path.write_text(yaml.safe_dump({"base": "lift", "doubts": doubts}))
+        with pytest.raises(SceneError, match=message):
+            load_scenario(path)
 
     def test_what_scenes_state_differently_is_left_to_each(self):
         other = small_lift(**{**GENTLE, "integrator": "implicit", "friction_obstacle": 0.9})

@@ -28,22 +28,25 @@ def relaxed(system, steps):
     return positions[-1], float(np.abs(positions[-1] - positions[-2]).max() / system.time_step)
 
 
-def test_a_coarse_mesh_gathers_as_a_fine_one_does_where_it_wrinkles():
-    """The lift, against the same on a mesh of half the edge length: where compression is resisted in full, faces stand
-    like plates."""
+@pytest.mark.parametrize("poisson", [0.0, 0.3])
+def test_a_sheared_panel_that_wrinkles_carries_diagonal_tension(poisson):
+    """Wagner 1929: sheared by γ between two beams it pulls at 45° with k γ/2 (k: of a strip with free sides), that is with
+    k γ/4 along the beams and as much across, which draws them together. A plate: k γ/(2 (1 + ν)) along and none across."""
+    stiffness, gamma, side = 60.0, 0.1, 0.3
+    mesh = grid_cloth(7, 7, side, side)
+    deformation = np.array([[1.0, gamma], [0.0, np.sqrt(1 - gamma**2)]])  # of strain γ/2 in shear, and none along the sides
+    at = np.column_stack([mesh.nodes[:, :2] @ deformation.T, mesh.nodes[:, 2]])
+    sheet = replace(isotropic("m", density=DENSITY, stretching=stiffness, bending=1e-5, poisson=poisson), compression=0.0)
+    panel = Forces(mesh, sheet)
 
-    def apart(compression: float) -> float:
-        scenario = grid_scenario(built_in("lift").model_copy(update={"compression": compression}))
-        ends = []
-        for one in (scenario, scenario.finer()):
-            system, _ = one.scene.build()
-            with torch.no_grad():
-                ends.append(rollout(system, one.steps).positions[0, -1, : len(scenario.scene.mesh.nodes)])
-        return float((ends[0] - ends[1]).square().sum(-1).mean().sqrt())
+    def on_the_beam(*names: str) -> np.ndarray:  # [N/m] along it and across, in the material's axes
+        forces = sum(panel.force(name, panel.motion(at)) for name in names).reshape(7, 7, 3)
+        np.testing.assert_allclose(forces[1:-1, 1:-1], 0.0, atol=1e-12)
+        return np.linalg.solve(deformation, -forces[-1, :, :2].sum(0) / side)
 
-    locked, wrinkled = apart(1.0), apart(0.003)
-    assert locked > 0.02
-    assert wrinkled < 0.5 * locked
+    # to 4 %: less compression than a strain of 0.0005 is resisted in full
+    assert on_the_beam("stretching") == pytest.approx([stiffness * gamma / (2 * (1 + poisson)), 0.0], abs=1e-9)
+    assert on_the_beam("stretching", "wrinkling") == pytest.approx([stiffness * gamma / 4] * 2, rel=0.04)
 
 
 def test_uniaxial_patch_pulls_with_stiffness_times_strain():

@@ -14,7 +14,7 @@ from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim import Properties, State, init, rollout, rollout_tangents
 from diffcloud.sim.system import System
 
-SCALARS = ("stretch", "mass", "density", "bending", "damping", "drag", "friction_obstacle")
+SCALARS = ("stretch", "shear", "mass", "density", "bending", "damping", "drag", "friction_obstacle")
 STEPS = tuple(10.0**-k for k in range(2, 9))
 
 
@@ -58,6 +58,7 @@ class Episode:
         one = torch.ones(1, dtype=torch.float64)
         return {
             "stretch": 1.3 * one,
+            "shear": 0.7 * one,
             "mass": 0.8 * one,
             "density": 1.1 * one,
             "bending": 1.2 * one,

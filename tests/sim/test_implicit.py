@@ -139,7 +139,10 @@ def test_both_modes_agree_with_each_other_and_with_differences(name):
     )
     gradients = torch.autograd.grad((run.positions[0] * weights).sum(), inputs, materialize_grads=True)
     along = [*rates, *moves, *([] if pull is None else [pull])]
-    backwards = float(sum((g * a).sum() for g, a in zip(gradients, along, strict=True)))
+    parts = [g * a for g, a in zip(gradients, along, strict=True)]
+    backwards = float(sum(part.sum() for part in parts))
+    usual = float(sum(part.square().sum() for part in parts)) ** 0.5
+    scale = abs(backwards) if abs(backwards) > 0.3 * usual else usual  # where the parts cancel, that of a random direction
     _, found = rollout_tangents(
         system,
         STEPS,
@@ -152,10 +155,11 @@ def test_both_modes_agree_with_each_other_and_with_differences(name):
     )
     assert backwards == pytest.approx(float((found[0, 0] * weights).sum()), rel=1e-10)
     with torch.no_grad():
-        # where something begins to touch within the step of a difference, that difference is of two motions
-        sizes = (1e-5, 3e-6) if name == "body" else (1e-5,)
+        # where something begins to touch within the step of a difference, that difference is of two motions; and small
+        # ones show the solver's tolerance
+        sizes = (3e-5, 1e-5, 3e-6)
         differences = [float(value(size) - value(-size)) / (2 * size) for size in sizes]
-    assert min(abs(one / backwards - 1) for one in differences) < 1e-5
+    assert min(abs(one - backwards) for one in differences) < 1e-5 * scale
     assert (float(Properties(*gradients[: len(fields)]).compression) != 0) == (name == "wrinkling")
 
 

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import minimize
 
 from diffcloud.errors import SceneError
 from diffcloud.mesh import SurfaceMesh, grid_cloth
 from diffcloud.sim.compiled.data import Motion, Parameters
 from diffcloud.sim.compiled.trace import Graph
-from diffcloud.sim.materials import Material, isotropic
+from diffcloud.sim.materials import TABLE_ENTRY_TO_STRETCHING, Material, isotropic
 from diffcloud.sim.surrounding import ContactSettings, Surrounding
 from diffcloud.sim.terms import TERMS
 from diffcloud.sim.terms.stretching import _sampled
@@ -114,8 +115,7 @@ def test_kernels_are_as_their_twins_say(name, state, around, mesh, rng):
     bent = replace(mesh, nodes=crumpled(mesh, rng, 0.01))
     forces = Forces(bent, CAMEL, AROUND[around], shaped=True, rng=rng)
     moves = [0.5 * rng.normal(size=mesh.nodes.shape) for _ in range(3)]
-    press = 0.98 if name == "wrinkling" else 1.0  # at rest, rounding would decide what is compressed
-    motion = forces.motion(press * states(mesh, rng)[state], *moves)
+    motion = forces.motion(states(mesh, rng)[state], *moves)
     extra, twin = sampled(name, _sampled(CAMEL.stretching)), getattr(twins, name)
     inputs = {
         key: torch.as_tensor(value).requires_grad_()
@@ -244,6 +244,16 @@ class TestWrinkling:
         ids=["isotropic", "orthotropic"],
     )
 
+    FABRICS = pytest.mark.parametrize(
+        "fabric",
+        [
+            replace(CONSTANT, stretching=CONSTANT.stretching * [1, 0, 1, 1]),
+            replace(CONSTANT, stretching=CONSTANT.stretching * [1, 2, 1, 1]),
+            replace(CONSTANT, stretching=CONSTANT.stretching * [1, 2, 3, 1]),
+        ],
+        ids=["little shear", "coupled", "orthotropic"],
+    )
+
     @staticmethod
     def stored(sheet: Material, mesh, at: np.ndarray) -> tuple[float, float]:
         """(energy of both terms, of stretching alone)"""
@@ -275,10 +285,80 @@ class TestWrinkling:
         assert alone == pytest.approx(0.5 * 40 * area * (pull**2 + press**2))
         assert both == pytest.approx(0.5 * 40 * area * (pull**2 + 0.1 * press**2), rel=0.02)
 
+    @FABRICS
+    @pytest.mark.parametrize("degrees", [10.0, 45.0, 77.0])
+    def test_a_strip_pulled_in_any_direction_and_free_across_pulls_as_without(self, fabric, degrees, mesh):
+        """One tension is no compression, however much the strip narrows and shears."""
+        (k0, k1, k2, k3), (u, v) = _constants(fabric), (np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees)))
+        along_u, along_v = np.linalg.solve([[k0, k1], [k1, k2]], [u * u, v * v])
+        strain = 2.0 * np.array([[along_u, u * v / k3], [u * v / k3, along_v]])  # of 2 N/m
+        assert np.linalg.eigvalsh(strain).min() < -1e-3
+        forces, at = Forces(mesh, fabric), strained(mesh, strain)
+        found, alone = (np.abs(forces.force(name, forces.motion(at))).max() for name in ("wrinkling", "stretching"))
+        assert found < 1e-12 < 0.01 < alone
+
+    def test_derivatives_are_of_one_size_where_wrinkles_begin(self, mesh, rng):
+        """How much energy is lost must not come from the difference of what is stored and what is kept."""
+        (_, k1, k2, _), begins = _constants(CONSTANT), 5e-4
+        forces, moved = Forces(mesh, CONSTANT), 0.01 * rng.normal(size=mesh.nodes.shape)
+        adjoint = rng.normal(size=mesh.nodes.shape)
+
+        def largest(beyond: float) -> float:
+            narrowed = k1 / k2 * (0.1 + begins) + begins
+            at = strained(mesh, np.diag([0.1, -narrowed - beyond]))
+            motion = forces.motion(at, np.zeros_like(at), np.zeros_like(at), moved)
+            return np.abs(forces.reverse("wrinkling", motion, adjoint)[1].positions).max()
+
+        assert largest(-1e-5) == 0 < largest(1e-5)
+        assert max(largest(10.0**-power) for power in range(6, 15)) < 2 * largest(1e-5)
+
+    @FABRICS
+    def test_what_is_stored_is_the_least_over_all_slack_that_wrinkles_take_up(self, fabric, mesh, rng):
+        """Against a minimum over positive A of the energy at the strain and A, found by brute force."""
+        (k0, k1, k2, k3), begins, area = _constants(fabric), 5e-4, 0.3 * 0.4
+
+        def whole(tensor: np.ndarray) -> float:
+            return (
+                0.5 * (k0 * tensor[0, 0] ** 2 + k2 * tensor[1, 1] ** 2)
+                + k1 * tensor[0, 0] * tensor[1, 1]
+                + k3 * tensor[0, 1] ** 2
+            )
+
+        wrinkled = 0
+        for _ in range(40):
+            strain = 0.1 * rng.normal(size=(2, 2))
+            strain = 0.5 * (strain + strain.T)
+            shifted = strain + begins * np.eye(2)
+
+            def slackened(root: np.ndarray, shifted: np.ndarray = shifted) -> float:
+                lower = np.array([[root[0], 0.0], [root[1], root[2]]])
+                return whole(shifted + lower @ lower.T)
+
+            starts = [0.3 * rng.normal(size=3) for _ in range(4)]
+            kept = min(minimize(slackened, start, method="BFGS", options={"gtol": 1e-10}).fun for start in starts)
+            lost, scale = whole(shifted) - kept, 0.25 * begins**2 * (k0 + k2)
+            if lost > scale < kept:  # else easing counts
+                wrinkled += 1
+                eased = kept + scale * ((lost / scale) ** 0.5 - 1 / 3)  # a little compression is always resisted
+                both, alone = self.stored(replace(fabric, compression=0.0), mesh, strained(mesh, strain))
+                assert (alone - both) / area == pytest.approx(whole(shifted) - eased, rel=1e-5)
+        assert wrinkled > 10
+
     @pytest.mark.parametrize("compression", [-0.1, 1.5, float("nan")])
     def test_compression_outside_of_0_to_1_is_refused(self, compression):
         with pytest.raises(SceneError, match="compression must be between 0 and 1"):
             replace(CONSTANT, compression=compression)
+
+
+def _constants(sheet: Material) -> np.ndarray:
+    """(k0, k1, k2, k3) [N/m] of a sheet whose table is constant."""
+    return TABLE_ENTRY_TO_STRETCHING * sheet.stretching[0]
+
+
+def strained(mesh, strain: np.ndarray) -> np.ndarray:
+    """The nodes of a flat mesh under a Green strain [2, 2]."""
+    shape = np.linalg.cholesky(np.eye(2) + 2 * strain).T
+    return np.column_stack([mesh.nodes[:, :2] @ shape.T, mesh.nodes[:, 2]])
 
 
 def test_constant_stretching_stiffness_is_the_jacobian_under_tension(mesh):

@@ -9,9 +9,9 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from diffcloud.errors import SceneError
+from diffcloud.errors import SceneError, unknown_name
 from diffcloud.io.schema import Checked, NonNegative, Vector
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.scene.description import Scene
@@ -21,6 +21,7 @@ from diffcloud.scene.schema import Friction
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import Material, preset, read_material
 from diffcloud.sim.motion import Keyframe, Motion
+from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.surrounding import ContactSettings, Integrator, ReferenceContact, Surrounding
 
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
@@ -41,6 +42,8 @@ class ScenarioOptions(Checked):
     compression: Annotated[float, Field(ge=0, le=1)] = 1.0
     """The part of its stretching stiffness with which the cloth resists compression in its plane. Fabric wrinkles instead,
     finer than most meshes (docs/physics.md, wrinkles)."""
+    doubts: dict[str, Annotated[float, Field(gt=1, le=1e6)]] = Field(default_factory=dict)
+    """Material that is known less well, or better, than usual: parameter -> factor of one deviation (`fit.doubts`)."""
     path: Keyframes
     """The gripper's displacement."""
     frames: Annotated[int, Field(ge=1, le=100_000)] = 25
@@ -71,6 +74,14 @@ class ScenarioOptions(Checked):
     """Whether the cloth meets itself; without, layers pass through each other, and steps are several times quicker."""
     contact_stiffness: NonNegative = 1e4
     contact_thickness_m: Annotated[float, Field(gt=0, le=1)] = 0.003
+
+    @field_validator("doubts")
+    @classmethod
+    def _of_parameters(cls, doubts: dict[str, float]) -> dict[str, float]:
+        for name in doubts:
+            if name not in PARAMETERS:
+                raise ValueError(unknown_name("parameter", name, PARAMETERS))
+        return doubts
 
     @property
     def reach(self) -> float:
@@ -156,4 +167,5 @@ def assemble(
         learning_rate=options.learning_rate,
         threshold=options.threshold_m2,
         recorder=options.recorder,
+        doubts=options.doubts,
     )

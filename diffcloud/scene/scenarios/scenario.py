@@ -52,6 +52,8 @@ class Scenario:
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Overrides of the parameters' own bounds."""
     recorder: Recorder = "depth_cameras"
+    doubts: Mapping[str, float] = field(default_factory=dict)
+    """Material -> factor of one deviation, where it is known less well, or better, than usual (`fit.doubts`)."""
     laid: Mapping[str, float] = field(default_factory=dict)
     """How far from its place in the scene the cloth may lie at the start, which fits find: `turn` [rad] and `shape` [m]
     (`fit.laid`) -> standard deviation."""
@@ -107,7 +109,10 @@ class Scenario:
         scene, around = self.scene, self.scene.surrounding
         weight, air = values.get("mass", 1.0) * values.get("density", 1.0), values.get("drag", 1.0)
         material = scene.material.scaled(
-            density=weight, stretching=values.get("stretch", 1.0), bending=values.get("bending", 1.0)
+            density=weight,
+            stretching=values.get("stretch", 1.0),
+            shear=values.get("shear", 1.0),
+            bending=values.get("bending", 1.0),
         )
         heavy = values.get("body_mass", 1.0)
         bodies = tuple(

@@ -21,6 +21,8 @@ class Parameters(NamedTuple):
     """[N] of all points, zero for those of obstacles and bodies; follows from the node masses [1/kg]."""
     stretching: Floats
     """[F] multiplier on the stretching table of each face [-]."""
+    shear: Floats
+    """[1] multiplier on the shear of the stretching table [-]."""
     compression: Floats
     """[1] part of the stretching stiffness that resists compression [-]."""
     bending: Floats

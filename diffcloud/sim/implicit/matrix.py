@@ -97,8 +97,8 @@ def _without_air(p: Parameters) -> Parameters:
     """The cautious matrix has elastic forces and contact only."""
     none = np.zeros(1)
     return Parameters(
-        p.node_mass, p.inverse_mass, p.stretching, p.compression, p.bending, p.damping, none, none, p.friction_obstacle,
-        p.friction_cloth, p.body_mass, p.hold, p.target,
+        p.node_mass, p.inverse_mass, p.stretching, p.shear, p.compression, p.bending, p.damping, none, none,
+        p.friction_obstacle, p.friction_cloth, p.body_mass, p.hold, p.target,
     )  # fmt: skip
 
 

@@ -73,7 +73,7 @@ TERM = Term(
     build=build,
     constants={"area": (), "inverse_rest": (2, 2)},
     tables={"cells": 3},
-    parameters={"stretching": "element"},
+    parameters={"stretching": "element", "shear": "episode"},
 )
 """Constants: area in material space [m²]; inverse of its edge matrix [1/m], row i of edge i, column of direction u or v.
 Tables: [29³, 8, 4] trilinear polynomial (x, y, z, xy, xz, yz, xyz, 1) of (k0, k1, k2, k3) in each cell [N/m]."""
@@ -109,7 +109,7 @@ def on_corners(face: Element, row_u: Vector, row_v: Vector) -> Sequence[Vector]:
 
 
 def coefficients(face: Element, e00: Scalar, e11: Scalar, e01: Scalar) -> list[Scalar]:
-    """k0, k1, k2, k3 at a strain [N/m], times the face's multiplier."""
+    """k0, k1, k2, k3 at a strain [N/m], times the face's multiplier, and k3 times that of shear."""
     places = [clamped((e + 0.25) * _SCALE - 0.5, 0.0, _SAMPLES - 1.0) for e in (e00, e11)]
     places.append(clamped(absolute(e01) * _SCALE - 0.5, 0.0, _SAMPLES - 1.0))
     last = _SAMPLES - 2.0
@@ -123,7 +123,8 @@ def coefficients(face: Element, e00: Scalar, e11: Scalar, e01: Scalar) -> list[S
         for power, monomial in enumerate(monomials):
             value = value + monomial * face.look_up("cells", cell, power, number)
         found.append(value)
-    return [value * face.parameter("stretching") for value in found]
+    axial = [value * face.parameter("stretching") for value in found[:3]]
+    return [*axial, found[3] * (face.parameter("stretching") * face.parameter("shear"))]
 
 
 def _sampled(stretching: NDArray[np.float64]) -> NDArray[np.float64]:

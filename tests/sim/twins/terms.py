@@ -7,7 +7,7 @@ All take the element's constants and parameters by name, and `motion`: positions
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 
 import numpy as np
@@ -50,7 +50,8 @@ def strained(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -
     gradient, moved = along_material(constants, motion.positions), along_material(constants, motion.displacement)
     strain = 0.5 * (gradient.T @ gradient - torch.eye(2, dtype=gradient.dtype))
     change = 0.5 * (gradient.T @ moved + moved.T @ gradient)
-    found = parameters["stretching"] * coefficients(constants["samples"], strain[0, 0], strain[1, 1], strain[0, 1])
+    axial, shear = coefficients(constants["samples"], strain[0, 0], strain[1, 1], strain[0, 1]).split([3, 1])
+    found = parameters["stretching"] * torch.cat([axial, parameters["shear"] * shear])
     return gradient, strain, change, found
 
 
@@ -73,29 +74,48 @@ def stretching(constants: Numbers, parameters: Numbers, motion: SimpleNamespace)
 
 
 def wrinkling(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
-    """(1 - c) a of the stress √C : Φ'(√C : E) and of its change by the displacement."""
+    """(1 - c) a times the stress of W - W* and its change, by autograd. W* is the largest of e²/2y over many directions,
+    and Newton's method from there."""
     gradient, strain, change, (k0, k1, k2, k3) = strained(constants, parameters, motion)
-    between = ((k0 * k2 - k1**2).clamp(min=0) + 1e-24).sqrt()
-    root = torch.stack([k0 + between, k1, k1, k2 + between]).view(2, 2) / (k0 + k2 + 2 * between).sqrt()
-    width = 1e-3 * (0.5 * (k0 + k2)).sqrt()
+    k0, k2, k3 = (one + 1e-9 * (k0 + k2) for one in (k0, k2, k3))
+    k1 = torch.minimum(k1, 0.999 * (k0 * k2).sqrt())
+    stiffness = torch.stack([torch.stack([k0, k1]), torch.stack([k1, k2])])
+    flexible = torch.linalg.inv(stiffness)
+    strain = strain + 5e-4 * torch.eye(2, dtype=strain.dtype)
 
-    def rooted(tensor: Tensor) -> Tensor:
-        return (root @ tensor.diagonal()).diag() + (1 - torch.eye(2)) * tensor * (k3 + 1e-24).sqrt()
+    def stressed(tensor: Tensor) -> Tensor:
+        return (stiffness @ tensor.diagonal()).diag() + (1 - torch.eye(2, dtype=tensor.dtype)) * tensor * k3
 
-    def slope(value: Tensor) -> Tensor:  # Φ'
-        eased = torch.where(value > -width, -0.5 * value**2 / width, value + 0.5 * width)
-        return torch.where(value < 0, eased, 0.0)
+    def stored(angle: Tensor, tensor: Tensor) -> Tensor:  # e²/2y
+        t = torch.stack([angle.cos(), angle.sin()])
+        squares = t * t
+        compliance = ((flexible @ squares) * squares).sum(0) + 2 * (t[0] * t[1]) ** 2 / k3
+        pulled = (t * (tensor @ t)).sum(0)
+        return 0.5 * pulled.clamp(min=0) ** 2 / compliance
 
-    def compressed(tensor: Tensor) -> Tensor:  # Φ'(T) = f(λ₁) n₁n₁ᵀ + f(λ₂) n₂n₂ᵀ, by the tensor's deviator
-        mean = 0.5 * tensor.trace()
-        deviator = tensor - mean * torch.eye(2, dtype=tensor.dtype)
-        radius = (0.5 * deviator.square().sum() + 1e-24).sqrt()
-        first, second = slope(mean + radius), slope(mean - radius)
-        return 0.5 * (first + second) * torch.eye(2, dtype=tensor.dtype) + 0.5 * (first - second) * deviator / radius
+    def slope(of: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
+        at = at if at.requires_grad else at.detach().requires_grad_()
+        return torch.autograd.grad(of(at), at, create_graph=True)[0]
 
-    held, more = torch.autograd.functional.jvp(compressed, rooted(strain), rooted(change), create_graph=True)
-    stress = (parameters["compression"] - 1) * rooted(held + more)
-    return on_corners(constants, gradient @ stress)
+    def given_up(tensor: Tensor) -> Tensor:  # W - W*, eased
+        whole = 0.5 * (tensor * stressed(tensor)).sum()
+        if torch.linalg.eigvalsh(stressed(tensor).detach()).min() >= 0:
+            kept = whole
+        elif torch.linalg.eigvalsh(tensor.detach()).max() <= 0:
+            kept = 0 * whole
+        else:
+            angles = torch.linspace(0, math.pi, 3601, dtype=tensor.dtype)
+            angle = angles[stored(angles, tensor.detach()).argmax()]
+            for _ in range(4):  # differentiated: each step doubles the order to which the angle follows the strain
+                first = slope(lambda one: stored(one, tensor), angle)
+                angle = angle - first / slope(lambda one: slope(lambda other: stored(other, tensor), one), angle)
+            kept = stored(angle, tensor)
+        scale = 0.25 * 5e-4**2 * (k0 + k2)
+        r, q = (kept / scale + 1e-24).sqrt().clamp(max=1), ((whole - kept) / scale + 1e-24).sqrt()
+        return scale * (r**2 * (1 - r) ** 3 + torch.where(q < 1, q**3 / 3, q**2 - q + 1 / 3))
+
+    stress = torch.autograd.functional.jvp(lambda one: slope(given_up, one), strain, change, create_graph=True)
+    return on_corners(constants, gradient @ ((parameters["compression"] - 1) * sum(stress)))
 
 
 def dihedral(nodes: Tensor) -> tuple[Tensor, Tensor]:
