@@ -218,8 +218,8 @@ class FitConfig(Section):
     """Which parts of the pose are fitted too, and how far off each may well be: "x=0.1m,y=0.1m,yaw=30deg", or "none". If
     not given, all of them, as `fit.pose.default_priors` says."""
     laid: Name | None = None
-    """How the cloth may lie at the start, other than as its scenario has it, and how far off: "turn=5deg,shape=5mm", or
-    "none" (`fit.laid`). Default: what the scenario says, in implicit fits of one recording by gauss_newton; else none."""
+    """How the cloth may lie at the start, other than its scenario has it, and how far off: "turn=5deg,size=2%", or "none"
+    (`fit.laid`). Default: what the scenario says, in implicit fits of one recording by gauss_newton; else none."""
     prior: Name | None = None
     """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""
     doubts: Name | None = None
@@ -276,7 +276,7 @@ class FitConfig(Section):
 
     def laid_within(self, scenarios: Sequence[Scenario]) -> dict[str, float]:
         """How the cloth may lie otherwise at the start, in one fit of recordings in these scenarios: name of `fit.laid` ->
-        standard deviation [rad, m]."""
+        standard deviation [rad, m, 1]."""
         if self.laid is not None:
             return parse_laid(self.laid)
         alone = len(scenarios) == 1 and self._fits_more(scenarios)

@@ -108,15 +108,17 @@ def fit(
         str | None,
         typer.Option(
             help="What of the recording's pose is found too, each with how far it may be off (a weak prior, no bound), "
-            "such as x=2cm,yaw=5deg,lag=50ms. Of x, y, z, tilt_x, tilt_y, yaw, lag; none keeps the scene's pose. "
-            "Default: x and y 0.1m, yaw 30deg, z 2mm, tilt_x and tilt_y 0.29deg, lag 2ms or what preprocess says."
+            "such as x=2cm,yaw=5deg,lag=50ms. Of x, y, z, tilt_x, tilt_y, yaw, lag, scale; none keeps the scene's pose. "
+            "Default: x and y 0.1m, yaw 30deg, z 2mm, tilt_x and tilt_y 0.29deg, lag 2ms or what preprocess says; "
+            "scale (of the cameras' depths, such as 2%) where the episode says how far it may be off."
         ),
     ] = None,
     laid: Annotated[
         str | None,
         typer.Option(
             help="Also find how the cloth lay before the motion, and how far off that may be: turn=5deg (askew under the "
-            "gripper), shape=5mm (not flat; of each of nine waves). Only if the cloth starts level; not with --joint. "
+            "gripper), shape=5mm (not flat; of each of nine waves), size=2% (larger or smaller than stated), track=2% (the "
+            "gripper went farther or less far than recorded). Only if the cloth starts level; not with --joint. "
             "Default: what the scenario says (the recorded_ ones turn=10deg,shape=1cm; others none)."
         ),
     ] = None,

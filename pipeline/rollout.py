@@ -11,7 +11,7 @@ import torch
 import typer
 
 from diffcloud.errors import ConfigError, DivergedError
-from diffcloud.fit.laid import start_of
+from diffcloud.fit.inputs import Inputs
 from diffcloud.fit.record import RecordingFit, read_fit
 from diffcloud.fit.result import recorded_pose
 from diffcloud.fit.targets import track_displacement
@@ -22,7 +22,6 @@ from diffcloud.io.obj import write_cloth, write_surface
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.sim.moved import moved_surfaces
 from diffcloud.sim.properties import check_values, one_set
-from diffcloud.sim.simulate import rollout as simulate
 from pipeline.console import JsonFlag, assignments, errors, finish, progress_bar, warn, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario, limits
 
@@ -62,9 +61,8 @@ def rollout(
     frames = frames or chosen.frames
     steps = frames * chosen.scene.frame_steps
     system, _ = chosen.scene.build()
-    properties = chosen.properties(system, one_set(values))
     recording = None if fitted is None else _recording(fitted.episodes, chosen.name, episode)
-    start = None if fitted is None or recording is None else start_of(system, one_set(fitted.laid))
+    laid = {} if fitted is None or recording is None else fitted.laid
     track, warnings = None, limits(chosen)
     if episode is not None:
         recorded = read_episode(episode)
@@ -74,9 +72,8 @@ def rollout(
         track = torch.as_tensor(track_displacement(recorded, system.handles.grippers, steps, system.time_step))[None]
     with progress_bar("simulating", steps) as update, torch.no_grad():
         try:
-            run = simulate(
-                system, steps, properties=properties, state=start, track=track, progress=lambda done: update(done, "")
-            )
+            given = Inputs.of(chosen, system, steps, one_set({**values, **laid}), track)
+            run = given.rollout(progress=lambda done: update(done, ""))
         except DivergedError as error:
             shown = ", ".join(f"{name}={value:g}" for name, value in values.items()) or "the basis material"
             raise DivergedError(error.step, error.entries, error.reason, shown) from error

@@ -1,14 +1,16 @@
-"""How a cloth lies when its motion begins: turned under the gripper, and not quite flat.
+"""How a cloth lies when its motion begins: turned under the gripper, not quite flat, and not quite as large as stated.
 
 The pose (`fit.pose`) moves cloth, gripper and bodies together, which is the same motion seen from elsewhere. A cloth that a
-hand has laid down 5° askew, or with a rim that stands up, moves in another way. So these are variables of the motion, like
-doubtful material (`fit.doubts`): fitted under priors, one set for a recording, and no property of the cloth.
+hand has laid down 5° askew, or with a rim that stands up, moves in another way, and so does a larger one. So these are
+variables of the motion, like doubtful material (`fit.doubts`): fitted under priors, one set for a recording, and no
+property of the cloth.
 
 The turn is about the cloth's middle. Its height over where the scene lays it is a sum of nine waves over the cloth,
 
     h(u, v) = Σ c_ij cos(π i u) cos(π j v),      u, v in [0, 1],      0 < i + j <= 3,
 
-raised until no node is lower than before.
+raised until no node is lower than before. `size` and `track` are logarithms: of how many times as large as the scene's the
+cloth is, and of how many times as far as recorded the gripper goes. What they do to a motion: `fit.inputs`.
 """
 
 from __future__ import annotations
@@ -26,11 +28,9 @@ from diffcloud.fit.priors import parse_deviations
 from diffcloud.fit.record import NuisanceValue
 from diffcloud.mesh.topology import ClothMesh
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim.properties import Properties
-from diffcloud.sim.simulate import init
-from diffcloud.sim.system import State, System
+from diffcloud.sim.surrounding import Surrounding
 
-LAID: dict[str, Literal["m", "rad"]] = {"turn": "rad", "shape": "m"}
+LAID: dict[str, Literal["m", "rad", "1"]] = {"turn": "rad", "shape": "m", "size": "1", "track": "1"}
 """Name -> unit. `shape` stands for the height of each wave."""
 _SHAPES = {f"shape_{i}_{j}": (i, j) for i in range(4) for j in range(4) if 0 < i + j <= 3}
 _FLAT = 1e-6
@@ -40,7 +40,7 @@ _FARTHEST = 4.0
 
 
 def parse_laid(text: str) -> dict[str, float]:
-    """What `--laid` says -> name -> standard deviation of its prior [m, rad], as of `parse_deviations`.
+    """What `--laid` says -> name -> standard deviation of its prior [m, rad, 1], as of `parse_deviations`.
 
     Raises:
         ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.
@@ -52,11 +52,12 @@ def with_laid(space: FitSpace, laid: Mapping[str, float], scenarios: Sequence[Sc
     """The space with the variables appended.
 
     Args:
-        laid: name -> standard deviation [m, rad].
+        laid: name -> standard deviation [m, rad, 1].
         scenarios: of the recordings.
 
     Raises:
-        ConfigError: several recordings, of which each would need its own, or a cloth that does not lie level.
+        ConfigError: several recordings, of which each would need its own, a cloth that does not lie level, or a size where
+            there is more than a table around the cloth.
     """
     if not laid:
         return space
@@ -68,6 +69,8 @@ def with_laid(space: FitSpace, laid: Mapping[str, float], scenarios: Sequence[Sc
     nodes = scenarios[0].scene.mesh.nodes
     if np.ptp(nodes[:, 2]) > _FLAT * np.ptp(nodes, axis=0).max():
         raise ConfigError(f"{told}this needs a cloth that lies level at the start; that of {scenarios[0].name} does not.")
+    if "size" in laid and (more := _beyond_a_table(scenarios[0].scene.surrounding)):
+        raise ConfigError(f"laid size: this needs a scene of cloth and table alone; {scenarios[0].name} also has {more}.")
     names = [own for name in LAID if name in laid for own in (_SHAPES if name == "shape" else (name,))]
     own = [_variable(name, laid[asked_as(name)], scenarios[0].length_unit_m) for name in names]
     return FitSpace((*space.variables, *own), space.fixed)
@@ -81,14 +84,27 @@ def variables_of(described: Mapping[str, NuisanceValue], *, length_unit_m: float
     """
     for name in described:
         if not is_laid(name):
-            raise ConfigError(unknown_name("variable of how a cloth lies", name, ["turn", *_SHAPES]))
+            raise ConfigError(unknown_name("variable of how a cloth lies", name, [*filter(is_laid, LAID), *_SHAPES]))
     return [_variable(name, entry.prior, length_unit_m) for name, entry in described.items()]
+
+
+def _beyond_a_table(around: Surrounding) -> str:
+    """What of a scene does not grow with the cloth."""
+    planes = [surface.plane() for surface in around.obstacles]
+    level = [plane is not None and bool(abs(plane[0][2]) > 1 - _FLAT) for plane in planes]
+    found = {
+        "wind": any(around.wind),
+        "obstacles that move": bool(around.moving or around.bodies),
+        "further forces": bool(around.forces),
+        "obstacles other than a level table": not all(level) or len(level) > 1,
+    }
+    return ", ".join(name for name, there in found.items() if there)
 
 
 def _variable(name: str, deviation: float, length_unit_m: float) -> Variable:
     """
     Args:
-        deviation: [m, rad].
+        deviation: [m, rad, 1].
     """
     deviation /= length_unit_m if LAID[asked_as(name)] == "m" else 1.0
     return Variable(name, -_FARTHEST * deviation, _FARTHEST * deviation, centre=0.0, doubtful=True, deviation=deviation)
@@ -96,7 +112,7 @@ def _variable(name: str, deviation: float, length_unit_m: float) -> Variable:
 
 def is_laid(name: str) -> bool:
     """Whether a variable tells how a cloth lies."""
-    return name == "turn" or name in _SHAPES
+    return name in _SHAPES or (name in LAID and name != "shape")
 
 
 def asked_as(name: str) -> str:
@@ -104,13 +120,21 @@ def asked_as(name: str) -> str:
     return "shape" if name in _SHAPES else name
 
 
-def _material_of(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Those that do not tell how a cloth lies."""
-    return {name: value for name, value in values.items() if not is_laid(name)}
+def sizes_of(values: Mapping[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:
+    """[B] how many times as large as the scene's a cloth is, and how many times as far its gripper goes, in units of its
+    size; differentiable. None: as large, as far.
+
+    Args:
+        values: name -> [B], those of the material too.
+    """
+    size, track = values.get("size"), values.get("track")
+    if size is None:
+        return None, None if track is None else track.exp()
+    return size.exp(), (-size if track is None else track - size).exp()
 
 
 def laid_nodes(mesh: ClothMesh, values: Mapping[str, Tensor]) -> Tensor | None:
-    """[B, V, 3] where a cloth starts; differentiable. None: as the scene has it.
+    """[B, V, 3] where a cloth starts, at the scene's size; differentiable. None: as the scene has it.
 
     Args:
         values: name -> [B], those of the material too.
@@ -125,6 +149,8 @@ def laid_nodes(mesh: ClothMesh, values: Mapping[str, Tensor]) -> Tensor | None:
     for name, (i, j) in _SHAPES.items():
         if name in own:
             heights = heights + own[name][:, None] * torch.cos(torch.pi * i * across) * torch.cos(torch.pi * j * along)
+    size, _ = sizes_of(own)
+    heights = heights if size is None else heights / size[:, None]
     turn = own.get("turn", torch.zeros(batch, dtype=torch.float64))
     middle = nodes[:, :2].mean(0)
     x, y = (nodes[:, :2] - middle).T
@@ -137,22 +163,6 @@ def laid_nodes(mesh: ClothMesh, values: Mapping[str, Tensor]) -> Tensor | None:
         ],
         dim=-1,
     )
-
-
-def start_of(system: System, values: Mapping[str, Tensor]) -> State | None:
-    """The state in which motions of these values begin; arguments as of `laid_nodes`. None: that of the scene."""
-    nodes = laid_nodes(system.mesh, values)
-    return None if nodes is None else init(system, len(nodes), positions=nodes)
-
-
-def inputs_of(scenario: Scenario, system: System, values: Mapping[str, Tensor]) -> tuple[Properties, State | None]:
-    """What parameter sets are to the simulator: properties, and a start (None: that of the scene).
-
-    Args:
-        system: of the scenario's scene.
-        values: name -> [B].
-    """
-    return scenario.properties(system, _material_of(values)), start_of(system, values)
 
 
 def described_laid(space: FitSpace, values: Mapping[str, float], *, length_unit_m: float) -> dict[str, NuisanceValue]:

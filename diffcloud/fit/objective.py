@@ -23,15 +23,13 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.alignment import aligned
-from diffcloud.fit.laid import inputs_of
+from diffcloud.fit.inputs import Inputs
 from diffcloud.fit.matching import Matcher, Motion, Pairs
 from diffcloud.fit.pose import PoseSpace, default_priors
 from diffcloud.fit.targets import read_target
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim.properties import Properties
-from diffcloud.sim.simulate import Rollout, rollout
-from diffcloud.sim.system import State
+from diffcloud.sim.simulate import Rollout
 
 CAP_M = 0.05
 """A larger distance counts as this one."""
@@ -216,15 +214,11 @@ class Objective:
 
     def simulate(self, parameters: Mapping[str, Tensor], *, steps: int | None = None) -> Rollout:
         """The rollout of parameter sets with an episode's gripper track, by default over the whole scenario."""
-        steps = self.scenario.steps if steps is None else steps
-        properties, start = self.inputs(parameters)
-        track = self._target.track
-        track = None if track is None else track[:, :steps]
-        return rollout(self.system, steps, properties=properties, state=start, track=track)
+        return self.inputs(parameters, self.scenario.steps if steps is None else steps).rollout()
 
-    def inputs(self, parameters: Mapping[str, Tensor]) -> tuple[Properties, State | None]:
-        """See `laid.inputs_of`."""
-        return inputs_of(self.scenario, self.system, parameters)
+    def inputs(self, parameters: Mapping[str, Tensor], steps: int) -> Inputs:
+        """Of parameter sets, with an episode's gripper track."""
+        return Inputs.of(self.scenario, self.system, steps, parameters, self._target.track)
 
     def frame_losses(self, run: Rollout, *, pose: Tensor | None = None) -> Tensor:
         """[B, L] losses of a rollout at each compared frame, at its pose or at poses [B, d]."""
@@ -354,7 +348,7 @@ class Objective:
             velocities = None if motion.velocities is None else pairs.places.of(motion.velocities)
             columns = [space.rates(points, motion.pose, velocities)]
             if rates is not None:
-                columns.insert(0, torch.stack([space.turned(pairs.places.of(rate), motion.pose) for rate in rates]))
+                columns.insert(0, torch.stack([space.carried(pairs.places.of(rate), motion.pose) for rate in rates]))
             moved.append(space.moved(points, motion.pose))
             every.append(torch.cat(columns))
         return moved, every

@@ -1,14 +1,15 @@
 """How a recording lies against the scene: fitted with the parameters, for each episode, and no property of the cloth.
 
 The scene is turned about the recording's centre c by the rotation vector w = (tilt_x, tilt_y, yaw), shifted by
-t = (x, y, z), and looked at later by `lag`, as far as its velocity v tells:
+t = (x, y, z), shown e^scale times as large, and looked at later by `lag`, as far as its velocity v tells:
 
-    x' = exp([w]×) (x + lag v - c) + c + t
+    x' = e^scale exp([w]×) (x + lag v - c) + c + t
 
 On a level table, x and y, and yaw of cloth, gripper and bodies together, are symmetries of the motion: they need no new
 simulation. A cloth that lies turned under a gripper which does not turn is another motion; yaw only approximates it. z and
-the tilts are those of the cameras against the robot, which a calibration knows to millimetres. A cloud stamped t shows the
-motion at t + lag.
+the tilts are those of the cameras against the robot, which a calibration knows to millimetres. `scale` is that of the
+cameras' depths: whatever a pinhole sees, depths that are 3 % too large show as 3 % larger about the camera. A cloud stamped
+t shows the motion at t + lag.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from diffcloud.fit.priors import INDEPENDENT, parse_deviations
 from diffcloud.fit.record import NuisanceValue
 from diffcloud.io.episodes import Episode
 
-NUISANCE: dict[str, Literal["m", "rad", "s"]] = {
+NUISANCE: dict[str, Literal["m", "rad", "s", "1"]] = {
     "x": "m",
     "y": "m",
     "z": "m",
@@ -34,13 +35,16 @@ NUISANCE: dict[str, Literal["m", "rad", "s"]] = {
     "tilt_y": "rad",
     "yaw": "rad",
     "lag": "s",
+    "scale": "1",
 }
 """Name -> unit."""
 SET_UP = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.005, "yaw": 0.005, "lag": 0.002}
 """Standard deviations of a calibrated set-up [m, rad, s]: of its cameras against the robot, and of its clock."""
 LAID = {"x": 0.1, "y": 0.1, "yaw": math.radians(30)}
 """Of where a hand lays a cloth that the scene places [m, rad]."""
-_RESOLVED = {"m": 3e-4, "rad": 1.5e-3, "s": 3e-4}
+TRIED = {**SET_UP, "scale": 0.002}
+"""A small change of each variable, in the same units."""
+_RESOLVED = {"m": 3e-4, "rad": 1.5e-3, "s": 3e-4, "1": 1.5e-3}
 """A step as small as this is the last one to a pose; what is left changes little."""
 _ANGLES = ("tilt_x", "tilt_y", "yaw")
 _SHIFTS = ("x", "y", "z")
@@ -62,16 +66,17 @@ def set_up_of(episode: Episode) -> dict[str, float]:
 
 
 def default_priors(episode: Episode) -> dict[str, float]:
-    """Name -> standard deviation [m, rad, s], of a cloth laid by hand in front of the episode's set-up.
+    """Name -> standard deviation [m, rad, s, 1], of a cloth laid by hand in front of the episode's set-up.
 
     Raises:
         EpisodeError: the episode's meta is damaged.
     """
-    return {**set_up_of(episode), **LAID}
+    scale = episode.scale_sigma
+    return {**set_up_of(episode), **LAID, **({} if scale is None else {"scale": scale})}
 
 
 def parse_priors(text: str) -> dict[str, float]:
-    """What `--nuisance` says -> name -> standard deviation of its prior [m, rad, s], as of `parse_deviations`.
+    """What `--nuisance` says -> name -> standard deviation of its prior [m, rad, s, 1], as of `parse_deviations`.
 
     Raises:
         ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.
@@ -144,7 +149,7 @@ class PoseSpace:
 
     def moved(self, points: Tensor, values: Tensor) -> Tensor:
         """[B, ..., 3] points of the scene at values [B, d] -> where the recording has them."""
-        turned = _turned(points - self.centre, self.rotation(values))
+        turned = self.carried(points - self.centre, values)
         return turned + _beside(self.centre + self._parts(values, _SHIFTS), turned)
 
     def moved_motion(self, at: Callable[[Tensor], Tensor], times: Tensor, values: Tensor) -> Tensor:
@@ -160,10 +165,14 @@ class PoseSpace:
         """[B, ..., 3] directions in the scene at values [B, d] -> in the recording."""
         return _turned(vectors, self.rotation(values))
 
+    def carried(self, vectors: Tensor, values: Tensor) -> Tensor:
+        """[B, ..., 3] distances in the scene at values [B, d] -> in the recording."""
+        return _turned(vectors, self._growth(values)[..., None] * self.rotation(values))
+
     def back(self, points: Tensor, values: Tensor) -> Tensor:
         """[..., 3] points of the recording -> [B, ..., 3] where the scene at values [B, d] has them."""
         shifted = points - _beside(self.centre + self._parts(values, _SHIFTS), points[None])
-        return _turned(shifted, self.rotation(values).mT) + self.centre
+        return _turned(shifted, self.rotation(values).mT / self._growth(values)[..., None]) + self.centre
 
     def rates(self, points: Tensor, values: Tensor, velocities: Tensor | None) -> Tensor:
         """[d, B, ..., 3] derivatives of `moved` by the values.
@@ -177,15 +186,21 @@ class PoseSpace:
         for name in self.names:
             if name == "lag":
                 assert velocities is not None
-                columns.append(_turned(velocities, self.rotation(values)))
+                columns.append(self.carried(velocities, values))
+            elif name == "scale":
+                columns.append(self.carried(centred, values))
             elif name in _SHIFTS:
                 columns.append(torch.zeros_like(points))
                 columns[-1][..., _SHIFTS.index(name)] = 1.0
             else:
                 way = torch.zeros_like(angles)
                 way[:, _ANGLES.index(name)] = 1.0
-                columns.append(_turned(centred, _turning(angles, way)))
+                columns.append(_turned(centred, self._growth(values)[..., None] * _turning(angles, way)))
         return torch.stack(columns) if columns else points.new_zeros(0, *points.shape)
+
+    def _growth(self, values: Tensor) -> Tensor:
+        """[B, 1] of values [B, d]: how many times as large the scene shows."""
+        return self._parts(values, ("scale",)).exp()
 
     def _parts(self, values: Tensor, names: tuple[str, ...]) -> Tensor:
         """[B, n] of values [B, d]; zero for what is not free."""

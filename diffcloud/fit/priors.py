@@ -21,9 +21,9 @@ DEFAULT_FACTOR = 10.0
 """One deviation of a multiplier."""
 INDEPENDENT = 100
 """Residuals of a recording that count as independent."""
-_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180, "s": 1.0, "ms": 1e-3}
-_QUANTITY = {"m": "m", "cm": "m", "mm": "m", "rad": "rad", "deg": "rad", "s": "s", "ms": "s"}
-_EXAMPLES = {"m": "2cm", "rad": "5deg", "s": "50ms"}
+_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180, "s": 1.0, "ms": 1e-3, "%": 1e-2}
+_QUANTITY = {"m": "m", "cm": "m", "mm": "m", "rad": "rad", "deg": "rad", "s": "s", "ms": "s", "%": "1"}
+_EXAMPLES = {"m": "2cm", "rad": "5deg", "s": "50ms", "1": "2%"}
 
 
 def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str, tuple[float, float]]) -> dict[str, float]:
@@ -80,13 +80,13 @@ def parse_factor(text: str, told: str, example: str) -> float:
 
 
 def parse_deviations(text: str, option: str, units: Mapping[str, str]) -> dict[str, float]:
-    """What an option says of how far each variable may well be off zero -> name -> standard deviation [m, rad, s].
+    """What an option says of how far each variable may well be off zero -> name -> standard deviation [m, rad, s, 1].
 
     Args:
-        text: "none", or as in "x=10cm,y=0.1,yaw=30deg"; a length without a unit in m, a time in s. An angle names its
-            unit: 30 may be meant in degrees, and 0.5 in radians.
+        text: "none", or as in "x=10cm,y=0.1,yaw=30deg,size=2%"; a length without a unit in m, a time in s. An angle names
+            its unit, since 30 may be meant in degrees and 0.5 in radians, and a share is in percent.
         option: its name, for messages.
-        units: of each variable, m, rad or s.
+        units: of each variable, m, rad, s or 1.
 
     Raises:
         ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.
@@ -98,9 +98,9 @@ def parse_deviations(text: str, option: str, units: Mapping[str, str]) -> dict[s
         name, _, value = (part.strip() for part in item.partition("="))
         if name not in units:
             raise ConfigError(f"{option}: {unknown_name(f'{option} variable', name, units)}")
-        match = re.fullmatch(r"([0-9.eE+-]+?)\s*([a-z]*)", value)
+        match = re.fullmatch(r"([0-9.eE+-]+?)\s*([a-z]*|%)", value)
         number = _number(match[1]) if match else math.nan
-        unit = (match[2] if match else "") or {"rad": ""}.get(units[name], units[name])
+        unit = (match[2] if match else "") or {"rad": "", "1": ""}.get(units[name], units[name])
         if not (number > 0 and math.isfinite(number)) or _QUANTITY.get(unit) != units[name]:
             allowed = ", ".join(one for one, quantity in _QUANTITY.items() if quantity == units[name])
             raise ConfigError(

@@ -33,7 +33,7 @@ class NuisanceValue(_Model):
     value: Pose
     prior: Annotated[float, Field(gt=0, le=1e3)]
     """Standard deviation of its prior about zero."""
-    unit: Literal["m", "rad", "s"]
+    unit: Literal["m", "rad", "s", "1"]
     """Of both."""
     of: Literal["pose", "cloth"] = "pose"
     """Of the scene against the recording (`fit.pose`), or of the cloth when its motion begins (`fit.laid`)."""
@@ -78,7 +78,7 @@ class RecordingFit(_Model):
     @classmethod
     def _lies_at_a_place(cls, told: dict[str, NuisanceValue]) -> dict[str, NuisanceValue]:
         if any(entry.of == "cloth" and entry.unit == "s" for entry in told.values()):
-            raise ValueError("how a cloth lies is in m or rad")
+            raise ValueError("how a cloth lies is in m, rad or 1")
         return told
 
     @model_validator(mode="after")
@@ -255,7 +255,7 @@ class FitRecord(_Model):
     @property
     def laid(self) -> dict[str, float]:
         """Name -> value, of how the cloth lies when its motion begins (`fit.laid`), as the simulator takes it."""
-        unit = {"m": self.length_unit_m, "rad": 1.0}
+        unit = {"m": self.length_unit_m, "rad": 1.0, "1": 1.0}
         return {name: entry.value / unit[entry.unit] for name, entry in self.nuisance.items() if entry.of == "cloth"}
 
     @property

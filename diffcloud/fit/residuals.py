@@ -21,11 +21,11 @@ import torch
 from torch import Tensor
 
 from diffcloud.fit.batches import without_diverged
+from diffcloud.fit.inputs import Inputs
 from diffcloud.fit.joint import AnyObjective, mean_terms
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
-from diffcloud.sim.properties import Properties
-from diffcloud.sim.simulate import Rollout, rollout_tangents, still
+from diffcloud.sim.simulate import Rollout
 from diffcloud.sim.threads import map_threads
 
 STEP = 0.05
@@ -130,21 +130,14 @@ def moved_by(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rol
 def _by_tangents(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rollout, Tensor]:
     axis = Axis.of(space)
 
+    def given(at: Tensor) -> Inputs:
+        return objective.inputs(space.parameters(axis.values(at)), objective.loss_steps)
+
     def inputs(at: Tensor) -> tuple[Tensor, ...]:
-        properties, start = objective.inputs(space.parameters(axis.values(at)))
-        return *properties.tensors(), *(() if start is None else (start.positions,))
+        return given(at).tensors()
 
     rates = [torch.cat(parts) for parts in zip(*_along(inputs, places, _ways(places)), strict=True)]
-    properties, start = objective.inputs(space.parameters(axis.values(places)))
-    run, moves = rollout_tangents(
-        objective.system,
-        objective.loss_steps,
-        properties=properties,
-        tangents=Properties(*rates[: len(properties.tensors())]),
-        state=start,
-        state_tangents=None if start is None else still(objective.system, rates[-1]),
-        track=objective.track,
-    )
+    run, moves = given(places).rollout_tangents(rates)
     times = objective.times
     return run, torch.stack([replace(run, positions=move).at(times) for move in moves])
 

@@ -31,17 +31,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from diffcloud.fit.inputs import Inputs
 from diffcloud.fit.joint import AnyObjective, loss_weights, mean_loss
-from diffcloud.fit.laid import asked_as, inputs_of
+from diffcloud.fit.laid import asked_as
 from diffcloud.fit.matching import Motion
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
-from diffcloud.fit.pose import NUISANCE, SET_UP, set_up_of, unit_of
+from diffcloud.fit.pose import NUISANCE, SET_UP, TRIED, set_up_of, unit_of
 from diffcloud.fit.residuals import Axis, moved_by
 from diffcloud.fit.targets import track_displacement
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import one_set
-from diffcloud.sim.simulate import Rollout, rollout
+from diffcloud.sim.simulate import Rollout
 from diffcloud.sim.threads import map_threads
 
 REFINED = 4
@@ -220,7 +221,7 @@ class _Part:
         # what is tried, to both sides: variables move nodes, pose variables the pose
         ways = torch.cat([rates * _STEP, refined[None]])[:, 0]
         ways = torch.nn.functional.pad(ways, (0, 0, 0, motion.nodes.shape[-2] - ways.shape[-2]))
-        small = torch.tensor([SET_UP[name] / unit_of(name, objective.length_unit_m) for name in pose_names])
+        small = torch.tensor([TRIED[name] / unit_of(name, objective.length_unit_m) for name in pose_names])
         still = torch.zeros(len(pose_names), *ways.shape[1:], dtype=torch.float64)
         ways, turns = torch.cat([ways, still]), torch.cat([torch.zeros(k + 1, len(pose_names)), small.diag()]).double()
         both = torch.cat([torch.zeros_like(ways[:1]), ways, -ways])
@@ -298,8 +299,7 @@ def _way_to(finer: Scenario, objective: Objective, parameters: Mapping[str, Tens
     if objective.episode.gripper is not None:
         moved = track_displacement(objective.episode, system.handles.grippers, steps, system.time_step)
         track = torch.as_tensor(moved)[None]
-    properties, start = inputs_of(finer, system, parameters)
-    fine = rollout(system, steps, properties=properties, state=start, track=track)
+    fine = Inputs.of(finer, system, steps, parameters, track).rollout()
     own = run.at(objective.times)
     return fine.at(objective.times)[..., : own.shape[-2], :] - own
 

@@ -179,6 +179,20 @@ class Episode:
             raise EpisodeError(f"lag_sigma_s of an episode's refinement is a positive number of seconds, got {told!r}.")
         return float(told)
 
+    @property
+    def scale_sigma(self) -> float | None:
+        """By which part of themselves distances in the clouds may be off, one standard deviation; None where nobody says.
+
+        Raises:
+            EpisodeError: the meta's is no part between 0 and 1.
+        """
+        told = self.meta.get("scale_sigma")
+        if told is None:
+            return None
+        if isinstance(told, bool) or not isinstance(told, int | float) or not 0 < told < 1:
+            raise EpisodeError(f"scale_sigma of an episode's meta is a part above 0 and below 1, got {told!r}.")
+        return float(told)
+
     @cached_property
     def pinholes(self) -> tuple[Pinhole, ...]:
         """[C] the cameras whose lost pixels are known; empty where none is.

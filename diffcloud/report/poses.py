@@ -11,7 +11,7 @@ from diffcloud.fit.laid import asked_as
 from diffcloud.fit.record import FitRecord, NuisanceValue, RecordingFit
 from diffcloud.report.tables import UNKNOWN, Cell, Table, number, table
 
-_SHOWN = {"m": (1e3, "mm", 1), "rad": (180 / math.pi, "°", 1), "s": (1e3, "ms", 1)}
+_SHOWN = {"m": (1e3, "mm", 1), "rad": (180 / math.pi, "°", 1), "s": (1e3, "ms", 1), "1": (1e2, "%", 1)}
 """Unit -> factor, unit shown, digits."""
 _WIDE = 2.0
 """A value so many of its prior's deviations off zero is pointed out."""

@@ -63,6 +63,7 @@ def build_system(
                 "shear": 1.0,
                 "compression": material.compression,
                 "damping": material.damping,
+                "gravity": 1.0,
                 "air_density": surrounding.air_density,
                 "air_drag": surrounding.air_drag,
                 "friction_obstacle": surrounding.friction_obstacle,

@@ -98,6 +98,25 @@ class Handles:
         first = np.where(active.any(axis=0), active.argmax(axis=0), len(times))
         return HandleSchedule(strength, linear, translation, first, np.full(len(self.handles), -1))
 
+    def own_track(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[S, G, 3] displacement of each gripper since the start at the end of each step, times [S] [s], as the scene says.
+
+        Raises:
+            SceneError: a gripper turns what it holds, or moves its nodes in different ways.
+        """
+        schedule = self.schedule(times)
+        first = np.minimum(schedule.first_step, len(times) - 1)
+        moved = schedule.translation - schedule.translation[first, np.arange(len(self.handles))]
+        found = np.zeros((len(times), len(self.grippers), 3))
+        for index, name in enumerate(self.grippers):
+            own = [h for h, handle in enumerate(self.handles) if handle.motion is not None and handle.gripper == name]
+            found[:, index] = moved[:, own[0]]
+            if not np.allclose(schedule.linear[:, own], np.eye(3)) or not np.allclose(moved[:, own], found[:, index, None]):
+                raise SceneError(
+                    f"The gripper {name} turns what it holds, or moves its nodes differently: that is no track. Record one."
+                )
+        return found
+
     def tracked_schedule(self, times: NDArray[np.float64]) -> HandleSchedule:
         """The schedule with moving handles displaced as their grippers are, from where their nodes start.
 

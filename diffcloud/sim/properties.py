@@ -34,6 +34,8 @@ class Properties:
     """[B, H] multiplier on the bending table of each hinge [-]."""
     damping: Tensor
     """[B] stiffness-proportional damping [s]."""
+    gravity: Tensor
+    """[B] multiplier on gravity [-]."""
     air_density: Tensor
     """[B] of the quadratic normal drag [kg/m³]."""
     air_drag: Tensor

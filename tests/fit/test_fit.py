@@ -14,14 +14,13 @@ from diffcloud.errors import ConfigError, DivergedError, EpisodeError
 from diffcloud.fit import AdamSettings, FitSpace, JointObjective, Objective, fit_adam
 from diffcloud.fit.agreement import Agreement, gradient_agreement, random_parameters
 from diffcloud.fit.benchmark import time_contact
-from diffcloud.fit.laid import inputs_of
+from diffcloud.fit.inputs import Inputs
 from diffcloud.fit.record import FittedParameter, read_fit
 from diffcloud.fit.result import describe_fit, write_fit
 from diffcloud.fit.targets import track_displacement
 from diffcloud.fit.visibility import visibility_map
 from diffcloud.io.episodes import Episode
 from diffcloud.scene import load_scenario
-from diffcloud.sim import rollout
 from diffcloud.sim.properties import one_set
 from tests.conftest import paper_objective, small_lift
 
@@ -31,9 +30,7 @@ def clouds_of(scenario, *, points=800, seed=5, gripper=True, shift=(0, 0, 0), ya
     from diffcloud.clouds import SurfaceSampler
 
     system, _ = scenario.scene.build()
-    values = one_set(truth)
-    properties, start = inputs_of(scenario, system, values)
-    run = rollout(system, scenario.steps, properties=properties, state=start)
+    run = Inputs.of(scenario, system, scenario.steps, one_set(truth), None).rollout()
     nodes = run.positions[0, :: scenario.scene.frame_steps]
     generator = torch.Generator().manual_seed(seed)
     sampler = SurfaceSampler.build(torch.as_tensor(system.mesh.faces), points, generator=generator)

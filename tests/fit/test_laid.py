@@ -176,7 +176,7 @@ def test_it_is_told_as_nuisance_and_read_back(objective, fits, tmp_path):
     assert flat > 5 * again
     (lies,) = laid_nodes(SCENARIO.scene.mesh, column(**record.laid))
     np.testing.assert_allclose(result.motions[0].nodes[0], lies, atol=1e-15)
-    for change, message in (({"unit": "s"}, "m or rad"), ({"of": "table"}, "cloth")):
+    for change, message in (({"unit": "s"}, "how a cloth lies is in m, rad or 1"), ({"of": "table"}, "cloth")):
         told = json.loads((tmp_path / "e.json").read_text())
         told["episodes"][0]["nuisance"]["turn"] |= change
         (tmp_path / "damaged.json").write_text(json.dumps(told))

@@ -237,6 +237,11 @@ class TestWhatCounts:
         with pytest.raises(EpisodeError, match="lag_sigma_s of an episode's refinement"):
             Objective(scenario, replace(episode, meta={"quality": {"refinement": {"lag_sigma_s": told}}}))
 
+    @pytest.mark.parametrize("told", [-0.01, 0, 1.5, math.nan, True, "4%", [0.04]])
+    def test_scales_that_are_none(self, scenario, episode, told):
+        with pytest.raises(EpisodeError, match="scale_sigma of an episode's meta"):
+            Objective(scenario, replace(episode, meta={"scale_sigma": told}))
+
     def test_points_that_are_sure_count_more(self, scenario, episode):
         """Half of the recorded points are 2 cm too high; said to be uncertain, they move the loss less."""
         points = episode.points.copy()

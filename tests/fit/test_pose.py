@@ -33,11 +33,11 @@ def points(generator):
 class TestTransform:
     def test_a_rotation_vector_about_the_centre_and_a_shift(self, points, poses):
         found = space().moved(points, poses)
-        x, y, z, tilt_x, tilt_y, yaw = poses[:, :6].T
+        x, y, z, tilt_x, tilt_y, yaw, _, scale = poses.T
         for row in range(len(poses)):
             turn = Rotation.from_rotvec([tilt_x[row], tilt_y[row], yaw[row]]).as_matrix()
             shift = np.array([x[row], y[row], z[row]])
-            expected = (points[row].numpy() - CENTRE.numpy()) @ turn.T + CENTRE.numpy() + shift
+            expected = math.exp(scale[row]) * (points[row].numpy() - CENTRE.numpy()) @ turn.T + CENTRE.numpy() + shift
             np.testing.assert_allclose(found[row].numpy(), expected, atol=1e-12)
 
     def test_back_is_its_inverse(self, points, poses):
@@ -45,9 +45,18 @@ class TestTransform:
         there = space().back(recorded, poses)
         torch.testing.assert_close(space().moved(there, poses), recorded.expand_as(there))
 
-    def test_distances_stay(self, points, poses):
+    def test_distances_scale(self, points, poses):
         moved = space().moved(points, poses)
-        torch.testing.assert_close((moved[:, 0] - moved[:, 1]).norm(dim=-1), (points[:, 0] - points[:, 1]).norm(dim=-1))
+        before, after = ((of[:, 0] - of[:, 1]).norm(dim=-1) for of in (points, moved))
+        torch.testing.assert_close(after, poses[:, -1, None].exp() * before)
+
+    def test_depths_that_are_too_large_scale_about_the_camera(self, points):
+        """So a scale about the centre and a shift tell of the same clouds."""
+        camera, part = torch.tensor([1.2, 0.1, 0.9], dtype=torch.float64), 0.03
+        seen = camera + math.exp(part) * (points - camera)
+        shift = (math.exp(part) - 1) * (CENTRE - camera)
+        values = torch.cat([shift, torch.tensor([part], dtype=torch.float64)]).expand(4, -1)
+        torch.testing.assert_close(space("x", "y", "z", "scale").moved(points, values), seen)
 
     def test_zero_leaves_all_in_place(self, points):
         torch.testing.assert_close(space().moved(points, torch.zeros(4, len(NUISANCE), dtype=torch.float64)), points)

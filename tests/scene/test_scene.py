@@ -78,7 +78,7 @@ def test_every_field_reaches_the_system(folder):
     assert float(system.properties.friction_cloth) == 0.5
     assert float(system.properties.friction_obstacle) == 0.2
     assert (system.scene.terms.air.wind == [1, 0, 0]).all()
-    assert (system.scene.terms.gravity.gravity == [0, 0, -30]).all()
+    assert (system.scene.terms.gravity.acceleration == [0, 0, -30]).all()
     assert system.handles.nodes == [0, 2, 8]
     assert system.handles.stiffness == 500
     assert system.handles.handles[2].start == 0.1

@@ -156,8 +156,8 @@ def test_both_modes_agree_with_each_other_and_with_differences(name):
     assert backwards == pytest.approx(float((found[0, 0] * weights).sum()), rel=1e-10)
     with torch.no_grad():
         # where something begins to touch within the step of a difference, that difference is of two motions; and small
-        # ones show the solver's tolerance
-        sizes = (3e-5, 1e-5, 3e-6)
+        # ones are of the iterate with which the solver stops, not of the solution that it is close to
+        sizes = (3e-4, 3e-5, 3e-6)
         differences = [float(value(size) - value(-size)) / (2 * size) for size in sizes]
     assert min(abs(one - backwards) for one in differences) < 1e-5 * scale
     assert (float(Properties(*gradients[: len(fields)]).compression) != 0) == (name == "wrinkling")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
@@ -148,6 +149,14 @@ class TestProblem:
         assert (problem.friction, problem.self_friction) == (0.4, 0.6)
         assert problem.table == pytest.approx(float(towel().scene.surrounding.obstacles[0].nodes[0, 2]))
         np.testing.assert_allclose(problem.times, np.arange(7) * 0.1)
+
+    def test_has_the_fitted_size(self):
+        size = NuisanceValue(value=0.05, prior=0.02, unit="1", of="cloth")
+        larger = exported(one=recording_of("e1", nuisance={"size": size}, centre=[0.5, 0.0, 0.1])).problem
+        grown, own = math.exp(0.05), exported().problem
+        np.testing.assert_allclose(larger.mesh.verts, grown * own.mesh.verts)
+        np.testing.assert_allclose(larger.node_mass, grown**2 * own.node_mass)
+        assert larger.sheet == own.sheet
 
     def test_holds_its_nodes_as_the_fit_did(self):
         cloth = exported()

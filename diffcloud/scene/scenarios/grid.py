@@ -56,6 +56,10 @@ class GridScenario(ScenarioOptions):
     """How far askew the cloth may lie at the start, one standard deviation; 0: not at all. Fits find it."""
     laid_shape_m: Annotated[float, Field(ge=0, le=1)] = 0.0
     """How uneven: one standard deviation of the height of each of nine waves."""
+    laid_size: Annotated[float, Field(ge=0, le=0.2)] = 0.0
+    """By which part of itself the cloth may be larger or smaller than `size_m`, one standard deviation."""
+    laid_track: Annotated[float, Field(ge=0, le=0.2)] = 0.0
+    """By which part of itself the gripper's way may be longer or shorter than recorded, one standard deviation."""
 
     @model_validator(mode="after")
     def _is_grasped_once(self) -> GridScenario:
@@ -127,7 +131,12 @@ def grid_scenario(options: GridScenario) -> Scenario:
         held=_named_nodes(options, options.held),
         loss_faces=_half(mesh, grasped) if options.loss_surface == "grasped_half" else None,
     )
-    laid = {"turn": math.radians(options.laid_turn_deg), "shape": options.laid_shape_m}
+    laid = {
+        "turn": math.radians(options.laid_turn_deg),
+        "shape": options.laid_shape_m,
+        "size": options.laid_size,
+        "track": options.laid_track,
+    }
     return replace(scenario, laid={name: deviation for name, deviation in laid.items() if deviation})
 
 

@@ -29,6 +29,8 @@ class Parameters(NamedTuple):
     """[H] multiplier on the bending table of each hinge [-]."""
     damping: Floats
     """[1] stiffness-proportional damping [s]."""
+    gravity: Floats
+    """[1] multiplier on gravity [-]."""
     air_density: Floats
     """[1] of the quadratic normal drag [kg/m³]."""
     air_drag: Floats

@@ -97,9 +97,22 @@ def _without_air(p: Parameters) -> Parameters:
     """The cautious matrix has elastic forces and contact only."""
     none = np.zeros(1)
     return Parameters(
-        p.node_mass, p.inverse_mass, p.stretching, p.shear, p.compression, p.bending, p.damping, none, none,
-        p.friction_obstacle, p.friction_cloth, p.body_mass, p.hold, p.target,
-    )  # fmt: skip
+        node_mass=p.node_mass,
+        inverse_mass=p.inverse_mass,
+        stretching=p.stretching,
+        shear=p.shear,
+        compression=p.compression,
+        bending=p.bending,
+        damping=p.damping,
+        gravity=p.gravity,
+        air_density=none,
+        air_drag=none,
+        friction_obstacle=p.friction_obstacle,
+        friction_cloth=p.friction_cloth,
+        body_mass=p.body_mass,
+        hold=p.hold,
+        target=p.target,
+    )
 
 
 @kernel

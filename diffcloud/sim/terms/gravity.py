@@ -1,4 +1,4 @@
-"""Weight: f = m g on each node."""
+"""Weight: f = m γ g on each node, with a multiplier γ on gravity."""
 
 from __future__ import annotations
 
@@ -11,15 +11,24 @@ from diffcloud.sim.terms.term import Element, Elements, Setup, Term
 
 
 def force(node: Element) -> Sequence[Vector]:
-    """m g."""
-    return [node.parameter("node_mass") * node.vector("gravity")]
+    """m γ g."""
+    return [(node.parameter("node_mass") * node.parameter("gravity")) * node.vector("acceleration")]
 
 
 def build(setup: Setup) -> Elements:
     """All nodes."""
     nodes = np.arange(len(setup.mesh.nodes))[:, None]
-    return Elements(nodes, {"gravity": np.tile(np.array(setup.surrounding.gravity, dtype=np.float64), (len(nodes), 1))})
+    return Elements(
+        nodes, {"acceleration": np.tile(np.array(setup.surrounding.gravity, dtype=np.float64), (len(nodes), 1))}
+    )
 
 
-TERM = Term("gravity", corners=1, force=force, build=build, constants={"gravity": (3,)}, parameters={"node_mass": "corner"})
+TERM = Term(
+    "gravity",
+    corners=1,
+    force=force,
+    build=build,
+    constants={"acceleration": (3,)},
+    parameters={"node_mass": "corner", "gravity": "episode"},
+)
 """Constants: g [m/s²]."""

@@ -36,10 +36,9 @@ def force(face: Element) -> Sequence[Vector]:
     du, dv = along_material(face, face.displacement)
     along_u, along_v = along_material(face, [face.ahead * velocity for velocity in face.after])
     e00, e11, e01 = strain(xu, xv)
-    k0, k1, k2, k3 = coefficients(face, e00, e11, e01)
+    stiffness = k0, k1, k2, _ = coefficients(face, e00, e11, e01)
     d00, d11, d01 = strain_change(xu, xv, du, dv)
-    p00, p11, p01 = e00 + d00, e11 + d11, e01 + d01
-    stress_u, stress_v, shear = k0 * p00 + k1 * p11, k1 * p00 + k2 * p11, k3 * p01
+    stress_u, stress_v, shear = stress(stiffness, (e00 + d00, e11 + d11, e01 + d01))
     stretched_u, stretched_v = maximum(e00, 0.0), maximum(e11, 0.0)
     tension_u, tension_v = k0 * stretched_u + k1 * stretched_v, k1 * stretched_u + k2 * stretched_v
     row_u = stress_u * xu + shear * xv + tension_u * along_u
@@ -96,6 +95,12 @@ def strain(xu: Vector, xv: Vector) -> Symmetric:
 def strain_change(xu: Vector, xv: Vector, du: Vector, dv: Vector) -> Symmetric:
     """Of E by a displacement with these derivatives, to first order."""
     return dot(xu, du), dot(xv, dv), 0.5 * (dot(xu, dv) + dot(xv, du))
+
+
+def stress(stiffness: Sequence[Scalar], by: Symmetric) -> Symmetric:
+    """C : by, of an orthotropic C."""
+    (k0, k1, k2, k3), (along_u, along_v, across) = stiffness, by
+    return k0 * along_u + k1 * along_v, k1 * along_u + k2 * along_v, k3 * across
 
 
 def on_corners(face: Element, row_u: Vector, row_v: Vector) -> Sequence[Vector]:

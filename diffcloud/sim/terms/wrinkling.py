@@ -34,6 +34,7 @@ from diffcloud.sim.terms.stretching import (
     on_corners,
     strain,
     strain_change,
+    stress,
 )
 from diffcloud.sim.terms.term import Element, Elements, Setup, Term
 
@@ -94,7 +95,7 @@ class _Wrinkling:
         k1 = minimum(k1, _COUPLED * squareroot(k0 * k2))
         self._stiffness = k0, k1, k2, k3
         strained = e00, e11, e01 = along_u + _BEGINS, along_v + _BEGINS, across
-        whole = s00, s11, s01 = self._stress(strained)
+        whole = s00, s11, s01 = stress(self._stiffness, strained)
         self._taut = (s00 * s11 >= s01 * s01) & (s00 + s11 >= 0.0)
         self._slack = (e00 * e11 >= e01 * e01) & (e00 + e11 <= 0.0)
         flat = k0 * k2 - k1 * k1
@@ -104,7 +105,7 @@ class _Wrinkling:
         self._lost = lost = _combined(1.0, whole, -1.0, self._kept)
         energy = 0.5 * _double(strained, whole)
         kept = where(self._taut, energy, where(self._slack, 0.0, self._pulled.energy()))
-        given_up = 0.5 * _squared(lost, compliance)  # energy - kept, without what would cancel
+        given_up = 0.5 * _double(lost, stress(compliance, lost))  # energy - kept, without what would cancel
         self._scale = 0.25 * _BEGINS * _BEGINS * (k0 + k2) + _TINY
         self._slackening = _Slackening(squareroot(kept / self._scale + _TINY))
         self._loss = _Loss(squareroot(given_up / self._scale + _TINY))
@@ -117,7 +118,7 @@ class _Wrinkling:
 
     def change(self, by: Symmetric) -> Symmetric:
         """Of the stress by a change of the strain."""
-        whole = self._stress(by)
+        whole = stress(self._stiffness, by)
         kept = self._relaxed(whole, self._pulled.change(by))
         shares = _combined(self._slackening.share, kept, self._loss.share, _combined(1.0, whole, -1.0, kept))
         slackens, loses = (
@@ -125,11 +126,6 @@ class _Wrinkling:
             for one, stress in ((self._slackening, self._kept), (self._loss, self._lost))
         )
         return _combined(1.0, shares, 1.0, _combined(slackens, self._kept, loses, self._lost))
-
-    def _stress(self, by: Symmetric) -> Symmetric:
-        """C : by"""
-        (k0, k1, k2, k3), (along_u, along_v, across) = self._stiffness, by
-        return k0 * along_u + k1 * along_v, k1 * along_u + k2 * along_v, k3 * across
 
     def _relaxed(self, whole: Symmetric, pulled: Symmetric) -> Symmetric:
         """By whether the face is taut, slack or wrinkled."""
@@ -216,7 +212,7 @@ class _Along:
         self.turning = -between, between, 0.5 * cosine
         self.strain = _double(self.tensor, strained)
         turned = _double(self.turning, strained)
-        self.compliance = _squared(self.tensor, compliance)
+        self.compliance = _double(self.tensor, stress(compliance, self.tensor))
         rate = second * along_v - first * along_u + 0.5 * shared * cosine
         self.softer = sine * rate
         softest = cosine * rate + 0.5 * sine * sine * (first + second - shared)
@@ -242,13 +238,6 @@ def _turned(cosine: Scalar, sine: Scalar, tangent: Scalar) -> tuple[Scalar, Scal
 def _double(one: Sequence[Scalar], other: Sequence[Scalar]) -> Scalar:
     """one : other"""
     return one[0] * other[0] + one[1] * other[1] + 2.0 * one[2] * other[2]
-
-
-def _squared(stress: Symmetric, compliance: Sequence[Scalar]) -> Scalar:
-    """stress : C⁻¹ : stress"""
-    (along_u, along_v, across), (first, coupled, second, shear) = stress, compliance
-    axial = first * along_u * along_u + 2.0 * coupled * along_u * along_v + second * along_v * along_v
-    return axial + 2.0 * shear * across * across
 
 
 def _combined(a: Scalar | float, one: Symmetric, b: Scalar | float, other: Symmetric) -> Symmetric:

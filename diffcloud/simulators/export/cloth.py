@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -84,6 +85,9 @@ def fitted_cloth(
             f"The fit's mesh ({motion.nodes.shape[1]} nodes) is not that of the scenario {scenario.name} "
             f"({len(scene.mesh.nodes)} nodes); give the fitted one with --scenario."
         )
+    size = recording.nuisance.get("size")
+    if size is not None:
+        scene = replace(scene, mesh=replace(scene.mesh, verts=math.exp(size.value) * scene.mesh.verts))
     linear = bool(np.allclose(scene.material.stretching, scene.material.stretching[0], rtol=_WORTH_SAYING))
     tried = [_cloth(recording, motion, scene, strained) for strained in ((0.0,) if linear else _STRAINED)]
     return tried[0] if linear else min(tried, key=lambda cloth: float(cloth.simplified_m.mean()))
@@ -214,12 +218,13 @@ def _metric(mesh: ClothMesh, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _levelled(points: NDArray[np.float64], space: PoseSpace, pose: torch.Tensor) -> tuple[NDArray[np.float64], float]:
-    """Points of the recording [..., 3] without its tilt, and that [rad]."""
+    """Points of the recording [..., 3] without its tilt, as large as they are, and the tilt [rad]."""
     level = pose.clone()
     tilted = [index for index, name in enumerate(space.names) if name.startswith("tilt")]
-    if not tilted or not len(points):
+    of_cameras = [*tilted, *(index for index, name in enumerate(space.names) if name == "scale")]
+    if not of_cameras or not len(points):
         return points, 0.0
-    level[:, tilted] = 0.0
+    level[:, of_cameras] = 0.0
     scene = space.back(torch.as_tensor(points), pose)[0]
     return space.moved(scene[None], level)[0].numpy(), float(pose[0, tilted].norm())
 
