@@ -17,7 +17,7 @@ from rich.table import Table
 from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, state_intervals
 from diffcloud.fit import solve
-from diffcloud.fit.pose import NUISANCE, SET_UP, PoseSpace
+from diffcloud.fit.pose import SET_UP, PoseSpace
 from diffcloud.fit.uncertainty import finer_steps
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import write_json, write_text
@@ -300,7 +300,7 @@ def _misplaced(config: EpisodesConfig, set_up: Mapping[str, float]) -> EpisodesC
 def _displaced(episode: Episode, set_up: Mapping[str, float]) -> Episode:
     """An episode as it would be seen with these errors."""
     points = torch.from_numpy(episode.points.astype(np.float64))
-    names = tuple(name for name in NUISANCE if name != "lag")
+    names = tuple(name for name in SET_UP if name != "lag")
     space = PoseSpace.build(dict.fromkeys(names, 1.0), points.mean(0), length_unit_m=1.0)
     values = [set_up[name] + set_up.get(f"laid_{name}", 0.0) for name in names]
     moved = space.moved(points[None], torch.tensor([values], dtype=torch.float64))[0]

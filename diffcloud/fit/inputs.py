@@ -2,12 +2,15 @@
 
 A cloth s times as large as the scene's, x = c + s (ξ - c), moves as the scene's own cloth ξ does where
 
-    stretching is k / s²,  bending B / s⁴,  gravity g / s,  air density ρ s,  and the gripper goes u / s.
+    stretching is k / s²,  bending B / s⁴,  gravity g / s,  air density ρ s,  and the gripper's displacement u / s.
 
-For its inertia grows with s⁴, its weight with s³, the energy of stretching with s², that of bending not at all, and the
-work of quadratic drag with s⁵. Tangential drag grows as inertia does; shear, compression, damping and friction are ratios.
-So the mesh and all that is computed from it stay. c is below the cloth's middle, on the table, which so stays too. Contact
-is s times as thick, and soft handles are s² times as stiff; for sizes off by a few percent, neither matters.
+Written in ξ, inertia gains a factor s⁴, weight s³, the energy of stretching s², that of bending none, and the work of
+quadratic drag s⁵; all is divided by s⁴. Linear drag gains what inertia does; shear, compression and friction are ratios,
+and damping is a time. So the mesh and all that is computed from it stay.
+
+c is below the cloth's middle, on the table, so the table does not move. The grasped nodes do, and the pose takes that up.
+Contact and the gap below the cloth are s times as thick, soft handles s² times as stiff, and a bending table is read at a
+curvature s times too large: for sizes off by a few percent, this hardly matters.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloud.fit.laid import is_laid, laid_nodes, sizes_of
+from diffcloud.fit.laid import check_resizable, is_laid, laid_nodes, sizes_of
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.simulate import Rollout, init, rollout, rollout_tangents, still
@@ -50,13 +53,16 @@ class Inputs:
             track: [1, S or more, G, 3] recorded displacement of the grippers [m]; None: the scene's own motion.
 
         Raises:
-            ConfigError: an unknown parameter.
-            SceneError: a size, or a scale of the track, where the scene turns what it holds.
+            ConfigError: an unknown parameter, or a size where there is more around the cloth than a table.
+            SceneError: a size or a longer way, but neither a track nor a motion of the scene that is one.
         """
         size, reach = sizes_of(values)
+        count = len(next(iter(values.values()))) if values else 1
         nodes = laid_nodes(system.mesh, values)
         properties = scenario.properties(system, {name: value for name, value in values.items() if not is_laid(name)})
+        properties = properties.repeated(count) if properties.batch < count else properties
         if size is not None:
+            check_resizable(scenario)
             properties = replace(
                 properties,
                 stretching=properties.stretching / size[:, None] ** 2,
@@ -64,11 +70,11 @@ class Inputs:
                 gravity=properties.gravity / size,
                 air_density=properties.air_density * size,
             )
-        if reach is not None:
+        if reach is not None and system.handles.grippers:
             if track is None:
                 track = torch.as_tensor(system.handles.own_track(np.cumsum(np.full(steps, system.time_step))))[None]
             track = track * _beside(reach)
-        track = None if track is None else track[:, :steps].expand(properties.batch, -1, -1, -1)
+        track = None if track is None else track[:, :steps].expand(count, -1, -1, -1)
         state = None if nodes is None else init(system, len(nodes), positions=nodes)
         return Inputs(system, steps, properties, state, track, size)
 

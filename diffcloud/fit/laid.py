@@ -28,10 +28,11 @@ from diffcloud.fit.priors import parse_deviations
 from diffcloud.fit.record import NuisanceValue
 from diffcloud.mesh.topology import ClothMesh
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim.surrounding import Surrounding
 
 LAID: dict[str, Literal["m", "rad", "1"]] = {"turn": "rad", "shape": "m", "size": "1", "track": "1"}
 """Name -> unit. `shape` stands for the height of each wave."""
+LARGEST_SHARE = 0.2
+"""Standard deviation of `size` or `track`."""
 _SHAPES = {f"shape_{i}_{j}": (i, j) for i in range(4) for j in range(4) if 0 < i + j <= 3}
 _FLAT = 1e-6
 """Part of its size by which a level cloth may be off."""
@@ -43,9 +44,16 @@ def parse_laid(text: str) -> dict[str, float]:
     """What `--laid` says -> name -> standard deviation of its prior [m, rad, 1], as of `parse_deviations`.
 
     Raises:
-        ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.
+        ConfigError: an unknown name or unit, a unit of something else, what is no positive number, or a share that is too
+            large; names it.
     """
-    return parse_deviations(text, "laid", LAID)
+    found = parse_deviations(text, "laid", LAID)
+    for name, deviation in found.items():
+        if LAID[name] == "1" and deviation > LARGEST_SHARE:
+            raise ConfigError(
+                f"laid {name}={100 * deviation:g}%: at most {100 * LARGEST_SHARE:g}%; state what is that far off."
+            )
+    return found
 
 
 def with_laid(space: FitSpace, laid: Mapping[str, float], scenarios: Sequence[Scenario]) -> FitSpace:
@@ -69,8 +77,8 @@ def with_laid(space: FitSpace, laid: Mapping[str, float], scenarios: Sequence[Sc
     nodes = scenarios[0].scene.mesh.nodes
     if np.ptp(nodes[:, 2]) > _FLAT * np.ptp(nodes, axis=0).max():
         raise ConfigError(f"{told}this needs a cloth that lies level at the start; that of {scenarios[0].name} does not.")
-    if "size" in laid and (more := _beyond_a_table(scenarios[0].scene.surrounding)):
-        raise ConfigError(f"laid size: this needs a scene of cloth and table alone; {scenarios[0].name} also has {more}.")
+    if "size" in laid:
+        check_resizable(scenarios[0])
     names = [own for name in LAID if name in laid for own in (_SHAPES if name == "shape" else (name,))]
     own = [_variable(name, laid[asked_as(name)], scenarios[0].length_unit_m) for name in names]
     return FitSpace((*space.variables, *own), space.fixed)
@@ -88,8 +96,12 @@ def variables_of(described: Mapping[str, NuisanceValue], *, length_unit_m: float
     return [_variable(name, entry.prior, length_unit_m) for name, entry in described.items()]
 
 
-def _beyond_a_table(around: Surrounding) -> str:
-    """What of a scene does not grow with the cloth."""
+def check_resizable(scenario: Scenario) -> None:
+    """
+    Raises:
+        ConfigError: there is more around the cloth than a level table, which does not grow with it.
+    """
+    around = scenario.scene.surrounding
     planes = [surface.plane() for surface in around.obstacles]
     level = [plane is not None and bool(abs(plane[0][2]) > 1 - _FLAT) for plane in planes]
     found = {
@@ -98,7 +110,9 @@ def _beyond_a_table(around: Surrounding) -> str:
         "further forces": bool(around.forces),
         "obstacles other than a level table": not all(level) or len(level) > 1,
     }
-    return ", ".join(name for name, there in found.items() if there)
+    if any(found.values()):
+        more = ", ".join(name for name, there in found.items() if there)
+        raise ConfigError(f"laid size: this needs a scene of cloth and table alone; {scenario.name} also has {more}.")
 
 
 def _variable(name: str, deviation: float, length_unit_m: float) -> Variable:

@@ -8,8 +8,9 @@ t = (x, y, z), shown e^scale times as large, and looked at later by `lag`, as fa
 On a level table, x and y, and yaw of cloth, gripper and bodies together, are symmetries of the motion: they need no new
 simulation. A cloth that lies turned under a gripper which does not turn is another motion; yaw only approximates it. z and
 the tilts are those of the cameras against the robot, which a calibration knows to millimetres. `scale` is that of the
-cameras' depths: whatever a pinhole sees, depths that are 3 % too large show as 3 % larger about the camera. A cloud stamped
-t shows the motion at t + lag.
+cameras' depths. One camera whose depths are 3 % too large shows everything 3 % larger, about itself; but where cameras were
+registered by such depths, their clouds fit together, and are in place, where the board was. So the scale is about c, and
+shifts are what is left. A cloud stamped t shows the motion at t + lag.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ SET_UP = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.005, 
 """Standard deviations of a calibrated set-up [m, rad, s]: of its cameras against the robot, and of its clock."""
 LAID = {"x": 0.1, "y": 0.1, "yaw": math.radians(30)}
 """Of where a hand lays a cloth that the scene places [m, rad]."""
-TRIED = {**SET_UP, "scale": 0.002}
+TRIED = {**SET_UP, "scale": 0.01}
 """A small change of each variable, in the same units."""
 _RESOLVED = {"m": 3e-4, "rad": 1.5e-3, "s": 3e-4, "1": 1.5e-3}
 """A step as small as this is the last one to a pose; what is left changes little."""
@@ -56,13 +57,14 @@ def unit_of(name: str, length_unit_m: float) -> float:
 
 
 def set_up_of(episode: Episode) -> dict[str, float]:
-    """`SET_UP` with the clock of an episode: as far as preprocessing has measured it.
+    """`SET_UP` with the clock of an episode, as far as preprocessing has measured it, and its scale, where it says how far
+    that may be off.
 
     Raises:
         EpisodeError: the episode's meta is damaged.
     """
-    measured = episode.lag_sigma_s
-    return SET_UP if measured is None else {**SET_UP, "lag": measured}
+    measured = {"lag": episode.lag_sigma_s, "scale": episode.scale_sigma}
+    return SET_UP | {name: sigma for name, sigma in measured.items() if sigma is not None}
 
 
 def default_priors(episode: Episode) -> dict[str, float]:
@@ -71,8 +73,7 @@ def default_priors(episode: Episode) -> dict[str, float]:
     Raises:
         EpisodeError: the episode's meta is damaged.
     """
-    scale = episode.scale_sigma
-    return {**set_up_of(episode), **LAID, **({} if scale is None else {"scale": scale})}
+    return {**set_up_of(episode), **LAID}
 
 
 def parse_priors(text: str) -> dict[str, float]:
@@ -91,7 +92,7 @@ class PoseSpace:
     names: tuple[str, ...]
     """d of them."""
     deviations: Tensor
-    """[d] of their priors about zero, in the scene's length unit, rad and s."""
+    """[d] of their priors about zero, in the scene's length unit, rad, s and 1."""
     resolved: Tensor
     """[d] a step no larger than this ends the search for a pose."""
     prior_weights: Tensor
@@ -103,7 +104,7 @@ class PoseSpace:
     def build(priors: Mapping[str, float], centre: Tensor, *, length_unit_m: float) -> PoseSpace:
         """
         Args:
-            priors: name -> standard deviation [m, rad, s].
+            priors: name -> standard deviation [m, rad, s, 1].
 
         Raises:
             ConfigError: an unknown name, or what is no positive number.
@@ -166,7 +167,7 @@ class PoseSpace:
         return _turned(vectors, self.rotation(values))
 
     def carried(self, vectors: Tensor, values: Tensor) -> Tensor:
-        """[B, ..., 3] distances in the scene at values [B, d] -> in the recording."""
+        """[B, ..., 3] displacements in the scene at values [B, d] -> in the recording."""
         return _turned(vectors, self._growth(values)[..., None] * self.rotation(values))
 
     def back(self, points: Tensor, values: Tensor) -> Tensor:

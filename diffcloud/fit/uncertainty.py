@@ -37,7 +37,7 @@ from diffcloud.fit.laid import asked_as
 from diffcloud.fit.matching import Motion
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
-from diffcloud.fit.pose import NUISANCE, SET_UP, TRIED, set_up_of, unit_of
+from diffcloud.fit.pose import NUISANCE, TRIED, set_up_of, unit_of
 from diffcloud.fit.residuals import Axis, moved_by
 from diffcloud.fit.targets import track_displacement
 from diffcloud.scene.scenarios import Scenario
@@ -240,7 +240,7 @@ class _Part:
         if len(felt) > k:
             onto[:, k:] = -np.linalg.solve(curved[k:, k:], curved[k:, :k]).T
         found = {
-            name: onto @ change[index, felt] * (set_up[name] / SET_UP[name] if name in NUISANCE else 1.0)
+            name: onto @ change[index, felt] * (set_up[name] / TRIED[name] if name in set_up else 1.0)
             for index, name in enumerate(names)
             if index not in own and not (name in NUISANCE and objective.paper)
         }

@@ -181,16 +181,16 @@ class Episode:
 
     @property
     def scale_sigma(self) -> float | None:
-        """By which part of themselves distances in the clouds may be off, one standard deviation; None where nobody says.
+        """By what fraction distances in the clouds may be off, one standard deviation; None where the meta does not say.
 
         Raises:
-            EpisodeError: the meta's is no part between 0 and 1.
+            EpisodeError: the meta's value is not between 0 and 1.
         """
         told = self.meta.get("scale_sigma")
         if told is None:
             return None
         if isinstance(told, bool) or not isinstance(told, int | float) or not 0 < told < 1:
-            raise EpisodeError(f"scale_sigma of an episode's meta is a part above 0 and below 1, got {told!r}.")
+            raise EpisodeError(f"scale_sigma in an episode's meta must be a fraction between 0 and 1, got {told!r}.")
         return float(told)
 
     @cached_property

@@ -29,7 +29,8 @@ RECORDED_START_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(
 )
 """Kind of motion -> x and y in the clouds' frame where its gripper starts, and what to add to the robot's z [m]."""
 _SCALE_SIGMA = 0.04
-"""By which part distances in the clouds may be off: in published calibration images, the board is 3 to 6 % too large."""
+"""By what fraction distances in the clouds may be off. In the published calibration images, the board is 3 to 6 % too
+large; but what the clouds themselves were made with was not published, so the prior is about zero."""
 _FARTHEST_M = 5.0
 """No arm of one piece reaches farther: such numbers are millimetres."""
 

@@ -102,7 +102,8 @@ class Handles:
         """[S, G, 3] displacement of each gripper since the start at the end of each step, times [S] [s], as the scene says.
 
         Raises:
-            SceneError: a gripper turns what it holds, or moves its nodes in different ways.
+            SceneError: a gripper turns what it holds, moves its nodes in different ways, begins later, or moves a node that
+                another handle keeps in place: as a track, that would be another motion.
         """
         schedule = self.schedule(times)
         first = np.minimum(schedule.first_step, len(times) - 1)
@@ -111,9 +112,12 @@ class Handles:
         for index, name in enumerate(self.grippers):
             own = [h for h, handle in enumerate(self.handles) if handle.motion is not None and handle.gripper == name]
             found[:, index] = moved[:, own[0]]
-            if not np.allclose(schedule.linear[:, own], np.eye(3)) or not np.allclose(moved[:, own], found[:, index, None]):
+            alike = np.allclose(schedule.linear[:, own], np.eye(3)) and np.allclose(moved[:, own], found[:, index, None])
+            kept = {handle.node for handle in self.handles if handle.motion is None}
+            if not alike or first[own].any() or kept & {self.handles[h].node for h in own}:
                 raise SceneError(
-                    f"The gripper {name} turns what it holds, or moves its nodes differently: that is no track. Record one."
+                    f"The gripper {name} turns what it holds, moves its nodes differently, begins later or shares a node "
+                    "with another handle: that is no track. Give a recorded one."
                 )
         return found
 

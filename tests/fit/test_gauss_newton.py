@@ -376,6 +376,6 @@ class TestFits:
         def diverges(*_, **__):
             raise DivergedError(3, list(range(1)), "too soft")
 
-        monkeypatch.setattr("diffcloud.fit.residuals.rollout_tangents", diverges)
+        monkeypatch.setattr("diffcloud.fit.inputs.rollout_tangents", diverges)
         with pytest.raises(DivergedError, match="starts diverged"):
             fit_gauss_newton(objective, SPACE, GaussNewtonSettings(screen=0, starts=1))

@@ -18,7 +18,7 @@ from diffcloud.fit.residuals import Axis, linearise
 from diffcloud.mesh.topology import ClothMesh
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.scene.scenarios.sheet import Sheet
-from diffcloud.sim.handles import Handle
+from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.properties import one_set
 from tests.conftest import small_lift
@@ -88,6 +88,22 @@ class TestSize:
             scenario = replace(SCENARIO, scene=replace(SCENARIO.scene, surrounding=changed[name]))
         with pytest.raises(ConfigError, match=more):
             with_laid(FitSpace.build(["stretch"]), {"size": 0.02}, [scenario])
+        if name in changed:
+            with pytest.raises(ConfigError, match=more):
+                motion(scenario, size=0.02)
+
+    def test_sizes_alone_are_a_batch(self):
+        system, _ = SCENARIO.scene.build()
+        sizes = torch.tensor([0.0, 0.05], dtype=torch.float64)
+        with torch.no_grad():
+            found = Inputs.of(SCENARIO, system, SCENARIO.steps, {"size": sizes}, None).rollout().positions.numpy()
+        np.testing.assert_allclose(found[1], motion(SCENARIO, size=0.05), atol=1e-12)
+
+    def test_a_cloth_that_nothing_moves(self):
+        still = Handles((Handle(0), Handle(4)), hard=True)
+        pinned = replace(SCENARIO, frames=3, scene=replace(SCENARIO.scene, handles=still))
+        larger = motion(scaled(pinned, LARGER))
+        assert rms_mm(motion(pinned, size=math.log(1 + LARGER)), larger) < 0.3
 
 
 class TestTrack:
@@ -107,6 +123,14 @@ class TestTrack:
         turning = Motion((Keyframe(0.0, (0, 0, 0)), Keyframe(1.0, (0, 0, 0.1), quaternion=(0.0, 0.0, 0.0, 1.0))))
         handles = replace(SCENARIO.scene.handles, handles=(Handle(SCENARIO.grasped[0], turning),))
         with pytest.raises(SceneError, match="turns what it holds"):
+            handles.own_track(np.linspace(0.1, 1.0, 10))
+
+    @pytest.mark.parametrize("late", [True, False])
+    def test_a_late_gripper_and_a_shared_node_have_none(self, late):
+        moving = SCENARIO.scene.handles.handles[0]
+        told = (replace(moving, start=0.5),) if late else (moving, Handle(moving.node))
+        handles = Handles(told, hard=late)
+        with pytest.raises(SceneError, match="no track"):
             handles.own_track(np.linspace(0.1, 1.0, 10))
 
 

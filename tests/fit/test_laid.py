@@ -82,6 +82,9 @@ class TestSpace:
             ("shape=5deg", "one of m, cm, mm"),
             ("shape=-1mm", "a positive number"),
             ("shape=1mm,shape=2mm", "names shape twice"),
+            ("size=0.02", "one of %, such as size=2%"),
+            ("track=2cm", "one of %"),
+            ("size=50%", "size=50%: at most 20%"),
             ("", "Unknown laid variable"),
         ],
     )

@@ -239,7 +239,7 @@ class TestWhatCounts:
 
     @pytest.mark.parametrize("told", [-0.01, 0, 1.5, math.nan, True, "4%", [0.04]])
     def test_scales_that_are_none(self, scenario, episode, told):
-        with pytest.raises(EpisodeError, match="scale_sigma of an episode's meta"):
+        with pytest.raises(EpisodeError, match="scale_sigma in an episode's meta"):
             Objective(scenario, replace(episode, meta={"scale_sigma": told}))
 
     def test_points_that_are_sure_count_more(self, scenario, episode):

@@ -72,6 +72,18 @@ class TestDoubts:
         assert deviation(other, "lag") == pytest.approx(deviation(one, "lag") / 4, rel=0.1)
         assert deviation(other, "noise") == pytest.approx(deviation(one, "noise"), rel=1e-6)
 
+    def test_clouds_that_are_too_large_move_the_fit_as_far_as_it_says(self, scenario):
+        """Where the episode says how far their scale may be off, but the fit takes it as exact."""
+        episode = replace(recorded(scenario), meta={"scale_sigma": 0.03})
+        one = Objective(scenario, episode, nuisance={})
+        centre = one.pose_space.centre.numpy()
+        sizes = [(centre + np.exp(part) * (episode.points - centre)).astype(np.float32) for part in (0.03, -0.03)]
+        large, small = (logarithm(Objective(scenario, replace(episode, points=each), nuisance={})) for each in sizes)
+        found = uncertainty(one, SPACE, TRUTH)
+        assert deviation(found, "scale") == pytest.approx(abs(large - small) / 2, rel=0.4)
+        exact = Objective(scenario, replace(episode, meta={}), nuisance={})
+        assert "scale" not in uncertainty(exact, SPACE, TRUTH).sources
+
     def test_finer_steps_move_the_fit_as_far_as_it_says(self, scenario):
         episode = recorded(scenario)
         fine = replace(scenario, scene=replace(scenario.scene, frame_steps=4 * scenario.scene.frame_steps))

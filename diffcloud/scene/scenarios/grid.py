@@ -57,9 +57,9 @@ class GridScenario(ScenarioOptions):
     laid_shape_m: Annotated[float, Field(ge=0, le=1)] = 0.0
     """How uneven: one standard deviation of the height of each of nine waves."""
     laid_size: Annotated[float, Field(ge=0, le=0.2)] = 0.0
-    """By which part of itself the cloth may be larger or smaller than `size_m`, one standard deviation."""
+    """By what fraction the cloth may be larger or smaller than `size_m`, one standard deviation."""
     laid_track: Annotated[float, Field(ge=0, le=0.2)] = 0.0
-    """By which part of itself the gripper's way may be longer or shorter than recorded, one standard deviation."""
+    """By what fraction the gripper's path may be longer or shorter than recorded, one standard deviation."""
 
     @model_validator(mode="after")
     def _is_grasped_once(self) -> GridScenario:

@@ -55,8 +55,8 @@ class Scenario:
     doubts: Mapping[str, float] = field(default_factory=dict)
     """Material -> factor of one deviation, where it is known less well, or better, than usual (`fit.doubts`)."""
     laid: Mapping[str, float] = field(default_factory=dict)
-    """How far off its cloths, and how they lie at the start, may be, which fits find: `turn` [rad], `shape` [m], `size` and
-    `track` [1] (`fit.laid`) -> standard deviation."""
+    """How far the cloth's start, its size and the gripper's path may be off, which fits find: `turn` [rad], `shape` [m],
+    `size` and `track` [1] (`fit.laid`) -> standard deviation."""
 
     @property
     def steps(self) -> int:

@@ -28,7 +28,7 @@ def norm(vector: Tensor) -> Tensor:
 
 
 def gravity(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
-    return parameters["node_mass"][:, None] * constants["gravity"]
+    return parameters["node_mass"][:, None] * parameters["gravity"] * constants["acceleration"]
 
 
 def coefficients(samples: Tensor, e00: Tensor, e11: Tensor, e01: Tensor) -> Tensor:
