@@ -237,6 +237,10 @@ class TestWhatCounts:
         with pytest.raises(EpisodeError, match="lag_sigma_s of an episode's refinement"):
             Objective(scenario, replace(episode, meta={"quality": {"refinement": {"lag_sigma_s": told}}}))
 
+    def test_the_scale_is_free_where_the_episode_says_how_far_it_may_be_off(self, scenario, episode):
+        assert "scale" not in Objective(scenario, episode).nuisance
+        assert Objective(scenario, replace(episode, meta={"scale_sigma": 0.04})).nuisance["scale"] == 0.04
+
     @pytest.mark.parametrize("told", [-0.01, 0, 1.5, math.nan, True, "4%", [0.04]])
     def test_scales_that_are_none(self, scenario, episode, told):
         with pytest.raises(EpisodeError, match="scale_sigma in an episode's meta"):
