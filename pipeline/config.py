@@ -218,7 +218,7 @@ class FitConfig(Section):
     """Which parts of the pose are fitted too, and how far off each may well be: "x=0.1m,y=0.1m,yaw=30deg", or "none". If
     not given, all of them, as `fit.pose.default_priors` says."""
     laid: Name | None = None
-    """How the cloth may lie at the start, other than its scenario has it, and how far off: "turn=5deg,size=2%", or "none"
+    """How the cloth may lie other than as its scenario has it, and how far off: "turn=5deg,shape=5mm,size=2%", or "none"
     (`fit.laid`). Default: what the scenario says, in implicit fits of one recording by gauss_newton; else none."""
     prior: Name | None = None
     """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""

@@ -54,7 +54,7 @@ class Inputs:
 
         Raises:
             ConfigError: an unknown parameter, or a size where there is more around the cloth than a table.
-            SceneError: a size or a longer way, but neither a track nor a motion of the scene that is one.
+            SceneError: a size or a longer path, but neither a track nor a motion of the scene that is one.
         """
         size, reach = sizes_of(values)
         count = len(next(iter(values.values()))) if values else 1

@@ -31,8 +31,8 @@ from diffcloud.scene.scenarios import Scenario
 
 LAID: dict[str, Literal["m", "rad", "1"]] = {"turn": "rad", "shape": "m", "size": "1", "track": "1"}
 """Name -> unit. `shape` stands for the height of each wave."""
-LARGEST_SHARE = 0.2
-"""Standard deviation of `size` or `track`."""
+_LARGEST_SHARE = 0.2
+"""Largest standard deviation of `size` or `track`; scenarios have the same limit."""
 _SHAPES = {f"shape_{i}_{j}": (i, j) for i in range(4) for j in range(4) if 0 < i + j <= 3}
 _FLAT = 1e-6
 """Part of its size by which a level cloth may be off."""
@@ -49,9 +49,9 @@ def parse_laid(text: str) -> dict[str, float]:
     """
     found = parse_deviations(text, "laid", LAID)
     for name, deviation in found.items():
-        if LAID[name] == "1" and deviation > LARGEST_SHARE:
+        if LAID[name] == "1" and deviation > _LARGEST_SHARE:
             raise ConfigError(
-                f"laid {name}={100 * deviation:g}%: at most {100 * LARGEST_SHARE:g}%; state what is that far off."
+                f"laid {name}={100 * deviation:g}%: at most {100 * _LARGEST_SHARE:g}%; state what is that far off."
             )
     return found
 

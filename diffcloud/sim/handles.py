@@ -109,11 +109,11 @@ class Handles:
         first = np.minimum(schedule.first_step, len(times) - 1)
         moved = schedule.translation - schedule.translation[first, np.arange(len(self.handles))]
         found = np.zeros((len(times), len(self.grippers), 3))
+        kept = {handle.node for handle in self.handles if handle.motion is None}
         for index, name in enumerate(self.grippers):
             own = [h for h, handle in enumerate(self.handles) if handle.motion is not None and handle.gripper == name]
             found[:, index] = moved[:, own[0]]
             alike = np.allclose(schedule.linear[:, own], np.eye(3)) and np.allclose(moved[:, own], found[:, index, None])
-            kept = {handle.node for handle in self.handles if handle.motion is None}
             if not alike or first[own].any() or kept & {self.handles[h].node for h in own}:
                 raise SceneError(
                     f"The gripper {name} turns what it holds, moves its nodes differently, begins later or shares a node "

@@ -19,6 +19,7 @@ from diffcloud.fit.residuals import Axis, Linearisation, linearise
 from diffcloud.fit.solvers import gauss_newton
 from diffcloud.scene import load_scenario
 from tests.conftest import paper_objective, small_lift
+from tests.fit.slopes import linearised
 from tests.fit.test_fit import GENTLE, clouds_of
 
 TRUTH = {"stretch": 0.6, "mass": 1.7}
@@ -59,14 +60,7 @@ class TestAxis:
 class TestLinearisation:
     @pytest.mark.parametrize("measure", [{"paper": True}, {"nuisance": {}}], ids=["paper", "both ways"])
     def test_the_slope_is_that_of_the_loss(self, measure):
-        """Half of the exact gradient, by reverse mode through the simulation."""
-        objective = lifted(**measure)
-        places = Axis.of(SPACE).places(SPACE.starts(3, seed=1)[0]).requires_grad_(True)
-        losses = at(objective, SPACE, places)
-        (gradient,) = torch.autograd.grad(losses.sum(), places)
-        found = linearise(objective, SPACE, places.detach())
-        torch.testing.assert_close(found.losses, losses.detach())
-        torch.testing.assert_close(2 * found.slope, gradient, rtol=1e-8, atol=1e-14)
+        found = linearised(lifted(**measure), SPACE, Axis.of(SPACE).places(SPACE.starts(3, seed=1)[0]))
         assert found.simulations == 3
 
     def test_the_mean_over_episodes_is_linearised(self):

@@ -48,7 +48,7 @@ def simulated(scenario, values, every=None):
 
 
 def recording(**nuisance):
-    units = {"x": "m", "z": "m", "yaw": "rad", "tilt_x": "rad"}
+    units = {"x": "m", "z": "m", "yaw": "rad", "tilt_x": "rad", "scale": "1"}
     found = {name: NuisanceValue(value=value, prior=1.0, unit=units[name]) for name, value in nuisance.items()}
     return recording_of("e1", nuisance=found, centre=[0.5, 0.0, 0.1])
 
@@ -180,6 +180,10 @@ class TestProblem:
         # what is given lies in the recording's frame; without its tilt the flat cloth is no longer parallel to it
         assert np.ptp(nodes[0, :, 2]) < 1e-9 < np.ptp(heights)
         np.testing.assert_array_equal(upright.motion, nodes)
+
+    def test_is_as_large_as_it_is_where_clouds_are_too_large(self):
+        nodes, right = exported().motion, exported(one=recording(scale=0.05)).motion
+        np.testing.assert_allclose(np.ptp(right, axis=1), math.exp(-0.05) * np.ptp(nodes, axis=1))
 
     def test_is_refused_where_units_or_cloth_are_others(self):
         scenario = towel()
