@@ -20,15 +20,19 @@ _DAMPING = 1e-6
 def aligned(space: PoseSpace, start: Tensor, terms: Terms, caps: Sequence[float]) -> Tensor:
     """[B, d] poses that steps from `start` [B, d] lead to, each one on the loss with another factor of the cap.
 
-    An entry of the batch stops early once the factor is 1 and its step is small, whatever the others do.
+    An entry of the batch stops early once the factor is 1 and its step is small, whatever the others do. The scale stays
+    until then: a scene that lies elsewhere comes nearer as it shrinks.
     """
     poses, going = start.clone(), torch.arange(len(start))
     eye = torch.eye(len(space.names), dtype=torch.float64)
+    unscaled = torch.tensor([name != "scale" for name in space.names], dtype=torch.float64)
     for cap in caps:
         loss, slope, curvature = terms(poses[going], cap, None if len(going) == len(start) else going)
         # without a cap, a frame in which no place counts has an infinite loss; there, no prior holds the pose
         prior = torch.where(loss.isfinite(), loss, 0.0)[:, None] * space.prior_weights
         slope, curvature = slope + prior * poses[going], curvature + torch.diag_embed(prior)
+        if cap != 1.0:
+            slope, curvature = slope * unscaled, curvature * unscaled * unscaled[:, None]
         scaled = curvature * space.resolved[:, None] * space.resolved
         damping = _DAMPING * scaled.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1e-300)
         step = -torch.linalg.solve(scaled + damping[:, None, None] * eye, slope * space.resolved)

@@ -268,12 +268,26 @@ class Objective:
         with torch.no_grad():
             still = nodes.detach(), None if velocities is None else velocities.detach()
             if pose is None and self.pose_space.names:
-                start = self._first_pose().expand(len(nodes), -1)
-                pose, matcher = self._follow(*still, start, _CAPS)
+                pose, matcher = self._lowest(*still)
             else:
                 pose = torch.zeros(len(nodes), 0, dtype=torch.float64) if pose is None else pose
                 matcher = self._matcher(*still, range(nodes.shape[1]))
             return replace(matcher(pose), nodes=nodes, velocities=velocities)
+
+    def _lowest(self, nodes: Tensor, velocities: Tensor | None) -> tuple[Tensor, Matcher]:
+        """As of `_follow`, from the pose of the basis material. With a scale, poses have several minima: then the lower one
+        of two, reached from the basis material's scale and from none."""
+        space, first = self.pose_space, self._first_pose().expand(len(nodes), -1)
+        pose, matcher = self._follow(nodes, velocities, first, _CAPS)
+        if "scale" in space.names:
+            unscaled = torch.where(torch.tensor([name == "scale" for name in space.names]), 0.0, first)
+            other, _ = self._follow(nodes, velocities, unscaled, _CAPS)
+            losses = []
+            for one in (pose, other):
+                losses.append(self.terms(matcher(one), None)[0] * space.prior_factor(one))
+                matcher.look_anew()
+            pose = torch.where((losses[1] < losses[0])[:, None], other, pose)
+        return pose, matcher
 
     def _first_pose(self) -> Tensor:
         """[1, d] of the basis material, from zero on."""
@@ -363,7 +377,7 @@ class Objective:
         target = self._target
         space = PoseSpace.build(nuisance, target.space.centre, length_unit_m=self.length_unit_m)
         other.nuisance, other._target, other._first = dict(nuisance), replace(target, space=space), None
-        other.loss_steps = min(self.loss_steps + 1, self.scenario.steps)  # a velocity has two sides
+        other.loss_steps = other._steps_to_loss()
         return other
 
     def until(self, part: float) -> Objective:

@@ -302,12 +302,14 @@ class TestFits:
 
         monkeypatch.setattr(gauss_newton, "_drawn", watched)
         place = Axis.of(SPACE).places(torch.tensor([list(TRUTH.values())], dtype=torch.float64))[0]
-        settings, spent = GaussNewtonSettings(iterations=1), []
-        for explained in (objective.explained, 0.01 * objective.explained):
-            monkeypatch.setattr(Objective, "explained", explained)
+        settings, known, spent = GaussNewtonSettings(iterations=1), objective.explained, []
+        for early, later in ((1.0, 1.0), (1.0, 0.01), (0.01, 0.01)):  # a wrong beginning says little of what goes on
+            levels = {len(stages[0].frames): early * known, len(stages[1].frames): later * known}
+            monkeypatch.setattr(Objective, "explained", property(lambda self, levels=levels: levels[len(self.frames)]))
             spent.append(gauss_newton._grown(stages, SPACE, place, settings, 0, Axis.of(SPACE), lambda: None)[1])
-        assert widths == [1.0, 1.0, 2.0, 4.0]
+        assert widths == [1.0, 1.0, 2.0, 4.0, 1.0]
         assert spent[1] - spent[0] == 2 * 16
+        assert spent[2] == spent[0]
 
     def test_ends_are_equal_only_if_they_come_from_different_candidates(self):
         """One candidate's own two descents, from the whole recording and from its beginning, are no two witnesses."""
@@ -316,10 +318,31 @@ class TestFits:
         ways = gauss_newton._Ways([], 3, torch.zeros(1, dtype=torch.bool))
         for origin in (0, 0):
             ways.begin(gauss_newton._Start(place, origin), place, found)
-        assert not ways.enough(0.5, 0.0)
+        assert not ways.enough(0.5, 0.0, 3)
         ways.begin(gauss_newton._Start(place, 1), place, found)
-        assert ways.enough(0.5, 0.0)
-        assert not ways.enough(0.5, 2.0)  # where it is known that so high a loss is wrong
+        assert ways.enough(0.5, 0.0, 3)
+        assert not ways.enough(0.5, 2.0, 3)  # where it is known that so high a loss is wrong
+        ways.begin(gauss_newton._Start(place, 2), place, found)
+        assert ways.enough(0.5, 2.0, 3)
+        assert not ways.enough(0.5, 2.0, math.inf)
+
+    @pytest.mark.parametrize(
+        ("second", "witnesses", "order"),
+        [(1.0, 4, ["1", "2", "search", "grown"]), (0.5, 4, ["1", "2", "grown", "search"]), (1.0, math.inf, None)],
+        ids=["all agree", "the second one does not", "agreeing says nothing"],
+    )
+    def test_starts_that_grow_wait_while_the_best_end_is_not_alone(self, second, witnesses, order):
+        place, curvature = torch.zeros(1, dtype=torch.float64), torch.eye(1).double()[None]
+        names = {"grown": (0, True), "1": (1, False), "2": (2, False), "search": (-1, False)}
+        starts = {gauss_newton._Start(place, origin, grows=grows): name for name, (origin, grows) in names.items()}
+        ways, start, taken = gauss_newton._Ways(list(starts), 3, torch.zeros(1, dtype=torch.bool)), None, []
+        for loss in (1.0, second, *[1.0] * 3):
+            found = Linearisation(torch.tensor([loss]).double(), torch.zeros(1, 1).double(), curvature, 1)
+            ways.begin(start or gauss_newton._Start(place, 0), place, found)
+            if ways.waiting:
+                start = ways.next(witnesses)
+                taken.append(starts[start])
+        assert taken == (order or list(names))
 
     def test_a_start_that_grows_tells_of_its_progress(self, monkeypatch):
         """So that Ctrl-C ends it, also in a worker."""

@@ -159,8 +159,8 @@ def test_the_size_of_a_cloth_is_found():
 
 def test_depths_that_are_too_large_are_no_property_of_the_cloth():
     """Clouds 4 % too large about a camera, while the gripper's track, known from the joints, is right: with the scale free,
-    the fit is that of right clouds."""
-    right = clouds_of(SCENARIO, points=3000, stretch=0.6, mass=1.7)
+    the fit is that of right clouds. (Of 3,000 points a frame, a scale of 2.6 % has the lowest loss.)"""
+    right = clouds_of(SCENARIO, points=12_000, stretch=0.6, mass=1.7)
     camera = np.array([1.2, 0.1, 0.9])
     large = replace(right, points=(camera + 1.04 * (right.points - camera)).astype(np.float32))
     shifts = {"x": 0.1, "y": 0.1, "z": 0.1}

@@ -241,6 +241,18 @@ class TestWhatCounts:
         assert "scale" not in Objective(scenario, episode).nuisance
         assert Objective(scenario, replace(episode, meta={"scale_sigma": 0.04})).nuisance["scale"] == 0.04
 
+    @pytest.mark.parametrize("scale", [-0.2, 0.3])
+    def test_a_wrong_scale_of_the_basis_material_costs_nothing(self, scenario, episode, scale):
+        objective = Objective(scenario, replace(episode, meta={"scale_sigma": 0.04}))
+        assert objective.pose_space.names[-1] == "scale"
+        losses = []
+        for start in (0.0, scale):
+            objective._first = objective._first_pose().clone()
+            objective._first[:, -1] = start
+            with torch.no_grad():
+                losses.append(float(objective(one_set(TRUTH))))
+        assert losses[1] <= losses[0] * (1 + 1e-9)
+
     @pytest.mark.parametrize("told", [-0.01, 0, 1.5, math.nan, True, "4%", [0.04]])
     def test_scales_that_are_none(self, scenario, episode, told):
         with pytest.raises(EpisodeError, match="scale_sigma in an episode's meta"):

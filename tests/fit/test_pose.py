@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import ConfigError
+from diffcloud.fit.alignment import aligned
 from diffcloud.fit.pose import NUISANCE, PoseSpace, parse_priors
 
 CENTRE = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
@@ -82,6 +83,22 @@ class TestTransform:
         found = space("yaw").moved(points, values)
         torch.testing.assert_close(found[..., 2], points[..., 2])
         torch.testing.assert_close(found.mean((1, 2))[:, 2], points.mean((1, 2))[:, 2])
+
+
+class TestSearch:
+    def test_the_scale_stays_until_distances_are_capped_as_in_the_loss(self):
+        """Of a quadratic loss in x and scale, whose slope couples them."""
+        seen, lowest = [], torch.tensor([0.05, 0.03], dtype=torch.float64)
+        curvature = torch.tensor([[1.0, 0.8], [0.8, 1.0]], dtype=torch.float64)
+
+        def terms(poses, factor, entries):
+            seen.append((factor, float(poses[0, 1])))
+            slope = (poses - lowest) @ curvature
+            return 1e-9 + ((poses - lowest) * slope).sum(-1), slope, curvature.expand(len(poses), -1, -1)
+
+        found = aligned(space("x", "scale"), torch.zeros(1, 2).double(), terms, (4.0, 2.0, 1.0, 1.0, 1.0, 1.0))
+        assert [scale for factor, scale in seen if factor > 1.0] == [0.0, 0.0]
+        torch.testing.assert_close(found[0], lowest, atol=1e-4, rtol=0)
 
 
 class TestText:

@@ -72,6 +72,21 @@ def test_where_it_is_not_known_what_explains_a_recording_two_equal_ends_are_enou
     assert int(found.history.losses[-1].isfinite().sum()) == followed
 
 
+@pytest.mark.parametrize(("floor", "followed"), [(0.05, 4), (0.0095, 1)])
+def test_ends_that_agree_and_a_search_that_finds_nothing_lower_are_enough(monkeypatch, floor, followed):
+    """Nothing explains the recording, for the model is wrong; or the first start does."""
+
+    class Wide(Bowl):
+        def __call__(self, parameters):
+            return floor + 0.02 * parameters["stretch"].log().square()
+
+    monkeypatch.setattr(gauss_newton, "linearise", linearised)
+    objective = Wide(explained=0.01, knows_gaps=True)
+    found = fit_gauss_newton(objective, FitSpace.build(["stretch"]), GaussNewtonSettings(screen=0, scans=0))
+    assert math.log(found.values["stretch"]) == pytest.approx(0.0, abs=1e-3)
+    assert int(found.history.losses[-1].isfinite().sum()) == followed
+
+
 @pytest.mark.parametrize(("starts", "ended"), [(None, 1.2), (8, 0.0)])
 def test_where_three_starts_explain_nothing_a_search_finds_the_next(monkeypatch, starts, ended):
     """All candidates lie in a wide well around 0; what explains the recording is a deeper one at 1.2. A stated number of

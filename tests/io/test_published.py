@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from diffcloud.fit import Objective
+from diffcloud.fit.pose import default_priors
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.imports import release_episodes
 from diffcloud.io.published import RECORDED_START_M, RELEASE_UNIT_M, in_clouds_frame, read_trajectories, recorded_episode
@@ -84,6 +85,8 @@ class TestImport:
         # the published pairs are multipliers of the published scene's material
         assert "predictions" in units.meta
         assert "predictions" not in metres.meta
+        assert default_priors(metres)["scale"] == 0.02
+        assert "scale" not in default_priors(units)
         assert metres.gripper.shape == (FRAMES, 1, 3)
         np.testing.assert_allclose(metres.gripper[0, 0, :2], RECORDED_START_M[kind][:2])
 

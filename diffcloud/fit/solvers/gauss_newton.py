@@ -6,12 +6,12 @@ With half of the loss's slope g and of its curvature H on the axis of `residuals
 
 over the variables that no bound holds (Marquardt 1963; Madsen, Nielsen and Tingleff 2004, section 3.2). Each start keeps
 its own λ: it falls by how much of the predicted decrease a step brings, and grows, faster and faster, where it brings
-none. Starts are the best of a screen of candidates spread over the box, the best one first, and the rest stays where it is
-as soon as one explains the recording; where a right motion may have a higher loss, also as soon as two from different
-candidates have ended equally low. If the first one does not, the next two are found by fitting the recording's beginning,
-then more and more of it. If the first three candidates do not, a derivative-free search from the best place over what is
-asked for finds the next. Then losses along the principal axes of the best place tell whether another minimum is lower
-nearby; from there it goes on.
+none. Starts are the best of a screen of candidates spread over the box, the best one first. The rest stays where it is as
+soon as one explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and more
+of it; the other is a derivative-free search from the best place over what is asked for. They come after three candidates,
+the former only while no second end is as low as the best one. Four such ends are enough, though they explain nothing, and
+two where a right motion may have such a loss. Then losses along the principal axes of the best place tell whether another
+minimum is lower nearby; from there it goes on.
 """
 
 from __future__ import annotations
@@ -61,11 +61,14 @@ _WIDENING = (1.0, 2.0, 4.0)
 """Times the deviations of what is known so far, one after the other, while no draw is low enough: where a motion may go on
 in two ways, the right one may be rare, and a beginning may have gone astray itself."""
 _LOW_ENOUGH, _AS_LOW = 1.1, 1.3
-"""Times what explains the frames; where that is not known, times what the part before ended at."""
+"""Times what explains the frames; where that is not known, or the part before did not, times what that ended at."""
 _MISFIT = 30.0
 """Times what explains a recording; above that, it is the model that does not: no start will."""
 _EQUALLY = 1.01
 """Losses within this factor are equally low."""
+_WITNESSES, _FEW_WITNESSES = _BEFORE + 1, 2
+"""Of different candidates, ends that have to be equally low to be believed though they explain nothing, and where a right
+motion may have such a loss."""
 _SCREENED = 0.5
 """Part of the frames on which candidates are compared: the rest costs as much again, and has more wrong minima."""
 _GIVE_UP = 6
@@ -110,8 +113,9 @@ def fit_gauss_newton(
     axis = Axis.of(space)
     known = objective.explained
     most, explained = settings.starts or _MOST, settings.threshold or known
-    # where a right motion can have no higher loss than what explains the recording, equal ones say nothing
-    wrong = math.inf if not known and settings.threshold else _MISFIT * known if objective.knows_gaps else 0.0
+    misfit = math.inf if not known and settings.threshold else _MISFIT * known if objective.knows_gaps else 0.0
+    # a threshold says that something is lower, a number of starts that so many are to be followed
+    witnesses = math.inf if settings.threshold or settings.starts else _WITNESSES
     places, simulations = _starts(objective, space, settings, axis, most)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
@@ -129,7 +133,7 @@ def fit_gauss_newton(
         best = 1 if settings.init else 0  # of the screen; a first start that was given says little
         for index, stages in reversed(list(enumerate(_growths(objective)))):
             grown = partial(_grown, stages, space, places[best], settings, index, axis, tell)
-            waiting.insert(best + 1, _Start(places[best], best, grown))
+            waiting.insert(best + 1, _Start(places[best], best, grown, grows=True))
     scans, looked, ways = 0, None, _Ways(waiting, settings.iterations, _laid(space))
     try:
         while True:
@@ -139,8 +143,8 @@ def fit_gauss_newton(
                 found = linearise(objective, space, tried[None])
                 simulations += found.simulations
                 ways.judge(way, tried, found)
-            elif ways.waiting and not ways.enough(explained, wrong):
-                start = ways.waiting.pop(0)
+            elif ways.waiting and not ways.enough(explained, misfit, witnesses):
+                start = ways.next(witnesses)
                 place, spent = start.found()
                 found = linearise(objective, space, place[None])
                 simulations += spent + found.simulations
@@ -195,6 +199,8 @@ class _Start:
     origin: int
     """The candidate that it comes from; -1: none."""
     look: Callable[[], tuple[Tensor, int]] | None = None
+    grows: bool = False
+    """Whether it is looked for by letting the recording grow, which takes longest."""
 
     def found(self) -> tuple[Tensor, int]:
         """The start [k], and how many simulations it took to find it."""
@@ -295,13 +301,30 @@ class _Ways:
         """The one under way."""
         return next((way for way in self.every if way.end is None), None)
 
-    def enough(self, explained: float, wrong: float) -> bool:
-        """Whether the best one explains the recording, or another one is equally low and it is not known that all are wrong
-        that explain nothing, up to this loss."""
+    def enough(self, explained: float, misfit: float, witnesses: float) -> bool:
+        """Whether the best one explains the recording, or enough others have ended as low.
+
+        Args:
+            explained: the highest loss that explains the recording.
+            misfit: above this one, where a right motion may be too, a few ends are enough.
+            witnesses: ends that are enough below.
+        """
         if not self.every or not math.isfinite(self.best.loss):
             return False
-        equal = len({way.origin for way in self.every if way.loss <= _EQUALLY * self.best.loss}) > 1
-        return self.best.loss <= explained or (equal and self.best.loss > wrong)
+        needed = _FEW_WITNESSES if self.best.loss > misfit else witnesses
+        return self.best.loss <= explained or len(self._witnesses) >= needed
+
+    def next(self, witnesses: float) -> _Start:
+        """The next start. Where some equal ends would be enough, those that grow wait for the first candidates, and as long
+        as the best end is not alone."""
+        wait = math.isfinite(witnesses) and (len(self.every) < _BEFORE or len(self._witnesses) > 1)
+        quick = (place for place, start in enumerate(self.waiting) if not start.grows)
+        return self.waiting.pop(next(quick, 0) if wait else 0)
+
+    @property
+    def _witnesses(self) -> set[int]:
+        """The candidates from which ends as low as the best one come."""
+        return {way.origin for way in self.every if way.loss <= _EQUALLY * self.best.loss}
 
     def begin(self, start: _Start, place: Tensor, found: Linearisation) -> None:
         """A start, at its place [k], with what was found there."""
@@ -413,8 +436,13 @@ def _goes_on(
     tell: Callable[[], None],
 ) -> tuple[Tensor, int]:
     """The place [k] at which to continue with the later frames, the lowest of the way's end and of places drawn around it,
-    ever farther from it while none is low enough; and how many simulations that took."""
-    enough = _LOW_ENOUGH * later.explained if later.knows_gaps else _AS_LOW * way.loss
+    ever farther from it while none is low enough; and how many simulations that took.
+
+    Args:
+        early, later: the recordings on which the way went, and those that come next.
+    """
+    explains = later.knows_gaps and way.loss <= _LOW_ENOUGH * early.explained
+    enough = _LOW_ENOUGH * later.explained if explains else _AS_LOW * way.loss
     place, lowest, simulations, tried = way.place, math.inf, 0, way.place[None]
     for widening in _WIDENING:
         tell()
