@@ -25,7 +25,7 @@ def aligned(space: PoseSpace, start: Tensor, terms: Terms, caps: Sequence[float]
     """
     poses, going = start.clone(), torch.arange(len(start))
     eye = torch.eye(len(space.names), dtype=torch.float64)
-    unscaled = torch.tensor([name != "scale" for name in space.names], dtype=torch.float64)
+    unscaled = space.unscaled
     for cap in caps:
         loss, slope, curvature = terms(poses[going], cap, None if len(going) == len(start) else going)
         # without a cap, a frame in which no place counts has an infinite loss; there, no prior holds the pose

@@ -280,8 +280,7 @@ class Objective:
         space, first = self.pose_space, self._first_pose().expand(len(nodes), -1)
         pose, matcher = self._follow(nodes, velocities, first, _CAPS)
         if "scale" in space.names:
-            unscaled = torch.where(torch.tensor([name == "scale" for name in space.names]), 0.0, first)
-            other, _ = self._follow(nodes, velocities, unscaled, _CAPS)
+            other, _ = self._follow(nodes, velocities, first * space.unscaled, _CAPS)
             losses = []
             for one in (pose, other):
                 losses.append(self.terms(matcher(one), None)[0] * space.prior_factor(one))

@@ -140,6 +140,11 @@ class PoseSpace:
         """[B] by which the priors multiply the loss at values [B, d]."""
         return (self.prior_weights * values.square()).sum(-1).exp()
 
+    @property
+    def unscaled(self) -> Tensor:
+        """[d] factors that leave values as they are, but for the scale, which they set to zero."""
+        return torch.tensor([name != "scale" for name in self.names], dtype=torch.float64)
+
     def lag(self, values: Tensor) -> Tensor | None:
         """[B] of values [B, d]; None where it is not free."""
         return values[:, self.names.index("lag")] if "lag" in self.names else None

@@ -340,7 +340,7 @@ class TestFits:
             found = Linearisation(torch.tensor([loss]).double(), torch.zeros(1, 1).double(), curvature, 1)
             ways.begin(start or gauss_newton._Start(place, 0), place, found)
             if ways.waiting:
-                start = ways.next(witnesses)
+                start = ways.following(witnesses)
                 taken.append(starts[start])
         assert taken == (order or list(names))
 

@@ -144,7 +144,7 @@ def fit_gauss_newton(
                 simulations += found.simulations
                 ways.judge(way, tried, found)
             elif ways.waiting and not ways.enough(explained, misfit, witnesses):
-                start = ways.next(witnesses)
+                start = ways.following(witnesses)
                 place, spent = start.found()
                 found = linearise(objective, space, place[None])
                 simulations += spent + found.simulations
@@ -314,7 +314,7 @@ class _Ways:
         needed = _FEW_WITNESSES if self.best.loss > misfit else witnesses
         return self.best.loss <= explained or len(self._witnesses) >= needed
 
-    def next(self, witnesses: float) -> _Start:
+    def following(self, witnesses: float) -> _Start:
         """The next start. Where some equal ends would be enough, those that grow wait for the first candidates, and as long
         as the best end is not alone."""
         wait = math.isfinite(witnesses) and (len(self.every) < _BEFORE or len(self._witnesses) > 1)
