@@ -67,7 +67,7 @@ def newton_matrix(
         _jacobian(terms, parameters, motion, timing, dt * parameters.damping[0], dt, lower, upper)
     if caution > 0:
         safe, unused = np.zeros((own + 1, 9)), np.zeros((len(motion.positions), 3))
-        _assemble(terms, _without_air(parameters), motion, Timing(dt, dt), reach, dt, unused, safe)
+        _assemble(terms, _cautious(parameters), motion, Timing(dt, dt), reach, dt, unused, safe)
         for p in range(own):
             for k in range(9):
                 lower[p, k] += caution * (safe[p, k] - lower[p, k])
@@ -93,15 +93,16 @@ def newton_matrix(
 
 
 @kernel
-def _without_air(p: Parameters) -> Parameters:
-    """The cautious matrix has elastic forces and contact only."""
-    none = np.zeros(1)
+def _cautious(p: Parameters) -> Parameters:
+    """The cautious matrix has elastic forces and contact only; where cloth is slack, it is as stiff as where it is taut, which
+    a step may make it."""
+    none, whole = np.zeros(1), np.ones(1)
     return Parameters(
         node_mass=p.node_mass,
         inverse_mass=p.inverse_mass,
         stretching=p.stretching,
         shear=p.shear,
-        compression=p.compression,
+        compression=whole,
         bending=p.bending,
         damping=p.damping,
         gravity=p.gravity,

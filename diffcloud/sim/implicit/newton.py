@@ -38,6 +38,8 @@ _ALMOST_WHOLE = 0.999
 """A step of this part of its direction shows what the residual does along it."""
 _LEAST_REST = 0.2
 """Of the divisor in Broyden's update: a smaller one makes too much of a step."""
+_LEAST_PART = 1e-3
+"""Of its direction that a step goes; a shorter one, which something is in the way of, leaves Newton's method where it is."""
 _PROBE = 1e-4
 """Part of the obstacles' way over which its effect is measured."""
 
@@ -117,7 +119,9 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
                     work.serves = work.time_step
                 return True, here, room, change
             taken = _remember(steps, sizes, taken, direction) if part > _ALMOST_WHOLE else 0
-            bad = short
+            if part < _LEAST_PART and caution >= 1:
+                return False, here, room, change
+            bad = short or part < _LEAST_PART
             stale = bad or caution > 0 or change > _REUSE or not (fresh or change < _SHRINKING * before)
             if not stale:
                 continue

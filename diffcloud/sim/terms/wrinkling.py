@@ -19,6 +19,9 @@ Where a face becomes slack, or begins to wrinkle, the second derivatives of W* j
 Two functions of the energies ease the jumps and keep the energy convex, so that the sum with `stretching` has a positive
 matrix. For the sheet at rest to be taut, E is the strain plus `_BEGINS` in all directions: so much compression is resisted
 in full, and about 1.5 times that stress remains.
+
+Damping has c C in whatever state a face is. With the second derivatives of the energy, damping forces themselves would jump
+where a face becomes slack or taut, and steps would not converge.
 """
 
 from __future__ import annotations
@@ -53,11 +56,14 @@ _TINY = 1e-24
 
 
 def force(face: Element) -> Sequence[Vector]:
-    """-∂W/∂x - H d on the three corners."""
+    """-∂W/∂x - H d on the three corners, with C in the place of the second derivatives in H for what damps."""
     xu, xv = along_material(face, face.positions)
-    du, dv = along_material(face, face.displacement)
+    ahead = strain_change(xu, xv, *along_material(face, [face.ahead * velocity for velocity in face.after]))
+    whole = strain_change(xu, xv, *along_material(face, face.displacement))
     sheet, off = _Wrinkling(face, xu, xv), face.parameter("compression") - 1.0
-    stress_u, stress_v, shear = _combined(off, sheet.stress(), off, sheet.change(strain_change(xu, xv, du, dv)))
+    damped = stress(sheet.stiffness, _combined(1.0, whole, -1.0, ahead))
+    changed = _combined(1.0, sheet.change(ahead), 1.0, damped)
+    stress_u, stress_v, shear = _combined(off, sheet.stress(), off, changed)
     return on_corners(face, stress_u * xu + shear * xv, shear * xu + stress_v * xv)
 
 
@@ -93,9 +99,9 @@ class _Wrinkling:
         k0, k1, k2, k3 = coefficients(face, along_u, along_v, across)
         k0, k2, k3 = (one + _LEAST * (k0 + k2) + _TINY for one in (k0, k2, k3))
         k1 = minimum(k1, _COUPLED * squareroot(k0 * k2))
-        self._stiffness = k0, k1, k2, k3
+        self.stiffness = k0, k1, k2, k3
         strained = e00, e11, e01 = along_u + _BEGINS, along_v + _BEGINS, across
-        whole = s00, s11, s01 = stress(self._stiffness, strained)
+        whole = s00, s11, s01 = stress(self.stiffness, strained)
         self._taut = (s00 * s11 >= s01 * s01) & (s00 + s11 >= 0.0)
         self._slack = (e00 * e11 >= e01 * e01) & (e00 + e11 <= 0.0)
         flat = k0 * k2 - k1 * k1
@@ -118,7 +124,7 @@ class _Wrinkling:
 
     def change(self, by: Symmetric) -> Symmetric:
         """Of the stress by a change of the strain."""
-        whole = stress(self._stiffness, by)
+        whole = stress(self.stiffness, by)
         kept = self._relaxed(whole, self._pulled.change(by))
         shares = _combined(self._slackening.share, kept, self._loss.share, _combined(1.0, whole, -1.0, kept))
         slackens, loses = (

@@ -74,8 +74,8 @@ def stretching(constants: Numbers, parameters: Numbers, motion: SimpleNamespace)
 
 
 def wrinkling(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
-    """(1 - c) a times the stress of W - W* and its change, by autograd. W* is the largest of e²/2y over many directions,
-    and Newton's method from there."""
+    """(1 - c) a times the stress of W - W* and its change by the motion ahead, by autograd, and the change that W alone has
+    by the rest of the displacement. W* is the largest of e²/2y over many directions, and Newton's method from there."""
     gradient, strain, change, (k0, k1, k2, k3) = strained(constants, parameters, motion)
     k0, k2, k3 = (one + 1e-9 * (k0 + k2) for one in (k0, k2, k3))
     k1 = torch.minimum(k1, 0.999 * (k0 * k2).sqrt())
@@ -114,8 +114,11 @@ def wrinkling(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) 
         r, q = (kept / scale + 1e-24).sqrt().clamp(max=1), ((whole - kept) / scale + 1e-24).sqrt()
         return scale * (r**2 * (1 - r) ** 3 + torch.where(q < 1, q**3 / 3, q**2 - q + 1 / 3))
 
-    stress = torch.autograd.functional.jvp(lambda one: slope(given_up, one), strain, change, create_graph=True)
-    return on_corners(constants, gradient @ ((parameters["compression"] - 1) * sum(stress)))
+    onward = motion.ahead * along_material(constants, motion.after)
+    ahead = 0.5 * (gradient.T @ onward + onward.T @ gradient)
+    stress = torch.autograd.functional.jvp(lambda one: slope(given_up, one), strain, ahead, create_graph=True)
+    given = sum(stress) + stressed(change - ahead)
+    return on_corners(constants, gradient @ ((parameters["compression"] - 1) * given))
 
 
 def dihedral(nodes: Tensor) -> tuple[Tensor, Tensor]:
