@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import diffcloud
-from diffcloud.errors import ConfigError
+from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.joint import AnyObjective, mean_loss
 from diffcloud.fit.laid import described_laid, is_laid
 from diffcloud.fit.objective import Objective
@@ -42,7 +42,7 @@ class FittedMotion:
     """What is simulated with the fitted parameters, in the scene's unit and one recording's frame: its pose applied."""
 
     nodes: NDArray[np.float64]
-    """[T + 1, V, 3] of the cloth at each frame."""
+    """[T + 1, V, 3] of the cloth at each frame, as far as the motion goes."""
     start_nodes: NDArray[np.float64]
     """[T + 1, V, 3] at the first start's parameters, at the pose found with these."""
     faces: NDArray[np.int64]
@@ -118,6 +118,9 @@ def describe_fit(
 
     Args:
         episodes: names of the recordings.
+
+    Raises:
+        DivergedError: the motion diverges within the compared frames.
     """
     members, paper = objective.members, objective.paper
     first = members[0]
@@ -126,7 +129,7 @@ def describe_fit(
     start_values = outcome.start | dict(space.fixed)
     unit = first.scenario.length_unit_m
     with torch.no_grad():
-        runs = [_motion(member, values) for member in members]
+        runs, starts = zip(*(_as_far_as_both_go(member, values, start_values) for member in members), strict=True)
         recordings = [
             describe_recording(member, run, name) for member, run, name in zip(members, runs, episodes, strict=True)
         ]
@@ -134,7 +137,8 @@ def describe_fit(
             recording.nuisance |= described_laid(space, values, length_unit_m=unit)
         poses = [recorded_pose(recording, length_unit_m=unit)[1] for recording in recordings]
         motions = [
-            _fitted_motion(member, run, pose, start_values) for member, run, pose in zip(members, runs, poses, strict=True)
+            _fitted_motion(member, run, start, pose)
+            for member, run, start, pose in zip(members, runs, starts, poses, strict=True)
         ]
         resampled = []
         for seed in range(1, resampled_seeds + 1):
@@ -174,7 +178,7 @@ def describe_fit(
         settings={name: value for name, value in asdict(settings).items() if name != "init"},
         history=_history(outcome),
         scan=None if outcome.scan is None else outcome.scan.record(),
-        failures=list(outcome.failures),
+        failures=[*outcome.failures, *_cut_short(members, runs, episodes)],
         versions={"diffcloud": diffcloud.__version__, "torch": torch.__version__, "python": platform.python_version()},
     )
     return FitResult(record, motions)
@@ -297,8 +301,8 @@ def _key(name: str, index: int) -> str:
     return name if index == 0 else f"{name}_{index}"
 
 
-def _fitted_motion(objective: Objective, run: Rollout, pose: Tensor, start_values: Mapping[str, float]) -> FittedMotion:
-    scene, start = objective.scenario.scene, _motion(objective, start_values)
+def _fitted_motion(objective: Objective, run: Rollout, start: Rollout, pose: Tensor) -> FittedMotion:
+    scene = objective.scenario.scene
     held = np.unique(scene.handles.nodes).astype(np.int64)
     return FittedMotion(
         nodes=objective.posed_nodes(run, pose),
@@ -312,8 +316,36 @@ def _fitted_motion(objective: Objective, run: Rollout, pose: Tensor, start_value
     )
 
 
-def _motion(objective: Objective, values: Mapping[str, float]) -> Rollout:
-    return objective.simulate(one_set(values))
+def _as_far_as_both_go(
+    objective: Objective, values: Mapping[str, float], start_values: Mapping[str, float]
+) -> tuple[Rollout, Rollout]:
+    """The rollouts with fitted and first values over the whole scenario, or up to the last frame before one diverges.
+
+    Raises:
+        DivergedError: within the compared frames.
+    """
+    steps, each = objective.scenario.steps, objective.scenario.scene.frame_steps
+    while True:
+        try:
+            run, start = (objective.simulate(one_set(told), steps=steps) for told in (values, start_values))
+        except DivergedError as error:
+            reached = max((error.step - 1) // each * each, objective.loss_steps)
+            if reached >= steps:
+                raise
+            steps = reached
+        else:
+            return run, start
+
+
+def _cut_short(members: Sequence[Objective], runs: Sequence[Rollout], episodes: Sequence[str]) -> list[str]:
+    """What to tell of motions that do not last for the whole scenario."""
+    ends = [float(run.times[-1]) for run in runs]
+    return [
+        f"{name}: the motion is recorded up to {end:.2f} s; after the compared frames it diverges, with the fitted or the "
+        "first values"
+        for name, member, run, end in zip(episodes, members, runs, ends, strict=True)
+        if len(run.times) <= member.scenario.steps
+    ]
 
 
 def _parameters(scenario: Scenario, space: FitSpace, values: Mapping[str, float]) -> dict[str, FittedParameter]:

@@ -16,7 +16,7 @@ from diffcloud.fit.agreement import Agreement, gradient_agreement, random_parame
 from diffcloud.fit.benchmark import time_contact
 from diffcloud.fit.inputs import Inputs
 from diffcloud.fit.record import FittedParameter, read_fit
-from diffcloud.fit.result import describe_fit, write_fit
+from diffcloud.fit.result import describe_fit, read_motion, write_fit
 from diffcloud.fit.targets import track_displacement
 from diffcloud.fit.visibility import visibility_map
 from diffcloud.io.episodes import Episode
@@ -203,6 +203,33 @@ class TestRun:
         assert any("start 0 (stretch=5.05)" in failure for failure in outcome.failures)
         with pytest.raises(DivergedError, match=r"stretch=5\.05"):
             fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings())
+
+    def test_a_motion_that_diverges_after_the_compared_frames_is_recorded_as_far_as_it_goes(self, monkeypatch, tmp_path):
+        scenario = small_lift(**GENTLE)
+        objective = Objective(scenario, clouds_of(scenario, stretch=2.0), frames=range(5), nuisance={})
+        space, settings = FitSpace.build(["stretch"]), AdamSettings(iterations=2)
+        outcome = fit_adam(objective, space, settings)
+        whole = describe_fit(objective, space, settings, outcome, episodes=["e"])
+        assert not whole.record.failures
+        real, reached, fragile = Objective.simulate, 7, set[float]()
+
+        def simulate(self, parameters, *, steps=None):
+            last = (self.scenario.steps if steps is None else steps) // scenario.scene.frame_steps
+            if last > reached and float(parameters["stretch"]) in fragile:
+                raise DivergedError(reached * scenario.scene.frame_steps + 2, [0], "test")
+            return real(self, parameters, steps=steps)
+
+        monkeypatch.setattr(Objective, "simulate", simulate)
+        for values in (outcome.values, outcome.start):
+            fragile = {values["stretch"]}
+            told = describe_fit(objective, space, settings, outcome, episodes=["e"])
+            assert told.record.loss == whole.record.loss
+            assert "e: the motion is recorded up to" in told.record.failures[0]
+            np.testing.assert_array_equal(told.motions[0].nodes, whole.motions[0].nodes[: reached + 1])
+            read_motion(write_fit(tmp_path, "e", told).with_suffix(".npz"))
+        reached = 3
+        with pytest.raises(DivergedError):
+            describe_fit(objective, space, settings, outcome, episodes=["e"])
 
     def test_a_copy_that_diverges_does_not_cost_its_start(self, objective, monkeypatch):
         real = Objective.__call__

@@ -94,8 +94,8 @@ def newton_matrix(
 
 @kernel
 def _cautious(p: Parameters) -> Parameters:
-    """The cautious matrix has elastic forces and contact only; where cloth is slack, it is as stiff as where it is taut, which
-    a step may make it."""
+    """The cautious matrix has elastic forces and contact only. Where cloth is slack it is as stiff as where it is taut: a
+    step may make it so."""
     none, whole = np.zeros(1), np.ones(1)
     return Parameters(
         node_mass=p.node_mass,

@@ -39,7 +39,7 @@ _ALMOST_WHOLE = 0.999
 _LEAST_REST = 0.2
 """Of the divisor in Broyden's update: a smaller one makes too much of a step."""
 _LEAST_PART = 1e-3
-"""Of its direction that a step goes; a shorter one, which something is in the way of, leaves Newton's method where it is."""
+"""Of its direction that a step goes at least: a shorter one, blocked by a contact, leaves Newton's method where it is."""
 _PROBE = 1e-4
 """Part of the obstacles' way over which its effect is measured."""
 
