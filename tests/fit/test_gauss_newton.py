@@ -264,6 +264,34 @@ class TestFits:
         objective = lifted(nuisance={}, frames=range(1, count + 1))
         assert [[len(one.frames) for one in growth] for growth in gauss_newton._growths(objective)] == stages
 
+    def test_a_step_is_the_lowest_between_the_bounds(self, rng):
+        """Cutting off a step at a bound may lead uphill, which looked like the end of a descent."""
+        held = 0
+        for _ in range(50):
+            root = torch.from_numpy(rng.normal(size=(6, 6)))
+            matrix, slope = root @ root.T + 1e-3 * torch.eye(6).double(), torch.from_numpy(rng.normal(size=6))
+            least, most = torch.from_numpy(-rng.uniform(0, 1, 6)), torch.from_numpy(rng.uniform(0, 1, 6))
+            step = gauss_newton._lowest(matrix, slope, least, most)
+            uphill = slope + matrix @ step
+            below, above = step <= least + 1e-12, step >= most - 1e-12
+            assert bool(((step >= least - 1e-12) & (step <= most + 1e-12)).all())
+            assert bool((uphill[below] > -1e-9).all())
+            assert bool((uphill[above] < 1e-9).all())
+            assert float(uphill[~below & ~above].abs().sum()) < 1e-8
+            held += int(below.sum() + above.sum())
+        assert held > 50
+
+    def test_a_way_that_runs_into_a_bound_goes_on_along_it(self):
+        """Both variables of a valley fall together; the second one is nearly at its lower bound."""
+        curvature = torch.tensor([[1.0, -0.99], [-0.99, 1.0]]).double()
+        slope = torch.tensor([0.1, 0.3]).double()
+        way = gauss_newton._Way(
+            torch.tensor([0.0, -0.99]).double(), Linearisation(torch.ones(1).double(), slope[None], curvature[None], 1), 3
+        )
+        tried = way.propose(torch.full((2,), -1.0).double(), torch.full((2,), 1.0).double())
+        torch.testing.assert_close(tried, torch.tensor([-0.1 - 0.99 * 0.01, -1.0]).double(), atol=0.01, rtol=0)
+        assert way._predicted > 0
+
     @pytest.mark.parametrize(
         "corner", [(0.0, 0.0), (-2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)], ids=["none", "lower", "upper", "across"]
     )

@@ -2,9 +2,10 @@
 
 With half of the loss's slope g and of its curvature H on the axis of `residuals.Axis`, a step s solves
 
-    (H + λ diag H) s = -g
+    minimise  g·s + s·(H + λ diag H) s / 2  between the bounds, and within a factor e
 
-over the variables that no bound holds (Marquardt 1963; Madsen, Nielsen and Tingleff 2004, section 3.2). Each start keeps
+(Marquardt 1963; Madsen, Nielsen and Tingleff 2004, section 3.2). A step without bounds that is cut off at one would leave the
+others where they make up for what has been cut off, and may lead uphill. Each start keeps
 its own λ: it falls by how much of the predicted decrease a step brings, and grows, faster and faster, where it brings
 none. Starts are the best of a screen of candidates spread over the box, the best one first. The rest stays where it is as
 soon as one explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and more
@@ -43,6 +44,8 @@ a step takes several simulations."""
 _FIRST_DAMPING = 1e-2
 _LARGEST_STEP = 1.0
 """On the axis: a factor e, or the whole range."""
+_LEAST_SPREAD = 1e-12
+"""Of the matrix of a step, in its largest eigenvalue: below is rounding."""
 _SMALLEST_STEP = 1e-3
 """A step below 0.1 % of a value, or a predicted decrease below this part of the loss, means that a start has arrived."""
 _SMALLEST_DECREASE = 1e-4
@@ -247,15 +250,14 @@ class _Way:
     def propose(self, low: Tensor, high: Tensor) -> Tensor:
         """[k] the next place, between the bounds [k]."""
         place, slope, normal = self.place, self.slope, self.normal
-        free = ~(((place <= low) & (slope > 0)) | ((place >= high) & (slope < 0))) & (normal.diagonal() > 0)
+        free = normal.diagonal() > 0
         if self._held is not None:
             free &= ~self._held
         step = torch.zeros_like(place)
         if bool(free.any()):
             inner = normal[free][:, free]
-            step[free] = -torch.linalg.solve(inner + self._damping * inner.diagonal().diag(), slope[free])
-        step *= min(1.0, _LARGEST_STEP / max(float(step.abs().max()), 1e-300))
-        step = torch.minimum(torch.maximum(place + step, low), high) - place
+            least, most = ((end - place)[free].clamp(-_LARGEST_STEP, _LARGEST_STEP) for end in (low, high))
+            step[free] = _lowest(inner + self._damping * inner.diagonal().diag(), slope[free], least, most)
         self._predicted = float(-2 * slope @ step - step @ normal @ step)
         return place + step
 
@@ -276,6 +278,18 @@ class _Way:
         if self._held is not None and self.end is not None and math.isfinite(self.loss):
             self._held = None
             self._begin()
+
+
+def _lowest(matrix: Tensor, slope: Tensor, least: Tensor, most: Tensor) -> Tensor:
+    """[k] where slope · s + s · matrix s / 2 is lowest between `least` and `most` [k], of a positive matrix [k, k]."""
+    from scipy.optimize import lsq_linear  # slow to import
+
+    spread, axes = torch.linalg.eigh(matrix)
+    root = spread.clamp(min=_LEAST_SPREAD * float(spread[-1])).sqrt()
+    found = lsq_linear(
+        (root * axes).T.numpy(), (-(axes.T @ slope) / root).numpy(), (least.numpy(), most.numpy()), method="bvls"
+    )
+    return torch.from_numpy(found.x)
 
 
 class _Ways:
