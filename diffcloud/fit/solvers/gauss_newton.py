@@ -1,18 +1,18 @@
 """Gauss–Newton with Levenberg–Marquardt damping and bounds, from one start after the other.
 
-With half of the loss's slope g and of its curvature H on the axis of `residuals.Axis`, a step s solves
+With half of the loss's slope g and of its curvature H on the axis of `residuals.Axis`, a step s minimises
 
-    minimise  g·s + s·(H + λ diag H) s / 2  between the bounds, and within a factor e
+    g·s + s·(H + λ diag H) s / 2     between the bounds and within a length of one
 
-(Marquardt 1963; Madsen, Nielsen and Tingleff 2004, section 3.2). A step without bounds that is cut off at one would leave the
-others where they make up for what has been cut off, and may lead uphill. Each start keeps
-its own λ: it falls by how much of the predicted decrease a step brings, and grows, faster and faster, where it brings
-none. Starts are the best of a screen of candidates spread over the box, the best one first. The rest stays where it is as
-soon as one explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and more
-of it; the other is a derivative-free search from the best place over what is asked for. They come after three candidates,
-the former only while no second end is as low as the best one. Four such ends are enough, though they explain nothing, and
-two where a right motion may have such a loss. Then losses along the principal axes of the best place tell whether another
-minimum is lower nearby; from there it goes on.
+(Marquardt 1963; Madsen, Nielsen and Tingleff 2004, section 3.2). A step that knows no bounds, and is cut off at one,
+may lead uphill: its other variables make up for what has been cut off. Each start keeps its own λ: it falls by how much
+of the predicted decrease a step brings, and grows, faster and faster, where it brings none. Starts are the best of a
+screen of candidates spread over the box, the best one first. The rest stays where it is as soon as one explains the
+recording. Two further ways lead to starts: one fits the recording's beginning, then more and more of it; the other is a
+derivative-free search from the best place over what is asked for. They come after three candidates, the former only
+while no second end is as low as the best one. Four such ends are enough, though they explain nothing, and two where a
+right motion may have such a loss. Then losses along the principal axes of the best place tell whether another minimum
+is lower nearby; from there it goes on.
 """
 
 from __future__ import annotations
