@@ -238,6 +238,15 @@ class TestFits:
         assert begun[1][1:] == [0, 0]
         assert begun[0][0] > begun[0][1] > begun[0][2] > 0
         assert enough.simulations < every.simulations == lower.simulations
+        monkeypatch.setattr(Objective, "explained", 1e-12)
+        monkeypatch.setattr(Objective, "knows_gaps", False)  # then two ends are enough, but not with a threshold
+        followed = [
+            sum(torch.stack(found.history.losses).isfinite().any(0).tolist())
+            for found in (
+                fit_gauss_newton(lifted(), SPACE, replace(settings, threshold=threshold)) for threshold in (0.0, 1e-30)
+            )
+        ]
+        assert followed == [2, 3]
         assert enough.stop_reason == every.stop_reason == "converged"
 
     @pytest.mark.parametrize("measure", [{"nuisance": {}}, {"paper": True}], ids=["all frames", "one frame"])

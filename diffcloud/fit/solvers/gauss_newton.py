@@ -2,17 +2,18 @@
 
 With half of the loss's slope g and of its curvature H on the axis of `residuals.Axis`, a step s minimises
 
-    g·s + s·(H + λ diag H) s / 2     between the bounds and within a length of one
+    g·s + s·(H + λ diag H) s / 2     between the bounds, no component longer than one
 
-(Marquardt 1963; Madsen, Nielsen and Tingleff 2004, section 3.2). A step that knows no bounds, and is cut off at one,
-may lead uphill: its other variables make up for what has been cut off. Each start keeps its own λ: it falls by how much
-of the predicted decrease a step brings, and grows, faster and faster, where it brings none. Starts are the best of a
-screen of candidates spread over the box, the best one first. The rest stays where it is as soon as one explains the
-recording. Two further ways lead to starts: one fits the recording's beginning, then more and more of it; the other is a
-derivative-free search from the best place over what is asked for. They come after three candidates, the former only
-while no second end is as low as the best one. Four such ends are enough, though they explain nothing, and two where a
-right motion may have such a loss. Then losses along the principal axes of the best place tell whether another minimum
-is lower nearby; from there it goes on.
+(Marquardt 1963; Madsen, Nielsen and Tingleff 2004, section 3.2). A step that is computed without the bounds, and then cut
+off at one, may lead uphill: its other components were chosen to go with what was cut off. Each start keeps its own λ: it
+falls by how much of the predicted decrease a step brings, and grows, faster and faster, where it brings none. Starts are
+the best of a screen of candidates spread over the box, the best one first. The remaining ones are not followed once one
+explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and more of it; the
+other is a derivative-free search, from the best place so far, over the parameters asked for only. Both come after three
+candidates (with a threshold, growing starts come after the first); growing starts wait as long as a second end is as low
+as the best one. Four equally low ends are taken for the minimum although they do not explain the recording; two are,
+where it is not known what cameras missed, or where the loss is so high that the model must be wrong. Then losses along
+the principal axes of the best place tell whether another minimum is lower nearby; from there it goes on.
 """
 
 from __future__ import annotations
@@ -70,8 +71,8 @@ _MISFIT = 30.0
 _EQUALLY = 1.01
 """Losses within this factor are equally low."""
 _WITNESSES, _FEW_WITNESSES = _BEFORE + 1, 2
-"""Of different candidates, ends that have to be equally low to be believed though they explain nothing, and where a right
-motion may have such a loss."""
+"""Equally low ends of different candidates that are taken for the minimum although they do not explain the recording; fewer
+where it is not known what cameras missed, or where the model must be wrong."""
 _SCREENED = 0.5
 """Part of the frames on which candidates are compared: the rest costs as much again, and has more wrong minima."""
 _GIVE_UP = 6
@@ -116,7 +117,7 @@ def fit_gauss_newton(
     axis = Axis.of(space)
     known = objective.explained
     most, explained = settings.starts or _MOST, settings.threshold or known
-    misfit = math.inf if not known and settings.threshold else _MISFIT * known if objective.knows_gaps else 0.0
+    misfit = math.inf if settings.threshold else _MISFIT * known if objective.knows_gaps else 0.0
     # a threshold says that something is lower, a number of starts that so many are to be followed
     witnesses = math.inf if settings.threshold or settings.starts else _WITNESSES
     places, simulations = _starts(objective, space, settings, axis, most)

@@ -1,4 +1,4 @@
-"""Energy that a sheet does not store in compression because it wrinkles finer than its mesh.
+"""What wrinkles finer than the mesh take off the energy that `stretching` stores in compression.
 
     energy per face = (1 - c) a [W*(E) - W(E)],   W(E) = E:C:E / 2,   W*(E) = min over slack A ⪰ 0 of W(E + A)
 
@@ -17,11 +17,11 @@ direction and free to narrow has no compression in its stress, and pulls as with
 
 Where a face becomes slack, or begins to wrinkle, the second derivatives of W* jump, and Newton's method oscillates.
 Two functions of the energies ease the jumps and keep the energy convex, so that the sum with `stretching` has a positive
-matrix. For the sheet at rest to be taut, E is the strain plus `_BEGINS` in all directions: so much compression is resisted
-in full, and about 1.5 times that stress remains.
+matrix. For the sheet at rest to be taut, E is the strain plus `_BEGINS` in all directions: compression up to
+that strain is resisted in full, and beyond it about 1.5 times the stress at that strain remains.
 
-Damping has c C in whatever state a face is. With the second derivatives of the energy, damping forces themselves would jump
-where a face becomes slack or taut, and steps would not converge.
+Together with `stretching`, damping has the stiffness c C, whatever state a face is in. With the second derivatives of the
+energy, the damping forces themselves would jump where a face becomes slack or taut, and steps would often not converge.
 """
 
 from __future__ import annotations
