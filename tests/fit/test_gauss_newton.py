@@ -426,6 +426,12 @@ class TestFits:
         assert not objective.knows_gaps  # a camera may have missed a part of it
         assert objective.explained == pytest.approx(2.0 / 1.1 * whole)
 
+    def test_a_first_start_beyond_the_bounds_begins_at_the_bound(self):
+        settings = GaussNewtonSettings(starts=1, screen=0, scans=0, init={"stretch": 40.0, "mass": 1.0})
+        found = fit_gauss_newton(lifted(), SPACE, settings)
+        assert found.history.values[0][0].tolist() == pytest.approx([float(Axis.of(SPACE).high[0]), 1.0])
+        assert found.loss < float(found.history.losses[0][0])
+
     def test_when_all_diverge(self, monkeypatch):
         objective = lifted()
 
