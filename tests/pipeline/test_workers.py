@@ -63,15 +63,17 @@ def test_workers_end_with_a_process_that_is_killed(tmp_path):
         "class Endless:\n"
         "    label = 'endless'\n"
         "    def run(self, tell):\n"
-        "        print(os.getpid(), flush=True)\n"
+        "        os.write(1, b'%d\\n' % os.getpid())\n"  # at once: print writes the end of a line apart
         "        time.sleep(600)\n"
         "if __name__ == '__main__':\n"
         "    list(run_all('endless', [Endless(), Endless()], 2))\n"
     )
     with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as process:
-        workers = [psutil.Process(int(process.stdout.readline())) for _ in range(2)]
-        servers = {worker.parent() for worker in workers}
-        process.kill()
+        try:
+            workers = [psutil.Process(int(process.stdout.readline())) for _ in range(2)]
+            servers = {worker.parent() for worker in workers}
+        finally:
+            process.kill()
     _, alive = psutil.wait_procs([*workers, *servers], timeout=30)
     assert not alive
 
