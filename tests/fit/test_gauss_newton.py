@@ -238,6 +238,7 @@ class TestFits:
         assert begun[1][1:] == [0, 0]
         assert begun[0][0] > begun[0][1] > begun[0][2] > 0
         assert enough.simulations < every.simulations == lower.simulations
+        assert enough.stop_reason == every.stop_reason == "converged"
         monkeypatch.setattr(Objective, "explained", 1e-12)
         monkeypatch.setattr(Objective, "knows_gaps", False)  # then two equal ends are enough, but not with a threshold
         monkeypatch.setattr(gauss_newton, "_EQUALLY", math.inf)
@@ -248,7 +249,6 @@ class TestFits:
             )
         ]
         assert followed == [2, 3]
-        assert enough.stop_reason == every.stop_reason == "converged"
 
     @pytest.mark.parametrize("measure", [{"nuisance": {}}, {"paper": True}], ids=["all frames", "one frame"])
     def test_where_the_first_start_explains_too_little_the_next_two_begin_with_the_first_frames(self, monkeypatch, measure):

@@ -362,8 +362,7 @@ def _starts(
     """Places [B, k] to start at, at least so many, the best ones first; and how many simulations it took to tell. A first
     start beyond a bound is taken to the bound."""
     count = max(1 + settings.screen, most)
-    values = space.starts(count, seed=settings.seed, first=settings.init)[0].double()
-    values = torch.minimum(torch.maximum(values, axis.low), axis.high)
+    values = space.starts(count, seed=settings.seed, first=settings.init)[0].double().clamp(axis.low, axis.high)
     if not settings.screen:
         return axis.places(values), 0
     losses = batch_losses(objective.until(_SCREENED), space, values)
