@@ -219,7 +219,7 @@ class FitConfig(Section):
     not given, all of them, as `fit.pose.default_priors` says."""
     laid: Name | None = None
     """How the cloth may lie other than as its scenario has it, and how far off: "turn=5deg,shape=5mm,size=2%", or "none"
-    (`fit.laid`). Default: what the scenario says, in implicit fits of one recording by gauss_newton; else none."""
+    (`fit.laid`). Default: what the scenario says, in implicit fits by gauss_newton; else none."""
     prior: Name | None = None
     """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""
     doubts: Name | None = None
@@ -274,13 +274,12 @@ class FitConfig(Section):
             if name not in {*self.parameters, *self.fixed}
         }
 
-    def laid_within(self, scenarios: Sequence[Scenario]) -> dict[str, float]:
-        """How the cloth may lie otherwise at the start, in one fit of recordings in these scenarios: name of `fit.laid` ->
-        standard deviation [rad, m, 1]."""
+    def laid_within(self, scenarios: Sequence[Scenario]) -> list[dict[str, float]]:
+        """How the cloth may lie otherwise at the start of each recording, in one fit of recordings in these scenarios: name
+        of `fit.laid` -> standard deviation [rad, m, 1]."""
         if self.laid is not None:
-            return parse_laid(self.laid)
-        alone = len(scenarios) == 1 and self._fits_more(scenarios)
-        return dict(scenarios[0].laid) if alone else {}
+            return [parse_laid(self.laid)] * len(scenarios)
+        return [dict(one.laid) if self._fits_more(scenarios) else {} for one in scenarios]
 
     def _fits_more(self, scenarios: Sequence[Scenario]) -> bool:
         """Whether more than what is asked for is fitted by default: where derivatives make that cheap."""

@@ -118,7 +118,7 @@ def fit(
         typer.Option(
             help="Also find how the cloth lay before the motion, and how far off that may be: turn=5deg (askew under the "
             "gripper), shape=5mm (not flat; of each of nine waves), size=2% (larger or smaller than stated), track=2% (the "
-            "gripper's path longer or shorter than recorded). Only if the cloth starts level; not with --joint. "
+            "gripper's path longer or shorter than recorded). Only if the cloth starts level. "
             "Default: what the scenario says (the recorded_ ones turn=10deg,shape=1cm; others none)."
         ),
     ] = None,

@@ -12,9 +12,9 @@ from diffcloud.fit import FitSpace, JointObjective, Objective, Progress, read_fi
 from diffcloud.fit.doubts import with_doubts
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.laid import with_laid
-from diffcloud.fit.left_out import leave_each_out
+from diffcloud.fit.left_out import leave_out_and_go_on
 from diffcloud.fit.priors import parameter_priors
-from diffcloud.fit.record import FitRecord
+from diffcloud.fit.record import FitRecord, LeftOut
 from diffcloud.fit.result import describe_fit
 from diffcloud.fit.solvers import SearchSettings
 from diffcloud.io.episodes import Episode, read_episode
@@ -183,17 +183,22 @@ class FitJob:
         objective, space = self.objective(), self.space
         settings = replace(self.settings.solver_settings(self.scenario), init=self.init)
         outcome = solve(objective, space, settings, progress=show_progress)
-        result = describe_fit(objective, space, settings, outcome, episodes=[one.name for one in self.recordings])
-        record, interrupted = result.record, outcome.stop_reason == "interrupted"
+        left, failures, interrupted = list[LeftOut](), list[str](), outcome.stop_reason == "interrupted"
         if isinstance(objective, JointObjective) and not interrupted:
             try:
-                left = leave_each_out(objective, space, outcome.values, progress=lambda progress: check_interrupt())
-                for recording, told in zip(record.episodes, left, strict=True):
-                    recording.left_out = told
+                outcome, left = leave_out_and_go_on(
+                    objective, space, outcome, settings, progress=lambda progress: check_interrupt()
+                )
             except DivergedError as error:
-                record.failures.append(f"leaving one recording out: {error}")
+                failures.append(f"leaving one recording out: {error}")
             except KeyboardInterrupt:
-                record.stop_reason, interrupted = "interrupted", True
+                interrupted = True
+        result = describe_fit(objective, space, settings, outcome, episodes=[one.name for one in self.recordings])
+        record = result.record
+        record.failures += failures
+        record.stop_reason = "interrupted" if interrupted else record.stop_reason
+        for recording, told in zip(record.episodes, left, strict=bool(left)):
+            recording.left_out = told
         record.fingerprint = self._fingerprint
         write_fit(self.folder, self.name, result)
         if interrupted:

@@ -6,13 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from diffcloud.errors import DiffCloudError
+from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.evaluation import methods
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, state_intervals
 from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
 from diffcloud.fit import AdamSettings, CmaEsSettings, FitRecord, FitSpace, Objective, RandomSearchSettings
+from diffcloud.fit.names import of_recording
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 
@@ -66,22 +67,30 @@ def compare_episode(
         fit_name: of the fit, if it is another than the episode's: a joint fit has several episodes.
         predictions: of networks, and why those that should be there are not.
         transfers: episode -> parameters fitted on it, of other recordings of the same fabric.
+
+    Raises:
+        ConfigError: a joint fit that knows no such episode.
     """
     settings = settings or ComparisonSettings()
     measure = fit.measure.model_dump(exclude={"seed"})
-    space = methods.space_of(fit)
+    number = fit.number_of(name, scenario.name)
+    if number is None:
+        known = ", ".join(f"{one.scenario}/{one.name}" for one in fit.episodes)
+        raise ConfigError(f"The fit is of {known}, not of {scenario.name}/{name}.")
+    space, _ = methods.space_of(fit).of_recording(number)
     objective = Objective(scenario, episode, **measure, seed=fit.measure.seed)
-    told: list[Estimate | Gap] = [methods.fitted(fit)]
-    laid = FitSpace(space.asked.variables, {**space.asked.fixed, **fit.laid})  # as the pose, for all methods
-    told += [_run(rival, objective, laid, fit, settings.seed) for rival in settings.rivals]
+    told: list[Estimate | Gap] = [methods.fitted(fit, number)]
+    laid = fit.episodes[number].laid(length_unit_m=fit.length_unit_m)  # as the pose, for all methods
+    lying = FitSpace(space.asked.variables, {**space.asked.fixed, **laid})
+    told += [_run(rival, objective, lying, fit, settings.seed) for rival in settings.rivals]
     told += [*predictions, *methods.published(episode.meta)]
     estimates = [entry for entry in told if isinstance(entry, Estimate)]
     gaps = [entry for entry in told if isinstance(entry, Gap)]
     meter = EpisodeMeter(objective, draws=settings.draws, seed=settings.seed)
     sources = dict(transfers or {})
     every = (*(e.values for e in estimates), *sources.values())
-    sets = [methods.clipped({**fit.laid, **values}, space) for values in every]
-    measured = meter.measure([*sets, fit.start])
+    sets = [methods.clipped({**laid, **values}, space) for values in every]
+    measured = meter.measure([*sets, of_recording(fit.start, number)])
     rows, transferred = [], []
     for index, estimate in enumerate(estimates):
         if index in measured.diverged:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from diffcloud.fit import AdamSettings, CmaEsSettings, FitRecord, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
 from diffcloud.fit.laid import variables_of
+from diffcloud.fit.names import of_recording
 from diffcloud.fit.parameters import Variable
 from diffcloud.fit.scan import Scan
 from diffcloud.fit.solvers import SOLVER_NAMES, SOLVERS, FitOutcome, SearchSettings
@@ -59,8 +60,8 @@ def space_of(fit: FitRecord) -> FitSpace:
             fixed[name] = entry.value
         else:
             variables.append(Variable(name, *entry.bounds, entry.prior, entry.centre, entry.doubtful))
-    laid = {name: entry for name, entry in fit.nuisance.items() if entry.of == "cloth"}
-    return FitSpace((*variables, *variables_of(laid, length_unit_m=fit.length_unit_m)), fixed)
+    laid = variables_of([one.nuisance for one in fit.episodes], length_unit_m=fit.length_unit_m)
+    return FitSpace((*variables, *laid), fixed)
 
 
 def scan_of(fit: FitRecord) -> Scan | None:
@@ -68,11 +69,11 @@ def scan_of(fit: FitRecord) -> Scan | None:
     return None if fit.scan is None else Scan.of(fit.scan)
 
 
-def fitted(fit: FitRecord) -> Estimate:
-    """The fit itself."""
+def fitted(fit: FitRecord, recording: int) -> Estimate:
+    """The fit itself, of one of its recordings."""
     return Estimate(
         "diffcloud",
-        fit.simulated,
+        of_recording(fit.simulated, recording),
         simulations=fit.simulations,
         gradients=not issubclass(SOLVERS[fit.solver], SearchSettings),
         seconds={"optimisation": fit.seconds},

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from diffcloud.errors import ConfigError
+from diffcloud.fit.names import of_recording
 from diffcloud.fit.objective import Objective
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS
@@ -58,8 +59,13 @@ class JointObjective:
         return float(mean_loss(levels, paper=self.paper))
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Losses [B], as of `Objective`."""
-        return mean_loss(torch.stack(map_threads(lambda one: one(parameters), self.members)), paper=self.paper)
+        """Losses [B], as of `Objective`.
+
+        Args:
+            parameters: name -> [B]; what is one recording's own is named as `fit.names` says.
+        """
+        own = [(one, of_recording(parameters, index)) for index, one in enumerate(self.members)]
+        return mean_loss(torch.stack(map_threads(lambda pair: pair[0](pair[1]), own)), paper=self.paper)
 
     def until(self, part: float) -> JointObjective:
         """As of `Objective`, of every one."""

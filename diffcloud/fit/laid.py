@@ -2,8 +2,8 @@
 
 The pose (`fit.pose`) moves cloth, gripper and bodies together, which is the same motion seen from elsewhere. A cloth that a
 hand has laid down 5° askew, or with a rim that stands up, moves in another way, and so does a larger one. So these are
-variables of the motion, like doubtful material (`fit.doubts`): fitted under priors, one set for a recording, and no
-property of the cloth.
+variables of the motion, like doubtful material (`fit.doubts`): fitted under priors, and no property of the material. In a
+joint fit, each recording has its own, but for the size, which is that of the one cloth.
 
 The turn is about the cloth's middle. Its height over where the scene lays it is a sum of nine waves over the cloth,
 
@@ -23,14 +23,15 @@ import torch
 from torch import Tensor
 
 from diffcloud.errors import ConfigError, unknown_name
+from diffcloud.fit.names import of_all, plain_name
 from diffcloud.fit.parameters import FitSpace, Variable
 from diffcloud.fit.priors import parse_deviations
 from diffcloud.fit.record import NuisanceValue
 from diffcloud.mesh.topology import ClothMesh
 from diffcloud.scene.scenarios import Scenario
 
-LAID: dict[str, Literal["m", "rad", "1"]] = {"turn": "rad", "shape": "m", "size": "1", "track": "1"}
-"""Name -> unit. `shape` stands for the height of each wave."""
+LAID: dict[str, Literal["m", "rad", "1"]] = {"size": "1", "turn": "rad", "shape": "m", "track": "1"}
+"""Name -> unit, what recordings share first (`fit.names`). `shape` stands for the height of each wave."""
 _LARGEST_SHARE = 0.2
 """Largest standard deviation of `size` or `track`; scenarios have the same limit."""
 _SHAPES = {f"shape_{i}_{j}": (i, j) for i in range(4) for j in range(4) if 0 < i + j <= 3}
@@ -56,44 +57,57 @@ def parse_laid(text: str) -> dict[str, float]:
     return found
 
 
-def with_laid(space: FitSpace, laid: Mapping[str, float], scenarios: Sequence[Scenario]) -> FitSpace:
+def with_laid(space: FitSpace, laid: Sequence[Mapping[str, float]], scenarios: Sequence[Scenario]) -> FitSpace:
     """The space with the variables appended.
 
     Args:
-        laid: name -> standard deviation [m, rad, 1].
+        laid: for each recording, name -> standard deviation [m, rad, 1]. One of a shared variable holds for all; of
+            several, the largest.
         scenarios: of the recordings.
 
     Raises:
-        ConfigError: several recordings, of which each would need its own, a cloth that does not lie level, or a size where
-            there is more than a table around the cloth.
+        ConfigError: a cloth that does not lie level, or a size where there is more than a table around the cloth.
     """
-    if not laid:
-        return space
-    told = f"laid {', '.join(laid)}: "
-    if len(scenarios) > 1:
-        raise ConfigError(
-            f"{told}the cloth lies differently in each recording, which joint fits do not support; fit them one by one."
-        )
-    nodes = scenarios[0].scene.mesh.nodes
-    if np.ptp(nodes[:, 2]) > _FLAT * np.ptp(nodes, axis=0).max():
-        raise ConfigError(f"{told}this needs a cloth that lies level at the start; that of {scenarios[0].name} does not.")
-    if "size" in laid:
-        check_resizable(scenarios[0])
-    names = [own for name in LAID if name in laid for own in (_SHAPES if name == "shape" else (name,))]
-    own = [_variable(name, laid[asked_as(name)], scenarios[0].length_unit_m) for name in names]
-    return FitSpace((*space.variables, *own), space.fixed)
+    sizes = [own["size"] for own in laid if "size" in own]
+    deviations: list[dict[str, float]] = []
+    for own, scenario in zip(laid, scenarios, strict=True):
+        nodes = scenario.scene.mesh.nodes
+        if own and np.ptp(nodes[:, 2]) > _FLAT * np.ptp(nodes, axis=0).max():
+            told = (
+                f"laid {', '.join(own)}: this needs a cloth that lies level at the start; that of {scenario.name} does not."
+            )
+            raise ConfigError(told)
+        known = {**own, "size": max(sizes)} if sizes else own
+        if sizes:
+            check_resizable(scenario)
+        names = [each for name in LAID if name in known for each in (_SHAPES if name == "shape" else (name,))]
+        deviations.append({name: known[asked_as(name)] for name in names})
+    own_variables = _variables(deviations, length_unit_m=scenarios[0].length_unit_m)
+    return FitSpace((*space.variables, *own_variables), space.fixed)
 
 
-def variables_of(described: Mapping[str, NuisanceValue], *, length_unit_m: float) -> list[Variable]:
+def variables_of(described: Sequence[Mapping[str, NuisanceValue]], *, length_unit_m: float) -> list[Variable]:
     """Those that `described_laid` tells of.
+
+    Args:
+        described: of each recording; other nuisance is passed over.
 
     Raises:
         ConfigError: an unknown one.
     """
-    for name in described:
+    every = [{name: entry.prior for name, entry in one.items() if entry.of == "cloth"} for one in described]
+    for name in (name for one in every for name in one):
         if not is_laid(name):
             raise ConfigError(unknown_name("variable of how a cloth lies", name, [*filter(is_laid, LAID), *_SHAPES]))
-    return [_variable(name, entry.prior, length_unit_m) for name, entry in described.items()]
+    return _variables(every, length_unit_m=length_unit_m)
+
+
+def _variables(deviations: Sequence[Mapping[str, float]], *, length_unit_m: float) -> list[Variable]:
+    """
+    Args:
+        deviations: for each recording, name of a variable -> [m, rad, 1].
+    """
+    return [_variable(name, deviation, length_unit_m) for name, deviation in of_all(deviations).items()]
 
 
 def check_resizable(scenario: Scenario) -> None:
@@ -126,12 +140,14 @@ def _variable(name: str, deviation: float, length_unit_m: float) -> Variable:
 
 def is_laid(name: str) -> bool:
     """Whether a variable tells how a cloth lies."""
-    return name in _SHAPES or (name in LAID and name != "shape")
+    plain = plain_name(name)
+    return plain in _SHAPES or (plain in LAID and plain != "shape")
 
 
 def asked_as(name: str) -> str:
     """The name in `LAID` under which a variable is asked for; of any other, its own."""
-    return "shape" if name in _SHAPES else name
+    plain = plain_name(name)
+    return "shape" if plain in _SHAPES else plain
 
 
 def sizes_of(values: Mapping[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:

@@ -1,45 +1,100 @@
-"""What the other recordings of a joint fit say of one: whether parameters carry over."""
+"""What the other recordings of a joint fit say of one: whether parameters carry over.
+
+A fit of the others begins where the joint one ended. Where it explains even the one that it has never seen better, the
+joint fit has missed a lower minimum, and goes on from there.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import torch
 
-from diffcloud.fit.joint import JointObjective
+from diffcloud.fit.batches import batch_losses
+from diffcloud.fit.joint import AnyObjective, JointObjective
+from diffcloud.fit.laid import is_laid
+from diffcloud.fit.names import SHARED, of_recording, with_recording, without_recording
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.record import LeftOut
-from diffcloud.fit.solvers import GaussNewtonSettings, Progress, fit_gauss_newton
+from diffcloud.fit.scan import LOWER
+from diffcloud.fit.solvers import FitOutcome, GaussNewtonSettings, Progress, Settings, fit_gauss_newton
 from diffcloud.sim.properties import one_set
 
 _STEPS = 10
+_TIMES = 2
+"""That a joint fit goes on, at most."""
+Tell = Callable[[Progress], None]
+
+
+def leave_out_and_go_on(
+    objective: JointObjective,
+    space: FitSpace,
+    outcome: FitOutcome,
+    settings: Settings,
+    *,
+    progress: Tell | None = None,
+) -> tuple[FitOutcome, list[LeftOut]]:
+    """`leave_each_out` of a joint fit; one by Gauss–Newton that has missed a lower minimum goes on first.
+
+    Raises:
+        DivergedError, KeyboardInterrupt: as there.
+    """
+    left = _TIMES
+    while True:
+        told, lower = leave_each_out(objective, space, outcome.values, progress=progress)
+        if lower is None or not left or not isinstance(settings, GaussNewtonSettings):
+            return outcome, told
+        left -= 1
+        further = replace(settings, starts=1, screen=0, init=lower)
+        outcome = outcome.gone_on(fit_gauss_newton(objective, space, further, progress=progress))
+        if outcome.stop_reason == "interrupted":
+            raise KeyboardInterrupt
 
 
 def leave_each_out(
-    objective: JointObjective,
-    space: FitSpace,
-    values: Mapping[str, float],
-    *,
-    progress: Callable[[Progress], None] | None = None,
-) -> list[LeftOut]:
-    """For each recording: a fit to all others, from the joint optimum on, measured on it with its own pose.
+    objective: JointObjective, space: FitSpace, values: Mapping[str, float], *, progress: Tell | None = None
+) -> tuple[list[LeftOut], dict[str, float] | None]:
+    """For each recording: a fit to all others, from the joint optimum on, measured on it with its own pose, and with how
+    the cloth lay in it, which is fitted to it alone.
 
     Args:
-        values: fitted to all.
+        values: fitted to all, named as `fit.names` says.
+
+    Returns:
+        What came of each, and values of a clearly lower loss of all, if one of these fits has met them.
 
     Raises:
         DivergedError: a motion diverges.
         KeyboardInterrupt: Ctrl-C.
     """
-    told = []
-    settings = GaussNewtonSettings(iterations=_STEPS, starts=1, screen=0, scans=0, init=values)
+    told, places = [], [dict(values)]
     for index, member in enumerate(objective.members):
         others = JointObjective([*objective.members[:index], *objective.members[index + 1 :]])
-        found = fit_gauss_newton(others, space, settings, progress=progress)
-        if found.stop_reason == "interrupted":
-            raise KeyboardInterrupt
-        parameters = found.values | dict(space.fixed)
+        found = _from(others, space.without_recording(index), without_recording(values, index), progress)
+        alike = {name: value for name, value in found.items() if not _own(name)}
+        here, _ = space.of_recording(index)
+        lying = FitSpace(tuple(one for one in here.variables if _own(one.name)), {**here.fixed, **alike})
+        lies = _from(member, lying, of_recording(values, index), progress) if lying.variables else {}
         with torch.no_grad():
-            loss = float(member(one_set(parameters)))
+            loss = float(member(one_set({**lying.fixed, **lies})))
+        parameters = {name: value for name, value in lying.fixed.items() if not is_laid(name)}
         told.append(LeftOut(loss=loss, rms_mm=1e3 * member.scenario.length_unit_m * loss**0.5, parameters=parameters))
-    return told
+        places.append(with_recording(found, lies, index))
+    rows = torch.tensor([[place[name] for name in space.names] for place in places], dtype=torch.float64)
+    losses = batch_losses(objective, space, rows)
+    return told, places[int(losses.argmin())] if float(losses.min()) < (1 - LOWER) * float(losses[0]) else None
+
+
+def _own(name: str) -> bool:
+    """Whether each recording has a variable for itself."""
+    return is_laid(name) and name not in SHARED
+
+
+def _from(objective: AnyObjective, space: FitSpace, values: Mapping[str, float], progress: Tell | None) -> dict[str, float]:
+    """The lowest values near these, of what is fitted."""
+    settings = GaussNewtonSettings(iterations=_STEPS, starts=1, screen=0, scans=0, init=values)
+    found = fit_gauss_newton(objective, space, settings, progress=progress)
+    if found.stop_reason == "interrupted":
+        raise KeyboardInterrupt
+    return found.values

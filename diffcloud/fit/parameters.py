@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from diffcloud.errors import ConfigError, unknown_name
+from diffcloud.fit.names import of_recording, without_recording
 from diffcloud.fit.priors import INDEPENDENT
 from diffcloud.sim.properties import PARAMETERS, check_values
 
@@ -99,6 +100,18 @@ class FitSpace:
         """What was asked for; doubtful material is where its prior has it."""
         known = {variable.name: variable.centre for variable in self.variables if variable.doubtful}
         return FitSpace(tuple(v for v in self.variables if not v.doubtful), {**self.fixed, **known})
+
+    def of_recording(self, recording: int) -> tuple[FitSpace, Tensor]:
+        """Of one recording of a joint fit (`fit.names`), and where its k variables are among all."""
+        chosen = of_recording(dict(zip(self.names, range(len(self.names)), strict=True)), recording)
+        variables = tuple(replace(self.variables[place], name=name) for name, place in chosen.items())
+        return FitSpace(variables, of_recording(self.fixed, recording)), torch.tensor([*chosen.values()])
+
+    def without_recording(self, recording: int) -> FitSpace:
+        """Of the others of a joint fit."""
+        left = without_recording(dict(zip(self.names, self.variables, strict=True)), recording)
+        variables = tuple(replace(variable, name=name) for name, variable in left.items())
+        return FitSpace(variables, without_recording(self.fixed, recording))
 
     def check_start(self, first: Mapping[str, float]) -> None:
         """

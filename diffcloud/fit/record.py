@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from diffcloud.errors import ConfigError
+from diffcloud.fit.names import of_all
 from diffcloud.io.files import read_json
 
 SCHEMA = 8
@@ -73,6 +74,11 @@ class RecordingFit(_Model):
     """[3] of the recording, about which the scene is turned [length unit]."""
     left_out: LeftOut | None = None
     """In a joint fit of several recordings."""
+
+    def laid(self, *, length_unit_m: float) -> dict[str, float]:
+        """Name -> value, of how the cloth lies when its motion begins (`fit.laid`), as the simulator takes it."""
+        unit = {"m": length_unit_m, "rad": 1.0, "1": 1.0}
+        return {name: entry.value / unit[entry.unit] for name, entry in self.nuisance.items() if entry.of == "cloth"}
 
     @field_validator("nuisance")
     @classmethod
@@ -216,7 +222,7 @@ class FitRecord(_Model):
     seconds: NonNegative
     stop_reason: Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
     start: dict[str, NonNegative]
-    """Parameters of the first start, the given ones too, and how the cloth lies (`fit.laid`)."""
+    """Parameters of the first start, the given ones too, and how the cloth lies, named as in `free`."""
     best_start: Annotated[int, Field(ge=0, le=1_000_000)]
     measure: Measure
     settings: dict[str, Annotated[int, Field(ge=0)] | bool | NonNegative | None]
@@ -236,6 +242,11 @@ class FitRecord(_Model):
             raise ValueError("scan.directions must hold one number for each fitted parameter")
         return self
 
+    def number_of(self, name: str, scenario: str) -> int | None:
+        """The place of a recording among `episodes`; None: it is none of them. A single one may go by another name."""
+        found = [index for index, one in enumerate(self.episodes) if (one.name, one.scenario) == (name, scenario)]
+        return found[0] if found else 0 if len(self.episodes) == 1 else None
+
     @property
     def values(self) -> dict[str, float]:
         """Parameter -> value, the given ones too."""
@@ -248,20 +259,18 @@ class FitRecord(_Model):
 
     @property
     def free(self) -> dict[str, float]:
-        """Name -> value, of all that was fitted: asked for, doubtful, or of how the cloth lies."""
+        """Name -> value, of all that was fitted: asked for, doubtful, or of how the cloth lies (`fit.names`)."""
         material = {name: parameter.value for name, parameter in self.parameters.items() if not parameter.fixed}
-        return {**material, **self.laid}
-
-    @property
-    def laid(self) -> dict[str, float]:
-        """Name -> value, of how the cloth lies when its motion begins (`fit.laid`), as the simulator takes it."""
-        unit = {"m": self.length_unit_m, "rad": 1.0, "1": 1.0}
-        return {name: entry.value / unit[entry.unit] for name, entry in self.nuisance.items() if entry.of == "cloth"}
+        return {**material, **self._laid}
 
     @property
     def simulated(self) -> dict[str, float]:
-        """Name -> value, of all that the fitted motion was simulated with."""
-        return {**self.values, **self.laid}
+        """Name -> value, of all that the fitted motions were simulated with, named as in `free`."""
+        return {**self.values, **self._laid}
+
+    @property
+    def _laid(self) -> dict[str, float]:
+        return of_all([one.laid(length_unit_m=self.length_unit_m) for one in self.episodes])
 
     def plain(self) -> dict[str, Any]:
         """As the file has it."""

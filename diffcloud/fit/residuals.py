@@ -99,7 +99,7 @@ def linearise(objective: AnyObjective, space: FitSpace, places: Tensor) -> Linea
     paper = objective.paper
 
     def run(index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        parts = map_threads(lambda one: _over_pose(one, *moved_by(one, space, places[index])), objective.members)
+        parts = map_threads(lambda one: _part(objective, space, places[index], one), range(len(objective.members)))
         loss, slope, curvature = mean_terms(parts, paper=paper)
         values, count = Axis.of(space).values(places[index]), len(objective.members)
         prior, factor = loss[:, None] * space.prior_weights(count), space.prior_factor(values, count)
@@ -113,8 +113,20 @@ def linearise(objective: AnyObjective, space: FitSpace, places: Tensor) -> Linea
     slope, curvature = places.new_zeros(count, variables), places.new_zeros(count, variables, variables)
     if found is not None:
         losses[kept], slope[kept], curvature[kept] = found
-    each = sum(1 if by_tangents(member) else 1 + 2 * variables for member in objective.members)
+    sizes = [len(space.of_recording(index)[1]) for index in range(len(objective.members))]
+    each = sum(1 if by_tangents(one) else 1 + 2 * size for one, size in zip(objective.members, sizes, strict=True))
     return Linearisation(losses, slope, curvature, each * count)
+
+
+def _part(objective: AnyObjective, space: FitSpace, places: Tensor, recording: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Loss [B], slope [B, k] and curvature [B, k, k] of one recording, which only its own variables move."""
+    own, columns = space.of_recording(recording)
+    member = objective.members[recording]
+    loss, own_slope, own_curvature = _over_pose(member, *moved_by(member, own, places[:, columns]))
+    batch, variables = places.shape
+    slope, curvature = places.new_zeros(batch, variables), places.new_zeros(batch, variables, variables)
+    slope[:, columns], curvature[:, columns[:, None], columns] = own_slope, own_curvature
+    return loss, slope, curvature
 
 
 def by_tangents(objective: Objective) -> bool:

@@ -17,6 +17,7 @@ import diffcloud
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.joint import AnyObjective, mean_loss
 from diffcloud.fit.laid import described_laid, is_laid
+from diffcloud.fit.names import of_recording
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.pose import PoseSpace
@@ -129,12 +130,14 @@ def describe_fit(
     start_values = outcome.start | dict(space.fixed)
     unit = first.scenario.length_unit_m
     with torch.no_grad():
-        runs, starts = zip(*(_as_far_as_both_go(member, values, start_values) for member in members), strict=True)
+        own = [(of_recording(values, index), of_recording(start_values, index)) for index in range(len(members))]
+        both = (_as_far_as_both_go(member, *told) for member, told in zip(members, own, strict=True))
+        runs, starts = zip(*both, strict=True)
         recordings = [
             describe_recording(member, run, name) for member, run, name in zip(members, runs, episodes, strict=True)
         ]
-        for recording in recordings:  # a joint fit has no variables of a start
-            recording.nuisance |= described_laid(space, values, length_unit_m=unit)
+        for index, recording in enumerate(recordings):
+            recording.nuisance |= described_laid(space.of_recording(index)[0], own[index][0], length_unit_m=unit)
         poses = [recorded_pose(recording, length_unit_m=unit)[1] for recording in recordings]
         motions = [
             _fitted_motion(member, run, start, pose)

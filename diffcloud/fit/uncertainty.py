@@ -35,6 +35,7 @@ from diffcloud.fit.inputs import Inputs
 from diffcloud.fit.joint import AnyObjective, loss_weights, mean_loss
 from diffcloud.fit.laid import asked_as
 from diffcloud.fit.matching import Motion
+from diffcloud.fit.names import of_recording
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.pose import NUISANCE, TRIED, set_up_of, unit_of
@@ -107,7 +108,7 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
     axis = Axis.of(space)
     places = axis.places(torch.tensor([[values[name] for name in space.names]], dtype=torch.float64))
     with torch.no_grad():
-        parts = map_threads(lambda member: _Part.of(member, space, places), objective.members)
+        parts = map_threads(lambda index: _part(objective, space, places, index), range(len(objective.members)))
     losses, factors = torch.tensor([[part.loss, part.factor] for part in parts], dtype=torch.float64).T[:, :, None]
     weights = loss_weights(losses, paper=objective.paper)[:, 0].numpy()
     loss = float(mean_loss(losses, paper=objective.paper))
@@ -167,20 +168,20 @@ def distance_to_finer_mm(
     spacing of the recorded points account for [mm]; of the recording in which the first is the larger part of the second.
 
     Args:
-        values: all parameters, the given ones too.
+        values: all parameters, the given ones too, and how the cloth lies.
         finer: `finer_steps` or `Scenario.finer`.
 
     Raises:
         DivergedError: a motion diverges.
     """
-    parameters = one_set(values)
 
-    def told(member: Objective) -> tuple[float, float]:
+    def told(recording: int) -> tuple[float, float]:
+        member, parameters = objective.members[recording], one_set(of_recording(values, recording))
         way = _way_to(finer(member.scenario), member, parameters, member.simulate_to_loss(parameters))
         return 1e3 * member.length_unit_m * float(way.square().sum(-1).mean().sqrt()), noise_mm(member)
 
     with torch.no_grad():
-        return max(map_threads(told, objective.members), key=lambda pair: pair[0] / pair[1])
+        return max(map_threads(told, range(len(objective.members))), key=lambda pair: pair[0] / pair[1])
 
 
 def noise_mm(objective: Objective) -> float:
@@ -249,6 +250,20 @@ class _Part:
         scores = _clustered(free, motion, rates)
         factor = float(objective.pose_space.prior_factor(fitted_pose[None]))
         return _Part(loss, factor, onto @ slope, onto @ curved[:, :k], scores[:, felt] @ onto.T, found)
+
+
+def _part(objective: AnyObjective, space: FitSpace, places: Tensor, recording: int) -> _Part:
+    """Of one recording, over all variables; those of the others do nothing here."""
+    own, columns = space.of_recording(recording)
+    part = _Part.of(objective.members[recording], own, places[:, columns])
+    spread = np.eye(len(space.names))[columns.numpy()]
+    return replace(
+        part,
+        slope=part.slope @ spread,
+        normal=spread.T @ part.normal @ spread,
+        scores=part.scores @ spread,
+        doubts={name: change @ spread for name, change in part.doubts.items()},
+    )
 
 
 def _slopes(

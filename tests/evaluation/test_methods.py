@@ -93,7 +93,7 @@ def test_an_interrupted_rival_is_no_result(rival, monkeypatch):
 
 @pytest.mark.parametrize(("solver", "gradients"), [("gauss_newton", True), ("adam", True), ("random_search", False)])
 def test_a_fit_by_a_search_had_no_gradients(solver, gradients):
-    assert fitted(record_of(solver=solver)).gradients is gradients
+    assert fitted(record_of(solver=solver), 0).gradients is gradients
 
 
 def test_batches_without_the_diverged_are_the_single_ones():

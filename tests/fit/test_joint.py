@@ -6,16 +6,30 @@ import os
 import signal
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from diffcloud.errors import ConfigError, DivergedError
-from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton
+from diffcloud.evaluation.methods import space_of
+from diffcloud.fit import (
+    FitSpace,
+    GaussNewtonSettings,
+    JointObjective,
+    Objective,
+    fit_gauss_newton,
+    read_fit,
+    write_fit,
+)
+from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.joint import mean_loss, mean_terms
-from diffcloud.fit.left_out import leave_each_out
+from diffcloud.fit.laid import laid_nodes, with_laid
+from diffcloud.fit.left_out import leave_each_out, leave_out_and_go_on
 from diffcloud.fit.residuals import Axis, linearise
+from diffcloud.fit.result import describe_fit
+from diffcloud.fit.uncertainty import uncertainty
 from diffcloud.sim.properties import one_set
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.threads import map_threads, use_threads
@@ -32,6 +46,76 @@ def motions(**changes):
     """Two scenarios of one cloth: a slow lift, and the same corner pulled to the side."""
     settings = {**GENTLE, "integrator": "implicit", "points": 500, **changes}
     return small_lift(**settings), small_lift(**{**settings, "path": SIDEWAYS})
+
+
+@pytest.fixture(scope="module")
+def askew():
+    """Two motions of one cloth that lay askew in each, the fit of all that, and of the material alone."""
+    lies = [{"turn": 0.15}, {"turn": -0.1}]
+    told = [clouds_of(s, points=4000, **TRUTH, **own) for s, own in zip(motions(), lies, strict=True)]
+    members = [Objective(scenario, one, nuisance={}) for scenario, one in zip(motions(), told, strict=True)]
+    joint, settings = JointObjective(members), GaussNewtonSettings(starts=1, screen=0, scans=0, init=TRUTH)
+    space = with_laid(SPACE, [{"turn": 0.1}] * 2, motions())
+    return joint, settings, space, [(one, fit_gauss_newton(joint, one, settings)) for one in (SPACE, space)]
+
+
+class TestLaid:
+    def test_each_recording_shows_how_its_cloth_lay(self, askew):
+        *_, ((_, flat), (_, found)) = askew
+        assert [found.values[f"turn@{number}"] for number in (0, 1)] == pytest.approx([0.15, -0.1], abs=0.01)
+        assert {name: found.values[name] for name in TRUTH} == pytest.approx(TRUTH, rel=0.05)
+        assert abs(np.log(flat.values["stretch"] / TRUTH["stretch"])) > 1.0
+        assert found.loss < 0.1 * flat.loss
+
+    def test_of_the_one_left_out_it_is_found_anew(self, askew):
+        joint, _, space, (_, (_, found)) = askew
+        told, lower = leave_each_out(joint, space, found.values)
+        assert lower is None
+        for one, member, own in zip(told, joint.members, ({"turn": 0.15}, {"turn": -0.1}), strict=True):
+            assert set(one.parameters) == set(TRUTH)
+            with torch.no_grad():
+                true = float(member(one_set({**TRUTH, **own})))
+            assert one.loss < 1.5 * true
+
+    def test_a_joint_fit_goes_on_where_one_of_the_others_shows_a_lower_minimum(self, askew):
+        """One that was ended at the middle of the range: what is left out of it finds the way."""
+        joint, settings, space, (_, (_, found)) = askew
+        stopped = fit_gauss_newton(joint, space, replace(settings, init={}, iterations=1))
+        assert stopped.loss > 2 * found.loss
+        _, lower = leave_each_out(joint, space, stopped.values)
+        assert (
+            float(batch_losses(joint, space, torch.tensor([[lower[name] for name in space.names]]).double())) < stopped.loss
+        )
+        outcome, told = leave_out_and_go_on(joint, space, stopped, settings)
+        assert outcome.loss == pytest.approx(found.loss, rel=0.05)
+        assert outcome.start == stopped.start
+        assert outcome.simulations > stopped.simulations
+        assert outcome.iterations == len(outcome.history.values) - 1 > stopped.iterations
+        assert outcome.history.losses[-1].min() == outcome.loss
+        assert len(told) == 2
+
+    def test_records_tell_it_of_each_recording(self, askew, tmp_path):
+        joint, settings, space, (_, (_, found)) = askew
+        result = describe_fit(joint, space, settings, found, episodes=["a", "b"])
+        record = read_fit(write_fit(tmp_path, "joint", result))
+        assert [one.nuisance["turn"].value for one in record.episodes] == [found.values[f"turn@{n}"] for n in (0, 1)]
+        assert not record.nuisance
+        assert space_of(record) == space
+        with torch.no_grad():
+            assert float(joint(one_set(record.simulated))) == pytest.approx(record.loss, rel=1e-9)
+        for scenario, motion, own in zip(motions(), result.motions, record.episodes, strict=True):
+            (lies,) = laid_nodes(scenario.scene.mesh, one_set(own.laid(length_unit_m=1.0)))
+            np.testing.assert_allclose(motion.nodes[0], lies, atol=1e-15)
+
+    def test_intervals_do_not_depend_on_the_order(self, askew):
+        joint, _, space, (_, (_, found)) = askew
+        swapped = {"turn@0": "turn@1", "turn@1": "turn@0"}
+        values = {swapped.get(name, name): value for name, value in found.values.items()}
+        one = uncertainty(joint, space, found.values)
+        other = uncertainty(JointObjective(joint.members[::-1]), space, values)
+        assert "turn" in one.sources
+        for name, covariance in one.sources.items():
+            np.testing.assert_allclose(other.sources[name], covariance, rtol=1e-6, atol=1e-16)
 
 
 class TestMean:
@@ -76,7 +160,7 @@ class TestFit:
         joint = JointObjective(members)
         found = fit_gauss_newton(joint, SPACE, GaussNewtonSettings(starts=2, screen=7))
         assert found.values == pytest.approx(TRUTH, rel=0.03)
-        left = leave_each_out(joint, SPACE, found.values)
+        left, _ = leave_each_out(joint, SPACE, found.values)
         for one, member in zip(left, members, strict=True):
             # a single motion tells the ratio; how heavy the cloth is, it hardly tells
             ratio = one.parameters["stretch"] / one.parameters["mass"]
@@ -91,7 +175,7 @@ class TestFit:
             Objective(second, clouds_of(second, points=6000, stretch=2.5, mass=1.0), nuisance={}),
         ]
         space = FitSpace.build(["stretch"], fixed={"mass": 1.0})
-        one, other = leave_each_out(JointObjective(members), space, {"stretch": 1.0})
+        (one, other), _ = leave_each_out(JointObjective(members), space, {"stretch": 1.0})
         assert one.parameters["stretch"] == pytest.approx(2.5, rel=0.1)  # stiff cloth hardly stretches
         assert other.parameters["stretch"] == pytest.approx(0.4, rel=0.05)
 
@@ -100,6 +184,15 @@ class TestFit:
         joint = JointObjective(members)
         found = linearised(joint, SPACE, Axis.of(SPACE).places(torch.tensor([[0.8, 1.2]]).double()))
         assert found.simulations == 2
+
+    def test_the_slope_is_that_of_the_loss_where_each_lies_in_its_own_way(self, generator):
+        members = [Objective(s, clouds_of(s, points=4000, **TRUTH), nuisance={}) for s in motions()]
+        space = with_laid(SPACE, [{"turn": 0.1, "shape": 0.01, "size": 0.05}, {"turn": 0.1}], motions())
+        places = 0.3 * torch.randn(1, len(space.names), generator=generator).double()
+        found = linearised(JointObjective(members), space, places, rtol=1e-6, atol=1e-12)
+        assert found.simulations == 2  # one each, though most variables are of one of them
+        turns = [space.names.index(f"turn@{number}") for number in (0, 1)]
+        assert found.curvature[0, turns[0], turns[1]] == 0
 
     def test_threads_change_nothing(self):
         """To the last bit; and in threads, too, gradients are recorded where they are wanted, and only there."""

@@ -14,6 +14,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.evaluation.methods import space_of
 from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton, read_fit, write_fit
 from diffcloud.fit.laid import laid_nodes, parse_laid, with_laid
+from diffcloud.fit.names import of_all, of_recording, with_recording, without_recording
 from diffcloud.fit.residuals import Axis
 from diffcloud.fit.result import describe_fit
 from diffcloud.fit.uncertainty import uncertainty
@@ -94,27 +95,43 @@ class TestSpace:
 
     def test_a_cloth_that_hangs_does_not_lie(self):
         with pytest.raises(ConfigError, match="lies level at the start; that of vest_hang does not"):
-            with_laid(ASKED, {"turn": 0.1}, [load_scenario("vest_hang")])
+            with_laid(ASKED, [{"turn": 0.1}], [load_scenario("vest_hang")])
 
-    def test_several_recordings_lie_in_several_ways(self):
-        with pytest.raises(ConfigError, match="joint fits do not support"):
-            with_laid(ASKED, {"shape": 0.005}, [SCENARIO, SCENARIO])
+    def test_each_recording_has_its_own_but_the_cloth_has_one_size(self):
+        space = with_laid(ASKED, [{"turn": 0.1, "size": 0.02}, {"turn": 0.2, "track": 0.01}], [SCENARIO, SCENARIO])
+        assert space.names == ("stretch", "size", "turn@0", "turn@1", "track@1")
+        assert [one.deviation for one in space.variables[1:]] == [0.02, 0.1, 0.2, 0.01]
+        second, places = space.of_recording(1)
+        assert second.names == ("stretch", "size", "turn", "track")
+        assert places.tolist() == [0, 1, 3, 4]
+        assert space.without_recording(0).names == ("stretch", "size", "turn@0", "track@0")
+        assert space.without_recording(0).asked.fixed == {"mass": 1.7, "size": 0.0, "turn@0": 0.0, "track@0": 0.0}
+
+    def test_names_of_a_joint_fit_are_those_of_its_recordings(self):
+        """What each says, put together and taken apart again; of one recording, plain names stay."""
+        each = [{"size": 0.1, "turn": 1.0}, {"size": 0.1, "turn": 2.0}, {"size": 0.1, "shape_1_0": 3.0}]
+        joint = of_all(each)
+        assert [of_recording(joint, number) for number in range(3)] == each
+        assert without_recording(joint, 1) == of_all([each[0], each[2]])
+        for number, own in enumerate(each):
+            others = without_recording(joint, number)
+            assert with_recording(others, {name: own[name] for name in own if name != "size"}, number) == joint
+        assert of_all(each[:1]) == each[0]
 
     def test_a_scenario_says_how_its_cloths_may_lie(self):
-        """For fits of one recording by derivatives; what the option says comes first."""
+        """For fits by derivatives; what the option says comes first."""
         recorded = load_scenario("recorded_lift")
         said = {"turn": pytest.approx(math.radians(10)), "shape": 0.01}
         assert recorded.laid == said
-        assert FitConfig().laid_within([recorded]) == said
-        assert FitConfig().laid_within([load_scenario("lift")]) == {}
-        assert FitConfig().laid_within([recorded, load_scenario("recorded_fold")]) == {}
-        assert FitConfig(paper=True).laid_within([recorded]) == {}
-        assert FitConfig(solver="cma_es").laid_within([recorded]) == {}
-        assert FitConfig(laid="none").laid_within([recorded]) == {}
-        assert FitConfig(laid="turn=5deg").laid_within([recorded]) == {"turn": pytest.approx(math.radians(5))}
+        assert FitConfig().laid_within([recorded]) == [said]
+        assert FitConfig().laid_within([recorded, load_scenario("lift")]) == [said, {}]
+        assert FitConfig(paper=True).laid_within([recorded]) == [{}]
+        assert FitConfig(solver="cma_es").laid_within([recorded]) == [{}]
+        assert FitConfig(laid="none").laid_within([recorded]) == [{}]
+        assert FitConfig(laid="turn=5deg").laid_within([recorded] * 2) == [{"turn": pytest.approx(math.radians(5))}] * 2
 
     def test_it_stands_behind_what_is_asked_for_in_the_scenes_unit(self):
-        space = with_laid(ASKED, {"shape": 0.007, "turn": 0.1}, [replace(SCENARIO, length_unit_m=0.35)])
+        space = with_laid(ASKED, [{"shape": 0.007, "turn": 0.1}], [replace(SCENARIO, length_unit_m=0.35)])
         assert space.names[:2] == ("stretch", "turn")
         assert set(space.names[2:]) == WAVES
         assert space.asked.fixed == {"mass": 1.7, "turn": 0.0, **dict.fromkeys(WAVES, 0.0)}
@@ -122,7 +139,7 @@ class TestSpace:
         assert space.variables[1].low == pytest.approx(-0.4)
 
     def test_its_axis_counts_deviations_and_its_prior_is_normal(self):
-        space = with_laid(ASKED, {"turn": 0.1}, [SCENARIO])
+        space = with_laid(ASKED, [{"turn": 0.1}], [SCENARIO])
         places = torch.tensor([[0.3, -2.0]], dtype=torch.float64)
         values = Axis.of(space).values(places)
         assert values.tolist() == [pytest.approx([math.exp(0.3), -0.2])]
@@ -135,7 +152,7 @@ def objective():
     return Objective(SCENARIO, clouds_of(SCENARIO, points=3000, stretch=0.6, mass=1.7, **LAID), nuisance={})
 
 
-SPACE = with_laid(ASKED, {"turn": 0.1, "shape": 0.01}, [SCENARIO])
+SPACE = with_laid(ASKED, [{"turn": 0.1, "shape": 0.01}], [SCENARIO])
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +189,7 @@ def test_it_is_told_as_nuisance_and_read_back(objective, fits, tmp_path):
         flat = float(objective(column(**record.values)))
     assert again == pytest.approx(record.loss, rel=1e-9)
     assert flat > 5 * again
-    (lies,) = laid_nodes(SCENARIO.scene.mesh, column(**record.laid))
+    (lies,) = laid_nodes(SCENARIO.scene.mesh, column(**record.episodes[0].laid(length_unit_m=1.0)))
     np.testing.assert_allclose(result.motions[0].nodes[0], lies, atol=1e-15)
     for change, message in (({"unit": "s"}, "how a cloth lies is in m, rad or 1"), ({"of": "table"}, "cloth")):
         told = json.loads((tmp_path / "e.json").read_text())
@@ -180,7 +197,8 @@ def test_it_is_told_as_nuisance_and_read_back(objective, fits, tmp_path):
         (tmp_path / "damaged.json").write_text(json.dumps(told))
         with pytest.raises(ConfigError, match=message):
             read_fit(tmp_path / "damaged.json")
-    stranger = record.model_copy(update={"nuisance": {"slope": record.nuisance["turn"]}})
+    lost = record.episodes[0].model_copy(update={"nuisance": {"slope": record.nuisance["turn"]}})
+    stranger = record.model_copy(update={"episodes": [lost]})
     with pytest.raises(ConfigError, match="Unknown variable of how a cloth lies 'slope'"):
         space_of(stranger)
 

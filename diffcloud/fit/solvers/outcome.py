@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -59,6 +59,21 @@ class FitOutcome:
     """Messages of starts that diverged."""
     scan: Scan | None = None
     """Of the place where it ended, which then has no lower minimum beside it."""
+
+    def gone_on(self, further: FitOutcome) -> FitOutcome:
+        """This fit, whose best start went on by itself, with what came of that."""
+        history, column = self.history, self.best_start
+        rows = [(history.losses, further.history.losses), (history.values, further.history.values)]
+        rows += [(history.gradients, further.history.gradients)] if history.gradients else []
+        longer = [[*one, *(torch.cat([one[-1][:column], row, one[-1][column + 1 :]]) for row in new)] for one, new in rows]
+        return replace(
+            further,
+            best_start=column,
+            simulations=self.simulations + further.simulations,
+            seconds=self.seconds + further.seconds,
+            history=FitHistory(history.names, *longer),
+            failures=(*self.failures, *further.failures),
+        )
 
     @property
     def iterations(self) -> int:

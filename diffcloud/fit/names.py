@@ -1,0 +1,66 @@
+"""What variables are called in a fit of several recordings.
+
+Material is that of the one cloth, and so is its size. How it lay before the motion, each recording has for itself:
+`turn@0` is the turn in the first recording, `turn` in the fit of a single one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TypeVar
+
+SHARED = ("size",)
+"""Of how the cloth lies (`fit.laid`), what is the same in all recordings."""
+_OWN = "@"
+T = TypeVar("T")
+
+
+def plain_name(name: str) -> str:
+    """Without the recording."""
+    return name.partition(_OWN)[0]
+
+
+def of_recording(named: Mapping[str, T], recording: int) -> dict[str, T]:
+    """What holds for one recording: what all share, and what is its own, under plain names.
+
+    Args:
+        recording: its number, from 0.
+    """
+    here = {name: name.partition(_OWN)[2] in ("", str(recording)) for name in named}
+    return {plain_name(name): value for name, value in named.items() if here[name]}
+
+
+def without_recording(named: Mapping[str, T], recording: int) -> dict[str, T]:
+    """What is left without one recording; those after it move up."""
+    found = dict[str, T]()
+    for name, value in named.items():
+        plain, own, number = name.partition(_OWN)
+        if not own:
+            found[name] = value
+        elif int(number) != recording:
+            found[f"{plain}{_OWN}{int(number) - (int(number) > recording)}"] = value
+    return found
+
+
+def with_recording(others: Mapping[str, T], own: Mapping[str, T], recording: int) -> dict[str, T]:
+    """The inverse of `without_recording`.
+
+    Args:
+        own: what is the recording's own, under plain names.
+    """
+    found = dict[str, T]()
+    for name, value in others.items():
+        plain, mark, number = name.partition(_OWN)
+        found[f"{plain}{_OWN}{int(number) + (int(number) >= recording)}" if mark else name] = value
+    return {**found, **{f"{name}{_OWN}{recording}": value for name, value in own.items()}}
+
+
+def of_all(each: Sequence[Mapping[str, T]]) -> dict[str, T]:
+    """What is told of how the cloth lies in each recording, as a fit of all of them names it; the inverse of
+    `of_recording`."""
+    found = dict[str, T]()
+    for number, own in enumerate(each):
+        for name, value in own.items():
+            alone = len(each) == 1 or name in SHARED
+            found[name if alone else f"{name}{_OWN}{number}"] = value
+    return found
