@@ -238,6 +238,8 @@ class TestFits:
         assert begun[1][1:] == [0, 0]
         assert begun[0][0] > begun[0][1] > begun[0][2] > 0
         assert enough.simulations < every.simulations == lower.simulations
+        assert enough.scan is None  # nothing lower is looked for
+        assert every.scan is not None
         assert enough.stop_reason == every.stop_reason == "converged"
         monkeypatch.setattr(Objective, "explained", 1e-12)
         monkeypatch.setattr(Objective, "knows_gaps", False)  # then two equal ends are enough, but not with a threshold

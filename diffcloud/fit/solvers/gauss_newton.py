@@ -12,8 +12,9 @@ explains the recording. Two further ways lead to starts: one fits the recording'
 other is a derivative-free search, from the best place so far, over the parameters asked for only. Both come after three
 candidates (with a threshold, growing starts come after the first); growing starts wait as long as a second end is as low
 as the best one. Four equally low ends are taken for the minimum although they do not explain the recording; two are,
-where it is not known what cameras missed, or where the loss is so high that the model must be wrong. Then losses along
-the principal axes of the best place tell whether another minimum is lower nearby; from there it goes on.
+where it is not known what cameras missed, or where the loss is so high that the model must be wrong. Unless the recording
+is explained, losses along the principal axes of the best place then tell whether another minimum is lower nearby; from
+there it goes on.
 """
 
 from __future__ import annotations
@@ -155,7 +156,8 @@ def fit_gauss_newton(
                 ways.begin(start, place, found)
             else:
                 reason = ways.best.end or reason
-                if scans == settings.scans or reason == "iterations":
+                done = objective.knows_gaps and ways.best.loss <= explained
+                if scans == settings.scans or reason == "iterations" or done:
                     break
                 scans += 1
                 seen, spent = scan(objective, space, ways.best.place, ways.best.normal)
