@@ -32,6 +32,8 @@ JOINT = "joint"
 _CODE = ("mesh", "io", "sim", "scene", "clouds", "fit")
 """Packages whose source decides the numbers of a fit."""
 _MOST_RECORDINGS = 1000
+_JOINT_PART = 0.4
+"""Of the time of a joint fit, until recordings are left out; about."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +180,12 @@ class FitJob:
                 done, most = progress.simulations or 0, settings.simulations
             else:  # of Gauss–Newton for each start, of which it is not known how many are followed
                 done, most = progress.iteration, settings.iterations
-            tell(min(done / max(most, 1), 1.0), f"step {done}  best {progress.best:.3e}  {values}")
+            part = _JOINT_PART if isinstance(objective, JointObjective) else 1.0
+            tell(part * min(done / max(most, 1), 1.0), f"step {done}  best {progress.best:.3e}  {values}")
+
+        def show_left_out(done: float, progress: Progress) -> None:
+            check_interrupt()
+            tell(_JOINT_PART + (1 - _JOINT_PART) * done, f"leaving each recording out  step {progress.iteration}")
 
         objective, space = self.objective(), self.space
         settings = replace(self.settings.solver_settings(self.scenario), init=self.init)
@@ -186,9 +193,7 @@ class FitJob:
         left, failures, interrupted = list[LeftOut](), list[str](), outcome.stop_reason == "interrupted"
         if isinstance(objective, JointObjective) and not interrupted:
             try:
-                outcome, left = leave_out_and_go_on(
-                    objective, space, outcome, settings, progress=lambda progress: check_interrupt()
-                )
+                outcome, left = leave_out_and_go_on(objective, space, outcome, settings, progress=show_left_out)
             except DivergedError as error:
                 failures.append(f"leaving one recording out: {error}")
             except KeyboardInterrupt:

@@ -1,13 +1,15 @@
 """What the other recordings of a joint fit say of one: whether parameters carry over.
 
-A fit of the others begins where the joint one ended. Where it explains even the one that it has never seen better, the
-joint fit has missed a lower minimum, and goes on from there.
+A fit of the others begins where the joint one ended. With what it found, and with how the cloth lay in the recording that
+was left out, the loss of all may be lower than where the joint fit ended. Then that one has missed a lower minimum, or
+stopped too early, and goes on from there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 
 import torch
 
@@ -24,7 +26,8 @@ from diffcloud.sim.properties import one_set
 _STEPS = 10
 _TIMES = 2
 """That a joint fit goes on, at most."""
-Tell = Callable[[Progress], None]
+Tell = Callable[[float, Progress], None]
+"""What a progress display gets: which part of the recordings have been left out, and how the fit goes that is under way."""
 
 
 def leave_out_and_go_on(
@@ -47,7 +50,8 @@ def leave_out_and_go_on(
             return outcome, told
         left -= 1
         further = replace(settings, starts=1, screen=0, init=lower)
-        outcome = outcome.gone_on(fit_gauss_newton(objective, space, further, progress=progress))
+        shown = None if progress is None else partial(progress, 0.0)
+        outcome = outcome.gone_on(fit_gauss_newton(objective, space, further, progress=shown))
         if outcome.stop_reason == "interrupted":
             raise KeyboardInterrupt
 
@@ -70,12 +74,13 @@ def leave_each_out(
     """
     told, places = [], [dict(values)]
     for index, member in enumerate(objective.members):
+        shown = None if progress is None else partial(progress, index / len(objective.members))
         others = JointObjective([*objective.members[:index], *objective.members[index + 1 :]])
-        found = _from(others, space.without_recording(index), without_recording(values, index), progress)
+        found = _from(others, space.without_recording(index), without_recording(values, index), shown)
         alike = {name: value for name, value in found.items() if not _own(name)}
         here, _ = space.of_recording(index)
         lying = FitSpace(tuple(one for one in here.variables if _own(one.name)), {**here.fixed, **alike})
-        lies = _from(member, lying, of_recording(values, index), progress) if lying.variables else {}
+        lies = _from(member, lying, of_recording(values, index), shown) if lying.variables else {}
         with torch.no_grad():
             loss = float(member(one_set({**lying.fixed, **lies})))
         parameters = {name: value for name, value in lying.fixed.items() if not is_laid(name)}
@@ -91,7 +96,9 @@ def _own(name: str) -> bool:
     return is_laid(name) and name not in SHARED
 
 
-def _from(objective: AnyObjective, space: FitSpace, values: Mapping[str, float], progress: Tell | None) -> dict[str, float]:
+def _from(
+    objective: AnyObjective, space: FitSpace, values: Mapping[str, float], progress: Callable[[Progress], None] | None
+) -> dict[str, float]:
     """The lowest values near these, of what is fitted."""
     settings = GaussNewtonSettings(iterations=_STEPS, starts=1, screen=0, scans=0, init=values)
     found = fit_gauss_newton(objective, space, settings, progress=progress)

@@ -18,6 +18,8 @@ SCHEMA = 8
 LARGEST = 1e12
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0, le=LARGEST)]
+Value = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+"""Of a variable; those of how a cloth lies may be negative."""
 Count = Annotated[int, Field(ge=0, le=1_000_000_000)]
 Text = Annotated[str, Field(max_length=1000)]
 Friction = Annotated[float, Field(ge=0, le=100)]
@@ -158,8 +160,8 @@ class History(_Model):
     """[k]"""
     loss: list[list[NonNegative | None]]
     """[N][B]"""
-    values: list[list[list[Annotated[float, Field(ge=-LARGEST, le=LARGEST)] | None]]]
-    """[N][B][k]; those of how the cloth lies may be negative."""
+    values: list[list[list[Value | None]]]
+    """[N][B][k]"""
     gradient_norm: list[list[NonNegative | None]]
     """[N][B]; empty of a search."""
 
@@ -221,7 +223,7 @@ class FitRecord(_Model):
     """Runs of the simulator; one with derivatives counts once."""
     seconds: NonNegative
     stop_reason: Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
-    start: dict[str, NonNegative]
+    start: dict[str, Value]
     """Parameters of the first start, the given ones too, and how the cloth lies, named as in `free`."""
     best_start: Annotated[int, Field(ge=0, le=1_000_000)]
     measure: Measure

@@ -203,6 +203,13 @@ def test_it_is_told_as_nuisance_and_read_back(objective, fits, tmp_path):
         space_of(stranger)
 
 
+def test_a_fit_may_begin_with_a_turn_to_the_other_side(objective):
+    settings = GaussNewtonSettings(iterations=1, starts=1, screen=0, scans=0, init={"stretch": 1.0, "turn": -0.1})
+    outcome = fit_gauss_newton(objective, SPACE, settings)
+    record = describe_fit(objective, SPACE, settings, outcome, episodes=["e"]).record
+    assert record.start["turn"] == pytest.approx(-0.1)
+
+
 def test_intervals_know_what_it_leaves_open(objective, fits):
     space, _, outcome = fits[1]
     found = uncertainty(objective, space, outcome.values)
