@@ -208,6 +208,7 @@ def test_a_fit_may_begin_with_a_turn_to_the_other_side(objective):
     outcome = fit_gauss_newton(objective, SPACE, settings)
     record = describe_fit(objective, SPACE, settings, outcome, episodes=["e"]).record
     assert record.start["turn"] == pytest.approx(-0.1)
+    assert outcome.values["turn"] > 0.0  # it need not wait
 
 
 def test_intervals_know_what_it_leaves_open(objective, fits):

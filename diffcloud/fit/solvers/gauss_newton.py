@@ -139,7 +139,7 @@ def fit_gauss_newton(
         for index, stages in reversed(list(enumerate(_growths(objective)))):
             grown = partial(_grown, stages, space, places[best], settings, index, axis, tell)
             waiting.insert(best + 1, _Start(places[best], best, grown, grows=True))
-    scans, looked, ways = 0, None, _Ways(waiting, settings.iterations, _laid(space))
+    scans, looked, ways = 0, None, _Ways(waiting, settings.iterations, _laid(space, settings.init))
     try:
         while True:
             way = ways.going
@@ -498,11 +498,11 @@ def _frames(objective: AnyObjective) -> int:
     return sum(len(one.frames) for one in objective.members)
 
 
-def _laid(space: FitSpace) -> Tensor:
-    """bool [k] which variables tell how a cloth lies. With all of them free from the beginning, a motion that may go in
-    several ways finds more wrong minima; without them, a cloth that lies askew leads to wrong places. So one start has them
-    wait, the others do not."""
-    return torch.tensor([variable.deviation is not None for variable in space.variables])
+def _laid(space: FitSpace, init: Mapping[str, float]) -> Tensor:
+    """bool [k] which variables tell how a cloth lies, but for those of which it is known where to begin. With all of them
+    free from the beginning, a motion that may go in several ways finds more wrong minima; without them, a cloth that lies
+    askew leads to wrong places. So one start has them wait, the others do not."""
+    return torch.tensor([one.deviation is not None and one.name not in init for one in space.variables])
 
 
 def _remember(history: FitHistory, ways: _Ways, axis: Axis) -> None:
