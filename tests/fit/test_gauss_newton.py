@@ -367,20 +367,26 @@ class TestFits:
         assert not ways.enough(0.5, 2.0, math.inf)
 
     @pytest.mark.parametrize(
-        ("second", "witnesses", "order"),
-        [(1.0, 4, ["1", "2", "search", "grown"]), (0.5, 4, ["1", "2", "grown", "search"]), (1.0, math.inf, None)],
-        ids=["all agree", "the second one does not", "agreeing says nothing"],
+        ("second", "witnesses", "misfit", "order"),
+        [
+            (1.0, 4, 0.9, ["1", "2", "search", "grown", "again"]),
+            (0.5, 4, 0.4, ["1", "2", "grown", "again", "search"]),
+            (0.5, 4, 1.1, ["grown", "1", "again", "2", "search"]),
+            (1.0, 4, 1.1, ["grown", "1", "2", "search", "again"]),
+            (1.0, math.inf, 0.9, None),
+        ],
+        ids=["all agree", "the second one does not", "the model may be right", "and all agree", "agreeing says nothing"],
     )
-    def test_starts_that_grow_wait_while_the_best_end_is_not_alone(self, second, witnesses, order):
+    def test_starts_that_grow_wait_while_the_best_end_is_not_alone(self, second, witnesses, misfit, order):
         place, curvature = torch.zeros(1, dtype=torch.float64), torch.eye(1).double()[None]
-        names = {"grown": (0, True), "1": (1, False), "2": (2, False), "search": (-1, False)}
-        starts = {gauss_newton._Start(place, origin, grows=grows): name for name, (origin, grows) in names.items()}
+        names = {"grown": (0, True), "again": (0, True), "1": (1, False), "2": (2, False), "search": (-1, False)}
+        starts = {gauss_newton._Start(place.clone(), o, grows=grows): name for name, (o, grows) in names.items()}
         ways, start, taken = gauss_newton._Ways(list(starts), 3, torch.zeros(1, dtype=torch.bool)), None, []
-        for loss in (1.0, second, *[1.0] * 3):
+        for loss in (1.0, second, *[1.0] * 4):
             found = Linearisation(torch.tensor([loss]).double(), torch.zeros(1, 1).double(), curvature, 1)
             ways.begin(start or gauss_newton._Start(place, 0), place, found)
             if ways.waiting:
-                start = ways.following(witnesses)
+                start = ways.following(witnesses, misfit)
                 taken.append(starts[start])
         assert taken == (order or list(names))
 

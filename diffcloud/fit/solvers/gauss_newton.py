@@ -9,12 +9,12 @@ off at one, may lead uphill: its other components were chosen to go with what wa
 falls by how much of the predicted decrease a step brings, and grows, faster and faster, where it brings none. Starts are
 the best of a screen of candidates spread over the box, the best one first. The remaining ones are not followed once one
 explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and more of it; the
-other is a derivative-free search, from the best place so far, over the parameters asked for only. Both come after three
-candidates (with a threshold, growing starts come after the first); growing starts wait as long as a second end is as low
-as the best one. Four equally low ends are taken for the minimum although they do not explain the recording; two are,
-where it is not known what cameras missed, or where the loss is so high that the model must be wrong. Unless the recording
-is explained, losses along the principal axes of the best place then tell whether another minimum is lower nearby; from
-there it goes on.
+other is a derivative-free search, from the best place so far, over the parameters asked for only. The search comes after
+three candidates. So do growing starts, but for one of them, which follows the first candidate where that one's end is not
+too high for a right model (with a threshold, all of them do). They wait as long as a second end is as low as the best one.
+Four equally low ends are taken for the minimum although they do not explain the recording; two are, where it is not known
+what cameras missed, or where the loss is so high that the model must be wrong. Unless the recording is explained, losses
+along the principal axes of the best place then tell whether another minimum is lower nearby; from there it goes on.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def fit_gauss_newton(
                 simulations += found.simulations
                 ways.judge(way, tried, found)
             elif ways.waiting and not ways.enough(explained, misfit, witnesses):
-                start = ways.following(witnesses)
+                start = ways.following(witnesses, misfit)
                 place, spent = start.found()
                 found = linearise(objective, space, place[None])
                 simulations += spent + found.simulations
@@ -307,6 +307,7 @@ class _Ways:
         """
         self.waiting, self.every, self._steps = list(starts), list[_Way](), steps
         self._held = held if bool(held.any()) else None
+        self._grew = False
 
     @property
     def best(self) -> _Way:
@@ -331,12 +332,20 @@ class _Ways:
         needed = _FEW_WITNESSES if self.best.loss > misfit else witnesses
         return self.best.loss <= explained or len(self._witnesses) >= needed
 
-    def following(self, witnesses: float) -> _Start:
+    def following(self, witnesses: float, misfit: float) -> _Start:
         """The next start. Where some equal ends would be enough, those that grow wait for the first candidates, and as long
-        as the best end is not alone."""
-        wait = math.isfinite(witnesses) and (len(self.every) < _BEFORE or len(self._witnesses) > 1)
+        as the best end is not alone; but for one of them, if the first end is low enough for the model to be right.
+
+        Args:
+            witnesses, misfit: as of `enough`.
+        """
+        soon = bool(self.every) and not self._grew and self.best.loss <= misfit
+        early = len(self.every) < (1 if soon else _BEFORE)
+        wait = math.isfinite(witnesses) and (early or len(self._witnesses) > 1)
         quick = (place for place, start in enumerate(self.waiting) if not start.grows)
-        return self.waiting.pop(next(quick, 0) if wait else 0)
+        start = self.waiting.pop(next(quick, 0) if wait else 0)
+        self._grew |= start.grows
+        return start
 
     @property
     def _witnesses(self) -> set[int]:
