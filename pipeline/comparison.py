@@ -41,6 +41,8 @@ class Job:
     name: str
     fit: str
     """Name of its fit."""
+    recording: str
+    """What the fit calls the episode."""
     episode: Episode
     fitted: FitRecord
     predictions: Sequence[Estimate | Gap]
@@ -61,7 +63,16 @@ class Job:
         """
         # seconds of predictions differ from run to run, and change nothing in the record
         told = [(entry.method, entry.values if isinstance(entry, Estimate) else entry.reason) for entry in self.predictions]
-        inputs = [self.name, self.fit, self.episode, self.fitted.plain(), told, self.transfers, self.settings]
+        inputs = [
+            self.name,
+            self.fit,
+            self.recording,
+            self.episode,
+            self.fitted.plain(),
+            told,
+            self.transfers,
+            self.settings,
+        ]
         mark = fingerprint([self.scenario, self.group, *inputs], packages=_CODE)
         if (known := kept_record(self.kept, mark)) is not None:
             return EpisodeRecord(known["record"], known["seconds"])
@@ -71,6 +82,7 @@ class Job:
             self.fitted,
             name=self.name,
             fit_name=self.fit,
+            recording=self.recording,
             predictions=self.predictions,
             transfers=self.transfers,
             settings=self.settings,
@@ -160,6 +172,7 @@ def comparison_jobs(
                 group=group,
                 name=label,
                 fit=fit_name,
+                recording=name,
                 episode=recorded[name],
                 fitted=fit,
                 predictions=[network.of(recorded[name]) for network in networks],

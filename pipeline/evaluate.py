@@ -69,7 +69,8 @@ def loss(
         measure, values = record.measure.model_dump(), dict(record.values)
     chosen = choose_scenario(scenario, scene)
     if fit is not None:
-        laid = _laid(record, episode.stem, chosen.name)
+        known = {one.scenario: number for number, one in enumerate(record.episodes) if one.name == episode.stem}
+        laid = record.laid_in(known.get(chosen.name, next(iter(known.values()), None)))
     given = {"points": points, "frames": frame, "seed": seed, "paper": paper or None}
     measure |= {name: value for name, value in given.items() if value is not None}
     if nuisance is not None:
@@ -86,13 +87,6 @@ def loss(
         shifts = ", ".join(f"{name} {entry.value:.4g} {entry.unit}" for name, entry in found.nuisance.items())
         output.print(f"{found.loss:.6e}  RMS {found.rms_mm:.2f} mm" + (f"  at {shifts}" if shifts else ""))
     finish({**found.model_dump(), "parameters": values, "length_unit_m": chosen.length_unit_m}, json)
-
-
-def _laid(record: FitRecord, name: str, scenario: str) -> dict[str, float]:
-    """How the cloth lies in a recording; of one that is new to the fit, as the scenario has it."""
-    known = {one.scenario: one for one in record.episodes if one.name == name}
-    found = known.get(scenario, next(iter(known.values()), None))
-    return {} if found is None else found.laid(length_unit_m=record.length_unit_m)
 
 
 def _scenario_of(record: FitRecord, name: str) -> str:

@@ -183,22 +183,24 @@ class FitJob:
             part = _JOINT_PART if isinstance(objective, JointObjective) else 1.0
             tell(part * min(done / max(most, 1), 1.0), f"step {done}  best {progress.best:.3e}  {values}")
 
-        def show_left_out(done: float, progress: Progress) -> None:
+        def show_left_out(done: float, doing: str, progress: Progress) -> None:
             check_interrupt()
-            tell(_JOINT_PART + (1 - _JOINT_PART) * done, f"leaving each recording out  step {progress.iteration}")
+            reached.append(max(reached[-1], _JOINT_PART + (1 - _JOINT_PART) * done))  # what goes on begins anew
+            tell(reached[-1], f"{doing}  step {progress.iteration}  best {progress.best:.3e}")
 
         objective, space = self.objective(), self.space
         settings = replace(self.settings.solver_settings(self.scenario), init=self.init)
         outcome = solve(objective, space, settings, progress=show_progress)
         left, failures, interrupted = list[LeftOut](), list[str](), outcome.stop_reason == "interrupted"
+        fits, reached = [outcome], [0.0]
         if isinstance(objective, JointObjective) and not interrupted:
             try:
-                outcome, left = leave_out_and_go_on(objective, space, outcome, settings, progress=show_left_out)
+                left = leave_out_and_go_on(objective, space, outcome, settings, keep=fits.append, progress=show_left_out)
             except DivergedError as error:
                 failures.append(f"leaving one recording out: {error}")
             except KeyboardInterrupt:
                 interrupted = True
-        result = describe_fit(objective, space, settings, outcome, episodes=[one.name for one in self.recordings])
+        result = describe_fit(objective, space, settings, fits[-1], episodes=[one.name for one in self.recordings])
         record = result.record
         record.failures += failures
         record.stop_reason = "interrupted" if interrupted else record.stop_reason

@@ -30,6 +30,7 @@ from diffcloud.report import EpisodeEntry, build_page
 from diffcloud.scene.scenarios import Scenario, load_scenario
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
 from diffcloud.scene.scenarios.layout import FIELDS, Found, find_layout, found_size, node_counts
+from diffcloud.sim.properties import one_set
 from diffcloud.sim.threads import use_threads
 from pipeline.config import Config, FitConfig
 from pipeline.console import JsonFlag, Threads, errors, finish, progress_bar, warn
@@ -313,7 +314,7 @@ def _stated(
         found = state_intervals(objective, space, record.free, level=level, within=within, seen=seen)
         if found.lower is None or not left:
             break
-        near = ", ".join(f"{name} {value:.3g}" for name, value in found.lower.items())
+        near = ", ".join(f"{name} {found.lower[name]:.3g}" for name in space.asked.names)
         errors.print(f"The loss is lower at {near}; fitting again from there.")
         init, settings = found.lower, _single_start(settings)
     return record, objective, job, found
@@ -362,11 +363,11 @@ def _validation(record: FitRecord, objective: AnyObjective) -> str:
     if not isinstance(objective, JointObjective):
         return "One recording: whether its parameters carry over to another is not known."
     held, gains = [], []
-    for member, episode in zip(objective.members, record.episodes, strict=True):
+    for number, (member, episode) in enumerate(zip(objective.members, record.episodes, strict=True)):
         if episode.left_out is None:
             return "Leaving one recording out failed: whether parameters carry over is not known."
         with torch.no_grad():
-            middle = float(member({}))
+            middle = float(member(one_set(record.laid_in(number))))
         held.append(episode.left_out.rms_mm / episode.rms_mm)
         gains.append((middle - episode.left_out.loss) / max(middle - episode.loss, 1e-300))
     told = f"when a recording is left out of the fit, its misfit is at most {max(held):.2f} times that in the joint fit"

@@ -62,7 +62,8 @@ def rollout(
     steps = frames * chosen.scene.frame_steps
     system, _ = chosen.scene.build()
     recording = None if fitted is None else _recording(fitted.episodes, chosen.name, episode)
-    laid = {} if recording is None else recording.laid(length_unit_m=chosen.length_unit_m)
+    number = None if fitted is None or recording is None else fitted.episodes.index(recording)
+    laid = {} if fitted is None else fitted.laid_in(number)
     track, warnings = None, limits(chosen)
     if episode is not None:
         recorded = read_episode(episode)

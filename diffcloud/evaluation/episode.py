@@ -56,6 +56,7 @@ def compare_episode(
     *,
     name: str,
     fit_name: str | None = None,
+    recording: str | None = None,
     predictions: Sequence[Estimate | Gap] = (),
     transfers: Mapping[str, Mapping[str, float]] | None = None,
     settings: ComparisonSettings | None = None,
@@ -65,6 +66,7 @@ def compare_episode(
     Args:
         fit: of the episode; its measure, bounds, given parameters and number of iterations hold for every method.
         fit_name: of the fit, if it is another than the episode's: a joint fit has several episodes.
+        recording: what that one calls the episode, if something else.
         predictions: of networks, and why those that should be there are not.
         transfers: episode -> parameters fitted on it, of other recordings of the same fabric.
 
@@ -73,14 +75,14 @@ def compare_episode(
     """
     settings = settings or ComparisonSettings()
     measure = fit.measure.model_dump(exclude={"seed"})
-    number = fit.number_of(name, scenario.name)
+    number = fit.number_of(recording or name, scenario.name)
     if number is None:
         known = ", ".join(f"{one.scenario}/{one.name}" for one in fit.episodes)
-        raise ConfigError(f"The fit is of {known}, not of {scenario.name}/{name}.")
+        raise ConfigError(f"The fit is of {known}, not of {scenario.name}/{recording or name}.")
     space, _ = methods.space_of(fit).of_recording(number)
     objective = Objective(scenario, episode, **measure, seed=fit.measure.seed)
     told: list[Estimate | Gap] = [methods.fitted(fit, number)]
-    laid = fit.episodes[number].laid(length_unit_m=fit.length_unit_m)  # as the pose, for all methods
+    laid = fit.laid_in(number)  # as the pose, for all methods
     lying = FitSpace(space.asked.variables, {**space.asked.fixed, **laid})
     told += [_run(rival, objective, lying, fit, settings.seed) for rival in settings.rivals]
     told += [*predictions, *methods.published(episode.meta)]

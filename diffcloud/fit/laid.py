@@ -3,7 +3,7 @@
 The pose (`fit.pose`) moves cloth, gripper and bodies together, which is the same motion seen from elsewhere. A cloth that a
 hand has laid down 5° askew, or with a rim that stands up, moves in another way, and so does a larger one. So these are
 variables of the motion, like doubtful material (`fit.doubts`): fitted under priors, and no property of the material. In a
-joint fit, each recording has its own, but for the size, which is that of the one cloth.
+joint fit, each recording has its own, except for the size, which belongs to the cloth.
 
 The turn is about the cloth's middle. Its height over where the scene lays it is a sum of nine waves over the cloth,
 
@@ -31,7 +31,8 @@ from diffcloud.mesh.topology import ClothMesh
 from diffcloud.scene.scenarios import Scenario
 
 LAID: dict[str, Literal["m", "rad", "1"]] = {"size": "1", "turn": "rad", "shape": "m", "track": "1"}
-"""Name -> unit, what recordings share first (`fit.names`). `shape` stands for the height of each wave."""
+"""Name -> unit. `shape` stands for the height of each wave. What recordings share comes first (`fit.names`), so that the
+variables of each are in the same order in a fit and in its record."""
 _LARGEST_SHARE = 0.2
 """Largest standard deviation of `size` or `track`; scenarios have the same limit."""
 _SHAPES = {f"shape_{i}_{j}": (i, j) for i in range(4) for j in range(4) if 0 < i + j <= 3}
@@ -61,7 +62,7 @@ def with_laid(space: FitSpace, laid: Sequence[Mapping[str, float]], scenarios: S
     """The space with the variables appended.
 
     Args:
-        laid: for each recording, name -> standard deviation [m, rad, 1]. One of a shared variable holds for all; of
+        laid: for each recording, name -> standard deviation [m, rad, 1]. That of `size` of any recording holds for all; of
             several, the largest.
         scenarios: of the recordings.
 
@@ -72,12 +73,10 @@ def with_laid(space: FitSpace, laid: Sequence[Mapping[str, float]], scenarios: S
     deviations: list[dict[str, float]] = []
     for own, scenario in zip(laid, scenarios, strict=True):
         nodes = scenario.scene.mesh.nodes
-        if own and np.ptp(nodes[:, 2]) > _FLAT * np.ptp(nodes, axis=0).max():
-            told = (
-                f"laid {', '.join(own)}: this needs a cloth that lies level at the start; that of {scenario.name} does not."
-            )
-            raise ConfigError(told)
         known = {**own, "size": max(sizes)} if sizes else own
+        if known and np.ptp(nodes[:, 2]) > _FLAT * np.ptp(nodes, axis=0).max():
+            told = f"laid {', '.join(known)}: this needs a cloth that lies level at the start"
+            raise ConfigError(f"{told}; that of {scenario.name} does not.")
         if sizes:
             check_resizable(scenario)
         names = [each for name in LAID if name in known for each in (_SHAPES if name == "shape" else (name,))]
@@ -126,7 +125,9 @@ def check_resizable(scenario: Scenario) -> None:
     }
     if any(found.values()):
         more = ", ".join(name for name, there in found.items() if there)
-        raise ConfigError(f"laid size: this needs a scene of cloth and table alone; {scenario.name} also has {more}.")
+        raise ConfigError(
+            f"laid size: this needs a scene of cloth and table alone; {scenario.name} also has {more}. Leave size out."
+        )
 
 
 def _variable(name: str, deviation: float, length_unit_m: float) -> Variable:

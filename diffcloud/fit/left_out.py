@@ -1,8 +1,8 @@
 """What the other recordings of a joint fit say of one: whether parameters carry over.
 
 A fit of the others begins where the joint one ended. With what it found, and with how the cloth lay in the recording that
-was left out, the loss of all may be lower than where the joint fit ended. Then that one has missed a lower minimum, or
-stopped too early, and goes on from there.
+was left out, the loss of all may be lower than where the joint fit ended. Then the joint fit has missed a lower minimum, or
+stopped too early, and continues from those values.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ from diffcloud.sim.properties import one_set
 
 _STEPS = 10
 _TIMES = 2
-"""That a joint fit goes on, at most."""
-Tell = Callable[[float, Progress], None]
-"""What a progress display gets: which part of the recordings have been left out, and how the fit goes that is under way."""
+"""How often a joint fit may go on."""
+Tell = Callable[[float, str, Progress], None]
+"""What a progress display gets: the part of the recordings that have been left out, what is done now, and the progress of
+the current fit."""
 
 
 def leave_out_and_go_on(
@@ -36,22 +37,31 @@ def leave_out_and_go_on(
     outcome: FitOutcome,
     settings: Settings,
     *,
+    keep: Callable[[FitOutcome], None],
     progress: Tell | None = None,
-) -> tuple[FitOutcome, list[LeftOut]]:
-    """`leave_each_out` of a joint fit; one by Gauss–Newton that has missed a lower minimum goes on first.
+) -> list[LeftOut]:
+    """Leave each recording out in turn. If that shows a lower minimum, a fit by Gauss–Newton continues from there, and the
+    recordings are left out again.
+
+    Args:
+        outcome: of the joint fit.
+        settings: that it was made with.
+        keep: takes the joint fit whenever it has gone on.
 
     Raises:
-        DivergedError, KeyboardInterrupt: as there.
+        DivergedError, KeyboardInterrupt: as `leave_each_out`.
     """
+    objective.reseed(settings.seed)
     left = _TIMES
     while True:
         told, lower = leave_each_out(objective, space, outcome.values, progress=progress)
         if lower is None or not left or not isinstance(settings, GaussNewtonSettings):
-            return outcome, told
+            return told
         left -= 1
         further = replace(settings, starts=1, screen=0, init=lower)
-        shown = None if progress is None else partial(progress, 0.0)
+        shown = None if progress is None else partial(progress, 0.0, "going on from a lower loss")
         outcome = outcome.gone_on(fit_gauss_newton(objective, space, further, progress=shown))
+        keep(outcome)
         if outcome.stop_reason == "interrupted":
             raise KeyboardInterrupt
 
@@ -66,15 +76,15 @@ def leave_each_out(
         values: fitted to all, named as `fit.names` says.
 
     Returns:
-        What came of each, and values of a clearly lower loss of all, if one of these fits has met them.
+        What came of each; and, if the values of one of these fits give a clearly lower joint loss, these values.
 
     Raises:
         DivergedError: a motion diverges.
         KeyboardInterrupt: Ctrl-C.
     """
-    told, places = [], [dict(values)]
+    told, places, count = [], [dict(values)], len(objective.members)
     for index, member in enumerate(objective.members):
-        shown = None if progress is None else partial(progress, index / len(objective.members))
+        shown = None if progress is None else partial(progress, index / count, f"leaving out {index + 1} of {count}")
         others = JointObjective([*objective.members[:index], *objective.members[index + 1 :]])
         found = _from(others, space.without_recording(index), without_recording(values, index), shown)
         alike = {name: value for name, value in found.items() if not _own(name)}
@@ -92,14 +102,14 @@ def leave_each_out(
 
 
 def _own(name: str) -> bool:
-    """Whether each recording has a variable for itself."""
+    """Whether each recording has its own variable of this name."""
     return is_laid(name) and name not in SHARED
 
 
 def _from(
     objective: AnyObjective, space: FitSpace, values: Mapping[str, float], progress: Callable[[Progress], None] | None
 ) -> dict[str, float]:
-    """The lowest values near these, of what is fitted."""
+    """The fitted values at the end of a descent from these."""
     settings = GaussNewtonSettings(iterations=_STEPS, starts=1, screen=0, scans=0, init=values)
     found = fit_gauss_newton(objective, space, settings, progress=progress)
     if found.stop_reason == "interrupted":

@@ -1,7 +1,7 @@
 """What variables are called in a fit of several recordings.
 
-Material is that of the one cloth, and so is its size. How it lay before the motion, each recording has for itself:
-`turn@0` is the turn in the first recording, `turn` in the fit of a single one.
+Material and size belong to the cloth, so all recordings share them. Turn, shape and track are each recording's own: in a
+joint fit, `turn@0` is the turn in the first recording; in the fit of a single one, it is plain `turn`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def plain_name(name: str) -> str:
-    """Without the recording."""
+    """Without the number of its recording."""
     return name.partition(_OWN)[0]
 
 
@@ -31,7 +31,7 @@ def of_recording(named: Mapping[str, T], recording: int) -> dict[str, T]:
 
 
 def without_recording(named: Mapping[str, T], recording: int) -> dict[str, T]:
-    """What is left without one recording; those after it move up."""
+    """All but what is one recording's own; recordings after it are renumbered, each number lower by one."""
     found = dict[str, T]()
     for name, value in named.items():
         plain, own, number = name.partition(_OWN)
@@ -56,8 +56,8 @@ def with_recording(others: Mapping[str, T], own: Mapping[str, T], recording: int
 
 
 def of_all(each: Sequence[Mapping[str, T]]) -> dict[str, T]:
-    """What is told of how the cloth lies in each recording, as a fit of all of them names it; the inverse of
-    `of_recording`."""
+    """Puts together what is told of how the cloth lies in each recording, under the names of a joint fit; `of_recording`
+    takes it apart again."""
     found = dict[str, T]()
     for number, own in enumerate(each):
         for name, value in own.items():

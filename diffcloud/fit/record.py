@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from diffcloud.errors import ConfigError
-from diffcloud.fit.names import of_all
+from diffcloud.fit.names import SHARED, of_all
 from diffcloud.io.files import read_json
 
 SCHEMA = 8
@@ -76,11 +76,6 @@ class RecordingFit(_Model):
     """[3] of the recording, about which the scene is turned [length unit]."""
     left_out: LeftOut | None = None
     """In a joint fit of several recordings."""
-
-    def laid(self, *, length_unit_m: float) -> dict[str, float]:
-        """Name -> value, of how the cloth lies when its motion begins (`fit.laid`), as the simulator takes it."""
-        unit = {"m": length_unit_m, "rad": 1.0, "1": 1.0}
-        return {name: entry.value / unit[entry.unit] for name, entry in self.nuisance.items() if entry.of == "cloth"}
 
     @field_validator("nuisance")
     @classmethod
@@ -220,7 +215,7 @@ class FitRecord(_Model):
     length_unit_m: Annotated[float, Field(gt=0, le=1e3)]
     iterations: Count
     simulations: Annotated[int, Field(ge=1, le=1_000_000_000)]
-    """Runs of the simulator; one with derivatives counts once."""
+    """Runs of the simulator; one with derivatives counts once. Those of fits that leave a recording out do not."""
     seconds: NonNegative
     stop_reason: Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
     start: dict[str, Value]
@@ -243,6 +238,20 @@ class FitRecord(_Model):
         if self.scan is not None and {len(row) for row in self.scan.directions} != {len(self.free)}:
             raise ValueError("scan.directions must hold one number for each fitted parameter")
         return self
+
+    def laid_in(self, recording: int | None) -> dict[str, float]:
+        """Name -> value, of how the cloth lies when a recording's motion begins (`fit.laid`), as the simulator takes it.
+
+        Args:
+            recording: its place among `episodes`; None: one that is new to the fit, of which is known what all share.
+        """
+        unit = {"m": self.length_unit_m, "rad": 1.0, "1": 1.0}
+        told = self.episodes[recording or 0].nuisance
+        return {
+            name: entry.value / unit[entry.unit]
+            for name, entry in told.items()
+            if entry.of == "cloth" and (recording is not None or name in SHARED)
+        }
 
     def number_of(self, name: str, scenario: str) -> int | None:
         """The place of a recording among `episodes`; None: it is none of them. A single one may go by another name."""
@@ -272,7 +281,7 @@ class FitRecord(_Model):
 
     @property
     def _laid(self) -> dict[str, float]:
-        return of_all([one.laid(length_unit_m=self.length_unit_m) for one in self.episodes])
+        return of_all([self.laid_in(number) for number in range(len(self.episodes))])
 
     def plain(self) -> dict[str, Any]:
         """As the file has it."""

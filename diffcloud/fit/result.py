@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -31,9 +32,7 @@ from diffcloud.sim.properties import PARAMETERS, one_set
 from diffcloud.sim.simulate import Rollout
 
 _AT_BOUND = 0.01
-"""Part of the range from an end within which a value counts as there."""
-
-
+"""Part of the range from an end within which a value counts as there; of the logarithmic range, if no bound is zero."""
 _FARTHEST = 1e6
 """Of a place or time in a motion."""
 
@@ -356,10 +355,11 @@ def _parameters(scenario: Scenario, space: FitSpace, values: Mapping[str, float]
     for name in space.fixed:
         found[name].fixed = True
     for variable in (one for one in space.variables if one.name in values):
-        entry, (low, high) = found[variable.name], (variable.low, variable.high)
-        entry.bounds, entry.prior, entry.centre = (low, high), variable.prior, variable.centre
+        entry, bounds = found[variable.name], (variable.low, variable.high)
+        entry.bounds, entry.prior, entry.centre = bounds, variable.prior, variable.centre
         entry.doubtful = variable.doubtful
-        entry.at_bound = min(entry.value - low, high - entry.value) < _AT_BOUND * (high - low)
+        low, high, here = (math.log(one) if variable.low > 0 else one for one in (*bounds, entry.value))
+        entry.at_bound = min(here - low, high - here) < _AT_BOUND * (high - low)
     return found
 
 

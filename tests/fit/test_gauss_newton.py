@@ -371,7 +371,7 @@ class TestFits:
         [
             (1.0, 4, 0.9, ["1", "2", "search", "grown", "again"]),
             (0.5, 4, 0.4, ["1", "2", "grown", "again", "search"]),
-            (0.5, 4, 1.1, ["grown", "1", "again", "2", "search"]),
+            (0.5, 4, 1.1, ["grown", "1", "2", "again", "search"]),
             (1.0, 4, 1.1, ["grown", "1", "2", "search", "again"]),
             (1.0, math.inf, 0.9, None),
         ],

@@ -86,7 +86,13 @@ class TestLaid:
         assert (
             float(batch_losses(joint, space, torch.tensor([[lower[name] for name in space.names]]).double())) < stopped.loss
         )
-        outcome, told = leave_out_and_go_on(joint, space, stopped, settings)
+        fits, seen = [], []
+        told = leave_out_and_go_on(
+            joint, space, stopped, settings, keep=fits.append, progress=lambda *shown: seen.append(shown[:2])
+        )
+        outcome = fits[-1]
+        assert seen[0] == (0.0, "leaving out 1 of 2")
+        assert (0.0, "going on from a lower loss") in seen
         assert outcome.loss == pytest.approx(found.loss, rel=0.05)
         assert outcome.start == stopped.start
         assert outcome.simulations > stopped.simulations
@@ -103,8 +109,8 @@ class TestLaid:
         assert space_of(record) == space
         with torch.no_grad():
             assert float(joint(one_set(record.simulated))) == pytest.approx(record.loss, rel=1e-9)
-        for scenario, motion, own in zip(motions(), result.motions, record.episodes, strict=True):
-            (lies,) = laid_nodes(scenario.scene.mesh, one_set(own.laid(length_unit_m=1.0)))
+        for number, (scenario, motion) in enumerate(zip(motions(), result.motions, strict=True)):
+            (lies,) = laid_nodes(scenario.scene.mesh, one_set(record.laid_in(number)))
             np.testing.assert_allclose(motion.nodes[0], lies, atol=1e-15)
 
     def test_intervals_do_not_depend_on_the_order(self, askew):

@@ -112,6 +112,21 @@ def test_tables_hold_methods_repeats_and_transfer(work):
     assert spent["diffcloud"]["simulations"] == spent["cma_es"]["simulations"] == np.mean(budgets)
 
 
+def test_recordings_of_a_joint_fit_are_compared_each_as_it_lay(work):
+    told = ("--joint", "--laid", "turn=5deg", "--starts", 1, "--screen", 0, "--iterations", 2)
+    invoke(
+        "fit", "--params", "params.yaml", *told, "--scenario", "small", "--out", "data/fits/small", "data/episodes/small"
+    )
+    fit = read_fit(work / "data" / "fits" / "small" / "joint.json")
+    invoke("evaluate", "--params", "params.yaml")
+    for number, one in enumerate(fit.episodes):
+        kept = work / "reports" / "episodes" / "small" / f"joint-{one.name}.json"
+        record = json.loads(kept.read_text())["record"]
+        row = next(row for row in record["methods"] if row["method"] == "diffcloud")
+        assert record["fit"] == "joint"
+        assert row["clipped"]["turn"] == fit.laid_in(number)["turn"] != 0
+
+
 def test_finished_episodes_are_kept_until_their_inputs_change(work, monkeypatch):
     def never(*arguments, name, **options):
         raise AssertionError(f"{name} was compared again")

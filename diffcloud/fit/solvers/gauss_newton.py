@@ -10,8 +10,9 @@ falls by how much of the predicted decrease a step brings, and grows, faster and
 the best of a screen of candidates spread over the box, the best one first. The remaining ones are not followed once one
 explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and more of it; the
 other is a derivative-free search, from the best place so far, over the parameters asked for only. The search comes after
-three candidates. So do growing starts, but for one of them, which follows the first candidate where that one's end is not
-too high for a right model (with a threshold, all of them do). They wait as long as a second end is as low as the best one.
+three candidates. So do growing starts, but the first of them comes as soon as the best end is low enough for the model to
+be right (with a threshold, all of them come right after the first candidate). They also wait while an end from another
+candidate is as low as the best one.
 Four equally low ends are taken for the minimum although they do not explain the recording; two are, where it is not known
 what cameras missed, or where the loss is so high that the model must be wrong. Unless the recording is explained, losses
 along the principal axes of the best place then tell whether another minimum is lower nearby; from there it goes on.
@@ -307,7 +308,7 @@ class _Ways:
         """
         self.waiting, self.every, self._steps = list(starts), list[_Way](), steps
         self._held = held if bool(held.any()) else None
-        self._grew = False
+        self._grown = 0
 
     @property
     def best(self) -> _Way:
@@ -333,18 +334,19 @@ class _Ways:
         return self.best.loss <= explained or len(self._witnesses) >= needed
 
     def following(self, witnesses: float, misfit: float) -> _Start:
-        """The next start. Where some equal ends would be enough, those that grow wait for the first candidates, and as long
-        as the best end is not alone; but for one of them, if the first end is low enough for the model to be right.
+        """The next start. Where some equal ends would be enough, those that grow wait until three others were followed, and
+        while the best end is not alone. The first of them need not wait for three once the best end is low enough for the
+        model to be right.
 
         Args:
             witnesses, misfit: as of `enough`.
         """
-        soon = bool(self.every) and not self._grew and self.best.loss <= misfit
-        early = len(self.every) < (1 if soon else _BEFORE)
-        wait = math.isfinite(witnesses) and (early or len(self._witnesses) > 1)
-        quick = (place for place, start in enumerate(self.waiting) if not start.grows)
-        start = self.waiting.pop(next(quick, 0) if wait else 0)
-        self._grew |= start.grows
+        soon = bool(self.every) and not self._grown and self.best.loss <= misfit
+        early = len(self.every) - self._grown < (1 if soon else _BEFORE)
+        grows = not (early or len(self._witnesses) > 1)
+        fitting = (place for place, start in enumerate(self.waiting) if start.grows == grows)
+        start = self.waiting.pop(next(fitting, 0) if math.isfinite(witnesses) else 0)
+        self._grown += start.grows
         return start
 
     @property
