@@ -41,8 +41,8 @@ class Job:
     name: str
     fit: str
     """Name of its fit."""
-    recording: str
-    """What the fit calls the episode."""
+    recording: int
+    """The episode's place among those of the fit."""
     episode: Episode
     fitted: FitRecord
     predictions: Sequence[Estimate | Gap]
@@ -63,16 +63,7 @@ class Job:
         """
         # seconds of predictions differ from run to run, and change nothing in the record
         told = [(entry.method, entry.values if isinstance(entry, Estimate) else entry.reason) for entry in self.predictions]
-        inputs = [
-            self.name,
-            self.fit,
-            self.recording,
-            self.episode,
-            self.fitted.plain(),
-            told,
-            self.transfers,
-            self.settings,
-        ]
+        inputs = [self.name, self.fit, self.episode, self.fitted.plain(), told, self.transfers, self.settings]
         mark = fingerprint([self.scenario, self.group, *inputs], packages=_CODE)
         if (known := kept_record(self.kept, mark)) is not None:
             return EpisodeRecord(known["record"], known["seconds"])
@@ -153,17 +144,17 @@ def comparison_jobs(
     """
     found = [(path.stem, read_fit(path)) for path in [*files_in(fits / group, ".json"), *joint_fit(fits)]]
     fitted = [
-        (name, recording.name, fit)
+        (name, recording.name, number, fit)
         for name, fit in found
-        for recording in fit.episodes
+        for number, recording in enumerate(fit.episodes)
         if recording.scenario == scenario.name
     ]
-    recorded = {name: read_episode(episodes / group / f"{name}.npz") for _, name, _ in fitted}
-    values = {name: fit.values for _, name, fit in fitted}
+    recorded = {name: read_episode(episodes / group / f"{name}.npz") for _, name, _, _ in fitted}
+    values = {name: fit.values for _, name, _, fit in fitted}
     others = other_repeats({name: episode.meta for name, episode in recorded.items()}, values)
     networks = _networks(config, group, regressors, simulated)
     jobs = []
-    for fit_name, name, fit in fitted:
+    for fit_name, name, number, fit in fitted:
         label = name if fit_name == name else f"{fit_name}-{name}"  # a joint fit has several episodes
         real = not recorded[name].meta.get("truth")
         jobs.append(
@@ -172,7 +163,7 @@ def comparison_jobs(
                 group=group,
                 name=label,
                 fit=fit_name,
-                recording=name,
+                recording=number,
                 episode=recorded[name],
                 fitted=fit,
                 predictions=[network.of(recorded[name]) for network in networks],

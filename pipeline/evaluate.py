@@ -69,7 +69,7 @@ def loss(
         measure, values = record.measure.model_dump(), dict(record.values)
     chosen = choose_scenario(scenario, scene)
     if fit is not None:
-        known = {one.scenario: number for number, one in enumerate(record.episodes) if one.name == episode.stem}
+        known = {one.scenario: one for one in record.episodes if one.name == episode.stem}
         laid = record.laid_in(known.get(chosen.name, next(iter(known.values()), None)))
     given = {"points": points, "frames": frame, "seed": seed, "paper": paper or None}
     measure |= {name: value for name, value in given.items() if value is not None}

@@ -172,6 +172,7 @@ class FitJob:
         known = self.known()
         if known is not None and known.stop_reason != "interrupted":
             return known
+        reached = 0.0
 
         def show_progress(progress: Progress) -> None:
             check_interrupt()
@@ -184,15 +185,16 @@ class FitJob:
             tell(part * min(done / max(most, 1), 1.0), f"step {done}  best {progress.best:.3e}  {values}")
 
         def show_left_out(done: float, doing: str, progress: Progress) -> None:
+            nonlocal reached
             check_interrupt()
-            reached.append(max(reached[-1], _JOINT_PART + (1 - _JOINT_PART) * done))  # what goes on begins anew
-            tell(reached[-1], f"{doing}  step {progress.iteration}  best {progress.best:.3e}")
+            reached = max(reached, _JOINT_PART + (1 - _JOINT_PART) * done)  # what goes on begins anew
+            tell(reached, f"{doing}  step {progress.iteration}  best {progress.best:.3e}")
 
         objective, space = self.objective(), self.space
         settings = replace(self.settings.solver_settings(self.scenario), init=self.init)
         outcome = solve(objective, space, settings, progress=show_progress)
         left, failures, interrupted = list[LeftOut](), list[str](), outcome.stop_reason == "interrupted"
-        fits, reached = [outcome], [0.0]
+        fits = [outcome]
         if isinstance(objective, JointObjective) and not interrupted:
             try:
                 left = leave_out_and_go_on(objective, space, outcome, settings, keep=fits.append, progress=show_left_out)

@@ -62,8 +62,7 @@ def rollout(
     steps = frames * chosen.scene.frame_steps
     system, _ = chosen.scene.build()
     recording = None if fitted is None else _recording(fitted.episodes, chosen.name, episode)
-    number = None if fitted is None or recording is None else fitted.episodes.index(recording)
-    laid = {} if fitted is None else fitted.laid_in(number)
+    laid = {} if fitted is None else fitted.laid_in(recording)
     track, warnings = None, limits(chosen)
     if episode is not None:
         recorded = read_episode(episode)

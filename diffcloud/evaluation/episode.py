@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from diffcloud.errors import ConfigError, DiffCloudError
+from diffcloud.errors import DiffCloudError
 from diffcloud.evaluation import methods
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, state_intervals
 from diffcloud.evaluation.landscape import loss_landscape
@@ -56,7 +56,7 @@ def compare_episode(
     *,
     name: str,
     fit_name: str | None = None,
-    recording: str | None = None,
+    recording: int = 0,
     predictions: Sequence[Estimate | Gap] = (),
     transfers: Mapping[str, Mapping[str, float]] | None = None,
     settings: ComparisonSettings | None = None,
@@ -66,23 +66,16 @@ def compare_episode(
     Args:
         fit: of the episode; its measure, bounds, given parameters and number of iterations hold for every method.
         fit_name: of the fit, if it is another than the episode's: a joint fit has several episodes.
-        recording: what that one calls the episode, if something else.
+        recording: the episode's place among those of the fit.
         predictions: of networks, and why those that should be there are not.
         transfers: episode -> parameters fitted on it, of other recordings of the same fabric.
-
-    Raises:
-        ConfigError: a joint fit that knows no such episode.
     """
     settings = settings or ComparisonSettings()
     measure = fit.measure.model_dump(exclude={"seed"})
-    number = fit.number_of(recording or name, scenario.name)
-    if number is None:
-        known = ", ".join(f"{one.scenario}/{one.name}" for one in fit.episodes)
-        raise ConfigError(f"The fit is of {known}, not of {scenario.name}/{recording or name}.")
-    space, _ = methods.space_of(fit).of_recording(number)
+    space, _ = methods.space_of(fit).of_recording(recording)
     objective = Objective(scenario, episode, **measure, seed=fit.measure.seed)
-    told: list[Estimate | Gap] = [methods.fitted(fit, number)]
-    laid = fit.laid_in(number)  # as the pose, for all methods
+    told: list[Estimate | Gap] = [methods.fitted(fit, recording)]
+    laid = fit.laid_in(fit.episodes[recording])  # as the pose, for all methods
     lying = FitSpace(space.asked.variables, {**space.asked.fixed, **laid})
     told += [_run(rival, objective, lying, fit, settings.seed) for rival in settings.rivals]
     told += [*predictions, *methods.published(episode.meta)]
@@ -92,7 +85,7 @@ def compare_episode(
     sources = dict(transfers or {})
     every = (*(e.values for e in estimates), *sources.values())
     sets = [methods.clipped({**laid, **values}, space) for values in every]
-    measured = meter.measure([*sets, of_recording(fit.start, number)])
+    measured = meter.measure([*sets, of_recording(fit.start, recording)])
     rows, transferred = [], []
     for index, estimate in enumerate(estimates):
         if index in measured.diverged:

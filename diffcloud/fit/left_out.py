@@ -16,7 +16,7 @@ import torch
 from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.joint import AnyObjective, JointObjective
 from diffcloud.fit.laid import is_laid
-from diffcloud.fit.names import SHARED, of_recording, with_recording, without_recording
+from diffcloud.fit.names import of_recording, plain_name, with_recording, without_recording
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.record import LeftOut
 from diffcloud.fit.scan import LOWER
@@ -87,9 +87,9 @@ def leave_each_out(
         shown = None if progress is None else partial(progress, index / count, f"leaving out {index + 1} of {count}")
         others = JointObjective([*objective.members[:index], *objective.members[index + 1 :]])
         found = _from(others, space.without_recording(index), without_recording(values, index), shown)
-        alike = {name: value for name, value in found.items() if not _own(name)}
+        alike = {name: value for name, value in found.items() if name == plain_name(name)}
         here, _ = space.of_recording(index)
-        lying = FitSpace(tuple(one for one in here.variables if _own(one.name)), {**here.fixed, **alike})
+        lying = FitSpace(tuple(one for one in here.variables if one.name not in alike), {**here.fixed, **alike})
         lies = _from(member, lying, of_recording(values, index), shown) if lying.variables else {}
         with torch.no_grad():
             loss = float(member(one_set({**lying.fixed, **lies})))
@@ -99,11 +99,6 @@ def leave_each_out(
     rows = torch.tensor([[place[name] for name in space.names] for place in places], dtype=torch.float64)
     losses = batch_losses(objective, space, rows)
     return told, places[int(losses.argmin())] if float(losses.min()) < (1 - LOWER) * float(losses[0]) else None
-
-
-def _own(name: str) -> bool:
-    """Whether each recording has its own variable of this name."""
-    return is_laid(name) and name not in SHARED
 
 
 def _from(

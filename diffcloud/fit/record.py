@@ -239,24 +239,18 @@ class FitRecord(_Model):
             raise ValueError("scan.directions must hold one number for each fitted parameter")
         return self
 
-    def laid_in(self, recording: int | None) -> dict[str, float]:
+    def laid_in(self, recording: RecordingFit | None) -> dict[str, float]:
         """Name -> value, of how the cloth lies when a recording's motion begins (`fit.laid`), as the simulator takes it.
 
         Args:
-            recording: its place among `episodes`; None: one that is new to the fit, of which is known what all share.
+            recording: one of `episodes`; None: one that is new to the fit, of which is known what all share.
         """
         unit = {"m": self.length_unit_m, "rad": 1.0, "1": 1.0}
-        told = self.episodes[recording or 0].nuisance
         return {
             name: entry.value / unit[entry.unit]
-            for name, entry in told.items()
+            for name, entry in (recording or self.episodes[0]).nuisance.items()
             if entry.of == "cloth" and (recording is not None or name in SHARED)
         }
-
-    def number_of(self, name: str, scenario: str) -> int | None:
-        """The place of a recording among `episodes`; None: it is none of them. A single one may go by another name."""
-        found = [index for index, one in enumerate(self.episodes) if (one.name, one.scenario) == (name, scenario)]
-        return found[0] if found else 0 if len(self.episodes) == 1 else None
 
     @property
     def values(self) -> dict[str, float]:
@@ -281,7 +275,7 @@ class FitRecord(_Model):
 
     @property
     def _laid(self) -> dict[str, float]:
-        return of_all([self.laid_in(number) for number in range(len(self.episodes))])
+        return of_all([self.laid_in(one) for one in self.episodes])
 
     def plain(self) -> dict[str, Any]:
         """As the file has it."""

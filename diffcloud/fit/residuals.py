@@ -113,8 +113,9 @@ def linearise(objective: AnyObjective, space: FitSpace, places: Tensor) -> Linea
     slope, curvature = places.new_zeros(count, variables), places.new_zeros(count, variables, variables)
     if found is not None:
         losses[kept], slope[kept], curvature[kept] = found
-    sizes = [len(space.of_recording(index)[1]) for index in range(len(objective.members))]
-    each = sum(1 if by_tangents(one) else 1 + 2 * size for one, size in zip(objective.members, sizes, strict=True))
+    each = sum(
+        1 if by_tangents(one) else 1 + 2 * len(space.of_recording(index)[1]) for index, one in enumerate(objective.members)
+    )
     return Linearisation(losses, slope, curvature, each * count)
 
 

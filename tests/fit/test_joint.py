@@ -110,7 +110,7 @@ class TestLaid:
         with torch.no_grad():
             assert float(joint(one_set(record.simulated))) == pytest.approx(record.loss, rel=1e-9)
         for number, (scenario, motion) in enumerate(zip(motions(), result.motions, strict=True)):
-            (lies,) = laid_nodes(scenario.scene.mesh, one_set(record.laid_in(number)))
+            (lies,) = laid_nodes(scenario.scene.mesh, one_set(record.laid_in(record.episodes[number])))
             np.testing.assert_allclose(motion.nodes[0], lies, atol=1e-15)
 
     def test_intervals_do_not_depend_on_the_order(self, askew):

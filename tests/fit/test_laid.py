@@ -189,7 +189,7 @@ def test_it_is_told_as_nuisance_and_read_back(objective, fits, tmp_path):
         flat = float(objective(column(**record.values)))
     assert again == pytest.approx(record.loss, rel=1e-9)
     assert flat > 5 * again
-    (lies,) = laid_nodes(SCENARIO.scene.mesh, column(**record.laid_in(0)))
+    (lies,) = laid_nodes(SCENARIO.scene.mesh, column(**record.laid_in(record.episodes[0])))
     np.testing.assert_allclose(result.motions[0].nodes[0], lies, atol=1e-15)
     for change, message in (({"unit": "s"}, "how a cloth lies is in m, rad or 1"), ({"of": "table"}, "cloth")):
         told = json.loads((tmp_path / "e.json").read_text())

@@ -119,12 +119,12 @@ def test_recordings_of_a_joint_fit_are_compared_each_as_it_lay(work):
     )
     fit = read_fit(work / "data" / "fits" / "small" / "joint.json")
     invoke("evaluate", "--params", "params.yaml")
-    for number, one in enumerate(fit.episodes):
+    for one in fit.episodes:
         kept = work / "reports" / "episodes" / "small" / f"joint-{one.name}.json"
         record = json.loads(kept.read_text())["record"]
         row = next(row for row in record["methods"] if row["method"] == "diffcloud")
         assert record["fit"] == "joint"
-        assert row["clipped"]["turn"] == fit.laid_in(number)["turn"] != 0
+        assert row["clipped"]["turn"] == fit.laid_in(one)["turn"] != 0
 
 
 def test_finished_episodes_are_kept_until_their_inputs_change(work, monkeypatch):
