@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import os
 import shlex
-import signal
 import sys
 import tempfile
-import threading
 import traceback
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
 from diffcloud import __version__
 from diffcloud.errors import DiffCloudError
+from pipeline import ctrl_c
 from pipeline.console import errors, say
 from pipeline.fork_server import begin_importing
 from pipeline.lazy import lazy_group
@@ -77,40 +76,23 @@ def main() -> None:
     # spinning costs tenfold. Said to OpenMP, which reads it when torch is imported, by those commands that need torch.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     keep_freed_memory()
-    sys.unraisablehook = _hear_again
+    ctrl_c.listen()
     try:
         if sys.argv[1:2] and sys.argv[1] in _PARALLEL:
             begin_importing(COMMANDS[sys.argv[1]].partition(":")[0], sys.argv[1:])
-        app()
+        with ctrl_c.none_lost():
+            app()
     except DiffCloudError as error:
         say("Error:", str(error), style="bold red")
         sys.exit(1)
     except KeyboardInterrupt:
-        _interrupted()
+        errors.print("Interrupted.")
+        sys.exit(130)
     except Exception as error:
-        # numba's dispatcher overlooks a Ctrl-C that comes in it; the interpreter finds that, and names it as the cause
-        if isinstance(error, SystemError) and isinstance(error.__cause__, KeyboardInterrupt):
-            _interrupted()
         if "--debug" in sys.argv[1:2]:
             raise
         say("Error:", _unforeseen(error), style="bold red")
         sys.exit(1)
-
-
-def _interrupted() -> NoReturn:
-    errors.print("Interrupted.")
-    sys.exit(130)
-
-
-def _hear_again(lost: sys.UnraisableHookArgs) -> None:
-    """Python loses a Ctrl-C that comes in a callback, such as those of the import system: it is pressed once more then."""
-    if isinstance(lost.exc_value, KeyboardInterrupt):
-        # a real signal, which ends a wait of the main thread too
-        again = threading.Timer(0.02, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
-        again.daemon = True
-        again.start()
-    else:
-        sys.__unraisablehook__(lost)
 
 
 def _unforeseen(error: Exception) -> str:

@@ -16,6 +16,7 @@ from diffcloud.io.manifests import read_manifest, write_manifest
 from diffcloud.sim.threads import use_threads
 from pipeline.config import Config, load_config, updated
 from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, episode_files, errors, finish, say, show, writes
+from pipeline.ctrl_c import none_lost
 from pipeline.fit_jobs import JOINT, FitJob, Recording, first_start, read_recordings, remove_stale, stated_recordings
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 from pipeline.workers import run_all
@@ -205,12 +206,13 @@ def fit(
     if every:  # stated before, so that what an interrupted call leaves is known too
         write_manifest(out, read_manifest(out) | {path.relative_to(out).as_posix() for job in jobs for path in job.files})
     try:
-        for job, record, error in run_all("fit", jobs, settings.workers, patient=True):
-            if error is None:
-                errors.print(f"{job.label}: loss {record.loss_start:.3e} -> {record.loss:.3e}")
-                add(job, record)
-            else:
-                failures.append(f"{told_as(job)}: {error}")
+        with none_lost():
+            for job, record, error in run_all("fit", jobs, settings.workers, patient=True):
+                if error is None:
+                    errors.print(f"{job.label}: loss {record.loss_start:.3e} -> {record.loss:.3e}")
+                    add(job, record)
+                else:
+                    failures.append(f"{told_as(job)}: {error}")
     except KeyboardInterrupt:
         for job in jobs:
             if told_as(job) not in results and (best := job.known()) is not None:

@@ -12,6 +12,7 @@ from diffcloud.datasets import ParameterBox, ParameterDraws, SimulationPlan, sim
 from diffcloud.sim.threads import use_threads
 from pipeline.config import load_config, updated
 from pipeline.console import JsonFlag, ParamsFile, Threads, errors, finish, progress_bar, show, warn, writes
+from pipeline.ctrl_c import none_lost
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 
 _INTERRUPTED = 130
@@ -62,14 +63,15 @@ def simulate(
     )
     with progress_bar(f"simulating {chosen.name}", settings.train + settings.test) as update:
         try:
-            outcome = simulate_set(
-                plan,
-                out,
-                workers=workers,
-                scheduler=scheduler,
-                clouds=chosen.points if export_clouds else None,
-                progress=lambda done: update(done, ""),
-            )
+            with none_lost():
+                outcome = simulate_set(
+                    plan,
+                    out,
+                    workers=workers,
+                    scheduler=scheduler,
+                    clouds=chosen.points if export_clouds else None,
+                    progress=lambda done: update(done, ""),
+                )
         except KeyboardInterrupt:
             errors.print(f"Interrupted: finished runs are kept in {out}.partial; the same command goes on from there.")
             raise typer.Exit(_INTERRUPTED) from None

@@ -25,6 +25,7 @@ from diffcloud.regressors import (
 from diffcloud.regressors.checkpoints import timings_path
 from pipeline.config import TrainConfig, load_config, updated
 from pipeline.console import JsonFlag, ParamsFile, errors, finish, show, writes
+from pipeline.ctrl_c import none_lost
 from pipeline.workers import Tell, run_all
 
 _INTERRUPTED = 130
@@ -125,15 +126,16 @@ def train(
     results: dict[str, Any] = {}
     failures: list[str] = []
     try:
-        for job, told, error in run_all("train", jobs, config.workers):
-            if error is None:
-                name = job.label if every else job.model
-                results[name] = told
-                _add_rows(table, name, told)
-                if told["resumed_from"]:
-                    errors.print(f"{job.label}: went on after epoch {told['resumed_from']} of an interrupted run.")
-            else:
-                failures.append(f"{job.label}: {error}")
+        with none_lost():
+            for job, told, error in run_all("train", jobs, config.workers):
+                if error is None:
+                    name = job.label if every else job.model
+                    results[name] = told
+                    _add_rows(table, name, told)
+                    if told["resumed_from"]:
+                        errors.print(f"{job.label}: went on after epoch {told['resumed_from']} of an interrupted run.")
+                else:
+                    failures.append(f"{job.label}: {error}")
     except KeyboardInterrupt:
         errors.print("Interrupted; the same command keeps finished networks and goes on from the last saved epoch.")
         raise typer.Exit(_INTERRUPTED) from None
