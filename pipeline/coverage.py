@@ -16,7 +16,7 @@ from rich.table import Table
 
 from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, state_intervals
-from diffcloud.fit import solve
+from diffcloud.fit.finer_mesh import solve_and_refine
 from diffcloud.fit.pose import SET_UP, PoseSpace
 from diffcloud.fit.uncertainty import finer_steps
 from diffcloud.io.episodes import Episode, read_episode, write_episode
@@ -227,11 +227,13 @@ class CoverageJob:
         fit = fit.model_copy(update={"fixed": {**fit.fixed, **{name: truth[name] for name in self.known}}})
         job = FitJob(self.label, [Recording(self.scenario, self.label, episode)], fit, self.folder)
         objective, space = job.objective(), job.space
-        outcome = solve(objective, space, fit.solver_settings(self.scenario))
+        settings, cuts = fit.solver_settings(self.scenario), fit.cuts([self.scenario])
+        fitted = solve_and_refine(objective, space, settings, cuts=cuts)
+        outcome = fitted.outcome
         if outcome.stop_reason == "interrupted":
             raise KeyboardInterrupt
         found = state_intervals(
-            objective,
+            fitted.objective,
             space,
             outcome.values,
             level=self.level,
@@ -239,7 +241,12 @@ class CoverageJob:
             restarts=RESTARTS,
             seen=outcome.scan,
         )
-        told = {"loss": outcome.loss, "stop_reason": outcome.stop_reason, "simulations": outcome.simulations}
+        told: dict[str, Any] = {
+            "loss": outcome.loss,
+            "mesh_cuts": fitted.cuts,
+            "stop_reason": outcome.stop_reason,
+            "simulations": outcome.simulations,
+        }
         return told | {"seconds": outcome.seconds, "intervals": found.model_dump(mode="json")}
 
     def _true_scenario(self) -> Scenario:

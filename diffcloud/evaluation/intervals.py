@@ -28,7 +28,7 @@ from scipy.special import stdtrit
 
 from diffcloud.errors import ConfigError
 from diffcloud.fit.joint import AnyObjective
-from diffcloud.fit.objective import Objective
+from diffcloud.fit.objective import UNEXPLAINED, Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis
 from diffcloud.fit.result import physical_values
@@ -54,10 +54,9 @@ _PLAIN = 1e6
 """Below it numbers are written out."""
 RESTARTS = 2
 """Of a fit that has not arrived, from a lower loss beside it."""
-_DOUBTED, _UNEXPLAINED = 1.3, 2.0
-"""Multiples of the loss that noise and spacing of the points leave, where it is known what the recording misses: from the
-first on a fit gets a remark, above the second the model does not explain the recording. Of random cloths that this
-simulator moved, right fits have had 1.14 times that loss at most (folds of finer steps 1.9), wrong minima 1.4 at least."""
+_DOUBTED = 1.3
+"""Multiple of the loss that noise and spacing of the points leave, where it is known what the recording misses, from which
+on a fit gets a remark (see `UNEXPLAINED`)."""
 _UNEXPLAINED_RMS = 2.0
 """RMS over a coarse allowance for noise and spacing, from which the model does not explain another recording."""
 _STEP = 2.0
@@ -443,7 +442,7 @@ def _misfit(objective: Objective, loss: float) -> tuple[float, float, float]:
     if over is None:
         accounted = noise_mm(objective)
         return rms, accounted, rms / (_UNEXPLAINED_RMS * accounted)
-    return rms, to_mm * objective.noise_loss**0.5, (over / _UNEXPLAINED) ** 0.5
+    return rms, to_mm * objective.noise_loss**0.5, (over / UNEXPLAINED) ** 0.5
 
 
 def _over_noise(objective: Objective, loss: float) -> float | None:

@@ -55,8 +55,12 @@ class JointObjective:
     @property
     def explained(self) -> float:
         """As of `Objective`."""
-        levels = torch.tensor([[one.explained] for one in self.members], dtype=torch.float64)
-        return float(mean_loss(levels, paper=self.paper))
+        return self._mean([one.explained for one in self.members])
+
+    @property
+    def unexplained(self) -> float:
+        """As of `Objective`."""
+        return self._mean([one.unexplained for one in self.members])
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Losses [B], as of `Objective`.
@@ -70,6 +74,13 @@ class JointObjective:
     def until(self, part: float) -> JointObjective:
         """As of `Objective`, of every one."""
         return JointObjective([one.until(part) for one in self.members])
+
+    def finer(self) -> JointObjective:
+        """As of `Objective`, of every one."""
+        return JointObjective([one.finer() for one in self.members])
+
+    def _mean(self, losses: Sequence[float]) -> float:
+        return float(mean_loss(torch.tensor(losses, dtype=torch.float64)[:, None], paper=self.paper))
 
     def reseed(self, seed: int) -> None:
         """Draw the common random numbers anew."""
