@@ -358,13 +358,18 @@ class TestFits:
         ways = gauss_newton._Ways([], 3, torch.zeros(1, dtype=torch.bool))
         for origin in (0, 0):
             ways.begin(gauss_newton._Start(place, origin), place, found)
-        assert not ways.enough(0.5, 0.0, 3)
+        unknown, wrong, near, all_of_them = (
+            gauss_newton._Enough(0.5, nearly, misfit, witnesses)
+            for nearly, misfit, witnesses in ((0.6, 0.0, 3), (0.6, 2.0, 3), (1.1, 2.0, 3), (0.0, 2.0, math.inf))
+        )
+        assert not any(ways.enough(when) for when in (unknown, wrong, near))
         ways.begin(gauss_newton._Start(place, 1), place, found)
-        assert ways.enough(0.5, 0.0, 3)
-        assert not ways.enough(0.5, 2.0, 3)  # where it is known that so high a loss is wrong
+        assert ways.enough(unknown)
+        assert not ways.enough(wrong)  # where it is known that so high a loss is wrong
+        assert ways.enough(near)  # and that this one hardly is
         ways.begin(gauss_newton._Start(place, 2), place, found)
-        assert ways.enough(0.5, 2.0, 3)
-        assert not ways.enough(0.5, 2.0, math.inf)
+        assert ways.enough(wrong)
+        assert not ways.enough(all_of_them)
 
     @pytest.mark.parametrize(
         ("second", "witnesses", "misfit", "order"),
@@ -386,7 +391,7 @@ class TestFits:
             found = Linearisation(torch.tensor([loss]).double(), torch.zeros(1, 1).double(), curvature, 1)
             ways.begin(start or gauss_newton._Start(place, 0), place, found)
             if ways.waiting:
-                start = ways.following(witnesses, misfit)
+                start = ways.following(gauss_newton._Enough(0.1, 0.1, misfit, witnesses))
                 taken.append(starts[start])
         assert taken == (order or list(names))
 

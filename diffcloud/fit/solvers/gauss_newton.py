@@ -70,11 +70,13 @@ _LOW_ENOUGH, _AS_LOW = 1.1, 1.3
 """Times what explains the frames; where that is not known, or the part before did not, times what that ended at."""
 _MISFIT = 30.0
 """Times what explains a recording; above that, it is the model that does not: no start will."""
+_NEARLY = 1.1
+"""Times what explains a recording; below that, a loss is lower than that of most wrong minima."""
 _EQUALLY = 1.01
 """Losses within this factor are equally low."""
 _WITNESSES, _FEW_WITNESSES = _BEFORE + 1, 2
 """Equally low ends of different candidates that are taken for the minimum although they do not explain the recording; fewer
-where it is not known what cameras missed, or where the model must be wrong."""
+where they nearly do, where it is not known what cameras missed, or where the model must be wrong."""
 _SCREENED = 0.5
 """Part of the frames on which candidates are compared: the rest costs as much again, and has more wrong minima."""
 _GIVE_UP = 6
@@ -117,11 +119,7 @@ def fit_gauss_newton(
     """
     began = time.perf_counter()
     axis = Axis.of(space)
-    known = objective.explained
-    most, explained = settings.starts or _MOST, settings.threshold or known
-    misfit = math.inf if settings.threshold else _MISFIT * known if objective.knows_gaps else 0.0
-    # a threshold says that something is lower, a number of starts that so many are to be followed
-    witnesses = math.inf if settings.threshold or settings.starts else _WITNESSES
+    most, when = settings.starts or _MOST, _Enough.of(objective, settings)
     places, simulations = _starts(objective, space, settings, axis, most)
     history = FitHistory(space.names)
     reason: StopReason = "iterations"
@@ -149,15 +147,15 @@ def fit_gauss_newton(
                 found = linearise(objective, space, tried[None])
                 simulations += found.simulations
                 ways.judge(way, tried, found)
-            elif ways.waiting and not ways.enough(explained, misfit, witnesses):
-                start = ways.following(witnesses, misfit)
+            elif ways.waiting and not ways.enough(when):
+                start = ways.following(when)
                 place, spent = start.found()
                 found = linearise(objective, space, place[None])
                 simulations += spent + found.simulations
                 ways.begin(start, place, found)
             else:
                 reason = ways.best.end or reason
-                done = objective.knows_gaps and ways.best.loss <= explained
+                done = objective.knows_gaps and ways.best.loss <= when.explained
                 if scans == settings.scans or reason == "iterations" or done:
                     break
                 scans += 1
@@ -296,6 +294,30 @@ def _lowest(matrix: Tensor, slope: Tensor, least: Tensor, most: Tensor) -> Tenso
     return torch.from_numpy(found.x)
 
 
+@dataclass(frozen=True)
+class _Enough:
+    """When no more starts are followed."""
+
+    explained: float
+    """The highest loss that explains the recording, or the threshold: one end is enough."""
+    nearly: float
+    """Up to this one, a few equally low ends are."""
+    misfit: float
+    """And above this one, where a right motion may be too."""
+    witnesses: float
+    """Equally low ends that are enough between."""
+
+    @staticmethod
+    def of(objective: AnyObjective, settings: GaussNewtonSettings) -> _Enough:
+        known = objective.explained
+        if settings.threshold:  # something is lower
+            return _Enough(settings.threshold, 0.0, math.inf, math.inf)
+        misfit = _MISFIT * known if objective.knows_gaps else 0.0
+        if settings.starts:  # so many are to be followed
+            return _Enough(known, 0.0, misfit, math.inf)
+        return _Enough(known, _NEARLY * known, misfit, _WITNESSES)
+
+
 class _Ways:
     """From B starts, one after the other."""
 
@@ -320,32 +342,22 @@ class _Ways:
         """The one under way."""
         return next((way for way in self.every if way.end is None), None)
 
-    def enough(self, explained: float, misfit: float, witnesses: float) -> bool:
-        """Whether the best one explains the recording, or enough others have ended as low.
-
-        Args:
-            explained: the highest loss that explains the recording.
-            misfit: above this one, where a right motion may be too, a few ends are enough.
-            witnesses: ends that are enough below.
-        """
+    def enough(self, when: _Enough) -> bool:
+        """Whether the best one explains the recording, or enough others have ended as low."""
         if not self.every or not math.isfinite(self.best.loss):
             return False
-        needed = _FEW_WITNESSES if self.best.loss > misfit else witnesses
-        return self.best.loss <= explained or len(self._witnesses) >= needed
+        needed = when.witnesses if when.nearly < self.best.loss <= when.misfit else _FEW_WITNESSES
+        return self.best.loss <= when.explained or len(self._witnesses) >= needed
 
-    def following(self, witnesses: float, misfit: float) -> _Start:
+    def following(self, when: _Enough) -> _Start:
         """The next start. Where some equal ends would be enough, those that grow wait until three others were followed, and
         while the best end is not alone. The first of them need not wait for three once the best end is low enough for the
-        model to be right.
-
-        Args:
-            witnesses, misfit: as of `enough`.
-        """
-        soon = bool(self.every) and not self._grown and self.best.loss <= misfit
+        model to be right."""
+        soon = bool(self.every) and not self._grown and self.best.loss <= when.misfit
         early = len(self.every) - self._grown < (1 if soon else _BEFORE)
         grows = not (early or len(self._witnesses) > 1)
         fitting = (place for place, start in enumerate(self.waiting) if start.grows == grows)
-        start = self.waiting.pop(next(fitting, 0) if math.isfinite(witnesses) else 0)
+        start = self.waiting.pop(next(fitting, 0) if math.isfinite(when.witnesses) else 0)
         self._grown += start.grows
         return start
 
