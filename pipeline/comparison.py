@@ -159,7 +159,7 @@ def comparison_jobs(
         real = not recorded[name].meta.get("truth")
         jobs.append(
             Job(
-                scenario=scenario.finer(fit.mesh_cuts),
+                scenario=scenario.halved(fit.halvings),
                 group=group,
                 name=label,
                 fit=fit_name,

@@ -16,7 +16,7 @@ from diffcloud.evaluation.intervals import LEVEL, WITHIN
 from diffcloud.fit.doubts import MATERIAL_DOUBTS, parse_doubts
 from diffcloud.fit.laid import parse_laid
 from diffcloud.fit.pose import parse_priors
-from diffcloud.fit.record import MOST_CUTS
+from diffcloud.fit.record import MOST_HALVINGS
 from diffcloud.fit.solvers import SOLVERS, Settings
 from diffcloud.fit.solvers.gauss_newton import ROUGH_SCREEN, ROUGH_STARTS
 from diffcloud.io.files import read_yaml
@@ -227,9 +227,9 @@ class FitConfig(Section):
     """The factor within which material that is not asked for is known: "bending=1.5x,drag=1.3x", or "none". It is fitted
     too, and is not a result (`fit.doubts`). Default: `MATERIAL_DOUBTS` and what the scenario says, of gauss_newton unless
     linearised, else none."""
-    mesh_cuts: Annotated[int, Field(ge=0, le=MOST_CUTS)] | None = None
-    """How often each face of the cloth may be cut into four where a fit does not explain its recording, to go on with the
-    finer mesh (`fit.finer_mesh`). Default: 1 of gauss_newton unless linearised, else 0."""
+    halvings: Annotated[int, Field(ge=0, le=MOST_HALVINGS)] | None = None
+    """How often the mesh's edges and the step may be halved where a fit does not explain its recording, to go on from there
+    (`fit.finer`). Default: 1 of gauss_newton unless linearised, else 0."""
     joint: bool = False
     """One parameter set for all episodes, whatever their scenario: they must be of one cloth."""
     workers: Workers = 1
@@ -253,8 +253,8 @@ class FitConfig(Section):
             raise ValueError("laid: the published measure takes the cloth to lie as the scene has it; leave it out")
         if self.paper and parse_doubts(self.doubts or "none"):
             raise ValueError("doubts: the published measure takes the rest of the material for known; leave them out")
-        if self.mesh_cuts and (self.paper or self.solver != "gauss_newton"):
-            raise ValueError("mesh_cuts: of solver gauss_newton, and not of the published measure; leave it out")
+        if self.halvings and (self.paper or self.solver != "gauss_newton"):
+            raise ValueError("halvings: of solver gauss_newton, and not of the published measure; leave it out")
         if foreign := [name for name in self._solver_options() if self.solver not in _solvers_with(name)]:
             told = "; ".join(f"{name}: of solver {' or '.join(_solvers_with(name))}" for name in foreign)
             raise ValueError(f"{told}; not of {self.solver}: leave out, or choose that solver")
@@ -287,9 +287,9 @@ class FitConfig(Section):
             return [parse_laid(self.laid)] * len(scenarios)
         return [dict(one.laid) if self._fits_more(scenarios) else {} for one in scenarios]
 
-    def cuts(self, scenarios: Sequence[Scenario]) -> int:
-        """How often the mesh may be cut finer in a fit of recordings in these scenarios."""
-        return int(self._fits_more(scenarios)) if self.mesh_cuts is None else self.mesh_cuts
+    def halved_at_most(self, scenarios: Sequence[Scenario]) -> int:
+        """How often edges and step may be halved in a fit of recordings in these scenarios."""
+        return int(self._fits_more(scenarios)) if self.halvings is None else self.halvings
 
     def _fits_more(self, scenarios: Sequence[Scenario]) -> bool:
         """Whether more than what is asked for is fitted by default: where derivatives make that cheap."""

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, state_intervals
-from diffcloud.fit.finer_mesh import solve_and_refine
+from diffcloud.fit.finer import solve_and_refine
 from diffcloud.fit.pose import SET_UP, PoseSpace
 from diffcloud.fit.uncertainty import finer_steps
 from diffcloud.io.episodes import Episode, read_episode, write_episode
@@ -227,8 +227,8 @@ class CoverageJob:
         fit = fit.model_copy(update={"fixed": {**fit.fixed, **{name: truth[name] for name in self.known}}})
         job = FitJob(self.label, [Recording(self.scenario, self.label, episode)], fit, self.folder)
         objective, space = job.objective(), job.space
-        settings, cuts = fit.solver_settings(self.scenario), fit.cuts([self.scenario])
-        fitted = solve_and_refine(objective, space, settings, cuts=cuts)
+        settings, halvings = fit.solver_settings(self.scenario), fit.halved_at_most([self.scenario])
+        fitted = solve_and_refine(objective, space, settings, halvings=halvings)
         outcome = fitted.outcome
         if outcome.stop_reason == "interrupted":
             raise KeyboardInterrupt
@@ -243,7 +243,7 @@ class CoverageJob:
         )
         told: dict[str, Any] = {
             "loss": outcome.loss,
-            "mesh_cuts": fitted.cuts,
+            "halvings": fitted.halvings,
             "stop_reason": outcome.stop_reason,
             "simulations": outcome.simulations,
         }

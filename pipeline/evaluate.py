@@ -69,7 +69,7 @@ def loss(
         measure, values = record.measure.model_dump(), dict(record.values)
     chosen = choose_scenario(scenario, scene)
     if fit is not None:
-        chosen = chosen.finer(record.mesh_cuts)
+        chosen = chosen.halved(record.halvings)
         known = {one.scenario: one for one in record.episodes if one.name == episode.stem}
         laid = record.laid_in(known.get(chosen.name, next(iter(known.values()), None)))
     given = {"points": points, "frames": frame, "seed": seed, "paper": paper or None}
@@ -124,7 +124,7 @@ def intervals(
         single = len(episodes) == 1 or one.scenario == record.scenario
         stated = scenario if scenario is not None and single else None
         chosen = choose_scenario(stated or fitted_scenario(fit, one.scenario), scene)
-        members.append(Objective(chosen.finer(record.mesh_cuts), read_episode(path), **measure))
+        members.append(Objective(chosen.halved(record.halvings), read_episode(path), **measure))
     objective = members[0] if len(members) == 1 else JointObjective(members)
     found = state_intervals(
         objective, space_of(record), record.free,

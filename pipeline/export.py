@@ -72,7 +72,7 @@ def export(
     index = _index(record, recording)
     one = record.episodes[index]
     drawn = _draws(record, intervals or fit.parent / "intervals.json", samples, seed) if samples else []
-    chosen = choose_scenario(scenario or fitted_scenario(fit, one.scenario)).finer(record.mesh_cuts)
+    chosen = choose_scenario(scenario or fitted_scenario(fit, one.scenario)).halved(record.halvings)
     motion = read_motion(fit.with_suffix(".npz"), index)
     cloth = fitted_cloth(one, motion, chosen, record.values)
     with together():

@@ -138,11 +138,11 @@ def fit(
             "bending=3x,mass=2x; none for no prior. Default: 10x, which decides only what the recording does not show."
         ),
     ] = None,
-    mesh_cuts: Annotated[
+    halvings: Annotated[
         int | None,
         typer.Option(
-            help="Where the recording's noise does not explain the misfit, halve the edge length of the mesh and go on, "
-            "so often at most. Default: 1 of gauss_newton unless linearised.",
+            help="Where the recording's noise does not explain the misfit, halve the mesh's edges and the step and go on, "
+            "so often at most. Default: 1 of gauss_newton unless linearised."
         ),
     ] = None,
     joint: Annotated[
@@ -178,7 +178,7 @@ def fit(
         laid=laid,
         prior=prior,
         doubts=doubts,
-        mesh_cuts=mesh_cuts,
+        halvings=halvings,
         joint=joint,
         workers=workers,
     )
@@ -217,7 +217,7 @@ def fit(
         with none_lost():
             for job, record, error in run_all("fit", jobs, settings.workers, patient=True):
                 if error is None:
-                    mesh = f", on a mesh of edges {2**record.mesh_cuts} times shorter" if record.mesh_cuts else ""
+                    mesh = f", on a mesh of edges {2**record.halvings} times shorter" if record.halvings else ""
                     errors.print(f"{job.label}: loss {record.loss_start:.3e} -> {record.loss:.3e}{mesh}")
                     add(job, record)
                 else:

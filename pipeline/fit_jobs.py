@@ -10,7 +10,7 @@ from pathlib import Path
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit import FitSpace, JointObjective, Objective, Progress, read_fit, write_fit
 from diffcloud.fit.doubts import with_doubts
-from diffcloud.fit.finer_mesh import solve_and_refine
+from diffcloud.fit.finer import solve_and_refine
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.laid import with_laid
 from diffcloud.fit.left_out import leave_out_and_go_on
@@ -112,8 +112,8 @@ class FitJob:
     folder: Path
     init: Mapping[str, float] = field(default_factory=dict)
     """Values of the first start; the middle of the range where not given."""
-    mesh_cuts: int = 0
-    """How often the mesh is cut to begin with."""
+    halvings: int = 0
+    """How often edges and step of the scenario are halved to begin with."""
 
     @property
     def scenario(self) -> Scenario:
@@ -149,16 +149,16 @@ class FitJob:
         space = with_doubts(space, settings.known_within(scenarios), scenarios)
         return with_laid(space, settings.laid_within(scenarios), scenarios)
 
-    def objective(self, mesh_cuts: int | None = None) -> AnyObjective:
+    def objective(self, halvings: int | None = None) -> AnyObjective:
         """
         Args:
-            mesh_cuts: of the fit that was made; by default, those to begin with.
+            halvings: of the fit that was made; by default, those to begin with.
 
         Raises:
             ConfigError, EpisodeError: the episodes lack the frames of the loss, an unknown frame, or different cloths.
         """
-        cuts, measure = self.mesh_cuts if mesh_cuts is None else mesh_cuts, self.settings.measure()
-        members = [Objective(one.scenario.finer(cuts), one.episode, **measure) for one in self.recordings]
+        times, measure = self.halvings if halvings is None else halvings, self.settings.measure()
+        members = [Objective(one.scenario.halved(times), one.episode, **measure) for one in self.recordings]
         return members[0] if len(members) == 1 else JointObjective(members)
 
     def known(self) -> FitRecord | None:
@@ -201,8 +201,9 @@ class FitJob:
 
         objective, space = self.objective(), self.space
         settings = replace(self.settings.solver_settings(self.scenario), init=self.init)
-        cuts = max(self.settings.cuts([one.scenario for one in self.recordings]) - self.mesh_cuts, 0)
-        fitted = solve_and_refine(objective, space, settings, cuts=cuts, progress=show_progress)
+        most = self.settings.halved_at_most([one.scenario for one in self.recordings])
+        more = max(most - self.halvings, 0)
+        fitted = solve_and_refine(objective, space, settings, halvings=more, progress=show_progress)
         objective, outcome = fitted.objective, fitted.outcome
         left, failures, interrupted = list[LeftOut](), list[str](), outcome.stop_reason == "interrupted"
         fits = [outcome]
@@ -215,7 +216,7 @@ class FitJob:
                 interrupted = True
         result = describe_fit(objective, space, settings, fits[-1], episodes=[one.name for one in self.recordings])
         record = result.record
-        record.mesh_cuts, record.finer_loss = self.mesh_cuts + fitted.cuts, fitted.finer_loss
+        record.halvings, record.finer_loss = self.halvings + fitted.halvings, fitted.finer_loss
         record.failures += failures
         record.stop_reason = "interrupted" if interrupted else record.stop_reason
         for recording, told in zip(record.episodes, left, strict=bool(left)):
@@ -229,7 +230,7 @@ class FitJob:
     @cached_property
     def _fingerprint(self) -> str:
         settings = self.settings.model_dump(exclude={"workers", "joint"})  # which the name and the recordings tell
-        return fingerprint([self.name, self.recordings, settings, self.init, self.mesh_cuts], packages=_CODE)
+        return fingerprint([self.name, self.recordings, settings, self.init, self.halvings], packages=_CODE)
 
 
 def first_start(init: str, job: FitJob) -> dict[str, float]:

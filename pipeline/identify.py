@@ -335,14 +335,14 @@ def _fitted(
     init: Mapping[str, float],
 ) -> _Fitted:
     """Fit, with finer and finer steps from the place found, until they no longer matter; and the steps a frame."""
-    mesh_cuts = 0
+    halvings = 0
     while True:
         scenarios = _scenarios(out, cloth, layouts, steps)
         members = [Recording(scenarios[name], name, episode) for name, episode in episodes.items()]
-        job = FitJob("fit", members, settings, out, init, mesh_cuts)
+        job = FitJob("fit", members, settings, out, init, halvings)
         with progress_bar("identify", 1) as update:
             record = job.run(partial(_tell, update, steps))
-        objective = job.objective(record.mesh_cuts)
+        objective = job.objective(record.halvings)
         apart, noise = distance_to_finer_mm(objective, record.simulated, finer_steps)
         errors.print(
             f"{steps} steps a frame: {record.rms_mm:.1f} mm RMS; four times the steps move the cloth by {apart:.1f} mm, "
@@ -352,7 +352,7 @@ def _fitted(
             if apart > _NOISE_PART * noise:
                 warn(f"finer steps still move the cloth by {apart:.1f} mm: what is found includes an error of that size.")
             return record, objective, job, steps
-        steps, init, settings, mesh_cuts = 2 * steps, record.free, _single_start(settings), record.mesh_cuts
+        steps, init, settings, halvings = 2 * steps, record.free, _single_start(settings), record.halvings
 
 
 def _tell(update: Callable[[float, str], None], steps: int, done: float, text: str) -> None:
@@ -445,10 +445,10 @@ def _findings(record: FitRecord, objective: AnyObjective, found: Intervals, mesh
 def _of_finer_mesh(record: FitRecord) -> list[str]:
     """What finer meshes brought where the scenario's does not explain the recordings."""
     lines = []
-    if record.mesh_cuts:
+    if record.halvings:
         lines.append(
-            f"A mesh with edges {2**record.mesh_cuts} times shorter than the scenario's explains the recordings better; "
-            "the parameters are those of that mesh."
+            f"A mesh with edges {2**record.halvings} times shorter than the scenario's explains the recordings better; "
+            "the parameters are of that mesh."
         )
     if record.finer_loss is not None:
         rms_mm = 1e3 * record.length_unit_m * record.finer_loss**0.5
@@ -477,7 +477,7 @@ def _result(record: FitRecord, found: Intervals, findings: Sequence[str], mesh_m
         "explains": found.explains and found.arrived,
         "reason": found.reason,
         "remark": found.remark,
-        "mesh_cuts": record.mesh_cuts,
+        "halvings": record.halvings,
         "finer_mesh_mm": mesh_mm,
         "findings": list(findings),
         "episodes": {one.name: one.rms_mm for one in record.episodes},

@@ -51,7 +51,7 @@ def rollout(
     fitted = None if fit is None else read_fit(fit)
     if fit is not None and fitted is not None and scenario is None and scene is None:
         scenario = fitted_scenario(fit, fitted.scenario)
-    chosen = choose_scenario(scenario, scene).finer(0 if fitted is None else fitted.mesh_cuts)
+    chosen = choose_scenario(scenario, scene).halved(0 if fitted is None else fitted.halvings)
     values: dict[str, float] = {}
     if fitted is not None:
         values |= fitted.values

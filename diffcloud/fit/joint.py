@@ -75,9 +75,9 @@ class JointObjective:
         """As of `Objective`, of every one."""
         return JointObjective([one.until(part) for one in self.members])
 
-    def finer(self) -> JointObjective:
+    def halved(self) -> JointObjective:
         """As of `Objective`, of every one."""
-        return JointObjective([one.finer() for one in self.members])
+        return JointObjective([one.halved() for one in self.members])
 
     def _mean(self, losses: Sequence[float]) -> float:
         return float(mean_loss(torch.tensor(losses, dtype=torch.float64)[:, None], paper=self.paper))

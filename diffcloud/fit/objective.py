@@ -179,10 +179,10 @@ class Objective:
         """The recorded clouds of the L compared frames."""
         return self._target.clouds
 
-    def finer(self) -> Objective:
-        """The same on a mesh of half the edge length (`Scenario.finer`)."""
+    def halved(self) -> Objective:
+        """The same with half the edge length and half the step."""
         return Objective(
-            self.scenario.finer(),
+            self.scenario.halved(1),
             self.episode,
             paper=self.paper,
             nuisance=self.nuisance,

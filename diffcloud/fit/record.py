@@ -13,8 +13,8 @@ from diffcloud.io.files import read_json
 
 SCHEMA = 8
 """Of the file. Another one is refused, by name."""
-MOST_CUTS = 3
-"""Of a mesh."""
+MOST_HALVINGS = 3
+"""Of a mesh's edges."""
 
 LARGEST = 1e12
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
@@ -223,11 +223,11 @@ class FitRecord(_Model):
     """Parameters of the first start, the given ones too, and how the cloth lies, named as in `free`."""
     best_start: Annotated[int, Field(ge=0, le=1_000_000)]
     measure: Measure
-    mesh_cuts: Annotated[int, Field(ge=0, le=MOST_CUTS)] = 0
-    """How often each face of the scenario's cloth was cut into four, because the coarser meshes did not explain the
-    recordings: parameters are of the mesh after that."""
+    halvings: Annotated[int, Field(ge=0, le=MOST_HALVINGS)] = 0
+    """How often edges and step of the scenario were halved, because what was coarser did not explain the recordings:
+    parameters are of the mesh after that (`Scenario.halved`)."""
     finer_loss: NonNegative | None = None
-    """Of a mesh cut once more, which was tried because this one does not explain the recordings, and is no better."""
+    """After one more halving, which was tried because this mesh does not explain the recordings, and is no better."""
     settings: dict[str, Annotated[int, Field(ge=0)] | bool | NonNegative | None]
     """Of the solver."""
     history: History

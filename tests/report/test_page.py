@@ -59,3 +59,10 @@ def test_material_that_was_fitted_along_is_no_column_but_is_told_where_it_is_off
 def test_a_number_that_is_not_known_is_a_dash():
     assert "<td>–</td>" in main_of(page_of())
     assert "nan" not in main_of(page_of())
+
+
+def test_a_finer_mesh_than_the_scenarios_is_told():
+    one = entry()
+    assert "times shorter" not in main_of(page_of(one))
+    one.fit.halvings = 2
+    assert "edges 4 times shorter" in main_of(page_of(one))

@@ -67,11 +67,17 @@ class Scenario:
         """Nodes that a moving handle holds."""
         return [handle.node for handle in self.scene.handles.handles if handle.motion is not None]
 
-    def finer(self, cuts: int = 1) -> Scenario:
-        """The same experiment on a mesh with half the edge length (`Scene.finer`), or a quarter after two cuts, and so on.
-        What lies between two nodes of a set belongs to it, and what a face is cut into has the face's part in the loss."""
-        if cuts == 0:
-            return self
+    def halved(self, times: int) -> Scenario:
+        """The same experiment with half the edge length (`finer`) and half the step, so many times."""
+        found = self
+        for _ in range(times):
+            finer = found.finer()
+            found = replace(finer, scene=replace(finer.scene, frame_steps=2 * finer.scene.frame_steps))
+        return found
+
+    def finer(self) -> Scenario:
+        """The same experiment on a mesh with half the edge length (`Scene.finer`). What lies between two nodes of a set
+        belongs to it, and what a face is cut into has the face's part in the loss."""
         _, edges = refined(self.scene.mesh)
         first = len(self.scene.mesh.nodes)
         sets = {
@@ -79,7 +85,7 @@ class Scenario:
             for name, nodes in self.node_sets.items()
         }
         faces = None if self.loss_faces is None else (4 * self.loss_faces[:, None] + np.arange(4)).reshape(-1)
-        return replace(self, scene=self.scene.finer(), node_sets=sets, loss_faces=faces).finer(cuts - 1)
+        return replace(self, scene=self.scene.finer(), node_sets=sets, loss_faces=faces)
 
     def check_parameters(self, names: Iterable[str]) -> None:
         """

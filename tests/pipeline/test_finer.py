@@ -55,16 +55,16 @@ def here(work, monkeypatch):
 
 
 def test_the_fit_says_so_and_finds_the_truth(record):
-    assert record["mesh_cuts"] == 1
+    assert record["halvings"] == 1
     assert record["parameters"]["stretch"]["value"] == pytest.approx(TRUTH["stretch"], rel=0.05)
     with np.load("fits/cloth.npz") as motion:
         assert motion["nodes"].shape[1] == 81
 
 
 def test_the_mesh_stays_where_asked(record, work):
-    invoke("fit", "cloth.npz", *OPTIONS, "--mesh-cuts", 0, "--out", "kept")
+    invoke("fit", "cloth.npz", *OPTIONS, "--halvings", 0, "--out", "kept")
     kept = json.loads((work / "kept" / "cloth.json").read_text())
-    assert kept["mesh_cuts"] == 0
+    assert kept["halvings"] == 0
     assert kept["loss"] > 5 * record["loss"]
 
 
@@ -96,9 +96,9 @@ def test_it_is_exported_and_shown_with_that_mesh(record, work):
 @pytest.mark.parametrize(
     ("options", "message", "code"),
     [
-        (("--mesh-cuts", 9), "less than or equal to 3", 1),
-        (("--mesh-cuts", 1, "--solver", "adam"), "mesh_cuts: of solver gauss_newton", 1),
-        (("--mesh-cuts", 1, "--paper"), "not of the published measure", 1),
+        (("--halvings", 9), "less than or equal to 3", 1),
+        (("--halvings", 1, "--solver", "adam"), "halvings: of solver gauss_newton", 1),
+        (("--halvings", 1, "--paper"), "not of the published measure", 1),
     ],
 )
 def test_what_cannot_be_is_refused(work, options, message, code):
