@@ -85,7 +85,9 @@ def main() -> None:
     except DiffCloudError as error:
         say("Error:", str(error), style="bold red")
         sys.exit(1)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as pressed:
+        if pressed.__cause__ is not None and "--debug" in sys.argv[1:2]:
+            raise
         errors.print("Interrupted.")
         sys.exit(130)
     except Exception as error:

@@ -151,6 +151,7 @@ def comparison_jobs(
     ]
     recorded = {name: read_episode(episodes / group / f"{name}.npz") for _, name, _, _ in fitted}
     values = {name: fit.values for _, name, _, fit in fitted}
+    meshes = {name: fit.halvings for _, name, _, fit in fitted}
     others = other_repeats({name: episode.meta for name, episode in recorded.items()}, values)
     networks = _networks(config, group, regressors, simulated)
     jobs = []
@@ -167,8 +168,8 @@ def comparison_jobs(
                 episode=recorded[name],
                 fitted=fit,
                 predictions=[network.of(recorded[name]) for network in networks],
-                # simulated targets share labels, not parameters
-                transfers=others[name] if real else {},
+                # simulated targets share labels, not parameters; those of another mesh mean something else
+                transfers={one: told for one, told in others[name].items() if meshes[one] == fit.halvings} if real else {},
                 settings=config.evaluate.comparison(f"{group}/{label}"),
                 kept=kept / group / f"{label}.json",
             )

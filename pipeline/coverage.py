@@ -243,6 +243,7 @@ class CoverageJob:
         )
         told: dict[str, Any] = {
             "loss": outcome.loss,
+            "values": outcome.values,
             "halvings": fitted.halvings,
             "stop_reason": outcome.stop_reason,
             "simulations": outcome.simulations,

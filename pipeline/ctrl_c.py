@@ -1,4 +1,4 @@
-"""A Ctrl-C that comes at any moment ends the command as one.
+"""A Ctrl-C that a library turns into another error still ends the command as a Ctrl-C.
 
 Python raises KeyboardInterrupt wherever the main thread is. Where that is inside a library's C code, the library may drop
 it and raise an error of its own (numpy's comparison of structured arrays: a TypeError without a cause). In a callback of

@@ -141,8 +141,8 @@ def fit(
     halvings: Annotated[
         int | None,
         typer.Option(
-            help="Where the recording's noise does not explain the misfit, halve the mesh's edges and the step and go on, "
-            "so often at most. Default: 1 of gauss_newton unless linearised."
+            help="Where noise does not explain the misfit, halve edge length and step and go on fitting, at most this "
+            "often (0 to 3). Default: 1 of gauss_newton unless linearised, else 0."
         ),
     ] = None,
     joint: Annotated[
@@ -217,7 +217,7 @@ def fit(
         with none_lost():
             for job, record, error in run_all("fit", jobs, settings.workers, patient=True):
                 if error is None:
-                    mesh = f", on a mesh of edges {2**record.halvings} times shorter" if record.halvings else ""
+                    mesh = f" ({record.finer_by})" if record.finer_by else ""
                     errors.print(f"{job.label}: loss {record.loss_start:.3e} -> {record.loss:.3e}{mesh}")
                     add(job, record)
                 else:

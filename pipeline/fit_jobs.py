@@ -181,7 +181,7 @@ class FitJob:
             return known
         reached = 0.0
 
-        def show_progress(progress: Progress) -> None:
+        def show_progress(halvings: int, progress: Progress) -> None:
             nonlocal reached
             check_interrupt()
             values = "  ".join(f"{key} {progress.values[key]:.3g}" for key in space.asked.names)
@@ -191,7 +191,8 @@ class FitJob:
                 done, most = progress.iteration, settings.iterations
             part = _JOINT_PART if isinstance(objective, JointObjective) else 1.0
             reached = max(reached, part * min(done / max(most, 1), 1.0))  # on a finer mesh, steps count anew
-            tell(reached, f"step {done}  best {progress.best:.3e}  {values}")
+            mesh = "finer mesh  " if halvings else ""
+            tell(reached, f"{mesh}step {done}  best {progress.best:.3e}  {values}")
 
         def show_left_out(done: float, doing: str, progress: Progress) -> None:
             nonlocal reached

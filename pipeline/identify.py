@@ -292,7 +292,7 @@ def _scenarios(
 
 
 def _stated(
-    fit: Callable[[FitConfig, int, Mapping[str, float]], _Fitted],
+    fit: Callable[[FitConfig, int, int, Mapping[str, float]], _Fitted],
     settings: FitConfig,
     steps: int,
     *,
@@ -308,15 +308,16 @@ def _stated(
         steps: a frame, to begin with.
     """
     init: Mapping[str, float] = {}
+    halvings = 0
     for left in range(RESTARTS, -1, -1):
-        record, objective, job, steps = fit(settings, steps, init)
+        record, objective, job, steps = fit(settings, steps, halvings, init)
         space, seen = space_of(record), scan_of(record)
         found = state_intervals(objective, space, record.free, level=level, within=within, seen=seen)
         if found.lower is None or not left:
             break
         near = ", ".join(f"{name} {found.lower[name]:.3g}" for name in space.asked.names)
         errors.print(f"The loss is lower at {near}; fitting again from there.")
-        init, settings = found.lower, _single_start(settings)
+        init, settings, halvings = found.lower, _single_start(settings), record.halvings
     return record, objective, job, found
 
 
@@ -332,10 +333,14 @@ def _fitted(
     layouts: Mapping[str, Mapping[str, Any]],
     settings: FitConfig,
     steps: int,
+    halvings: int,
     init: Mapping[str, float],
 ) -> _Fitted:
-    """Fit, with finer and finer steps from the place found, until they no longer matter; and the steps a frame."""
-    halvings = 0
+    """Fit, with finer and finer steps from the place found, until they no longer matter; and the scenario's steps a frame.
+
+    Args:
+        halvings: of edges and steps, to begin with.
+    """
     while True:
         scenarios = _scenarios(out, cloth, layouts, steps)
         members = [Recording(scenarios[name], name, episode) for name, episode in episodes.items()]
@@ -345,8 +350,8 @@ def _fitted(
         objective = job.objective(record.halvings)
         apart, noise = distance_to_finer_mm(objective, record.simulated, finer_steps)
         errors.print(
-            f"{steps} steps a frame: {record.rms_mm:.1f} mm RMS; four times the steps move the cloth by {apart:.1f} mm, "
-            f"the points' noise is {noise:.1f} mm.",
+            f"{steps * 2**record.halvings} steps a frame: {record.rms_mm:.1f} mm RMS; four times the steps move the cloth "
+            f"by {apart:.1f} mm, the points' noise is {noise:.1f} mm.",
         )
         if apart <= _NOISE_PART * noise or 2 * steps > _MOST_STEPS:
             if apart > _NOISE_PART * noise:
@@ -427,7 +432,7 @@ def _findings(record: FitRecord, objective: AnyObjective, found: Intervals, mesh
     lines.append(_validation(record, objective))
     if found.explains:
         lines += found.sentences
-    lines += _of_finer_mesh(record)
+    lines += finer_mesh_sentences(record, explains=found.explains)
     lines.append(mesh_sentence(mesh))
     for name, entry in found.parameters.items():
         digits = significant(entry.low, entry.high)
@@ -442,19 +447,19 @@ def _findings(record: FitRecord, objective: AnyObjective, found: Intervals, mesh
     return lines
 
 
-def _of_finer_mesh(record: FitRecord) -> list[str]:
+def finer_mesh_sentences(record: FitRecord, *, explains: bool) -> list[str]:
     """What finer meshes brought where the scenario's does not explain the recordings."""
     lines = []
     if record.halvings:
         lines.append(
-            f"A mesh with edges {2**record.halvings} times shorter than the scenario's explains the recordings better; "
-            "the parameters are of that mesh."
+            f"The recordings are explained better with {record.finer_by} as the scenario's, and steps too: the parameters "
+            "are of that mesh."
         )
-    if record.finer_loss is not None:
+    if record.finer_loss is not None and not explains:
         rms_mm = 1e3 * record.length_unit_m * record.finer_loss**0.5
         lines.append(
-            f"Fitted with a mesh of half the edge length, the misfit is no smaller ({rms_mm:.1f} mm RMS): it is not the "
-            "mesh that the model lacks."
+            f"A fit with half the edge length and half the step leaves hardly less misfit ({rms_mm:.1f} mm RMS): the mesh "
+            "is probably not what the model lacks."
         )
     return lines
 

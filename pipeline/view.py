@@ -101,7 +101,6 @@ def _layers(
         recording = record.episodes[names.index(path.stem)]
         motion = read_motion(fit.with_suffix(".npz"), names.index(path.stem))
         found = choose_scenario(name or (None if scene else fitted_scenario(fit, recording.scenario)), scene)
-        found = found.halved(record.halvings)
         layers += fitted_layers(motion, times)
         layers += [unposed_layer(found, recording, motion, times), *table_layers(found, motion.nodes.reshape(-1, 3))]
         values = ", ".join(f"{key} {value:.3g}" for key, value in record.values.items())

@@ -59,7 +59,7 @@ class JointObjective:
 
     @property
     def unexplained(self) -> float:
-        """As of `Objective`."""
+        """As of `Objective`: the geometric mean of all, infinity if it is not known of one what it misses."""
         return self._mean([one.unexplained for one in self.members])
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:

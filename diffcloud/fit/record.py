@@ -14,7 +14,7 @@ from diffcloud.io.files import read_json
 SCHEMA = 8
 """Of the file. Another one is refused, by name."""
 MOST_HALVINGS = 3
-"""Of a mesh's edges."""
+"""Each multiplies the nodes by about four."""
 
 LARGEST = 1e12
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
@@ -209,7 +209,7 @@ class FitRecord(_Model):
     """[squared length unit, mean over points], by the fit's own random points, without priors; of a joint fit the geometric
     mean over its recordings, with `paper` the plain one."""
     loss_start: NonNegative
-    """At `start`."""
+    """At `start`, on the scenario's own mesh."""
     loss_resampled: NonNegative
     """Mean over fresh points, which the fit could not adapt to."""
     rms_mm: NonNegative
@@ -227,10 +227,12 @@ class FitRecord(_Model):
     """How often edges and step of the scenario were halved, because what was coarser did not explain the recordings:
     parameters are of the mesh after that (`Scenario.halved`)."""
     finer_loss: NonNegative | None = None
-    """After one more halving, which was tried because this mesh does not explain the recordings, and is no better."""
+    """With priors, after one more halving, which was tried because this mesh does not explain the recordings, and hardly
+    lowers it."""
     settings: dict[str, Annotated[int, Field(ge=0)] | bool | NonNegative | None]
     """Of the solver."""
     history: History
+    """On the scenario's own mesh at first, and on finer ones as far as starts went on there."""
     scan: ScanRecord | None
     """Of the place where it ended; None if the solver has not looked around there."""
     failures: list[str]
@@ -257,6 +259,11 @@ class FitRecord(_Model):
             for name, entry in (recording or self.episodes[0]).nuisance.items()
             if entry.of == "cloth" and (recording is not None or name in SHARED)
         }
+
+    @property
+    def finer_by(self) -> str:
+        """How its mesh differs from the scenario's, for people; empty if it does not."""
+        return f"edges 1/{2**self.halvings} as long" if self.halvings else ""
 
     @property
     def values(self) -> dict[str, float]:

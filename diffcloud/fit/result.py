@@ -321,10 +321,11 @@ def _fitted_motion(objective: Objective, run: Rollout, start: Rollout, pose: Ten
 def _as_far_as_both_go(
     objective: Objective, values: Mapping[str, float], start_values: Mapping[str, float]
 ) -> tuple[Rollout, Rollout]:
-    """The rollouts with fitted and first values over the whole scenario, or up to the last frame before one diverges.
+    """The rollouts with fitted and first values over the whole scenario, or up to the last frame before one diverges. First
+    values that diverge before (on a finer mesh than that which they were tried on) are replaced by the fitted ones.
 
     Raises:
-        DivergedError: within the compared frames.
+        DivergedError: the fitted ones, within the compared frames.
     """
     steps, each = objective.scenario.steps, objective.scenario.scene.frame_steps
     while True:
@@ -333,7 +334,8 @@ def _as_far_as_both_go(
         except DivergedError as error:
             reached = max((error.step - 1) // each * each, objective.loss_steps)
             if reached >= steps:
-                raise
+                run = objective.simulate(one_set(values), steps=steps)
+                return run, run
             steps = reached
         else:
             return run, start

@@ -8,11 +8,13 @@ and s_i what pair i adds to half of its slope. A disturbance that adds g to the 
     a known doubt   b bᵀ,  b = -H⁻¹ h,        h: the slope's change if what is not fitted is one deviation off
 
 Residuals of one place on the cloth have much in common, over both directions and all frames: an edge that curls, a fold in
-the wrong place. So pairs are clustered by place. Doubtful material (`fit.doubts`) and the pose (`fit.pose`) are fitted too,
-and the prior of each is a source. Other doubts are what the fit takes for known: what of the pose is not free. The size of
-the simulator's step moves the fit to one side; for it, h is the slope's change between this motion and the one with four
-times the steps. A misfit that the recording's own noise does not explain is inside of the residuals, and widens the
-interval with them.
+the wrong place. So pairs are clustered by place. A misfit that the recording's own noise does not explain is inside of the
+residuals, and widens the interval with them. More than that: the part e of the loss that is above what explains the
+recording has a cause which nobody stated, and which all C clusters may share. So their variance counts 1 + e (C - 1) times.
+
+Doubtful material (`fit.doubts`) and the pose (`fit.pose`) are fitted too, and the prior of each is a source. Other doubts
+are what the fit takes for known: what of the pose is not free. The size of the simulator's step moves the fit to one side;
+for it, h is the slope's change between this motion and the one with four times the steps.
 
 Changes of the slope are differences between motions to both sides, each matched with the recording anew, with nodes moved
 along the derivatives of one simulation: as a surface moves, its points find other partners, which Gauss and Newton's
@@ -125,8 +127,9 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
         moved = rows @ inverse
         return moved.T @ moved
 
-    clusters = np.concatenate([w * part.scores for w, part in zip(weights, parts, strict=True)])
-    clusters = clusters[np.abs(clusters).max(axis=1) > 0]
+    clusters = np.concatenate(
+        [w * part.common * part.scores[np.abs(part.scores).max(axis=1) > 0] for w, part in zip(weights, parts, strict=True)]
+    )
     sources = {"noise": spread(clusters) * len(clusters) / max(len(clusters) - 1, 1)}
     of_priors = np.diag(prior * space.prior_steps().numpy())
     if prior[asked].any():
@@ -205,6 +208,8 @@ class _Part:
     """[k, k]"""
     scores: NDArray[np.float64]
     """[C, k] of the clusters."""
+    common: float
+    """What deviations by these count times, because of a misfit that the noise of the recording does not explain."""
     doubts: Mapping[str, NDArray[np.float64]]
     """Name -> [k] the slope's change at one deviation."""
 
@@ -247,9 +252,9 @@ class _Part:
         }
         for index, name in enumerate(objective.pose_space.names, k):  # what a prior about another centre would add
             found[name] = onto[:, index] * prior[index] * float(objective.pose_space.deviations[index - k])
-        scores = _clustered(free, motion, rates)
+        scores = _clustered(free, motion, rates)[:, felt] @ onto.T
         factor = float(objective.pose_space.prior_factor(fitted_pose[None]))
-        return _Part(loss, factor, onto @ slope, onto @ curved[:, :k], scores[:, felt] @ onto.T, found)
+        return _Part(loss, factor, onto @ slope, onto @ curved[:, :k], scores, _common(objective, loss, scores), found)
 
 
 def _part(objective: AnyObjective, space: FitSpace, places: Tensor, recording: int) -> _Part:
@@ -317,6 +322,14 @@ def _way_to(finer: Scenario, objective: Objective, parameters: Mapping[str, Tens
     fine = Inputs.of(finer, system, steps, parameters, track).rollout()
     own = run.at(objective.times)
     return fine.at(objective.times)[..., : own.shape[-2], :] - own
+
+
+def _common(objective: Objective, loss: float, scores: NDArray[np.float64]) -> float:
+    """See `_Part.common`; one where it is not known what the recording misses, and thus what explains it."""
+    if not objective.knows_gaps:
+        return 1.0
+    above, clusters = max(1 - objective.explained / loss, 0.0), int((np.abs(scores).max(axis=1) > 0).sum())
+    return float(np.sqrt(1 + above * max(clusters - 1, 0)))
 
 
 def _clustered(objective: Objective, motion: Motion, rates: Tensor) -> NDArray[np.float64]:

@@ -159,7 +159,7 @@ def _fit_row(index: int, entry: EpisodeEntry, names: Sequence[str]) -> list[Cell
     true_ratio = row.get("true_ratio")
     return [
         Cell(entry.name, episode=index),
-        Cell(entry.scenario, note=f"edges {2**fit.halvings} times shorter" if fit.halvings else ""),
+        Cell(entry.scenario, note=fit.finer_by),
         Cell(str(entry.episode.meta.get("fabric", ""))),
         number(row["rms_start_mm"], 1),
         replace(number(row["rms_mm"], 1), strong=True),

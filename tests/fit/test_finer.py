@@ -158,20 +158,31 @@ def test_the_ends_of_all_starts_go_on_by_their_losses_there(fine, monkeypatch, t
     assert len(outcome.history.losses) == 1 + len(followed)
 
 
-def test_ctrl_c_on_the_finer_mesh_keeps_the_best_so_far(fine, monkeypatch):
-    first = solve(fine, SPACE, QUICK)
-    before = len(first.history.losses)
-    told = []
+@pytest.mark.parametrize(("steps", "moved"), [(1, False), (4, True)])
+def test_ctrl_c_on_the_finer_mesh_keeps_the_best_so_far(fine, steps, moved):
+    """Which has the lower loss there even before the first step."""
+    first, told = solve(fine, SPACE, QUICK), []
 
-    def press(progress):
-        told.append(progress)
-        if len(told) == before + 2:
+    def press(halvings, progress):
+        told.append(halvings)
+        if told.count(1) == steps:
             raise KeyboardInterrupt
 
     found = solve_and_refine(fine, SPACE, QUICK, halvings=1, progress=press)
     assert found.outcome.stop_reason == "interrupted"
-    assert found.outcome.loss <= first.loss
-    assert len(found.objective.scenario.scene.mesh.nodes) == (81 if found.halvings else 25)
+    assert (found.halvings, found.finer_loss) == (1, None)
+    assert len(found.objective.scenario.scene.mesh.nodes) == 81
+    assert found.outcome.loss < 0.9 * first.loss
+    assert (found.outcome.values["stretch"] == pytest.approx(first.values["stretch"])) != moved
+
+
+def test_ctrl_c_while_ends_are_tried_on_the_finer_mesh_keeps_the_fit(fine, monkeypatch):
+    def pressed(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(finer, "batch_losses", pressed)
+    first, found = solve(fine, SPACE, QUICK), solve_and_refine(fine, SPACE, QUICK, halvings=1)
+    assert (found.outcome.stop_reason, found.outcome.values, found.halvings) == ("interrupted", first.values, 0)
 
 
 def test_edges_and_steps_are_halved_as_often_as_asked(scenario):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -370,6 +371,30 @@ class TestFits:
         ways.begin(gauss_newton._Start(place, 2), place, found)
         assert ways.enough(wrong)
         assert not ways.enough(all_of_them)
+
+    @pytest.mark.parametrize(
+        ("options", "knows", "loss", "enough"),
+        [
+            ({}, True, 0.9, True),
+            ({}, True, 1.05, True),  # hardly above what explains the recording
+            ({}, True, 1.2, False),
+            ({}, True, 31.0, True),  # the model must be wrong
+            ({}, False, 1.2, True),
+            ({"starts": 4}, True, 1.05, False),
+            ({"starts": 4}, True, 0.9, True),
+            ({"threshold": 0.5}, True, 0.9, False),
+            ({"threshold": 0.5}, True, 31.0, False),
+            ({"threshold": 0.5}, True, 0.4, True),
+        ],
+    )
+    def test_two_equally_low_ends_are_enough_near_what_explains_the_recording(self, options, knows, loss, enough):
+        recording = SimpleNamespace(explained=1.0, knows_gaps=knows)
+        place = torch.zeros(1, dtype=torch.float64)
+        found = Linearisation(torch.tensor([loss]).double(), torch.zeros(1, 1).double(), torch.eye(1).double()[None], 1)
+        ways = gauss_newton._Ways([], 3, torch.zeros(1, dtype=torch.bool))
+        for origin in (0, 1):
+            ways.begin(gauss_newton._Start(place, origin), place, found)
+        assert ways.enough(gauss_newton._Enough.of(recording, GaussNewtonSettings(**options))) == enough
 
     @pytest.mark.parametrize(
         ("second", "witnesses", "misfit", "order"),

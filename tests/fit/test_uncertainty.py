@@ -135,6 +135,20 @@ class TestDoubts:
 
 
 class TestNoise:
+    @pytest.mark.parametrize(("times", "knows", "widened"), [(0.9, True, False), (2.0, True, True), (2.0, False, False)])
+    def test_an_unexplained_misfit_may_be_common_to_all_places(self, scenario, monkeypatch, times, knows, widened):
+        """Half of the loss is above what explains it: with it common to all, and the rest as it was."""
+        objective = Objective(scenario, recorded(scenario), nuisance={})
+        monkeypatch.setattr(Objective, "knows_gaps", False)
+        plain = uncertainty(objective, SPACE, TRUTH)
+        monkeypatch.setattr(Objective, "knows_gaps", knows)
+        monkeypatch.setattr(Objective, "explained", float(plain.losses[0]) / times)
+        found = uncertainty(objective, SPACE, TRUTH)
+        wider = 1 + 0.5 * (plain.clusters - 1) if widened else 1.0
+        assert plain.clusters > 10
+        assert found.sources["noise"][0, 0] == pytest.approx(wider * plain.sources["noise"][0, 0])
+        assert all(found.sources[name] == pytest.approx(plain.sources[name]) for name in plain.sources if name != "noise")
+
     @pytest.mark.slow
     def test_refits_of_new_noise_scatter_as_it_says(self, scenario):
         """Each place of the cloth has an error of its own, the same in all frames: 20 recordings."""

@@ -63,6 +63,6 @@ def test_a_number_that_is_not_known_is_a_dash():
 
 def test_a_finer_mesh_than_the_scenarios_is_told():
     one = entry()
-    assert "times shorter" not in main_of(page_of(one))
+    assert "as long" not in main_of(page_of(one))
     one.fit.halvings = 2
-    assert "edges 4 times shorter" in main_of(page_of(one))
+    assert "edges 1/4 as long" in main_of(page_of(one))

@@ -13,9 +13,10 @@ other is a derivative-free search, from the best place so far, over the paramete
 three candidates. So do growing starts, but the first of them comes as soon as the best end is low enough for the model to
 be right (with a threshold, all of them come right after the first candidate). They also wait while an end from another
 candidate is as low as the best one.
-Four equally low ends are taken for the minimum although they do not explain the recording; two are, where it is not known
-what cameras missed, or where the loss is so high that the model must be wrong. Unless the recording is explained, losses
-along the principal axes of the best place then tell whether another minimum is lower nearby; from there it goes on.
+Four equally low ends are taken for the minimum although they do not explain the recording; two are, where their loss is
+hardly above what does, or so high that the model must be wrong, or where it is not known what cameras missed. Unless the
+recording is explained, losses along the principal axes of the best place then tell whether another minimum is lower nearby;
+from there it goes on.
 """
 
 from __future__ import annotations
@@ -299,13 +300,13 @@ class _Enough:
     """When no more starts are followed."""
 
     explained: float
-    """The highest loss that explains the recording, or the threshold: one end is enough."""
+    """One end at or below this loss (the threshold, if given) is enough."""
     nearly: float
-    """Up to this one, a few equally low ends are."""
+    """Up to this loss, `_FEW_WITNESSES` equally low ends are enough."""
     misfit: float
-    """And above this one, where a right motion may be too."""
+    """Above this one, too: the model must be wrong. Zero where it is not known what cameras missed."""
     witnesses: float
-    """Equally low ends that are enough between."""
+    """Equally low ends that are needed in between."""
 
     @staticmethod
     def of(objective: AnyObjective, settings: GaussNewtonSettings) -> _Enough:
