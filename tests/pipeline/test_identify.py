@@ -10,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +23,10 @@ from diffcloud.io.clouds import write_ply
 from diffcloud.io.raw_episodes import read_raw_episode
 from diffcloud.scene.scenarios import built_in, make_scenario
 from diffcloud.sim.simulate import rollout
-from pipeline.identify import mesh_sentence
+from pipeline import identify
+from pipeline.config import FitConfig
+from pipeline.identify import finer_mesh_sentences, mesh_sentence
+from tests.fit.records import record_of, recording_of
 from tests.io.ros_bag import bag
 from tests.pipeline.invoke import invoke
 from tests.test_architecture import check_commands
@@ -381,3 +385,37 @@ class TestProject:
 )
 def test_the_mesh_matters_where_it_moves_the_cloth_by_more_than_half_of_the_noise(mesh, told):
     assert told in mesh_sentence(mesh)
+
+
+@pytest.mark.parametrize(
+    ("changes", "explains", "told"),
+    [
+        ({}, True, []),
+        ({"halvings": 1}, True, ["explained better with edges 1/2 as long"]),
+        (
+            {"halvings": 2, "finer_loss": 2.5e-5},
+            False,
+            ["edges 1/4 as long", "a misfit of 5.0 mm RMS: the mesh is probably not"],
+        ),
+        ({"finer_loss": 2.5e-5}, True, []),
+    ],
+)
+def test_what_finer_meshes_brought_is_told(changes, explains, told):
+    sentences = finer_mesh_sentences(record_of(recording_of("one"), **changes), explains=explains)
+    assert len(sentences) == len(told)
+    assert all(part in sentence for part, sentence in zip(told, sentences, strict=True))
+
+
+def test_fits_go_on_with_the_mesh_that_the_last_one_ended_with(monkeypatch):
+    """Where intervals meet a lower loss, which that mesh has."""
+    lower, asked = {"stretch": 0.5}, []
+
+    def fit(settings, steps, halvings, init):
+        asked.append((settings.starts, steps, halvings, dict(init)))
+        return record_of(recording_of("one"), halvings=1), None, None, 16
+
+    monkeypatch.setattr(identify, "space_of", lambda record: SimpleNamespace(asked=SimpleNamespace(names=("stretch",))))
+    found = [SimpleNamespace(lower=lower), SimpleNamespace(lower=None)]
+    monkeypatch.setattr(identify, "state_intervals", lambda *given, **options: found.pop(0))
+    identify._stated(fit, FitConfig(starts=2), 8, level=0.9, within=1.5)
+    assert asked == [(2, 8, 0, {}), (1, 16, 1, lower)]
