@@ -228,6 +228,10 @@ class TestRun:
             np.testing.assert_array_equal(told.motions[0].nodes, whole.motions[0].nodes[: reached + 1])
             read_motion(write_fit(tmp_path, "e", told).with_suffix(".npz"))
         reached = 3
+        told = describe_fit(objective, space, settings, outcome, episodes=["e"])  # the first values, before the fitted ones
+        np.testing.assert_array_equal(told.motions[0].start_nodes, told.motions[0].nodes)
+        assert told.record.loss == whole.record.loss
+        fragile = {outcome.values["stretch"]}
         with pytest.raises(DivergedError):
             describe_fit(objective, space, settings, outcome, episodes=["e"])
 
