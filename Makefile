@@ -119,7 +119,8 @@ coverage: venv
 	$(COVERAGE) $(DRAWN) --recordings 60 --fix mass
 	$(COVERAGE) $(DRAWN) --recordings 60
 	$(COVERAGE) $(UNEXPECTED) --seed 16567761 --recordings 16 --truth refined
-	$(COVERAGE) $(UNEXPECTED) --seed 76345934 --recordings 4 --truth finer
+	$(COVERAGE) --fix mass --scenario lift --seed 48393309 --recordings 12 --truth finer
+	$(COVERAGE) --fix mass --scenario fold --seed 48393309 --recordings 8 --truth finer
 	$(COVERAGE) --seed 87294376 --recordings 3 --refits 20
 	diffcloud simulate --scenario lift --draws logarithmic --train 1500 --test 375 --seed 5 --out $(POSTERIOR)/lift \
 	    --doubts bending=1.5x,drag=1.3x,damping=1.5x,friction_obstacle=1.3x,friction_cloth=1.3x
