@@ -100,7 +100,7 @@ def _gone_on(
     all of them diverge.
 
     Raises:
-        KeyboardInterrupt: interrupted before the first end.
+        KeyboardInterrupt: interrupted while the losses of the starts are found there.
     """
     began, ends, losses = time.perf_counter(), fitted.history.values[-1], list[float]()
     begun = fitted.history.losses[-1].isfinite().nonzero()[:, 0]
