@@ -114,11 +114,10 @@ moved: venv
 POSTERIOR := build/coverage-posterior
 COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --out build/coverage --workers 2
 DRAWN := --seed 16210837
-UNEXPECTED := --fix mass --scenario lift --scenario fold
 coverage: venv
 	$(COVERAGE) $(DRAWN) --recordings 60 --fix mass
 	$(COVERAGE) $(DRAWN) --recordings 60
-	$(COVERAGE) $(UNEXPECTED) --seed 16567761 --recordings 16 --truth refined
+	$(COVERAGE) --fix mass --scenario lift --scenario fold --seed 16567761 --recordings 16 --truth refined
 	$(COVERAGE) --fix mass --scenario lift --seed 48393309 --recordings 12 --truth finer
 	$(COVERAGE) --fix mass --scenario fold --seed 48393309 --recordings 8 --truth finer
 	$(COVERAGE) --seed 87294376 --recordings 3 --refits 20

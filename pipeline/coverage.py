@@ -16,7 +16,6 @@ from rich.table import Table
 
 from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, state_intervals
-from diffcloud.fit.finer import solve_and_refine
 from diffcloud.fit.pose import SET_UP, PoseSpace
 from diffcloud.fit.uncertainty import finer_steps
 from diffcloud.io.episodes import Episode, read_episode, write_episode
@@ -226,15 +225,13 @@ class CoverageJob:
         fit = self.config.fit
         fit = fit.model_copy(update={"fixed": {**fit.fixed, **{name: truth[name] for name in self.known}}})
         job = FitJob(self.label, [Recording(self.scenario, self.label, episode)], fit, self.folder)
-        objective, space = job.objective(), job.space
-        settings, halvings = fit.solver_settings(self.scenario), fit.halved_at_most([self.scenario])
-        fitted = solve_and_refine(objective, space, settings, halvings=halvings)
+        fitted = job.solved()
         outcome = fitted.outcome
         if outcome.stop_reason == "interrupted":
             raise KeyboardInterrupt
         found = state_intervals(
             fitted.objective,
-            space,
+            job.space,
             outcome.values,
             level=self.level,
             within=self.config.evaluate.within,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,14 +10,14 @@ from pathlib import Path
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit import FitSpace, JointObjective, Objective, Progress, read_fit, write_fit
 from diffcloud.fit.doubts import with_doubts
-from diffcloud.fit.finer import solve_and_refine
+from diffcloud.fit.finer import FinerFit, solve_and_refine
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.laid import with_laid
 from diffcloud.fit.left_out import leave_out_and_go_on
 from diffcloud.fit.priors import parameter_priors
 from diffcloud.fit.record import FitRecord, LeftOut
 from diffcloud.fit.result import describe_fit
-from diffcloud.fit.solvers import SearchSettings
+from diffcloud.fit.solvers import SearchSettings, Settings
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import read_yaml
 from diffcloud.io.fingerprints import fingerprint
@@ -149,17 +149,33 @@ class FitJob:
         space = with_doubts(space, settings.known_within(scenarios), scenarios)
         return with_laid(space, settings.laid_within(scenarios), scenarios)
 
-    def objective(self, halvings: int | None = None) -> AnyObjective:
+    def objective(self) -> AnyObjective:
         """
-        Args:
-            halvings: of the fit that was made; by default, those to begin with.
-
         Raises:
             ConfigError, EpisodeError: the episodes lack the frames of the loss, an unknown frame, or different cloths.
         """
-        times, measure = self.halvings if halvings is None else halvings, self.settings.measure()
-        members = [Objective(one.scenario.halved(times), one.episode, **measure) for one in self.recordings]
+        measure = self.settings.measure()
+        members = [Objective(one.scenario.halved(self.halvings), one.episode, **measure) for one in self.recordings]
         return members[0] if len(members) == 1 else JointObjective(members)
+
+    @property
+    def solver_settings(self) -> Settings:
+        return replace(self.settings.solver_settings(self.scenario), init=self.init)
+
+    def solved(self, progress: Callable[[int, Progress], None] | None = None) -> FinerFit:
+        """The fit, of which nothing is written; the halvings are those after the ones to begin with.
+
+        Args:
+            progress: as of `solve_and_refine`.
+
+        Raises:
+            ConfigError, EpisodeError: as of `space` and `objective`.
+            DivergedError, KeyboardInterrupt: as of `solve_and_refine`.
+        """
+        more = self.settings.halved_at_most([one.scenario for one in self.recordings]) - self.halvings
+        return solve_and_refine(
+            self.objective(), self.space, self.solver_settings, halvings=max(more, 0), progress=progress
+        )
 
     def known(self) -> FitRecord | None:
         """What this job, or an earlier one of the same inputs and code, has left; maybe interrupted."""
@@ -189,7 +205,7 @@ class FitJob:
                 done, most = progress.simulations or 0, settings.simulations
             else:  # of Gauss–Newton for each start, of which it is not known how many are followed
                 done, most = progress.iteration, settings.iterations
-            part = _JOINT_PART if isinstance(objective, JointObjective) else 1.0
+            part = _JOINT_PART if len(self.recordings) > 1 else 1.0
             reached = max(reached, part * min(done / max(most, 1), 1.0))  # on a finer mesh, steps count anew
             mesh = "finer mesh  " if halvings else ""
             tell(reached, f"{mesh}step {done}  best {progress.best:.3e}  {values}")
@@ -200,11 +216,8 @@ class FitJob:
             reached = max(reached, _JOINT_PART + (1 - _JOINT_PART) * done)  # what goes on begins anew
             tell(reached, f"{doing}  step {progress.iteration}  best {progress.best:.3e}")
 
-        objective, space = self.objective(), self.space
-        settings = replace(self.settings.solver_settings(self.scenario), init=self.init)
-        most = self.settings.halved_at_most([one.scenario for one in self.recordings])
-        more = max(most - self.halvings, 0)
-        fitted = solve_and_refine(objective, space, settings, halvings=more, progress=show_progress)
+        space, settings = self.space, self.solver_settings
+        fitted = self.solved(show_progress)
         objective, outcome = fitted.objective, fitted.outcome
         left, failures, interrupted = list[LeftOut](), list[str](), outcome.stop_reason == "interrupted"
         fits = [outcome]

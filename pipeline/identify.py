@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -347,7 +348,7 @@ def _fitted(
         job = FitJob("fit", members, settings, out, init, halvings)
         with progress_bar("identify", 1) as update:
             record = job.run(partial(_tell, update, steps))
-        objective = job.objective(record.halvings)
+        objective = replace(job, halvings=record.halvings).objective()
         apart, noise = distance_to_finer_mm(objective, record.simulated, finer_steps)
         errors.print(
             f"{steps * 2**record.halvings} steps a frame: {record.rms_mm:.1f} mm RMS; four times the steps move the cloth "

@@ -28,7 +28,7 @@ from scipy.special import stdtrit
 
 from diffcloud.errors import ConfigError
 from diffcloud.fit.joint import AnyObjective
-from diffcloud.fit.objective import UNEXPLAINED, Objective
+from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis
 from diffcloud.fit.result import physical_values
@@ -56,7 +56,7 @@ RESTARTS = 2
 """Of a fit that has not arrived, from a lower loss beside it."""
 _DOUBTED = 1.3
 """Multiple of the loss that noise and spacing of the points leave, where it is known what the recording misses, from which
-on a fit gets a remark (see `UNEXPLAINED`)."""
+on a fit gets a remark (see `Objective.unexplained`)."""
 _UNEXPLAINED_RMS = 2.0
 """RMS over a coarse allowance for noise and spacing, from which the model does not explain another recording."""
 _STEP = 2.0
@@ -442,7 +442,7 @@ def _misfit(objective: Objective, loss: float) -> tuple[float, float, float]:
     if over is None:
         accounted = noise_mm(objective)
         return rms, accounted, rms / (_UNEXPLAINED_RMS * accounted)
-    return rms, to_mm * objective.noise_loss**0.5, (over / UNEXPLAINED) ** 0.5
+    return rms, to_mm * objective.noise_loss**0.5, (loss / objective.unexplained) ** 0.5
 
 
 def _over_noise(objective: Objective, loss: float) -> float | None:

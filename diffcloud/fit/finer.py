@@ -21,6 +21,7 @@ from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis
 from diffcloud.fit.solvers import FitOutcome, GaussNewtonSettings, Progress, Settings, solve
+from diffcloud.fit.solvers.gauss_newton import EQUALLY
 
 _CLEARLY = 0.9
 """Times the former loss, below which a finer mesh is worth what its simulations cost."""
@@ -28,8 +29,6 @@ _FOLLOWED = 3
 """Ends of the coarse fit from which descents on a finer mesh begin: its lowest one need not lead to the lowest there."""
 _APART = 0.1
 """On the axis: ends that are closer are one."""
-_EQUALLY = 1.01
-"""Losses within this factor are equally low."""
 _MOST_NODES = 3000
 """Of a cloth; a motion of more takes minutes."""
 
@@ -109,7 +108,7 @@ def _gone_on(
     outcome = replace(fitted, simulations=fitted.simulations + len(begun) * len(finer.members))
     best, followed, interrupted = replace(outcome, loss=math.inf), list[int](), False
     for start in begun[there.argsort()][: int(there.isfinite().sum())].tolist():
-        if len(followed) == _FOLLOWED or interrupted:
+        if len(followed) == _FOLLOWED:
             break
         if any(float((places[start] - places[other]).abs().max()) < _APART for other in followed):
             continue
@@ -127,10 +126,9 @@ def _gone_on(
             best = outcome
         losses.append(further.loss)
         interrupted = further.stop_reason == "interrupted"
-        low, *others = sorted(losses)
-        equal = bool(others) and others[0] <= _EQUALLY * low
+        equal = sum(loss <= EQUALLY * best.loss for loss in losses) > 1
         explained = best.loss <= finer.explained or further.stop_reason == "threshold"
-        if explained or equal or best.loss > _CLEARLY * fitted.loss:
+        if interrupted or explained or equal or best.loss > _CLEARLY * fitted.loss:
             break
     return replace(
         best,

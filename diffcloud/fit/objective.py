@@ -42,7 +42,7 @@ _NEAR_M = 0.008
 _EXPLAINED, _EXPLAINED_BY_CAMERAS = 1.1, 2.0
 """Times what noise and spacing account for. Of the four scenarios, right motions have 0.85 to 1.08 of it, and wrong minima
 rarely less than 1.2; seen by depth cameras, 0.65 to 1.02. Where it is not known which pixels these lost, 1.4 to 4."""
-UNEXPLAINED = 2.0
+_UNEXPLAINED = 2.0
 """Times what noise and spacing leave, where it is known what the recording misses: above, the model does not explain the
 recording. Of random cloths that this simulator moved, right fits have had 1.14 times that loss at most (folds of finer
 steps 1.9), wrong minima 1.4 at least."""
@@ -157,7 +157,7 @@ class Objective:
     @property
     def unexplained(self) -> float:
         """Above this loss, the model cannot explain the recording; infinity where it is not known what that misses."""
-        return UNEXPLAINED * self.noise_loss if self.knows_gaps else math.inf
+        return _UNEXPLAINED * self.noise_loss if self.knows_gaps else math.inf
 
     @property
     def pose_space(self) -> PoseSpace:

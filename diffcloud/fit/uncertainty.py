@@ -127,9 +127,8 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
         moved = rows @ inverse
         return moved.T @ moved
 
-    clusters = np.concatenate(
-        [w * part.common * part.scores[np.abs(part.scores).max(axis=1) > 0] for w, part in zip(weights, parts, strict=True)]
-    )
+    clusters = np.concatenate([w * part.scores for w, part in zip(weights, parts, strict=True)])
+    clusters = clusters[np.abs(clusters).max(axis=1) > 0]
     sources = {"noise": spread(clusters) * len(clusters) / max(len(clusters) - 1, 1)}
     of_priors = np.diag(prior * space.prior_steps().numpy())
     if prior[asked].any():
@@ -160,8 +159,7 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
 
 def finer_steps(scenario: Scenario) -> Scenario:
     """With `REFINED` times the steps."""
-    scene = scenario.scene
-    return replace(scenario, scene=replace(scene, frame_steps=REFINED * scene.frame_steps))
+    return scenario.with_steps(REFINED)
 
 
 def distance_to_finer_mm(
@@ -207,9 +205,7 @@ class _Part:
     normal: NDArray[np.float64]
     """[k, k]"""
     scores: NDArray[np.float64]
-    """[C, k] of the clusters."""
-    common: float
-    """What deviations by these count times, because of a misfit that the noise of the recording does not explain."""
+    """[C, k] of the clusters, as often as they count."""
     doubts: Mapping[str, NDArray[np.float64]]
     """Name -> [k] the slope's change at one deviation."""
 
@@ -254,7 +250,7 @@ class _Part:
             found[name] = onto[:, index] * prior[index] * float(objective.pose_space.deviations[index - k])
         scores = _clustered(free, motion, rates)[:, felt] @ onto.T
         factor = float(objective.pose_space.prior_factor(fitted_pose[None]))
-        return _Part(loss, factor, onto @ slope, onto @ curved[:, :k], scores, _common(objective, loss, scores), found)
+        return _Part(loss, factor, onto @ slope, onto @ curved[:, :k], scores * _times(objective, loss, scores), found)
 
 
 def _part(objective: AnyObjective, space: FitSpace, places: Tensor, recording: int) -> _Part:
@@ -324,8 +320,9 @@ def _way_to(finer: Scenario, objective: Objective, parameters: Mapping[str, Tens
     return fine.at(objective.times)[..., : own.shape[-2], :] - own
 
 
-def _common(objective: Objective, loss: float, scores: NDArray[np.float64]) -> float:
-    """See `_Part.common`; one where it is not known what the recording misses, and thus what explains it."""
+def _times(objective: Objective, loss: float, scores: NDArray[np.float64]) -> float:
+    """How often deviations by clusters count, because their misfit may have a common cause where noise does not explain it;
+    once where it is not known what the recording misses, and thus what explains it."""
     if not objective.knows_gaps:
         return 1.0
     above, clusters = max(1 - objective.explained / loss, 0.0), int((np.abs(scores).max(axis=1) > 0).sum())

@@ -244,7 +244,7 @@ class TestFits:
         assert enough.stop_reason == every.stop_reason == "converged"
         monkeypatch.setattr(Objective, "explained", 1e-12)
         monkeypatch.setattr(Objective, "knows_gaps", False)  # then two equal ends are enough, but not with a threshold
-        monkeypatch.setattr(gauss_newton, "_EQUALLY", math.inf)
+        monkeypatch.setattr(gauss_newton, "EQUALLY", math.inf)
         followed = [
             sum(torch.stack(found.history.losses).isfinite().any(0).tolist())
             for found in (

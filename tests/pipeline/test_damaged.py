@@ -310,7 +310,7 @@ pipeline.app.main()
             import_open3d()
 
     @pytest.mark.parametrize("pressed", [True, False])
-    def test_a_ctrl_c_that_a_library_turns_into_its_own_error_is_none_of_the_programs_faults(self, pressed, tmp_path):
+    def test_a_ctrl_c_that_a_library_turns_into_its_own_error_is_none_of_the_programs_faults(self, pressed):
         """As numpy's comparison of structured arrays does, and numba's calls."""
         code = f"""
 import signal

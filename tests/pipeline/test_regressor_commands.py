@@ -167,7 +167,8 @@ def test_an_interrupted_training_goes_on(work):
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
-    *_, last = errors.strip().splitlines()  # where it takes long, its progress is told before
+    *before, last = errors.strip().splitlines()
+    assert all(line.startswith("train: ") for line in before)  # where it takes long, its progress is told
     assert last == "Interrupted; the same command keeps finished networks and goes on from the last saved epoch."
     assert "Traceback" not in errors
     assert not (work / CHECKPOINT).exists()

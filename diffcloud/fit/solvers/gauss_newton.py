@@ -73,7 +73,7 @@ _MISFIT = 30.0
 """Times what explains a recording; above that, it is the model that does not: no start will."""
 _NEARLY = 1.1
 """Times what explains a recording; below that, a loss is lower than that of most wrong minima."""
-_EQUALLY = 1.01
+EQUALLY = 1.01
 """Losses within this factor are equally low."""
 _WITNESSES, _FEW_WITNESSES = _BEFORE + 1, 2
 """Equally low ends of different candidates that are taken for the minimum although they do not explain the recording; fewer
@@ -365,7 +365,7 @@ class _Ways:
     @property
     def _witnesses(self) -> set[int]:
         """The candidates from which ends as low as the best one come."""
-        return {way.origin for way in self.every if way.loss <= _EQUALLY * self.best.loss}
+        return {way.origin for way in self.every if way.loss <= EQUALLY * self.best.loss}
 
     def begin(self, start: _Start, place: Tensor, found: Linearisation) -> None:
         """A start, at its place [k], with what was found there."""

@@ -71,9 +71,12 @@ class Scenario:
         """The same experiment with half the edge length (`finer`) and half the step, so many times."""
         found = self
         for _ in range(times):
-            finer = found.finer()
-            found = replace(finer, scene=replace(finer.scene, frame_steps=2 * finer.scene.frame_steps))
+            found = found.finer().with_steps(2)
         return found
+
+    def with_steps(self, times: int) -> Scenario:
+        """The same experiment with so many times the steps."""
+        return replace(self, scene=replace(self.scene, frame_steps=times * self.scene.frame_steps))
 
     def finer(self) -> Scenario:
         """The same experiment on a mesh with half the edge length (`Scene.finer`). What lies between two nodes of a set
