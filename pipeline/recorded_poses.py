@@ -10,14 +10,12 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.evaluation.markdown import markdown_table
-from diffcloud.fit import Objective, solve
-from diffcloud.fit.result import describe_recording, recorded_pose
+from diffcloud.fit.result import describe_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
 from diffcloud.scene.scenarios import GridScenario, Scenario, make_scenario
@@ -25,7 +23,6 @@ from diffcloud.scene.scenarios.layout import find_layout
 from diffcloud.sensing.calibration.checkerboard import rigid_motion
 from diffcloud.sensing.cameras import inverse, transform
 from diffcloud.sensing.recorder import Truth, read_truth
-from diffcloud.sim.properties import one_set
 from pipeline.config import EpisodesConfig, FitConfig
 from pipeline.fit_jobs import FitJob, Recording
 from pipeline.scenario_options import scenario_options
@@ -75,19 +72,15 @@ class PoseJob:
             scenario = laid(self.scenario, episode) if start == STARTS[2] else self.scenario
             turned = _TURN if start == STARTS[1] else "none"
             told = {"parameters": ["stretch"], "fixed": {"mass": hidden["mass"]}, "nuisance": nuisance, "laid": turned}
-            config = self.config.model_copy(update=told)
+            config = self.config.model_copy(update={**told, "halvings": 0})  # the truth has the scenario's nodes
             job = FitJob(self.label, [Recording(scenario, self.label, episode)], config, self.folder)
-            objective = job.objective()
-            assert isinstance(objective, Objective)
-            outcome = solve(objective, job.space, config.solver_settings(scenario))
+            fitted = job.solved()
+            outcome = fitted.outcome
             if outcome.stop_reason == "interrupted":
                 raise KeyboardInterrupt
-            with torch.no_grad():
-                run = objective.simulate_to_loss(one_set(outcome.values))
-            recording = describe_recording(objective, run, self.label)
-            space, pose = recorded_pose(recording, length_unit_m=scenario.length_unit_m)
-            moved = space.moved(run.positions[:, 0], pose)[0].numpy()
-            lag = recording.nuisance.get("lag")
+            result = describe_fit(fitted.objective, job.space, job.solver_settings, outcome, episodes=[self.label])
+            moved = result.motions[0].nodes[0]
+            lag = result.record.nuisance.get("lag")
             found.append(
                 {
                     "start": start,

@@ -189,3 +189,22 @@ def test_poses_found_are_held_against_the_true_ones(work, tmp_path):
                     "--out", tmp_path / "poses2.md", "--nuisance", "sideways=2", code=1)  # fmt: skip
     assert "sideways" in broken.errors
     assert not (tmp_path / "poses2.md").exists()
+
+
+def test_the_pose_of_a_heavy_displaced_cloth_is_the_true_one(tmp_path, monkeypatch):
+    """With the mass that fits are given: with the scenario's, the motion would lie elsewhere."""
+    monkeypatch.chdir(tmp_path)
+    heavy = {"per_scenario": 1, "hidden_range": [2.8, 3.0], "beside": [30, 0]}
+    scene = {**SMALL, "frames": 10, "path": [[0, 0, 0, 0], [1.0, 0, -0.1, 0.3]]}
+    settings = {"scenarios": ["small"], "episodes": heavy, "preprocess": PARAMS["preprocess"]}
+    Path("raw/scenes").mkdir(parents=True)
+    Path("raw/scenes/small.yaml").write_text(yaml.safe_dump(scene), encoding="utf-8")
+    Path("params.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
+    invoke("episodes", "--params", "params.yaml", "--out", "recorded")
+    invoke("preprocess", "--params", "params.yaml", "--out", "episodes", "recorded")
+    told = invoke(
+        "recordings", "--recorded", "recorded", "--episodes", "episodes", "--params", "params.yaml", "--out", "poses.md",
+        "--nuisance", "x=10cm,y=10cm",
+    )  # fmt: skip
+    (fits,) = told.result["recordings"]
+    assert max(fit["shift_mm"] for fit in fits) < 2
