@@ -381,11 +381,12 @@ class Objective:
         for pairs in motion.pairs:
             points = pairs.places.of(here)
             velocities = None if motion.velocities is None else pairs.places.of(motion.velocities)
-            columns = [space.rates(points, motion.pose, velocities)]
+            columns = space.rates(points, motion.pose, velocities)
             if rates is not None:
-                columns.insert(0, torch.stack([space.carried(pairs.places.of(rate), motion.pose) for rate in rates]))
+                own = [space.carried(pairs.places.of(rate), motion.pose) for rate in rates]
+                columns = torch.cat([torch.stack(own), columns])
             moved.append(space.moved(points, motion.pose))
-            every.append(torch.cat(columns))
+            every.append(columns)
         return moved, every
 
     def freed(self, nuisance: Mapping[str, float]) -> Objective:

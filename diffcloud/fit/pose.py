@@ -151,7 +151,7 @@ class PoseSpace:
 
     def rotation(self, values: Tensor) -> Tensor:
         """[B, 3, 3] of values [B, d]."""
-        return torch.linalg.matrix_exp(_cross(self._parts(values, _ANGLES)))
+        return _rotation(self._parts(values, _ANGLES))
 
     def moved(self, points: Tensor, values: Tensor) -> Tensor:
         """[B, ..., 3] points of the scene at values [B, d] -> where the recording has them."""
@@ -186,23 +186,22 @@ class PoseSpace:
         Args:
             velocities: [B, ..., 3] of the points; needed where `lag` is free.
         """
-        columns = []
+        found = points.new_zeros(len(self.names), *points.shape)
         angles = self._parts(values, _ANGLES)
         centred = points - self.centre
-        for name in self.names:
+        for name, column in zip(self.names, found, strict=True):
             if name == "lag":
                 assert velocities is not None
-                columns.append(self.carried(velocities, values))
+                column[:] = self.carried(velocities, values)
             elif name == "scale":
-                columns.append(self.carried(centred, values))
+                column[:] = self.carried(centred, values)
             elif name in _SHIFTS:
-                columns.append(torch.zeros_like(points))
-                columns[-1][..., _SHIFTS.index(name)] = 1.0
+                column[..., _SHIFTS.index(name)] = 1.0
             else:
                 way = torch.zeros_like(angles)
                 way[:, _ANGLES.index(name)] = 1.0
-                columns.append(_turned(centred, self._growth(values)[..., None] * _turning(angles, way)))
-        return torch.stack(columns) if columns else points.new_zeros(0, *points.shape)
+                column[:] = _turned(centred, self._growth(values)[..., None] * _turning(angles, way))
+        return found
 
     def _growth(self, values: Tensor) -> Tensor:
         """[B, 1] of values [B, d]: how many times as large the scene shows."""
@@ -214,12 +213,27 @@ class PoseSpace:
         return torch.stack([values[:, self.names.index(n)] if n in self.names else zero for n in names], dim=-1)
 
 
-def _turning(angles: Tensor, way: Tensor) -> Tensor:
-    """[B, 3, 3] the derivative of the rotation exp([w]×) along a way [B, 3]: a corner of the exponential of twice the size
-    (Van Loan 1978)."""
-    along, cross = _cross(way), _cross(angles)
-    both = torch.cat([torch.cat([cross, along], dim=-1), torch.cat([torch.zeros_like(cross), cross], dim=-1)], dim=-2)
-    return torch.linalg.matrix_exp(both)[:, :3, 3:]
+def _rotation(vectors: Tensor) -> Tensor:
+    """[B, 3, 3] by vectors w [B, 3]: I + sin θ / θ [w]× + (1 - cos θ) / θ² [w]×², θ = |w| (Rodrigues)."""
+    cross, (first, second, _) = _cross(vectors), _weights(vectors)
+    return torch.eye(3, dtype=vectors.dtype) + first * cross + second * (cross @ cross)
+
+
+def _turning(vectors: Tensor, way: Tensor) -> Tensor:
+    """[B, 3, 3] the derivative of the rotation by w along a way [B, 3]: [J way]× times the rotation, with
+    J = I + (1 - cos θ) / θ² [w]× + (θ - sin θ) / θ³ [w]×² (Chirikjian 2012, section 10.8)."""
+    cross, (_, second, third) = _cross(vectors), _weights(vectors)
+    once = cross @ way[..., None]
+    return _cross((way[..., None] + second * once + third * (cross @ once)).squeeze(-1)) @ _rotation(vectors)
+
+
+def _weights(vectors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """[B, 1, 1] sin θ / θ, (1 - cos θ) / θ² and (θ - sin θ) / θ³ of vectors of length θ [B, 3], for θ = 0 too: what
+    rounding leaves of the last is multiplied by θ²."""
+    squared = vectors.square().sum(-1)[:, None, None]
+    turns = squared.sqrt() / torch.pi
+    first = torch.sinc(turns)
+    return first, torch.sinc(turns / 2).square() / 2, (1 - first) / squared.clamp(min=1e-300)
 
 
 def _turned(points: Tensor, rotation: Tensor) -> Tensor:

@@ -62,7 +62,9 @@ class TestTransform:
     def test_zero_leaves_all_in_place(self, points):
         torch.testing.assert_close(space().moved(points, torch.zeros(4, len(NUISANCE), dtype=torch.float64)), points)
 
-    def test_rates_are_those_of_differences(self, points, poses, generator):
+    @pytest.mark.parametrize("size", [0.0, 1e-9, 1e-4, 1.0, 4.0])
+    def test_rates_are_those_of_differences(self, points, poses, generator, size):
+        poses = size * poses
         velocities = torch.randn(points.shape, generator=generator, dtype=torch.float64)
         whole, step = space(), 1e-6
 
