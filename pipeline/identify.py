@@ -370,11 +370,12 @@ def _validation(record: FitRecord, objective: AnyObjective) -> str:
     if not isinstance(objective, JointObjective):
         return "One recording: whether its parameters carry over to another is not known."
     held, gains = [], []
+    weighed = {name: entry.value for name, entry in record.parameters.items() if entry.fixed}
     for member, episode in zip(objective.members, record.episodes, strict=True):
         if episode.left_out is None:
             return "Leaving one recording out failed: whether parameters carry over is not known."
         with torch.no_grad():
-            middle = float(member(one_set(record.laid_in(episode))))
+            middle = float(member(one_set({**weighed, **record.laid_in(episode)})))
         held.append(episode.left_out.rms_mm / episode.rms_mm)
         gains.append((middle - episode.left_out.loss) / max(middle - episode.loss, 1e-300))
     told = f"when a recording is left out of the fit, its misfit is at most {max(held):.2f} times that in the joint fit"

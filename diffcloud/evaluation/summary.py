@@ -12,6 +12,7 @@ import pandas as pd
 from diffcloud.evaluation.intervals import Combination, significant
 from diffcloud.evaluation.methods import PHASES
 from diffcloud.evaluation.repeats import consistency, fit_of, parameter_table, repeatability, transfer
+from diffcloud.fit.laid import is_laid
 
 LABELS = {
     "diffcloud": "DiffCloud",
@@ -87,7 +88,7 @@ def fit_table(records: Records) -> pd.DataFrame:
         }
         row: dict[str, Any] = {"scenario": scenario, "episode": name, **losses}
         row |= {key.replace("loss", "rms") + "_mm": to_mm * value**0.5 for key, value in losses.items()}
-        row |= {f"fitted_{parameter}": value for parameter, value in fit["values"].items()}
+        row |= {f"fitted_{parameter}": value for parameter, value in fit["values"].items() if not is_laid(parameter)}
         truth = {parameter: value for parameter, value in record["truth"].items() if parameter in fit["values"]}
         row |= {f"true_{parameter}": value for parameter, value in truth.items()}
         for kind, values in (("fitted", fit["values"]), ("true", truth)):

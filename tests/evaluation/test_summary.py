@@ -68,7 +68,9 @@ def test_a_fit_has_a_row_with_what_its_start_and_its_end_are_worth():
         record("fold", "a", stretch=8.0, methods={"diffcloud": 0.004}, start=None),  # whose start diverges
         record("fold", "b", methods={"middle": 0.004}),  # whose fit diverges
     ]
+    told[2]["methods"][0]["values"]["turn"] = -0.1  # how the cloth lay is not what the cloth is
     table = fit_table(told)
+    assert "fitted_turn" not in table
     assert table[["scenario", "episode"]].to_numpy().tolist() == [["lift", "joint"], ["fold", "a"]]
     assert table["loss"].tolist() == pytest.approx([0.002, 0.004])
     assert table["rms_mm"].tolist() == pytest.approx([1e3 * 0.002**0.5, 1e3 * 0.004**0.5])

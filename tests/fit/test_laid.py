@@ -18,7 +18,8 @@ from diffcloud.fit.names import of_all, of_recording, with_recording, without_re
 from diffcloud.fit.residuals import Axis
 from diffcloud.fit.result import describe_fit
 from diffcloud.fit.uncertainty import uncertainty
-from diffcloud.scene.scenarios import load_scenario
+from diffcloud.scene.scenarios import load_scenario, make_scenario
+from diffcloud.scene.scenarios.grid import LIFT
 from diffcloud.sim.properties import one_set
 from pipeline.config import FitConfig
 from tests.conftest import small_lift
@@ -121,10 +122,13 @@ class TestSpace:
     def test_a_scenario_says_how_its_cloths_may_lie(self):
         """For fits by derivatives; what the option says comes first."""
         recorded = load_scenario("recorded_lift")
-        said = {"turn": pytest.approx(math.radians(10)), "shape": 0.01}
+        turn = {"turn": pytest.approx(math.radians(10))}
+        said = {**turn, "shape": 0.01}
         assert recorded.laid == said
         assert FitConfig().laid_within([recorded]) == [said]
-        assert FitConfig().laid_within([recorded, load_scenario("lift")]) == [said, {}]
+        assert FitConfig().laid_within([recorded, load_scenario("lift")]) == [said, turn]
+        assert FitConfig().laid_within([make_scenario(LIFT.model_copy(update={"laid_turn_deg": 0.0}))]) == [{}]
+        assert FitConfig().laid_within([load_scenario("vest_hang")]) == [{}]
         assert FitConfig(paper=True).laid_within([recorded]) == [{}]
         assert FitConfig(solver="cma_es").laid_within([recorded]) == [{}]
         assert FitConfig(laid="none").laid_within([recorded]) == [{}]
@@ -228,6 +232,9 @@ def test_one_start_has_it_wait_and_others_do_not(objective, fits):
     assert not first[:waiting, turn].any()
     assert first[waiting:, turn].all()
     assert first[0, stretch] != first[waiting - 1, stretch]
+    alone = with_laid(ASKED, [{"turn": 0.1}], [SCENARIO])
+    settings = GaussNewtonSettings(starts=1, screen=0, scans=0, iterations=1, init={"stretch": 1.0})
+    assert fit_gauss_newton(objective, alone, settings).values["turn"] != 0  # fewer steps so, and no worse ends
     settings = GaussNewtonSettings(starts=2, screen=0, scans=0, iterations=3)
     second = torch.stack([values[1] for values in fit_gauss_newton(objective, SPACE, settings).history.values])
     assert second[-1, turn] != 0
