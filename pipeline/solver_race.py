@@ -187,7 +187,7 @@ def race_page(rows: Sequence[Sequence[str]], seed: int) -> str:
         f"How long each solver takes until its loss is at most {WITHIN:g} times that of a reference fit: the lower one of "
         "Gauss–Newton from the truth, and from the six best of 97 candidates. A target is a cloth of drawn parameters "
         f"(seed {seed}), its whole surface with {1e3 * _NOISE_M:g} mm of noise, shifted by about {1e2 * _BESIDE_M:g} cm "
-        "and turned by about 5°. All solvers minimise the same objective, with priors and with the pose (x, y, yaw) found "
+        "and turned by about 5°. All solvers minimise the same objective, with priors and with the pose found "
         f"for every parameter set, and may spend {BUDGET} simulations; Adam has the screen of Gauss–Newton and "
         f"{_ADAM_STARTS} starts.",
         "",

@@ -194,7 +194,7 @@ class TestRefusals:
         (work / "found" / "recordings.yaml").write_text("first: 3\n")
         assert "recordings.yaml: first must be a mapping" in invoke(*COMMAND, code=1).errors
         (work / "found" / "recordings.yaml").write_text("first: {yaw_deg: 10.0}\n")
-        assert "recordings.yaml: first lacks center_m, table_height_m" in invoke(*COMMAND, code=1).errors
+        assert "recordings.yaml: first lacks center_m, laid_turn_deg, table_height_m" in invoke(*COMMAND, code=1).errors
 
     def test_two_of_one_name(self, work):
         twice = invoke("identify", "recorded/first", "recorded/first", "--out", "found", code=1)

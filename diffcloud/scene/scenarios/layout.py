@@ -34,7 +34,7 @@ _TRAVEL_M = 0.03
 _CELL_M = 0.034
 _NODES = (5, 13)
 _FEW_POINTS = 100
-FIELDS = ("center_m", "yaw_deg", "table_height_m", "grasped", "rate_hz", "frames", "path")
+FIELDS = ("center_m", "yaw_deg", "laid_turn_deg", "table_height_m", "grasped", "rate_hz", "frames", "path")
 """Of a scenario, those that `find_layout` finds."""
 
 
@@ -132,6 +132,7 @@ def find_layout(episode: Episode, size: tuple[float, float]) -> Layout:
     found = {
         "center_m": Found([round(float(part), 4) for part in centre], "middle of the rectangle around the first frame"),
         "yaw_deg": Found(round(math.degrees(yaw) % 360, 2), "turn at which that rectangle is smallest"),
+        "laid_turn_deg": Found(0.0, "the first frame shows the turn; above 0, a fit finds how far it is off"),
         "table_height_m": Found(round(table, 4), f"{1e3 * _GAP_M:.0f} mm below the middle height of the first frame"),
         "grasped": Found(
             [corners.get(node, node)], f"node nearest the gripper's first position, {1e3 * distances[node]:.0f} mm away"
