@@ -182,8 +182,9 @@ def pose_page(rows: Sequence[Sequence[str]], recordings: Sequence[dict[str, Any]
         f"together, the second camera's by {apart:g} mm and {twisted:g}° more; cloth and gripper are shifted by {beside:g} "
         f"mm and turned by {yaw:g}° from the stated place; the joint log is {1e3 * recorded.lag_s:g} ms late. `diffcloud "
         "preprocess` finds the cameras' places and the lag again. Then the stretch is fitted, with the mass known. The "
-        f"cloth starts exactly as the scenario says (`--laid none`), there with its turn fitted too (`--laid {_TURN}`, the "
-        "default), or where the first frame of the recording shows it, as `diffcloud identify` lays it.",
+        "cloth starts in one of three ways: exactly as the scenario says (`--laid none`); there, but with its turn fitted "
+        f"too (`--laid {_TURN}`, the default); or where the first frame of the recording shows it, as `diffcloud identify` "
+        "lays it.",
         "",
         f"Preprocessing had the worse camera {np.median(shifts):.1f} mm from its place in the median and "
         f"{max(shifts):.1f} mm at most, and the log's lag within {np.median(late):.1f} ms in the median and "
