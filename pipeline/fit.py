@@ -120,8 +120,8 @@ def fit(
             help="Also find how the cloth lay before the motion, and how far off that may be: turn=5deg (askew under the "
             "gripper), shape=5mm (not flat; of each of nine waves), size=2% (larger or smaller than stated), track=2% (the "
             "gripper's path longer or shorter than recorded). Only if the cloth starts level. Replaces the default, which "
-            "is what the scenario says (turn=10deg for a cloth on a table, and shape=1cm too in the recorded_ ones; none for "
-            "bands and vests, other solvers and --paper)."
+            "is what the scenario says (turn=10deg for a cloth on a table, and shape=1cm too in the recorded_ ones; none "
+            "for bands and vests, other solvers and --paper)."
         ),
     ] = None,
     doubts: Annotated[
