@@ -15,6 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
+import torch
+
 from diffcloud.errors import DivergedError
 from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.joint import AnyObjective
@@ -94,20 +96,25 @@ def _gone_on(
     fitted: FitOutcome,
     progress: Callable[[Progress], None] | None,
 ) -> FitOutcome:
-    """The fit with what came of its starts on a finer mesh. Those with the lowest losses there go on, until one explains
+    """The fit with what came of its starts on a finer mesh, each as it ended and with the cloth laid as the scenario says:
+    what a coarse mesh cannot do, a turn may have made up for. Those with the lowest losses there go on, until one explains
     the recordings, or two end equally low, or the first one shows that a finer mesh does not help. The loss is infinite if
     all of them diverge.
 
     Raises:
         KeyboardInterrupt: interrupted while the losses of the starts are found there.
     """
-    began, ends, losses = time.perf_counter(), fitted.history.values[-1], list[float]()
+    began, losses = time.perf_counter(), list[float]()
     begun = fitted.history.losses[-1].isfinite().nonzero()[:, 0]
+    ends = fitted.history.values[-1][begun]
+    laid = torch.tensor([one.deviation is not None for one in space.variables])
+    if bool(laid.any()):
+        begun, ends = begun.repeat(2), torch.cat([ends, torch.where(laid, 0.0, ends)])
     places = Axis.of(space).places(ends)
-    there = batch_losses(finer, space, ends[begun])
-    outcome = replace(fitted, simulations=fitted.simulations + len(begun) * len(finer.members))
+    there = batch_losses(finer, space, ends)
+    outcome = replace(fitted, simulations=fitted.simulations + len(ends) * len(finer.members))
     best, followed, interrupted = replace(outcome, loss=math.inf), list[int](), False
-    for start in begun[there.argsort()][: int(there.isfinite().sum())].tolist():
+    for start in there.argsort()[: int(there.isfinite().sum())].tolist():
         if len(followed) == _FOLLOWED:
             break
         if any(float((places[start] - places[other]).abs().max()) < _APART for other in followed):
@@ -121,7 +128,7 @@ def _gone_on(
         except KeyboardInterrupt:
             interrupted = True
             break
-        outcome = replace(outcome, best_start=start).gone_on(further)
+        outcome = replace(outcome, best_start=int(begun[start])).gone_on(further)
         if outcome.loss < best.loss:
             best = outcome
         losses.append(further.loss)
