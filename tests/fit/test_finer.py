@@ -12,6 +12,7 @@ import torch
 from diffcloud.errors import DivergedError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, finer, solve
 from diffcloud.fit.finer import solve_and_refine
+from diffcloud.fit.laid import with_laid
 from diffcloud.fit.solvers import FitOutcome, RandomSearchSettings
 from diffcloud.fit.solvers.outcome import FitHistory
 from tests.conftest import small_lift
@@ -192,3 +193,23 @@ def test_edges_and_steps_are_halved_as_often_as_asked(scenario):
     assert [one.scene.frame_steps for one in (scenario, once, twice)] == [3, 6, 12]
     assert twice.scene.frame_time == scenario.scene.frame_time
     np.testing.assert_array_equal(twice.scene.mesh.nodes, scenario.finer().finer().scene.mesh.nodes)
+
+
+def test_a_turn_that_made_up_for_a_coarse_mesh_is_given_up(fine, monkeypatch):
+    """The cloth lies as the scenario says; from a turned end alone, the finer fit would begin turned."""
+    space = with_laid(SPACE, [{"turn": 0.2}], [fine.scenario])
+    history = FitHistory(space.names, [torch.tensor([10.0]).double()], [torch.tensor([[0.6, 0.5]]).double()], [])
+    fitted = FitOutcome({"stretch": 0.6, "turn": 0.5}, 10.0, 0, 5, "converged", 1.0, history)
+    began = []
+
+    def solve_as_told(objective, space, settings, **given):
+        if objective is fine:
+            return fitted
+        began.append(settings.init)
+        return solve(objective, space, settings, **given)
+
+    monkeypatch.setattr(finer, "solve", solve_as_told)
+    found = solve_and_refine(fine, space, QUICK, halvings=1)
+    assert began == [{"stretch": pytest.approx(0.6), "turn": 0.0}]
+    assert abs(found.outcome.values["turn"]) < 0.02
+    assert found.outcome.best_start == 0
