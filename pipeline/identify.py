@@ -370,7 +370,7 @@ def _validation(record: FitRecord, objective: AnyObjective) -> str:
     if not isinstance(objective, JointObjective):
         return "One recording: whether its parameters carry over to another is not known."
     held, gains = [], []
-    weighed = {name: entry.value for name, entry in record.parameters.items() if entry.fixed}
+    weighed = space_of(record).fixed
     for member, episode in zip(objective.members, record.episodes, strict=True):
         if episode.left_out is None:
             return "Leaving one recording out failed: whether parameters carry over is not known."

@@ -187,7 +187,7 @@ class PoseSpace:
             velocities: [B, ..., 3] of the points; needed where `lag` is free.
         """
         found = points.new_zeros(len(self.names), *points.shape)
-        angles = self._parts(values, _ANGLES)
+        turnings = dict(zip(_ANGLES, _turnings(self._parts(values, _ANGLES)), strict=True))
         centred = points - self.centre
         for name, column in zip(self.names, found, strict=True):
             if name == "lag":
@@ -198,9 +198,7 @@ class PoseSpace:
             elif name in _SHIFTS:
                 column[..., _SHIFTS.index(name)] = 1.0
             else:
-                way = torch.zeros_like(angles)
-                way[:, _ANGLES.index(name)] = 1.0
-                column[:] = _turned(centred, self._growth(values)[..., None] * _turning(angles, way))
+                column[:] = _turned(centred, self._growth(values)[..., None] * turnings[name])
         return found
 
     def _growth(self, values: Tensor) -> Tensor:
@@ -219,12 +217,12 @@ def _rotation(vectors: Tensor) -> Tensor:
     return torch.eye(3, dtype=vectors.dtype) + first * cross + second * (cross @ cross)
 
 
-def _turning(vectors: Tensor, way: Tensor) -> Tensor:
-    """[B, 3, 3] the derivative of the rotation by w along a way [B, 3]: [J way]× times the rotation, with
+def _turnings(vectors: Tensor) -> Tensor:
+    """[3, B, 3, 3] the derivatives of the rotation by w along each axis e: [J e]× times the rotation, with
     J = I + (1 - cos θ) / θ² [w]× + (θ - sin θ) / θ³ [w]×² (Chirikjian 2012, section 10.8)."""
     cross, (_, second, third) = _cross(vectors), _weights(vectors)
-    once = cross @ way[..., None]
-    return _cross((way[..., None] + second * once + third * (cross @ once)).squeeze(-1)) @ _rotation(vectors)
+    jacobian = torch.eye(3, dtype=vectors.dtype) + second * cross + third * (cross @ cross)
+    return _cross(jacobian.movedim(-1, 0)) @ _rotation(vectors)
 
 
 def _weights(vectors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -247,7 +245,7 @@ def _beside(vector: Tensor, points: Tensor) -> Tensor:
 
 
 def _cross(vector: Tensor) -> Tensor:
-    """[B, 3] -> [B, 3, 3] that multiplies like a cross product."""
+    """[..., 3] -> [..., 3, 3] that multiplies like a cross product."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))

@@ -528,9 +528,8 @@ def _laid(space: FitSpace, init: Mapping[str, float]) -> Tensor:
     free from the beginning, a motion that may go in several ways finds more wrong minima; without them, a cloth that lies
     askew leads to wrong places. So one start has them wait, the others do not. A turn alone never waits: with it, the same
     ends are reached in fewer steps, whether the cloth lies askew or not."""
-    laid = [one for one in space.variables if one.deviation is not None]
-    waits = any(plain_name(one.name) != "turn" for one in laid)
-    return torch.tensor([waits and one in laid and one.name not in init for one in space.variables])
+    alone = {plain_name(one.name) for one in space.variables if one.deviation is not None} == {"turn"}
+    return torch.tensor([one.deviation is not None and not alone and one.name not in init for one in space.variables])
 
 
 def _remember(history: FitHistory, ways: _Ways, axis: Axis) -> None:
