@@ -266,7 +266,6 @@ class CoverageJob:
             "fabric": f"drawn{self.index}",
             "repeat": 1,
             "truth": dict(truth),
-            "made": made,
         }
         tell(0.0, "recording")
         sets = {name: np.array([value]) for name, value in truth.items()}
@@ -287,6 +286,8 @@ class CoverageJob:
             if self.kind != "same":
                 shaken = episode.points + _OTHER_NOISE_M * rng.standard_normal(episode.points.shape)
                 episode = replace(episode, points=shaken.astype(np.float32))
+        # here, not in `meta`: a raw recording carries only keys of its own on to its clouds
+        episode = replace(episode, meta={**episode.meta, "made": made})
         write_episode(path, episode)
         return episode
 

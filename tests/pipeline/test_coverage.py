@@ -68,6 +68,16 @@ class TestCoverage:
         assert first.meta["made"] != second.meta["made"]
         assert episode.stat().st_mtime_ns != written
 
+    def test_fits_with_other_known_parameters_share_a_raw_recording(self, work):
+        (work / "small.yaml").write_text(yaml.safe_dump(LIFT))
+        (work / "params.yaml").write_text(yaml.safe_dump({**PARAMS, "episodes": {"image_size": [212, 120]}}))
+        invoke(*COVERAGE, "--recordings", 1, "--fix", "mass")
+        episode = work / "out/small/episodes/0000.npz"
+        written = episode.stat().st_mtime_ns
+        assert read_episode(episode).meta["source"] == "raw episode"
+        invoke(*COVERAGE, "--recordings", 1)
+        assert episode.stat().st_mtime_ns == written
+
     @pytest.mark.parametrize("truth", ["refined", "finer"])
     def test_another_truth_has_a_folder_of_its_own(self, work, truth, monkeypatch):
         """The same cloth, as other steps and another mesh move it."""
