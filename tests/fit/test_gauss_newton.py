@@ -231,6 +231,7 @@ class TestFits:
     def test_starts_are_followed_one_after_the_other_until_one_explains_the_recording(self, monkeypatch):
         settings, fits = GaussNewtonSettings(starts=3, screen=7), []
         monkeypatch.setattr(Objective, "knows_gaps", True)
+        monkeypatch.setattr(gauss_newton, "_MISFIT", math.inf)  # the model may be right, however high the loss
         for explained, threshold in ((1e-12, 0.0), (1.0, 0.0), (1.0, 1e-30)):  # never, at once, not low enough
             monkeypatch.setattr(Objective, "explained", explained)
             fits.append(fit_gauss_newton(lifted(), SPACE, replace(settings, threshold=threshold)))
@@ -395,6 +396,49 @@ class TestFits:
         for origin in (0, 1):
             ways.begin(gauss_newton._Start(place, origin), place, found)
         assert ways.enough(gauss_newton._Enough.of(recording, GaussNewtonSettings(**options))) == enough
+
+    @pytest.mark.parametrize(
+        ("knows", "losses", "enough"),
+        [
+            (True, (31.0, 32.4), True),
+            (True, (31.0, 33.0), False),
+            (True, (1.05, 1.08), False),
+            (False, (31.0, 32.4), False),
+        ],
+        ids=["the model is wrong", "apart", "the model may be right", "nobody knows"],
+    )
+    def test_where_the_model_must_be_wrong_ends_are_equally_low_within_five_per_cent(self, knows, losses, enough):
+        recording, place = SimpleNamespace(explained=1.0, knows_gaps=knows), torch.zeros(1, dtype=torch.float64)
+        ways = gauss_newton._Ways([], 3, torch.zeros(1, dtype=torch.bool))
+        for origin, loss in enumerate(losses):
+            found = Linearisation(torch.tensor([loss]).double(), torch.zeros(1, 1).double(), torch.eye(1).double()[None], 1)
+            ways.begin(gauss_newton._Start(place, origin), place, found)
+        assert ways.enough(gauss_newton._Enough.of(recording, GaussNewtonSettings())) == enough
+
+    def test_a_step_in_vain_makes_the_next_one_shorter_and_a_good_one_longer(self):
+        """The lowest place of a flat valley lies 20 away."""
+        curvature, slope = torch.tensor([[1.0, 0.0], [0.0, 1e-6]]).double(), torch.tensor([0.0, 2e-5]).double()
+        end = torch.full((2,), 100.0).double()
+
+        def told(loss):
+            return Linearisation(torch.tensor([loss]).double(), slope[None], curvature[None], 1)
+
+        way, steps = gauss_newton._Way(torch.zeros(2).double(), told(1e-3), 9), []
+        for part in (-1, -1, 1, 0, 0):  # of the predicted decrease
+            tried = way.propose(-end, end)
+            steps.append(float((tried - way.place).abs().max()))
+            way.judge(tried, told(way.loss - part * way._predicted))
+        assert steps == pytest.approx([1.0, 0.2, 0.04, 0.12, 0.024])
+
+    def test_a_start_that_is_not_about_to_be_of_use_is_given_up(self):
+        """Nothing is looked for around its end, either."""
+        settings = GaussNewtonSettings(starts=1, screen=0)
+        fits = [fit_gauss_newton(lifted(), SPACE, replace(settings, of_use=loss)) for loss in (math.inf, 1.0, -1.0)]
+        assert fits[0].values == fits[1].values
+        assert fits[0].simulations == fits[1].simulations
+        assert fits[0].scan is not None
+        assert fits[2].scan is None
+        assert fits[2].simulations < fits[0].simulations - len(SPACE.names)
 
     @pytest.mark.parametrize(
         ("second", "witnesses", "misfit", "order"),

@@ -1,18 +1,20 @@
-"""Gauss–Newton with Levenberg–Marquardt damping and bounds, from one start after the other.
+"""Gauss–Newton with bounds and a trust region, from one start after the other.
 
 With half of the loss's slope g and of its curvature H on the axis of `residuals.Axis`, a step s minimises
 
-    g·s + s·(H + λ diag H) s / 2     between the bounds, no component longer than one
+    g·s + s·(H + λ diag H) s / 2     between the bounds, no component longer than a radius
 
-(Marquardt 1963; Madsen, Nielsen and Tingleff 2004, section 3.2). A step that is computed without the bounds, and then cut
-off at one, may lead uphill: its other components were chosen to go with what was cut off. Each start keeps its own λ: it
-falls by how much of the predicted decrease a step brings, and grows, faster and faster, where it brings none. Starts are
-the best of a screen of candidates spread over the box, the best one first. The remaining ones are not followed once one
-explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and more of it; the
-other is a derivative-free search, from the best place so far, over the parameters asked for only. The search comes after
-three candidates. So do growing starts, but the first of them comes as soon as the best end is low enough for the model to
-be right (with a threshold, all of them come right after the first candidate). They also wait while an end from another
-candidate is as low as the best one.
+(Conn, Gould and Toint 2000, chapter 7; a trust region that is a box leaves the bounds what they are). A step that is
+computed without the bounds, and then cut off at one, may lead uphill: its other components were chosen to go with what was
+cut off. Each start keeps its own radius: it grows where a step brings at least half of the decrease that was predicted, and
+shrinks to a part of the step where it brings none. λ is small and stays. Where the damping λ takes the place of the radius
+(Marquardt 1963), it must first grow by several powers of ten before a step in vain becomes shorter, and each of them costs
+a simulation. Starts are the best of a screen of candidates spread over the box, the best one first. The remaining ones are
+not followed once one explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more
+and more of it; the other is a derivative-free search, from the best place so far, over the parameters asked for only. The
+search comes after three candidates. So do growing starts, but the first of them comes as soon as the best end is low enough
+for the model to be right (with a threshold, all of them come right after the first candidate). They also wait while an end
+from another candidate is as low as the best one.
 Four equally low ends are taken for the minimum although they do not explain the recording; two are, where their loss is
 hardly above what does, or so high that the model must be wrong, or where it is not known what cameras missed. Unless the
 recording is explained, losses along the principal axes of the best place then tell whether another minimum is lower nearby;
@@ -46,14 +48,20 @@ from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, Stop
 ROUGH_SCREEN, ROUGH_STARTS = 96, 3
 """Candidates and starts where the loss is too rough for derivatives: there are more minima, a candidate costs a tenth, and
 a step takes several simulations."""
-_FIRST_DAMPING = 1e-2
+_DAMPING = 1e-3
+"""λ, so that what the recording hardly tells moves little."""
 _LARGEST_STEP = 1.0
-"""On the axis: a factor e, or the whole range."""
+"""On the axis: a factor e, or the whole range. The first radius, and the largest one."""
+_SHRINKS, _GROWS = 0.2, 3.0
+"""Times a step: the next radius where it was in vain, and where it brought enough."""
+_ENOUGH, _TOO_LITTLE = 0.5, 0.25
+"""Parts of the predicted decrease: from the first on, the next radius is larger; below the second, half the step."""
 _LEAST_SPREAD = 1e-12
 """Of the matrix of a step, in its largest eigenvalue: below is rounding."""
 _SMALLEST_STEP = 1e-3
-"""A step below 0.1 % of a value, or a predicted decrease below this part of the loss, means that a start has arrived."""
-_SMALLEST_DECREASE = 1e-4
+"""A step below 0.1 % of a value, or a predicted decrease below the first part of the loss, means that a start has arrived;
+below the second one, if it is not even a decrease: the loss is rougher than what is left to gain."""
+_SMALLEST_DECREASE, _IN_VAIN = 1e-4, 1e-3
 _SAME = 0.02
 """A start that comes as close to a better one, on the axis, leaves the rest of the way to it."""
 _MOST = 8
@@ -74,8 +82,9 @@ _MISFIT = 30.0
 """Times what explains a recording; above that, it is the model that does not: no start will."""
 _NEARLY = 1.1
 """Times what explains a recording; below that, a loss is lower than that of most wrong minima."""
-EQUALLY = 1.01
-"""Losses within this factor are equally low."""
+EQUALLY, _ABOUT_EQUALLY = 1.01, 1.05
+"""Losses within the first factor are equally low; within the second one, where the model must be wrong: what it cannot do
+weighs more than such a difference."""
 _WITNESSES, _FEW_WITNESSES = _BEFORE + 1, 2
 """Equally low ends of different candidates that are taken for the minimum although they do not explain the recording; fewer
 where they nearly do, where it is not known what cameras missed, or where the model must be wrong."""
@@ -83,6 +92,8 @@ _SCREENED = 0.5
 """Part of the frames on which candidates are compared: the rest costs as much again, and has more wrong minima."""
 _GIVE_UP = 6
 """Steps in vain, one after the other: the loss is rougher than its slope."""
+_HOPE = 10.0
+"""Steps like the next one; where not even so many would get below what is of use, a start is given up."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +115,8 @@ class GaussNewtonSettings:
     """Of the candidates."""
     init: Mapping[str, float] = field(default_factory=dict)
     """Values of the first candidate, which is followed in any case; the middle of the range where not given."""
+    of_use: float = math.inf
+    """Loss that a start must be about to get below; else it is given up, and no lower minimum is looked for around it."""
 
 
 def fit_gauss_newton(
@@ -140,12 +153,16 @@ def fit_gauss_newton(
         for index, stages in reversed(list(enumerate(_growths(objective)))):
             grown = partial(_grown, stages, space, places[best], settings, index, axis, tell)
             waiting.insert(best + 1, _Start(places[best], best, grown, grows=True))
-    scans, looked, ways = 0, None, _Ways(waiting, settings.iterations, _laid(space, settings.init))
+    scans, looked = 0, None
+    ways = _Ways(waiting, settings.iterations, _laid(space, settings.init), settings.of_use)
     try:
         while True:
             way = ways.going
             if way is not None:
                 tried = way.propose(*axis.ends)
+                if way.hopeless:
+                    way.arrived = True
+                    continue
                 found = linearise(objective, space, tried[None])
                 simulations += found.simulations
                 ways.judge(way, tried, found)
@@ -158,7 +175,7 @@ def fit_gauss_newton(
             else:
                 reason = ways.best.end or reason
                 done = objective.knows_gaps and ways.best.loss <= when.explained
-                if scans == settings.scans or reason == "iterations" or done:
+                if scans == settings.scans or reason == "iterations" or done or ways.best.loss > settings.of_use:
                     break
                 scans += 1
                 seen, spent = scan(objective, space, ways.best.place, ways.best.normal)
@@ -218,7 +235,13 @@ class _Way:
     """From one start, at its lowest place so far."""
 
     def __init__(
-        self, place: Tensor, found: Linearisation, steps: int, origin: int = -1, held: Tensor | None = None
+        self,
+        place: Tensor,
+        found: Linearisation,
+        steps: int,
+        origin: int = -1,
+        held: Tensor | None = None,
+        of_use: float = math.inf,
     ) -> None:
         """
         Args:
@@ -227,14 +250,15 @@ class _Way:
             steps: it may take.
             origin: of its start.
             held: bool [k] what stays until it has arrived; then it goes on with all free, and as many steps again.
+            of_use: loss that it must be about to get below.
         """
-        self.origin = origin
+        self.origin, self._of_use = origin, of_use
         self._take(place, found)
         self._most, self._held = steps, held
         self._begin()
 
     def _begin(self) -> None:
-        self._steps, self._damping, self._growth, self._in_vain = self._most, _FIRST_DAMPING, 2.0, 0
+        self._steps, self._radius, self._in_vain = self._most, _LARGEST_STEP, 0
         self._predicted = 0.0
         self.arrived = False
 
@@ -251,6 +275,11 @@ class _Way:
             return "rough"
         return None if self._steps else "iterations"
 
+    @property
+    def hopeless(self) -> bool:
+        """Whether many steps like the one that is proposed would not get below what is of use."""
+        return self.loss - _HOPE * self._predicted > self._of_use
+
     def propose(self, low: Tensor, high: Tensor) -> Tensor:
         """[k] the next place, between the bounds [k]."""
         place, slope, normal = self.place, self.slope, self.normal
@@ -260,24 +289,26 @@ class _Way:
         step = torch.zeros_like(place)
         if bool(free.any()):
             inner = normal[free][:, free]
-            least, most = ((end - place)[free].clamp(-_LARGEST_STEP, _LARGEST_STEP) for end in (low, high))
-            step[free] = _lowest(inner + self._damping * inner.diagonal().diag(), slope[free], least, most)
+            least, most = ((end - place)[free].clamp(-self._radius, self._radius) for end in (low, high))
+            step[free] = _lowest(inner + _DAMPING * inner.diagonal().diag(), slope[free], least, most)
         self._predicted = float(-2 * slope @ step - step @ normal @ step)
         return place + step
 
     def judge(self, tried: Tensor, found: Linearisation) -> None:
-        """Take the step if it lowered the loss, and set the damping for the next."""
+        """Take the step if it lowered the loss, and set the radius for the next."""
         self._steps -= 1
         step, decrease = float((tried - self.place).abs().max()), self.loss - float(found.losses[0])
-        self.arrived = step < _SMALLEST_STEP or self._predicted < _SMALLEST_DECREASE * self.loss
+        least = _SMALLEST_DECREASE if decrease > 0 else _IN_VAIN
+        self.arrived = step < _SMALLEST_STEP or self._predicted < least * self.loss
         if decrease > 0:
-            ratio = decrease / max(self._predicted, 1e-300)
-            self._damping *= max(1 / 3, 1 - (2 * min(ratio, 1.0) - 1) ** 3)
-            self._growth, self._in_vain = 2.0, 0
+            if decrease >= _ENOUGH * self._predicted:
+                self._radius = min(max(self._radius, _GROWS * step), _LARGEST_STEP)
+            elif decrease < _TOO_LITTLE * self._predicted:
+                self._radius = step / 2
+            self._in_vain = 0
             self._take(tried, found)
         else:
-            self._damping *= self._growth
-            self._growth *= 2
+            self._radius = _SHRINKS * step
             self._in_vain += 1
         if self._held is not None and self.end is not None and math.isfinite(self.loss):
             self._held = None
@@ -323,14 +354,15 @@ class _Enough:
 class _Ways:
     """From B starts, one after the other."""
 
-    def __init__(self, starts: Sequence[_Start], steps: int, held: Tensor) -> None:
+    def __init__(self, starts: Sequence[_Start], steps: int, held: Tensor, of_use: float = math.inf) -> None:
         """
         Args:
             starts: B, in their order.
             steps: each may take.
             held: bool [k] what the first one leaves as it is at first.
+            of_use: loss that each must be about to get below.
         """
-        self.waiting, self.every, self._steps = list(starts), list[_Way](), steps
+        self.waiting, self.every, self._steps, self._of_use = list(starts), list[_Way](), steps, of_use
         self._held = held if bool(held.any()) else None
         self._grown = 0
 
@@ -349,7 +381,7 @@ class _Ways:
         if not self.every or not math.isfinite(self.best.loss):
             return False
         needed = when.witnesses if when.nearly < self.best.loss <= when.misfit else _FEW_WITNESSES
-        return self.best.loss <= when.explained or len(self._witnesses) >= needed
+        return self.best.loss <= when.explained or len(self._witnesses(when)) >= needed
 
     def following(self, when: _Enough) -> _Start:
         """The next start. Where some equal ends would be enough, those that grow wait until three others were followed, and
@@ -357,20 +389,21 @@ class _Ways:
         model to be right."""
         soon = bool(self.every) and not self._grown and self.best.loss <= when.misfit
         early = len(self.every) - self._grown < (1 if soon else _BEFORE)
-        grows = not (early or len(self._witnesses) > 1)
+        grows = not (early or len(self._witnesses(when)) > 1)
         fitting = (place for place, start in enumerate(self.waiting) if start.grows == grows)
         start = self.waiting.pop(next(fitting, 0) if math.isfinite(when.witnesses) else 0)
         self._grown += start.grows
         return start
 
-    @property
-    def _witnesses(self) -> set[int]:
+    def _witnesses(self, when: _Enough) -> set[int]:
         """The candidates from which ends as low as the best one come."""
-        return {way.origin for way in self.every if way.loss <= EQUALLY * self.best.loss}
+        equally = _ABOUT_EQUALLY if 0 < when.misfit < self.best.loss else EQUALLY
+        return {way.origin for way in self.every if way.loss <= equally * self.best.loss}
 
     def begin(self, start: _Start, place: Tensor, found: Linearisation) -> None:
         """A start, at its place [k], with what was found there."""
-        self.every.append(_Way(place, found, self._steps, start.origin, None if self.every else self._held))
+        held = None if self.every else self._held
+        self.every.append(_Way(place, found, self._steps, start.origin, held, self._of_use))
 
     def judge(self, way: _Way, tried: Tensor, found: Linearisation) -> None:
         """As of the way; one that comes close to a better one leaves it the rest."""
@@ -380,7 +413,8 @@ class _Ways:
 
     def go_on(self, place: Tensor, found: Linearisation) -> None:
         """From a lower place [k] than the best one's."""
-        self.every[self.every.index(self.best)] = _Way(place, found, self._steps, self.best.origin)
+        way = _Way(place, found, self._steps, self.best.origin, of_use=self._of_use)
+        self.every[self.every.index(self.best)] = way
 
 
 def _starts(

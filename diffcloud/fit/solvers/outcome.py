@@ -12,9 +12,9 @@ from torch import Tensor
 from diffcloud.fit.scan import Scan
 
 StopReason = Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
-"""`converged`: the best start cannot get lower by more than a ten-thousandth, or the candidates of a search lie together.
-`rough`: steps along its slope lower the loss no more. `threshold`: low enough. `iterations`, or `simulations` of a search:
-none of them yet."""
+"""`converged`: the best start cannot get lower by more than a ten-thousandth, or by a thousandth where the loss is rough, or
+the candidates of a search lie together. `rough`: steps along its slope lower the loss no more. `threshold`: low enough.
+`iterations`, or `simulations` of a search: none of them yet."""
 
 
 @dataclass(frozen=True)
