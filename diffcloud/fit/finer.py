@@ -24,7 +24,7 @@ from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis
-from diffcloud.fit.solvers import FitOutcome, GaussNewtonSettings, Progress, Settings, solve
+from diffcloud.fit.solvers import FitOutcome, GaussNewtonSettings, Progress, Settings, fit_gauss_newton, solve
 from diffcloud.fit.solvers.gauss_newton import EQUALLY
 
 _CLEARLY = 0.9
@@ -111,9 +111,9 @@ def _gone_on(
     try:
         for start, values in islice(starts, _FOLLOWED):
             of_use = min(_CLEARLY * fitted.loss, EQUALLY * best.loss)
-            alone = replace(settings, starts=1, screen=0, init=values, of_use=of_use)
+            alone = replace(settings, starts=1, screen=0, init=values)
             try:
-                further = solve(finer, space, alone, progress=progress)
+                further = fit_gauss_newton(finer, space, alone, progress=progress, of_use=of_use)
             except DivergedError:
                 continue
             outcome = replace(outcome, best_start=start).gone_on(further)

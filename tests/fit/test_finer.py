@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from diffcloud.errors import DivergedError
-from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, finer, solve
+from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, finer, fit_gauss_newton, solve
 from diffcloud.fit.finer import solve_and_refine
 from diffcloud.fit.laid import with_laid
 from diffcloud.fit.solvers import FitOutcome, RandomSearchSettings
@@ -109,15 +109,14 @@ def test_a_finer_mesh_that_hardly_helps_is_not_kept(fine, monkeypatch):
 def test_a_finer_mesh_that_diverges_costs_nothing(fine, monkeypatch):
     first, tried = solve(fine, SPACE, QUICK), []
 
-    def solve_unless_finer(objective, *rest, **given):
-        tried.append(objective)
-        if objective is not fine:
-            raise DivergedError(3, [0], "too fast")
-        return first
+    def too_fast(*arguments, **given):
+        tried.append(1)
+        raise DivergedError(3, [0], "too fast")
 
-    monkeypatch.setattr(finer, "solve", solve_unless_finer)
+    monkeypatch.setattr(finer, "solve", lambda *arguments, **given: first)
+    monkeypatch.setattr(finer, "fit_gauss_newton", too_fast)
     found = solve_and_refine(fine, SPACE, QUICK, halvings=1)
-    assert (found.objective, found.halvings, found.finer_loss, len(tried)) == (fine, 0, None, 2)
+    assert (found.objective, found.halvings, found.finer_loss, len(tried)) == (fine, 0, None, 1)
     assert (found.outcome.values, found.outcome.loss, found.outcome.scan) == (first.values, first.loss, first.scan)
 
 
@@ -153,7 +152,7 @@ def test_the_best_end_goes_on_and_then_others_by_their_losses_there(fine, monkey
     def descend(objective, space, settings, **given):
         (start,) = settings.init.values()
         began.append(start)
-        of_use.append(settings.of_use)
+        of_use.append(given["of_use"])
         loss = ends[start]
         row = FitHistory(("stretch",), [torch.tensor([loss]).double()], [place[:1]], [torch.zeros(1, 1).double()])
         return FitOutcome({"stretch": start + 0.1}, loss, 0, 7, "converged", 1.0, row)
@@ -163,7 +162,7 @@ def test_the_best_end_goes_on_and_then_others_by_their_losses_there(fine, monkey
     def losses(objective, space, values):
         return torch.tensor([there[one] for one in values[:, 0].tolist()], dtype=torch.float64)
 
-    monkeypatch.setattr(finer, "solve", descend)
+    monkeypatch.setattr(finer, "fit_gauss_newton", descend)
     monkeypatch.setattr(finer, "batch_losses", losses)
     monkeypatch.setattr(Objective, "explained", 0.5)
     outcome = finer._gone_on(fine, SPACE, QUICK, fitted, None)
@@ -244,13 +243,12 @@ def test_a_turn_that_made_up_for_a_coarse_mesh_is_given_up(fine, monkeypatch):
     fitted = FitOutcome({"stretch": 0.6, "turn": 0.5}, 10.0, 0, 5, "converged", 1.0, history)
     began = []
 
-    def solve_as_told(objective, space, settings, **given):
-        if objective is fine:
-            return fitted
+    def watched(objective, space, settings, **given):
         began.append(settings.init)
-        return solve(objective, space, settings, **given)
+        return fit_gauss_newton(objective, space, settings, **given)
 
-    monkeypatch.setattr(finer, "solve", solve_as_told)
+    monkeypatch.setattr(finer, "solve", lambda *arguments, **given: fitted)
+    monkeypatch.setattr(finer, "fit_gauss_newton", watched)
     found = solve_and_refine(fine, space, QUICK, halvings=1)
     assert began == [{"stretch": pytest.approx(0.6), "turn": 0.0}]
     assert abs(found.outcome.values["turn"]) < 0.02

@@ -433,7 +433,7 @@ class TestFits:
     def test_a_start_that_is_not_about_to_be_of_use_is_given_up(self):
         """Nothing is looked for around its end, either."""
         settings = GaussNewtonSettings(starts=1, screen=0)
-        fits = [fit_gauss_newton(lifted(), SPACE, replace(settings, of_use=loss)) for loss in (math.inf, 1.0, -1.0)]
+        fits = [fit_gauss_newton(lifted(), SPACE, settings, of_use=loss) for loss in (math.inf, 1.0, -1.0)]
         assert fits[0].values == fits[1].values
         assert fits[0].simulations == fits[1].simulations
         assert fits[0].scan is not None

@@ -48,7 +48,7 @@ from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, Stop
 ROUGH_SCREEN, ROUGH_STARTS = 96, 3
 """Candidates and starts where the loss is too rough for derivatives: there are more minima, a candidate costs a tenth, and
 a step takes several simulations."""
-_DAMPING = 1e-3
+_DAMPING = 1e-4
 """λ, so that what the recording hardly tells moves little."""
 _LARGEST_STEP = 1.0
 """On the axis: a factor e, or the whole range. The first radius, and the largest one."""
@@ -115,8 +115,6 @@ class GaussNewtonSettings:
     """Of the candidates."""
     init: Mapping[str, float] = field(default_factory=dict)
     """Values of the first candidate, which is followed in any case; the middle of the range where not given."""
-    of_use: float = math.inf
-    """Loss that a start must be about to get below; else it is given up, and no lower minimum is looked for around it."""
 
 
 def fit_gauss_newton(
@@ -125,8 +123,13 @@ def fit_gauss_newton(
     settings: GaussNewtonSettings,
     *,
     progress: Callable[[Progress], None] | None = None,
+    of_use: float = math.inf,
 ) -> FitOutcome:
     """Minimise; the lowest iterate wins. Ctrl-C ends the fit and keeps the best so far.
+
+    Args:
+        of_use: loss that a start must be about to get below; else it is given up, and no lower minimum is looked for around
+            it.
 
     Raises:
         DivergedError: every candidate diverged.
@@ -154,7 +157,7 @@ def fit_gauss_newton(
             grown = partial(_grown, stages, space, places[best], settings, index, axis, tell)
             waiting.insert(best + 1, _Start(places[best], best, grown, grows=True))
     scans, looked = 0, None
-    ways = _Ways(waiting, settings.iterations, _laid(space, settings.init), settings.of_use)
+    ways = _Ways(waiting, settings.iterations, _laid(space, settings.init), of_use)
     try:
         while True:
             way = ways.going
@@ -175,7 +178,7 @@ def fit_gauss_newton(
             else:
                 reason = ways.best.end or reason
                 done = objective.knows_gaps and ways.best.loss <= when.explained
-                if scans == settings.scans or reason == "iterations" or done or ways.best.loss > settings.of_use:
+                if scans == settings.scans or reason == "iterations" or done or ways.best.loss > of_use:
                     break
                 scans += 1
                 seen, spent = scan(objective, space, ways.best.place, ways.best.normal)

@@ -12,7 +12,7 @@ from torch import Tensor
 from diffcloud.fit.scan import Scan
 
 StopReason = Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
-"""`converged`: the best start cannot get lower by more than a ten-thousandth, or by a thousandth where the loss is rough, or
+"""`converged`: the best start cannot get lower by more than a ten-thousandth, or a thousandth where the loss is rough; or
 the candidates of a search lie together. `rough`: steps along its slope lower the loss no more. `threshold`: low enough.
 `iterations`, or `simulations` of a search: none of them yet."""
 
