@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
 
 import torch
 from torch import Tensor
@@ -98,80 +97,61 @@ def _gone_on(
     fitted: FitOutcome,
     progress: Callable[[Progress], None] | None,
 ) -> FitOutcome:
-    """The fit with what came of its starts on a finer mesh. The best one goes on first. If that shows that a finer mesh
-    helps, those with the lowest losses there follow, until one explains the recordings, or two end equally low. The loss is
-    infinite if all of them diverge.
+    """The fit with what came of its starts on a finer mesh, each as it ended and with the cloth laid as the scenario says:
+    what a coarse mesh cannot do, a turn may have made up for. Those with the lowest losses there go on, until one explains
+    the recordings, or two end equally low, or the first one shows that a finer mesh does not help. The loss is infinite if
+    none of them has got anywhere.
 
     Raises:
-        KeyboardInterrupt: interrupted before one of them has gone on.
+        KeyboardInterrupt: interrupted while the losses of the starts are found there.
     """
-    began, starts = time.perf_counter(), _Ends(finer, space, fitted)
-    outcome, losses, interrupted = fitted, list[float](), False
-    best = replace(fitted, loss=math.inf)
-    try:
-        for start, values in islice(starts, _FOLLOWED):
-            of_use = min(_CLEARLY * fitted.loss, EQUALLY * best.loss)
-            alone = replace(settings, starts=1, screen=0, init=values)
-            try:
-                further = fit_gauss_newton(finer, space, alone, progress=progress, of_use=of_use)
-            except DivergedError:
-                continue
-            outcome = replace(outcome, best_start=start).gone_on(further)
-            if outcome.loss < best.loss:
-                best = outcome
-            losses.append(further.loss)
-            interrupted = further.stop_reason == "interrupted"
-            equal = sum(loss <= EQUALLY * best.loss for loss in losses) > 1
-            explained = best.loss <= finer.explained or further.stop_reason == "threshold"
-            if interrupted or explained or equal or best.loss > _CLEARLY * fitted.loss:
-                break
-    except KeyboardInterrupt:
-        if not losses:
-            raise
-        interrupted = True
+    began = time.perf_counter()
+    begun, ends = _ends(fitted, space)
+    places = Axis.of(space).places(ends)
+    there = batch_losses(finer, space, ends)
+    outcome = replace(fitted, simulations=fitted.simulations + len(ends) * len(finer.members))
+    best, losses, followed, interrupted = replace(outcome, loss=math.inf), list[float](), list[int](), False
+    for end in there.argsort()[: int(there.isfinite().sum())].tolist():
+        if len(followed) == _FOLLOWED:
+            break
+        if any(float((places[end] - places[other]).abs().max()) < _APART for other in followed):
+            continue
+        followed.append(end)
+        alone = replace(settings, starts=1, screen=0, init=dict(zip(space.names, ends[end].tolist(), strict=True)))
+        of_use = min(_CLEARLY * fitted.loss, EQUALLY * best.loss)
+        try:
+            further = fit_gauss_newton(finer, space, alone, progress=progress, of_use=of_use)
+        except DivergedError:
+            continue
+        except KeyboardInterrupt:
+            interrupted = True
+            break
+        outcome = replace(outcome, best_start=int(begun[end])).gone_on(further)
+        if outcome.loss < best.loss:
+            best = outcome
+        losses.append(further.loss)
+        interrupted = further.stop_reason == "interrupted"
+        equal = sum(loss <= EQUALLY * best.loss for loss in losses) > 1
+        explained = best.loss <= finer.explained or further.stop_reason == "threshold"
+        if interrupted or explained or equal or best.loss > _CLEARLY * fitted.loss:
+            break
     return replace(
         best,
         history=outcome.history,
-        simulations=outcome.simulations + starts.simulations,
+        simulations=outcome.simulations,
         seconds=fitted.seconds + time.perf_counter() - began,
         stop_reason="interrupted" if interrupted else best.stop_reason,
     )
 
 
-class _Ends:
-    """Where descents on a finer mesh begin: at the ends of a fit's starts, each as it is and with the cloth laid as the
-    scenario says: what a coarse mesh cannot do, a turn may have made up for."""
-
-    def __init__(self, finer: AnyObjective, space: FitSpace, fitted: FitOutcome) -> None:
-        self.simulations = 0
-        self._finer, self._space, self._fitted = finer, space, fitted
-
-    def __iter__(self) -> Iterator[tuple[int, dict[str, float]]]:
-        """(start, values), the best start's first, then those with the lowest loss on the finer mesh; places that are close
-        to an earlier one are left out."""
-        losses, values = self._fitted.history.losses[-1], self._fitted.history.values[-1]
-        starts = losses.isfinite().nonzero()[:, 0]
-        laid = torch.tensor([one.deviation is not None for one in self._space.variables])
-        askew = starts[(self._places(values[starts]) * laid).abs().amax(-1) >= _APART]
-        ends = torch.cat([values[starts], torch.where(laid, 0.0, values[askew])])
-        starts = torch.cat([starts, askew])
-        places, followed = self._places(ends), list[int]()
-        there, best = torch.full((len(ends),), math.inf, dtype=torch.float64), starts == int(losses.argmin())
-        for group in (best, ~best):
-            if not bool(group.any()):
-                continue
-            there[group] = batch_losses(self._finer, self._space, ends[group])
-            self.simulations += int(group.sum()) * len(self._finer.members)
-            for index in there.argsort()[: int(there.isfinite().sum())].tolist():
-                if any(float((places[index] - places[other]).abs().max()) < _APART for other in followed):
-                    continue
-                followed.append(index)
-                yield int(starts[index]), dict(zip(self._space.names, ends[index].tolist(), strict=True))
-                if group is best:
-                    break
-
-    def _places(self, values: Tensor) -> Tensor:
-        return Axis.of(self._space).places(values)
+def _ends(fitted: FitOutcome, space: FitSpace) -> tuple[Tensor, Tensor]:
+    """Starts [n], and values [n, k] of where they ended; then once more those that ended with a cloth that lies otherwise
+    than the scenario says, now laid so."""
+    begun = fitted.history.losses[-1].isfinite().nonzero()[:, 0]
+    ends = fitted.history.values[-1][begun]
+    laid = torch.tensor([one.deviation is not None for one in space.variables])
+    askew = (Axis.of(space).places(ends) * laid).abs().amax(-1) >= _APART
+    return torch.cat([begun, begun[askew]]), torch.cat([ends, torch.where(laid, 0.0, ends[askew])])
 
 
 def _without(found: FinerFit, further: FitOutcome) -> FinerFit:

@@ -424,21 +424,53 @@ class TestFits:
             return Linearisation(torch.tensor([loss]).double(), slope[None], curvature[None], 1)
 
         way, steps = gauss_newton._Way(torch.zeros(2).double(), told(1e-3), 9), []
-        for part in (-1, -1, 1, 0, 0):  # of the predicted decrease
+        for part in (-1, -1, 1, 0.1, 0.4, 1, 1, 1, 1, 0, 0):  # of the predicted decrease
             tried = way.propose(-end, end)
             steps.append(float((tried - way.place).abs().max()))
             way.judge(tried, told(way.loss - part * way._predicted))
-        assert steps == pytest.approx([1.0, 0.2, 0.04, 0.12, 0.024])
+        assert steps == pytest.approx([1.0, 0.2, 0.04, 0.12, 0.06, 0.06, 0.18, 0.54, 1.0, 1.0, 0.2])
+        assert way.end is None
+
+    @pytest.mark.parametrize(
+        ("predicted", "part", "end"),
+        [(5e-5, 1, "converged"), (5e-4, 1, None), (5e-4, -1, "converged"), (5e-3, -1, None)],
+        ids=["little to gain", "enough to gain", "rough over that length", "a shorter step may help"],
+    )
+    def test_what_ends_a_way(self, predicted, part, end):
+        """By the predicted decrease, as a part of the loss, and what part of that a step brings."""
+        slope = torch.tensor([predicted / 2]).double()
+        flat = torch.tensor([[1e-9]]).double()
+        way = gauss_newton._Way(
+            torch.zeros(1).double(), Linearisation(torch.ones(1).double(), slope[None], flat[None], 1), 9
+        )
+        tried = way.propose(torch.full((1,), -9.0).double(), torch.full((1,), 9.0).double())
+        assert way._predicted == pytest.approx(predicted, rel=1e-3)
+        loss = torch.tensor([1.0 - part * way._predicted]).double()
+        way.judge(tried, Linearisation(loss, slope[None], flat[None], 1))
+        assert way.end == end
+
+    def test_where_no_step_lowers_a_loss_it_is_rough(self):
+        """However much is predicted."""
+        slope, curvature = torch.tensor([[0.5]]).double(), torch.eye(1).double()[None]
+        found = Linearisation(torch.ones(1).double(), slope, curvature, 1)
+        way, end, steps = gauss_newton._Way(torch.zeros(1).double(), found, 20), torch.ones(1).double(), 0
+        while way.end is None:
+            way.judge(way.propose(-9 * end, 9 * end), replace(found, losses=torch.full((1,), 2.0).double()))
+            steps += 1
+        assert (way.end, steps) == ("rough", 4)
 
     def test_a_start_that_is_not_about_to_be_of_use_is_given_up(self):
         """Nothing is looked for around its end, either."""
         settings = GaussNewtonSettings(starts=1, screen=0)
-        fits = [fit_gauss_newton(lifted(), SPACE, settings, of_use=loss) for loss in (math.inf, 1.0, -1.0)]
-        assert fits[0].values == fits[1].values
-        assert fits[0].simulations == fits[1].simulations
-        assert fits[0].scan is not None
-        assert fits[2].scan is None
-        assert fits[2].simulations < fits[0].simulations - len(SPACE.names)
+        whole = fit_gauss_newton(lifted(), SPACE, settings)
+        losses = [float(row[0]) for row in whole.history.losses]
+        within_reach = fit_gauss_newton(lifted(), SPACE, settings, of_use=(losses[0] + whole.loss) / 2)
+        assert (within_reach.values, within_reach.simulations) == (whole.values, whole.simulations)
+        assert whole.scan is not None
+        beyond = fit_gauss_newton(lifted(), SPACE, settings, of_use=0.5 * whole.loss)
+        assert beyond.scan is None
+        assert 1 < len(beyond.history.losses) < len(losses)
+        assert beyond.loss < losses[0]
 
     @pytest.mark.parametrize(
         ("second", "witnesses", "misfit", "order"),

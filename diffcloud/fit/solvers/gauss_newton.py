@@ -4,14 +4,13 @@ With half of the loss's slope g and of its curvature H on the axis of `residuals
 
     g·s + s·(H + λ diag H) s / 2     between the bounds, no component longer than a radius
 
-(Conn, Gould and Toint 2000, chapter 7; a trust region that is a box leaves the bounds what they are). A step that is
-computed without the bounds, and then cut off at one, may lead uphill: its other components were chosen to go with what was
-cut off. Each start keeps its own radius: it grows where a step brings at least half of the decrease that was predicted, and
-shrinks to a part of the step where it brings none. λ is small and stays. Where the damping λ takes the place of the radius
-(Marquardt 1963), it must first grow by several powers of ten before a step in vain becomes shorter, and each of them costs
-a simulation. Starts are the best of a screen of candidates spread over the box, the best one first. The remaining ones are
-not followed once one explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more
-and more of it; the other is a derivative-free search, from the best place so far, over the parameters asked for only. The
+(Conn, Gould and Toint 2000, chapter 7). The trust region is a box, so that it and the bounds together are a box again. A
+step that is computed without the bounds, and then cut off at one, may lead uphill: its other components were chosen to go
+with what was cut off. Each start keeps its own radius. It may grow where a step brings at least half of the decrease that
+was predicted, becomes half the step where it brings less than a quarter, and a fifth of it where it brings none. λ is small
+and stays. Starts are the best of a screen of candidates spread over the box, the best one first. The remaining ones are not
+followed once one explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and
+more of it; the other is a derivative-free search, from the best place so far, over the parameters asked for only. The
 search comes after three candidates. So do growing starts, but the first of them comes as soon as the best end is low enough
 for the model to be right (with a threshold, all of them come right after the first candidate). They also wait while an end
 from another candidate is as low as the best one.
@@ -49,19 +48,19 @@ ROUGH_SCREEN, ROUGH_STARTS = 96, 3
 """Candidates and starts where the loss is too rough for derivatives: there are more minima, a candidate costs a tenth, and
 a step takes several simulations."""
 _DAMPING = 1e-4
-"""λ, so that what the recording hardly tells moves little."""
+"""λ: combinations of variables that the recording hardly tells do not move far."""
 _LARGEST_STEP = 1.0
-"""On the axis: a factor e, or the whole range. The first radius, and the largest one."""
-_SHRINKS, _GROWS = 0.2, 3.0
-"""Times a step: the next radius where it was in vain, and where it brought enough."""
-_ENOUGH, _TOO_LITTLE = 0.5, 0.25
-"""Parts of the predicted decrease: from the first on, the next radius is larger; below the second, half the step."""
+"""On the axis: a factor e, a standard deviation, or the whole range. The first radius, and the largest one."""
+_GOOD, _POOR = 0.5, 0.25
+"""Parts of the predicted decrease that a good step brings, and that a poor one does not."""
+_GROWS, _HALVES, _SHRINKS = 3.0, 0.5, 0.2
+"""Times a step: the next radius after a good one, unless it is larger already, after a poor one, and after one in vain."""
 _LEAST_SPREAD = 1e-12
 """Of the matrix of a step, in its largest eigenvalue: below is rounding."""
 _SMALLEST_STEP = 1e-3
 """A step below 0.1 % of a value, or a predicted decrease below the first part of the loss, means that a start has arrived;
-below the second one, if it is not even a decrease: the loss is rougher than what is left to gain."""
-_SMALLEST_DECREASE, _IN_VAIN = 1e-4, 1e-3
+below the second one, if the step was in vain: over that length, the loss is rougher than its slope."""
+_SMALLEST_DECREASE, _SMALLEST_IN_VAIN = 1e-4, 1e-3
 _SAME = 0.02
 """A start that comes as close to a better one, on the axis, leaves the rest of the way to it."""
 _MOST = 8
@@ -90,8 +89,6 @@ _WITNESSES, _FEW_WITNESSES = _BEFORE + 1, 2
 where they nearly do, where it is not known what cameras missed, or where the model must be wrong."""
 _SCREENED = 0.5
 """Part of the frames on which candidates are compared: the rest costs as much again, and has more wrong minima."""
-_GIVE_UP = 6
-"""Steps in vain, one after the other: the loss is rougher than its slope."""
 _HOPE = 10.0
 """Steps like the next one; where not even so many would get below what is of use, a start is given up."""
 
@@ -164,7 +161,7 @@ def fit_gauss_newton(
             if way is not None:
                 tried = way.propose(*axis.ends)
                 if way.hopeless:
-                    way.arrived = True
+                    way.give_up()
                     continue
                 found = linearise(objective, space, tried[None])
                 simulations += found.simulations
@@ -261,7 +258,7 @@ class _Way:
         self._begin()
 
     def _begin(self) -> None:
-        self._steps, self._radius, self._in_vain = self._most, _LARGEST_STEP, 0
+        self._steps, self._radius, self._in_vain = self._most, _LARGEST_STEP, False
         self._predicted = 0.0
         self.arrived = False
 
@@ -274,14 +271,19 @@ class _Way:
         """Why it goes no further; None while it does."""
         if self.arrived:
             return "converged"
-        if self._in_vain >= _GIVE_UP or not math.isfinite(self.loss):
+        if self._radius < _SMALLEST_STEP or not math.isfinite(self.loss):
             return "rough"
         return None if self._steps else "iterations"
 
     @property
     def hopeless(self) -> bool:
-        """Whether many steps like the one that is proposed would not get below what is of use."""
-        return self.loss - _HOPE * self._predicted > self._of_use
+        """Whether many steps like the one that is proposed would not get below what is of use. A step in vain says nothing
+        of that, and neither does one with variables held."""
+        return not self._in_vain and self._held is None and self.loss - _HOPE * self._predicted > self._of_use
+
+    def give_up(self) -> None:
+        """Go no further."""
+        self.arrived = True
 
     def propose(self, low: Tensor, high: Tensor) -> Tensor:
         """[k] the next place, between the bounds [k]."""
@@ -301,18 +303,17 @@ class _Way:
         """Take the step if it lowered the loss, and set the radius for the next."""
         self._steps -= 1
         step, decrease = float((tried - self.place).abs().max()), self.loss - float(found.losses[0])
-        least = _SMALLEST_DECREASE if decrease > 0 else _IN_VAIN
+        self._in_vain = not decrease > 0
+        least = _SMALLEST_IN_VAIN if self._in_vain else _SMALLEST_DECREASE
         self.arrived = step < _SMALLEST_STEP or self._predicted < least * self.loss
-        if decrease > 0:
-            if decrease >= _ENOUGH * self._predicted:
-                self._radius = min(max(self._radius, _GROWS * step), _LARGEST_STEP)
-            elif decrease < _TOO_LITTLE * self._predicted:
-                self._radius = step / 2
-            self._in_vain = 0
-            self._take(tried, found)
-        else:
+        if self._in_vain:
             self._radius = _SHRINKS * step
-            self._in_vain += 1
+        elif decrease < _POOR * self._predicted:
+            self._radius = _HALVES * step
+        elif decrease >= _GOOD * self._predicted:
+            self._radius = min(max(self._radius, _GROWS * step), _LARGEST_STEP)
+        if not self._in_vain:
+            self._take(tried, found)
         if self._held is not None and self.end is not None and math.isfinite(self.loss):
             self._held = None
             self._begin()
