@@ -460,8 +460,8 @@ def finer_mesh_sentences(record: FitRecord, *, explains: bool) -> list[str]:
     if record.finer_loss is not None and not explains:
         rms_mm = 1e3 * record.length_unit_m * record.finer_loss**0.5
         lines.append(
-            f"A fit with half the edge length and half the step leaves a misfit of {rms_mm:.1f} mm RMS: the mesh is "
-            "probably not what the model lacks."
+            f"With half the edge length and half the step, the fit ended at a misfit of {rms_mm:.1f} mm RMS, or was given "
+            "up there: the mesh is probably not what the model lacks."
         )
     return lines
 

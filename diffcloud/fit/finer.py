@@ -46,7 +46,7 @@ class FinerFit:
     halvings: int
     """How often edges and step were halved."""
     finer_loss: float | None = None
-    """With priors, after one more halving, which was tried and hardly lowers it."""
+    """With priors, where a fit after one more halving, which hardly helped, ended or was given up."""
 
 
 def solve_and_refine(

@@ -227,8 +227,8 @@ class FitRecord(_Model):
     """How often edges and step of the scenario were halved, because what was coarser did not explain the recordings:
     parameters are of the mesh after that (`Scenario.halved`)."""
     finer_loss: NonNegative | None = None
-    """With priors, after one more halving, which was tried because this mesh does not explain the recordings, and hardly
-    lowers it."""
+    """With priors, where a fit after one more halving ended or was given up; it was tried because this mesh does not
+    explain the recordings, and hardly helped."""
     settings: dict[str, Annotated[int, Field(ge=0)] | bool | NonNegative | None]
     """Of the solver."""
     history: History
