@@ -154,13 +154,13 @@ def fit_gauss_newton(
             grown = partial(_grown, stages, space, places[best], settings, index, axis, tell)
             waiting.insert(best + 1, _Start(places[best], best, grown, grows=True))
     scans, looked = 0, None
-    ways = _Ways(waiting, settings.iterations, _laid(space, settings.init), of_use)
+    ways = _Ways(waiting, settings.iterations, _laid(space, settings.init))
     try:
         while True:
             way = ways.going
             if way is not None:
                 tried = way.propose(*axis.ends)
-                if way.hopeless:
+                if not way.may_get_below(of_use):
                     way.give_up()
                     continue
                 found = linearise(objective, space, tried[None])
@@ -235,13 +235,7 @@ class _Way:
     """From one start, at its lowest place so far."""
 
     def __init__(
-        self,
-        place: Tensor,
-        found: Linearisation,
-        steps: int,
-        origin: int = -1,
-        held: Tensor | None = None,
-        of_use: float = math.inf,
+        self, place: Tensor, found: Linearisation, steps: int, origin: int = -1, held: Tensor | None = None
     ) -> None:
         """
         Args:
@@ -250,9 +244,8 @@ class _Way:
             steps: it may take.
             origin: of its start.
             held: bool [k] what stays until it has arrived; then it goes on with all free, and as many steps again.
-            of_use: loss that it must be about to get below.
         """
-        self.origin, self._of_use = origin, of_use
+        self.origin = origin
         self._take(place, found)
         self._most, self._held = steps, held
         self._begin()
@@ -275,11 +268,10 @@ class _Way:
             return "rough"
         return None if self._steps else "iterations"
 
-    @property
-    def hopeless(self) -> bool:
-        """Whether many steps like the one that is proposed would not get below what is of use. A step in vain says nothing
-        of that, and neither does one with variables held."""
-        return not self._in_vain and self._held is None and self.loss - _HOPE * self._predicted > self._of_use
+    def may_get_below(self, loss: float) -> bool:
+        """Whether many steps like the one that is proposed would. A step in vain says nothing against it, and neither does
+        one with variables held."""
+        return self._in_vain or self._held is not None or self.loss - _HOPE * self._predicted <= loss
 
     def give_up(self) -> None:
         """Go no further."""
@@ -358,15 +350,14 @@ class _Enough:
 class _Ways:
     """From B starts, one after the other."""
 
-    def __init__(self, starts: Sequence[_Start], steps: int, held: Tensor, of_use: float = math.inf) -> None:
+    def __init__(self, starts: Sequence[_Start], steps: int, held: Tensor) -> None:
         """
         Args:
             starts: B, in their order.
             steps: each may take.
             held: bool [k] what the first one leaves as it is at first.
-            of_use: loss that each must be about to get below.
         """
-        self.waiting, self.every, self._steps, self._of_use = list(starts), list[_Way](), steps, of_use
+        self.waiting, self.every, self._steps = list(starts), list[_Way](), steps
         self._held = held if bool(held.any()) else None
         self._grown = 0
 
@@ -406,8 +397,7 @@ class _Ways:
 
     def begin(self, start: _Start, place: Tensor, found: Linearisation) -> None:
         """A start, at its place [k], with what was found there."""
-        held = None if self.every else self._held
-        self.every.append(_Way(place, found, self._steps, start.origin, held, self._of_use))
+        self.every.append(_Way(place, found, self._steps, start.origin, None if self.every else self._held))
 
     def judge(self, way: _Way, tried: Tensor, found: Linearisation) -> None:
         """As of the way; one that comes close to a better one leaves it the rest."""
@@ -417,8 +407,7 @@ class _Ways:
 
     def go_on(self, place: Tensor, found: Linearisation) -> None:
         """From a lower place [k] than the best one's."""
-        way = _Way(place, found, self._steps, self.best.origin, of_use=self._of_use)
-        self.every[self.every.index(self.best)] = way
+        self.every[self.every.index(self.best)] = _Way(place, found, self._steps, self.best.origin)
 
 
 def _starts(
