@@ -4,8 +4,9 @@ Variances come from `fit.uncertainty`. On the axis of the fit (a factor up and d
 both sides as far as the variance's root times the quantile of Student's t, with the degrees of freedom of Welch and
 Satterthwaite: the noise is estimated from few clusters, the stated doubts are not. The effect of the simulator's step size
 is known; how much of it a recording contains is not: all of it for a real cloth, none for a motion of this simulator. So
-the interval reaches further by the whole effect, to the side to which finer steps would move the fit. Intervals end at the
-bounds.
+the interval reaches further by the whole effect, to the side to which finer steps would move the fit. Where that is far,
+only one end of the interval can miss the truth. The quantile is the smallest with which the interval has its level for any
+part of the effect (Imbens and Manski 2004). Intervals end at the bounds.
 
 Gauss and Newton's next step, which the fit has not taken, is one of its sources. No interval is stated where a fit has not
 arrived: that step is far longer than the deviations, or a loss nearby is clearly lower. `restarts` lets the fit start again
@@ -24,7 +25,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
-from scipy.special import stdtrit
+from scipy.optimize import brentq
+from scipy.special import stdtr, stdtrit
 
 from diffcloud.errors import ConfigError
 from diffcloud.fit.joint import AnyObjective
@@ -381,8 +383,23 @@ def _reach(found: Uncertainty, row: NDArray[np.float64], level: float) -> tuple[
     width = 0.0
     if total > 0:
         freedom = max(found.clusters - 1, 1) / max(noise / total, 1e-6) ** 2
-        width = float(stdtrit(freedom, 0.5 + level / 2) * math.sqrt(total))
+        width = _quantile(freedom, abs(refined) / math.sqrt(total), level) * math.sqrt(total)
     return width + max(-refined, 0.0), width + max(refined, 0.0)
+
+
+def _quantile(freedom: float, length: float, level: float) -> float:
+    """Deviations c that an interval reaches beyond both ends of a range, so that it holds a truth at either end with this
+    probability.
+
+    Args:
+        freedom: degrees of freedom of Student's t.
+        length: of the range, in deviations. Of none, c is the two-sided quantile; of an endless one, the one-sided.
+    """
+
+    def too_much(c: float) -> float:
+        return float(stdtr(freedom, c + length) - stdtr(freedom, -c) - level)
+
+    return 0.0 if too_much(0.0) >= 0 else float(brentq(too_much, 0.0, 1.001 * stdtrit(freedom, 0.5 + level / 2)))
 
 
 def _ends(space: FitSpace, index: int, value: float, reach: tuple[float, float]) -> tuple[float, float, list[float]]:

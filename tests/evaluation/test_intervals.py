@@ -72,13 +72,20 @@ class TestEnds:
 
     def test_they_reach_further_to_where_finer_steps_have_it(self, told):
         found = told({"noise": np.zeros((2, 2)), "z": np.diag([0.04, 0.01])}, refined=[-0.3, 0.1])
-        width, entry, other = 0.2 * norm.ppf(0.95), found.parameters["stretch"], found.parameters["mass"]
-        assert math.log(entry.high / entry.value) == pytest.approx(width, rel=1e-6)
+        entry, other, ratio = found.parameters["stretch"], found.parameters["mass"], found.ratio
+        width = math.log(entry.high / entry.value)
         assert math.log(entry.value / entry.low) == pytest.approx(width + 0.3, rel=1e-6)
         assert entry.factor == pytest.approx(entry.value / entry.low)
-        assert math.log(other.high / other.value) == pytest.approx(width / 2 + 0.1, rel=1e-6)
-        assert math.log(found.ratio.value / found.ratio.low) == pytest.approx(math.hypot(width, width / 2) + 0.4, rel=1e-6)
-        assert math.log(found.ratio.high / found.ratio.value) == pytest.approx(math.hypot(width, width / 2), rel=1e-6)
+        assert math.log(other.high / other.value) - math.log(other.value / other.low) == pytest.approx(0.1, rel=1e-6)
+        assert math.log(ratio.value / ratio.low) - math.log(ratio.high / ratio.value) == pytest.approx(0.4, rel=1e-6)
+
+    @pytest.mark.parametrize("moved", [0.0, 1e-3, 0.1, 0.3, 2.0])
+    def test_they_hold_a_truth_at_either_end_of_that_reach_as_often_as_they_say(self, told, moved):
+        entry = told({"noise": np.zeros((2, 2)), "z": np.diag([0.04, 0.01])}, refined=[moved, 0.0]).parameters["stretch"]
+        below, above = math.log(entry.value / entry.low), math.log(entry.high / entry.value)
+        for truth in (0.0, moved):  # where fits scatter around 0
+            held = norm.cdf(truth + below, scale=0.2) - norm.cdf(truth - above, scale=0.2)
+            assert held == pytest.approx(0.9, abs=1e-9)
 
     def test_they_stop_at_the_bounds(self, told):
         entry = told({"noise": np.diag([25.0, 25.0])}).parameters["stretch"]
