@@ -12,6 +12,7 @@ What is rendered is not what a mask is made of (`arm_body`), and the joint log i
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from diffcloud.errors import EpisodeError
+from diffcloud.errors import EpisodeError, RobotError
 from diffcloud.io.arrays import read_npz
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.clouds import import_open3d
@@ -43,6 +44,8 @@ STARTED_AT = "2000-01-01T00:00:00.000+00:00"
 
 _DOWN = np.diag([1.0, -1.0, -1.0])
 """The gripper points down, its fingers on both sides of the cloth along x."""
+_LEANS_DEG = (0.0, 10.0, 20.0, 30.0)
+"""By which it points outwards instead, during all of a motion that goes too high for a gripper that points down."""
 _GRASP_M = 0.071
 """From the tool's frame to where the fingers' ends hold the cloth, along the tool's z."""
 _GRIPPER_CLOSED = 1.0
@@ -169,7 +172,7 @@ def record(
 
     Raises:
         EpisodeError: the folder exists.
-        RobotError: the cloth's path is out of the arm's reach.
+        RobotError: the cloth's path is out of the arm's reach, however the gripper leans.
     """
     settings = settings or RecorderSettings()
     rng, others = np.random.default_rng(seed), np.random.default_rng([seed, 1])
@@ -177,7 +180,7 @@ def record(
     placement = _laid_beside(settings, motion.nodes, others)
     nodes = placement.to_world(motion.nodes)
     held = nodes[:, list(motion.grasped)].mean(axis=1)
-    joints = robot.inverse_kinematics(held - _GRASP_M * _DOWN[:, 2], rotations=_DOWN)
+    joints = _holding(robot, held)
     poses = robot.forward_kinematics(robot.configuration(joints, _GRIPPER_CLOSED))
     scene = _Scene(robot, motion.faces, _table(motion, settings), settings, np.array(cloth_color, dtype=np.float64), rng)
     moved = _motion(*settings.cameras_moved, nodes, others)
@@ -215,6 +218,25 @@ def record(
     write_json(folder / "truth" / "cameras.json", {"T_world_camera": true, "scene_in_world": asdict(placement)})
     cloth = {"nodes": nodes, "faces": motion.faces, "times": motion.times}
     write_npz(folder / "truth" / "cloth.npz", compressed=False, **cloth)
+
+
+def _holding(robot: Robot, held: Floats) -> Floats:
+    """[T, J] joint angles of an arm whose gripper holds what is at [T, 3], pointing down if it can.
+
+    Raises:
+        RobotError: out of reach.
+    """
+    x, y, _ = held.mean(axis=0)
+    sideways = np.array([y, -x, 0.0]) / np.hypot(x, y)
+
+    def leaning(degrees: float) -> Floats:
+        rotation = Rotation.from_rotvec(np.radians(degrees) * sideways).as_matrix() @ _DOWN
+        return robot.inverse_kinematics(held - _GRASP_M * rotation[:, 2], rotations=rotation)
+
+    for degrees in _LEANS_DEG[:-1]:
+        with contextlib.suppress(RobotError):
+            return leaning(degrees)
+    return leaning(_LEANS_DEG[-1])
 
 
 class _Scene:

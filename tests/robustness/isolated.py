@@ -55,8 +55,10 @@ def read_alone(folder: Path, read: Callable[[], None]) -> Outcome:
         status, usage, hung = _wait(child, began + SECONDS)
         seconds = time.monotonic() - began
         told.seek(0)
-        text = " ".join(told.read().decode(errors="replace").split())
-    taken = max(0.0, usage.ru_maxrss / 1024 - psutil.Process().memory_info().rss / 1e6)
+        first, _, rest = told.read().partition(b"\n")
+        text = " ".join(rest.decode(errors="replace").split())
+    # as the fork counted it: pages of libraries, of which this process has many, are not its own until it uses them
+    taken = max(0.0, 1024 * usage.ru_maxrss - int(first)) / 1e6
     code = os.waitstatus_to_exitcode(status)
     left = sorted(str(path.relative_to(folder)) for path in set(folder.rglob("*")) - before)
     for name in left:  # the next reading begins as this one did
@@ -82,8 +84,9 @@ def _run(folder: Path, read: Callable[[], None], told: int) -> None:
         os.chdir(folder)
         os.dup2(told, 1)
         os.dup2(told, 2)
-        mapped = psutil.Process().memory_info().vms
-        resource.setrlimit(resource.RLIMIT_AS, (mapped + _RESERVE,) * 2)
+        memory = psutil.Process().memory_info()
+        os.write(told, b"%d\n" % memory.rss)
+        resource.setrlimit(resource.RLIMIT_AS, (memory.vms + _RESERVE,) * 2)
         try:
             read()
             code = 0

@@ -110,6 +110,21 @@ class TestRecording:
         )  # rows are 25 ms apart, and the arm is at full speed after 0.1 s
         assert np.linalg.norm(stated - corrected, axis=1)[1:-1].min() > 0.005  # at rest as it starts and ends
 
+    @pytest.mark.parametrize(("height", "leans"), [(0.40, 0.0), (0.46, 10.0), (0.50, 20.0)])
+    def test_where_it_cannot_point_down_the_gripper_leans(self, height, leans, tmp_path):
+        high = smooth_motion(((0.0, 0.0, 0.0), (0.0, -0.14, height)))
+        raw = read_raw_episode(write_recorded_episode(tmp_path / "lift", seen=high, size=(64, 48)))
+        tool = gen3().tool_pose(joints_at(raw.robot, high.times, lag_s=0.02)[0])
+        held = raw.placement.to_world(high.nodes[:, high.grasped[0]])
+        np.testing.assert_allclose(tool[:, :3, 3] + 0.071 * tool[:, :3, 2], held, atol=1e-3)
+        assert np.degrees(np.arccos(-tool[:, 2, 2])) == pytest.approx(leans, abs=0.1)
+        assert (tool[:, :2, 2] * held[:, :2]).sum(axis=1).min() > -0.01  # outwards
+
+    def test_what_no_gripper_reaches_is_an_error(self, tmp_path):
+        with pytest.raises(RobotError, match="does not reach"):
+            write_recorded_episode(tmp_path / "lift", seen=smooth_motion(((0.0, 0.0, 0.0), (0.0, 0.0, 0.9))))
+        assert not list(tmp_path.iterdir())
+
     def test_between_the_images_the_logged_arm_moves_smoothly(self, tmp_path):
         coarse, fine = (smooth_motion(LIFT, frames=frames) for frames in (26, 101))
         raw = read_raw_episode(write_recorded_episode(tmp_path / "lift", seen=coarse, size=(64, 48)))
