@@ -45,7 +45,7 @@ test-slow: venv
 	$(TESTS) -m "slow and not realtime"
 	python -m pytest -m realtime tests/hardware
 
-# minutes each on a slow machine: the lag in sixteen recordings, and identifying two more MuJoCo towels
+# minutes each on a slow machine: the lag in sixteen recordings, identifying two more MuJoCo towels, and an export that Newton runs
 test-longest: venv
 	$(TESTS) -m longest
 

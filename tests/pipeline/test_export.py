@@ -129,9 +129,10 @@ class TestRefusals:
         assert "holds intervals of stretch; the fit is of stretch, bending" in invoke(*command, code=1).errors
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("target", ["mujoco", "newton"])
+@pytest.mark.parametrize(
+    "target", [pytest.param("mujoco", marks=pytest.mark.slow), pytest.param("newton", marks=pytest.mark.longest)]
+)
 def test_the_export_runs_and_moves_as_fitted(target, tmp_path, monkeypatch):
     """A lift of two and a half seconds; in the last half second the cloth swings free."""
     pytest.importorskip(target)

@@ -22,9 +22,8 @@ def tried(*arguments: object) -> None:
 
 
 def test_a_sample_of_damaged_files_and_disturbed_commands():
-    """One of each kind of file; one disturbance each of two commands."""
-    commands = [part for name in ("fit", "export") for part in ("--command", name)]
-    tried("--only", "inputs", "--only", "faults", "--sample", 1, "--sample-faults", 1, *commands, "--workers", 2)
+    """One of each kind of file; one disturbance of a command."""
+    tried("--only", "inputs", "--only", "faults", "--sample", 1, "--sample-faults", 1, "--command", "fit", "--workers", 2)
 
 
 def test_a_moving_arm_is_stopped_and_what_was_recorded_is_kept():
