@@ -276,7 +276,7 @@ def _remark(objective: AnyObjective, found: Uncertainty) -> str:
         return ""
     return (
         f"the loss is {excess:.1f} times what noise and spacing of the points leave, and a right fit of an exact "
-        "model stays below about 1.15 times: the fit may have ended in a wrong minimum, or the model lacks something"
+        "model stays below about 1.25 times: the fit may have ended in a wrong minimum, or the model lacks something"
     )
 
 

@@ -223,7 +223,7 @@ def test_intervals_know_what_it_leaves_open(objective, fits):
     assert {"turn", "shape"} <= found.besides
 
 
-def test_one_start_has_it_wait_and_others_do_not(objective, fits):
+def test_one_start_has_it_wait_and_others_do_not(objective, fits, monkeypatch):
     """Else more minima are wrong; and a cloth that lies askew would always be taken for another material first."""
     (stretch, turn), (_, _, outcome) = (SPACE.names.index(name) for name in ("stretch", "turn")), fits[1]
     first = torch.stack([values[0] for values in outcome.history.values])
@@ -235,6 +235,7 @@ def test_one_start_has_it_wait_and_others_do_not(objective, fits):
     alone = with_laid(ASKED, [{"turn": 0.1}], [SCENARIO])
     settings = GaussNewtonSettings(starts=1, screen=0, scans=0, iterations=1, init={"stretch": 1.0})
     assert fit_gauss_newton(objective, alone, settings).values["turn"] != 0  # fewer steps so, and no worse ends
+    monkeypatch.setattr(type(objective), "explained", 0.0)  # so that the second one is followed
     settings = GaussNewtonSettings(starts=2, screen=0, scans=0, iterations=3)
     second = torch.stack([values[1] for values in fit_gauss_newton(objective, SPACE, settings).history.values])
     assert second[-1, turn] != 0

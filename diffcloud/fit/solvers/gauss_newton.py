@@ -11,13 +11,12 @@ was predicted, becomes half the step where it brings less than a quarter, and a 
 and stays. Starts are the best of a screen of candidates spread over the box, the best one first. The remaining ones are not
 followed once one explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and
 more of it; the other is a derivative-free search, from the best place so far, over the parameters asked for only. The
-search comes after three candidates. So do growing starts, but the first of them comes as soon as the best end is low enough
-for the model to be right (with a threshold, all of them come right after the first candidate). They also wait while an end
-from another candidate is as low as the best one.
-Four equally low ends are taken for the minimum although they do not explain the recording; two are, where their loss is
-hardly above what does, or so high that the model must be wrong, or where it is not known what cameras missed. Unless the
-recording is explained, losses along the principal axes of the best place then tell whether another minimum is lower nearby;
-from there it goes on.
+search comes after three candidates. So do growing starts, but the first of them comes after two where the best end is low
+enough for the model to be right (with a threshold, all of them come right after the first candidate). They also wait while
+an end from another candidate is as low as the best one.
+Four equally low ends are taken for the minimum although they do not explain the recording; two are, where their loss is so
+high that the model must be wrong, or where it is not known what cameras missed. Unless the recording is explained, losses
+along the principal axes of the best place then tell whether another minimum is lower nearby; from there it goes on.
 """
 
 from __future__ import annotations
@@ -67,26 +66,26 @@ _MOST = 8
 """Candidates that are followed, unless fewer are enough."""
 _BEFORE, _SEARCHED = 3, 64
 """Candidates that are followed before a search looks for one more start, and how many places that search simulates."""
-_GROWING = (0.5, 0.75), (0.4, 0.6, 0.8)
-"""For each start that is found so, the parts of the frames over which the recording grows. Where one of them goes astray at
-the end, the other seldom does."""
+_SOON = 2
+"""The same before the first start by a growing recording, where the best end is low enough for the model to be right."""
 _DRAWS = 16
-"""Places that are drawn before each next part, around where the part before ended."""
+"""Places that are drawn before each next part of a growing recording, around where the part before ended."""
+_GROWING = ((0.4, 0.6, 0.8), 0), ((0.5, 0.75), _DRAWS), ((0.4, 0.6, 0.8), _DRAWS)
+"""For each start that is found so, the parts of the frames over which the recording grows, and how many places are drawn.
+The first one takes a fifth of the others' simulations. Where one goes astray at the end, another seldom does."""
 _WIDENING = (1.0, 2.0, 4.0)
 """Times the deviations of what is known so far, one after the other, while no draw is low enough: where a motion may go on
 in two ways, the right one may be rare, and a beginning may have gone astray itself."""
-_LOW_ENOUGH, _AS_LOW = 1.1, 1.3
-"""Times what explains the frames; where that is not known, or the part before did not, times what that ended at."""
-_MISFIT = 30.0
+_AS_LOW = 1.3
+"""Times what the part before ended at, where that did not explain its frames, or it is not known what would."""
+_MISFIT = 26.0
 """Times what explains a recording; above that, it is the model that does not: no start will."""
-_NEARLY = 1.1
-"""Times what explains a recording; below that, a loss is lower than that of most wrong minima."""
 EQUALLY, _ABOUT_EQUALLY = 1.01, 1.05
 """Losses within the first factor are equally low; within the second one, where the model must be wrong: what it cannot do
 weighs more than such a difference."""
 _WITNESSES, _FEW_WITNESSES = _BEFORE + 1, 2
 """Equally low ends of different candidates that are taken for the minimum although they do not explain the recording; fewer
-where they nearly do, where it is not known what cameras missed, or where the model must be wrong."""
+where it is not known what cameras missed, or where the model must be wrong."""
 _SCREENED = 0.5
 """Part of the frames on which candidates are compared: the rest costs as much again, and has more wrong minima."""
 _HOPE = 10.0
@@ -150,8 +149,8 @@ def fit_gauss_newton(
         search = _Start(places[0], -1, lambda: _searched(objective, space, ways.best, settings.seed, axis, tell))
         waiting.insert(_BEFORE, search)
         best = 1 if settings.init else 0  # of the screen; a first start that was given says little
-        for index, stages in reversed(list(enumerate(_growths(objective)))):
-            grown = partial(_grown, stages, space, places[best], settings, index, axis, tell)
+        for index, (stages, draws) in reversed(list(enumerate(_growths(objective)))):
+            grown = partial(_grown, stages, draws, space, places[best], settings, index, axis, tell)
             waiting.insert(best + 1, _Start(places[best], best, grown, grows=True))
     scans, looked = 0, None
     ways = _Ways(waiting, settings.iterations, _laid(space, settings.init))
@@ -329,22 +328,21 @@ class _Enough:
 
     explained: float
     """One end at or below this loss (the threshold, if given) is enough."""
-    nearly: float
-    """Up to this loss, `_FEW_WITNESSES` equally low ends are enough."""
     misfit: float
-    """Above this one, too: the model must be wrong. Zero where it is not known what cameras missed."""
+    """Above this one, `_FEW_WITNESSES` equally low ends are enough: the model must be wrong. Zero where it is not known
+    what cameras missed."""
     witnesses: float
-    """Equally low ends that are needed in between."""
+    """Equally low ends that are needed below."""
 
     @staticmethod
     def of(objective: AnyObjective, settings: GaussNewtonSettings) -> _Enough:
         known = objective.explained
         if settings.threshold:  # something is lower
-            return _Enough(settings.threshold, 0.0, math.inf, math.inf)
+            return _Enough(settings.threshold, math.inf, math.inf)
         misfit = _MISFIT * known if objective.knows_gaps else 0.0
         if settings.starts:  # so many are to be followed
-            return _Enough(known, 0.0, misfit, math.inf)
-        return _Enough(known, _NEARLY * known, misfit, _WITNESSES)
+            return _Enough(known, misfit, math.inf)
+        return _Enough(known, misfit, _WITNESSES)
 
 
 class _Ways:
@@ -375,15 +373,15 @@ class _Ways:
         """Whether the best one explains the recording, or enough others have ended as low."""
         if not self.every or not math.isfinite(self.best.loss):
             return False
-        needed = when.witnesses if when.nearly < self.best.loss <= when.misfit else _FEW_WITNESSES
+        needed = when.witnesses if self.best.loss <= when.misfit else _FEW_WITNESSES
         return self.best.loss <= when.explained or len(self._witnesses(when)) >= needed
 
     def following(self, when: _Enough) -> _Start:
         """The next start. Where some equal ends would be enough, those that grow wait until three others were followed, and
-        while the best end is not alone. The first of them need not wait for three once the best end is low enough for the
+        while the best end is not alone. The first of them waits for two only where the best end is low enough for the
         model to be right."""
         soon = bool(self.every) and not self._grown and self.best.loss <= when.misfit
-        early = len(self.every) - self._grown < (1 if soon else _BEFORE)
+        early = len(self.every) - self._grown < (_SOON if soon else _BEFORE)
         grows = not (early or len(self._witnesses(when)) > 1)
         fitting = (place for place, start in enumerate(self.waiting) if start.grows == grows)
         start = self.waiting.pop(next(fitting, 0) if math.isfinite(when.witnesses) else 0)
@@ -449,18 +447,20 @@ def _searched(
     return axis.places(torch.tensor([whole[name] for name in space.names], dtype=torch.float64)), found.simulations
 
 
-def _growths(objective: AnyObjective) -> list[list[AnyObjective]]:
-    """For each of `_GROWING`, the recordings as they grow, up to the whole; none where there are too few frames."""
-    growths = dict[tuple[int, ...], list[AnyObjective]]()
-    for parts in _GROWING:
+def _growths(objective: AnyObjective) -> list[tuple[list[AnyObjective], int]]:
+    """For each of `_GROWING`, the recordings as they grow, up to the whole, and how many places to draw; none where there
+    are too few frames."""
+    growths = dict[tuple[tuple[int, ...], int], list[AnyObjective]]()
+    for parts, draws in _GROWING:
         stages = {_frames(one): one for one in (*(objective.until(part) for part in parts), objective)}
         if len(stages) > 1:
-            growths.setdefault(tuple(stages), list(stages.values()))
-    return list(growths.values())
+            growths.setdefault((tuple(stages), draws), list(stages.values()))
+    return [(stages, draws) for (_, draws), stages in growths.items()]
 
 
 def _grown(
     stages: Sequence[AnyObjective],
+    draws: int,
     space: FitSpace,
     place: Tensor,
     settings: GaussNewtonSettings,
@@ -475,6 +475,7 @@ def _grown(
 
     Args:
         stages: the recordings as they grow; on the last one, the whole, the descent is the caller's.
+        draws: places drawn between two stages; 0: it goes on from where it is.
         place: [k]
         stream: number of the random stream.
     """
@@ -491,8 +492,10 @@ def _grown(
             way.judge(tried, found)
         if not math.isfinite(way.loss):
             break
-        place, spent = _goes_on(way, early, later, space, axis, generator, tell)
-        simulations += spent
+        place = way.place
+        if draws:
+            place, spent = _goes_on(way, early, later, space, axis, draws, generator, tell)
+            simulations += spent
     return place, simulations
 
 
@@ -502,6 +505,7 @@ def _goes_on(
     later: AnyObjective,
     space: FitSpace,
     axis: Axis,
+    draws: int,
     generator: torch.Generator,
     tell: Callable[[], None],
 ) -> tuple[Tensor, int]:
@@ -511,12 +515,12 @@ def _goes_on(
     Args:
         early, later: the recordings on which the way went, and those that come next.
     """
-    explains = later.knows_gaps and way.loss <= _LOW_ENOUGH * early.explained
-    enough = _LOW_ENOUGH * later.explained if explains else _AS_LOW * way.loss
+    explains = later.knows_gaps and way.loss <= early.explained
+    enough = later.explained if explains else _AS_LOW * way.loss
     place, lowest, simulations, tried = way.place, math.inf, 0, way.place[None]
     for widening in _WIDENING:
         tell()
-        tried = torch.cat([tried, _drawn(way, len(early.members), axis, widening, generator)])
+        tried = torch.cat([tried, _drawn(way, draws, len(early.members), axis, widening, generator)])
         losses = batch_losses(later, space, axis.bounded(tried))
         simulations += len(tried) * len(early.members)
         if float(losses.min()) < lowest:
@@ -527,7 +531,7 @@ def _goes_on(
     return place, simulations
 
 
-def _drawn(way: _Way, recordings: int, axis: Axis, widening: float, generator: torch.Generator) -> Tensor:
+def _drawn(way: _Way, draws: int, recordings: int, axis: Axis, widening: float, generator: torch.Generator) -> Tensor:
     """[n, k] places drawn from what a way's end says of all variables (`fit.priors`: the logarithm of the loss), with so
     many times its deviations.
 
@@ -536,8 +540,8 @@ def _drawn(way: _Way, recordings: int, axis: Axis, widening: float, generator: t
     """
     spread, axes = torch.linalg.eigh(way.normal)
     reach = (way.loss / (INDEPENDENT * recordings * spread.clamp(min=max(1e-9 * float(spread[-1]), 1e-300)))).sqrt()
-    lengths = widening * reach * torch.randn(_DRAWS, len(reach), generator=generator, dtype=torch.float64)
-    places = way.place.expand(_DRAWS, -1)
+    lengths = widening * reach * torch.randn(draws, len(reach), generator=generator, dtype=torch.float64)
+    places = way.place.expand(draws, -1)
     for along, direction in zip(lengths.T.flip(0), axes.T.flip(0), strict=True):
         step = along[:, None] * direction
         forth, back = (axis.room(places, sign * step).clamp(max=1.0) for sign in (1, -1))
