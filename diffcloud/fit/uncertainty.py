@@ -9,8 +9,8 @@ and s_i what pair i adds to half of its slope. A disturbance that adds g to the 
 
 Residuals of one place on the cloth have much in common, over both directions and all frames: an edge that curls, a fold in
 the wrong place. So pairs are clustered by place. A misfit that the recording's own noise does not explain is inside of the
-residuals, and widens the interval with them. More than that: the part e of the loss that is above what explains the
-recording has a cause which nobody stated, and which all C clusters may share. So their variance counts 1 + e (C - 1) times.
+residuals, and widens the interval with them. More than that: the part e of the loss that is above what noise explains
+has a cause which nobody stated, and which all C clusters may share. So their variance counts 1 + e (C - 1) times.
 
 Doubtful material (`fit.doubts`) and the pose (`fit.pose`) are fitted too, and the prior of each is a source. Other doubts
 are what the fit takes for known: what of the pose is not free. The size of the simulator's step moves the fit to one side;
@@ -59,6 +59,8 @@ _ROUGH = 4.0
 _CHUNK = 16
 """Motions matched together."""
 _PATCHES = 16
+_SCATTER = 1.1
+"""Times the estimated loss of a right motion: fits that lack nothing end below."""
 _NOISE_M = 0.002
 """Of recorded points whose own uncertainty is not stated."""
 
@@ -325,7 +327,7 @@ def _times(objective: Objective, loss: float, scores: NDArray[np.float64]) -> fl
     once where it is not known what the recording misses, and thus what explains it."""
     if not objective.knows_gaps:
         return 1.0
-    above, clusters = max(1 - objective.explained / loss, 0.0), int((np.abs(scores).max(axis=1) > 0).sum())
+    above, clusters = max(1 - _SCATTER * objective.noise_loss / loss, 0.0), int((np.abs(scores).max(axis=1) > 0).sum())
     return float(np.sqrt(1 + above * max(clusters - 1, 0)))
 
 

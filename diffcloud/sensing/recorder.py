@@ -45,7 +45,7 @@ STARTED_AT = "2000-01-01T00:00:00.000+00:00"
 _DOWN = np.diag([1.0, -1.0, -1.0])
 """The gripper points down, its fingers on both sides of the cloth along x."""
 _LEANS_DEG = (0.0, 10.0, 20.0, 30.0)
-"""By which it points outwards instead, during all of a motion that goes too high for a gripper that points down."""
+"""Angles by which it points outwards; the first at which the arm can hold the cloth during the whole motion is taken."""
 _GRASP_M = 0.071
 """From the tool's frame to where the fingers' ends hold the cloth, along the tool's z."""
 _GRIPPER_CLOSED = 1.0

@@ -79,13 +79,20 @@ class TestEnds:
         assert math.log(other.high / other.value) - math.log(other.value / other.low) == pytest.approx(0.1, rel=1e-6)
         assert math.log(ratio.value / ratio.low) - math.log(ratio.high / ratio.value) == pytest.approx(0.4, rel=1e-6)
 
-    @pytest.mark.parametrize("moved", [0.0, 1e-3, 0.1, 0.3, 2.0])
+    @pytest.mark.parametrize("moved", [0.0, 1e-3, 0.1, 0.3, 1.5])
     def test_they_hold_a_truth_at_either_end_of_that_reach_as_often_as_they_say(self, told, moved):
-        entry = told({"noise": np.zeros((2, 2)), "z": np.diag([0.04, 0.01])}, refined=[moved, 0.0]).parameters["stretch"]
-        below, above = math.log(entry.value / entry.low), math.log(entry.high / entry.value)
-        for truth in (0.0, moved):  # where fits scatter around 0
-            held = norm.cdf(truth + below, scale=0.2) - norm.cdf(truth - above, scale=0.2)
-            assert held == pytest.approx(0.9, abs=1e-9)
+        known = told({"noise": np.zeros((2, 2)), "z": np.diag([0.04, 0.01])}, refined=[moved, -moved / 4])
+        few = told({"noise": np.diag([0.04, 0.01])}, refined=[moved, 0.0], clusters=5)
+        for entry, scale, far, law in (
+            (known.parameters["stretch"], 0.2, moved, norm),
+            (known.parameters["mass"], 0.1, -moved / 4, norm),
+            (known.ratio, math.hypot(0.2, 0.1), 1.25 * moved, norm),
+            (few.parameters["stretch"], 0.2, moved, t(4)),
+        ):
+            below, above = math.log(entry.value / entry.low), math.log(entry.high / entry.value)
+            for truth in (0.0, far):  # where fits scatter around 0
+                held = law.cdf((truth + below) / scale) - law.cdf((truth - above) / scale)
+                assert held == pytest.approx(0.9, abs=1e-6)
 
     def test_they_stop_at_the_bounds(self, told):
         entry = told({"noise": np.diag([25.0, 25.0])}).parameters["stretch"]

@@ -255,7 +255,7 @@ class TestFits:
         assert followed == [2, 3]
 
     @pytest.mark.parametrize("measure", [{"nuisance": {}}, {"paper": True}], ids=["all frames", "one frame"])
-    def test_where_the_first_start_explains_too_little_the_next_two_begin_with_the_first_frames(self, monkeypatch, measure):
+    def test_where_the_first_start_explains_too_little_three_begin_with_the_first_frames(self, monkeypatch, measure):
         """A recording of one frame has no beginning."""
         monkeypatch.setattr(Objective, "knows_gaps", True)
         monkeypatch.setattr("diffcloud.fit.solvers.gauss_newton._MOST", 1)
@@ -356,6 +356,7 @@ class TestFits:
             levels = {len(stages[0].frames): early * known, len(stages[1].frames): later * known}
             monkeypatch.setattr(Objective, "explained", property(lambda self, levels=levels: levels[len(self.frames)]))
             spent.append(gauss_newton._grown(stages, 16, SPACE, place, settings, 0, Axis.of(SPACE), lambda: None)[1])
+        gauss_newton._grown(stages, 0, SPACE, place, settings, 0, Axis.of(SPACE), lambda: None)  # draws none
         assert widths == [1.0, 1.0, 2.0, 4.0, 1.0]
         assert spent[1] - spent[0] == 2 * 16
         assert spent[2] == spent[0]
@@ -383,7 +384,8 @@ class TestFits:
         [
             ({}, True, 0.9, True),
             ({}, True, 1.05, False),
-            ({}, True, 31.0, True),  # the model must be wrong
+            ({}, True, 25.0, False),
+            ({}, True, 27.0, True),  # the model must be wrong
             ({}, False, 1.2, True),
             ({"starts": 4}, True, 1.05, False),
             ({"starts": 4}, True, 0.9, True),

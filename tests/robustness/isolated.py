@@ -56,9 +56,10 @@ def read_alone(folder: Path, read: Callable[[], None]) -> Outcome:
         seconds = time.monotonic() - began
         told.seek(0)
         first, _, rest = told.read().partition(b"\n")
+        began_with, rest = (int(first), rest) if first.isdigit() else (0, first + b" " + rest)
         text = " ".join(rest.decode(errors="replace").split())
     # as the fork counted it: pages of libraries, of which this process has many, are not its own until it uses them
-    taken = max(0.0, 1024 * usage.ru_maxrss - int(first)) / 1e6
+    taken = max(0.0, 1024 * usage.ru_maxrss - began_with) / 1e6
     code = os.waitstatus_to_exitcode(status)
     left = sorted(str(path.relative_to(folder)) for path in set(folder.rglob("*")) - before)
     for name in left:  # the next reading begins as this one did

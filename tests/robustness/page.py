@@ -16,7 +16,8 @@ _HEAD = """# Damaged inputs and faults
 
 `make robustness` makes a small project with the outputs of all stages, damages its files one at a time, and reads each
 with the command that takes it. It disturbs each command in the middle of its work and runs it again, and it makes things
-go wrong while an arm moves. A fixed sample of each is part of the slow tests. The code is in `tests/robustness/`.
+go wrong while an arm moves. A small fixed sample (of commands, `fit` alone) is part of the slow tests. The code is in
+`tests/robustness/`.
 
 ## Damaged files
 

@@ -21,7 +21,7 @@ def tried(*arguments: object) -> None:
     assert done.returncode == 0, done.stdout + done.stderr[-3000:]
 
 
-def test_a_sample_of_damaged_files_and_disturbed_commands():
+def test_a_sample_of_damaged_files_and_a_disturbed_command():
     """One of each kind of file; one disturbance of a command."""
     tried("--only", "inputs", "--only", "faults", "--sample", 1, "--sample-faults", 1, "--command", "fit", "--workers", 2)
 

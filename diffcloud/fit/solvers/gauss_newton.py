@@ -67,7 +67,7 @@ _MOST = 8
 _BEFORE, _SEARCHED = 3, 64
 """Candidates that are followed before a search looks for one more start, and how many places that search simulates."""
 _SOON = 2
-"""The same before the first start by a growing recording, where the best end is low enough for the model to be right."""
+"""Candidates followed before the first growing start where the best end is low enough for the model to be right."""
 _DRAWS = 16
 """Places that are drawn before each next part of a growing recording, around where the part before ended."""
 _GROWING = ((0.4, 0.6, 0.8), 0), ((0.5, 0.75), _DRAWS), ((0.4, 0.6, 0.8), _DRAWS)
@@ -77,7 +77,7 @@ _WIDENING = (1.0, 2.0, 4.0)
 """Times the deviations of what is known so far, one after the other, while no draw is low enough: where a motion may go on
 in two ways, the right one may be rare, and a beginning may have gone astray itself."""
 _AS_LOW = 1.3
-"""Times what the part before ended at, where that did not explain its frames, or it is not known what would."""
+"""Times the loss at which the part before ended, if that did not explain its frames, or it is not known what would."""
 _MISFIT = 26.0
 """Times what explains a recording; above that, it is the model that does not: no start will."""
 EQUALLY, _ABOUT_EQUALLY = 1.01, 1.05
@@ -105,7 +105,7 @@ class GaussNewtonSettings:
     screen: int = 24
     """Candidates beside the first that are simulated once, without derivatives; 0: the starts are taken unseen."""
     starts: int | None = None
-    """The best of them, followed one after the other as far as it takes; by default 8, two found by letting the recording
+    """The best of them, followed one after the other as far as it takes; by default 8, three found by letting the recording
     grow, and one that a search finds."""
     seed: int = 0
     """Of the candidates."""
@@ -223,7 +223,7 @@ class _Start:
     """The candidate that it comes from; -1: none."""
     look: Callable[[], tuple[Tensor, int]] | None = None
     grows: bool = False
-    """Whether it is looked for by letting the recording grow, which takes longest."""
+    """Whether it is looked for by letting the recording grow, which takes long, above all with draws."""
 
     def found(self) -> tuple[Tensor, int]:
         """The start [k], and how many simulations it took to find it."""
@@ -332,7 +332,7 @@ class _Enough:
     """Above this one, `_FEW_WITNESSES` equally low ends are enough: the model must be wrong. Zero where it is not known
     what cameras missed."""
     witnesses: float
-    """Equally low ends that are needed below."""
+    """Equally low ends that are needed at or below `misfit`."""
 
     @staticmethod
     def of(objective: AnyObjective, settings: GaussNewtonSettings) -> _Enough:
@@ -378,8 +378,8 @@ class _Ways:
 
     def following(self, when: _Enough) -> _Start:
         """The next start. Where some equal ends would be enough, those that grow wait until three others were followed, and
-        while the best end is not alone. The first of them waits for two only where the best end is low enough for the
-        model to be right."""
+        while the best end is not alone. The first of them needs to wait for only two where the best end is low enough for
+        the model to be right."""
         soon = bool(self.every) and not self._grown and self.best.loss <= when.misfit
         early = len(self.every) - self._grown < (_SOON if soon else _BEFORE)
         grows = not (early or len(self._witnesses(when)) > 1)
@@ -470,12 +470,12 @@ def _grown(
 ) -> tuple[Tensor, int]:
     """The place [k] that a descent from this one comes to on the first frames alone, then on more of them; and how many
     simulations it took. What a cloth does early, before it has folded over or touched something, depends on the parameters
-    in a simple way: there, far fewer minima are wrong. Between two stages, it goes on from the best of some places drawn
-    from what the frames so far leave open, which the next ones may tell apart.
+    in a simple way: there, far fewer minima are wrong. With draws, it goes on between two stages from the best of the
+    place reached and of places drawn from what the frames so far leave open, which the next ones may tell apart.
 
     Args:
         stages: the recordings as they grow; on the last one, the whole, the descent is the caller's.
-        draws: places drawn between two stages; 0: it goes on from where it is.
+        draws: places drawn between two stages; with 0, it goes on from the place reached.
         place: [k]
         stream: number of the random stream.
     """
