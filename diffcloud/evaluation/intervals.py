@@ -399,7 +399,10 @@ def _quantile(freedom: float, length: float, level: float) -> float:
     def too_much(c: float) -> float:
         return float(stdtr(freedom, c + length) - stdtr(freedom, -c) - level)
 
-    return 0.0 if too_much(0.0) >= 0 else float(brentq(too_much, 0.0, 1.001 * stdtrit(freedom, 0.5 + level / 2)))
+    if too_much(0.0) >= 0:
+        return 0.0
+    most = 1.001 * stdtrit(freedom, 0.5 + level / 2)  # that of no length, and a little more for rounding
+    return float(brentq(too_much, 0.0, most))
 
 
 def _ends(space: FitSpace, index: int, value: float, reach: tuple[float, float]) -> tuple[float, float, list[float]]:
