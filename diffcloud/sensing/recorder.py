@@ -221,7 +221,10 @@ def record(
 
 
 def _holding(robot: Robot, held: Floats) -> Floats:
-    """[T, J] joint angles of an arm whose gripper holds what is at [T, 3], pointing down if it can.
+    """[T, J] joint angles [rad] of an arm whose gripper holds the cloth, pointing down if it can.
+
+    Args:
+        held: [T, 3] where it holds the cloth, in the world [m].
 
     Raises:
         RobotError: out of reach.
