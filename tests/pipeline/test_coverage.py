@@ -171,6 +171,21 @@ def test_refusals_and_failures_count_as_misses(tmp_path):
     assert "| lift | mass known | stretch | 5 | 3 | 1 (20 %) |" in coverage_page(counts_of(tmp_path))
 
 
+def test_rows_of_one_kind_of_truth_are_counted_together(tmp_path):
+    """Of twenty recordings, 14 to 20 are in the band of 90 %; networks and refits do not count."""
+    for folder, held in {"free": 16, "mass_known": 13, "mass_known_finer": 15, "posterior": 0, "free_refits": 20}.items():
+        (tmp_path / "lift" / folder).mkdir(parents=True)
+        for index in range(20):
+            entry = {"value": 1.0, "low": 0.9 if index < held else 1.1, "high": 1.2, "verdict": "identified"}
+            told = {"parameters": {"stretch": entry}, "within": 1.5, "level": 0.9}
+            record = {"truth": {"stretch": 1.0, "mass": 1.0}, "intervals": told}
+            (tmp_path / "lift" / folder / f"{index:04d}.json").write_text(json.dumps(record))
+    page = coverage_page(counts_of(tmp_path))
+    assert "| same | 2 | 40 | 29 (72 %) | 1 of 2 |" in page
+    assert "| finer | 1 | 20 | 15 (75 %) | 1 of 1 |" in page
+    assert "| refined |" not in page
+
+
 def test_refits_hold_what_nine_of_ten_find_within_the_factor(tmp_path):
     """Of ten refits of each of four cloths: the first has one beside, the second two; the third's fits fail twice, the
     fourth's always. Verdicts have nothing to do with it."""
