@@ -7,7 +7,7 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 # the tests start hundreds of processes; without byte code each would compile the package again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv repro test tests test-slow test-longest lint format bench acceptance comparison simulated recordings moved coverage robustness docs clean
+.PHONY: venv repro test tests test-slow test-longest lint format bench acceptance comparison simulated recordings moved coverage robustness pictures docs clean
 
 venv: $(STAMP)
 
@@ -27,7 +27,11 @@ $(STAMP): pyproject.toml
 
 # PROFILE: a file of parameters that takes the place of params.yaml, such as pipeline/profiles/paper.yaml
 repro: venv
-	$(if $(PROFILE),cp "$(PROFILE)" params.yaml)
+ifdef PROFILE
+	@cmp -s "$(PROFILE)" params.yaml || git diff --quiet HEAD -- params.yaml || \
+	    { echo "params.yaml has changes that are not committed, and $(PROFILE) would replace them. Commit or discard them first."; exit 2; }
+	cp "$(PROFILE)" params.yaml
+endif
 	dvc repro
 
 # one process per core and one more (tests/conftest.py), each with one thread: a step gains nothing from a second one
@@ -130,6 +134,10 @@ coverage: venv
 # Every damaged file and every fault; a sample of both is part of test-slow.
 robustness: venv
 	python -m tests.robustness --out docs/results/robustness.md
+
+# The pictures of docs/concepts.md, from what `make repro` leaves in data/.
+pictures: venv
+	python docs/site/pictures.py
 
 # The site of docs/, README and all commands, as files that open from disk: build/site/index.html.
 docs: venv

@@ -33,7 +33,7 @@ MATCHING_HEAD = ("frames", "points of a frame, each way", "ms", "ms, given match
 _POINTS = (200, 3500)
 """Points per frame: in a fit of 25 frames, and in a fit of one."""
 _TOWEL: dict[str, Any] = {
-    "size_m": (0.40, 0.30), "nodes": (9, 7), "yaw_deg": 0.0, "center_m": (0.55, 0.0), "table_height_m": 0.02,
+    "size_m": (0.40, 0.30), "nodes": (13, 10), "yaw_deg": 0.0, "center_m": (0.55, 0.0), "table_height_m": 0.02,
     "material": "jersey-knit", "steps_per_frame": 16, "grasped": ("right_top",),
     "path": [(0.0, 0.0, 0.0, 0.0), (2.5, -0.1, -0.1, 0.45)],
 }  # fmt: skip

@@ -83,7 +83,8 @@ def _page(own: dict[str, Scene], steps: list[StepRow], meshes: list[MeshRow]) ->
         "first is large, the motion is chaotic, and no step size makes it repeat; where the second is, as in folds that "
         "may buckle to either side, no recording repeats either. Milliseconds are processor time as far as the loss frame, "
         "of one core. "
-        "`diffcloud discretisation` makes this page; `towel` is the tutorial's cloth ([own-clouds.md](../own-clouds.md)).",
+        "`diffcloud discretisation` makes this page; `towel` is the tutorial's cloth with 9 × 7 nodes "
+        "([own-clouds.md](../own-clouds.md)).",
         "",
         *markdown_table(head, rows),
         "",

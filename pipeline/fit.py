@@ -70,7 +70,7 @@ def fit(
         int | None,
         typer.Option(
             help="Descents from as many places; of gauss_newton at most, from the best candidates only. Default of "
-            "gauss_newton: 8, two that grow with the recording, and one from a search (linearised: 3, and no others); of "
+            "gauss_newton: 8, three that grow with the recording, and one from a search (linearised: 3, and no others); of "
             "adam: 1."
         ),
     ] = None,

@@ -103,7 +103,13 @@ def _page(
 
 def _material() -> list[str]:
     rows = [
-        [THIS, "E h, ν", "Green's strain, constant moduli", "angle θ, k_b = 5 B", "the stiffness, with the tension in it"],
+        [
+            THIS,
+            "E h, ν",
+            "Green's strain, constant moduli",
+            "angle θ, k_b = 5 B",
+            "the stiffness, without the tension in it",
+        ],
         ["MuJoCo", "E h, ν", "the same", "chord 2 sin(θ/2), h² = 15 B (1 - ν²)/(E h)", "strain's rate"],
         ["Newton, VBD", "μ h, λ h of plane stress", "stable neo-Hookean", "angle, edge_ke = K/l", "strain's rate, μ alone"],
         [

@@ -42,8 +42,8 @@ def params(folder: Path, name: str = "params.yaml") -> None:
 
 
 def own_clouds(folder: Path) -> None:
-    """my_clouds/ with gripper.csv of the README's towel: its nodes, where a run puts them."""
-    towel = next(example for example in examples(read("README.md")) if example.words == ("towel.yaml",))
+    """my_clouds/ with gripper.csv of the tutorial's towel: its nodes, where a run puts them."""
+    towel = next(example for example in examples(read("docs/own-clouds.md")) if example.words == ("towel.yaml",))
     write(towel, folder)
     invoke("rollout", "--scenario", "towel.yaml", "--out", "true.npz")
     with np.load("true.npz") as run:
@@ -125,7 +125,7 @@ def towel(folder: Path) -> None:
 
 def write(example: Example, folder: Path) -> None:
     """The file that a page shows, a towel with fewer nodes and steps."""
-    fewer = example.text.replace("nodes: [9, 7]", "nodes: [4, 3]")
+    fewer = example.text.replace("nodes: [13, 10]", "nodes: [4, 3]")
     if "nodes: [4, 3]" in fewer:
         fewer = re.sub(r"^steps_per_frame:.*\n", "", fewer, flags=re.MULTILINE) + "steps_per_frame: 2\n"
     (folder / example.words[0]).write_text(fewer)
