@@ -187,6 +187,9 @@ def _cloth(
         fields = _fields(path)
         _refuse_missing(fields, _CLOTH_FIELDS, str(path))
         own_options(fields, "cloth", path, folder=out)
+        if stated is not None and list(stated) != fields["size_m"]:
+            other = f"--size {stated[0]:g}x{stated[1]:g}"
+            warn(f"{path} says size_m {fields['size_m']}, and that counts, not {other}: edit the file.")
         if isinstance(fields.get("material"), str) and fields["material"].endswith(".json"):
             fields["material"] = str((out / fields["material"]).resolve())  # scenarios are written to another folder
         return fields

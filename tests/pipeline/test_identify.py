@@ -191,6 +191,9 @@ class TestRefusals:
         assert "cloth.yaml: size_m: unknown or unsupported field" in invoke(*COMMAND, code=1).errors
         (work / "found" / "cloth.yaml").write_text(whole)
         assert "stated density_kg_m2" in invoke(*COMMAND, code=1).errors
+        assert "--size" not in invoke(*COMMAND, code=1).errors
+        other = invoke(*COMMAND, "--size", "0.16x0.2", code=1).errors
+        assert "cloth.yaml says size_m [0.16, 0.12], and that counts, not --size 0.16x0.2: edit the file" in other
         (work / "found" / "recordings.yaml").write_text("first: 3\n")
         assert "recordings.yaml: first must be a mapping" in invoke(*COMMAND, code=1).errors
         (work / "found" / "recordings.yaml").write_text("first: {yaw_deg: 10.0}\n")
