@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
@@ -47,6 +48,17 @@ class Variable:
             raise ConfigError(
                 f"Bounds of {self.name!r} must be finite and in order (low < high), got [{self.low}, {self.high}]."
             )
+
+    def spread(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[n] values that parts [n] of 1, evenly spread, stand for: as the prior of doubtful material has them, of another
+        variable log-uniform over its range, or uniform where that begins at zero."""
+        if self.doubtful and self.prior is not None:
+            from scipy.special import ndtri  # slow to import, and needed by few
+
+            return np.clip(self.centre * self.prior ** ndtri(parts), self.low, self.high)
+        if self.low > 0:
+            return self.low * (self.high / self.low) ** parts
+        return self.low + (self.high - self.low) * parts
 
 
 @dataclass(frozen=True)
@@ -157,26 +169,20 @@ class FitSpace:
     def starts(self, count: int, *, seed: int, first: Mapping[str, float] | None = None) -> tuple[Tensor, Tensor]:
         """Initial values [count, k] and which scale each start uses, bool [count].
 
-        The first start is the middle of the range on the paper's linear scale, or `first` where given; the others are
-        spread over the box log-uniformly by a scrambled Sobol sequence. Doubtful material starts where its prior has it.
+        The first start is the middle of the range on the paper's linear scale, doubtful material where its prior has it, or
+        `first` where given. The others are spread by a scrambled Sobol sequence: over the box log-uniformly, doubtful
+        material as its prior says. How a cloth lies begins as in the first one.
         """
-        asked = self.asked.variables
-        low, high = np.array([variable.low for variable in asked]), np.array([variable.high for variable in asked])
-        middle = 0.5 * (low + high)
-        for index, variable in enumerate(asked):
-            middle[index] = (first or {}).get(variable.name, middle[index])
-        values = np.repeat(middle[None], count, axis=0)
-        if count > 1:
-            sobol = SobolEngine(len(low), scramble=True, seed=seed).draw(count - 1, dtype=torch.float64).numpy()
-            safe = np.where(low > 0, low, 1.0)
-            logs = safe * np.where(low > 0, high / safe, 1.0) ** sobol
-            values[1:] = np.where(low > 0, logs, low + (high - low) * sobol)
-        columns = dict(zip((variable.name for variable in asked), values.T, strict=True))
-        every = [
-            columns[v.name] if not v.doubtful else np.full(count, (first or {}).get(v.name, v.centre))
-            for v in self.variables
-        ]
-        return torch.as_tensor(np.stack(every, axis=1)), torch.arange(count) > 0
+        values = np.empty((count, len(self.variables)))
+        for column, variable in zip(values.T, self.variables, strict=True):
+            middle = variable.centre if variable.doubtful else 0.5 * (variable.low + variable.high)
+            column[:] = (first or {}).get(variable.name, middle)
+        spread = [index for index, variable in enumerate(self.variables) if variable.deviation is None]
+        if count > 1 and spread:
+            sobol = SobolEngine(len(spread), scramble=True, seed=seed).draw(count - 1, dtype=torch.float64).numpy()
+            for index, part in zip(spread, sobol.T, strict=True):
+                values[1:, index] = self.variables[index].spread(part)
+        return torch.as_tensor(values), torch.arange(count) > 0
 
     def moved(self, values: Tensor, parts: Tensor) -> Tensor:
         """[..., k] values moved by these parts of themselves, or of the range where the lower bound is zero, inside the

@@ -102,11 +102,17 @@ class TestSpace:
         with pytest.raises(ConfigError, match="stretch is fitted"):
             with_doubts(ASKED, {"stretch": 1.3}, [SCENARIO])
 
-    def test_starts_spread_over_what_is_asked_for_alone(self):
-        values, _ = BENT.starts(5, seed=3)
-        alone, _ = ASKED.starts(5, seed=3)
-        assert values[:, 0].tolist() == alone[:, 0].tolist()
-        assert values[:, 1].tolist() == [1.0] * 5
+    def test_starts_spread_over_what_is_asked_for_and_over_what_is_known_of_the_rest(self):
+        laid = Variable("turn", -1.0, 1.0, deviation=0.2, centre=0.0, doubtful=True)
+        values = replace(BENT, variables=(*BENT.variables, laid)).starts(257, seed=3)[0]
+        assert values[0, 1] == 1.0
+        bending = values[1:, 1].log() / math.log(1.5)
+        assert float(bending.mean()) == pytest.approx(0.0, abs=0.02)
+        assert float(bending.std()) == pytest.approx(1.0, abs=0.05)
+        stretch = values[1:, 0].log10()
+        assert float(stretch.std()) == pytest.approx(2 / math.sqrt(12), abs=0.02)
+        assert abs(float(torch.corrcoef(torch.stack([stretch, bending]))[0, 1])) < 0.1
+        assert values[:, 2].tolist() == [0.0] * 257  # how a cloth lies
         first, _ = BENT.starts(1, seed=3, first={"stretch": 2.0, "bending": 1.2})
         assert first.tolist() == [[2.0, 1.2]]
 
