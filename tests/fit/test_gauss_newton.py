@@ -176,6 +176,29 @@ class TestFits:
         assert found.loss_start == pytest.approx(float(batch_losses(objective, SPACE, best[None])), rel=1e-9)
         assert found.simulations == 8 + 2
 
+    @pytest.mark.parametrize("init", [{}, {"stretch": 3.0}])
+    def test_the_first_start_has_doubtful_material_as_it_most_likely_is_the_others_as_it_may_be(self, init, monkeypatch):
+        monkeypatch.setattr(Objective, "explained", 1e-12)
+        monkeypatch.setattr(Objective, "knows_gaps", True)
+        monkeypatch.setattr(gauss_newton, "_MISFIT", math.inf)
+        objective = lifted(nuisance={})
+        space = with_doubts(SPACE, {"bending": 1.5}, [objective.scenario])
+        settings = GaussNewtonSettings(starts=3, screen=7, iterations=1, init=init)
+        found = fit_gauss_newton(objective, space, settings)
+        losses, values = torch.stack(found.history.losses), torch.stack(found.history.values)
+        began = [values[losses[:, start].isfinite().int().argmax(), start] for start in range(3)]
+        spread = space.starts(8, seed=0, first=init)[0]
+        likely = spread.clone()
+        likely[:, 2] = 1.0
+        early = objective.until(0.5)
+        usual, doubted = (batch_losses(early, space, places).argsort() for places in (likely, spread[1:]))
+        expected = [likely[0], likely[usual[usual > 0][0]]] if init else [likely[usual[0]]]
+        expected += [spread[1:][place] for place in doubted]
+        torch.testing.assert_close(torch.stack(began), torch.stack(expected[:3]))
+        assert found.simulations == 8 + 7 + 3 * 2
+        monkeypatch.setattr(Objective, "explained", 1.0)
+        assert fit_gauss_newton(objective, space, settings).simulations == 8 + 2
+
     def test_without_a_screen_starts_are_spread(self):
         found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=3, screen=0, iterations=1))
         assert found.simulations == 6

@@ -8,12 +8,14 @@ With half of the loss's slope g and of its curvature H on the axis of `residuals
 step that is computed without the bounds, and then cut off at one, may lead uphill: its other components were chosen to go
 with what was cut off. Each start keeps its own radius. It may grow where a step brings at least half of the decrease that
 was predicted, becomes half the step where it brings less than a quarter, and a fifth of it where it brings none. λ is small
-and stays. Starts are the best of a screen of candidates spread over the box, the best one first. The remaining ones are not
-followed once one explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and
-more of it; the other is a derivative-free search, from the best place so far, over the parameters asked for only. The
-search comes after three candidates. So do growing starts, but the first of them comes after two where the best end is low
-enough for the model to be right (with a threshold, all of them come right after the first candidate). They also wait while
-an end from another candidate is as low as the best one.
+and stays. The first start is the best of a screen of candidates spread over the box, with doubtful material as it most
+likely is. The following ones are the best of a second screen, spread over doubtful material too: otherwise, the best ones
+might lie beside each other, and their ends would say little of each other. The remaining ones are not followed, and the
+second screen is not made, once one explains the recording. Two further ways lead to starts: one fits the recording's
+beginning, then more and more of it; the other is a derivative-free search, from the best place so far, over the parameters
+asked for only. The search comes after three candidates. So do growing starts, but the first of them comes after two where
+the best end is low enough for the model to be right (with a threshold, all of them come right after the first candidate).
+They also wait while an end from another candidate is as low as the best one.
 Four equally low ends are taken for the minimum although they do not explain the recording; two are, where their loss is so
 high that the model must be wrong, or where it is not known what cameras missed. Unless the recording is explained, losses
 along the principal axes of the best place then tell whether another minimum is lower nearby; from there it goes on.
@@ -25,7 +27,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 
 import numpy as np
@@ -145,10 +147,14 @@ def fit_gauss_newton(
             values = dict(zip(space.names, axis.bounded(ways.best.place).tolist(), strict=True))
             progress(Progress(len(history.losses) - 1, ways.best.loss, ways.best.loss, values))
 
+    best = 1 if settings.init else 0  # of the screen; a first start that was given says little
+    if settings.screen and bool(_spread_doubts(space).any()):
+        screened = cache(lambda: _starts(objective, space, settings, axis, most, doubted=True))
+        for index in range(best + 1, len(waiting)):
+            waiting[index] = _Start(places[index], index, partial(_doubted, screened, index - best - 1))
     if settings.starts is None:
         search = _Start(places[0], -1, lambda: _searched(objective, space, ways.best, settings.seed, axis, tell))
         waiting.insert(_BEFORE, search)
-        best = 1 if settings.init else 0  # of the screen; a first start that was given says little
         for index, (stages, draws) in reversed(list(enumerate(_growths(objective)))):
             grown = partial(_grown, stages, draws, space, places[best], settings, index, axis, tell)
             waiting.insert(best + 1, _Start(places[best], best, grown, grows=True))
@@ -409,21 +415,44 @@ class _Ways:
 
 
 def _starts(
-    objective: AnyObjective, space: FitSpace, settings: GaussNewtonSettings, axis: Axis, most: int
+    objective: AnyObjective,
+    space: FitSpace,
+    settings: GaussNewtonSettings,
+    axis: Axis,
+    most: int,
+    *,
+    doubted: bool = False,
 ) -> tuple[Tensor, int]:
     """Places [B, k] to start at, at least so many, the best ones first; and how many simulations it took to tell. A first
-    start beyond a bound is taken to the bound."""
+    start beyond a bound is taken to the bound.
+
+    Args:
+        doubted: whether to spread doubtful material too, and leave out the first start; else it is as most likely.
+    """
     count = max(1 + settings.screen, most)
     values = space.starts(count, seed=settings.seed, first=settings.init)[0].double().clamp(axis.low, axis.high)
     if not settings.screen:
         return axis.places(values), 0
+    values = values[1:] if doubted else torch.where(_spread_doubts(space), values[0], values)
+    count = len(values)
     losses = batch_losses(objective.until(_SCREENED), space, values)
     if not math.isfinite(float(losses.min())):
         raise DivergedError(0, [], f"all {count} candidates diverged")
     order = losses.argsort()
-    if settings.init:
+    if settings.init and not doubted:
         order = torch.cat([torch.zeros(1, dtype=torch.long), order[order > 0]])
     return axis.places(values[order]), count * len(objective.members)
+
+
+def _doubted(screened: Callable[[], tuple[Tensor, int]], rank: int) -> tuple[Tensor, int]:
+    """One of the places of a second screen, and the simulations of that, which the first one of them pays."""
+    places, simulations = screened()
+    return places[rank], 0 if rank else simulations
+
+
+def _spread_doubts(space: FitSpace) -> Tensor:
+    """bool [k] which variables are doubtful material."""
+    return torch.tensor([one.doubtful and one.deviation is None for one in space.variables])
 
 
 def _searched(
