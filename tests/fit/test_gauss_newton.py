@@ -199,6 +199,21 @@ class TestFits:
         monkeypatch.setattr(Objective, "explained", 1.0)
         assert fit_gauss_newton(objective, space, settings).simulations == 8 + 2
 
+    def test_a_second_screen_that_diverges_does_not_cost_the_first_end(self, monkeypatch):
+        monkeypatch.setattr(Objective, "explained", 1e-12)
+        objective = lifted(nuisance={})
+        space = with_doubts(SPACE, {"bending": 1.5}, [objective.scenario])
+
+        def losses(objective, space, values):
+            found = batch_losses(objective, space, values)
+            return torch.where(values[:, 2] == 1.0, found, math.inf)
+
+        monkeypatch.setattr(gauss_newton, "batch_losses", losses)
+        settings = GaussNewtonSettings(starts=1, screen=7)
+        alone, several = (fit_gauss_newton(objective, space, replace(settings, starts=starts)) for starts in (1, 2))
+        assert several.simulations > alone.simulations + 7
+        assert several.loss <= alone.loss
+
     def test_without_a_screen_starts_are_spread(self):
         found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=3, screen=0, iterations=1))
         assert found.simulations == 6

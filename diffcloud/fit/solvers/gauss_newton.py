@@ -428,6 +428,9 @@ def _starts(
 
     Args:
         doubted: whether to spread doubtful material too, and leave out the first start; else it is as most likely.
+
+    Raises:
+        DivergedError: all candidates, and nothing else has been followed yet.
     """
     count = max(1 + settings.screen, most)
     values = space.starts(count, seed=settings.seed, first=settings.init)[0].double().clamp(axis.low, axis.high)
@@ -436,7 +439,7 @@ def _starts(
     values = values[1:] if doubted else torch.where(_spread_doubts(space), values[0], values)
     count = len(values)
     losses = batch_losses(objective.until(_SCREENED), space, values)
-    if not math.isfinite(float(losses.min())):
+    if not (doubted or math.isfinite(float(losses.min()))):
         raise DivergedError(0, [], f"all {count} candidates diverged")
     order = losses.argsort()
     if settings.init and not doubted:
