@@ -135,13 +135,12 @@ def _together(cells: Sequence[Cell]) -> list[list[str]]:
         if kind in kinds:  # not a network
             kinds[kind].append(count)
     rows = []
-    for kind in (kind for kind, counts in kinds.items() if counts):
-        cases, covered = np.array([(count["n"], count["covered"]) for count in kinds[kind]]).T
-        least, most = binom.interval(0.99, cases, LEVEL)
-        inside = ((least <= covered) & (covered <= most)).sum()
-        rows.append(
-            [kind, str(len(cases)), str(cases.sum()), _share(covered.sum(), cases.sum()), f"{inside} of {len(cases)}"]
-        )
+    for kind, counts in kinds.items():
+        if counts:
+            cases, covered = np.array([(count["n"], count["covered"]) for count in counts]).T
+            least, most = binom.interval(0.99, cases, LEVEL)
+            inside = f"{((least <= covered) & (covered <= most)).sum()} of {len(cases)}"
+            rows.append([kind, str(len(cases)), str(cases.sum()), _share(covered.sum(), cases.sum()), inside])
     return rows
 
 

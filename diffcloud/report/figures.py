@@ -66,7 +66,7 @@ def _losses(told: Tables) -> Figure | None:
     if measured.empty:
         return None
     scenarios, methods = _ordered(measured, "scenario"), _ordered(measured, "method")
-    canvas, axes = _canvas(len(scenarios), height=0.9 + 0.32 * len(methods))
+    canvas, axes = new_canvas(len(scenarios), height=0.9 + 0.32 * len(methods))
     for axis, scenario in zip(axes, scenarios, strict=True):
         group = measured[measured["scenario"] == scenario]
         categories = _categories(group)
@@ -99,7 +99,7 @@ def _seconds(told: Tables) -> Figure | None:
     if table.empty:
         return None
     means = table.groupby("method", sort=False)[[*PHASES, "total"]].mean()
-    canvas, (axis,) = _canvas(1, height=0.9 + 0.32 * len(means))
+    canvas, (axis,) = new_canvas(1, height=0.9 + 0.32 * len(means))
     methods = list(means.index)
     axis.barh(range(len(methods)), means["total"].clip(lower=1e-3), color=_COLOURS[5], alpha=0.35, label="all")
     for phase, marker, colour in zip(PHASES, "sDo^", _COLOURS, strict=False):
@@ -129,7 +129,7 @@ def _parameters(told: Tables) -> Figure | None:
     if fits.empty or not {"stretch", "mass"} <= set(fits.columns):
         return None
     scenarios = _ordered(fits, "scenario")
-    canvas, axes = _canvas(len(scenarios), height=3.2)
+    canvas, axes = new_canvas(len(scenarios), height=3.2)
     for axis, scenario in zip(axes, scenarios, strict=True):
         group = fits[fits["scenario"] == scenario]
         for category, colour in _categories(group).items():
@@ -157,7 +157,7 @@ def _success(told: Tables) -> Figure | None:
         return None
     known = means[means["success_rate"].notna()]
     scenarios, methods = _ordered(known, "scenario"), _ordered(known, "method")
-    canvas, axes = _canvas(len(scenarios), height=0.9 + 0.3 * len(methods))
+    canvas, axes = new_canvas(len(scenarios), height=0.9 + 0.3 * len(methods))
     for axis, scenario in zip(axes, scenarios, strict=True):
         group = known[known["scenario"] == scenario].set_index("method")
         rates = [100 * float(group["success_rate"].get(method, np.nan)) for method in methods]
@@ -187,7 +187,7 @@ def _curves(histories: Mapping[tuple[str, str], History]) -> Figure | None:
     scenarios = list(dict.fromkeys(scenario for scenario, _ in histories))
     if not scenarios:
         return None
-    canvas, axes = _canvas(len(scenarios), height=2.8)
+    canvas, axes = new_canvas(len(scenarios), height=2.8)
     for axis, scenario in zip(axes, scenarios, strict=True):
         for (owner, _), history in histories.items():
             if owner == scenario:
@@ -213,7 +213,7 @@ def overlay_figure(entries: Sequence[EpisodeEntry]) -> Figure | None:
     if not first:
         return None
     shown = [first[name] for name in dict.fromkeys(entry.scenario for entry in entries)]
-    canvas, axes = _canvas(2 * len(shown), height=2.9)
+    canvas, axes = new_canvas(2 * len(shown), height=2.9)
     for index, entry in enumerate(shown):
         frame = entry.last_frame
         state = int(np.abs(entry.motion.times - entry.episode.times[frame]).argmin())
@@ -245,7 +245,7 @@ def _landscape(record: Mapping[str, Any]) -> Figure | None:
     told = record["landscape"]
     if told is None:
         return None
-    canvas, (axis,) = _canvas(1, height=4.0, width=5.4)
+    canvas, (axis,) = new_canvas(1, height=4.0, width=5.4)
     loss = np.array(told["loss"], dtype=float)
     x, y = np.array(told["x"]), np.array(told["y"])
     picture = axis.contourf(x, y, np.log10(np.maximum(loss, 1e-30)), levels=18, cmap="viridis")
@@ -292,8 +292,13 @@ def _draw_ellipse(axis: Axes, record: Mapping[str, Any]) -> None:
     axis.plot(places[:, 0], places[:, 1], color=_COLOURS[1], linewidth=1.5, label=f"{told['level']:.0%} region")
 
 
-def _canvas(count: int, *, height: float, width: float | None = None) -> tuple[Canvas, list[Axes]]:
-    """One axis a scenario, two in a row."""
+def new_canvas(count: int, *, height: float, width: float | None = None) -> tuple[Canvas, list[Axes]]:
+    """A canvas of so many axes, two in a row, whose text and lines have the colour `INK`.
+
+    Args:
+        height: [inch] of a row.
+        width: [inch] of the whole; by default 5.2 for each column.
+    """
     from matplotlib.figure import Figure as Canvas  # takes half a second to import; no window, no pyplot
 
     columns = min(count, 2)
@@ -314,19 +319,24 @@ def _canvas(count: int, *, height: float, width: float | None = None) -> tuple[C
     return canvas, axes[:count]
 
 
-def _finished(canvas: Canvas, name: str, title: str, caption: str, source: str) -> Figure:
+def svg_of(canvas: Canvas, name: str) -> str:
+    """A transparent SVG. Without a date and with the name as salt, the same data gives the same bytes; text stays text."""
     import matplotlib
 
-    svg, png = io.StringIO(), io.BytesIO()
+    svg = io.StringIO()
     engine = canvas.get_layout_engine()
     if engine is not None:  # laid out once: that takes longer than drawing, and each savefig would do both twice
         engine.execute(canvas)
         canvas.set_layout_engine(None)
-    # without a date and with a fixed salt the same data gives the same bytes; text stays text
     with matplotlib.rc_context({"svg.hashsalt": name, "svg.fonttype": "none"}):
         canvas.savefig(svg, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    return svg.getvalue()
+
+
+def _finished(canvas: Canvas, name: str, title: str, caption: str, source: str) -> Figure:
+    svg, png = svg_of(canvas, name), io.BytesIO()
     canvas.savefig(png, format="png", dpi=150, facecolor="white", metadata={"Software": None})
-    return Figure(name, title, caption, source, svg.getvalue(), png.getvalue(), canvas.get_figwidth())
+    return Figure(name, title, caption, source, svg, png.getvalue(), canvas.get_figwidth())
 
 
 def _ordered(table: pd.DataFrame, column: str) -> list[str]:

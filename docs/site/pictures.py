@@ -12,9 +12,11 @@ from matplotlib.figure import Figure
 
 from diffcloud.fit import FitSpace, Objective
 from diffcloud.fit.batches import batch_losses
+from diffcloud.fit.doubts import MATERIAL_DOUBTS
+from diffcloud.fit.priors import DEFAULT_FACTOR
 from diffcloud.fit.record import read_fit
 from diffcloud.io.episodes import read_episode
-from diffcloud.report.figures import INK
+from diffcloud.report.figures import INK, new_canvas, svg_of
 from diffcloud.scene import load_scenario
 from diffcloud.sim.properties import one_set
 
@@ -23,11 +25,13 @@ RECORDED, CLOTH, HIDDEN, BELOW = "#8c96a3", "#2b8ccb", "#d55e00", "#009e73"
 FRAME = 14
 DISPLACED = {"x": 0.03, "y": -0.02, "yaw": np.radians(10.0)}
 """Where the first picture's cloth lies beside its place [m, rad]."""
+WIDTH = 7.2
+"""[inch]"""
 SHOWN = 700
 """Points of a cloud that are drawn."""
-PRIORS = {"stretch": 10.0, "mass": 10.0, "bending": 1.5, "drag": 1.3}
+PRIORS = dict.fromkeys(("stretch", "mass"), DEFAULT_FACTOR) | {name: MATERIAL_DOUBTS[name] for name in ("bending", "drag")}
 """Factor of one standard deviation by default, of what is asked for and of what is not."""
-mpl.rcParams.update({"svg.hashsalt": "diffcloud", "svg.fonttype": "none", "font.size": 9, "text.color": INK})
+mpl.rcParams.update({"font.size": 9, "text.color": INK})
 
 
 def main() -> None:
@@ -42,7 +46,7 @@ def main() -> None:
 
 def pose(objective: Objective, values: dict[str, float]) -> None:
     """A motion beside its recording, before its pose is found and after."""
-    canvas, axes = _canvas(2, height=3.1)
+    canvas, axes = new_canvas(2, height=3.1, width=WIDTH)
     run = objective.simulate_to_loss(one_set(values))
     space = objective.pose_space
     found = objective.pose(run)
@@ -66,7 +70,7 @@ def pose(objective: Objective, values: dict[str, float]) -> None:
 
 def view(objective: Objective, values: dict[str, float]) -> None:
     """Which sampled points of one frame count, beside what was recorded."""
-    canvas, (axis,) = _canvas(1, height=3.4)
+    canvas, (axis,) = new_canvas(1, height=3.4, width=WIDTH)
     motion = objective.match(objective.simulate_to_loss(one_set(values)))
     frame = objective.frames.index(FRAME)
     pairs = motion.pairs[0]
@@ -89,7 +93,7 @@ def view(objective: Objective, values: dict[str, float]) -> None:
 
 def priors(objective: Objective, values: dict[str, float]) -> None:
     """The loss beside the best place, where one, two or four parameters are multiplied by one factor."""
-    canvas, (axis,) = _canvas(1, height=3.2)
+    canvas, (axis,) = new_canvas(1, height=3.2, width=WIDTH)
     factors = torch.logspace(-1, 1, 41, dtype=torch.float64)
     best = torch.tensor([values.get(name, 1.0) for name in PRIORS], dtype=torch.float64)
     bounds = dict.fromkeys(PRIORS, (1e-3, 1e3))
@@ -107,7 +111,6 @@ def priors(objective: Objective, values: dict[str, float]) -> None:
     axis.set_xlabel("factor")
     axis.set_ylabel("root of the loss [mm]")
     axis.set_ylim(0, 8)
-    _ink(axis)
     _legend_beside(axis)
     _save(canvas, "priors")
 
@@ -118,11 +121,6 @@ def _cloud(objective: Objective) -> np.ndarray:
     return points[np.random.default_rng(0).permutation(len(points))[:SHOWN]]
 
 
-def _canvas(count: int, *, height: float) -> tuple[Figure, list[Axes]]:
-    canvas = Figure(figsize=(7.2, height), layout="constrained")
-    return canvas, list(canvas.subplots(1, count, squeeze=False)[0])
-
-
 def _legend_beside(axis: Axes) -> None:
     axis.legend(frameon=False, labelcolor=INK, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=2)
 
@@ -131,19 +129,10 @@ def _metres(axis: Axes, x: str, y: str) -> None:
     axis.set_aspect("equal")
     axis.set_xlabel(x)
     axis.set_ylabel(y)
-    _ink(axis)
-
-
-def _ink(axis: Axes) -> None:
-    for spine in axis.spines.values():
-        spine.set_color(INK)
-    axis.tick_params(colors=INK)
-    axis.xaxis.label.set_color(INK)
-    axis.yaxis.label.set_color(INK)
 
 
 def _save(canvas: Figure, name: str) -> None:
-    canvas.savefig(ROOT / "docs" / "images" / f"{name}.svg", transparent=True, metadata={"Date": None})
+    (ROOT / "docs" / "images" / f"{name}.svg").write_text(svg_of(canvas, name), encoding="utf-8")
 
 
 if __name__ == "__main__":
