@@ -41,12 +41,12 @@ _NEAR_M = 0.008
 """A layer of cloth that lies so close over another does not hide it: a camera sees both as one."""
 _EXPLAINED, _EXPLAINED_BY_CAMERAS = 1.25, 2.0
 """Times what noise and spacing account for. Of the four scenarios, right motions have 0.65 to 1.1 of it, descents that stop
-early because the loss around is rough up to 1.23, and wrong minima at least 1.4, most of them more than 1.7. Where it is
+early because the loss around is rough up to 1.23, and wrong minima at least 1.3, most of them more than 1.7. Where it is
 not known which pixels cameras lost, right motions have 1.4 to 4."""
 _UNEXPLAINED = 2.0
 """Times what noise and spacing leave, where it is known what the recording misses: above, the model does not explain the
 recording. Of random cloths that this simulator moved, right fits have had 1.23 times that loss at most (folds of finer
-steps 1.9), wrong minima 1.4 at least."""
+steps 1.9), wrong minima 1.3 at least."""
 _FEW = 5
 """Frames by which a pose is found before all have their say."""
 _FIRST_CAPS = (np.inf, np.inf, 4.0, 4.0, 2.0, 2.0, *[1.0] * 10)
