@@ -59,8 +59,6 @@ _ROUGH = 4.0
 _CHUNK = 16
 """Motions matched together."""
 _PATCHES = 16
-_SCATTER = 1.1
-"""Times the estimated loss of a right motion: fits that lack nothing end below."""
 _NOISE_M = 0.002
 """Of recorded points whose own uncertainty is not stated."""
 
@@ -327,7 +325,7 @@ def _times(objective: Objective, loss: float, scores: NDArray[np.float64]) -> fl
     once where it is not known what the recording misses, and thus what explains it."""
     if not objective.knows_gaps:
         return 1.0
-    above, clusters = max(1 - _SCATTER * objective.noise_loss / loss, 0.0), int((np.abs(scores).max(axis=1) > 0).sum())
+    above, clusters = max(1 - objective.noise_loss / loss, 0.0), int((np.abs(scores).max(axis=1) > 0).sum())
     return float(np.sqrt(1 + above * max(clusters - 1, 0)))
 
 
