@@ -62,6 +62,10 @@ class TrainingError(DiffCloudError):
     """A training that cannot go on."""
 
 
+class OutputError(DiffCloudError):
+    """A file that the system, or another process, keeps from being written."""
+
+
 class DivergedError(DiffCloudError):
     """A rollout left the numbers: says which step, which batch entries, which parameters."""
 

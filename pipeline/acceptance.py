@@ -62,24 +62,31 @@ def acceptance(
     """Fit the published real clouds, compare with the reference simulator, and time; writes Markdown tables."""
     if not (release / "conf").is_dir():
         raise ConfigError(f"{release} has no conf/; give the folder with lift_real_pcls/ and conf/.")
-    if reference is None or not reference.is_dir():
+    if reference is not None and not reference.is_dir():
+        raise ConfigError(f"--reference takes a folder of trajectories (*.npz); there is no folder {reference}.")
+    tables: dict[str, str] = {}
+
+    def keep(name: str, table: str) -> None:
+        tables[name] = table
+        write_text(out / name, table)
+
+    if reference is None:
         warn("No folder of reference trajectories (--reference): that table is skipped.")
     else:
-        write_text(out / "trajectories.md", _trajectories(release, reference))
-    write_text(out / "simulated_clouds.md", _simulated_clouds(release))
+        keep("trajectories.md", _trajectories(release, reference))
+    keep("simulated_clouds.md", _simulated_clouds(release))
     use_threads(1)
     timings = run_benchmarks({name: _scene(release, name) for name in SCENES}, repeats=3)
     matchings, costs = matching_benchmarks(repeats=5), contact_benchmarks(repeats=2)
     use_threads(None)
-    write_text(out / "speed.md", _speed(timings, matchings, costs))
+    keep("speed.md", _speed(timings, matchings, costs))
     write_bytes(out / CONTACT_FIGURE, contact_figure(costs))
     if not skip_fits:
-        write_text(out / "simulated_fits.md", _simulated_fits(release))
-        write_text(out / "real_fits.md", _real_fits(release, starts))
-    for name in ("trajectories.md", "simulated_clouds.md", "speed.md", "simulated_fits.md", "real_fits.md"):
-        if (out / name).is_file():
-            output.print((out / name).read_text(encoding="utf-8"))
-    errors.print(f"Tables are in {out}.")
+        keep("simulated_fits.md", _simulated_fits(release))
+        keep("real_fits.md", _real_fits(release, starts))
+    for table in tables.values():
+        output.print(table)
+    errors.print(f"Wrote {', '.join(tables)} to {out}.")
 
 
 @dataclass(frozen=True)
@@ -104,8 +111,8 @@ def _real_fits(release: Path, starts: int) -> str:
             objective = Objective(scenario, episode, paper=True)
             space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
             settings = AdamSettings(learning_rate=scenario.learning_rate, smoothing=SMOOTHING)
-            single = fit_adam(objective, space, settings)
-            many = fit_adam(objective, space, replace(settings, starts=starts))
+            single = fit_adam(objective, space, settings).uninterrupted()
+            many = fit_adam(objective, space, replace(settings, starts=starts)).uninterrupted()
             published = episode.meta["predictions"]
             values = {
                 key: torch.tensor([np.clip(pair[key], 0.1, 10.0) for pair in published.values()]) for key in space.names
@@ -226,7 +233,7 @@ def _simulated_fits(release: Path) -> str:
             scenario = load_scenario(name, _scene(release, name))
             space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
             settings = AdamSettings(learning_rate=scenario.learning_rate, threshold=scenario.threshold)
-            found = fit_adam(Objective(scenario, episode, paper=True), space, settings)
+            found = fit_adam(Objective(scenario, episode, paper=True), space, settings).uninterrupted()
             truth = episode.meta["truth"]
             rows.append(
                 [
@@ -288,7 +295,7 @@ def _speed(timings: list[dict[str, Any]], matchings: list[dict[str, Any]], costs
     note = (
         "Milliseconds per episode with one thread, all in one run on two cores of a server; of a batch, the time of all "
         "divided by their number. `diffcloud bench --threads 1` times the built-in scenarios, `make acceptance` the "
-        "published scenes (`release_`) too. The last column carries forward-mode derivatives in ten directions along."
+        "published scenes (`release_`) too. The last column also computes forward-mode derivatives in ten directions."
     )
     few, some, many = (next(of["forward"] for of in timings if of["nodes"] == nodes) for nodes in (256, 1024, 4096))
     growth = (

@@ -51,7 +51,7 @@ COMMANDS = {
     "coverage": "pipeline.coverage:coverage",
 }
 """Name -> where it lies; it is imported when it is run."""
-_PARALLEL = ("episodes", "preprocess", "fit", "train", "evaluate", "coverage")
+_PARALLEL = ("episodes", "preprocess", "fit", "train", "evaluate", "coverage", "recordings", "bench")
 """Commands that run their jobs through `pipeline.workers`."""
 
 app = typer.Typer(
@@ -85,6 +85,10 @@ def main() -> None:
     except DiffCloudError as error:
         say("Error:", str(error), style="bold red")
         sys.exit(1)
+    except SystemExit as ended:
+        if ended.code == 130:  # a Ctrl-C, of which typer has kept the status alone
+            errors.print("Interrupted.")
+        raise
     except KeyboardInterrupt as pressed:
         if pressed.__cause__ is not None and "--debug" in sys.argv[1:2]:
             raise

@@ -10,7 +10,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from diffcloud.errors import CalibrationError, EpisodeError
+from diffcloud.errors import CalibrationError, EpisodeError, unknown_name
 from diffcloud.io.calibrations import Calibration, CameraCalibration, write_calibration
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.images import write_color
@@ -21,7 +21,7 @@ from diffcloud.sensing.calibration.checkerboard import checkerboard_evidence, re
 from diffcloud.sensing.calibration.checks import CheckerboardEvidence, judge_checkerboard
 from diffcloud.sensing.calibration.hand_eye import calibrate_hand_eye, find_views
 from diffcloud.sensing.pictures import reprojection_picture
-from pipeline.console import JsonFlag, errors, finish, show, warn, writes
+from pipeline.console import JsonFlag, errors, finish, named_serials, show, warn, whole_numbers, writes
 
 _SHOWN = {
     "charuco": {
@@ -70,11 +70,11 @@ def calibrate(
 ) -> None:
     """Calibrate all cameras of a set-up into one file."""
     if method == "checkerboard":
-        found = _checkerboard(source, serial or [], _pair(size, "--size"))
+        found = _checkerboard(source, serial or [], whole_numbers(size, "--size"))
     else:
         if len(source) != 1:
             raise CalibrationError(f"--method charuco takes one raw episode, got {len(source)} sources.")
-        columns, rows = _pair(squares, "--squares")
+        columns, rows = whole_numbers(squares, "--squares")
         board = CharucoBoard(columns, rows, square_mm / 1000, marker_mm / 1000, dictionary)
         found = _charuco(read_raw_episode(source[0]), board, picture)
     summary, objections = found.summary, list(found.calibration.objections)
@@ -155,7 +155,10 @@ def _charuco(episode: RawEpisode, board: CharucoBoard, picture: Path | None) -> 
 
 
 def _checkerboard(folders: list[Path], serials: list[str], size: tuple[int, int]) -> _Found:
-    known = dict(item.partition("=")[::2] for item in serials)
+    known = named_serials(serials, "--serial")
+    names = [folder.name.removeprefix("calib_") for folder in folders]
+    if others := sorted(known.keys() - set(names)):
+        raise CalibrationError(unknown_name("camera in --serial", others[0], names))
     cameras: dict[str, CameraCalibration] = {}
     summary: dict[str, dict[str, Any]] = {}
     evidence: dict[str, CheckerboardEvidence] = {}
@@ -190,10 +193,3 @@ def _checkerboard(folders: list[Path], serials: list[str], size: tuple[int, int]
     warnings, objections = judge_checkerboard(evidence)
     board = {"corners": len(points[0])}
     return _Found(Calibration(cameras, "checkerboard", board, objections=tuple(objections)), summary, warnings)
-
-
-def _pair(text: str, option: str) -> tuple[int, int]:
-    first, _, second = text.partition("x")
-    if not (first.isdigit() and second.isdigit()):
-        raise CalibrationError(f"{option} takes two whole numbers such as 5x7, got {text!r}.")
-    return int(first), int(second)

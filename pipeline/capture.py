@@ -34,8 +34,9 @@ from diffcloud.hardware.kinova import KinovaArm
 from diffcloud.hardware.motion import plan_motion
 from diffcloud.hardware.realsense import RealSenseCamera
 from diffcloud.io.calibrations import read_calibration
+from diffcloud.io.raw_episodes import exists_already
 from diffcloud.sensing.robot import Robot, gen3
-from pipeline.console import JsonFlag, errors, finish, show_checks, warn
+from pipeline.console import JsonFlag, errors, finish, named_serials, show_checks, warn, whole_numbers
 
 _CLEAR = "Is the workspace clear, and a hand on the emergency stop? The arm will move"
 
@@ -141,8 +142,10 @@ def record(
     arm_limits = ArmLimits(table_m=table, margin_m=arm_margin)
     robot = None if urdf is None else Robot.from_urdf(urdf)
     path = None if trajectory is None else read_trajectory(trajectory, rate_hz=rate_hz, stretch_time=stretch_time)
-    serials = _serials(camera or [])
-    width, height = _size(size)
+    serials = named_serials(camera or [], "--camera")
+    width, height = whole_numbers(size, "--size")
+    if not rate_hz > 0:
+        raise ConfigError(f"--rate is in Hz, above 0, got {rate_hz:g}.")
     options: dict[str, Any] = {"width": width, "height": height, "fps": fps}
     if camera_driver is not None and (preset, laser, master, auto_exposure) != (None, None, None, False):
         raise ConfigError("--preset, --laser, --master and --auto-exposure are settings of RealSense cameras.")
@@ -165,6 +168,8 @@ def record(
         return
     if out is None or not serials:
         raise ConfigError("A capture needs --out, the folder of the episode, and at least one --camera NAME=SERIAL.")
+    if out.exists():
+        raise exists_already(out)
     calibrated = {} if calibration is None else read_calibration(calibration).cameras
     for name, serial in serials.items():
         if calibration is not None and serial not in calibrated:
@@ -229,18 +234,18 @@ def _check(
     checks: list[Check] = []
     for camera in cameras:
         checks += [replace(one, name=f"camera {camera.name}: {one.name}") for one in conformance.check_camera(camera)]
-    failure: DiffCloudError | None = None
+    failure: DiffCloudError | typer.Abort | None = None
     if checker is not None:
-        if path is not None:
-            check_trajectory(path, checker.limits)
-            with closing(connect()) as arm:
-                checks.append(_planned(arm, checker, path))
-        if ask and move:
-            typer.confirm(_CLEAR, abort=True, err=True)
         try:
+            if path is not None:
+                check_trajectory(path, checker.limits)
+                with closing(connect()) as arm:
+                    checks.append(_planned(arm, checker, path))
+            if ask and move:
+                typer.confirm(_CLEAR, abort=True, err=True)
             for one in conformance.check_arm(connect, checker, move=move, say=errors.print, ask=_request if ask else None):
                 checks.append(replace(one, name=f"arm: {one.name}"))
-        except DiffCloudError as error:  # what was found before it is printed first
+        except (DiffCloudError, typer.Abort) as error:  # what was found before it is printed first
             failure = error
     show_checks(checks, json)
     wrong = [one.name for one in checks if one.state != "ok"]
@@ -277,23 +282,6 @@ def _limits(box: str | None, **values: float) -> Limits:
     except ValueError as error:
         raise ConfigError(f"--box takes x0,y0,z0,x1,y1,z1 in metres, got {box!r}.") from error
     return replace(limits, box_low_m=(x0, y0, z0), box_high_m=(x1, y1, z1))
-
-
-def _serials(cameras: list[str]) -> dict[str, str]:
-    serials: dict[str, str] = {}
-    for item in cameras:
-        name, equals, serial = item.partition("=")
-        if not (name and equals and serial) or name in serials or serial in serials.values():
-            raise ConfigError(f"--camera takes NAME=SERIAL, each name and serial once, got {item!r}.")
-        serials[name] = serial
-    return serials
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit()):
-        raise ConfigError(f"--size takes WIDTHxHEIGHT, got {text!r}.")
-    return int(width), int(height)
 
 
 def _plan(path: ToolTrajectory | None, serials: dict[str, str], arm: str | None, limits: Limits) -> dict[str, Any]:

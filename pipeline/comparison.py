@@ -150,8 +150,8 @@ def comparison_jobs(
         if recording.scenario == scenario.name
     ]
     recorded = {name: read_episode(episodes / group / f"{name}.npz") for _, name, _, _ in fitted}
-    values = {name: fit.values for _, name, _, fit in fitted}
-    meshes = {name: fit.halvings for _, name, _, fit in fitted}
+    alone = {name: fit for _, name, _, fit in fitted if len(fit.episodes) == 1}  # a joint fit has seen its targets
+    values = {name: fit.values for name, fit in alone.items()}
     others = other_repeats({name: episode.meta for name, episode in recorded.items()}, values)
     networks = _networks(config, group, regressors, simulated)
     jobs = []
@@ -169,7 +169,9 @@ def comparison_jobs(
                 fitted=fit,
                 predictions=[network.of(recorded[name]) for network in networks],
                 # simulated targets share labels, not parameters; those of another mesh mean something else
-                transfers={one: told for one, told in others[name].items() if meshes[one] == fit.halvings} if real else {},
+                transfers={one: told for one, told in others[name].items() if alone[one].halvings == fit.halvings}
+                if real and len(fit.episodes) == 1
+                else {},
                 settings=config.evaluate.comparison(f"{group}/{label}"),
                 kept=kept / group / f"{label}.json",
             )

@@ -255,6 +255,11 @@ class FitConfig(Section):
             raise ValueError("doubts: the published measure takes the rest of the material for known; leave them out")
         if self.halvings and (self.paper or self.solver != "gauss_newton"):
             raise ValueError("halvings: of solver gauss_newton, and not of the published measure; leave it out")
+        if self.solver == "adam" and self.screen and not 2 <= (self.starts or 1) <= self.screen:
+            raise ValueError(
+                f"screen: adam chooses its further starts from so many candidates, {self.screen} are given for "
+                f"{self.starts or 1} start(s); give 2 or more starts and at least as many candidates, or leave it out"
+            )
         if foreign := [name for name in self._solver_options() if self.solver not in _solvers_with(name)]:
             told = "; ".join(f"{name}: of solver {' or '.join(_solvers_with(name))}" for name in foreign)
             raise ValueError(f"{told}; not of {self.solver}: leave out, or choose that solver")

@@ -144,7 +144,8 @@ def with_suffix(path: Path, suffix: str, option: str = "--out") -> Path:
         return path
     if path.suffix or path.is_dir():
         kind = "is a folder" if path.is_dir() else f"ends in {path.suffix}"
-        raise ConfigError(f"{option} takes a {suffix} file, and {path} {kind}. Try {path.with_suffix(suffix).name}.")
+        other = path / f"{path.resolve().name}{suffix}" if path.is_dir() else path.with_suffix(suffix)
+        raise ConfigError(f"{option} takes a {suffix} file, and {path} {kind}. Try {other}.")
     warn(f"{option} takes a {suffix} file: writing to {path}{suffix}.")
     return path.with_name(path.name + suffix)
 
@@ -159,6 +160,25 @@ def assignments(items: list[str] | None, option: str) -> dict[str, float]:
         except ValueError as error:
             raise ConfigError(f"{option} takes NAME=NUMBER, got {item!r}.") from error
     return values
+
+
+def named_serials(items: list[str], option: str) -> dict[str, str]:
+    """["overhead=012345", ...] -> {"overhead": "012345"}."""
+    serials: dict[str, str] = {}
+    for item in items:
+        name, equals, serial = item.partition("=")
+        if not (name and equals and serial) or name in serials or serial in serials.values():
+            raise ConfigError(f"{option} takes NAME=SERIAL, each name and serial once, got {item!r}.")
+        serials[name] = serial
+    return serials
+
+
+def whole_numbers(text: str, option: str) -> tuple[int, int]:
+    """ "640x480" -> (640, 480)."""
+    first, _, second = text.partition("x")
+    if not (first.isdigit() and second.isdigit()):
+        raise ConfigError(f"{option} takes two whole numbers such as 640x480 or 5x7, got {text!r}.")
+    return int(first), int(second)
 
 
 def episode_files(paths: list[Path]) -> list[Path]:

@@ -14,17 +14,17 @@ import torch
 import typer
 from rich.table import Table
 
-from diffcloud.errors import ConfigError, DiffCloudError
+from diffcloud.errors import ConfigError, DiffCloudError, OutputError
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, state_intervals
 from diffcloud.fit.pose import SET_UP, PoseSpace
 from diffcloud.fit.uncertainty import finer_steps
 from diffcloud.io.episodes import Episode, read_episode, write_episode
-from diffcloud.io.files import write_json, write_text
+from diffcloud.io.files import files_in, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint, kept_record
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.depth_camera import DepthNoise
 from pipeline.config import Config, EpisodesConfig, load_config
-from pipeline.console import JsonFlag, ParamsFile, errors, finish, show, writes
+from pipeline.console import JsonFlag, ParamsFile, errors, finish, show, warn, writes
 from pipeline.coverage_page import (
     HEAD,
     REFIT_HEAD,
@@ -122,6 +122,10 @@ def coverage(
             errors.print(failures[-1], soft_wrap=True)
     for regressor in readers:
         _predict(regressor, jobs)
+    for folder in dict.fromkeys(job.folder for job in jobs):
+        others = {*files_in(folder, ".json")} - {job.path for job in jobs}
+        if others:
+            warn(f"{folder} holds {len(others)} records of earlier calls too. They count, whatever they were made with.")
     counts = counts_of(out)
     for head, rows in ((HEAD, summary(list(cells_of(counts)))), (REFIT_HEAD, list(refit_rows(counts)))):
         if rows:
@@ -169,6 +173,11 @@ class CoverageJob:
         return self.out / self.scenario.name / "_".join([*told, *self.marks])
 
     @property
+    def path(self) -> Path:
+        """Of the record."""
+        return self.folder / f"{self.name}.json"
+
+    @property
     def marks(self) -> list[str]:
         """What distinguishes the recordings, as names of folders have it."""
         return [self.kind] * (self.kind != "same") + [REFITS] * (self.refit is not None)
@@ -179,18 +188,22 @@ class CoverageJob:
         Raises:
             DiffCloudError: the cloth cannot be simulated, recorded or fitted; the record says so.
         """
-        path = self.folder / f"{self.name}.json"
+        path = self.path
+        truth, set_up = self.truth(), self.set_up()
         plan = [self.scenario, self.index, self.refit, self.seed, self.known, self.level, self.kind]
+        plan += [truth, set_up, self._noise]
         sections = [self.config.episodes, self.config.preprocess, self.config.fit]
         mark = fingerprint([*plan, [str(section) for section in sections]], packages=_CODE)
-        if (kept := kept_record(path, mark)) is not None:
-            return kept
-        record: dict[str, Any] = {"fingerprint": mark, "truth": self.truth(), "set_up": self.set_up()}
-        try:
-            record |= self._measured(record["truth"], tell)
-        except DiffCloudError as error:
-            record["error"] = str(error)
-        write_json(path, record)
+        record = kept_record(path, mark)
+        if record is None:
+            record = {"fingerprint": mark, "truth": truth, "set_up": set_up}
+            try:
+                record |= self._measured(record["truth"], tell)
+            except OutputError:  # a full disk says nothing of the cloth
+                raise
+            except DiffCloudError as error:
+                record["error"] = str(error)
+            write_json(path, record)
         if "error" in record:
             raise DiffCloudError(str(record["error"]))
         return record
@@ -226,9 +239,7 @@ class CoverageJob:
         fit = fit.model_copy(update={"fixed": {**fit.fixed, **{name: truth[name] for name in self.known}}})
         job = FitJob(self.label, [Recording(self.scenario, self.label, episode)], fit, self.folder)
         fitted = job.solved()
-        outcome = fitted.outcome
-        if outcome.stop_reason == "interrupted":
-            raise KeyboardInterrupt
+        outcome = fitted.outcome.uninterrupted()
         found = state_intervals(
             fitted.objective,
             job.space,
@@ -247,6 +258,11 @@ class CoverageJob:
         }
         return told | {"seconds": outcome.seconds, "intervals": found.model_dump(mode="json")}
 
+    @property
+    def _noise(self) -> tuple[DepthNoise | None, float]:
+        """Of depth cameras, None for their usual one; and along each axis, of points of whole surfaces [m]."""
+        return (None, 0.0) if self.kind == "same" else (_OTHER_NOISE, _OTHER_NOISE_M)
+
     def _true_scenario(self) -> Scenario:
         """With the steps and the mesh of the truth."""
         true = self.scenario if self.kind == "same" else finer_steps(self.scenario)
@@ -258,7 +274,7 @@ class CoverageJob:
         told = [self.scenario, self.index, self.refit, self.seed, self.kind]
         told += [str(self.config.episodes), str(self.config.preprocess)]
         set_up = self.set_up()
-        made = fingerprint([*told, dict(truth), set_up], packages=_RECORDS)
+        made = fingerprint([*told, dict(truth), set_up, self._noise], packages=_RECORDS)
         if path.is_file() and (kept := read_episode(path)).meta.get("made") == made:
             return kept
         meta = {
@@ -275,7 +291,7 @@ class CoverageJob:
         with TemporaryDirectory(prefix="diffcloud-") as folder:
             work = Path(folder)
             config = _misplaced(self.config.episodes, set_up)
-            noise = None if self.kind == "same" else _OTHER_NOISE
+            noise, _ = self._noise
             record_motion(self.scenario, system, nodes, times, work, path.stem, config, seed=seed, meta=meta, noise=noise)
             source = work / path.stem if (work / path.stem).is_dir() else work / path.name
             tell(0.25, "preprocessing")
@@ -283,8 +299,9 @@ class CoverageJob:
             episode = read_episode(work / "clean" / path.name)
         if self.scenario.recorder == "whole_surface":
             episode = _displaced(episode, set_up)
-            if self.kind != "same":
-                shaken = episode.points + _OTHER_NOISE_M * rng.standard_normal(episode.points.shape)
+            _, noise_m = self._noise
+            if noise_m:
+                shaken = episode.points + noise_m * rng.standard_normal(episode.points.shape)
                 episode = replace(episode, points=shaken.astype(np.float32))
         # here, not in `meta`: a raw recording carries only keys of its own on to its clouds
         episode = replace(episode, meta={**episode.meta, "made": made})
@@ -345,7 +362,8 @@ def _predict(regressor: Regressor, jobs: Sequence[CoverageJob]) -> None:
         else:
             ends = zip(found.values[0].tolist(), found.first_intervals(job.level).items(), strict=True)
             parameters = {name: {"value": value, "low": low, "high": high} for value, (name, (low, high)) in ends}
-            record = {"intervals": {"parameters": parameters, "within": job.config.evaluate.within}}
+            stated = {"parameters": parameters, "within": job.config.evaluate.within, "level": job.level}
+            record = {"intervals": stated}
             if found.samples is not None and {"stretch", "mass"} <= set(told.names):
                 stretch, mass = (found.samples[0, :, told.names.index(name)] for name in ("stretch", "mass"))
                 ends = np.quantile((stretch / mass).numpy(), [0.5, 0.5 - job.level / 2, 0.5 + job.level / 2])

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from diffcloud.errors import ConfigError
 from diffcloud.evaluation.intervals import LEVEL, noise_quantile
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.evaluation.summary import largest_sources
@@ -51,17 +52,25 @@ def counted(folder: Path) -> dict[str, Any]:
     """What the records of one folder say.
 
     Returns:
-        parameters: name -> n, stated: with an interval, covered: those that hold the truth, median_factor: of the
-        intervals, rms_error: of the logarithm, verdicts, identified_within: of those called identified, how many are within
-        the factor, noise_alone: how many intervals of the noise of residuals alone would hold the truth, sources: source ->
-        median deviation; ratio: the same of stretch to mass, if both are fitted; refits: as of `_held_by_refits`, where
-        each cloth was recorded several times.
+        level: of the intervals; parameters: name -> n, stated: with an interval, covered: those that hold the truth,
+        median_factor: of the intervals, rms_error: of the logarithm, verdicts, identified_within: of those called
+        identified, how many are within the factor, noise_alone: how many intervals of the noise of residuals alone would
+        hold the truth, sources: source -> median deviation; ratio: the same of stretch to mass, if both are fitted; refits:
+        as of `_held_by_refits`, where each cloth was recorded several times.
+
+    Raises:
+        ConfigError: intervals of several levels.
     """
     named = {path.stem: read_json(path) for path in files_in(folder, ".json")}
     records = list(named.values())
     fitted = next((list(one["intervals"]["parameters"]) for one in records if "intervals" in one), [])
     parameters = {name: _count(records, name) for name in fitted}
-    told: dict[str, Any] = {"parameters": parameters}
+    levels = sorted({one["intervals"]["level"] for one in records if "intervals" in one})
+    if len(levels) > 1:
+        raise ConfigError(
+            f"{folder} holds intervals of several levels, {', '.join(map(str, levels))}. Choose another --out."
+        )
+    told: dict[str, Any] = {"parameters": parameters, "level": levels[0] if levels else LEVEL}
     if any("ratio" in one.get("intervals", {}) for one in records) and {"stretch", "mass"} <= set(fitted):
         told["ratio"] = _count(records, "ratio")
     if folder.name.endswith(REFITS):
@@ -124,7 +133,7 @@ def summary(cells: Sequence[Cell]) -> list[list[str]]:
     ]
 
 
-def _together(cells: Sequence[Cell]) -> list[list[str]]:
+def _together(cells: Sequence[Cell], level: float) -> list[list[str]]:
     """Rows under `TOGETHER_HEAD`, of fits whose truths are of one kind. The band is that of the binomial distribution."""
     from scipy.stats import binom  # slow to import
 
@@ -138,7 +147,7 @@ def _together(cells: Sequence[Cell]) -> list[list[str]]:
     for kind, counts in kinds.items():
         if counts:
             cases, covered = np.array([(count["n"], count["covered"]) for count in counts]).T
-            least, most = binom.interval(0.99, cases, LEVEL)
+            least, most = binom.interval(0.99, cases, level)
             inside = f"{((least <= covered) & (covered <= most)).sum()} of {len(cases)}"
             rows.append([kind, str(len(cases)), str(cases.sum()), _share(covered.sum(), cases.sum()), inside])
     return rows
@@ -209,7 +218,17 @@ def _held_by_refits(named: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, 
 
 
 def coverage_page(counts: Counts) -> str:
-    """Markdown of docs/results/coverage.md."""
+    """Markdown of docs/results/coverage.md.
+
+    Raises:
+        ConfigError: no records, or of several levels.
+    """
+    from scipy.stats import binom  # slow to import
+
+    levels = sorted({told["level"] for told in counts.values()})
+    if len(levels) != 1:
+        raise ConfigError(f"A page is of records of one level of intervals, got {', '.join(map(str, levels)) or 'none'}.")
+    level = f"{levels[0] * 100:g} %"
     cells = list(cells_of(counts))
     rows, sources, refits = summary(cells), _sources(cells), list(refit_rows(counts))
     networks = any({"free", "known"}.isdisjoint(row[1].split()) for row in rows)
@@ -217,7 +236,7 @@ def coverage_page(counts: Counts) -> str:
         "# How often intervals hold the truth",
         "",
         "Cloths of drawn parameters are simulated, recorded (`lift` and `fold` by two depth cameras through "
-        "`preprocess`, the others by their whole surface), fitted, and the 90 % interval is held against the truth. "
+        f"`preprocess`, the others by their whole surface), fitted, and the {level} interval is held against the truth. "
         "Material that is not asked for is off by the factors that fits state (`fit.doubts`); cameras and clock are "
         "off by what they assume of a calibrated set-up (2 mm and 0.3° along and about each axis, and 2 ms, as "
         "standard deviations; `preprocess` measures the clock anew), and the cloth is displaced by about a centimetre. "
@@ -234,10 +253,11 @@ def coverage_page(counts: Counts) -> str:
         *markdown_table(HEAD, rows),
         "",
     ]
-    if together := _together(cells):
+    if together := _together(cells, levels[0]):
+        least, most = binom.interval(0.99, 200, levels[0])
         lines += [
-            "All rows together, without those of networks. Were each interval to hold the truth in exactly 90 %, 99 of 100 "
-            "rows would be in the band, which for 200 recordings goes from 168 to 190.",
+            f"All rows together, without those of networks. Were each interval to hold the truth in exactly {level}, "
+            f"99 of 100 rows would be in the band, which for 200 recordings goes from {least:.0f} to {most:.0f}.",
             "",
             *markdown_table(TOGETHER_HEAD, together),
             "",
@@ -254,9 +274,9 @@ def coverage_page(counts: Counts) -> str:
         ]
     if refits:
         lines += [
-            "Fresh recordings of the same cloths, everything else drawn anew. A parameter is *held* where at least nine of "
-            "ten recordings (the level of the intervals) find it within the verdict's factor of the truth; the last two "
-            "columns count recordings with the verdict *identified*.",
+            "Fresh recordings of the same cloths, everything else drawn anew. A parameter is *held* where at least "
+            f"{level} of the recordings (the level of the intervals) find it within the verdict's factor of the truth; the "
+            "last two columns count recordings with the verdict *identified*.",
             "",
             *markdown_table(REFIT_HEAD, refits),
             "",

@@ -25,7 +25,9 @@ _BAR_MM = 3.0
 
 @writes(".md")
 def discretisation(
-    scenario: Annotated[list[str] | None, typer.Option(help="Built-in or YAML file; default: all built-ins.")] = None,
+    scenario: Annotated[
+        list[str] | None, typer.Option(help="Built-in or YAML file; default: the four of the paper.")
+    ] = None,
     cuts: Annotated[int, typer.Option(min=0, max=3, help="How often meshes are cut finer.")] = 2,
     out: Annotated[Path, typer.Option(help="Markdown page.")] = Path("docs/results/discretisation.md"),
     json: JsonFlag = False,

@@ -20,7 +20,6 @@ from diffcloud.evaluation.summary import PREDICTORS, label, largest_sources, sen
 from diffcloud.evaluation.summary import metrics as summary_metrics
 from diffcloud.fit import JointObjective, Objective, read_fit
 from diffcloud.fit.pose import parse_priors
-from diffcloud.fit.record import FitRecord
 from diffcloud.fit.result import describe_recording
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import claimed, files_in, together, write_json, write_text
@@ -64,14 +63,18 @@ def loss(
     laid: dict[str, float] = {}
     if fit is not None:
         record = read_fit(fit)
+        values = dict(record.values)
+        known = episode.stem in {one.name for one in record.episodes}
+        place = record.place_of(episode.stem, scenario) if known else None
+        laid = record.laid_in(None if place is None else record.episodes[place])
+        measure = record.measure.model_dump() if place is None else record.measured_by(place)
         if scenario is None and scene is None:
-            scenario = fitted_scenario(fit, _scenario_of(record, episode.stem))
-        measure, values = record.measure.model_dump(), dict(record.values)
+            scenario = fitted_scenario(fit, record.scenario if place is None else record.episodes[place].scenario)
     chosen = choose_scenario(scenario, scene)
     if fit is not None:
         chosen = chosen.halved(record.halvings)
-        known = {one.scenario: one for one in record.episodes if one.name == episode.stem}
-        laid = record.laid_in(known.get(chosen.name, next(iter(known.values()), None)))
+    if paper:
+        measure |= {"nuisance": None, "frames": None}  # the published measure has its own
     given = {"points": points, "frames": frame, "seed": seed, "paper": paper or None}
     measure |= {name: value for name, value in given.items() if value is not None}
     if nuisance is not None:
@@ -88,14 +91,6 @@ def loss(
         shifts = ", ".join(f"{name} {entry.value:.4g} {entry.unit}" for name, entry in found.nuisance.items())
         output.print(f"{found.loss:.6e}  RMS {found.rms_mm:.2f} mm" + (f"  at {shifts}" if shifts else ""))
     finish({**found.model_dump(), "parameters": values, "length_unit_m": chosen.length_unit_m}, json)
-
-
-def _scenario_of(record: FitRecord, name: str) -> str:
-    """In which a fit simulates a recording; that of its first one, if the recording is new to it."""
-    known = sorted({one.scenario for one in record.episodes if one.name == name})
-    if len(known) > 1:
-        raise ConfigError(f"The fit knows {name} in {' and '.join(known)}; choose one by --scenario.")
-    return known[0] if known else record.scenario
 
 
 @app.command()
@@ -118,13 +113,14 @@ def intervals(
         raise ConfigError(f"{fit} is a fit to {len(record.episodes)} episodes ({names}), {len(episodes)} were given.")
     if within <= 1:
         raise ConfigError(f"--within takes a factor above 1, got {within:g}.")
-    measure = record.measure.model_dump()
     members = []
-    for path, one in zip(episodes, record.episodes, strict=True):
+    for place, (path, one) in enumerate(zip(episodes, record.episodes, strict=True)):
+        if path.stem != one.name:
+            raise ConfigError(f"Recording {place + 1} of {fit} is {one.name}, and {path} was given in its place.")
         single = len(episodes) == 1 or one.scenario == record.scenario
         stated = scenario if scenario is not None and single else None
         chosen = choose_scenario(stated or fitted_scenario(fit, one.scenario), scene)
-        members.append(Objective(chosen.halved(record.halvings), read_episode(path), **measure))
+        members.append(Objective(chosen.halved(record.halvings), read_episode(path), **record.measured_by(place)))
     objective = members[0] if len(members) == 1 else JointObjective(members)
     found = state_intervals(
         objective, space_of(record), record.free,
@@ -316,14 +312,8 @@ def _columns(predictions: list[dict[str, Any]]) -> list[str]:
 def _metrics(fits: pd.DataFrame, predictions: list[dict[str, Any]]) -> dict[str, Any]:
     by_scenario: dict[str, Any] = {}
     for name, group in fits.groupby("scenario", sort=False):
-        by_scenario[str(name)] = {
-            "loss_start": float(group["loss_start"].mean()),
-            "loss": float(group["loss"].mean()),
-            "rms_mm": float(group["rms_mm"].mean()),
-        }
-        others = group["rms_other_frames_mm"].dropna()
-        if len(others):
-            by_scenario[str(name)]["rms_other_frames_mm"] = float(others.mean())
+        columns = ("loss_start", "loss", "rms_mm", "rms_other_frames_mm")  # starts may diverge, other frames be missing
+        by_scenario[str(name)] = {column: float(group[column].mean()) for column in columns if group[column].notna().any()}
     episodes = {
         f"{row['scenario']}/{row['episode']}": {k: v for k, v in row.items() if isinstance(v, float) and not math.isnan(v)}
         for row in fits.to_dict("records")

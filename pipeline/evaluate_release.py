@@ -27,8 +27,8 @@ from pipeline.workers import run_all
 _PROFILE = Path(__file__).parent / "profiles" / "release.yaml"
 
 
-@writes()
 @app.command("release")
+@writes()
 def release(
     folder: Annotated[Path, typer.Argument(help="The published data: holds lift_real_pcls/, conf/ and so on.")],
     params: Annotated[Path, typer.Option("--params", help="Profile; a file of parameters.")] = _PROFILE,

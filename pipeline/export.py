@@ -10,7 +10,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from diffcloud.errors import ConfigError, unknown_name
+from diffcloud.errors import ConfigError
 from diffcloud.fit.record import FitRecord, RecordingFit, read_fit
 from diffcloud.io.files import together
 from pipeline.console import JsonFlag, errors, finish, progress_bar, show, warn, writes
@@ -69,7 +69,7 @@ def export(
     if check and importlib.util.find_spec(to) is None:
         raise ConfigError(f"--check needs {to}. Try: pip install 'diffcloud[simulators]', or leave --check out.")
     record = read_fit(fit)
-    index = _index(record, recording)
+    index = _index(record, recording, scenario)
     one = record.episodes[index]
     drawn = _draws(record, intervals or fit.parent / "intervals.json", samples, seed) if samples else []
     chosen = choose_scenario(scenario or fitted_scenario(fit, one.scenario)).halved(record.halvings)
@@ -128,15 +128,13 @@ def _draws(record: FitRecord, path: Path, count: int, seed: int) -> list[dict[st
     return [{**record.values, **values} for values in draws(read_intervals(path, space), space, count, seed)]
 
 
-def _index(record: FitRecord, name: str | None) -> int:
+def _index(record: FitRecord, name: str | None, scenario: str | None) -> int:
     names = [one.name for one in record.episodes]
     if name is None:
         if len(names) > 1:
             errors.print(f"The motion is that of {names[0]}, the first of {len(names)} recordings.")
         return 0
-    if name not in names:
-        raise ConfigError(unknown_name("recording", name, names))
-    return names.index(name)
+    return record.place_of(name, scenario)
 
 
 def _show(found: Checked, target: str, json: bool) -> None:

@@ -228,7 +228,11 @@ class FitJob:
                 failures.append(f"leaving one recording out: {error}")
             except KeyboardInterrupt:
                 interrupted = True
-        result = describe_fit(objective, space, settings, fits[-1], episodes=[one.name for one in self.recordings])
+        names, pressed = [one.name for one in self.recordings], False
+        try:
+            result = describe_fit(objective, space, settings, fits[-1], episodes=names)
+        except KeyboardInterrupt:  # a fit that may have taken minutes is not given away for the second that this takes
+            result, pressed = describe_fit(objective, space, settings, fits[-1], episodes=names), True
         record = result.record
         record.halvings, record.finer_loss = self.halvings + fitted.halvings, fitted.finer_loss
         record.failures += failures
@@ -237,14 +241,16 @@ class FitJob:
             recording.left_out = told
         record.fingerprint = self._fingerprint
         write_fit(self.folder, self.name, result)
-        if interrupted:
+        if interrupted or pressed:
             raise KeyboardInterrupt
         return record
 
     @cached_property
     def _fingerprint(self) -> str:
         settings = self.settings.model_dump(exclude={"workers", "joint"})  # which the name and the recordings tell
-        return fingerprint([self.name, self.recordings, settings, self.init, self.halvings], packages=_CODE)
+        more = self.settings.halved_at_most([one.scenario for one in self.recordings])
+        resolved = [self.space, self.solver_settings, more]  # what is not given is decided here, outside of these packages
+        return fingerprint([self.name, self.recordings, settings, resolved, self.halvings], packages=_CODE)
 
 
 def first_start(init: str, job: FitJob) -> dict[str, float]:

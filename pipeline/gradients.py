@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,6 +21,8 @@ from pipeline.console import JsonFlag, Threads, finish, progress_bar, show, writ
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 
 _COLUMNS = [f"{kind}{name}" for kind in ("", "gradient_", "difference_") for name in NAMES]
+_OF = ["scenario", "integrator"]
+"""Columns that tell what was simulated."""
 
 
 @writes(".csv")
@@ -42,39 +45,44 @@ def gradients(
     if integrator is not None:
         chosen = replace(chosen, scene=chosen.scene.stepped(integrator))
     drawn = random_parameters(chosen, pairs, seed=seed)
-    done = _read(out, drawn)
+    simulated = {"scenario": chosen.name, "integrator": chosen.scene.integrator}
+    done = _read(out, drawn, simulated)
     with progress_bar("gradients", pairs) as update:
         update(len(done), "")
         for found in gradient_agreement(chosen, drawn[len(done) :]):
             done = np.concatenate([done, np.hstack([found.parameters, found.gradient, found.difference])])
             if out is not None:
-                write_text(out, pd.DataFrame(done, columns=_COLUMNS).to_csv(index=False))
+                write_text(out, pd.DataFrame(done, columns=_COLUMNS).assign(**simulated).to_csv(index=False))
             update(len(done), "")
     agreement = Agreement(*np.split(done[:pairs], 3, axis=1))
-    table = Table("parameter", "pairs", "sign %", "within 2 %")
+    table = Table("parameter", "pairs", "sign %", "within a factor of 2, %")
     shares = {}
     for index, name in enumerate(NAMES):
         shares[name] = {
             "sign": float(agreement.same_sign[:, index].mean()),
-            "within_2": float(agreement.same_size[:, index].mean()),
+            "within_factor_2": float(agreement.same_size[:, index].mean()),
         }
         table.add_row(name, str(pairs), *(f"{100 * share:.0f}" for share in shares[name].values()))
     show(table, json)
-    finish({"scenario": chosen.name, "integrator": chosen.scene.integrator, "pairs": pairs, "shares": shares}, json)
+    finish({**simulated, "pairs": pairs, "shares": shares}, json)
 
 
-def _read(path: Path | None, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
+def _read(path: Path | None, drawn: NDArray[np.float64], simulated: Mapping[str, str]) -> NDArray[np.float64]:
     """[n, 6] rows of an earlier run of the same pairs."""
     if path is None or not path.exists():
         return np.empty((0, len(_COLUMNS)))
     try:
         table = pd.read_csv(path)
         rows = table[_COLUMNS].to_numpy(dtype=np.float64)
+        others = table[_OF].drop_duplicates().to_dict("records")
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(
             f"{path} is not a table that `diffcloud gradients` wrote: {error}. Choose another --out."
         ) from error
     common = min(len(rows), len(drawn))
+    if others not in ([], [dict(simulated)]):
+        told = "; ".join(" ".join(map(str, one.values())) for one in others)
+        raise ConfigError(f"{path} holds pairs of {told}, not of {' '.join(simulated.values())}. Choose another --out.")
     if not np.allclose(rows[:common, : len(NAMES)], drawn[:common], rtol=1e-12):
-        raise ConfigError(f"{path} holds other pairs (another seed or scenario). Choose another --out.")
+        raise ConfigError(f"{path} holds other pairs (another seed, or other bounds). Choose another --out.")
     return rows[: len(drawn)]

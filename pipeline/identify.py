@@ -23,7 +23,7 @@ from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.result import read_motion
 from diffcloud.fit.uncertainty import distance_to_finer_mm, finer_steps
 from diffcloud.io.episodes import Episode, read_episode, write_episode
-from diffcloud.io.files import claimed, read_yaml, together, write_json, write_text
+from diffcloud.io.files import claimed, read_json, read_yaml, together, write_bytes, write_json, write_text
 from diffcloud.io.imports import cloud_folder
 from diffcloud.io.recordings import write_recording
 from diffcloud.io.ros.recording import ros_recording
@@ -86,7 +86,8 @@ def identify(
     if mass is not None and not (0 < mass < math.inf):
         raise ConfigError(f"--mass is in kg per square metre, above 0, got {mass:g}.")
     stated = None if size is None else _sides(size)
-    out.mkdir(parents=True, exist_ok=True)
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"--out takes a folder, and {out} is a file.")
     with claimed(out):
         episodes, cloth, layouts = find_scene(recordings, out, stated, mass)
         chosen = _chosen(parameters, cloth, mass)
@@ -96,12 +97,21 @@ def identify(
         mesh = _finer_mesh(objective, record)
         findings = _findings(record, objective, found, mesh)
         with together():
+            for path in job.files:
+                _copy(path, out / f"fit{path.suffix}")
             write_text(out / "report.html", _page(record, found, findings, episodes, job))
             write_json(out / "intervals.json", found.model_dump(mode="json"))
     for line in findings:
         errors.print(line, soft_wrap=True)
     errors.print(f"Wrote {out / 'report.html'}, {out / 'fit.json'}.")
     finish(_result(record, found, findings, None if mesh is None else mesh[0]), json)
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Write nothing where nothing would change."""
+    content = source.read_bytes()
+    if not target.is_file() or target.read_bytes() != content:
+        write_bytes(target, content)
 
 
 def find_scene(
@@ -153,7 +163,7 @@ def _read(path: Path, name: str, out: Path) -> Episode:
     if path.is_file():
         episode = read_episode(path)
     elif (path / "episode.json").is_file():
-        PreprocessJob("episodes", path, out, Config().preprocess, None).run(lambda done, text: None)
+        PreprocessJob("episodes", path.resolve(), out, Config().preprocess, None).run(lambda done, text: None)
         return read_episode(kept)
     else:
         track = path / "gripper.csv"
@@ -173,8 +183,14 @@ def _unpacked(bag: Path, folder: Path) -> Path:
             f"{bag} is a recording of the RealSense SDK, which does not say where the camera stands: make a raw episode of "
             "it first, by `diffcloud import recording NAME=FILE` and a calibration."
         )
+    files = sorted(bag.rglob("*")) if bag.is_dir() else [bag]
+    source = {"files": [[one.name, one.stat().st_size, one.stat().st_mtime_ns] for one in files]}
+    told = folder.with_name(f"{folder.name}.source.json")
     if not folder.is_dir():
         write_recording(folder, ros_recording(bag, description=partial(robot_description, None)))
+        write_json(told, source)
+    elif not told.is_file() or read_json(told) != source:
+        raise EpisodeError(f"{folder} was made of another {bag.name} than {bag} is now. Remove it to have it made anew.")
     return folder
 
 
@@ -242,7 +258,7 @@ def _layouts(
             warn(f"{name}: {message}.")
         layouts[name] = {key: entry.value for key, entry in layout.fields.items()}
         lines = _yaml(layout.fields, head=False).splitlines()
-        blocks.append("\n".join([f"{name}:", *(f"  {line}" for line in lines)]))
+        blocks.append("\n".join([f"{_inline(name)}:", *(f"  {line}" for line in lines)]))
     write_text(path, "\n".join(blocks) + "\n")
     return layouts
 
@@ -263,10 +279,14 @@ def _fields(path: Path) -> dict[str, Any]:
 
 def _yaml(found: Mapping[str, Found], *, head: bool = True) -> str:
     lines = [_HEAD] if head else []
-    for name, entry in found.items():
-        value = yaml.safe_dump(entry.value, default_flow_style=True, width=1000, sort_keys=False)
-        lines.append(f"{name}: {value.strip().removesuffix('...').strip()}  # {entry.reason}")
+    lines += [f"{name}: {_inline(entry.value)}  # {entry.reason}" for name, entry in found.items()]
     return "\n".join(lines) + "\n"
+
+
+def _inline(value: Any) -> str:
+    """As YAML in one line; a text that would be read as something else, such as the name 001, in quotes."""
+    text: str = yaml.safe_dump(value, default_flow_style=True, width=1000, sort_keys=False)
+    return text.strip().removesuffix("...").strip()
 
 
 def _chosen(parameters: str | None, cloth: Mapping[str, Any], mass: float | None) -> FitConfig:
@@ -296,7 +316,7 @@ def _scenarios(
 
 
 def _stated(
-    fit: Callable[[FitConfig, int, int, Mapping[str, float]], _Fitted],
+    fit: Callable[[str, FitConfig, int, int, Mapping[str, float]], _Fitted],
     settings: FitConfig,
     steps: int,
     *,
@@ -314,7 +334,7 @@ def _stated(
     init: Mapping[str, float] = {}
     halvings = 0
     for left in range(RESTARTS, -1, -1):
-        record, objective, job, steps = fit(settings, steps, halvings, init)
+        record, objective, job, steps = fit(f"fit{RESTARTS - left}", settings, steps, halvings, init)
         space, seen = space_of(record), scan_of(record)
         found = state_intervals(objective, space, record.free, level=level, within=within, seen=seen)
         if found.lower is None or not left:
@@ -335,6 +355,7 @@ def _fitted(
     episodes: Mapping[str, Episode],
     cloth: Mapping[str, Any],
     layouts: Mapping[str, Mapping[str, Any]],
+    name: str,
     settings: FitConfig,
     steps: int,
     halvings: int,
@@ -343,12 +364,13 @@ def _fitted(
     """Fit, with finer and finer steps from the place found, until they no longer matter; and the scenario's steps a frame.
 
     Args:
+        name: of the fit; one for each number of steps is kept in OUT/stages/, so that the same command goes on after it.
         halvings: of edges and steps, to begin with.
     """
     while True:
         scenarios = _scenarios(out, cloth, layouts, steps)
         members = [Recording(scenarios[name], name, episode) for name, episode in episodes.items()]
-        job = FitJob("fit", members, settings, out, init, halvings)
+        job = FitJob(f"{name}_steps{steps}", members, settings, out / "stages", init, halvings)
         with progress_bar("identify", 1) as update:
             record = job.run(partial(_tell, update, steps))
         objective = replace(job, halvings=record.halvings).objective()
@@ -378,7 +400,8 @@ def _validation(record: FitRecord, objective: AnyObjective) -> str:
         if episode.left_out is None:
             return "Leaving one recording out failed: whether parameters carry over is not known."
         with torch.no_grad():
-            middle = float(member(one_set({**weighed, **record.laid_in(episode)})))
+            run = member.simulate_to_loss(one_set({**weighed, **record.laid_in(episode)}))
+            middle = float(member.frame_losses(run).mean())  # as the others, without the prior of the pose
         held.append(episode.left_out.rms_mm / episode.rms_mm)
         gains.append((middle - episode.left_out.loss) / max(middle - episode.loss, 1e-300))
     told = f"when a recording is left out of the fit, its misfit is at most {max(held):.2f} times that in the joint fit"

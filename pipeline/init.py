@@ -40,9 +40,11 @@ stages:
       - scenarios:
           persist: true
       - fit.json:
-          persist: true  # the command checks whether it still belongs to these recordings
+          persist: true
       - fit.npz:
           persist: true
+      - stages:
+          persist: true  # finished fits; the command checks which still belong to these recordings
 
   export:
     cmd: diffcloud export fit.json --to ${export.to} --out exported

@@ -56,7 +56,7 @@ def preprocess(
     failures: list[str] = []
     for job, counts, error in run_all("preprocess", jobs, settings.workers):
         if error is None:
-            kept[job.name] = counts
+            kept[f"{job.scenario}/{job.name}"] = counts
         else:
             failures.append(error)
     errors.print(f"Cleaned {len(kept)} episodes into {out}.")

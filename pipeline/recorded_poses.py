@@ -75,9 +75,7 @@ class PoseJob:
             config = self.config.model_copy(update={**told, "halvings": 0})  # the truth has the scenario's nodes
             job = FitJob(self.label, [Recording(scenario, self.label, episode)], config, self.folder)
             fitted = job.solved()
-            outcome = fitted.outcome
-            if outcome.stop_reason == "interrupted":
-                raise KeyboardInterrupt
+            outcome = fitted.outcome.uninterrupted()
             result = describe_fit(fitted.objective, job.space, job.solver_settings, outcome, episodes=[self.label])
             moved = result.motions[0].nodes[0]
             lag = result.record.nuisance.get("lag")

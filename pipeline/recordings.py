@@ -84,13 +84,14 @@ def _poses(jobs: list[PoseJob], workers: int, out: Path, recorded: EpisodesConfi
             done.append(told)
         else:
             failures.append(f"{job.label}: {error}")
-    if failures:
-        raise DiffCloudError("; ".join(failures))
-    page = pose_page(pose_rows(done), [fits[0] for fits in done], recorded)
-    write_text(out, page)
-    if not json:
-        output.print(page)
+    if done:
+        page = pose_page(pose_rows(done), [fits[0] for fits in done], recorded)
+        write_text(out, page)
+        if not json:
+            output.print(page)
     finish({"out": str(out), "recordings": done}, json)
+    if failures:
+        raise DiffCloudError(f"{len(failures)} of {len(jobs)} are missing there. {'; '.join(failures)}")
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def _ratio(scenario: Scenario, episode: Episode, mass: float, config: FitConfig)
     """Fitted stretch over the weighed mass. With both free, bending and air hardly tell them apart (docs/concepts.md)."""
     objective = Objective(scenario, episode, **config.measure())
     space = FitSpace.build(["stretch"], bounds={**scenario.bounds, **config.bounds}, fixed={"mass": mass})
-    return solve(objective, space, config.solver_settings(scenario)).values["stretch"] / mass
+    return solve(objective, space, config.solver_settings(scenario)).uninterrupted().values["stretch"] / mass
 
 
 def _of_first_camera(episode: Episode) -> Episode:
@@ -153,8 +154,8 @@ def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: l
         shifts = "–" if refined is None else ", ".join(f"{1e3 * v:.1f}" for v in list(refined["shift_m"].values())[1:])
         tail = "– | –" if refined is None else f"{1e3 * refined['skin_m']:.1f} | {1e3 * refined['lag_s']:.0f}"
         lines.append(
-            f"| {name} | {figures.points.min()}–{figures.points.max()} | {100 * part['robot']:.2f} | "
-            f"{100 * part['table']:.2f} | {100 * part['lost']:.1f} | {100 * part['lost_flat']:.1f} | "
+            f"| {name} | {figures.points.min()}–{figures.points.max()} | {_percent(part['robot'], 2)} | "
+            f"{_percent(part['table'], 2)} | {_percent(part['lost'], 1)} | {_percent(part['lost_flat'], 1)} | "
             f"{_millimetres(figures.cloud_to_cloth_m)} | {_millimetres(figures.cloth_to_cloud_m)} | {shifts} | {tail} |"
         )
     if fitted:
@@ -180,14 +181,19 @@ def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: l
     return "\n".join(lines) + "\n"
 
 
-def _parts(figures: CloudFigures) -> dict[str, float]:
+def _parts(figures: CloudFigures) -> dict[str, float | None]:
+    """None where no frame is of the kind that it is about."""
     points, flat = figures.points.sum(), figures.flat
     return {
         "robot": float(figures.robot.sum() / points),
         "table": float(figures.table.sum() / points),
-        "lost": float(figures.lost[~flat].mean()) if (~flat).any() else float("nan"),
-        "lost_flat": float(figures.lost[flat].mean()) if flat.any() else float("nan"),
+        "lost": float(figures.lost[~flat].mean()) if (~flat).any() else None,
+        "lost_flat": float(figures.lost[flat].mean()) if flat.any() else None,
     }
+
+
+def _percent(part: float | None, digits: int) -> str:
+    return "–" if part is None else f"{100 * part:.{digits}f}"
 
 
 def _millimetres(values: Any) -> str:

@@ -58,7 +58,7 @@ def report(
         scenario, name = str(known["scenario"]), str(known["episode"])
         path = fit_file(fits, scenario, name)
         fit = read_fit(path)
-        known.setdefault("rms_other_frames_mm", float("nan"))
+        known = {"rms_start_mm": float("nan"), "rms_other_frames_mm": float("nan"), **known}
         index = next((i for i, one in enumerate(fit.episodes) if one.scenario == scenario), 0)
         source = fit.episodes[index].name
         entries.append(
@@ -147,11 +147,15 @@ def _pictures(folder: Path, name: str) -> dict[str, bytes]:
     return {caption: path.read_bytes() for caption, path in files.items() if path.is_file()}
 
 
+_NAMES = ("scenario", "episode", "model")
+"""Columns of tables that stay text, whatever episodes are called."""
+
+
 def table_rows(table: Path) -> list[dict[str, Any]]:
     """Rows of a table as column -> value, without what is not known; none if there is no such table."""
     if not table.is_file():
         return []
     return [
         {str(key): value for key, value in row.items() if not (isinstance(value, float) and np.isnan(value))}
-        for row in read_csv(table, kind="table", error=ConfigError).to_dict("records")
+        for row in read_csv(table, kind="table", error=ConfigError, text=_NAMES).to_dict("records")
     ]

@@ -74,17 +74,19 @@ class RaceJob:
             DivergedError: the truth, or every start of the reference, diverges.
         """
         path = self.out / self.scenario.name / str(self.count) / f"{self.index:04d}.json"
-        mark = fingerprint([self.scenario, self.names, self.index, self.seed, BUDGET, WITHIN], packages=_CODE)
+        truth = self.truth()
+        solvers = [self._settings(name, 0.0) for name in SOLVERS]
+        plan = [self.scenario, truth, solvers, self.index, self.seed, BUDGET, WITHIN, _NOISE_M, _BESIDE_M, _TURNED]
+        mark = fingerprint(plan, packages=_CODE)
         if (kept := kept_record(path, mark)) is not None:
             return kept
-        truth = self.truth()
         recording = Recording(self.scenario, self.label, self._episode(truth))
         job = FitJob(self.label, [recording], FitConfig(parameters=self.names, doubts="none", laid="none"), self.out)
         objective, space = job.objective(), job.space
         tell(0.0, "reference")
         wide = GaussNewtonSettings(starts=6, screen=96, scans=3, seed=self.seed)
         near = GaussNewtonSettings(starts=1, screen=0, init=truth)
-        lowest = min(solve(objective, space, settings).loss for settings in (near, wide))
+        lowest = min(solve(objective, space, settings).uninterrupted().loss for settings in (near, wide))
         told: dict[str, Any] = {"truth": truth, "reference": lowest, "solvers": {}}
         for place, name in enumerate(SOLVERS):
             tell((place + 1) / (len(SOLVERS) + 1), name)
@@ -134,12 +136,10 @@ class RaceJob:
     def _timed(self, objective: Objective | JointObjective, space: Any, settings: Settings) -> dict[str, Any]:
         began = time.process_time()
         try:
-            found = solve(objective, space, settings)
+            found = solve(objective, space, settings).uninterrupted()
         except DivergedError as error:
             return {"arrived": False, "error": str(error)}
         seconds = time.process_time() - began
-        if found.stop_reason == "interrupted":
-            raise KeyboardInterrupt
         arrived = found.loss <= settings.threshold and found.simulations <= BUDGET
         return {"arrived": arrived, "loss": found.loss, "seconds": seconds, "simulations": found.simulations}
 

@@ -63,7 +63,7 @@ def train(
     ] = None,
     subtract_background: Annotated[bool | None, typer.Option(help="Leave the known obstacle out of the clouds.")] = None,
     heteroscedastic: Annotated[
-        bool | None, typer.Option("--heteroscedastic", help="Learn a width of each prediction along.")
+        bool | None, typer.Option("--heteroscedastic", help="Also learn a width for each prediction.")
     ] = None,
     patience: Annotated[int | None, typer.Option(help="Stop after so many epochs without a better validation.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of all random numbers.")] = None,

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from diffcloud.errors import ConfigError
 from diffcloud.fit.record import FitRecord, read_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import write_text
@@ -95,11 +94,8 @@ def _layers(
     if fit is not None and record is not None:
         from diffcloud.fit.result import read_motion
 
-        names = [one.name for one in record.episodes]
-        if path.stem not in names:
-            raise ConfigError(f"{path.stem} is not among the recordings of {fit}: {', '.join(names)}.")
-        recording = record.episodes[names.index(path.stem)]
-        motion = read_motion(fit.with_suffix(".npz"), names.index(path.stem))
+        place = record.place_of(path.stem, name)
+        recording, motion = record.episodes[place], read_motion(fit.with_suffix(".npz"), place)
         found = choose_scenario(name or (None if scene else fitted_scenario(fit, recording.scenario)), scene)
         layers += fitted_layers(motion, times)
         layers += [unposed_layer(found, recording, motion, times), *table_layers(found, motion.nodes.reshape(-1, 3))]

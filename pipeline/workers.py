@@ -84,7 +84,7 @@ def run_all(
                     yield (job, *found)
             except BrokenProcessPool as error:
                 raise DiffCloudError(
-                    "A worker process died, as one does that gets no more memory. Try fewer --workers."
+                    "A worker process died, probably because memory ran out. Try fewer --workers."
                 ) from error
             except BaseException:  # Ctrl-C, or nobody wants the rest
                 stop.set()

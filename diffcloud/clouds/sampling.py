@@ -50,8 +50,6 @@ class SurfaceSampler:
 
     faces: Tensor
     """[F, 3] node indices of the faces that may be sampled."""
-    weights: Tensor | None
-    """[F] extra weight on each face's area (visibility, say); None for one."""
     choice: Tensor
     """[N] in [0, 1): picks the face, stratified so that each face gets its share."""
     barycentric: Tensor
@@ -64,7 +62,6 @@ class SurfaceSampler:
         *,
         generator: torch.Generator,
         subset: Tensor | None = None,
-        weights: Tensor | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> SurfaceSampler:
         """Draw the random numbers.
@@ -74,10 +71,9 @@ class SurfaceSampler:
             points: N.
             generator: of the random numbers (on the CPU).
             subset: indices of the faces that may be sampled (the paper's occlusion heuristic); None for all.
-            weights: [F] non-negative, on top of the area.
 
         Raises:
-            ConfigError: no points, no faces, an index out of range, or weights that are negative or all zero.
+            ConfigError: no points, no faces, or an index out of range.
         """
         if points < 1:
             raise ConfigError(f"At least one point must be sampled, got {points}.")
@@ -85,19 +81,16 @@ class SurfaceSampler:
             if len(subset) == 0 or int(subset.min()) < 0 or int(subset.max()) >= len(faces):
                 raise ConfigError(f"The face subset must hold indices in 0..{len(faces) - 1}, and at least one.")
             faces = faces[subset]
-            weights = None if weights is None else weights[subset]
-        if weights is not None and not (bool((weights >= 0).all()) and float(weights.sum()) > 0):
-            raise ConfigError("Face weights must not be negative, and at least one must be positive.")
         device = faces.device
         stratum = torch.arange(points, dtype=dtype)
         choice = (stratum + torch.rand(points, dtype=dtype, generator=generator)) / points
         r1, r2 = torch.rand(2, points, dtype=dtype, generator=generator)
-        return SurfaceSampler(faces, weights, choice.to(device), uniform_barycentric(r1, r2).to(device))
+        return SurfaceSampler(faces, choice.to(device), uniform_barycentric(r1, r2).to(device))
 
     def draw(self, positions: Tensor) -> SurfacePoints:
         """Points [..., N] on the mesh at node positions [..., V, 3]."""
         flat = positions.reshape(-1, *positions.shape[-2:])
-        nodes = _choose(flat, self.faces, self.choice, self.weights)
+        nodes = _choose(flat, self.faces, self.choice, None)
         return SurfacePoints(
             nodes.reshape(*positions.shape[:-2], -1, 3), self.barycentric.expand(*positions.shape[:-2], -1, 3)
         )

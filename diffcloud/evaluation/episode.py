@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from diffcloud.errors import DiffCloudError
+from diffcloud.errors import DiffCloudError, DivergedError
 from diffcloud.evaluation import methods
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, state_intervals
 from diffcloud.evaluation.landscape import loss_landscape
@@ -71,9 +71,8 @@ def compare_episode(
         transfers: episode -> parameters fitted on it, of other recordings of the same fabric.
     """
     settings = settings or ComparisonSettings()
-    measure = fit.measure.model_dump(exclude={"seed"})
     space, _ = methods.space_of(fit).of_recording(recording)
-    objective = Objective(scenario, episode, **measure, seed=fit.measure.seed)
+    objective = Objective(scenario, episode, **fit.measured_by(recording))
     told: list[Estimate | Gap] = [methods.fitted(fit, recording)]
     laid = fit.laid_in(fit.episodes[recording])  # as the pose, for all methods
     lying = FitSpace(space.asked.variables, {**space.asked.fixed, **laid})
@@ -116,6 +115,7 @@ def compare_episode(
         "scenario": scenario.name,
         "episode": name,
         "fit": fit_name or name,
+        "halvings": fit.halvings,
         **{key: meta.get(key) for key in ("fabric", "category", "repeat", "source")},
         "category_assumed": bool(meta.get("category_assumed", False)),
         "truth": {key: float(value) for key, value in (meta.get("truth") or {}).items()},
@@ -123,7 +123,6 @@ def compare_episode(
         "threshold": success_threshold(scenario),
         "frames": list(objective.frames),
         "doubtful": [variable.name for variable in space.variables if variable.doubtful],
-        "starts": int(fit.settings.get("starts") or 1),  # a search is one
         "start": None if len(sets) in measured.diverged else measured.rows[-1],
         "methods": rows,
         "gaps": [{"method": gap.method, "reason": gap.reason, "expected": gap.expected} for gap in gaps],
@@ -134,13 +133,17 @@ def compare_episode(
     }
     if 0 in measured.diverged:  # the fit itself: there is no optimum to look around
         return EpisodeRecord(record, seconds)
-    if settings.level is not None and len(fit.episodes) == 1:  # those of a joint fit are of all its recordings together
-        told_intervals = state_intervals(
-            objective, space, best,
-            level=settings.level, within=settings.within, restarts=RESTARTS, seen=methods.scan_of(fit),
-        )  # fmt: skip
-        record["intervals"] = told_intervals.model_dump(mode="json")
     objective.reseed(fit.measure.seed)
+    if settings.level is not None and len(fit.episodes) == 1:  # those of a joint fit are of all its recordings together
+        try:
+            told_intervals = state_intervals(
+                objective, space, best,
+                level=settings.level, within=settings.within, restarts=RESTARTS, seen=methods.scan_of(fit),
+            )  # fmt: skip
+            record["intervals"] = told_intervals.model_dump(mode="json")
+        except DivergedError as error:
+            record["gaps"].append({"method": "intervals", "reason": str(error), "expected": True})
+        objective.reseed(fit.measure.seed)
     if settings.landscape_size:
         record["landscape"] = loss_landscape(objective, space, best, fit.history, size=settings.landscape_size)
     return EpisodeRecord(record, seconds)
@@ -149,7 +152,7 @@ def compare_episode(
 def _run(rival: Rival, objective: Objective, space: FitSpace, fit: FitRecord, seed: int) -> Estimate | Gap:
     """One rival with the budget of the fit, or of one start of Adam; a gap if its simulations fail."""
     told, by_adam = fit.settings, fit.solver == "adam"
-    simulations = int(told["iterations"] or 0) + 1 if by_adam else fit.simulations
+    simulations = int(told["iterations"] or 0) + 1 if by_adam else methods.simulations_each(fit)
     threshold = float(told["threshold"] or 0.0)
     objective.reseed(fit.measure.seed)
     try:

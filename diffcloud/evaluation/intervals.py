@@ -168,9 +168,7 @@ def state_intervals(
     """
     found, lower = _with_scan(objective, space, values, uncertainty(objective, space, values), seen)
     if lower is not None and restarts > 0:
-        outcome = solve(objective, space, GaussNewtonSettings(starts=1, screen=0, init=lower))
-        if outcome.stop_reason == "interrupted":
-            raise KeyboardInterrupt
+        outcome = solve(objective, space, GaussNewtonSettings(starts=1, screen=0, init=lower)).uninterrupted()
         told_again = state_intervals(
             objective, space, outcome.values,
             level=level, within=within, restarts=restarts - 1, seen=outcome.scan,
@@ -219,7 +217,7 @@ def state_intervals(
             told = "identified"
         elif name in ("stretch", "mass") and ratio_reach is not None and math.exp(max(ratio_reach)) <= within:
             told = "only the ratio"
-        elif any(c.factor <= within and abs(c.powers[name]) > _SHARE for c in combinations if c.factor is not None):
+        elif any(name in _tied(one, space) for one in combinations if one.factor is not None and one.factor <= within):
             told = "only a combination"
         else:
             told = "not identified"
@@ -442,6 +440,12 @@ def _combinations(found: Uncertainty, space: FitSpace, level: float) -> list[Com
             )
         )
     return told
+
+
+def _tied(combination: Combination, space: FitSpace) -> set[str]:
+    """The parameters whose product a combination is: none where it is one alone, or where one has no logarithm."""
+    named = [one for one in space.variables if abs(combination.powers[one.name]) > _SHARE]
+    return {one.name for one in named} if len(named) > 1 and all(one.low > 0 for one in named) else set()
 
 
 def _sources(found: Uncertainty, space: FitSpace, ratio: NDArray[np.float64] | None) -> dict[str, dict[str, float]]:

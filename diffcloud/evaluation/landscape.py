@@ -1,4 +1,4 @@
-"""The loss over two parameters, simulated on a logarithmic grid in batches, and the optimiser's path on it."""
+"""The loss over two parameters, simulated on a grid in batches, and the optimiser's path on it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def loss_landscape(
     Args:
         values: the fitted ones.
         history: of the fit.
-        size: n places along each axis, between the bounds.
+        size: n places along each axis, between the bounds: at equal ratios, or at equal distances from a bound of zero.
 
     Returns:
         names; x, y: [n] of the first and the second parameter; loss: [n][n], rows of y, None where a run diverged; paths:

@@ -70,14 +70,19 @@ def scan_of(fit: FitRecord) -> Scan | None:
 
 
 def fitted(fit: FitRecord, recording: int) -> Estimate:
-    """The fit itself, of one of its recordings."""
+    """The fit itself, of one of its recordings, with its share of what all of them took."""
     return Estimate(
         "diffcloud",
         of_recording(fit.simulated, recording),
-        simulations=fit.simulations,
+        simulations=simulations_each(fit),
         gradients=not issubclass(SOLVERS[fit.solver], SearchSettings),
-        seconds={"optimisation": fit.seconds},
+        seconds={"optimisation": fit.seconds / len(fit.episodes)},
     )
+
+
+def simulations_each(fit: FitRecord) -> int:
+    """That a fit took for each of its recordings."""
+    return math.ceil(fit.simulations / len(fit.episodes))
 
 
 def middle(space: FitSpace) -> Estimate:
@@ -122,8 +127,7 @@ def searched(objective: Objective, space: FitSpace, settings: CmaEsSettings | Ra
 
 
 def _estimate(method: str, found: FitOutcome, *, gradients: bool) -> Estimate:
-    if found.stop_reason == "interrupted":
-        raise KeyboardInterrupt  # half a search is no method; the fit itself keeps its best so far
+    found = found.uninterrupted()  # half a search is no method; the fit itself keeps its best so far
     return Estimate(
         method,
         found.values,

@@ -61,8 +61,8 @@ class LandscapeRecord(Checked):
     """Losses around a fit."""
 
     names: Annotated[list[Text], Field(min_length=2, max_length=2)]
-    x: Annotated[list[Place], Field(min_length=1)]
-    y: Annotated[list[Place], Field(min_length=1)]
+    x: Annotated[list[NonNegative], Field(min_length=1)]
+    y: Annotated[list[NonNegative], Field(min_length=1)]
     loss: list[list[Value | None]]
     paths: list[list[list[Value]]]
     fitted: list[Value]
@@ -84,6 +84,7 @@ class ComparisonRecord(Checked):
     scenario: Text
     episode: Text
     fit: Text
+    halvings: int
     fabric: Text | None
     category: Text | None
     repeat: int | None
@@ -94,7 +95,6 @@ class ComparisonRecord(Checked):
     threshold: Value | None
     frames: list[int]
     doubtful: list[Text]
-    starts: int
     start: _Metrics | None
     methods: list[MethodRecord]
     gaps: list[GapRecord]
@@ -127,7 +127,8 @@ class FitRow(BaseModel):
     scenario: Text
     episode: Text
     loss: NonNegative
-    rms_start_mm: NonNegative
+    rms_start_mm: NonNegative | None = None
+    """None where the start diverges."""
     rms_mm: NonNegative
 
 

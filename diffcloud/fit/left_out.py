@@ -62,8 +62,7 @@ def leave_out_and_go_on(
         shown = None if progress is None else partial(progress, 0.0, "going on from a lower loss")
         outcome = outcome.gone_on(fit_gauss_newton(objective, space, further, progress=shown))
         keep(outcome)
-        if outcome.stop_reason == "interrupted":
-            raise KeyboardInterrupt
+        outcome.uninterrupted()
 
 
 def leave_each_out(
@@ -92,7 +91,8 @@ def leave_each_out(
         lying = FitSpace(tuple(one for one in here.variables if one.name not in alike), {**here.fixed, **alike})
         lies = _from(member, lying, of_recording(values, index), shown) if lying.variables else {}
         with torch.no_grad():
-            loss = float(member(one_set({**lying.fixed, **lies})))
+            run = member.simulate_to_loss(one_set({**lying.fixed, **lies}))
+            loss = float(member.frame_losses(run).mean())  # without the prior of the pose, as the joint fit's is told
         parameters = {name: value for name, value in lying.fixed.items() if not is_laid(name)}
         told.append(LeftOut(loss=loss, rms_mm=1e3 * member.scenario.length_unit_m * loss**0.5, parameters=parameters))
         places.append(with_recording(found, lies, index))
@@ -106,7 +106,4 @@ def _from(
 ) -> dict[str, float]:
     """The fitted values at the end of a descent from these."""
     settings = GaussNewtonSettings(iterations=_STEPS, starts=1, screen=0, scans=0, init=values)
-    found = fit_gauss_newton(objective, space, settings, progress=progress)
-    if found.stop_reason == "interrupted":
-        raise KeyboardInterrupt
-    return found.values
+    return fit_gauss_newton(objective, space, settings, progress=progress).uninterrupted().values

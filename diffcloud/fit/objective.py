@@ -182,15 +182,17 @@ class Objective:
 
     def halved(self) -> Objective:
         """The same with half the edge length and half the step."""
-        return Objective(
+        finer = Objective(
             self.scenario.halved(1),
             self.episode,
             paper=self.paper,
             nuisance=self.nuisance,
-            frames=self.asked_frames,
+            frames=self.frames,  # whatever the finer motion says of the cut
             points=self.asked_points,
             seed=self._seed,
         )
+        finer.asked_frames = self.asked_frames
+        return finer
 
     def reseed(self, seed: int) -> None:
         """Draw the common random numbers anew."""

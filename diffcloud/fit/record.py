@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from diffcloud.errors import ConfigError
+from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.fit.names import SHARED, of_all
 from diffcloud.io.files import read_json
 
@@ -137,11 +137,12 @@ class WholeMaterial(_Model):
 
 
 class Measure(_Model):
-    """What recording and motion were compared by: keyword arguments of `Objective`."""
+    """What recording and motion are compared by: keyword arguments of `Objective`, for a recording that is new to the fit;
+    `FitRecord.measured_by` has those for one that it knows."""
 
     paper: bool
     nuisance: dict[str, Annotated[float, Field(gt=0, le=1e3)]]
-    """Free variables of the pose -> standard deviation of the prior [m, rad, s]."""
+    """Free variables of the pose -> standard deviation of the prior [m, rad, s]; of the first recording."""
     frames: list[int] | None
     """Asked for; None: the scenario's, or every usable one."""
     points: Annotated[int, Field(ge=1, le=10_000_000)] | None
@@ -209,7 +210,7 @@ class FitRecord(_Model):
     """[squared length unit, mean over points], by the fit's own random points, without priors; of a joint fit the geometric
     mean over its recordings, with `paper` the plain one."""
     loss_start: NonNegative
-    """At `start`, on the scenario's own mesh."""
+    """At `start`, on the scenario's own mesh, with priors."""
     loss_resampled: NonNegative
     """Mean over fresh points, which the fit could not adapt to."""
     rms_mm: NonNegative
@@ -259,6 +260,34 @@ class FitRecord(_Model):
             for name, entry in (recording or self.episodes[0]).nuisance.items()
             if entry.of == "cloth" and (recording is not None or name in SHARED)
         }
+
+    def place_of(self, name: str, scenario: str | None = None) -> int:
+        """Of a recording in `episodes`.
+
+        Args:
+            scenario: that the fit simulates it in; needed where it has two recordings of this name.
+
+        Raises:
+            ConfigError: none, or several.
+        """
+        if name not in {one.name for one in self.episodes}:
+            raise ConfigError(unknown_name("recording of the fit", name, {one.name for one in self.episodes}))
+        found = {one.scenario: place for place, one in enumerate(self.episodes) if one.name == name}
+        if scenario in found:
+            return found[scenario]
+        if len(found) > 1:
+            raise ConfigError(f"The fit knows {name} in {' and '.join(sorted(found))}; choose one by --scenario.")
+        return next(iter(found.values()))
+
+    def measured_by(self, recording: int) -> dict[str, Any]:
+        """Keyword arguments of `Objective` with which a recording was compared, with its own pose and frames.
+
+        Args:
+            recording: its place in `episodes`.
+        """
+        one = self.episodes[recording]
+        pose = {name: entry.prior for name, entry in one.nuisance.items() if entry.of == "pose"}
+        return {**self.measure.model_dump(), "nuisance": pose, "frames": one.frames}
 
     @property
     def finer_by(self) -> str:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from diffcloud.errors import DivergedError
 from diffcloud.fit.batches import without_diverged
 from diffcloud.fit.inputs import Inputs
 from diffcloud.fit.joint import AnyObjective, mean_terms
@@ -156,12 +157,20 @@ def _by_tangents(objective: Objective, space: FitSpace, places: Tensor) -> tuple
 
 
 def _by_differences(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rollout, Tensor]:
+    """
+    Raises:
+        DivergedError: names the places beside which a motion diverges, or at which.
+    """
     axis = Axis.of(space)
     low, high = axis.ends
     ways = _ways(places)
     above, below = (torch.minimum(torch.maximum(places + sign * STEP * ways, low), high) for sign in (1, -1))
     every = torch.cat([places[None], above, below]).flatten(0, 1)
-    run = objective.simulate_to_loss(space.parameters(axis.values(every)))
+    try:
+        run = objective.simulate_to_loss(space.parameters(axis.values(every)))
+    except DivergedError as error:
+        entries = sorted({entry % len(places) for entry in error.entries})
+        raise DivergedError(error.step, entries, error.reason, error.parameters) from error
     there = run.at(objective.times)[len(places) :].unflatten(0, (2, -1, len(places)))
     width = ((above - below) * ways).sum(-1)  # halved at a bound
     return replace(run, positions=run.positions[: len(places)], velocities=run.velocities[: len(places)]), (

@@ -322,23 +322,36 @@ def _as_far_as_both_go(
     objective: Objective, values: Mapping[str, float], start_values: Mapping[str, float]
 ) -> tuple[Rollout, Rollout]:
     """The rollouts with fitted and first values over the whole scenario, or up to the last frame before one diverges. First
-    values that diverge before (on a finer mesh than that which they were tried on) are replaced by the fitted ones.
+    values that diverge within the compared frames (on a finer mesh than that which they were tried on) are replaced by the
+    fitted ones.
 
     Raises:
         DivergedError: the fitted ones, within the compared frames.
     """
-    steps, each = objective.scenario.steps, objective.scenario.scene.frame_steps
+    run = _as_far_as_it_goes(objective, values, objective.scenario.steps)
+    try:
+        start = _as_far_as_it_goes(objective, start_values, len(run.times) - 1)
+    except DivergedError:
+        return run, run
+    if len(start.times) < len(run.times):
+        run = _as_far_as_it_goes(objective, values, len(start.times) - 1)
+    return run, start
+
+
+def _as_far_as_it_goes(objective: Objective, values: Mapping[str, float], steps: int) -> Rollout:
+    """
+    Raises:
+        DivergedError: within the compared frames.
+    """
+    each = objective.scenario.scene.frame_steps
     while True:
         try:
-            run, start = (objective.simulate(one_set(told), steps=steps) for told in (values, start_values))
+            return objective.simulate(one_set(values), steps=steps)
         except DivergedError as error:
             reached = max((error.step - 1) // each * each, objective.loss_steps)
             if reached >= steps:
-                run = objective.simulate(one_set(values), steps=steps)
-                return run, run
+                raise
             steps = reached
-        else:
-            return run, start
 
 
 def _cut_short(members: Sequence[Objective], runs: Sequence[Rollout], episodes: Sequence[str]) -> list[str]:

@@ -190,7 +190,7 @@ def noise_mm(objective: Objective) -> float:
     to_mm = 1e3 * objective.length_unit_m
     spacing = to_mm * float(np.sqrt(np.mean([cloud.spacing**2 for cloud in objective.clouds])))
     sigma = objective.episode.sigma
-    return float(np.hypot(spacing, 1e3 * _NOISE_M if sigma is None else to_mm * float(np.median(sigma))))
+    return float(np.hypot(spacing, 1e3 * (_NOISE_M if sigma is None else float(np.median(sigma)))))
 
 
 @dataclass(frozen=True)

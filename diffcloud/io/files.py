@@ -32,7 +32,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import yaml
 
-from diffcloud.errors import DiffCloudError, EpisodeError
+from diffcloud.errors import DiffCloudError, EpisodeError, OutputError
 
 _MOST_VALUES = 100_000
 """Values that a YAML file may stand for."""
@@ -72,7 +72,7 @@ class _Outputs:
         """Give all files their names."""
         for path, (temporary, inode) in self._pending.items():
             if _inode(temporary) != inode:
-                raise DiffCloudError(f"Another process wrote {path} at the same time; run the command again.")
+                raise OutputError(f"Another process wrote {path} at the same time; run the command again.")
         if len(self._pending) > 1:
             next(reversed(self._pending)).unlink(missing_ok=True)
         for path, (temporary, _) in self._pending.items():
@@ -101,7 +101,7 @@ def together() -> Iterator[None]:
     replaces a former one, and the last to come. A block inside another belongs to the outer one.
 
     Raises:
-        DiffCloudError: the system refused to put the files in place; the message names one.
+        OutputError: the system refused to put the files in place; the message names one.
     """
     if _group.get() is not None:
         yield
@@ -126,7 +126,7 @@ def atomic(path: Path) -> Iterator[BinaryIO]:
     A library that wants a path may write to the stream's `name`.
 
     Raises:
-        DiffCloudError: the system refused the write, or another process is writing the same file; names the file.
+        OutputError: the system refused the write, or another process is writing the same file; names the file.
     """
     path = Path(path)
     with together():
@@ -146,7 +146,7 @@ def staged(folder: Path) -> Iterator[Path]:
     What a kill leaves of it is removed by the next call for the same folder.
 
     Raises:
-        DiffCloudError: the system refused to put it in place.
+        OutputError: the system refused to put it in place.
     """
     folder = Path(folder)
     temporary = folder.with_name(f".{folder.name}{TEMPORARY}")
@@ -177,7 +177,7 @@ def write_shared(path: Path, text: str) -> None:
     Whoever comes last, the file is the same, and so is its time of change, which caches compare.
 
     Raises:
-        DiffCloudError: the system refused the write; names the file.
+        OutputError: the system refused the write; names the file.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY}")
@@ -374,7 +374,7 @@ def claimed(output: Path) -> Iterator[None]:
     """Hold an output, file or folder, against other processes; by a lock file beside it that is there only meanwhile.
 
     Raises:
-        DiffCloudError: another process holds it (names that process), or the place cannot be written.
+        OutputError: another process holds it (names that process), or the place cannot be written.
     """
     output = Path(os.path.realpath(output))
     lock = output.with_name(f".{output.name}{LOCK}")
@@ -386,7 +386,7 @@ def claimed(output: Path) -> Iterator[None]:
         os.write(descriptor, json.dumps(_this_process()).encode())
     except OSError as error:
         _remove_empty(folders)
-        raise DiffCloudError(f"Cannot write {output}: {error.strerror or error}. Nothing was changed.") from error
+        raise OutputError(f"Cannot write {output}: {error.strerror or error}. Nothing was changed.") from error
     try:
         yield
     finally:
@@ -402,7 +402,7 @@ def _hold(lock: Path, output: Path) -> int:
         if not _try_lock(descriptor):
             holder = _holder(descriptor)
             os.close(descriptor)
-            raise DiffCloudError(f"{output} is being written by {holder}. Wait for it, stop it, or choose another output.")
+            raise OutputError(f"{output} is being written by {holder}. Wait for it, stop it, or choose another output.")
         # the former holder removes the file before it lets go: a lock on a removed file holds nobody off
         if os.fstat(descriptor).st_ino == _inode(lock):
             return descriptor
@@ -440,7 +440,7 @@ def _opened_alone(path: Path, temporary: Path) -> Iterator[BinaryIO]:
     """The temporary file, new and locked; one that an ended process left is removed.
 
     Raises:
-        DiffCloudError: another process holds it.
+        OutputError: another process holds it.
     """
     while True:
         try:
@@ -449,7 +449,7 @@ def _opened_alone(path: Path, temporary: Path) -> Iterator[BinaryIO]:
         except FileExistsError:
             with suppress(FileNotFoundError), temporary.open("rb") as left:
                 if not _try_lock(left.fileno()):
-                    raise DiffCloudError(
+                    raise OutputError(
                         f"Another process is writing {path}; wait for it, or choose another output."
                     ) from None
                 temporary.unlink()
@@ -458,8 +458,8 @@ def _opened_alone(path: Path, temporary: Path) -> Iterator[BinaryIO]:
         yield stream
 
 
-def _refused(path: Path, error: OSError) -> DiffCloudError:
-    return DiffCloudError(
+def _refused(path: Path, error: OSError) -> OutputError:
+    return OutputError(
         f"Cannot write {path}: {error.strerror or error}. Nothing was changed; free the disk, or choose another place, and "
         "run the command again."
     )

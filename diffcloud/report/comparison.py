@@ -178,8 +178,9 @@ def comparison_sections(entry: ComparisonEntry) -> list[Section]:
             "intervals",
             "What is identified",
             "Intervals hold the truth at the stated level, as far as the named sources of uncertainty go. A parameter "
-            "counts as identified if its interval ends within a factor of 1.5. “Improve first” names the largest sources "
-            "and their parts of the variance: what is known better makes the interval shorter.",
+            "counts as identified if its interval ends within the factor that was asked for (evaluate.within, by default "
+            "1.5). “Improve first” names the largest sources and their parts of the variance: what is known better makes "
+            "the interval shorter.",
             said["intervals"],
             _table(told["intervals"], _INTERVALS),
             "intervals",
@@ -187,7 +188,7 @@ def comparison_sections(entry: ComparisonEntry) -> list[Section]:
         Section(
             "repeats",
             "Repeats of one fabric",
-            "Parameters of the cloth come out again when it is recorded again.",
+            "Parameters of the cloth itself should come out again when it is recorded again.",
             [*said["repeats"], *said["credibility"]],
             _table(told["repeatability"], _REPEATS),
             "repeatability",

@@ -258,11 +258,14 @@ def _landscape(record: Mapping[str, Any]) -> Figure | None:
         axis.plot(places[:, 0], places[:, 1], color="white", linewidth=1, alpha=0.8, label=name)
         axis.plot(places[0, 0], places[0, 1], "o", color="white", markersize=3)
     axis.plot(*told["fitted"], "*", color=_COLOURS[1], markersize=13, markeredgecolor="white", label="fitted")
-    if truth := record["truth"]:
+    truth = record["truth"]
+    if truth.keys() >= set(told["names"]):
         axis.plot(*(truth[name] for name in told["names"]), "X", color="white", markersize=9, label="true")
-    _draw_ellipse(axis, record)
-    axis.set_xscale("log")
-    axis.set_yscale("log")
+    from_zero = [name for name, places in zip(told["names"], (x, y), strict=True) if places[0] == 0]
+    if not from_zero:
+        _draw_ellipse(axis, record)
+    axis.set_xscale("linear" if told["names"][0] in from_zero else "log")
+    axis.set_yscale("linear" if told["names"][1] in from_zero else "log")
     axis.set_xlim(x[0], x[-1])
     axis.set_ylim(y[0], y[-1])
     axis.set_xlabel(told["names"][0])
@@ -274,8 +277,9 @@ def _landscape(record: Mapping[str, Any]) -> Figure | None:
         canvas,
         name,
         f"Loss landscape of {record['scenario']} / {record['episode']}",
-        f"{len(x)} × {len(y)} simulations on a logarithmic grid, common random points. The ellipse holds the "
-        "parameters at the level of the intervals; where it is small it is within the star.",
+        f"{len(x)} × {len(y)} simulations, common random points."
+        + " The ellipse holds the parameters at the level of the intervals; where it is small it is within the star."
+        * (not from_zero),
         "tables/comparison.json",
     )
 

@@ -110,7 +110,8 @@ class _Summary:
     """The first sentences of the page, in numbers."""
 
     episodes: int
-    start_mm: float
+    start_mm: float | None
+    """None where no start could be simulated."""
     final_mm: float
     known: int
     """Episodes whose hidden ratio of stretch to mass is known."""
@@ -136,9 +137,10 @@ def _summary(entries: Sequence[EpisodeEntry]) -> _Summary:
     errors = [
         abs(np.log(entry.row["fitted_ratio"] / entry.row["true_ratio"])) for entry in entries if "true_ratio" in entry.row
     ]
+    starts = np.array([entry.row["rms_start_mm"] for entry in entries])
     return _Summary(
         len(entries),
-        float(np.mean([entry.row["rms_start_mm"] for entry in entries])),
+        float(np.nanmean(starts)) if np.isfinite(starts).any() else None,
         float(np.mean([entry.row["rms_mm"] for entry in entries])),
         len(errors),
         float(np.exp(np.median(errors)) - 1) if errors else 0.0,

@@ -19,6 +19,7 @@ def record(
     stated: bool = True,
     gaps: list[dict[str, Any]] | None = None,
     landscape: bool = False,
+    halvings: int = 0,
     reason: str = "",
 ) -> dict[str, Any]:
     """One episode; `methods` and `transfers` give losses."""
@@ -27,6 +28,7 @@ def record(
         "scenario": scenario,
         "episode": episode,
         "fit": fit or episode,
+        "halvings": halvings,
         "fabric": fabric,
         "category": "medium",
         "category_assumed": True,
@@ -37,7 +39,6 @@ def record(
         "threshold": 6e-5,
         "frames": [-1],
         "doubtful": [],
-        "starts": 2,
         "start": None if start is None else _measured(start),
         "methods": [_row(method, loss, stretch, truth) for method, loss in losses.items()],
         "gaps": gaps or [],

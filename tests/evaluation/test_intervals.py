@@ -135,6 +135,19 @@ class TestVerdicts:
         assert found.parameters["bending"].verdict == "only a combination"
         assert found.ratio is None
 
+    @pytest.mark.parametrize(
+        ("names", "covariance"),
+        [
+            (["stretch"], [[0.01]]),  # at a bound, and one parameter is no combination
+            (["stretch", "friction_cloth"], known_ratio(1.0, 0.1)),  # which has no logarithm, as it may be zero
+        ],
+    )
+    def test_what_is_no_product_of_several_is_no_combination(self, told, names, covariance):
+        space = FitSpace.build(names, bounds={"stretch": (0.1, 10.0), "friction_cloth": (0.0, 1.5)})
+        values = {"stretch": 0.1 if len(names) == 1 else 1.0, "friction_cloth": 0.5}
+        found = told({"noise": np.zeros((len(names),) * 2), "z": np.array(covariance)}, space=space, values=values)
+        assert found.parameters["stretch"].verdict == "not identified"
+
     def test_a_named_factor_decides(self, told):
         sources = {"noise": np.zeros((2, 2)), "z": np.diag([0.04, 0.04])}
         assert told(sources, within=1.2).parameters["stretch"].verdict == "not identified"

@@ -41,6 +41,16 @@ def test_against_predictors_compares_means_of_the_same_episodes(told):
     assert row["below"] == pytest.approx(1 - 0.0015 / 0.00252)
 
 
+def test_a_predictor_that_fails_in_a_hard_episode_looks_no_better_for_it():
+    told = [
+        record("lift", "easy", methods={"diffcloud": 0.001, "mlp": 0.002, "pointnet2": 0.003}),
+        record("lift", "hard", methods={"diffcloud": 0.010, "mlp": 0.015}),
+    ]
+    (row,) = against_predictors(tables(told, {})["methods"]).to_dict("records")
+    assert (row["predictor"], row["loss"], row["predictor_loss"]) == ("mlp", pytest.approx(0.0055), pytest.approx(0.0085))
+    assert row["below"] == pytest.approx(1 - 0.0055 / 0.0085)
+
+
 def test_reference_fits_are_a_column_with_a_tolerance_of_five_percent():
     references = {("lift", "tan1"): 0.00096, ("lift", "tan2"): 0.0019}
     table = tables(records(), {}, references)["methods"]
@@ -86,6 +96,22 @@ class TestRepeats:
         assert table.loc[("lift", "ratio"), "factor"] == pytest.approx(2.0)
         assert ("fold", "stretch") not in table.index  # one recording has no spread
 
+    def test_recordings_of_a_joint_fit_agree_because_they_were_made_to(self):
+        joint = [record("lift", f"joint-{name}", fit="joint") for name in ("tan1", "tan2")]
+        assert parameter_table(joint).empty
+        assert repeatability(parameter_table(joint)).empty
+        pd.testing.assert_frame_equal(parameter_table(records() + joint), parameter_table(records()))
+
+    def test_parameters_of_different_meshes_are_not_compared(self):
+        mixed = [
+            record("lift", "tan1"),
+            record("lift", "tan2", halvings=1),
+            record("fold", "tan1", halvings=1, stretch=3.0),
+        ]
+        table = parameter_table(mixed)
+        assert repeatability(table).empty
+        assert consistency(table).set_index("parameter").loc["stretch", "factor"] == pytest.approx(3.0)
+
     def test_transfer_between_own_fit_and_middle(self):
         (row,) = transfer(records()).to_dict("records")
         assert (row["source"], row["target"]) == ("tan2", "tan1")
@@ -116,7 +142,7 @@ class TestWords:
         assert "lift: stretch / mass is known within a factor of 1.07 (median)." in told_of
         assert "lift / tan2: the misfit is 14.2 mm." in told_of
         assert "lift / tan1: the loss is 1.7 times what noise leaves." in told_of
-        assert any("stretch a factor of 2" in line for line in said["repeats"])
+        assert any("by a factor of 2 in stretch" in line for line in said["repeats"])
 
     @pytest.mark.parametrize(("ends", "disagree"), [((3.0, 4.0), True), ((0.1, 0.2), True), ((0.1, 9.0), False)])
     def test_a_posterior_is_a_second_opinion(self, ends, disagree):

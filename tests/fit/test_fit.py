@@ -227,9 +227,12 @@ class TestRun:
             assert "e: the motion is recorded up to" in told.record.failures[0]
             np.testing.assert_array_equal(told.motions[0].nodes, whole.motions[0].nodes[: reached + 1])
             read_motion(write_fit(tmp_path, "e", told).with_suffix(".npz"))
-        reached = 3
-        told = describe_fit(objective, space, settings, outcome, episodes=["e"])  # the first values, before the fitted ones
+        # first values that do not even reach the compared frames cut nothing off
+        reached, fragile = 3, {outcome.start["stretch"]}
+        told = describe_fit(objective, space, settings, outcome, episodes=["e"])
         np.testing.assert_array_equal(told.motions[0].start_nodes, told.motions[0].nodes)
+        np.testing.assert_array_equal(told.motions[0].nodes, whole.motions[0].nodes)
+        assert not told.record.failures
         assert told.record.loss == whole.record.loss
         fragile = {outcome.values["stretch"]}
         with pytest.raises(DivergedError):

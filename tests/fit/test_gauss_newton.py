@@ -115,6 +115,21 @@ class TestLinearisation:
         assert bool((found.slope[1] == 0).all())
         assert bool((found.slope[0] != 0).all())
 
+    def test_a_difference_that_diverges_costs_its_place_alone(self, monkeypatch):
+        """The second place's: 5 % above it the cloth is too stiff, though not there."""
+        objective, real = lifted(integrator="linearised"), Objective.simulate_to_loss
+
+        def broken(self, parameters):
+            bad = (parameters["stretch"] > 9.0).nonzero().flatten().tolist()
+            if bad:
+                raise DivergedError(3, bad, "test")
+            return real(self, parameters)
+
+        monkeypatch.setattr(Objective, "simulate_to_loss", broken)
+        places = Axis.of(SPACE).places(torch.tensor([[1.0, 1.0], [8.9, 1.0], [2.0, 1.0]], dtype=torch.float64))
+        assert linearise(objective, SPACE, places).losses.isfinite().tolist() == [True, False, True]
+        assert linearise(objective, SPACE, places[1:2]).losses.isfinite().tolist() == [False]
+
 
 class TestSurface:
     def test_normals_of_a_sphere(self, generator):

@@ -21,6 +21,7 @@ from diffcloud.fit import (
     Objective,
     fit_gauss_newton,
     read_fit,
+    solve,
     write_fit,
 )
 from diffcloud.fit.batches import batch_losses
@@ -28,7 +29,7 @@ from diffcloud.fit.joint import mean_loss, mean_terms
 from diffcloud.fit.laid import laid_nodes, with_laid
 from diffcloud.fit.left_out import leave_each_out, leave_out_and_go_on
 from diffcloud.fit.residuals import Axis, linearise
-from diffcloud.fit.result import describe_fit
+from diffcloud.fit.result import describe_fit, describe_recording
 from diffcloud.fit.uncertainty import uncertainty
 from diffcloud.sim.properties import one_set
 from diffcloud.sim.simulate import rollout
@@ -184,6 +185,39 @@ class TestFit:
         (one, other), _ = leave_each_out(JointObjective(members), space, {"stretch": 1.0})
         assert one.parameters["stretch"] == pytest.approx(2.5, rel=0.1)  # stiff cloth hardly stretches
         assert other.parameters["stretch"] == pytest.approx(0.4, rel=0.05)
+
+    def test_the_misfit_of_what_is_left_out_has_no_prior_of_a_pose(self):
+        """As that of the joint fit, beside which it is held."""
+        members = []
+        for scenario in motions():
+            episode = clouds_of(scenario, points=6000, **TRUTH)
+            higher = replace(episode, points=episode.points + np.array([0.0, 0.0, 0.003], dtype=np.float32))
+            members.append(Objective(scenario, higher, nuisance={"z": 1e-3}))
+        space = FitSpace.build(["stretch"], fixed={"mass": 1.0})
+        left, _ = leave_each_out(JointObjective(members), space, {"stretch": TRUTH["stretch"]})
+        for one, member in zip(left, members, strict=True):
+            told = describe_recording(member, member.simulate_to_loss(one_set(one.parameters)), "one")
+            assert one.rms_mm == pytest.approx(told.rms_mm, rel=1e-9)
+            assert one.loss < 0.99 * float(member(one_set(one.parameters)))
+
+    def test_each_recording_is_measured_again_with_its_own_pose_and_frames(self):
+        members = [
+            Objective(scenario, clouds_of(scenario, **TRUTH), nuisance=nuisance, frames=frames)
+            for scenario, nuisance, frames in zip(
+                motions(), ({"x": 0.1}, {"x": 0.1, "scale": 0.02}), ([3, 4], [2]), strict=True
+            )
+        ]
+        space, settings = (
+            FitSpace.build(["stretch"], fixed={"mass": 1.0}),
+            GaussNewtonSettings(starts=1, screen=0, iterations=2),
+        )
+        joint = JointObjective(members)
+        record = describe_fit(joint, space, settings, solve(joint, space, settings), episodes=["a", "b"]).record
+        for place, member in enumerate(members):
+            again = Objective(member.scenario, member.episode, **record.measured_by(place))
+            assert (again.nuisance, again.frames) == (member.nuisance, member.frames)
+            told = describe_recording(again, again.simulate_to_loss(one_set(record.values)), "again")
+            assert told.loss == pytest.approx(record.episodes[place].loss, rel=1e-6)
 
     def test_the_slope_is_that_of_the_loss(self):
         members = [Objective(s, clouds_of(s, points=4000, **TRUTH), nuisance={}) for s in motions()]

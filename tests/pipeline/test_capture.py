@@ -75,6 +75,16 @@ def test_it_asks_before_the_arm_moves(tmp_path, server, path):
     assert "SendTwistCommand" in server.names()
 
 
+def test_a_folder_that_is_there_is_refused_before_anything_moves(tmp_path, server, path):
+    (tmp_path / "e").mkdir()
+    (tmp_path / "e" / "episode.json").write_text("{}")
+    for more in (("--dry-run",), ("--yes",)):
+        said = invoke("capture", "--out", tmp_path / "e", "--trajectory", path, "--arm", "a", *BOTH, *more, code=1).errors
+        assert "exists" in said
+        assert "recorded so far" not in said
+    assert server.calls == []
+
+
 def test_one_camera_without_an_arm(tmp_path, server):
     done = invoke("capture", "--out", tmp_path / "e", "--camera", "side=2", "--seconds", 0.2)
     assert done.result["robot_rows"] == 0
@@ -87,8 +97,9 @@ def test_one_camera_without_an_arm(tmp_path, server):
         (("--camera", "side"), "--camera takes NAME=SERIAL"),
         (("--camera", "side=1", "--camera", "side=2"), "each name and serial once"),
         (("--camera", "side=1", "--box", "1,2,3"), "--box takes x0,y0,z0,x1,y1,z1"),
-        (("--camera", "side=1", "--size", "big"), "--size takes WIDTHxHEIGHT"),
+        (("--camera", "side=1", "--size", "big"), "--size takes two whole numbers"),
         (("--camera", "side=1"), "say how long to record"),
+        (("--camera", "side=1", "--seconds", 1, "--rate", 0), "--rate is in Hz, above 0"),
         (("--camera", "side=1", "--master", "top"), "Unknown --master 'top'"),
         (("--camera", "side=1", "--camera-driver", "a:B", "--laser", 100), "are settings of RealSense cameras"),
         (("--camera", "side=1", "--arm", "127.0.0.1", "--yes"), "An arm needs a trajectory"),

@@ -21,6 +21,7 @@ from diffcloud.fit.pose import NUISANCE
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.obj import read_cloth, read_surface
 from diffcloud.scene.scenarios import load_scenario
+from pipeline import fit_jobs
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
 from tests.pipeline.invoke import DIFFCLOUD, ROOT, Invoked, environment, invoke
@@ -249,6 +250,23 @@ def test_interrupted_fit_leaves_the_best_so_far_and_goes_on(work, monkeypatch):
     begun = len(calls)
     run(*command, "--seed", 1, cwd=work)  # another fit
     assert len(calls) > begun
+
+
+def test_a_ctrl_c_after_the_last_step_does_not_cost_the_fit(work, monkeypatch):
+    real, pressed = fit_jobs.describe_fit, []
+
+    def describe(*arguments, **options):
+        if not pressed:
+            pressed.append(True)
+            raise KeyboardInterrupt
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(fit_jobs, "describe_fit", describe)
+    command = ("fit", "--scenario", "small.yaml", "--out", "fits", "--solver", "adam", "--iterations", 2, "e1.npz")
+    run(*command, cwd=work, code=130)
+    first = json.loads((work / "fits" / "e1.json").read_text())
+    assert first["stop_reason"] == "iterations"
+    assert run(*command, cwd=work).result["fits"]["e1"]["seconds"] == first["seconds"]  # kept
 
 
 @pytest.mark.slow
@@ -538,6 +556,8 @@ def test_a_study_of_gradients_goes_on_where_it_stopped(work):
     assert run(*options, "--pairs", 3, cwd=work).result["pairs"] == 3
     assert (work / "pairs.csv").read_text().splitlines()[:3] == first
     assert "other pairs" in run(*options, "--pairs", 3, "--seed", 1, cwd=work, code=1).errors
+    other = run(*options, "--pairs", 3, "--integrator", "linearised", cwd=work, code=1).errors
+    assert "holds pairs of small implicit, not of small linearised" in " ".join(other.split())
 
 
 def test_materials_are_listed_with_all_their_numbers(work):

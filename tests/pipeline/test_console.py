@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
+import pytest
+
+from diffcloud.errors import ConfigError
 from pipeline import console
 
 
@@ -16,3 +20,24 @@ def test_where_there_is_no_terminal_a_line_comes_every_ten_seconds(monkeypatch, 
             update(call / 3, f"loss {1 / call:.2f}")
     lines = capsys.readouterr().err.splitlines()
     assert lines == ["fit: 1 of 10, about 108 s left  loss 0.33", "fit: 2 of 10, about 96 s left  loss 0.17"]
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("a.csv", r"a\.csv ends in \.csv\. Try a\.html"),
+        (".", r"\. is a folder\. Try here\.html"),
+        ("sub", r"Try sub/sub\.html"),
+    ],
+)
+def test_a_file_of_another_kind_is_refused_with_what_to_try(tmp_path, monkeypatch, path, message):
+    (tmp_path / "here" / "sub").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here")
+    with pytest.raises(ConfigError, match=message):
+        console.with_suffix(Path(path), ".html")
+
+
+@pytest.mark.parametrize("items", [["side"], ["=1"], ["side="], ["side=1", "side=2"], ["side=1", "top=1"]])
+def test_each_camera_has_one_serial(items):
+    with pytest.raises(ConfigError, match="--serial takes NAME=SERIAL, each name and serial once"):
+        console.named_serials(items, "--serial")

@@ -9,6 +9,7 @@ import math
 import pytest
 import yaml
 
+from diffcloud.errors import ConfigError, DivergedError, OutputError
 from diffcloud.io.episodes import read_episode, write_episode
 from pipeline import coverage
 from pipeline.coverage_page import counted, counts_of, coverage_page
@@ -131,6 +132,29 @@ class TestCoverage:
         assert "| small | posterior | stretch / mass | 2 | 2 |" in (work / "page.md").read_text()
         assert set(done.result["parameters"]) == {"stretch", "mass"}  # of the fits
 
+    def test_a_failure_of_the_cloth_is_kept_and_told_again_a_full_disk_is_not(self, work, monkeypatch):
+        def diverging(*arguments, **options):
+            raise DivergedError(3, [0], "test")
+
+        def full(*arguments, **options):
+            raise OutputError("Cannot write there.")
+
+        path = work / "out/small/mass_known/0000.json"
+        monkeypatch.setattr(coverage, "state_intervals", full)
+        assert "Cannot write there" in invoke(*COVERAGE, "--recordings", 1, "--fix", "mass").errors
+        assert not path.exists()
+        monkeypatch.setattr(coverage, "state_intervals", diverging)
+        for _ in range(2):
+            done = invoke(*COVERAGE, "--recordings", 1, "--fix", "mass")
+            assert "diverged" in done.errors
+            assert done.result["failures"]
+        assert "error" in json.loads(path.read_text())
+
+    def test_records_of_other_calls_are_told(self, work):
+        invoke(*COVERAGE, "--fix", "mass")
+        said = invoke(*COVERAGE, "--fix", "mass", "--recordings", 1, "--seed", 5).errors
+        assert "mass_known holds 1 records of earlier calls" in said
+
     @pytest.mark.parametrize(
         ("options", "message"),
         [
@@ -149,7 +173,10 @@ class TestCoverage:
 def test_refusals_and_failures_count_as_misses(tmp_path):
     def record(value, low, high, verdict="identified"):
         entry = {"value": value, "low": low, "high": high, "verdict": verdict}
-        return {"truth": {"stretch": 1.0, "mass": 1.0}, "intervals": {"parameters": {"stretch": entry}, "within": 1.5}}
+        return {
+            "truth": {"stretch": 1.0, "mass": 1.0},
+            "intervals": {"parameters": {"stretch": entry}, "within": 1.5, "level": 0.9},
+        }
 
     folder = tmp_path / "lift" / "mass_known"
     folder.mkdir(parents=True)
@@ -221,6 +248,21 @@ def test_sources_are_told_beside_what_noise_alone_would_hold(tmp_path):
     assert "| lift | mass known | stretch | 1 (50 %) | step size 90 %, noise 10 % |" in coverage_page(counts_of(tmp_path))
 
 
+def test_a_page_is_of_one_level(tmp_path):
+    for place, level in enumerate((0.9, 0.5)):
+        folder = tmp_path / "lift" / ("free" if place else "mass_known")
+        folder.mkdir(parents=True)
+        entry = {"value": 1.0, "low": 0.9, "high": 1.1, "verdict": "identified"}
+        told = {"parameters": {"stretch": entry}, "within": 1.5, "level": level}
+        (folder / "0000.json").write_text(json.dumps({"truth": {"stretch": 1.0, "mass": 1.0}, "intervals": told}))
+    with pytest.raises(ConfigError, match=r"one level of intervals, got 0\.5, 0\.9"):
+        coverage_page(counts_of(tmp_path))
+    (tmp_path / "lift" / "mass_known" / "0000.json").unlink()
+    page = coverage_page(counts_of(tmp_path))
+    assert "the 50 % interval is held against the truth" in page
+    assert "exactly 50 %" in page
+
+
 class TestIntervals:
     @pytest.fixture
     def fitted(self, work):
@@ -251,6 +293,7 @@ class TestIntervals:
         ("arguments", "message"),
         [
             (("fits/joint.json", "e1.npz"), "is a fit to 2 episodes (e1, e2), 1 were given"),
+            (("fits/joint.json", "e2.npz", "e1.npz"), "Recording 1 of fits/joint.json is e1, and e2.npz was given"),
             (("fits/e1.json", "e1.npz", "--within", 1), "--within takes a factor above 1"),
             (("e1.npz", "e1.npz"), "e1.npz"),
         ],

@@ -298,6 +298,26 @@ pipeline.app.main()
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment(), timeout=25)
         assert (done.returncode, done.stderr.strip()) == (130, "Interrupted.")
 
+    def test_one_within_a_command_is_told_too(self):
+        """Of which typer keeps the exit status alone."""
+        code = """
+import sys
+import typer
+import pipeline.app
+
+app = typer.Typer()
+
+@app.command()
+def work():
+    raise KeyboardInterrupt
+
+pipeline.app.app = app
+sys.argv = ["diffcloud"]
+pipeline.app.main()
+"""
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment(), timeout=25)
+        assert (done.returncode, done.stderr.strip()) == (130, "Interrupted.")
+
     def test_a_ctrl_c_while_open3d_is_imported_is_no_missing_library(self, monkeypatch):
         def interrupted():
             try:

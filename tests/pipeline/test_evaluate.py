@@ -18,6 +18,7 @@ import yaml
 import pipeline.comparison
 from diffcloud.fit import read_fit
 from diffcloud.io.episodes import write_episode
+from diffcloud.io.files import claimed
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
 from tests.pipeline.invoke import invoke
@@ -119,11 +120,16 @@ def test_recordings_of_a_joint_fit_are_compared_each_as_it_lay(work):
     )
     fit = read_fit(work / "data" / "fits" / "small" / "joint.json")
     invoke("evaluate", "--params", "params.yaml")
-    for one in fit.episodes:
+    alone = {one.name: read_fit(work / "data" / "fits" / "small" / f"{one.name}.json") for one in fit.episodes}
+    for one, other in zip(fit.episodes, fit.episodes[::-1], strict=True):
+        own = json.loads((work / "reports" / "episodes" / "small" / f"{one.name}.json").read_text())["record"]
+        (transfer,) = own["transfers"]  # of the other's own fit, not of the joint one, which has seen this recording
+        assert transfer["clipped"]["stretch"] == pytest.approx(alone[other.name].values["stretch"])
         kept = work / "reports" / "episodes" / "small" / f"joint-{one.name}.json"
         record = json.loads(kept.read_text())["record"]
         row = next(row for row in record["methods"] if row["method"] == "diffcloud")
         assert record["fit"] == "joint"
+        assert record["transfers"] == []
         assert row["clipped"]["turn"] == fit.laid_in(one)["turn"] != 0
 
 
@@ -174,6 +180,33 @@ def test_a_fit_that_cannot_be_simulated_is_told_and_the_others_go_on(work):
     assert "small/tan1" in failed.errors
     assert "diverged" in failed.errors
     assert "small/tan2" not in failed.errors
+
+
+def test_episodes_may_be_called_by_numbers_and_a_bound_be_zero(tmp_path, monkeypatch):
+    """The report too reads names as names, and draws a landscape over a parameter that has no logarithm."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(SMALL))
+    changes = {
+        "scenarios": ["small.yaml"],
+        "fit": {"parameters": ["stretch", "damping"], "starts": 1, "screen": 0, "iterations": 1},
+    }
+    changes["evaluate"] = PARAMS["evaluate"] | {"landscapes": ["small/001"], "rivals": ["middle"], "level": None}
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump(PARAMS | changes | {"scenarios": ["small"]}))
+    (tmp_path / "raw" / "scenes").mkdir(parents=True)
+    (tmp_path / "small.yaml").rename(tmp_path / "raw" / "scenes" / "small.yaml")
+    hidden = clouds_of(small_lift(), seed=1, stretch=0.7, mass=1.0)
+    write_episode(tmp_path / "data/episodes/small/001.npz", replace(hidden, meta={"truth": {"stretch": 0.7, "mass": 1.0}}))
+    invoke("fit", "--params", "params.yaml", "--scenario", "small", "--out", "data/fits/small", "data/episodes/small")
+    invoke("evaluate", "--params", "params.yaml")
+    invoke("report", "--params", "params.yaml")
+    assert "small / 001" in (tmp_path / "reports/index.html").read_text(encoding="utf-8")
+    assert (tmp_path / "reports/figures/landscape_small_001.svg").is_file()
+
+
+def test_one_process_at_a_time_compares_the_published_data(tmp_path):
+    with claimed(tmp_path / "reports"):
+        said = invoke("evaluate", "release", tmp_path, "--out", tmp_path / "reports", code=1).errors
+    assert "is being written by" in said
 
 
 def test_profiles_are_whole_parameter_files():

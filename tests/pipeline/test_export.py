@@ -92,7 +92,7 @@ class TestRefusals:
         [
             (("nothing.json", "--to", "obj"), "nothing.json"),
             (("intervals.json", "--to", "obj"), "is not a fit written by"),
-            (("joint.json", "--to", "obj", "--recording", "e3"), "Unknown recording 'e3'"),
+            (("joint.json", "--to", "obj", "--recording", "e3"), "Unknown recording of the fit 'e3'"),
             (("joint.json", "--to", "obj", "--check"), "--check runs mujoco and newton; obj cannot be run"),
             (("joint.json", "--to", "obj", "--scenario", "lift"), "give the fitted one with --scenario"),
             (("joint.json", "--to", "obj", "--samples", 2, "--intervals", "joint.json"), "holds no intervals"),

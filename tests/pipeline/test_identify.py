@@ -155,6 +155,7 @@ class TestRefusals:
             (("--size", "big"), "--size takes two sides in metres"),
             (("--mass", -1), "--mass is in kg per square metre"),
             (("--within", 0.5), "--within takes a factor above 1"),
+            (("--out", "recorded/first/gripper.csv"), "--out takes a folder"),
         ],
     )
     def test_of_options(self, work, change, message):
@@ -175,6 +176,10 @@ class TestRefusals:
             name = path.stem if path.is_file() else path.name
             assert said.startswith(f"{path}: ")
             assert read_raw_episode(work / "found" / "recordings" / name).robot is not None
+            file = path if path.is_file() else next(iter(path.glob("*.db3")))
+            os.utime(file, ns=(0, 0))
+            said = invoke("identify", path, "--size", "0.16x0.12", "--out", "found", code=1).errors
+            assert f"was made of another {path.name}" in said
             shutil.rmtree(work / "found")
         (work / "d435.bag").write_bytes(b"#ROSBAG V2.0 /device_0/sensor_0/info")
         said = invoke("identify", "d435.bag", "--out", "found", code=1).errors
@@ -409,16 +414,22 @@ def test_what_finer_meshes_brought_is_told(changes, explains, told):
     assert all(part in sentence for part, sentence in zip(told, sentences, strict=True))
 
 
+@pytest.mark.parametrize("name", ["towel", "001", "2024-06-01", "on", "null", "a: b", "a # b", "'", "x" * 200])
+def test_a_recording_may_have_any_name(name):
+    """Among the keys of recordings.yaml, where a number, a date or a word of YAML would be no name."""
+    assert yaml.safe_load(f"{identify._inline(name)}:\n  a: 1") == {name: {"a": 1}}
+
+
 def test_fits_go_on_with_the_mesh_that_the_last_one_ended_with(monkeypatch):
     """Where intervals meet a lower loss, which that mesh has."""
     lower, asked = {"stretch": 0.5}, []
 
-    def fit(settings, steps, halvings, init):
-        asked.append((settings.starts, steps, halvings, dict(init)))
+    def fit(name, settings, steps, halvings, init):
+        asked.append((name, settings.starts, steps, halvings, dict(init)))
         return record_of(recording_of("one"), halvings=1), None, None, 16
 
     monkeypatch.setattr(identify, "space_of", lambda record: SimpleNamespace(asked=SimpleNamespace(names=("stretch",))))
     found = [SimpleNamespace(lower=lower), SimpleNamespace(lower=None)]
     monkeypatch.setattr(identify, "state_intervals", lambda *given, **options: found.pop(0))
     identify._stated(fit, FitConfig(starts=2), 8, level=0.9, within=1.5)
-    assert asked == [(2, 8, 0, {}), (1, 16, 1, lower)]
+    assert asked == [("fit0", 2, 8, 0, {}), ("fit1", 1, 16, 1, lower)]

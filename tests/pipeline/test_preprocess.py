@@ -25,7 +25,7 @@ def params(tmp_path) -> Path:
 def test_raw_episode_to_episode(tmp_path, params):
     raw = write_cloth_episode(tmp_path / "raw" / "lift" / "blue1", frames=2).folder
     done = invoke("preprocess", tmp_path / "raw", "--out", tmp_path / "episodes", "--params", params)
-    assert done.result["points"].keys() == {"blue1"}
+    assert done.result["points"].keys() == {"lift/blue1"}
     episode = read_episode(tmp_path / "episodes" / "lift" / "blue1.npz")
     assert episode.frame_count == 2
     assert (np.diff(episode.offsets) <= 800).all()
@@ -52,7 +52,7 @@ def test_workers_change_nothing_and_a_damaged_episode_stops_no_other(tmp_path, p
     for workers in (1, 2):
         out = tmp_path / str(workers)
         done = invoke("preprocess", tmp_path / "raw", "--out", out, "--params", params, "--workers", workers, code=1)
-        assert done.result["points"].keys() == {"blue1", "blue3"}
+        assert done.result["points"].keys() == {"lift/blue1", "lift/blue3"}
         assert "blue2: " in done.errors
         assert {path.name for path in (out / "lift").glob("*.npz")} == {"blue1.npz", "blue3.npz"}
     for path in (tmp_path / "1" / "lift").iterdir():

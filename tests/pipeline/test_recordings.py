@@ -106,7 +106,7 @@ def test_a_look_with_what_does_not_belong_to_it(work):
     invoke("fit", episode, "--scenario", "small", "--params", "params.yaml", "--out", "seen")
     shutil.copy(episode, work / "other.npz")
     told = invoke("view", "other.npz", "--fit", "seen/small_hidden1.json", "--out", "o.html", code=1).errors
-    assert "other is not among the recordings" in told
+    assert "Unknown recording of the fit 'other'" in told
     assert "small_hidden1" in told
     assert "No such episode" in invoke("view", "nothing.npz", "--out", "o.html", code=1).errors
     assert "holds no episodes" in invoke("view", raw.parent, "--out", "o.html", code=1).errors

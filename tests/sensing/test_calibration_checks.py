@@ -366,6 +366,15 @@ class TestCheckerboard:
             assert entry["rms_mm"] < entry["held_out_mm"] < 3
         assert done.result["warnings"] == done.result["objections"] == []
 
+    def test_serials_name_cameras_that_are_there(self, tmp_path, rng):
+        folders, written = self.folders(tmp_path, rng), tmp_path / "c.json"
+        name = next(iter(CAMERAS))
+        assert "Unknown camera in --serial 'top'" in self.registered(tmp_path, folders, "--serial", "top=1", code=1).errors
+        assert "--serial takes NAME=SERIAL" in self.registered(tmp_path, folders, "--serial", "12", code=1).errors
+        assert not written.exists()
+        self.registered(tmp_path, folders, "--serial", f"{name}=0123")
+        assert read_calibration(written).camera("0123").name == name
+
     def test_a_held_out_error_above_ten_millimetres_is_refused_unless_forced(self, tmp_path, rng):
         folders = self.folders(tmp_path, rng, noise_m=0.05)
         bad = self.registered(tmp_path, folders, code=1)

@@ -18,6 +18,8 @@ from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, Stop
 
 _NEAREST, _FARTHEST = 0.01, 0.3
 """Of starts that are moved beside the best iterate, as parts of its values."""
+_COPIES = 8
+"""Perturbed ones of the first start, in antithetic pairs; even."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +43,6 @@ class AdamSettings:
     are iterates like any other: each is a parameter set whose loss has been measured. Further starts go without: they
     search widely by their number.
     """
-    copies: int = 8
-    """Perturbed copies of the first start, in antithetic pairs; even."""
     init: Mapping[str, float] = field(default_factory=dict)
     """Values of the first start; the middle of the range where not given."""
     screen: int = 0
@@ -204,7 +204,7 @@ def _starts(objective: AnyObjective, space: FitSpace, settings: AdamSettings) ->
 def _trials(settings: AdamSettings, unbounded: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """What is simulated in one iteration: the start that each trial belongs to [E], and its perturbation [E, k]."""
     starts, variables = unbounded.shape
-    half = settings.smoothing * torch.randn(settings.copies // 2, variables, generator=generator)
+    half = settings.smoothing * torch.randn(_COPIES // 2, variables, generator=generator)
     copies = torch.cat([half, -half]) if settings.smoothing else half[:0]
     owner = torch.cat([torch.arange(starts), torch.zeros(len(copies), dtype=torch.long)])
     return owner.to(unbounded.device), torch.cat([torch.zeros(starts, variables), copies]).to(unbounded)

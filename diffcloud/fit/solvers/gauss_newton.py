@@ -472,9 +472,7 @@ def _searched(
     budget = _SEARCHED * len(objective.members)
     init = {name: values[name] for name in asked.names}
     settings = CmaEsSettings(simulations=budget, seed=seed, init=init)
-    found = fit_cma_es(objective, asked, settings, progress=lambda _: tell())
-    if found.stop_reason == "interrupted":
-        raise KeyboardInterrupt
+    found = fit_cma_es(objective, asked, settings, progress=lambda _: tell()).uninterrupted()
     whole = {**asked.fixed, **found.values}
     return axis.places(torch.tensor([whole[name] for name in space.names], dtype=torch.float64)), found.simulations
 

@@ -75,6 +75,16 @@ class FitOutcome:
             failures=(*self.failures, *further.failures),
         )
 
+    def uninterrupted(self) -> FitOutcome:
+        """This fit, for who has no use for one that Ctrl-C has cut short.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C ended it.
+        """
+        if self.stop_reason == "interrupted":
+            raise KeyboardInterrupt
+        return self
+
     @property
     def iterations(self) -> int:
         """Updates done, or batches of a search after the first."""
