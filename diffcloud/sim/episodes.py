@@ -79,7 +79,7 @@ class Batch:
                 *self._bodies(self.poses[entry]),
                 limit,
                 self._control[entry],
-                *([self._fault[entry]] if self._moves_bodies else []),
+                *([self._fault[entry]] if self._is_implicit else []),
             )
 
         self._run(job, count)
@@ -94,6 +94,7 @@ class Batch:
         def job(entry: int) -> None:
             parameters = self._parameters[entry]
             gradients = Parameters(*(np.zeros_like(array) for array in parameters))
+            done = self._ends[entry][1] + 1  # what was not simulated has no derivative, not even zero times what it holds
             self._integrator.reverse(
                 self.system.scene,
                 self.held,
@@ -101,13 +102,13 @@ class Batch:
                 self._track[entry],
                 *self._obstacles,
                 self._anchors[entry],
-                self.positions[entry],
-                self.velocities[entry],
-                *self._bodies(self.poses[entry]),
+                self.positions[entry, :done],
+                self.velocities[entry, :done],
+                *self._bodies(self.poses[entry, :done]),
                 self._ends[entry][2],
-                position[entry],
-                velocity[entry],
-                *self._bodies(pose[entry]),
+                position[entry, :done],
+                velocity[entry, :done],
+                *self._bodies(pose[entry, :done]),
                 gradients,
                 found[3][entry],
             )
@@ -169,16 +170,16 @@ class Batch:
     # --- arrays ------------------------------------------------------------------------------------------------------
 
     @property
-    def _moves_bodies(self) -> bool:
+    def _is_implicit(self) -> bool:
         return self._integrator is implicit
 
     @property
     def _obstacles(self) -> tuple[Floats, ...]:
-        """What the implicit step needs in addition."""
-        return (self._scenery,) if self._moves_bodies else ()
+        """What the implicit step takes beside the others."""
+        return (self._scenery,) if self._is_implicit else ()
 
     def _bodies(self, array: Floats) -> tuple[Floats, ...]:
-        return (array,) if self._moves_bodies else ()
+        return (array,) if self._is_implicit else ()
 
     def _over_time(self, first: Floats) -> Floats:
         """[B, S + 1, ...] that begins with [B, ...]; the rest is NaN."""
@@ -232,8 +233,10 @@ class Batch:
 
     def _stuck(self, entry: int) -> str:
         change, kind, *points = self._fault[entry].tolist()
-        name = ("point-face", "edge-edge", "point-plane")[int(kind)] if kind >= 0 else "no"
+        name = ("point-face", "edge-edge")[int(kind)] if 0 <= kind < 2 else "no"
         closest = f"{name} pair of points {[int(point) for point in points if point >= 0]}"
+        if kind == 2:
+            closest = f"point {int(points[0])} and half-space {int(points[1])}"
         of = self._parameters[entry]
         return (
             f"the implicit step did not converge (relative change {change:.1e}; closest: {closest}); sub-steps did not "

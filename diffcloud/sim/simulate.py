@@ -5,8 +5,8 @@ Kernels simulate one cloth at a time; here they are given batches, over threads,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import torch
@@ -91,7 +91,7 @@ def rollout(
 
     Raises:
         DivergedError: names the batch entries that diverged, and the first step in which one did.
-        SceneError: a track of other than the scene's grippers.
+        SceneError: a track of other grippers than the scene's or of fewer steps, or an input of another shape.
     """
     properties = system.properties if properties is None else properties
     state = init(system, properties.batch) if state is None else state
@@ -175,13 +175,27 @@ def _inputs(system: System, steps: int, properties: Properties, state: State, tr
     positions, velocities, poses = _packed(state)
     if poses is None:
         poses = torch.from_numpy(system.bodies.start)[None]
+    names = system.handles.grippers
     if track is None:
-        track = torch.zeros(1, steps, len(system.handles.grippers), 3, dtype=torch.float64)
-    elif track.shape[2:] != (len(names := system.handles.grippers), 3):
+        track = torch.zeros(1, steps, len(names), 3, dtype=torch.float64)
+    elif track.ndim != 4 or track.shape[2:] != (len(names), 3) or track.shape[1] < steps:
         raise SceneError(
-            f"A track has shape [batch, steps, {len(names)}, 3] here ({', '.join(names)}), got {list(track.shape)}."
+            f"A track has shape [batch, {steps} or more steps, {len(names)}, 3] here ({', '.join(names)}), got "
+            f"{list(track.shape)}."
         )
+    nodes = (len(system.mesh.nodes), 3)
+    # kernels do not look where arrays end
+    _check_shapes({"positions": (positions, nodes), "velocities": (velocities, nodes)})
+    _check_shapes({"bodies": (poses, system.bodies.start.shape)})
+    own = zip(fields(properties), properties.tensors(), system.properties.tensors(), strict=True)
+    _check_shapes({field.name: (tensor, like.shape[1:]) for field, tensor, like in own})
     return [positions, velocities, poses, track, *properties.tensors()]
+
+
+def _check_shapes(given: Mapping[str, tuple[Tensor, Sequence[int]]]) -> None:
+    for name, (tensor, shape) in given.items():
+        if tuple(tensor.shape[1:]) != tuple(shape):
+            raise SceneError(f"{name} has shape [batch, {', '.join(map(str, shape))}] here, got {list(tensor.shape)}.")
 
 
 def _packed(state: State) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -68,7 +68,7 @@ class Surrounding:
     friction_obstacle: float = 0.3
     contact: ContactSettings = field(default_factory=ContactSettings)
     proximity: bool = True
-    """Whether planes repel and rub (off: only projection)."""
+    """Of the linearised step: whether planes, and other meshes, repel and rub (off: only projection and impacts)."""
     self_contact: bool = True
     """Whether the cloth meets itself (implicit integrator); without, layers pass through each other in quicker steps."""
     obstacles: tuple[SurfaceMesh, ...] = ()

@@ -48,7 +48,8 @@ def run_all(jobs: Sequence[Callable[[], None]], *, look: Callable[[], None], sto
 
     Args:
         look: called now and then meanwhile.
-        stop: called when something interrupts; lets the jobs end soon.
+        stop: called when something interrupts; lets jobs that simulate end soon. Those that sweep an episode for its
+            derivatives end with it.
 
     Raises:
         KeyboardInterrupt: Ctrl-C, in the main thread or, within `map_threads`, in the one that waits there.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 
@@ -227,7 +228,7 @@ class TestHandles:
 
     def test_a_track_of_other_grippers(self):
         system, _ = shaken().scene.build()
-        with pytest.raises(SceneError, match=r"shape \[batch, steps, 2, 3\] here \(left, right\), got \[1, 6, 1, 3\]"):
+        with pytest.raises(SceneError, match=r"6 or more steps, 2, 3\] here \(left, right\), got \[1, 6, 1, 3\]"):
             rollout(system, 6, track=torch.zeros(1, 6, 1, 3, dtype=torch.float64))
 
     def test_a_track_without_a_moving_handle(self):
@@ -277,6 +278,29 @@ class TestHalfSpace:
         assert rollout(system, 100).positions[..., 2].max() <= 2.0
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda system: {"track": torch.zeros(1, 3, 1, 3).double()}, r"A track has shape \[batch, 4 or more steps, 1, 3\]"),
+        (lambda system: {"track": torch.zeros(1, 4, 1, 2).double()}, "A track has shape"),
+        (lambda system: {"track": torch.zeros(4, 1, 3).double()}, "A track has shape"),
+        (
+            lambda system: {"state": replace(init(system, 1), positions=torch.zeros(1, 3, 3).double())},
+            r"positions has shape \[batch, \d+, 3\] here, got \[1, 3, 3\]",
+        ),
+        (
+            lambda system: {"properties": replace(system.properties, node_mass=torch.ones(1, 2).double())},
+            r"node_mass has shape \[batch, \d+\] here",
+        ),
+    ],
+)
+def test_inputs_of_another_shape_are_refused(change, message):
+    """Kernels do not look where arrays end."""
+    system, _ = small_lift().scene.build()
+    with pytest.raises(SceneError, match=message):
+        rollout(system, 4, **change(system))
+
+
 class TestDivergence:
     def test_names_step_entries_and_advice(self):
         scenario = small_lift()
@@ -313,6 +337,26 @@ class TestDivergence:
         alone = rollout(system, 4, properties=scenario.properties(system, {"stretch": stretch[rest]}), track=track[rest])
         torch.testing.assert_close(run.positions[rest], alone.positions, rtol=1e-9, atol=1e-11)
         assert not alone.diverged
+
+    def test_one_that_fails_leaves_the_gradients_of_the_others_alone(self):
+        """Those of what all share, too, in which the entries add up."""
+        scenario = small_lift()
+        system, _ = scenario.scene.build()
+        track = torch.zeros(1, 4, 1, 3, dtype=torch.float64)
+        track[..., 2] = torch.linspace(0.001, 0.004, 4)[None, :, None]
+        found = []
+        for values in ([1.0, 2.0], [1.0, float("nan")]):
+            shared = track.clone().requires_grad_(True)
+            stretch = torch.tensor(values).double().requires_grad_(True)
+            run = rollout(
+                system, 4, properties=scenario.properties(system, {"stretch": stretch}), track=shared, drop_diverged=True
+            )
+            run.positions[0, -1].square().sum().backward()
+            assert len(run.diverged) == int(math.isnan(values[1]))
+            found.append((shared.grad, stretch.grad[0]))
+        for gradient, alone in zip(*found, strict=True):
+            assert bool(gradient.isfinite().all())
+            torch.testing.assert_close(gradient, alone)
 
     def test_bodies_go_on_too(self):
         box = box_surface((-0.05, -0.05, -0.9), (0.05, 0.05, -0.85))

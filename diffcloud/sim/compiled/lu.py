@@ -105,7 +105,9 @@ def solve_general(of: General, right: Floats, transposed: int, solution: Floats)
     else:
         _substitute(of.pattern, of.below, of.below, of.above, right, 0, solution)
     if of.sound == 0:
-        of.sound = 1 if _good(of, right, transposed, solution) else -1
+        of.sound = _judged(of, right, transposed, solution)
+        if of.sound == 0:
+            return True
     return True if of.sound > 0 else _dense(of, right, transposed, solution)
 
 
@@ -157,8 +159,8 @@ def _substitute(
 
 
 @kernel
-def _good(of: General, right: Floats, transposed: int, solution: Floats) -> bool:
-    """Whether what a solution leaves over is small."""
+def _judged(of: General, right: Floats, transposed: int, solution: Floats) -> int:
+    """1: what a solution leaves over is small; -1: it is not; 0: it solves for nothing, which tells nothing of factors."""
     pattern, low, high = of.pattern, of.lower, of.upper
     count = len(pattern.place)
     node = np.empty(count, np.int64)
@@ -187,14 +189,16 @@ def _good(of: General, right: Floats, transposed: int, solution: Floats) -> bool
     for i in range(count):
         for axis in range(3):
             if not np.isfinite(left[i, axis]):
-                return False
+                return -1
             worst, largest = max(worst, abs(left[i, axis])), max(largest, size[i, axis])
-    return worst <= _GOOD * largest
+    if largest == 0:
+        return 0
+    return 1 if worst <= _GOOD * largest else -1
 
 
 @kernel
 def _dense(of: General, right: Floats, transposed: int, solution: Floats) -> bool:
-    """The solution by dense LU; False: singular."""
+    """The solution by dense LU; False: singular, and the solution is no number."""
     pattern, low, high = of.pattern, of.lower, of.upper
     count = len(pattern.place)
     matrix = np.zeros((3 * count, 3 * count))
@@ -208,6 +212,7 @@ def _dense(of: General, right: Floats, transposed: int, solution: Floats) -> boo
                         matrix[3 * j + c, 3 * i + r] = high[p, 3 * r + c]
     pivots, work = np.empty(3 * count, np.int64), np.empty(3 * count)
     if not lu(matrix, pivots):
+        solution[:] = np.nan
         return False
     for i in range(count):
         for axis in range(3):

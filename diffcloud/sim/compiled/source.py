@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import cast
 
 from diffcloud.sim.compiled.trace import Scalar, ordered
@@ -43,10 +43,6 @@ class Code:
     def name(self, node: Scalar) -> str:
         """Of a node that has been computed: a variable or a number."""
         return self._known[node.number]
-
-    def names(self, nodes: Sequence[Scalar]) -> str:
-        """Separated by commas."""
-        return ", ".join(self.name(node) for node in nodes)
 
     def _expression(self, node: Scalar) -> str:
         names = [self._known[operand.number] for operand in node.operands]

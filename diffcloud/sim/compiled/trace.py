@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import overload
 
-_COMMUTE = {"add", "mul", "eq", "and", "or"}
+_COMMUTE = {"add", "mul", "eq", "and"}
 
 
 @dataclass(eq=False)
@@ -61,8 +61,7 @@ class Scalar:
 
     def __bool__(self) -> bool:
         raise TypeError(
-            "A formula is recorded before its numbers are known: `where` instead of `if`, `&` and `|` instead of `and` and "
-            "`or`."
+            "A formula is recorded before its numbers are known: `where` instead of `if`, `&` instead of `and`."
         )
 
     @property

@@ -32,7 +32,6 @@ from diffcloud.sim.terms.term import Element, Term
 
 _PARALLEL = 1e-3
 """Squared sine of the angle between two edges below which their force fades."""
-_TINY = 1e-300
 
 Place = Callable[[Element], tuple[list[Scalar], Vector, Scalar, Scalar]]
 """(signed weights of the corners, the vector between the closest places [m], area [m²], coefficient of friction)."""

@@ -52,13 +52,15 @@ define(Touching, TouchingType, ["point_point", "point_edge", "point_face", "edge
 
 @kernel
 def places(
-    surface: SurfaceBox, planes: Planes, thickness: float, pairs: Ints, distances: Floats, points: Floats
+    surface: SurfaceBox, planes: Planes, thickness: float, pairs: Ints, distances: Floats, points: Floats, holder: Ints
 ) -> tuple[Ints, Floats]:
     """The places nearer than the thickness, at points [N, 3].
 
     Args:
         pairs: [C, 7] kind (1: two edges), points and primitives.
         distances: [C] [m].
+        holder: [V] of the cloth's nodes; not negative of a prescribed one. These go through half-spaces, where the barrier
+            has no value; no force on them counts.
 
     Returns:
         (kind and points [E, 5], of a plane its number in the place of the second point; area [m²], whether an
@@ -110,6 +112,8 @@ def places(
         kept += 1
     for q in range(len(planes.points)):
         i = planes.points[q]
+        if i < len(holder) and holder[i] >= 0:
+            continue
         for w in range(len(planes.offsets)):
             if gap_of(planes, w, points, i) < thickness:
                 listed[kept, 0], listed[kept, 1], listed[kept, 2], listed[kept, 3], listed[kept, 4] = PLANE, i, w, i, i

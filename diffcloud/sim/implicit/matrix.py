@@ -206,7 +206,7 @@ def _add_contact(
         _turn_rows(force[first + p, 0], force[first + p, 1], force[first + p, 2], part)
         diagonal = wide.starts[wide.place[freedom[first + p, 1]]]
         for k in range(9):
-            lower[diagonal, k] += dt * dt * part[k]
+            lower[diagonal, k] += (1 - caution) * dt * dt * part[k]
 
 
 @kernel

@@ -232,11 +232,14 @@ def _closest(work: Work, points: Floats, pairs: Ints, fault: Floats) -> None:
     fault[1] = -1.0
     planes = work.planes
     for q in range(len(planes.points)):
+        i = planes.points[q]
+        if i < len(work.holder) and work.holder[i] >= 0:  # goes through
+            continue
         for w in range(len(planes.offsets)):
-            gap = gap_of(planes, w, points, planes.points[q])
+            gap = gap_of(planes, w, points, i)
             if gap < smallest:
                 smallest = gap
-                fault[1], fault[2], fault[3], fault[4], fault[5] = 2.0, planes.points[q], w, -1.0, -1.0
+                fault[1], fault[2], fault[3], fault[4], fault[5] = 2.0, i, w, -1.0, -1.0
     x, found = np.empty((4, 3)), np.empty(6)
     for c in range(len(pairs)):
         distance = distance_of(pairs, c, points, x, found)

@@ -84,7 +84,7 @@ def reverse(
             for i in range(nodes):
                 if holder[i] < 0:
                     gradients.inverse_mass[i] += mass_gradient[i]
-        project_reverse(scene, above, places)
+        stop_at_planes(scene, above, places, 1)
         for i in range(nodes):
             for axis in range(3):
                 slope = places[i, axis] - after[i, axis] / dt
@@ -157,9 +157,12 @@ def candidates(scene: Scene, motion: Motion):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def project_reverse(scene: Scene, above, places: Floats) -> None:  # type: ignore[no-untyped-def]
-    """What planes stop does not move along their normals."""
-    for p in range(len(above) - 1, -1, -1):
+def stop_at_planes(scene: Scene, above, places: Floats, backwards: int) -> None:  # type: ignore[no-untyped-def]
+    """What planes stop does not move along their normals. Each of these projections is its own transpose; their product
+    is that of the other order, which is `backwards`."""
+    count = len(above)
+    for q in range(count):
+        p = count - 1 - q if backwards > 0 else q
         normal = scene.plane_normals[p]
         for i in range(above.shape[1]):
             if not above[p, i]:

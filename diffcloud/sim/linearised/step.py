@@ -92,9 +92,9 @@ def simulate(
         if scene.collides:
             mobile = mobility(parameters, holder)
             resolved, impacts = resolve(surface, near, scene.projection, motion.positions, points, mobile, kept.impacts)
+            if not resolved:  # the last of its impacts is what an error names
+                return UNRESOLVED, step, Kept(kept.solved, kept.begins, kept.corners, kept.constants, impacts, kept.factors)
             kept = with_impacts(kept, impacts, step, keep)
-            if not resolved:
-                return UNRESOLVED, step, kept
         for i in range(nodes):
             for axis in range(3):
                 x = positions[step, i, axis] + scene.time_step * velocities[step + 1, i, axis]

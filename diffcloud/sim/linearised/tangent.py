@@ -9,7 +9,7 @@ from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Motion, Parameters, Timing
 from diffcloud.sim.compiled.sparse import solve
 from diffcloud.sim.held import Held, aim, aim_tangent, first_anchors, holders, take_anchors_tangent
-from diffcloud.sim.linearised.adjoint import candidates, factor_of, project_reverse, restore
+from diffcloud.sim.linearised.adjoint import candidates, factor_of, restore, stop_at_planes
 from diffcloud.sim.linearised.matrix import repelling
 from diffcloud.sim.linearised.record import Kept
 from diffcloud.sim.linearised.scene import Scene
@@ -96,7 +96,7 @@ def tangents(
                     places[k, i, axis] = x[k, i, axis] + dt * after[k, i, axis]
         candidate, above = candidates(scene, motion)
         for k in range(directions):
-            project_reverse(scene, above, places[k])  # projections are their own transposes
+            stop_at_planes(scene, above, places[k], 0)
         if scene.collides and kept.begins[step + 1, 2] > kept.begins[step, 2]:
             resolve_tangent(
                 scene.projection,

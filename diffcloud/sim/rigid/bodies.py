@@ -6,7 +6,7 @@ the balances of linear and of angular momentum,
     M (v₁ - v₀) = Δt (M g + Σ f),      I(R₁) ω₁ - I(R₀) ω₀ = Δt Σ (p - c₁) × f,
 
 so that a body without contact keeps its angular momentum exactly (`rigid.spin`). (The reference simulator uses Euler
-angles, a point mass per node and no angular acceleration; PHYSICS section 9.)
+angles, a point mass per node and no angular acceleration.)
 """
 
 from __future__ import annotations

@@ -133,7 +133,7 @@ def coefficients(face: Element, e00: Scalar, e11: Scalar, e01: Scalar) -> list[S
 
 
 def _sampled(stretching: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[6, 4] table -> [4, 30, 30, 30] coefficients over (C00, C11, C01), C = FᵀF (PHYSICS: grid of samples)."""
+    """[6, 4] table -> [4, 30, 30, 30] coefficients over (C00, C11, C01), C = FᵀF."""
     index = np.arange(_SAMPLES)
     c00, c11, c01 = np.meshgrid(0.5 + index / 15, 0.5 + index / 15, index / 15, indexing="ij")
     largest = 0.5 * (c00 + c11 + np.sqrt(4 * c01**2 + (c00 - c11) ** 2))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -107,6 +108,10 @@ def test_impacts_that_cannot_be_resolved_are_named():
         rollout(system, 3)
     assert caught.value.entries == [0]
     assert "smaller time step" in str(caught.value)
+    points = [int(number) for number in re.findall(r"\d+", caught.value.pair.partition("[")[2])]
+    count = len(system.mesh.nodes) + sum(len(one.nodes) for one in system.setup.surrounding.obstacles)
+    assert len(set(points)) == 4
+    assert all(0 <= point < count for point in points)
     dropped = rollout(system, 3, drop_diverged=True)
     assert set(dropped.diverged) == {0}
     assert torch.isnan(dropped.positions[0, -1]).all()
