@@ -33,6 +33,7 @@ from diffcloud.hardware.installed import Check
 from diffcloud.hardware.kinova import KinovaArm
 from diffcloud.hardware.motion import plan_motion
 from diffcloud.hardware.realsense import RealSenseCamera
+from diffcloud.hardware.trajectory import check_rate
 from diffcloud.io.calibrations import read_calibration
 from diffcloud.io.raw_episodes import exists_already
 from diffcloud.sensing.robot import Robot, gen3
@@ -111,7 +112,9 @@ def record(
     acceleration: Annotated[float, typer.Option(help="Limit of its acceleration, m/s².")] = Limits.acceleration_m_s2,
     force: Annotated[float, typer.Option(help="Limit of the change of the force at the tool, N.")] = Limits.force_N,
     torque: Annotated[float, typer.Option(help="Limit of the change of the torque, N·m.")] = Limits.torque_Nm,
-    preload: Annotated[float, typer.Option(help="Limit of the force at rest, N.")] = Limits.preload_N,
+    preload: Annotated[
+        float, typer.Option(help="Limit of the force at rest, N; the torque's, N·m, is a third of it.")
+    ] = Limits.preload_N,
     table: Annotated[float, typer.Option(help="Height of the table in the base frame, m; no link may be lower.")] = (
         ArmLimits.table_m
     ),
@@ -137,7 +140,13 @@ def record(
     even if this process is killed. What was recorded so far stays.
     """
     limits = _limits(
-        box, speed_m_s=speed, acceleration_m_s2=acceleration, force_N=force, torque_Nm=torque, preload_N=preload
+        box,
+        speed_m_s=speed,
+        acceleration_m_s2=acceleration,
+        force_N=force,
+        torque_Nm=torque,
+        preload_N=preload,
+        preload_Nm=preload * Limits.preload_Nm / Limits.preload_N,
     )
     arm_limits = ArmLimits(table_m=table, margin_m=arm_margin)
     robot = None if urdf is None else Robot.from_urdf(urdf)
@@ -177,6 +186,7 @@ def record(
     plan = _plan(path, serials, arm, limits)
     if path is not None:
         check_trajectory(path, limits)
+        check_rate(rate_hz)
     if dry_run:
         errors.print("Dry run: nothing was opened, nothing moved.")
         finish({"dry_run": True, "plan": plan}, json)
@@ -184,7 +194,7 @@ def record(
     if arm is not None and not yes:
         typer.confirm(_CLEAR, abort=True, err=True)
     cameras = [camera_of(name, out.parent / f"{out.name}_{name}.db3" if keep_recording else None) for name in serials]
-    settings = CaptureSettings(rate_hz=rate_hz, keep_every=max(1, round(fps / rate_hz)), go_home=home)
+    settings = CaptureSettings(rate_hz=rate_hz, frames_hz=rate_hz, go_home=home)
     opened = None if arm is None else open_arm(arm, arm_driver)
     try:
         if opened is not None and clear_faults:

@@ -13,6 +13,7 @@ from rich.table import Table
 from diffcloud.errors import ConfigError
 from diffcloud.fit.record import FitRecord, RecordingFit, read_fit
 from diffcloud.io.files import together
+from diffcloud.io.manifests import remove_files
 from pipeline.console import JsonFlag, errors, finish, progress_bar, show, warn, writes
 from pipeline.scenario_options import ScenarioName, choose_scenario, fitted_scenario
 
@@ -62,7 +63,7 @@ def export(
     """Write a fitted cloth for another simulator: mesh, material in SI units, and the recorded motion of what is held."""
     from diffcloud.fit.result import read_motion
     from diffcloud.simulators.export.cloth import fitted_cloth
-    from diffcloud.simulators.export.write import write_export
+    from diffcloud.simulators.export.write import exported_files, write_export
 
     if check and to not in _RUNNABLE:
         raise ConfigError(f"--check runs {' and '.join(_RUNNABLE)}; {to} cannot be run here.")
@@ -75,11 +76,15 @@ def export(
     chosen = choose_scenario(scenario or fitted_scenario(fit, one.scenario)).halved(record.halvings)
     motion = read_motion(fit.with_suffix(".npz"), index)
     cloth = fitted_cloth(one, motion, chosen, record.values)
+    former = exported_files(out)
     with together():
         names, left_out = write_export(cloth, to, out, _about(fit, one, chosen, record.values))
+        written = set(names)
         for number, values in enumerate(drawn):
             sample, folder = fitted_cloth(one, motion, chosen, values), out / f"sample_{number:04d}"
-            write_export(sample, to, folder, {"sample": number, **_about(fit, one, chosen, values)})
+            of_sample, _ = write_export(sample, to, folder, {"sample": number, **_about(fit, one, chosen, values)})
+            written |= {f"{folder.name}/{name}" for name in of_sample}
+    remove_files(out, sorted(former - written))
     for sentence in left_out:
         warn(sentence)
     if to in _SIMPLIFIED:

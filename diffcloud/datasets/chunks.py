@@ -1,8 +1,4 @@
-"""A chunk of runs: the unit of work. What it gives depends on nothing but the chunk, on one type of processor.
-
-Runs of a batch can differ in the last bits with the batch they are in and with the number of threads; so a chunk always
-has the same runs, in one batch, on one thread.
-"""
+"""A chunk of runs: the unit of work. What it gives depends on nothing but the chunk, on one type of processor."""
 
 from __future__ import annotations
 
@@ -17,6 +13,7 @@ from diffcloud.datasets.draws import ParameterDraws
 from diffcloud.errors import DatasetError, DivergedError
 from diffcloud.io.simulated import Split
 from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import rollout
 
 CHUNK = 32
@@ -83,7 +80,7 @@ def simulate_chunk(scenario: Scenario, draws: ParameterDraws, chunk: Chunk) -> S
             factors = [draws.doubtful(chunk.split, run, attempt) for run in runs]
             for name in draws.doubts:
                 if value := scenario.value(name):
-                    values[name] = value * np.array([one[name] for one in factors])
+                    values[name] = np.minimum(value * np.array([one[name] for one in factors]), PARAMETERS[name].most)
             nodes[missing], diverged = _nodes(scenario, values)
         except DivergedError as error:
             raise DatasetError(f"Runs from {chunk.start} of {chunk.split}: {error}") from error

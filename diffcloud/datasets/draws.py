@@ -1,7 +1,7 @@
 """Parameters of simulated runs: uniform, uniform in the logarithms, by a Sobol sequence, or as published.
 
 The published code picks one of four modes for each run (soft, medium, stiff, random) and then stretch and mass uniformly in
-the mode's ranges (PHYSICS: experiments). Draws outside of the bounds are rejected.
+the mode's ranges. Draws outside of the bounds are rejected.
 """
 
 from __future__ import annotations

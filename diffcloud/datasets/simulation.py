@@ -21,7 +21,7 @@ from diffcloud.datasets.draws import ParameterDraws
 from diffcloud.datasets.work import WorkFolder
 from diffcloud.errors import ConfigError, DatasetError, DiffCloudError
 from diffcloud.io.files import atomic, write_json
-from diffcloud.io.simulated import SimulatedSet, Split, write_simulated
+from diffcloud.io.simulated import SPLITS, SimulatedSet, Split, write_simulated
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.threads import use_threads
 
@@ -209,7 +209,8 @@ def _write(
     for split, simulated in sets.items():
         if clouds is None:
             break
-        written = export_clouds(folder / "clouds" / split, simulated, points=clouds, seed=plan.draws.seed)
+        seed = plan.draws.seed + SPLITS.index(split)  # the splits share no noise
+        written = export_clouds(folder / "clouds" / split, simulated, points=clouds, seed=seed)
         names += [f"clouds/{split}/{name}" for name in written]
     return names + write_simulated(folder, sets, about=about, replaced=_replaced_table(plan, results))
 
@@ -250,7 +251,8 @@ def export_clouds(folder: Path, simulated: SimulatedSet, *, points: int, seed: i
     """Write the clouds of every run and frame as `<run>/<frame>.npy` float32 [points, 3], the layout of the published data;
     return their names.
 
-    They are the first epoch's of a training with the same seed, number of points and the default augmentation.
+    They are the first epoch's of a training that sees all frames of this set, with the same seed, number of points and the
+    default augmentation.
     """
     maker = CloudMaker.build(simulated, Augmentation(), points=points)
     names = []

@@ -21,7 +21,7 @@ from diffcloud.io.arrays import read_npz
 from diffcloud.io.files import files_in, read_json, together, write_json, write_npz
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.manifests import remove_files
-from diffcloud.io.simulated import simulated_files
+from diffcloud.io.simulated import LARGEST_BYTES, simulated_files
 
 _CODE = ("mesh", "sim", "scene", "datasets")
 """Packages whose source decides the numbers."""
@@ -66,7 +66,8 @@ class WorkFolder:
     def read(self, chunk: Chunk) -> SimulatedChunk | None:
         """A finished chunk, None if it is missing or damaged."""
         try:
-            told = read_npz(self._file(chunk), kind="chunk of runs", error=DatasetError, names=_ARRAYS)
+            path, most = self._file(chunk), LARGEST_BYTES
+            told = read_npz(path, kind="chunk of runs", error=DatasetError, names=_ARRAYS, most_bytes=most)
             replaced = json.loads(str(told["replaced"]))
             return SimulatedChunk(
                 told["parameters"],

@@ -34,6 +34,10 @@ _BASE_M = 0.1
 """Half the width of the base, which stands at the origin."""
 _ELBOW_M = 0.76
 """Height of a Gen3's elbow when its upper arm points up [m]."""
+_SPEED_WINDOW_S = 0.4
+"""Joint speeds are measured over this long; a reading's moment is known to some 20 ms."""
+_SPEED_SLACK = 1.1
+"""A measured joint may be this much faster than a planned one: it also corrects errors, and its speed is known to 5 %."""
 _NOISE = 2e-3
 """m and rad: so much a motion that comes back into the limits may go outwards in between."""
 _TABLE = 8
@@ -82,6 +86,11 @@ class JointPath:
     def duration_s(self) -> float:
         return float(self.times[-1])
 
+    @property
+    def fastest_rad_s(self) -> float:
+        """Of any joint at any time."""
+        return float((np.abs(np.diff(self.joints_rad, axis=0)) / np.diff(self.times)[:, None]).max())
+
     def at(self, t_s: float) -> Floats:
         """[J] the ends are held."""
         return np.array([np.interp(t_s, self.times, column) for column in self.joints_rad.T])
@@ -93,10 +102,18 @@ class ArmChecker:
     Args:
         robot: description of the arm with its gripper, in the arm's base frame.
         limits: of the tool; the workspace box is also the core of the space that the links may use.
+
+    Raises:
+        LimitError: the description has no surfaces of links that move.
     """
 
     def __init__(self, robot: Robot, limits: Limits, arm_limits: ArmLimits) -> None:
         self.robot, self.limits, self.arm_limits = robot, limits, arm_limits
+        if not self._moving:
+            raise LimitError(
+                f"The description {robot.description.name} has no surfaces of links that move, so that nothing can be held "
+                "against table and box. Give a URDF whose links have visual or collision meshes, with --urdf."
+            )
         joints = [robot.moving[index] for index in robot.arm]
         self._ends = np.array([[joint.lower, joint.upper] for joint in joints])
         low, high = np.array(limits.box_low_m), np.array(limits.box_high_m)
@@ -339,6 +356,8 @@ class ArmWatch:
     def __init__(self, checker: ArmChecker, name: str, start: ArmReading, *, returning: bool) -> None:
         self._checker, self._name, self._returning = checker, name, returning
         self._orientation = _rotation(start)
+        self._since: tuple[float, Floats] | None = None
+        """When the joints' speed was last measured, and their angles [J] then."""
         self._allowed = np.zeros(len(start.joints_rad) + 12)
         if returning:
             self._allowed = np.maximum(self._excess(start), 0.0)
@@ -357,7 +376,12 @@ class ArmWatch:
             raise LimitError(f"{when} {what}.")
         if self._returning:
             self._allowed = np.minimum(self._allowed, np.maximum(excess, 0.0))
-            return
+        else:
+            self._check_tool(when, reading)
+        self._check_speed(when, t, reading.joints_rad)
+
+    def _check_tool(self, when: str, reading: ArmReading) -> None:
+        checker = self._checker
         turned = float((self._orientation.inv() * _rotation(reading)).magnitude())
         if not turned <= checker.arm_limits.turn_rad:
             raise LimitError(
@@ -369,6 +393,23 @@ class ArmWatch:
             raise LimitError(
                 f"{when} the arm is too near to a singularity: the Jacobian's least singular value is {value:.3f}, the "
                 f"limit is {checker.arm_limits.singular_value:g}."
+            )
+
+    def _check_speed(self, when: str, t: float, joints_rad: Floats) -> None:
+        if self._since is None:
+            self._since = t, joints_rad
+        before, joints = self._since
+        if t - before < _SPEED_WINDOW_S:
+            return
+        self._since = t, joints_rad
+        turned = (joints_rad - joints + np.pi) % (2 * np.pi) - np.pi  # a joint that turns without end may begin anew
+        speed = np.abs(turned) / (t - before)
+        limit = _SPEED_SLACK * self._checker.arm_limits.joint_speed_rad_s
+        if not speed.max() <= limit:
+            joint = int(speed.argmax())
+            raise LimitError(
+                f"{when} joint {joint + 1} turns with {speed[joint]:.2f} rad/s; the limit is {limit:g} rad/s. Slow down "
+                "with --stretch-time, or look for what turns it."
             )
 
     def _excess(self, reading: ArmReading) -> Floats:

@@ -58,8 +58,9 @@ _IN_FLIGHT_S = 0.5
 _LARGEST_MESSAGE = 1 << 16
 _OPEN_TIMEOUT_S = 60.0
 _CALL_TIMEOUT_S = 2.0
-_TIMEOUTS_S = {"prepare": 10.0, "stop": 2.5}
-"""Of calls that may take longer: `prepare` waits for a transient state, `stop` tries more than once."""
+_TIMEOUTS_S = {"prepare": 10.0, "stop": 2.5, "emergency_stop": 2.5}
+"""Of calls that may take longer: `prepare` waits for a transient state, a Stop may try more than once."""
+_VELOCITIES = ("send_velocity", "send_joint_velocity")
 _CLOSE_TIMEOUT_S = 6.0
 _DISCONNECT_TIMEOUT_S = 2.0
 _SHOUT_EVERY_S = 1.0
@@ -82,7 +83,13 @@ class ArmProcess:
     def __init__(self, open_arm: Callable[[], Arm], *, watchdog_s: float = WATCHDOG_S) -> None:
         self._lock = threading.Lock()
         self._number = 0
-        self._socket, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            self._socket, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        except OSError as error:
+            raise HardwareError(
+                f"This system has no sockets that keep message boundaries ({error}), over which the process that holds the "
+                "arm is reached. Linux has them, macOS does not: drive the arm from Linux."
+            ) from error
         code = (
             f"import sys; sys.path[:] = {sys.path!r}; from diffcloud.hardware.arm_process import serve; "
             f"serve({there.fileno()})"
@@ -157,16 +164,11 @@ class ArmProcess:
         Raises:
             UnconfirmedStopError: the arm confirmed neither Stop nor emergency stop. The child goes on trying.
         """
-        try:
-            self._call("stop")
-        except UnconfirmedStopError:
-            raise
-        except HardwareError as error:
-            raise UnconfirmedStopError(f"{MAY_BE_MOVING} Stop could not be sent: {error}") from error
+        self._stop("stop")
 
     def emergency_stop(self) -> None:
-        """See `Arm`."""
-        self._call("emergency_stop")
+        """The arm's emergency stop, without trying Stop first; otherwise as `stop`."""
+        self._stop("emergency_stop")
 
     def halt(self) -> None:
         """Have Stop sent without waiting: one message, whole or not at all, so a signal handler may do it anywhere."""
@@ -181,6 +183,14 @@ class ArmProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()  # it hangs in the driver; the arm's own timeout stops what moves
             self._process.wait()
+
+    def _stop(self, name: str) -> None:
+        try:
+            self._call(name)
+        except UnconfirmedStopError:
+            raise
+        except HardwareError as error:
+            raise UnconfirmedStopError(f"{MAY_BE_MOVING} Stop could not be sent: {error}") from error
 
     def _call(self, name: str, *arguments: Any) -> Any:
         with self._lock:
@@ -278,9 +288,24 @@ class _Service:
         self._tried = self._shouted = 0.0
 
     def run(self) -> None:
-        """Until the capture closes the socket, or dies."""
+        """Until the capture closes the socket, or dies; then the arm does not move."""
         worker = threading.Thread(target=self._work, name="arm calls", daemon=True)
         worker.start()
+        reason = "the capture has ended"
+        try:
+            self._attend()
+        except Exception as error:  # whatever went wrong here, the arm must not go on
+            reason = f"the process that holds it failed ({type(error).__name__}: {error})"
+            _shout(f"The arm is let go: {reason}.")
+        self._requests.put(None)
+        if self._moving:
+            self._halt(reason)
+            end = time.monotonic() + _GIVE_UP_S
+            while self._unconfirmed and time.monotonic() < end:
+                time.sleep(_REPEAT_S)
+                self._try_stop(1)
+
+    def _attend(self) -> None:
         heard = time.monotonic()
         while True:
             patience = None
@@ -303,13 +328,6 @@ class _Service:
                     self._try_stop(1)
             elif self._moving and time.monotonic() - heard >= self._watchdog_s:
                 self._halt(f"nothing came from the capture for {self._watchdog_s:g} s: it hangs, or was suspended")
-        self._requests.put(None)
-        if self._moving:
-            self._halt("the capture has ended")
-            end = time.monotonic() + _GIVE_UP_S
-            while self._unconfirmed and time.monotonic() < end:
-                time.sleep(_REPEAT_S)
-                self._try_stop(1)
 
     def _receive(self, data: bytes) -> None:
         number, name, arguments = pickle.loads(data)
@@ -317,15 +335,23 @@ class _Service:
             self._halt("the capture was interrupted")
         elif name == "stop":
             _send(self._link, number, None, self._halt("the capture sent Stop"))
+        elif name == "emergency_stop":
+            _send(self._link, number, None, self._halt("the capture sent the emergency stop", attempts=0))
+        elif name in _VELOCITIES and self._prepared != self._stops:
+            # refused here, where it arms no watchdog: an arm that nobody has moved gets no Stop
+            _send(self._link, number, None, self._refusal())
         else:
-            if name in ("send_velocity", "send_joint_velocity"):
+            if name in _VELOCITIES:
                 self._moving = True  # from here on silence counts, whatever becomes of the command
             self._requests.put(_Request(number, name, arguments, self._stops))
 
-    def _halt(self, reason: str) -> UnconfirmedStopError | None:
+    def _refusal(self) -> HardwareError:
+        return HardwareError(f"The arm was stopped and takes no velocities until it is prepared again: {self._reason}.")
+
+    def _halt(self, reason: str, attempts: int = _STOP_ATTEMPTS) -> UnconfirmedStopError | None:
         self._stops += 1  # first: from here on no velocity goes out
         self._reason = reason
-        return self._try_stop(_STOP_ATTEMPTS)
+        return self._try_stop(attempts)
 
     def _try_stop(self, attempts: int) -> UnconfirmedStopError | None:
         """Stop, then the emergency stop; None when the arm has confirmed one of them."""
@@ -361,27 +387,26 @@ class _Service:
             # The last resort: an arm that refuses Stop may still take this, and is then in fault. On a lost link it
             # fails like Stop did, and costs one call.
             self._arm.emergency_stop()
-            _shout(f"The arm did not confirm Stop ({failure}); its emergency stop was applied, and it is in fault.")
+            told = "The arm's" if failure is None else f"The arm did not confirm Stop ({failure}); its"
+            _shout(f"{told} emergency stop was applied, and it is in fault.")
             return None
-        except Exception:
-            return failure
+        except Exception as error:
+            return failure or error
 
     def _work(self) -> None:
         while (request := self._requests.get()) is not None:
-            try:
-                value, error = self._carry_out(request), None
+            try:  # pickled in here: what a driver returns need not be picklable
+                answer = pickle.dumps((request.number, self._carry_out(request), None))
             except Exception as failure:  # the capture gets every failure, and this thread goes on
-                value, error = None, _sendable(failure)
-            _send(self._link, request.number, value, error)
+                answer = pickle.dumps((request.number, None, _sendable(failure)))
+            _deliver(self._link, answer)
 
     def _carry_out(self, request: _Request) -> Any:
         call = getattr(self._arm, request.name)
-        if request.name in ("send_velocity", "send_joint_velocity"):
+        if request.name in _VELOCITIES:
             with self._commanding:
                 if self._prepared != self._stops:
-                    raise HardwareError(
-                        f"The arm was stopped and takes no velocities until it is prepared again: {self._reason}."
-                    )
+                    raise self._refusal()
                 return call(*request.arguments)
         value = call(*request.arguments)
         if request.name == "prepare":
@@ -405,8 +430,12 @@ def _received(link: socket.socket) -> bytes:
 
 
 def _send(link: socket.socket, number: int, value: Any, error: DiffCloudError | None) -> None:
+    _deliver(link, pickle.dumps((number, value, error)))
+
+
+def _deliver(link: socket.socket, message: bytes) -> None:
     with suppress(OSError):  # the capture is gone; the main thread sees it too, and stops the arm
-        link.send(pickle.dumps((number, value, error)))
+        link.send(message)
 
 
 def _shout(text: str) -> None:

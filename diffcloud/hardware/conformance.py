@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from diffcloud.errors import DiffCloudError, HardwareError, LimitError
+from diffcloud.errors import DiffCloudError, HardwareError, LimitError, UnconfirmedStopError
 from diffcloud.hardware.arm_limits import ArmChecker
 from diffcloud.hardware.arm_process import WATCHDOG_S, ArmProcess
-from diffcloud.hardware.contact import at_rest
+from diffcloud.hardware.contact import at_rest, sizes
 from diffcloud.hardware.devices import ArmReading, Camera
 from diffcloud.hardware.installed import Check
 from diffcloud.sensing.validation.episode import FARTHEST_M, NEAREST_M
@@ -55,7 +55,7 @@ def check_camera(camera: Camera, *, seconds: float = 2.0, timeout_s: float = 1.0
     except DiffCloudError as error:
         yield Check("opens", "wrong", str(error))
         return
-    frames, waits = [], []
+    frames, waits, failure = [], [], ""
     try:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -63,11 +63,11 @@ def check_camera(camera: Camera, *, seconds: float = 2.0, timeout_s: float = 1.0
             frames.append((camera.read(timeout_s), time.monotonic()))
             waits.append(frames[-1][1] - began)
     except DiffCloudError as error:
-        yield Check("delivers", "wrong", str(error))
+        failure = str(error)
     finally:
         camera.close()
-    if len(frames) < 2:
-        yield Check("delivers", "wrong", f"{len(frames)} frames in {seconds:g} s")
+    if failure or len(frames) < 2:
+        yield Check("delivers", "wrong", failure or f"{len(frames)} frames in {seconds:g} s")
         return
     yield Check("delivers", "ok", f"{len(frames) / seconds:.1f} frames a second, the longest wait {max(waits):.3f} s")
     times = np.array([frame.time_s for frame, _ in frames])
@@ -202,14 +202,25 @@ def check_arm(
 
 
 def _pulled(guarded: _Guarded, ask: Callable[[str], None]) -> Floats | None:
-    """The last place [3] that was heard of; None if the cable was not pulled."""
+    """The last place [3] that was heard of; None if the cable was not pulled.
+
+    Raises:
+        HardwareError, LimitError: something else ended the motion. The arm has been sent Stop.
+    """
     ask(f"The arm will move up at 2 cm/s for {_PULLED_S:g} s. Pull its network cable while it moves. Press Enter to start")
     last = None
     try:
         end = time.monotonic() + _PULLED_S
         while time.monotonic() < end:
             last = guarded.up(_COMMAND_S)[1][-1]
-    except HardwareError:
+    except HardwareError as error:
+        try:
+            guarded.arm.stop()
+        except UnconfirmedStopError:  # only this tells a lost link from an arm in trouble, which still confirms Stop
+            if isinstance(error, LimitError):
+                raise error from None
+        else:
+            raise
         ask("Plug the cable in again, wait until the arm can be reached, and press Enter")
         return last
     guarded.arm.stop()
@@ -248,19 +259,15 @@ def _readings(arm: ArmProcess, checker: ArmChecker) -> Iterator[Check]:
     except DiffCloudError as error:
         yield Check("tool frame", "wrong", str(error))
     finite = bool(np.isfinite([reading.wrench for reading in readings]).all())
-    size = float(np.linalg.norm(np.mean([reading.wrench for reading in readings], axis=0)[:3]))
+    force, torque = sizes(np.mean([reading.wrench for reading in readings], axis=0))
+    limits = checker.limits
     yield _check(
-        "wrench", finite and len(last.wrench) == 6 and size <= checker.limits.preload_N,
-        f"{size:.1f} N at rest; must be six finite numbers, force at most {checker.limits.preload_N:g} N (--preload)",
+        "wrench", finite and len(last.wrench) == 6 and force <= limits.preload_N and torque <= limits.preload_Nm,
+        f"{force:.1f} N and {torque:.1f} N·m at rest; must be six finite numbers, at most {limits.preload_N:g} N and "
+        f"{limits.preload_Nm:g} N·m (--preload)",
     )  # fmt: skip
     grip = last.gripper
     yield _check("gripper", grip is None or -0.05 <= grip <= 1.05, f"{grip}; must be 0 (open) to 1 (closed), or None")
-    refused = ""
-    try:
-        arm.send_velocity(np.zeros(3))
-    except HardwareError as error:
-        refused = str(error)
-    yield _check("velocities before prepare()", bool(refused), refused or "were accepted")
 
 
 def _motion(guarded: _Guarded) -> Iterator[Check]:

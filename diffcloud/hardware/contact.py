@@ -32,12 +32,15 @@ class Contact:
     """
 
     def __init__(self, zero: Floats, limits: Limits) -> None:
-        force, torque = _sizes(zero)
-        if not (force <= limits.preload_N and torque <= limits.preload_Nm):
+        force, torque = sizes(zero)
+        kept = {"force": force <= limits.preload_N, "torque": torque <= limits.preload_Nm}  # NaN is not kept
+        if not all(kept.values()):
+            beyond = ", ".join(name for name, inside in kept.items() if not inside)
             raise LimitError(
                 f"At rest the tool feels {force:.1f} N and {torque:.1f} N·m; up to {limits.preload_N:g} N and "
-                f"{limits.preload_Nm:g} N·m are taken for the estimate's offset. Free the tool, check the payload that is "
-                "configured on the arm (web page: Configurations, Tool), or raise --preload."
+                f"{limits.preload_Nm:g} N·m are taken for the estimate's offset (not within it: {beyond}). Free the tool, "
+                "check the payload that is configured on the arm (web page: Configurations, Tool), or raise --preload, "
+                "which scales both."
             )
         self._zero, self._limits = zero, limits
 
@@ -46,7 +49,7 @@ class Contact:
         LimitError: the change is beyond the limits, or not a number.
         """
         limits = self._limits
-        force, torque = _sizes(wrench - self._zero)
+        force, torque = sizes(wrench - self._zero)
         if not (force <= limits.force_N and torque <= limits.torque_Nm):  # also true of NaN
             raise LimitError(
                 f"{when} the tool felt {force:.1f} N and {torque:.1f} N·m; limits are {limits.force_N:g} N and "
@@ -67,5 +70,6 @@ def at_rest(arm: Arm, limits: Limits) -> tuple[ArmReading, Contact]:
     return readings[-1], Contact(np.mean([reading.wrench for reading in readings], axis=0), limits)
 
 
-def _sizes(wrench: Floats) -> tuple[float, float]:
+def sizes(wrench: Floats) -> tuple[float, float]:
+    """Of the force [N] and the torque [N·m] of a wrench [6]."""
     return float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))

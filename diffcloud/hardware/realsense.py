@@ -137,12 +137,13 @@ class RealSenseCamera:
             sensors = _sensors(rs, profile)
         self._last_number, self._times = None, None
         try:
-            camera_settings.apply(rs, sensors, self._settings, self.name)
-            for _ in range(self._warm_up):
-                self.read(5.0)
-            if self._settings.hold:
-                camera_settings.hold(rs, sensors, self.name)
-            info = replace(info, settings=camera_settings.read_back(rs, sensors))
+            with _explained(f"Camera {self.name} ({self.serial}) could not be set"):
+                camera_settings.apply(rs, sensors, self._settings, self.name)
+                for _ in range(self._warm_up):
+                    self.read(5.0)
+                if self._settings.hold:
+                    camera_settings.hold(rs, sensors, self.name)
+                info = replace(info, settings=camera_settings.read_back(rs, sensors))
         except HardwareError:
             self.close()
             raise
@@ -200,13 +201,17 @@ class RealSenseCamera:
 
 
 @contextmanager
-def play_recording(path: Path, name: str) -> Iterator[tuple[CameraInfo, Iterator[CameraFrame]]]:
+def play_recording(path: Path, name: str, *, alone: bool = True) -> Iterator[tuple[CameraInfo, Iterator[CameraFrame]]]:
     """A recording of the SDK (`.db3`, or an old `.bag`): the camera, and its frames with depth aligned to colour.
 
     Plays as fast as the frames are taken, once, without dropping any.
 
+    Args:
+        alone: otherwise its times will be compared with those of other cameras.
+
     Raises:
-        HardwareError: missing, not a recording, or without depth and colour.
+        HardwareError: missing, not a recording, without depth and colour, or stamped by the camera's own clock though it is
+            not alone.
     """
     rs = import_realsense()
     if not Path(path).is_file():
@@ -226,7 +231,8 @@ def play_recording(path: Path, name: str) -> Iterator[tuple[CameraInfo, Iterator
             serial = profile.get_device().get_info(rs.camera_info.serial_number)
             info = _camera_info(rs, name, serial, profile)
         ended = partial(_has_ended, playback, rs.playback_status.stopped)
-        yield info, _played(pipeline, rs.align(rs.stream.color), ended)
+        foreign = None if alone else rs.timestamp_domain.hardware_clock
+        yield info, _played(pipeline, rs.align(rs.stream.color), ended, path, foreign)
     finally:
         with _explained(f"{path} could not be closed"):
             pipeline.stop()
@@ -236,7 +242,8 @@ def play_recording(path: Path, name: str) -> Iterator[tuple[CameraInfo, Iterator
 def play_recordings(paths: Mapping[str, Path]) -> Iterator[Recording]:
     """Recordings of several cameras that ran together, by the camera's name, merged in order of time."""
     with ExitStack() as stack:
-        played = {name: stack.enter_context(play_recording(path, name)) for name, path in paths.items()}
+        alone = len(paths) == 1
+        played = {name: stack.enter_context(play_recording(path, name, alone=alone)) for name, path in paths.items()}
         streams = [_renamed(name, frames) for name, (_, frames) in played.items()]
         merged = heapq.merge(*streams, key=lambda frame: frame.time_s)
         files = ", ".join(Path(path).name for path in paths.values())
@@ -252,7 +259,11 @@ def _has_ended(playback: Any, stopped: Any) -> bool:
     return bool(playback.current_status() == stopped)
 
 
-def _played(pipeline: Any, align: Any, ended: Callable[[], bool]) -> Iterator[CameraFrame]:
+def _played(pipeline: Any, align: Any, ended: Callable[[], bool], path: Path, foreign: Any) -> Iterator[CameraFrame]:
+    """
+    Args:
+        foreign: the domain of stamps that is refused; None where all are good.
+    """
     last, waits = -1, 0
     while True:
         at_end = ended()  # asked first: a frame may come between the wait and the question
@@ -264,6 +275,12 @@ def _played(pipeline: Any, align: Any, ended: Callable[[], bool]) -> Iterator[Ca
             continue
         if frames.get_depth_frame() and frames.get_color_frame():
             number = frames.get_depth_frame().get_frame_number()
+            if foreign is not None and frames.get_depth_frame().get_frame_timestamp_domain() == foreign:
+                raise HardwareError(
+                    f"{path} is stamped by the camera's own clock, which has nothing to do with that of another camera: "
+                    "recordings of several cameras cannot be brought together. Import each alone, or record with global "
+                    "time enabled, which stamps frames with the computer's time."
+                )
             if number > last:  # the syncer may pair one depth image with two colour images
                 last = number
                 yield _frame(align.process(frames))

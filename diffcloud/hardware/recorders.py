@@ -10,6 +10,7 @@ them for ever. So that thread uses `SimpleQueue`, whose `put` is one instruction
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
 import time
@@ -48,7 +49,7 @@ class Recorders:
     """All cameras and, where there is one, the arm's log; the first failure of any is raised in the control loop.
 
     Args:
-        keep_every: of a camera's frames, one in so many is written.
+        frames_hz: so many of a camera's frames are written in a second; None writes all.
         camera_timeout_s: a camera that is silent for longer has failed.
     """
 
@@ -58,12 +59,12 @@ class Recorders:
         writer: RawEpisodeWriter,
         clock: Clock,
         *,
-        keep_every: int,
+        frames_hz: float | None,
         camera_timeout_s: float,
         with_arm: bool,
     ) -> None:
         self._cameras = [
-            _CameraRecorder(camera, writer, clock, keep_every=keep_every, timeout_s=camera_timeout_s) for camera in cameras
+            _CameraRecorder(camera, writer, clock, frames_hz=frames_hz, timeout_s=camera_timeout_s) for camera in cameras
         ]
         self._arm = _ArmRecorder(writer) if with_arm else None
 
@@ -129,12 +130,13 @@ class _CameraRecorder:
         writer: RawEpisodeWriter,
         clock: Clock,
         *,
-        keep_every: int,
+        frames_hz: float | None,
         timeout_s: float,
     ) -> None:
         self.error: DiffCloudError | None = None
         self._camera, self._writer, self._clock = camera, writer, clock
-        self._keep_every, self._timeout_s = keep_every, timeout_s
+        self._timeout_s = timeout_s
+        self._period, self._due = (0.0 if frames_hz is None else 1 / frames_hz), -math.inf
         self._ending = False
         self._frames: queue.SimpleQueue[CameraFrame | None] = queue.SimpleQueue()
         self._asked: float | None = None
@@ -183,6 +185,11 @@ class _CameraRecorder:
                 self._asked = None
                 t = self._clock.of(frame.time_s)
                 if count == 0 and t < 0:  # left over from before the start
+                    if self._clock.now() > self._timeout_s:
+                        raise HardwareError(
+                            f"Camera {self._camera.name}: its clock is behind by {self._clock.now() - t:.3g} s; frames "
+                            "cannot be placed in time."
+                        )
                     continue
                 if count and t <= last:  # dropped silently, such frames would hide a gap
                     raise HardwareError(
@@ -194,8 +201,8 @@ class _CameraRecorder:
                         f"Camera {self._camera.name}: its clock is ahead by {t - self._clock.now():.3g} s; frames cannot "
                         "be placed in time."
                     )
-                last = t
-                if count % self._keep_every == 0 and not self._queued(frame):
+                interval, last = (t - last if count else 0.0), t
+                if self._is_due(t, interval) and not self._queued(frame):
                     self._fail(HardwareError(f"Camera {self._camera.name}: the disk cannot keep up; lower the frame rate."))
                     break
                 count += 1
@@ -205,6 +212,14 @@ class _CameraRecorder:
         finally:
             self._asked = None
             self._frames.put(None)
+
+    def _is_due(self, t: float, interval: float) -> bool:
+        """Whether a frame is the nearest to the next moment at which one is to be written."""
+        if t + interval / 2 < self._due:
+            return False
+        late = t - self._due > self._period / 2  # the first one, or after a gap, whose missed moments are not made up for
+        self._due = (t if late else self._due) + self._period
+        return True
 
     def _queued(self, frame: CameraFrame) -> bool:
         """Wait for the disk, but not longer than for the camera; whether there was room."""

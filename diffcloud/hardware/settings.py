@@ -13,8 +13,8 @@ class CaptureSettings:
 
     rate_hz: float = 10.0
     """Of control, and of the episode."""
-    keep_every: int = 1
-    """Of the camera's frames, one in so many is written."""
+    frames_hz: float | None = None
+    """So many of a camera's frames are written in a second, evenly; None writes all."""
     gain: float = DEFAULT_GAIN
     approach_speed_m_s: float = 0.1
     """Of the tool on the way to the first keyframe, and of the arm's fastest point on the way home."""

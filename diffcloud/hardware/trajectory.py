@@ -96,13 +96,6 @@ class ToolTrajectory:
         """[3] where the tool should be; the ends are held."""
         return np.array([np.interp(t_s, self.times, self.positions[:, axis]) for axis in range(3)])
 
-    def velocity(self, t_s: float) -> Floats:
-        """[3] of the segment that holds `t_s` [m/s]; zero before the start and from the end on."""
-        if not 0 <= t_s < self.duration_s:
-            return np.zeros(3)
-        segment = int(np.searchsorted(self.times, t_s, side="right")) - 1
-        return (self.positions[segment + 1] - self.positions[segment]) / (self.times[segment + 1] - self.times[segment])
-
     def gripper_at(self, t_s: float) -> float | None:
         """Of the last keyframe that has passed: a gripper closes at once, not over seconds."""
         if self.gripper is None:
@@ -158,6 +151,19 @@ def check_trajectory(trajectory: ToolTrajectory, limits: Limits) -> None:
         )
 
 
+def check_rate(rate_hz: float, gain: float = DEFAULT_GAIN) -> None:
+    """Refuse a control rate at which the correction of an error is larger than twice the error.
+
+    Raises:
+        LimitError: says which rates and gains are stable.
+    """
+    if not gain < 2 * rate_hz:
+        raise LimitError(
+            f"A gain of {gain:g} 1/s at {rate_hz:g} Hz overshoots for ever: the arm needs a --rate above {gain / 2:g} Hz, "
+            f"or a gain below {2 * rate_hz:g} 1/s."
+        )
+
+
 def approach(start: Floats, goal: Floats, *, speed_m_s: float) -> ToolTrajectory | None:
     """A straight minimum-jerk motion from `start` to `goal` [3] that peaks at `speed_m_s`; None where they are one."""
     distance = float(np.linalg.norm(goal - start))
@@ -174,10 +180,7 @@ class VelocityController:
     """Closed loop: positions in, velocities out, one call per tick."""
 
     def __init__(self, trajectory: ToolTrajectory, limits: Limits, *, period_s: float, gain: float = DEFAULT_GAIN) -> None:
-        if gain * period_s >= 2:
-            raise HardwareError(
-                f"A gain of {gain:g} 1/s at {1 / period_s:g} Hz overshoots for ever; it must stay below {2 / period_s:g}."
-            )
+        check_rate(1 / period_s, gain)
         self._trajectory, self._limits, self._period, self._gain = trajectory, limits, period_s, gain
         self._last = np.zeros(3)
 

@@ -18,7 +18,7 @@ MOST_BYTES = 1 << 30
 """Of one file's arrays, unpacked."""
 ELEMENTS = "biufSU"
 """Kinds of elements that are read: numbers and strings; an object would be a pointer."""
-_DIMENSIONS = 8
+MOST_DIMENSIONS = 8
 _PIECE = 16 << 20
 """Bytes that are unpacked at a time, into their place: no array is in memory twice."""
 
@@ -96,10 +96,11 @@ def _array(stream: BinaryIO, size: int, name: str) -> NDArray[Any]:
         shape, fortran, dtype = npy_header(stream)
     except ValueError as damage:
         raise ValueError(f"{name} has no header of an array ({damage})") from damage
-    if dtype.hasobject or dtype.kind not in ELEMENTS:
-        raise ValueError(f"{name} holds {dtype} elements, which may be numbers or text")
+    # numpy takes memory for elements without any, as text of no letters has, which the file need not have
+    if dtype.hasobject or dtype.kind not in ELEMENTS or not dtype.itemsize:
+        raise ValueError(f"{name} holds {dtype} elements, which may be numbers, or text of a letter or more")
     there = size - stream.tell()
-    if len(shape) > _DIMENSIONS or any(extent < 0 for extent in shape):
+    if len(shape) > MOST_DIMENSIONS or any(extent < 0 for extent in shape):
         raise ValueError(f"{name} has the shape {list(shape)}")
     stated = math.prod(shape) * dtype.itemsize  # of Python's numbers, which do not overflow
     if stated != there:

@@ -1,8 +1,8 @@
 """Calibration files: where each camera stands in the robot's base frame, how surely, and how that was found.
 
-`raw/calibration/<name>.json` (DESIGN: data contracts): cameras by serial, each with intrinsics, `T_world_camera` (4 x 4,
-maps camera points to world points, metres) and a 6 x 6 covariance of (translation [m], rotation [rad]), perturbations on
-the world's side: T = (exp(rotation) R, translation + t).
+`raw/calibration/<name>.json`: cameras by serial, each with intrinsics, `T_world_camera` (4 x 4, maps camera points to world
+points, metres) and a 6 x 6 covariance of (translation [m], rotation [rad]), perturbations on the world's side:
+T = (exp(rotation) R, translation + t).
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ PLY goes through trimesh and PCD through open3d, which is imported only when a P
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -67,10 +68,12 @@ def _read_ply(path: Path) -> NDArray[Any]:
 
 def _read_xyz(path: Path) -> NDArray[Any]:
     try:
-        table = np.loadtxt(path, ndmin=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a file without rows
+            table = np.loadtxt(path, ndmin=2)
     except (ValueError, UnicodeDecodeError) as error:
         raise EpisodeError(f"{path} is not a readable XYZ file (three or more numbers a line): {error}.") from error
-    return table[:, :3]
+    return table[:, :3] if table.size else np.zeros((0, 3))
 
 
 def _read_pcd(path: Path) -> NDArray[Any]:

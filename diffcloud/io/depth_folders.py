@@ -20,7 +20,7 @@ from diffcloud.io.camera_models import Intrinsics, IntrinsicsFile, Pixels
 from diffcloud.io.files import numbered_files, read_json
 from diffcloud.io.images import decode_color, read_depth
 from diffcloud.io.raw_episodes import CameraFile, CameraInfo, Name, first_backwards, read_timestamps
-from diffcloud.io.recordings import RecordedFrame, Recording
+from diffcloud.io.recordings import RecordedFrame, Recording, check_rate
 from diffcloud.io.schema import Component, explain
 
 _IMAGES = (".png", ".jpg", ".jpeg")
@@ -35,7 +35,8 @@ def depth_folders(folders: Mapping[str, Path], *, rate_hz: float | None = None) 
         rate_hz: of frames without timestamps.csv.
 
     Raises:
-        EpisodeError: no images, no camera JSON, gaps in the numbers, JPEG depth, no times, or times that run backwards.
+        EpisodeError: no images, no camera JSON, gaps in the numbers, JPEG depth, no times, times that run backwards, or a
+            rate that is none.
     """
     cameras = {name: _camera(Path(folder), name) for name, folder in folders.items()}
     images = {name: numbered_files(Path(folder) / "depth", _IMAGES, kind="images") for name, folder in folders.items()}
@@ -120,6 +121,7 @@ def _times(folder: Path, numbers: list[int], rate_hz: float | None) -> dict[int,
         return known
     if rate_hz is None:
         raise EpisodeError(f"{folder} has no timestamps.csv; give the frame rate with --rate-hz.")
+    check_rate(rate_hz)
     return {number: (number - numbers[0]) / rate_hz for number in numbers}
 
 

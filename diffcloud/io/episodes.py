@@ -1,4 +1,4 @@
-"""Episodes: recorded point clouds over time, as one `.npz` without pickles (DESIGN: data contracts).
+"""Episodes: recorded point clouds over time, as one `.npz` without pickles.
 
 Fields: `points` float32 [P, 3] of all frames joined, `offsets` int64 [T+1], `times` [T] since the start [s], optional
 `gripper` [T, G, 3] of the `grippers` [G] (names), optional per-point `camera` uint8, `pixel` uint16 [P, 2], `sigma`

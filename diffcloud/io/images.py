@@ -80,8 +80,14 @@ def read_color(path: Path) -> NDArray[np.uint8]:
 
 
 def decode_color(data: bytes, name: str) -> NDArray[np.uint8]:
-    """Colour [H, W, 3] from the bytes of a PNG, or of a JPEG: for colour that is harmless."""
-    if not data.startswith(_JPEG):
+    """Colour [H, W, 3] from the bytes of a PNG, or of a JPEG: for colour that is harmless.
+
+    Raises:
+        EpisodeError: truncated, damaged, larger than any camera's image, or not 8-bit colour.
+    """
+    if data.startswith(_JPEG):
+        _check_size(*_jpeg_size(data, name), name)
+    else:
         check_png(data, name)
     image = _cv2_decode(data, name)
     if image.dtype != np.uint8:
@@ -120,14 +126,39 @@ def check_png(data: bytes, name: str) -> None:
             break
         if zlib.crc32(body) != struct.unpack(">I", data[end - 4 : end])[0]:
             raise EpisodeError(f"{name} is damaged (checksum of its {kind_bytes!r} chunk); record again or drop the frame.")
-        if kind_bytes == b"IHDR":
+        if kind_bytes == b"IHDR" and length >= 8:
             width, height = struct.unpack(">II", body[4:12])
-            if width * height > _LARGEST_PIXELS:
-                raise EpisodeError(f"{name} claims {width} x {height} pixels; at most {_LARGEST_PIXELS} are read.")
+            _check_size(width, height, name)
         if kind_bytes == b"IEND":
             return
         position = end
     raise EpisodeError(f"{name} is truncated ({len(data)} bytes); its end is missing. Drop the frame or copy it again.")
+
+
+def _jpeg_size(data: bytes, name: str) -> tuple[int, int]:
+    """(width, height) of the frame's header (SOF), which comes after other segments; each states its length.
+
+    Raises:
+        EpisodeError: there is none.
+    """
+    position = 2
+    while position + 9 <= len(data) and data[position] == 0xFF:
+        kind, length = data[position + 1], int.from_bytes(data[position + 2 : position + 4], "big")
+        if kind == 0xFF:  # a byte that fills up
+            position += 1
+            continue
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", data[position + 5 : position + 9])
+            return width, height
+        if kind in (0xD9, 0xDA) or length < 2:  # the end, or pixels
+            break
+        position += 2 + length
+    raise EpisodeError(f"{name} is a JPEG that states no size before its pixels: it is damaged. Drop the frame.")
+
+
+def _check_size(width: int, height: int, name: str) -> None:
+    if width * height > _LARGEST_PIXELS:
+        raise EpisodeError(f"{name} claims {width} x {height} pixels; at most {_LARGEST_PIXELS} are read.")
 
 
 def encode_jpeg(color: NDArray[np.uint8], *, width: int) -> bytes:
@@ -158,7 +189,10 @@ def _decode(data: bytes, name: str) -> NDArray[Any]:
 def _cv2_decode(data: bytes, name: str) -> NDArray[Any]:
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise EpisodeError(f"{name} is not a readable image: {error}.") from error
     if image is None:
         raise EpisodeError(f"{name} is not a readable image.")
     return np.asarray(image)

@@ -1,4 +1,4 @@
-"""Wavefront OBJ with ARCSim's meaning: `v` is a node, `vt` a material-space vert (PHYSICS: mesh reading)."""
+"""Wavefront OBJ with ARCSim's meaning: `v` is a node, `vt` a material-space vert."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Raw episodes: what cameras and arm recorded, as a folder of plain files (DESIGN: data contracts).
+"""Raw episodes: what cameras and arm recorded, as a folder of plain files.
 
     episode.json                      schema version, scenario, labels, rate, cameras, robot, source, units, status
     cameras/<cam>/camera.json         intrinsics, depth_scale_m, T_world_camera (or a calibration file), serial
@@ -45,6 +45,8 @@ _FILES = re.compile(
 """Relative paths of a raw episode's files, with the truth of a synthetic one."""
 _TOOL = ("tool_x", "tool_y", "tool_z", "tool_qw", "tool_qx", "tool_qy", "tool_qz")
 _LATEST_S = 1e6
+MOST_HZ = 1e5
+"""Of frames."""
 _FARTHEST_RAD, _LARGEST = 200.0, 1e5
 """Of joints that turn without end; and of any other number, which `episode validate` may yet find to be in another unit."""
 _WRENCH = ("wrench_fx", "wrench_fy", "wrench_fz", "wrench_tx", "wrench_ty", "wrench_tz")
@@ -134,7 +136,7 @@ class EpisodeFile(BaseModel):
     category: Name | None = None
     repeat: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
     truth: dict[str, Annotated[float, Field(gt=0, le=1e12)]] = Field(default_factory=dict)
-    rate_hz: Annotated[float, Field(gt=0, le=1e5)] | None = None
+    rate_hz: Annotated[float, Field(gt=0, le=MOST_HZ)] | None = None
     cameras: Annotated[list[Annotated[Name, AfterValidator(_plain_word)]], Field(min_length=1, max_length=64)]
     robot: dict[str, Any] | None = None
     source: Name | None = None
@@ -279,7 +281,7 @@ def read_raw_episode(folder: Path) -> RawEpisode:
             raise EpisodeError(f"{camera.folder / 'timestamps.csv'} lists no frame: the camera delivered nothing.")
     robot = None
     if description.get("robot") is not None:
-        robot = read_robot_log(folder / "robot.csv")
+        robot = read_robot_log(folder / "robot.csv", torn=True)
         _refuse_backwards(robot.times, folder / "robot.csv")
     return RawEpisode(folder, description, cameras, robot)
 
@@ -291,7 +293,7 @@ def read_raw_camera(folder: Path, name: str) -> RawCamera:
         EpisodeError: a file is missing or damaged, or times run backwards: names file and row.
     """
     place = folder / "cameras" / name
-    frames, times = read_timestamps(place / "timestamps.csv")
+    frames, times = read_timestamps(place / "timestamps.csv", torn=True)
     _refuse_backwards(times, place / "timestamps.csv")
     return RawCamera(read_camera_info(place / "camera.json"), place, frames, times)
 
@@ -305,10 +307,10 @@ def read_description(folder: Path) -> dict[str, Any]:
     path = Path(folder) / "episode.json"
     data = read_json(path, error=EpisodeError)
     try:
-        EpisodeFile.model_validate(data)
+        told = EpisodeFile.model_validate(data)
     except ValidationError as error:
         raise explain(path, error, EpisodeError) from error
-    return dict(data)
+    return told.model_dump(mode="json", exclude_unset=True)  # numbers even where the file has them as text
 
 
 def read_camera_info(path: Path) -> CameraInfo:
@@ -324,13 +326,16 @@ def read_camera_info(path: Path) -> CameraInfo:
     return told.camera(told.name or Path(path).parent.name)
 
 
-def read_timestamps(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def read_timestamps(path: Path, *, torn: bool = False) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """(frame numbers [T], times [T]) of timestamps.csv, in the order of the file.
+
+    Args:
+        torn: as of `read_csv`: whether `RawEpisodeWriter` wrote it, which ends every row.
 
     Raises:
         EpisodeError: missing, or not the columns frame and t_s.
     """
-    table = _read_table(path, ("frame", "t_s"))
+    table = _read_table(path, ("frame", "t_s"), torn=torn)
     frames = table["frame"].to_numpy(np.float64)
     if (frames != np.rint(frames)).any() or (frames < 0).any():
         raise EpisodeError(f"{path}: frame numbers must be whole and not negative.")
@@ -339,13 +344,16 @@ def read_timestamps(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]
     return frames.astype(np.int64), table["t_s"].to_numpy(np.float64)
 
 
-def read_robot_log(path: Path) -> RobotLog:
+def read_robot_log(path: Path, *, torn: bool = False) -> RobotLog:
     """robot.csv; columns other than t_s and the joints may be absent or empty.
+
+    Args:
+        torn: as of `read_timestamps`.
 
     Raises:
         EpisodeError: missing, not numbers, or without t_s and joints.
     """
-    table = _read_table(path, ("t_s", "joint_1"))
+    table = _read_table(path, ("t_s", "joint_1"), torn=torn)
     count = 1
     while f"joint_{count + 1}" in table.columns:
         count += 1
@@ -407,9 +415,10 @@ class RawEpisodeWriter:
     Args:
         folder: must not exist yet: raw episodes are never overwritten.
         cameras: by name.
+        rate_hz: of the frames; None where it is not known.
         robot: what the arm is (model, address); None without an arm.
         joint_count: of robot.csv.
-        durable: wait for the disk after each frame, so that a power cut keeps it.
+        durable: wait for the disk now and after each frame, so that a power cut keeps it.
         started_at: ISO 8601; by default now.
 
     Raises:
@@ -422,7 +431,7 @@ class RawEpisodeWriter:
         folder: Path,
         cameras: Mapping[str, CameraInfo],
         *,
-        rate_hz: float,
+        rate_hz: float | None,
         source: str,
         robot: Mapping[str, Any] | None = None,
         joint_count: int = 7,
@@ -464,6 +473,8 @@ class RawEpisodeWriter:
             self._robot = _Rows(self.folder / "robot.csv", ["t_s", *joints, "gripper", *_TOOL, *_WRENCH], durable=durable)
         self.robot_rows = 0
         write_json(self.folder / "episode.json", self._description)
+        if durable:  # no frame is read without these
+            _sync(self.folder / "episode.json", self.folder, self.folder / "cameras", self.folder.parent)
 
     @property
     def frame_counts(self) -> dict[str, int]:
@@ -492,7 +503,7 @@ class RawEpisodeWriter:
             self._robot.append(*rows)
             self.robot_rows += len(rows)
 
-    def state_rate(self, rate_hz: float) -> None:
+    def state_rate(self, rate_hz: float | None) -> None:
         """The rate of the frames, where it is known only at the end."""
         self._description["rate_hz"] = rate_hz
 
@@ -529,6 +540,8 @@ class _CameraFiles:
         self.count = 0
         write_json(folder / "camera.json", info.to_json())
         self.rows = _Rows(folder / "timestamps.csv", ["frame", "t_s"], durable=durable)
+        if durable:
+            _sync(folder / "camera.json", folder)
 
     def add(self, t_s: float, depth: NDArray[np.uint16], color: NDArray[np.uint8] | None) -> None:
         if depth.shape != self._shape or (color is not None and color.shape[:2] != self._shape):
@@ -539,9 +552,11 @@ class _CameraFiles:
             if color is not None:
                 write_color(self._folder / "color" / name, color, durable=self._durable)
             if self._durable:
-                _sync_folder(self._folder / "depth")
+                _sync(self._folder / "depth")
                 if color is not None:
-                    _sync_folder(self._folder / "color")
+                    _sync(self._folder / "color")
+                if self.count == 0:
+                    _sync(self._folder)  # where the folders of images are new
             self.rows.append([self.count, t_s])
         except (OSError, DiffCloudError) as error:
             raise DiffCloudError(
@@ -581,12 +596,17 @@ class _Rows:
             raise DiffCloudError(f"Cannot write {self._path}: {error.strerror}.") from error
 
 
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+def _sync(*paths: Path) -> None:
+    """Wait until files and folders are on the disk."""
+    for path in paths:
+        try:
+            handle = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
+        except OSError as error:
+            raise DiffCloudError(f"Cannot write {path}: {error.strerror}.") from error
 
 
 def _plain(name: str) -> bool:
@@ -604,8 +624,8 @@ def _refuse_backwards(times: NDArray[np.float64], path: Path) -> None:
         raise EpisodeError(f"{path}: a time is {times[-1]:g}; times are seconds since the start of the recording.")
 
 
-def _read_table(path: Path, required: Sequence[str]) -> pd.DataFrame:
-    table = read_csv(path, kind="table", error=EpisodeError, torn=True)
+def _read_table(path: Path, required: Sequence[str], *, torn: bool) -> pd.DataFrame:
+    table = read_csv(path, kind="table", error=EpisodeError, torn=torn)
     try:
         missing = [name for name in required if name not in table.columns]
         if missing:

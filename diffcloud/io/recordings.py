@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from diffcloud.errors import EpisodeError
 from diffcloud.io.files import staged
 from diffcloud.io.raw_episodes import (
+    MOST_HZ,
     CameraInfo,
     RawEpisodeWriter,
     RobotLog,
@@ -66,8 +67,9 @@ def write_recording(
         Frames by camera.
 
     Raises:
-        EpisodeError: no frame at all, or one that does not come after the camera's frame before it.
+        EpisodeError: no frame at all, one that does not come after the camera's frame before it, or a rate that is none.
     """
+    check_rate(rate_hz)
     frames = iter(recording.frames)
     first = next(frames, None)
     if first is None:
@@ -77,6 +79,18 @@ def write_recording(
         raise exists_already(folder)
     with staged(folder) as temporary:
         return _written(temporary, recording, chain([first], frames), start, rate_hz, meta)
+
+
+def check_rate(rate_hz: float | None) -> None:
+    """
+    Raises:
+        EpisodeError: no camera has it.
+    """
+    if rate_hz is not None and not 0 < rate_hz <= MOST_HZ:
+        raise EpisodeError(
+            f"A frame rate is in Hz, above 0 and at most {MOST_HZ:g}, got {rate_hz:g}. Correct --rate-hz, or leave it out "
+            "where the source has times."
+        )
 
 
 def _written(
@@ -93,7 +107,7 @@ def _written(
     writer = RawEpisodeWriter(
         folder,
         recording.cameras,
-        rate_hz=rate_hz or 0.0,
+        rate_hz=rate_hz,
         source=recording.source,
         robot=None if robot is None else {"joints": joint_count},
         joint_count=joint_count,
@@ -116,8 +130,9 @@ def _written(
             writer.add_frame(frame.camera, frame.time_s - start, frame.depth, frame.color)
         first = next(iter(latest))
         counted = writer.frame_counts[first] - 1
-        if not rate_hz and counted:
-            writer.state_rate(round(counted / (latest[first] - start), 3))
+        if rate_hz is None and counted:
+            measured = round(counted / (latest[first] - start), 3)
+            writer.state_rate(measured if 0 < measured <= MOST_HZ else None)
     return writer.frame_counts
 
 
@@ -126,8 +141,8 @@ def read_joint_log(path: Path, *, offset_s: float = 0.0, recording_start_s: floa
 
     Args:
         offset_s: is added to its times.
-        recording_start_s: of the first frame. A log whose times start near 0 is taken to count from there; one with times
-            since 1970 is on the recording's clock already.
+        recording_start_s: of the first frame. Where it is seconds since 1970 and the log's times are not, the log is taken
+            to count from the first frame; else both are on one clock.
 
     Raises:
         EpisodeError: missing, damaged, with times that run backwards, or on another clock than the recording.

@@ -13,7 +13,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import pandas as pd
@@ -29,7 +29,8 @@ from diffcloud.mesh.topology import SurfaceMesh
 Split = Literal["train", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 SCHEMA = 1
-_LARGEST_BYTES = 16 * 2**30
+LARGEST_BYTES = 16 * 2**30
+"""Of node trajectories in one file."""
 _LATEST_S = 1e6
 _DAMAGE = (ValueError, OSError, KeyError, TypeError)
 
@@ -235,10 +236,10 @@ def _about(path: Path) -> dict[str, Any]:
     if isinstance(about, dict) and about.get("schema", SCHEMA) != SCHEMA:
         raise DatasetError(f"{path} has schema {about['schema']}; this version reads {SCHEMA}. Simulate the set again.")
     try:
-        SetFile.model_validate(about)
+        told = SetFile.model_validate(about)
     except ValidationError as error:
         raise explain(f"{path} is no simulated set", error, DatasetError) from error
-    return cast(dict[str, Any], about)
+    return told.model_dump(mode="json", exclude_unset=True, by_alias=True)  # numbers even where the file has text
 
 
 def _surface(path: Path) -> dict[str, Any]:
@@ -276,7 +277,7 @@ def _table(path: Path, names: tuple[str, ...]) -> NDArray[np.float64]:
 
 
 def _nodes(path: Path) -> NDArray[np.float32]:
-    nodes = read_npy(path, kind="file of node trajectories", error=DatasetError, most_bytes=_LARGEST_BYTES)
+    nodes = read_npy(path, kind="file of node trajectories", error=DatasetError, most_bytes=LARGEST_BYTES)
     if nodes.dtype != np.float32:
         raise DatasetError(f"{path} holds no node trajectories: expected float32, got {nodes.dtype}.")
     return nodes

@@ -81,7 +81,7 @@ class Follower:
         self._shown = shown
         tool = None
         if description.get("robot") is not None:
-            known = read_robot_log(self._folder / "robot.csv").tool_position_m[-1:]
+            known = read_robot_log(self._folder / "robot.csv", torn=True).tool_position_m[-1:]
             tool = known[0] if len(known) and np.isfinite(known).all() else None
         return LiveFrame(status, {name: self._cloud(name, camera) for name, camera in cameras.items()}, tool)
 

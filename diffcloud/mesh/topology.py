@@ -97,8 +97,9 @@ class ClothMesh:
             ("face", self.face_verts, len(self.verts)),
             ("vert", self.vert_node, len(self.nodes)),
         ):
-            if index.min() < 0 or index.max() >= count:
-                raise MeshError(f"A {name} refers to index {int(index.max())} of {count}; indices run from 0.")
+            wrong = index[(index < 0) | (index >= count)]
+            if len(wrong):
+                raise MeshError(f"A {name} refers to index {int(wrong[0])} of {count}; indices run from 0.")
         self._refuse_degenerate_faces()
         self._refuse_crowded_edges()
 

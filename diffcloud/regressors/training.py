@@ -96,17 +96,17 @@ def train_regressor(
 
     Writes together: `out` (the checkpoint), a folder of the same name without suffix (`training.json`, beside DVCLive's
     metrics, which come epoch by epoch), and `<name>.timings.json`, apart since the other files have the same bytes for the
-    same seed. The state after the last whole epoch lies in a hidden file beside `out` until the end; the same call takes
+    same seed. The state after the last saved epoch lies in a hidden file beside `out` until the end; the same call takes
     it up.
 
     Args:
         workers: processes that sample clouds, on the CPU; 0 for none: then CUDA does, if the network is trained there.
-        mark: fingerprint of what is trained, kept with the timings.
+        mark: fingerprint of what is trained, code included; kept with the timings, and no state of another one is taken up.
 
     Raises:
         ConfigError: sets that do not belong together or are too small.
         TrainingError: a loss that is no number any more, or metrics that the system refuses to write.
-        KeyboardInterrupt: interrupted; the same call goes on from the last whole epoch.
+        KeyboardInterrupt: interrupted; the same call goes on from the last saved epoch.
     """
     began = time.perf_counter()
     if device == "gpu" and not (torch.cuda.is_available() or torch.backends.mps.is_available()):
@@ -116,6 +116,11 @@ def train_regressor(
     _check_sets(train, test, settings)
     if model == "posterior" and (settings.heteroscedastic or settings.loss != "normalised"):
         raise ConfigError("A posterior has a loss and widths of its own; leave out heteroscedastic, and loss: raw.")
+    if settings.heteroscedastic and settings.loss == "raw" and settings.target == "logarithmic":
+        raise ConfigError(
+            "With heteroscedastic and loss: raw, widths are learned in the parameters' units, but those of a logarithmic "
+            "target are on its scale. Use target: linear, or loss: normalised."
+        )
     on_gpu = device == "gpu" or (device == "auto" and torch.cuda.is_available())
     place = torch.device("cuda" if on_gpu and torch.cuda.is_available() else "cpu")
     clouds = _Clouds.build(model, train, test, settings, device=torch.device("cpu") if workers else place)
@@ -141,7 +146,7 @@ def train_regressor(
     )
     torch.manual_seed(settings.seed)
     module = _Training(told, settings, told.build(dropout=settings.dropout))
-    state = _resume_path(out, told, train, test)
+    state = _resume_path(out, told, train, test, f"{mark} {on_gpu}")
     live = out.with_suffix("")
     recorder = _Recorder(live, progress)
     try:
@@ -494,9 +499,13 @@ def _quiet() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _resume_path(out: Path, told: Description, train: SimulatedSet, test: SimulatedSet) -> Path:
-    """A hidden file whose name tells settings and data, so that no training takes up another one's state."""
-    digest = hashlib.sha256(told.model_dump_json().encode())
+def _resume_path(out: Path, told: Description, train: SimulatedSet, test: SimulatedSet, made_by: str) -> Path:
+    """A hidden file whose name tells settings and data, so that no training takes up another one's state.
+
+    Args:
+        made_by: code and type of processor, which decide the numbers too.
+    """
+    digest = hashlib.sha256((told.model_dump_json() + made_by).encode())
     for array in (train.parameters, train.nodes, test.parameters, test.nodes):
         digest.update(np.ascontiguousarray(array).data)
     return out.parent / f".{out.stem}.{digest.hexdigest()[:12]}.resume"

@@ -176,8 +176,16 @@ def _contact(scene: SceneFile) -> ReferenceContact | None:
 
 def _handles(path: Path, scene: SceneFile, mesh: ClothMesh, motions: list[Motion]) -> tuple[Handle, ...]:
     several = len({block.motion for block in scene.handles} - {None}) > 1
+    step = scene.frame_time / scene.frame_steps
     handles = []
     for index, block in enumerate(scene.handles):
+        taken = step * max(1.0, np.ceil(block.start_time / step))
+        # later the published scenes have it
+        if block.motion is not None and np.allclose(motions[block.motion].at(np.array([taken]))[0], 0.0):
+            raise SceneError(
+                f"{path}: handles.{index}.motion: motion {block.motion} has shrunk the cloth to a point when the handle "
+                f"takes hold, at {taken:g} s; its keyframes need a `scale` above 0 there."
+            )
         for node in block.nodes:
             if node >= len(mesh.nodes):
                 raise SceneError(

@@ -16,6 +16,9 @@ from diffcloud.sim.materials import Material
 from diffcloud.sim.motion import Motion
 from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
 
+_Owned = tuple[str | None, Motion]
+"""A motion, and the gripper whose it is; None of an obstacle's."""
+
 
 def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
     """Write `conf/<name>.json`, `meshes/<name>/*.obj` and `materials/<name>.json` below `folder`.
@@ -25,7 +28,8 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
 
     Raises:
         SceneError: what the format cannot say: masses that come from another material than the tables (the published
-            experiments' reload), further forces, and some settings of the implicit integrator.
+            experiments' reload), further forces, a gripper with several motions, contact of the linearised integrator that
+            is none of the three that have a name, and some settings of the implicit integrator.
     """
     folder = Path(folder)
     if scene.mass_material is not None:
@@ -36,6 +40,10 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
         "self_contact": not around.self_contact,
         "forces": bool(around.forces),
         "contact.sticking_speed": around.contact.sticking_speed != ContactSettings().sticking_speed,
+        "reference_contact": around.reference_contact not in (None, ReferenceContact(), ReferenceContact.as_published()),
+        "lagged_air": scene.integrator == "linearised"
+        and around.lagged_air != (around.reference_contact == ReferenceContact.as_published()),
+        "a gripper with several motions": _shared_grippers(scene),
     }
     if any(unsaid.values()):
         named = ", ".join(name for name, lost in unsaid.items() if lost)
@@ -43,7 +51,7 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
     cloth, material = f"meshes/{name}/cloth.obj", f"materials/{name}.json"
     write_cloth(folder / cloth, scene.mesh)
     write_json(folder / material, _material(scene.material))
-    motions: list[Motion] = []
+    motions: list[_Owned] = []
     obstacles = []
     for index, (surface, obstacle) in enumerate(_obstacles(around, motions)):
         mesh = f"meshes/{name}/obstacle{index}.obj"
@@ -56,14 +64,14 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
         if math.isfinite(handle.end):
             block["end_time"] = handle.end
         if handle.motion is not None:
-            block["motion"] = _number(handle.motion, motions)
+            block["motion"] = _number((handle.gripper, handle.motion), motions)
         handles.append(block)
 
     data: dict[str, Any] = {
         "frame_time": scene.frame_time,
         "frame_steps": scene.frame_steps,
         "cloths": [{"mesh": cloth, "materials": [{"data": material, "damping": scene.material.damping}]}],
-        "motions": [_motion(motion) for motion in motions],
+        "motions": [_motion(motion) for _, motion in motions],
         "handles": handles,
         "obstacles": obstacles,
         "gravity": list(around.gravity),
@@ -92,12 +100,18 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
     return path
 
 
-def _obstacles(around: Surrounding, motions: list[Motion]) -> Iterator[tuple[SurfaceMesh, dict[str, Any]]]:
+def _shared_grippers(scene: Scene) -> bool:
+    """Whether one gripper's handles have different motions: read again, each of these is a gripper."""
+    moved = {(handle.gripper, handle.motion) for handle in scene.handles.handles if handle.motion is not None}
+    return len(moved) > len({gripper for gripper, _ in moved})
+
+
+def _obstacles(around: Surrounding, motions: list[_Owned]) -> Iterator[tuple[SurfaceMesh, dict[str, Any]]]:
     """Meshes and blocks; new motions are appended to the list."""
     for surface in around.obstacles:
         yield surface, {"movable": 0}
     for moving in around.moving:
-        block = {"movable": 0, "motion": _number(moving.motion, motions), "start_time": moving.start}
+        block = {"movable": 0, "motion": _number((None, moving.motion), motions), "start_time": moving.start}
         yield moving.mesh, block | ({"end_time": moving.end} if math.isfinite(moving.end) else {})
     for body in around.bodies:
         weight = {"density": body.density} if body.mass is None else {"mass": body.mass}
@@ -105,8 +119,8 @@ def _obstacles(around: Surrounding, motions: list[Motion]) -> Iterator[tuple[Sur
         yield body.mesh, {"movable": 1, "diffcloud": weight | own}
 
 
-def _number(motion: Motion, motions: list[Motion]) -> int:
-    """Of a motion in the list, to which it is appended if it is new."""
+def _number(motion: _Owned, motions: list[_Owned]) -> int:
+    """Of a motion in the list, to which it is appended if it is new; grippers share none, since each motion is one's."""
     if motion not in motions:
         motions.append(motion)
     return motions.index(motion)

@@ -241,8 +241,18 @@ class _Cameras:
         return _without_scraps(parts, self._settings)
 
     def sight(self) -> Sight:
-        """What a few frames show, for the refinement."""
+        """What a few frames show, for the refinement.
+
+        Raises:
+            EpisodeError: no frame has an image of every camera.
+        """
         whole = [frame for frame in range(len(self.times)) if len(self._images(frame)) == len(self._views)]
+        if not whole:
+            raise EpisodeError(
+                f"There is no frame in which all cameras ({', '.join(self._views)}) have an image, so their places cannot "
+                "be compared. Are they on one clock (timestamps.csv)? Otherwise switch the refinement off, or leave a "
+                "camera out."
+            )
         frames = [whole[place] for place in _spread(len(whole), _REFINED_FRAMES)]
         images = [self._images(frame) for frame in frames]
         parts = [self.cloth(frame) for frame in frames]

@@ -135,6 +135,7 @@ class Problem:
             "table": np.nan if self.table is None else self.table,
             "friction": self.friction,
             "self_contact": self.self_contact,
+            "shaped": self.shaped,
             "body_nodes": bodies.nodes,
             "body_faces": bodies.faces,
             "gravity": self.gravity,

@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from diffcloud.clouds import Augmentation
-from diffcloud.datasets import CHUNK, ParameterBox, ParameterDraws, SimulationPlan, chunks, simulate_set
+from diffcloud.datasets import CHUNK, ParameterBox, ParameterDraws, SimulationPlan, chunks, simulate_set, work
 from diffcloud.errors import ConfigError, DatasetError, DivergedError
+from diffcloud.io import arrays
 from diffcloud.io.simulated import SimulatedSet
 from diffcloud.regressors.dataset import CloudDataset
 from diffcloud.sim.simulate import rollout
@@ -82,6 +83,29 @@ def test_doubtful_material_of_a_run_is_simulated():
     run = rollout(system, scenario.steps, properties=scenario.properties(system, values))
     expected = run.positions[:, :: scenario.scene.frame_steps].to(torch.float32)
     np.testing.assert_array_equal(found.nodes, expected.numpy())
+
+
+def test_doubtful_material_stays_possible(monkeypatch):
+    """Of a compression a little below one, which is the most there is."""
+    plain, drawn = small_lift(), []
+    scenario = replace(plain, scene=replace(plain.scene, material=replace(plain.scene.material, compression=0.9)))
+    nodes = np.zeros((8, scenario.frames + 1, 25, 3), np.float32)
+    monkeypatch.setattr(chunks, "_nodes", lambda scenario, values: drawn.append(values) or (nodes, {}))
+    draws = ParameterDraws(BOX, "uniform", scenario.name, 0, {"compression": 1.5})
+    (chunk,) = chunks.chunks_of(draws, "test", 8)
+    chunks.simulate_chunk(scenario, draws, chunk)
+    found = drawn[0]["compression"]
+    assert found.max() == 1.0
+    assert found.min() < 1.0
+
+
+def test_chunks_may_be_as_large_as_sets(tmp_path, monkeypatch):
+    asked, whole = [], plan()
+    (chunk,) = chunks.chunks_of(whole.draws, "test", 3)
+    folder = work.WorkFolder(tmp_path / "set", "plan", [chunk])
+    monkeypatch.setattr(work, "read_npz", lambda *a, most_bytes=arrays.MOST_BYTES, **k: asked.append(most_bytes) or {})
+    folder.read(chunk)
+    assert asked == [16 * 2**30]
 
 
 def test_a_chunk_keeps_no_derivatives(monkeypatch):
@@ -194,13 +218,15 @@ def test_a_run_that_always_diverges_is_an_error(tmp_path, monkeypatch):
 
 
 def test_exported_clouds_are_those_of_the_first_epoch(tmp_path):
-    simulate_set(plan(train=2, test=1, seed=5), tmp_path / "set", workers=0, clouds=50)
-    simulated = SimulatedSet.read(tmp_path / "set", "train")
-    clouds, _ = CloudDataset(simulated, Augmentation(), frames="all", points=50, seed=5)[1]
-    folder = tmp_path / "set" / "clouds" / "train" / "1"
-    assert [path.name for path in sorted(folder.iterdir())] == [f"{frame:03d}.npy" for frame in range(len(clouds))]
-    for frame, cloud in enumerate(clouds):
-        np.testing.assert_array_equal(np.load(folder / f"{frame:03d}.npy"), cloud.numpy())
+    """Of either split, which a training gives random numbers of their own."""
+    simulate_set(plan(train=2, test=2, seed=5), tmp_path / "set", workers=0, clouds=50)
+    for split, seed in (("train", 5), ("test", 6)):
+        simulated = SimulatedSet.read(tmp_path / "set", split)
+        clouds, _ = CloudDataset(simulated, Augmentation(), frames="all", points=50, seed=seed)[1]
+        folder = tmp_path / "set" / "clouds" / split / "1"
+        assert [path.name for path in sorted(folder.iterdir())] == [f"{frame:03d}.npy" for frame in range(len(clouds))]
+        for frame, cloud in enumerate(clouds):
+            np.testing.assert_array_equal(np.load(folder / f"{frame:03d}.npy"), cloud.numpy())
 
 
 def test_a_folder_of_other_things_is_left_alone(tmp_path):

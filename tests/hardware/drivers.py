@@ -35,6 +35,11 @@ class ScalarFirst(SimulatedUR5e):
         return replace(reading, tool_quaternion=np.roll(reading.tool_quaternion, -1))
 
 
+class Twisted(SimulatedUR5e):
+    def read(self):
+        return replace(super().read(), wrench=np.array([0.0, 0.0, 0.0, 0.0, 0.0, 8.0]))
+
+
 class Slow(SimulatedUR5e):
     def read(self):
         time.sleep(0.05)

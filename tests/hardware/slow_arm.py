@@ -47,6 +47,13 @@ class SlowArm:
         pass
 
 
+class Unsendable(SlowArm):
+    """Its driver returns what cannot be pickled."""
+
+    def read(self):
+        return lambda: None
+
+
 def broken():
     raise HardwareError("No arm answers.")
 

@@ -47,6 +47,7 @@ class SoftwareD435:
     Args:
         baseline_m: of colour to the depth sensor; 0 makes alignment the identity, so that depth can be compared bit by bit.
         settable: with the options of a D435 (`OPTIONS`), which software devices lack.
+        domain: of the stamps, in `rs.timestamp_domain`.
     """
 
     _uid = 100
@@ -61,8 +62,10 @@ class SoftwareD435:
         depth_scale: float = DEPTH_SCALE,
         seed: int = 0,
         settable: bool = False,
+        domain: str = "system_time",
     ) -> None:
         self._rs, self.serial, self._seed, self._scale = rs, serial, seed, depth_scale
+        self._domain = getattr(rs.timestamp_domain, domain)
         self._device = rs.software_device()
         self._device.register_info(rs.camera_info.serial_number, serial)
         self._device.register_info(rs.camera_info.name, "Intel RealSense D435")
@@ -112,7 +115,7 @@ class SoftwareD435:
         ):
             frame = rs.software_video_frame()
             frame.pixels, frame.stride, frame.bpp = pixels, WIDTH * width, width
-            frame.timestamp, frame.domain = time_ms, rs.timestamp_domain.system_time
+            frame.timestamp, frame.domain = time_ms, self._domain
             frame.frame_number, frame.profile = number, profile.as_video_stream_profile()
             if width == 2:
                 frame.depth_units = self._scale

@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import LimitError
 from diffcloud.hardware import ArmLimits, ArmReading, CaptureSettings, Limits, ToolTrajectory, capture, read_trajectory
-from diffcloud.hardware.arm_limits import ArmChecker
+from diffcloud.hardware.arm_limits import ArmChecker, JointPath
 from diffcloud.hardware.contact import Contact
-from diffcloud.sensing.robot import GEN3_HOME_RAD
+from diffcloud.hardware.motion import JointFollower, Motion
+from diffcloud.sensing.robot import GEN3_HOME_RAD, Robot
 from tests.hardware.gen3_body import Gen3Body, home_pose, quaternion, robot
 from tests.hardware.kortex.opening import in_process
 from tests.hardware.kortex.server import HOME_M, MOTIONS, FakeArm
@@ -164,6 +165,12 @@ class TestPlan:
             held.check_trajectory("trajectory", path, start)
 
 
+def test_a_description_without_surfaces_is_refused():
+    bare = replace(robot().description, meshes={})
+    with pytest.raises(LimitError, match=r"has no surfaces of links that move.*--urdf"):
+        ArmChecker(Robot(bare), Limits(), ArmLimits())
+
+
 class TestToolFrame:
     def test_an_arm_without_its_gripper_configured(self):
         bare = replace(reading(), tool_position_m=HOME_M - 0.12 * HOME_ROTATION[:, 2])
@@ -235,6 +242,22 @@ class TestWayHome:
             held.plan_home(np.deg2rad([0.0, 15.0, 180.0, -147.0, 0.0, 55.0, 90.0]), beyond, speed_m_s=0.1)
 
 
+class TestJointFollower:
+    def test_a_correction_keeps_its_direction_and_hardly_outruns_the_path(self):
+        arm = PointArm()
+        sent = []
+        arm.send_joint_velocity = sent.append
+        motion = Motion(arm, checker(), Limits(), CaptureSettings(rate_hz=10.0), lambda: None)
+        path = JointPath(np.linspace(0.0, 2.0, 21), GEN3_HOME_RAD + np.linspace(0, 0.1, 21)[:, None] * np.eye(7)[0])
+        follower = JointFollower(motion, "way home", path, reading(), Contact(np.zeros(6), Limits()))
+        off = np.array([0.05, -0.1, 0.02, 0.0, 0.0, 0.0, 0.1])
+        follower.command(1.0, replace(reading(), joints_rad=path.at(1.0) - off))
+        wanted = 0.05 * np.eye(7)[0] + 4.0 * off
+        np.testing.assert_allclose(sent[0], wanted * 1.5 * 0.05 / np.abs(wanted).max(), rtol=1e-9, atol=1e-12)
+        follower.command(1.0, replace(reading(), joints_rad=path.at(1.0)))
+        np.testing.assert_allclose(sent[1], 0.05 * np.eye(7)[0], atol=1e-12)
+
+
 class TestWatch:
     """What is measured while it moves."""
 
@@ -264,6 +287,20 @@ class TestWatch:
         joints, _ = checker().predict(start, HOME_M + np.linspace(0, 0.25, 60)[:, None] * [0.0, 0.0, 1.0])
         with pytest.raises(LimitError, match="too near to a singularity"):
             self.watch(start).check(1.0, reading(joints[-1]))
+
+    @pytest.mark.parametrize("returning", [False, True])
+    def test_a_joint_that_is_too_fast(self, returning):
+        """Planned are up to 1.2 rad/s. A joint that turns without end may begin anew."""
+
+        def turned(angle):
+            return replace(reading(), joints_rad=np.add(GEN3_HOME_RAD, [0, 0, 0, 0, 0, 0, angle]))
+
+        watch = self.watch(returning=returning)
+        watch.check(0.0, turned(0.0))
+        watch.check(0.1, turned(0.2))  # over a shorter time a reading's moment is not known well enough
+        watch.check(0.4, turned(0.5 + 2 * np.pi))
+        with pytest.raises(LimitError, match=r"t = 0\.80 s of the trajectory joint 7 turns with 1\.50 rad/s; .* is 1\.32"):
+            watch.check(0.8, turned(1.1))
 
     @pytest.mark.parametrize("field", ["joints_rad", "tool_position_m"])
     def test_what_is_no_number_trips(self, field):
@@ -303,7 +340,9 @@ class TestContact:
         ("wrench", "message"),
         [
             ([0, 0, 80, 0, 0, 0], r"At rest the tool feels 80\.0 N and 0\.0 N·m; up to 15 N and 5 N·m"),
-            ([0, 0, 0, 0, 6, 0], r"6\.0 N·m"),
+            ([0, 0, 80, 0, 0, 0], r"not within it: force\)"),
+            ([0, 0, 0, 0, 6, 0], r"6\.0 N·m.*not within it: torque\).*--preload, which scales both"),
+            ([0, 0, 80, 0, 6, 0], r"not within it: force, torque\)"),
             ([0, 0, np.nan, 0, 0, 0], "nan N"),
         ],
     )

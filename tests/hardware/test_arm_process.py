@@ -8,7 +8,9 @@ for a busy machine, and the arm's lag.
 from __future__ import annotations
 
 import os
+import pickle
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -27,7 +29,7 @@ from tests.hardware.capturing import ROOT, SPEED_M_S, Capture, sideways
 from tests.hardware.kortex.opening import in_process
 from tests.hardware.kortex.server import LAG_S, FakeArm
 from tests.hardware.simulated import TestCard
-from tests.hardware.slow_arm import SlowArm, broken, crashing
+from tests.hardware.slow_arm import SlowArm, Unsendable, broken, crashing
 
 BUSY_S = 0.5
 UP = np.array([0.0, 0.0, SPEED_M_S])
@@ -184,6 +186,36 @@ def test_velocities_are_refused_before_the_first_prepare_and_after_every_stop(ar
     assert "SendTwistCommand" not in server.names()
 
 
+def test_a_velocity_that_was_refused_arms_no_watchdog(server):
+    """An arm that nobody has moved gets no Stop, neither from the watchdog nor at the end; and a prepare is not undone."""
+    with closing(in_process(server, watchdog_s=0.1)) as arm:
+        with pytest.raises(HardwareError, match="it has not been prepared yet"):
+            arm.send_velocity(UP)
+        time.sleep(0.3)
+        arm.prepare()
+        with suppress(HardwareError):
+            arm.send_joint_velocity(np.zeros(7))
+        arm.stop()
+        with pytest.raises(HardwareError, match="the capture sent Stop"):
+            arm.send_velocity(UP)
+        time.sleep(0.3)
+    assert server.names().count("Stop") == 1
+
+
+def test_the_emergency_stop_locks_velocities_as_stop_does(server, capfd):
+    with closing(in_process(server)) as arm:
+        arm.prepare()
+        arm.send_velocity(UP)
+        before = server.position
+        arm.emergency_stop()
+        assert server.names()[-1] == "ApplyEmergencyStop"
+        assert moved(server, before) < farthest(0.0)
+        with pytest.raises(HardwareError, match="the capture sent the emergency stop"):
+            arm.send_velocity(UP)
+    assert "The arm's emergency stop was applied" in capfd.readouterr().err
+    assert "Stop" not in server.names()
+
+
 def test_a_disk_that_hangs_does_not_stop_the_arm(tmp_path, arm, server, monkeypatch):
     """Each fsync of the arm's log takes twice the watchdog's patience."""
     wait = os.fsync
@@ -278,6 +310,36 @@ class TestSlowArm:
         finally:
             arm.close()
 
+    def test_the_emergency_stop_does_not_wait_for_a_call_that_hangs(self, tmp_path):
+        arm = self.opened(tmp_path / "log", read=0.6)
+        try:
+            arm._socket.send(pickle.dumps((-1, "read", ())))  # as a call that a signal interrupted
+            arm.emergency_stop()
+            assert self.lines(tmp_path / "log") == ["emergency stop"]
+        finally:
+            arm.close()
+
+    def test_a_message_that_cannot_be_read_ends_the_process_and_stops_the_arm(self, tmp_path, capfd):
+        arm = self.opened(tmp_path / "log")
+        try:
+            arm.prepare()
+            arm.send_velocity(UP)
+            arm._socket.send(b"garbage")
+            assert arm._process.wait(10) == 0
+            assert self.lines(tmp_path / "log") == ["prepare", "twist", "stop"]
+        finally:
+            arm.close()
+        assert "the process that holds it failed (UnpicklingError" in capfd.readouterr().err
+
+    def test_a_reading_that_cannot_be_sent_is_an_error_like_others(self, tmp_path):
+        arm = ArmProcess(partial(Unsendable, tmp_path / "log", {}))
+        try:
+            with pytest.raises(HardwareError, match="pickle"):
+                arm.read()
+            arm.prepare()  # the thread that carries calls out is still there
+        finally:
+            arm.close()
+
     def test_a_prepare_that_is_overtaken_by_a_stop_releases_nothing(self, tmp_path):
         arm = self.opened(tmp_path / "log", prepare=0.3)
         try:
@@ -291,6 +353,15 @@ class TestSlowArm:
             assert self.lines(tmp_path / "log") == ["stop", "prepare"]
         finally:
             arm.close()
+
+
+def test_a_system_without_such_sockets_is_told(monkeypatch):
+    def refuse(*_):
+        raise OSError(43, "Protocol not supported")
+
+    monkeypatch.setattr(socket, "socketpair", refuse)
+    with pytest.raises(HardwareError, match="macOS does not: drive the arm from Linux"):
+        ArmProcess(broken)
 
 
 def test_an_arm_that_does_not_open():

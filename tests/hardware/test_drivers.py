@@ -9,7 +9,7 @@ from importlib.resources import as_file, files
 import numpy as np
 import pytest
 
-from diffcloud.errors import ConfigError, HardwareError, LimitError
+from diffcloud.errors import ConfigError, HardwareError, LimitError, UnconfirmedStopError
 from diffcloud.hardware import Limits, conformance, drivers
 from diffcloud.hardware.arm_limits import ArmChecker, ArmLimits
 from diffcloud.hardware.examples.folder_camera import FolderCamera
@@ -114,6 +114,16 @@ class TestArm:
     def test_units_and_frames_show_in_the_readings(self, controller, driver, wrong):
         assert wrong_arm(controller, f"tests.hardware.drivers:{driver}") == wrong
 
+    def test_a_torque_at_rest(self, controller):
+        assert wrong_arm(controller, "tests.hardware.drivers:Twisted") == {"wrench"}
+
+    def test_an_arm_that_is_only_read_gets_no_stop(self):
+        """Somebody else may be driving it."""
+        with FakeArm() as server:
+            checker = ArmChecker(gen3(), Limits(), ArmLimits())
+            list(conformance.check_arm(lambda: in_process(server), checker, move=False))
+            assert "Stop" not in server.names()
+
     def test_a_description_of_another_arm(self, controller):
         assert {"joints", "tool frame"} <= wrong_arm(controller, robot=gen3())
 
@@ -155,6 +165,43 @@ class TestArm:
         assert "stops by itself when its cable is pulled" in {one.name for one in found}
 
 
+class Troubled:
+    """An arm that moves up until something happens; `lost` means that it does not confirm Stop."""
+
+    def __init__(self, error, lost):
+        self.arm, self._error, self._lost, self.stops, self._moves = self, error, lost, 0, 0
+
+    def up(self, seconds):
+        self._moves += 1
+        if self._moves > 2:
+            raise self._error
+        return np.zeros(1), np.full((1, 3), float(self._moves))
+
+    def stop(self):
+        self.stops += 1
+        if self._lost:
+            raise UnconfirmedStopError("MAY STILL BE MOVING")
+
+
+class TestCable:
+    def test_a_lost_link_is_one_on_which_no_stop_is_confirmed(self):
+        arm, asked = Troubled(HardwareError("no answer"), lost=True), []
+        np.testing.assert_array_equal(conformance._pulled(arm, asked.append), np.full(3, 2.0))
+        assert arm.stops == 1
+        assert "Plug the cable in again" in asked[1]
+
+    @pytest.mark.parametrize(
+        ("error", "lost"),
+        [(LimitError("felt 40 N"), False), (LimitError("felt 40 N"), True), (HardwareError("went into fault"), False)],
+    )
+    def test_an_arm_in_trouble_is_stopped_and_told(self, error, lost):
+        arm, asked = Troubled(error, lost), []
+        with pytest.raises(type(error), match=str(error)):
+            conformance._pulled(arm, asked.append)
+        assert arm.stops == 1
+        assert len(asked) == 1
+
+
 class TestCamera:
     def wrong(self, camera):
         return {one.name for one in conformance.check_camera(camera, seconds=0.4, timeout_s=0.3) if one.state != "ok"}
@@ -183,12 +230,16 @@ class TestCamera:
             (Dated, {"times are time.monotonic()", "depth scale", "closed"}),
             (Metres, {"depth", "depth scale", "closed"}),
             (Undead, {"depth scale", "closed"}),
-            (Silent, {"delivers", "depth scale"}),
+            (Silent, {"delivers"}),
         ],
     )
     def test_faults_are_named(self, camera, wrong):
         """A test card's depth is its frame's number, millimetres."""
         assert self.wrong(camera()) == wrong
+
+    def test_one_that_falls_silent_does_not_also_deliver(self):
+        found = list(conformance.check_camera(Silent(), seconds=0.4, timeout_s=0.3))
+        assert [(one.name, one.state) for one in found] == [("delivers", "wrong")]
 
 
 @contextmanager

@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 
 from diffcloud.errors import HardwareError
-from diffcloud.hardware import CaptureSettings, capture
+from diffcloud.hardware import CaptureSettings, camera_settings, capture
 from diffcloud.hardware.camera_settings import CameraSettings
-from diffcloud.hardware.realsense import RealSenseCamera, connected_cameras, import_realsense, play_recording
+from diffcloud.hardware.realsense import (
+    RealSenseCamera,
+    connected_cameras,
+    import_realsense,
+    play_recording,
+    play_recordings,
+)
 from diffcloud.io.files import write_json
 from diffcloud.io.raw_episodes import read_camera_info, read_raw_episode
 from diffcloud.sensing.validation.episode import validate_raw_episode
@@ -109,6 +115,26 @@ def test_the_usual_scale_comes_back_exactly(tmp_path, make_cameras):
     with play_recording(tmp_path / "a.db3", "overhead") as (info, frames):
         assert info.depth_scale_m == 0.001
         assert len(list(frames)) >= 1
+
+
+@pytest.mark.parametrize("domain", ["system_time", "hardware_clock"])
+def test_recordings_on_the_cameras_own_clocks_are_not_brought_together(tmp_path, make_cameras, domain):
+    cameras = make_cameras(domain=domain)
+    paths = {name: tmp_path / f"{name}.db3" for name in ("overhead", "side")}
+    for index, camera in enumerate(opened(cameras, paths)):
+        camera.open()
+        for number in range(1, 4):
+            cameras.cameras[index].push_numbered(number, time.time() * 1000 + 17 * number)
+        camera.read(2.0)
+        camera.close()
+    if domain == "system_time":
+        with play_recordings(paths) as recording:
+            assert {frame.camera for frame in recording.frames} == set(paths)
+        return
+    with pytest.raises(HardwareError, match=r"by the camera's own clock.*Import each"), play_recordings(paths) as both:
+        list(both.frames)
+    with play_recordings({"side": paths["side"]}) as alone:
+        assert len(list(alone.frames)) >= 1
 
 
 @pytest.mark.parametrize("change_s", [-3600.0, 3600.0])
@@ -235,6 +261,18 @@ class TestSettings:
     def test_what_cannot_be_set_is_said_and_the_camera_closed(self, cameras, settings, message):
         with pytest.raises(HardwareError, match=message):
             self.opened(cameras, **settings)
+        camera, _ = self.opened(cameras)  # nobody holds it
+        camera.close()
+
+    @pytest.mark.parametrize("step", ["apply", "hold", "read_back"])
+    def test_an_error_of_the_sdk_closes_the_camera_too(self, cameras, monkeypatch, step):
+        def fail(*_):
+            raise RuntimeError("xioctl(VIDIOC_S_CTRL) failed")
+
+        with monkeypatch.context() as broken:
+            broken.setattr(camera_settings, step, fail)
+            with pytest.raises(HardwareError, match=r"Camera a \(111111111111\) could not be set: xioctl"):
+                self.opened(cameras)
         camera, _ = self.opened(cameras)  # nobody holds it
         camera.close()
 

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,13 +23,13 @@ class Rows:
     """A writer that only counts."""
 
     def __init__(self):
-        self.rows = 0
+        self.rows, self.times = 0, []
 
     def add_robot(self, *samples):
         self.rows += len(samples)
 
-    def add_frame(self, *frame):
-        pass
+    def add_frame(self, name, t_s, depth, color):
+        self.times.append(t_s)
 
 
 class InterruptedAt:
@@ -56,6 +57,21 @@ class InterruptedAt:
         return self._trace
 
 
+class Stamped(TestCard):
+    """Frames of given times [s], at once; then it waits to be ended."""
+
+    def __init__(self, times):
+        super().__init__()
+        self._times, self._start = list(times), time.monotonic()
+
+    def read(self, timeout_s):
+        if self.delivered == len(self._times):
+            time.sleep(0.01)
+            raise HardwareError("no more")
+        frame = super().read(timeout_s)
+        return replace(frame, time_s=self._start + self._times[self.delivered - 1])
+
+
 class StuckCard(TestCard):
     """Its driver does not come back until it is let go."""
 
@@ -68,6 +84,36 @@ class StuckCard(TestCard):
         raise HardwareError("unplugged")
 
 
+@pytest.mark.parametrize(
+    ("fps", "frames_hz", "kept"),
+    [(30, 10, range(0, 30, 3)), (10, 10, range(10)), (60, 20, range(0, 60, 3)), (10, 30, range(10)),
+     (30, None, range(30))],
+)  # fmt: skip
+def test_frames_are_thinned_by_their_times(fps, frames_hz, kept):
+    """Stamps tremble by 2 ms, as those of a camera do."""
+    times = 0.1 + np.arange(kept[-1] + 1) / fps + np.random.default_rng(0).uniform(-2e-3, 2e-3, kept[-1] + 1)
+    np.testing.assert_allclose(written(times, frames_hz), times[list(kept)], atol=5e-3)
+
+
+def test_a_rate_that_does_not_divide_the_cameras_is_kept_on_average():
+    assert len(written(0.1 + np.arange(30) / 30, 20.0)) in (19, 20, 21)
+
+
+def test_a_gap_is_not_made_up_for():
+    times = [0.1, 0.2, 0.3, 0.7, 0.733, 0.766, 0.8, 0.833]
+    np.testing.assert_allclose(written(times, 10.0), [0.1, 0.2, 0.3, 0.7, 0.8], atol=5e-3)
+
+
+def written(times, frames_hz):
+    """Those of the frames that come to the writer."""
+    writer = Rows()
+    recorders = Recorders([Stamped(times)], writer, Clock(), frames_hz=frames_hz, camera_timeout_s=1.0, with_arm=False)
+    recorders.start()
+    recorders._cameras[0]._taker.join(5.0)
+    recorders.finish()
+    return writer.times
+
+
 def finished(recorders):
     """Whether everything queued gets written: not where a lock is still held that the interrupted call had taken."""
     ending = threading.Thread(target=recorders.finish, daemon=True)
@@ -78,7 +124,7 @@ def finished(recorders):
 
 def recording(*cameras, timeout_s=1.0):
     writer = Rows()
-    recorders = Recorders(cameras, writer, Clock(), keep_every=1, camera_timeout_s=timeout_s, with_arm=True)
+    recorders = Recorders(cameras, writer, Clock(), frames_hz=None, camera_timeout_s=timeout_s, with_arm=True)
     recorders.start()
     return recorders, writer
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from diffcloud.errors import DiffCloudError, EpisodeError
+from diffcloud.errors import DiffCloudError, EmptyCloudError, EpisodeError
 from diffcloud.io.clouds import import_open3d, read_cloud, write_ply
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import (
@@ -490,6 +490,12 @@ class TestClouds:
         np.save(tmp_path / "c.npy", array)
         with pytest.raises(EpisodeError, match=message):
             read_cloud(tmp_path / "c.npy")
+
+    @pytest.mark.parametrize("text", ["", "# x y z\n"])
+    def test_an_xyz_file_without_points_is_an_empty_cloud(self, tmp_path, text):
+        (tmp_path / "c.xyz").write_text(text)
+        with pytest.raises(EmptyCloudError, match="is an empty cloud"):
+            read_cloud(tmp_path / "c.xyz")
 
     def test_bad_files(self, tmp_path):
         (tmp_path / "c.ply").write_text("ply\nnonsense\n")

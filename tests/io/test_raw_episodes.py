@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -82,6 +83,14 @@ def test_what_a_source_does_not_know_is_nan(tmp_path):
     assert episode.cameras["side"].color(0) is None
 
 
+def test_numbers_in_quotes_are_numbers_and_labels_of_ones_own_are_kept(tmp_path):
+    folder = write_table_episode(tmp_path / "e", frames=1)
+    good = json.loads((folder / "episode.json").read_text())
+    (folder / "episode.json").write_text(json.dumps({**good, "rate_hz": "10", "repeat": "3", "mine": {"a": ["3"]}}))
+    told = read_raw_episode(folder).description
+    assert told == {**good, "rate_hz": 10.0, "repeat": 3, "mine": {"a": ["3"]}}
+
+
 def test_episodes_are_never_overwritten(tmp_path):
     write_table_episode(tmp_path / "e", frames=1)
     with pytest.raises(EpisodeError, match="never overwritten"):
@@ -144,6 +153,20 @@ def test_a_killed_capture_keeps_every_finished_frame(tmp_path):
     assert episode.cameras["side"].frames.tolist() == [0, 1, 2, 3]
     assert [int(episode.cameras["side"].depth(index)[0, 0]) for index in range(4)] == [500, 501, 502, 503]
     assert len(episode.robot.times) == 4
+
+
+def test_what_every_frame_needs_is_on_the_disk_before_the_first(tmp_path, monkeypatch):
+    """And the folder with the images' folders after it."""
+    fsync, waited = os.fsync, set()
+    monkeypatch.setattr(os, "fsync", lambda handle: (waited.add(os.fstat(handle).st_ino), fsync(handle)))
+    folder, infos = tmp_path / "e", {"side": camera_infos()["side"]}
+    writer = RawEpisodeWriter(folder, infos, rate_hz=10, source="test")
+    for name in ("..", "", "episode.json", "cameras", "cameras/side", "cameras/side/camera.json"):
+        assert (folder / name).stat().st_ino in waited, name
+    waited.clear()
+    writer.add_frame("side", 0.0, np.full((120, 160), 700, np.uint16))
+    assert (folder / "cameras" / "side").stat().st_ino in waited
+    writer.close()
 
 
 def test_a_full_disk_ends_cleanly(tmp_path, monkeypatch):
@@ -239,6 +262,30 @@ def test_jpeg_is_never_depth():
     with pytest.raises(EpisodeError, match="uint16"):
         write_depth("x.png", np.zeros((3, 3)))
     assert isinstance(CameraInfo("a", "1", INTRINSICS, 0.001).to_json(), dict)
+
+
+def test_the_size_of_a_jpeg_is_known_before_it_is_unpacked(rng):
+    color = rng.integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    data = images.encode_jpeg(color, width=64)
+    assert images.decode_color(data, "x.jpg").shape == (48, 64, 3)
+    place = data.index(b"\xff\xc0") + 5
+    huge = data[:place] + struct.pack(">HH", 65500, 65500) + data[place + 4 :]
+    with pytest.raises(EpisodeError, match=r"x\.jpg claims 65500 x 65500 pixels"):
+        images.decode_color(huge, "x.jpg")
+    for sizeless in (b"\xff\xd8\xff\xe0rest", data[:2] + data[data.index(b"\xff\xda") :], data[: place + 3]):
+        with pytest.raises(EpisodeError, match="states no size before its pixels"):
+            images.decode_color(sizeless, "x.jpg")
+
+
+def test_what_opencv_refuses_is_named(monkeypatch):
+    import cv2
+
+    def refuse(*_):
+        raise cv2.error("too many pixels")
+
+    monkeypatch.setattr(cv2, "imdecode", refuse)
+    with pytest.raises(EpisodeError, match=r"x\.jpg is not a readable image: too many pixels"):
+        images.decode_color(images.encode_jpeg(np.zeros((8, 8, 3), np.uint8), width=8), "x.jpg")
 
 
 def test_where_the_scene_lies(tmp_path):

@@ -12,7 +12,7 @@ import pytest
 from diffcloud.errors import EpisodeError, HardwareError
 from diffcloud.io.files import write_json
 from diffcloud.io.raw_episodes import CameraInfo, read_raw_episode
-from diffcloud.io.recordings import RecordedFrame, Recording, write_recording
+from diffcloud.io.recordings import RecordedFrame, Recording, read_joint_log, write_recording
 from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.io.ros_bag import FRAMES, START, TOOL, bag
 from tests.pipeline.invoke import invoke
@@ -168,6 +168,36 @@ def test_colour_that_a_folder_lacks_is_counted(tmp_path):
     done = invoke("import", "recording", folders[0], "--out", tmp_path / "e", "--joint-log", log)
     (message,) = done.result["warnings"]
     assert "Camera overhead: 2 of 4 frames have no colour image of their number, such as frame 2" in message
+
+
+@pytest.mark.parametrize("rate", [0, -5])
+def test_a_rate_that_is_none_is_refused(tmp_path, rate):
+    folders, _ = as_folders(tmp_path)
+    for untimed in (False, True):
+        if untimed:
+            (folders[1] / "timestamps.csv").unlink()
+        bad = invoke("import", "recording", folders[1], "--out", tmp_path / "e", "--rate-hz", rate, code=1)
+        assert f"A frame rate is in Hz, above 0 and at most 100000, got {rate}" in bad.errors
+        assert not (tmp_path / "e").exists()
+
+
+@pytest.mark.parametrize("times", [(1.0,), (1.0, 5001.0)])
+def test_a_rate_that_cannot_be_measured_is_left_open(tmp_path, times):
+    """Of one frame, and of frames so far apart that nothing is left after rounding."""
+    info = CameraInfo("side", "1", INTRINSICS, 0.001)
+    frames = [RecordedFrame("side", t, table_depth(poses()["side"])) for t in times]
+    write_recording(tmp_path / "e", Recording({"side": info}, frames, "test"))
+    assert read_raw_episode(tmp_path / "e").description["rate_hz"] is None
+
+
+def test_files_of_others_need_no_end_of_line(tmp_path):
+    folders, log = as_folders(tmp_path)
+    for path in (log, folders[0] / "timestamps.csv"):
+        path.write_text(path.read_text().rstrip("\n"))
+    count = len(log.read_text().splitlines()) - 1
+    assert len(read_joint_log(log).times) == count
+    done = invoke("import", "recording", folders[0], "--out", tmp_path / "e", "--joint-log", log)
+    assert done.result["frames"] == {"overhead": 4}
 
 
 @pytest.mark.parametrize("second_s", [1.0, 0.9])

@@ -6,12 +6,15 @@ import shutil
 import struct
 from contextlib import suppress
 from importlib.resources import files
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.raw_episodes import read_raw_episode
+from diffcloud.io.ros.files import opened
+from diffcloud.io.ros.messages import color_image
 from diffcloud.io.rvl import decode_rvl
 from diffcloud.sensing.robot import gen3
 from tests.io.ros_bag import FRAMES, START, Bag, Habits, bag, rvl
@@ -75,6 +78,23 @@ class TestCompressedDepth:
         path = bag(tmp_path, "rosbag2", encoding=stated, unaligned=False)
         assert message in imported(tmp_path, path, code=1).errors
         assert not (tmp_path / "e").exists()
+
+
+class TestDamage:
+    def test_that_is_met_while_reading_is_named(self, tmp_path):
+        path = bag(tmp_path, "rosbag1")
+        with (
+            pytest.raises(EpisodeError, match=rf"{path.name} cannot be read to its end \(ValueError: broken\)"),
+            opened([path]),
+        ):
+            raise ValueError("broken")
+        with pytest.raises(EpisodeError, match=r"^an error of its own$"), opened([path]):
+            raise EpisodeError("an error of its own")
+
+    def test_rows_that_are_too_short_for_their_colours(self):
+        message = SimpleNamespace(encoding="rgb8", is_bigendian=0, width=4, height=2, step=4, data=bytes(8))
+        with pytest.raises(EpisodeError, match="An image of 4 x 2 has 8 bytes; the recording is damaged"):
+            color_image(message, "/camera")
 
 
 class TestRvl:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from diffcloud.errors import DatasetError
-from diffcloud.io.simulated import SimulatedSet, write_simulated
+from diffcloud.io.simulated import SimulatedSet, simulated_files, write_simulated
 from diffcloud.mesh.topology import SurfaceMesh
 from tests.conftest import flat_set
 
@@ -46,6 +46,16 @@ def test_what_is_written_is_read(tmp_path):
     assert read.loss_faces.tolist() == [1, 3]
     np.testing.assert_array_equal(read.obstacle.nodes, body.nodes)
     np.testing.assert_array_equal(read.obstacle.faces, body.faces)
+
+
+def test_numbers_in_quotes_are_numbers(folder):
+    """As tools write them that know only text; what else a file says is kept."""
+    good = SimulatedSet.read(folder, "train")
+    for key, value in (("train", "4"), ("loss_frame", str(good.loss_frame)), ("length_unit_m", str(good.length_unit_m))):
+        changed(key, value)(folder)
+    changed("mine", {"a": ["3"]})(folder)
+    assert_equal(SimulatedSet.read(folder, "train"), good)
+    assert simulated_files(folder)
 
 
 def test_the_same_set_gives_the_same_bytes(tmp_path):

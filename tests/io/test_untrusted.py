@@ -15,6 +15,7 @@ from diffcloud.fit.record import read_fit
 from diffcloud.io import arrays, files, tables
 from diffcloud.io.arrays import read_npy, read_npz
 from diffcloud.io.files import read_json, read_yaml
+from diffcloud.io.pickles import load_npy
 from diffcloud.io.tables import read_csv
 
 
@@ -90,6 +91,20 @@ class TestArrays:
         (path.parent / "b.npy").write_bytes(head)
         with pytest.raises(EpisodeError, match="states 240000000000 bytes"):
             read_npy(path.parent / "b.npy", kind="set", error=EpisodeError)
+
+    @pytest.mark.parametrize(
+        ("kind", "shape", "message"),
+        [("<U0", (10**9,), "holds .*<U0"), ("<f8", (0, 10**30), "allowed dimension"), ("<f8", (1,) * 9, "shape")],
+    )
+    def test_a_shape_that_needs_no_bytes_takes_no_memory(self, path, kind, shape, message):
+        """numpy has a letter's memory for each text without letters: four gigabytes here."""
+        stream = io.BytesIO()
+        np.lib.format.write_array_header_1_0(stream, {"descr": kind, "fortran_order": False, "shape": shape})
+        path.with_suffix(".npy").write_bytes(stream.getvalue() + (b"" if 0 in shape or kind == "<U0" else bytes(8)))
+        with pytest.raises(EpisodeError, match=message):
+            read_npy(path.with_suffix(".npy"), kind="set", error=EpisodeError)
+        with pytest.raises(EpisodeError, match=message):
+            load_npy(path.with_suffix(".npy"))
 
     @pytest.mark.parametrize("head", [b"{", b"{'descr': '<f8', 'fortran_order': False, 'shape': (", b"[" * 60, b"1 +"])
     def test_a_header_that_is_no_header(self, path, head):

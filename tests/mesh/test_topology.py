@@ -72,6 +72,7 @@ def test_seam_uses_the_mean_material_length_of_both_sides():
         ([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], "no area in material space"),
         (SQUARE, [[0, 2, 1]], "turned over"),
         (SQUARE, [[0, 1, 9]], "index 9 of 4"),
+        (SQUARE, [[0, 1, 2], [0, -2, 3]], "A face refers to index -2 of 4"),
         ([[0, 0, np.nan], [1, 0, 0], [1, 1, 0]], [[0, 1, 2]], "NaN"),
         (SQUARE, np.zeros((0, 3), dtype=int), "no faces"),
     ],

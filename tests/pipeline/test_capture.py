@@ -103,6 +103,7 @@ def test_one_camera_without_an_arm(tmp_path, server):
         (("--camera", "side=1", "--master", "top"), "Unknown --master 'top'"),
         (("--camera", "side=1", "--camera-driver", "a:B", "--laser", 100), "are settings of RealSense cameras"),
         (("--camera", "side=1", "--arm", "127.0.0.1", "--yes"), "An arm needs a trajectory"),
+        (("--camera", "side=1", "--trajectory", "up.csv", "--rate", 2, "--dry-run"), "the arm needs a --rate above 2 Hz"),
         (("--camera", "side=1", "--box", "0.4,-0.3,0.1,0.9,0.3,0.44", "--trajectory", "up.csv"), "outside the workspace"),
     ],
 )
@@ -121,7 +122,7 @@ def test_bad_options(tmp_path, server, path, arguments, message, monkeypatch):
             ("--box", "0.4,-0.3,0.1,0.6,0.3,0.9", "--arm-margin", 0.01),
             "finger_pad reaches x = 0.637 m; the arm's space ends",
         ),
-        (("--preload", 5), "At rest the tool feels 6.0 N"),
+        (("--preload", 5), "At rest the tool feels 6.0 N and 0.0 N·m; up to 5 N and 1.66667 N·m"),
         (("--urdf", "longer.urdf"), "The arm reports its tool 50 mm"),
     ],
 )

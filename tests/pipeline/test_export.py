@@ -86,6 +86,16 @@ def test_samples_spread_as_the_intervals_do(work):
     assert again.result["samples"] == done.result["samples"][:3]
 
 
+def test_a_second_export_takes_the_place_of_the_first_and_of_nothing_else(work):
+    invoke("export", "joint.json", "--to", "mujoco", "--samples", 3, "--out", "out")
+    (work / "out" / "sample_0002" / "nodes.npz").write_bytes(b"mine")
+    (work / "out" / "mine.txt").write_text("mine")
+    invoke("export", "joint.json", "--to", "obj", "--samples", 1, "--out", "out")
+    there = {path.relative_to(work / "out").as_posix() for path in (work / "out").rglob("*") if path.is_file()}
+    own = {f"{folder}{name}" for folder in ("", "sample_0000/") for name in ("cloth.obj", "held.csv", "cloth.json")}
+    assert there == own | {"mine.txt", "sample_0002/nodes.npz"}
+
+
 class TestRefusals:
     @pytest.mark.parametrize(
         ("command", "message"),

@@ -80,6 +80,9 @@ def test_other_settings_and_damaged_states_start_anew(tmp_path):
     (state,) = tmp_path.glob(".m.*.resume")
     state.write_bytes(state.read_bytes()[:5000])
     assert train(tmp_path).resumed_from == 0
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, progress=stop, mark="older code")
+    assert train(tmp_path, mark="newer code").resumed_from == 0
 
 
 def test_it_learns_and_the_best_epoch_is_kept(tmp_path):
@@ -106,7 +109,7 @@ def test_a_patient_training_stops_early(tmp_path):
 
 
 def test_a_width_per_prediction_can_be_learned(tmp_path):
-    result = train(tmp_path, settings=replace(TINY, heteroscedastic=True, loss="raw", target="logarithmic", draws=16))
+    result = train(tmp_path, settings=replace(TINY, heteroscedastic=True, target="logarithmic", draws=16))
     found = result.regressor.predict(torch.rand(4, 1, 24, 3))
     assert found.width.shape == (4, 2)
     assert len(set(found.width[:, 0].tolist())) == 4
@@ -145,6 +148,11 @@ class TestBadInput:
             train_regressor("mlp", sagging_sheet(8), sagging_sheet(8, scenario="fold"), TINY, tmp_path / "m.safetensors")
         with pytest.raises(ConfigError, match="at least 2 train and 4 test draws, got 8 and 3"):
             train_regressor("mlp", sagging_sheet(8), sagging_sheet(3), TINY, tmp_path / "m.safetensors")
+
+    def test_widths_in_units_of_a_logarithmic_target(self, tmp_path):
+        settings = replace(TINY, heteroscedastic=True, loss="raw", target="logarithmic")
+        with pytest.raises(ConfigError, match="Use target: linear, or loss: normalised"):
+            train(tmp_path, settings=settings)
 
     def test_a_loss_that_is_no_number(self, tmp_path):
         with pytest.raises(TrainingError, match=r"The losses of epoch \d are .* Try a learning rate below 1e\+30"):

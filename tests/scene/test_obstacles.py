@@ -14,9 +14,11 @@ import torch
 from diffcloud.errors import MeshError, SceneError
 from diffcloud.scene import load_scene, write_scene
 from diffcloud.scene.schema import BodyBlock, ExtensionBlock
+from diffcloud.sim.handles import Handle, Handles
+from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.moved import moved_surfaces
 from diffcloud.sim.simulate import rollout
-from diffcloud.sim.surrounding import ContactSettings, Surrounding
+from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
 from tests.docs.examples import ROOT
 from tests.scene.files import (
     MESHES,
@@ -165,6 +167,12 @@ def test_a_written_scene_has_the_same_obstacles(folder, tmp_path, mass):
         ({"surrounding": Surrounding(self_contact=False)}, "self_contact"),
         ({"surrounding": Surrounding(contact=ContactSettings(sticking_speed=1e-4))}, "sticking_speed"),
         ({"surrounding": Surrounding(forces={"wind_box": {}})}, "forces"),
+        ({"surrounding": Surrounding(reference_contact=ReferenceContact(residue=1e-3))}, "reference_contact"),
+        ({"surrounding": Surrounding(lagged_air=True), "integrator": "linearised"}, "lagged_air"),
+        (
+            {"handles": Handles((Handle(0, Motion((Keyframe(0.0),))), Handle(1, Motion((Keyframe(1.0),)))))},
+            "a gripper with several motions",
+        ),
     ],
 )
 def test_what_a_file_cannot_say_is_not_written(folder, tmp_path, changes, named):

@@ -134,6 +134,14 @@ def test_a_written_scene_loads_to_the_same_system(folder, tmp_path, source):
     assert (again.frame_time, again.frame_steps, again.end_time) == (scene.frame_time, scene.frame_steps, scene.end_time)
 
 
+def test_grippers_that_move_alike_stay_two(tmp_path):
+    """Their names are not kept."""
+    scene = load_scenario("shake").scene
+    again = load_scene(write_scene(scene, tmp_path / "written"))
+    names = [[handle.gripper for handle in one.handles.handles] for one in (scene, again)]
+    assert len(set(names[0])) == len(set(names[1])) == len(set(zip(*names, strict=True))) == 2
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -146,6 +154,10 @@ def test_a_written_scene_loads_to_the_same_system(folder, tmp_path, source):
         ({"handles": [{"nodes": [9]}]}, r"node 9 does not exist, the cloth has nodes 0\.\.8"),
         ({"handles": [{"nodes": [0], "motion": 4}]}, "handles.0.motion: 4, but the scene has 1"),
         ({"handles": [{"nodes": [0], "type": "glue"}]}, "handles.0.type"),
+        (
+            {"motions": [[{"time": 0}, {"time": 0.1, "transform": {"scale": 0}}]]},
+            r"handles.1.motion: motion 0 has shrunk the cloth .* takes hold, at 0\.1 s",
+        ),
         ({"frame_time": -1}, "frame_time.*greater than 0"),
         ({"gravity": [0, 0]}, "gravity"),
         ({"cloths": []}, "cloths"),

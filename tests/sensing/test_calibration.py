@@ -12,10 +12,10 @@ from diffcloud.errors import CalibrationError
 from diffcloud.io.calibrations import read_calibration
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.images import read_color
-from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter, RobotSample
+from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter, RobotLog, RobotSample
 from diffcloud.sensing.calibration.charuco import CameraViews, View
 from diffcloud.sensing.calibration.checkerboard import onto_plane, register_checkerboard, rigid_motion
-from diffcloud.sensing.calibration.hand_eye import calibrate_hand_eye, still_pose
+from diffcloud.sensing.calibration.hand_eye import calibrate_hand_eye, find_views, still_pose
 from diffcloud.sensing.cameras import depth_points, inverse, project, rays, transform
 from tests.pipeline.invoke import invoke
 from tests.sensing.charuco_scene import BOARD, CAMERAS, GRIPPER_BOARD, INTRINSICS, board_depth, gripper_poses, render
@@ -259,9 +259,34 @@ def test_charuco_images_give_the_cameras_within_a_millimetre(tmp_path, rng):
     assert (picture == [255, 0, 0]).all(axis=-1).sum() > 100
 
 
-def test_a_moving_gripper_gives_no_pose(tmp_path, rng):
-    from diffcloud.io.raw_episodes import RobotLog
+@pytest.mark.parametrize(("numbers", "seen"), [(range(0, 24, 4), 0), ([*range(0, 24, 4), 1], 7), ([0, 5, 10, 15, 3, 6], 6)])
+def test_corners_on_one_line_are_no_view(monkeypatch, numbers, seen):
+    """They leave open how the board is turned about that line."""
+    import cv2
 
+    class Detector:
+        def __init__(self, board):
+            pass
+
+        def detectBoard(self, image):
+            return np.zeros((len(numbers), 1, 2), np.float32), np.array(numbers).reshape(-1, 1), None, None
+
+    monkeypatch.setattr(cv2.aruco, "CharucoDetector", Detector)
+    found, pixels = BOARD.detect(np.zeros((4, 4, 3), np.uint8))
+    assert len(found) == len(pixels) == seen
+
+
+@pytest.mark.parametrize(
+    ("factor", "message"), [(0.5, r"has a length of 0\.5 instead of 1"), (np.nan, "no poses of the tool")]
+)
+def test_orientations_that_are_none(factor, message):
+    quaternions = factor * np.tile([1.0, 0, 0, 0], (3, 1))
+    log = RobotLog(np.arange(3.0), np.zeros((3, 7)), np.zeros(3), np.zeros((3, 3)), quaternions, np.zeros((3, 6)))
+    with pytest.raises(CalibrationError, match=message):
+        find_views({}, log, BOARD)
+
+
+def test_a_moving_gripper_gives_no_pose(tmp_path, rng):
     times = np.arange(11) / 10
     position = np.column_stack([np.where(times > 0.5, times - 0.5, 0), np.zeros(11), np.zeros(11)])
     still = np.tile([1.0, 0, 0, 0], (11, 1))

@@ -246,6 +246,15 @@ class TestBadInput:
         with pytest.raises(CalibrationError, match=r"no camera overhead \(serial 000\)"):
             fuse(read_raw_episode(scene.folder), mask, PLAIN, calibration=other)
 
+    def test_cameras_that_never_see_the_same_moment(self, tmp_path, mask):
+        folder = write_cloth_episode(tmp_path / "raw", frames=2).folder
+        place = folder / "cameras" / "side" / "timestamps.csv"
+        rows = [line.split(",") for line in place.read_text(encoding="utf-8").splitlines()]
+        later = [f"{number},{float(t) + 0.5}" for number, t in rows[1:]]
+        place.write_text("\n".join([",".join(rows[0]), *later]) + "\n", encoding="utf-8")
+        with pytest.raises(EpisodeError, match=r"no frame in which all cameras .* Are they on one clock"):
+            fuse(read_raw_episode(folder), None, FusionSettings(**SETTINGS))
+
     def test_not_calibrated(self, tmp_path, mask):
         folder = write_cloth_episode(tmp_path / "raw", frames=1).folder
         path = folder / "cameras" / "side" / "camera.json"

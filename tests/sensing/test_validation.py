@@ -107,6 +107,19 @@ def test_millimetres_for_metres(episode):
     assert codes(episode) == {"length_unit"}
 
 
+def test_a_tool_that_is_too_far_away_for_an_arm_and_not_by_millimetres(episode):
+    edit_column(episode / "robot.csv", "tool_x", lambda x: x + 4)
+    assert codes(episode) == {"length_unit"}
+    assert "check their unit and their frame" in message(episode, "length_unit")
+
+
+def test_a_quaternion_that_is_none(episode):
+    for part in "wxyz":
+        edit_column(episode / "robot.csv", f"tool_q{part}", lambda q: q / 2)
+    assert codes(episode) == {"quaternion"}
+    assert "has a length of 0.5 instead of 1" in message(episode, "quaternion")
+
+
 def test_a_gripper_in_percent(episode):
     edit_column(episode / "robot.csv", "gripper", lambda x: 100 * x)
     assert codes(episode) == {"gripper_unit"}

@@ -263,6 +263,35 @@ class TestFiles:
         np.testing.assert_allclose(rows[:, 1:], cloth.motion[:, list(cloth.problem.held)].reshape(7, -1), atol=1e-7)
 
 
+class TestWhatATargetLacks:
+    @pytest.mark.parametrize("target", ["mujoco", "isaac"])
+    def test_a_ratio_that_no_solid_has_is_clipped_and_said(self, target, tmp_path):
+        cloth = exported(towel(material={**ISOTROPIC, "poisson": 0.6}))
+        _, left_out = write_export(cloth, target, tmp_path, {})
+        assert "Poisson's ratio is 0.49, the largest that can be exported; in the fit it is 0.6." in left_out
+        if target == "mujoco":
+            engine = pytest.importorskip("mujoco")
+            engine.MjModel.from_xml_path(str(tmp_path / "cloth.xml"))  # which refuses 0.5 and more
+        else:
+            assert "omniphysics:poissonsRatio = 0.49\n" in (tmp_path / "cloth.usda").read_text()
+
+    @pytest.mark.parametrize("target", TARGETS)
+    def test_only_mujoco_flattens_what_is_shaped(self, target, tmp_path):
+        cloth = exported(towel(shaped=True))
+        _, left_out = write_export(cloth, target, tmp_path, {})
+        assert any("hinges are flat" in sentence for sentence in left_out) == (target == "mujoco")
+
+    @pytest.mark.parametrize("target", TARGETS)
+    def test_a_strained_start_is_the_targets_own(self, target, tmp_path):
+        cloth = exported()
+        mesh = replace(cloth.problem.mesh, nodes=cloth.problem.mesh.nodes * [1.1, 1.0, 1.0])
+        strained = replace(cloth, problem=replace(cloth.problem, mesh=mesh))
+        assert strained.simplified == cloth.simplified
+        _, left_out = write_export(strained, target, tmp_path, {})
+        told = any("unstrained at the start" in sentence for sentence in left_out)
+        assert told == (target in ("mujoco", "newton", "isaac"))
+
+
 def test_the_script_finds_the_cloth_in_a_model_with_other_things():
     """Beside a body that floats, which has more positions than velocities."""
     engine = pytest.importorskip("mujoco")

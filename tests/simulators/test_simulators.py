@@ -138,6 +138,33 @@ def test_the_stiffness_that_makes_up_for_a_neo_hookean_membrane(along, across):
 
 
 @NOISY
+@pytest.mark.parametrize("shaped", [False, True])
+def test_hinges_in_newton_rest_as_in_the_fit_and_other_cloths_keep_theirs(shaped):
+    """A cloth that starts bent by a tenth, and another one in the same model with what the builder gives it."""
+    engine = pytest.importorskip("newton")
+    from diffcloud.simulators.scripts import run_newton
+
+    flat = grid_cloth(3, 3, 0.2, 0.2)
+    bent = replace(flat, nodes=np.column_stack([flat.nodes[:, :2], 0.1 * np.abs(flat.nodes[:, 0])]))
+    sheet = Sheet(density=0.2, stretching=30.0, poisson=0.3, bending=1e-5, damping=0.01)
+    cloth = Problem("bent", bent, sheet, 0.1, {0: None}, shaped=shaped).arrays()
+    builder = engine.ModelBuilder()
+    run_newton.add_cloth(builder, cloth)
+    own = builder.edge_count
+    run_newton.add_cloth(builder, cloth)
+    model = builder.finalize(device="cpu")
+    started = model.edge_rest_angle.numpy().copy()
+    run_newton.finish_cloth(model, cloth)
+    rest, bending = model.edge_rest_angle.numpy(), model.edge_bending_properties.numpy()
+    assert np.abs(started[:own]).max() > 0.05
+    np.testing.assert_allclose(rest[:own], started[:own] if shaped else 0.0)
+    np.testing.assert_array_equal(rest[own:], started[own:])
+    np.testing.assert_array_equal(bending[own:], np.tile([1.0, 0.0], (model.edge_count - own, 1)))
+    inner = (model.edge_indices.numpy()[:own, :2] >= 0).all(axis=1)
+    np.testing.assert_allclose(np.sort(bending[:own][inner, 0]), np.sort(cloth["hinge_stiffness"] / cloth["hinge_length"]))
+
+
+@NOISY
 @pytest.mark.slow
 def test_newton_is_the_third_opinion_with_its_membrane():
     pytest.importorskip("newton")

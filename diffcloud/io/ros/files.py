@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from diffcloud.errors import EpisodeError
+from diffcloud.errors import DiffCloudError, EpisodeError
 from diffcloud.io.ros.topics import is_depth
 
 _METADATA = "metadata.yaml"
@@ -32,11 +32,12 @@ def opened(paths: Sequence[Path]) -> Iterator[Any]:
     """A reader (`rosbags.highlevel.AnyReader`) of all files together, messages in order of their arrival.
 
     Raises:
-        EpisodeError: missing, or not a readable recording.
+        EpisodeError: missing, or not a readable recording, also where damage is only met later, while it is read.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
+    shown = ", ".join(map(str, paths))
     # bags of rosbag2 before 2023 carry no message definitions; those of Humble serve
     try:
         reader = AnyReader([Path(path) for path in paths], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
@@ -44,10 +45,13 @@ def opened(paths: Sequence[Path]) -> Iterator[Any]:
     except FileNotFoundError as error:
         raise EpisodeError(f"No such recording: {error}.") from error
     except Exception as error:  # damaged files fail in many ways inside
-        shown = ", ".join(map(str, paths))
         raise EpisodeError(f"{shown} is not a readable ROS recording ({type(error).__name__}: {error}).") from error
     try:
         yield reader
+    except (DiffCloudError, MemoryError):
+        raise
+    except Exception as error:
+        raise EpisodeError(f"{shown} cannot be read to its end ({type(error).__name__}: {error}).") from error
     finally:
         with suppress(Exception):
             reader.close()

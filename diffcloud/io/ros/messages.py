@@ -151,11 +151,11 @@ def _pixels(message: Any, kind: np.dtype[Any]) -> NDArray[Any]:
     """[H, W, C] of an Image message; rows may be padded, bytes may be swapped."""
     kind = kind.newbyteorder(">" if message.is_bigendian else "<")
     data = np.frombuffer(bytes(message.data), np.uint8)
-    if len(data) != message.height * message.step or message.step < message.width * kind.itemsize:
+    channels = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}.get(message.encoding, 1)
+    if len(data) != message.height * message.step or message.step < message.width * channels * kind.itemsize:
         raise EpisodeError(
             f"An image of {message.width} x {message.height} has {len(data)} bytes; the recording is damaged."
         )
     rows = data.reshape(message.height, message.step)
-    channels = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}.get(message.encoding, 1)
     used = np.ascontiguousarray(rows[:, : message.width * channels * kind.itemsize])
     return used.view(kind).reshape(message.height, message.width, channels)

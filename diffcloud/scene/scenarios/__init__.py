@@ -2,8 +2,8 @@
 
 The built-ins are procedural and in SI: `lift`, `fold`, `shake` (grid), `band_stretch` (band), `vest_hang` (vest), and, for
 the published recordings under their gripper's track, `recorded_lift` and `recorded_fold` (grid). The `release_*` scenarios
-carry the settings of the experiments published with the paper and take their scene from the published JSON (PHYSICS:
-experiments). A person's own scenario is a YAML file that starts from a built-in and changes what differs.
+carry the settings of the experiments published with the paper and take their scene from the published JSON. A
+person's own scenario is a YAML file that starts from a built-in and changes what differs.
 """
 
 from diffcloud.io.published import RELEASE_UNIT_M

@@ -19,7 +19,7 @@ PAPER_THRESHOLD = 5e-4
 
 @dataclass(frozen=True)
 class ReleaseExperiment:
-    """Settings of one published experiment (PHYSICS section 13)."""
+    """Settings of one published experiment."""
 
     frames: int
     loss_frame: int

@@ -58,14 +58,22 @@ class CharucoBoard:
         return np.asarray(self.opencv().getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
 
     def detect(self, color: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Floats]:
-        """(corner numbers [N], pixels [N, 2]) in an image [H, W, 3]; empty where the board is not seen."""
+        """(corner numbers [N], pixels [N, 2]) in an image [H, W, 3]; empty where the board is not seen.
+
+        Corners on one line are not enough: the board may stand at any angle about it.
+        """
         import cv2
 
         detector = cv2.aruco.CharucoDetector(self.opencv())
         pixels, numbers, _, _ = detector.detectBoard(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
         if numbers is None or len(numbers) < FEWEST_CORNERS:
             return np.zeros(0, np.int64), np.zeros((0, 2))
-        return np.asarray(numbers, np.int64).reshape(-1), np.asarray(pixels, np.float64).reshape(-1, 2)
+        numbers = np.asarray(numbers, np.int64).reshape(-1)
+        seen = self.corners()[numbers]
+        across = float(np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)[1])
+        if across < self.square_m / 2:  # one corner beside a line of others gives more
+            return np.zeros(0, np.int64), np.zeros((0, 2))
+        return numbers, np.asarray(pixels, np.float64).reshape(-1, 2)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from diffcloud.errors import CalibrationError
 from diffcloud.sensing.calibration.chain import Estimate
 from diffcloud.sensing.calibration.charuco import CameraViews, board_in_camera
+from diffcloud.sensing.tool_poses import unreachable
 
 Floats = NDArray[np.float64]
 Remark = tuple[Literal["warning", "objection"], str]
@@ -38,8 +39,6 @@ ten cameras that were calibrated at five poses stood 6 to 28 mm out of place, at
 ADVISED_POSES = 15
 LARGEST_ERROR_MM = 10.0
 """Held out."""
-_LONGEST_REACH_M = 3.0
-"""No arm of this kind reaches farther."""
 _LARGEST_TURN_DEG = 5.0
 """Between how arm and board turn, median over pairs of poses; right ones differ by tenths."""
 _HINT, _WRONG = 0.01, 0.02
@@ -105,14 +104,9 @@ def check_reach(positions: Floats) -> None:
     Raises:
         CalibrationError: more than three metres from the base, as millimetres are.
     """
-    known = positions[np.isfinite(positions).all(axis=1)]
-    farthest = float(np.linalg.norm(known, axis=1).max()) if len(known) else 0.0
-    if farthest > _LONGEST_REACH_M:
-        unit = "they look like millimetres: divide by 1000" if farthest > 50 else "check their unit and their frame"
-        raise CalibrationError(
-            f"The gripper's positions lie up to {farthest:.0f} m from the robot's base, farther than an arm reaches. They "
-            f"are metres in the base frame; {unit}."
-        )
+    wrong = unreachable(positions)
+    if wrong is not None:
+        raise CalibrationError(wrong)
 
 
 def check_orientations(cameras: Mapping[str, CameraViews], T_world_gripper: Floats, corners: Floats) -> None:

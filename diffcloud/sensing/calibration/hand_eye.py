@@ -29,6 +29,7 @@ from diffcloud.sensing.calibration.checks import (
     judge_hand_eye,
 )
 from diffcloud.sensing.cameras import inverse, project, transform
+from diffcloud.sensing.tool_poses import not_unit
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -71,18 +72,14 @@ def find_views(
         CalibrationError: a joint log without tool poses or in other units, or a camera without colour images.
     """
     check_reach(robot.tool_position_m)
-    lengths = np.linalg.norm(robot.tool_quaternion, axis=1)
-    if not np.isfinite(robot.tool_position_m).all(axis=1).any() or not np.isfinite(lengths).any():
+    if not all(np.isfinite(column).all(axis=1).any() for column in (robot.tool_position_m, robot.tool_quaternion)):
         raise CalibrationError(
             "robot.csv has no poses of the tool (tool_x..z and tool_qw..qz): where the board was is not known. Record "
             "them, or import with the tool's frame in tf (--tool-frame)."
         )
-    off = float(np.nanmax(np.abs(lengths - 1)))
-    if off > 0.01:
-        raise CalibrationError(
-            f"A tool quaternion in robot.csv has a length of {1 + off:.3g} instead of 1: tool_qw..qz are a unit quaternion "
-            "(w, x, y, z), not angles in degrees or radians. Convert them."
-        )
+    wrong = not_unit(robot.tool_quaternion)
+    if wrong is not None:
+        raise CalibrationError(wrong)
     found: dict[str, CameraViews] = {}
     poses: list[Floats] = []
     for name, camera in cameras.items():

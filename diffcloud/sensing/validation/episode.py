@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.images import png_size, read_color, read_depth
@@ -22,6 +21,7 @@ from diffcloud.io.raw_episodes import (
     read_robot_log,
     read_timestamps,
 )
+from diffcloud.sensing.tool_poses import not_unit, unreachable
 from diffcloud.sensing.validation.calibration import calibration_findings, exchanged_cameras
 from diffcloud.sensing.validation.findings import Finding, RecordedCamera
 
@@ -32,8 +32,6 @@ _GAP = 2.5
 """A gap is this many times the median interval."""
 NEAREST_M, FARTHEST_M = 0.1, 8.0
 """Median depth of a table-top scene lies between."""
-_LONGEST_REACH_M = 3.0
-"""No arm of this kind reaches farther."""
 _GEN3_JOINTS = 7
 _ALIKE = ("depth.emitter_enabled", "depth.laser_power", "depth.visual_preset")
 _PACE = "depth.inter_cam_sync_mode"
@@ -79,7 +77,7 @@ def validate_raw_episode(folder: Path, *, calibration: Path | None = None, robot
     findings += exchanged_cameras(cameras, folder, calibration)
     if description.get("robot") is not None:
         try:
-            log = read_robot_log(folder / "robot.csv")
+            log = read_robot_log(folder / "robot.csv", torn=True)
         except EpisodeError as error:
             findings.append(Finding("fault", "robot_log", "robot.csv", str(error)))
         else:
@@ -95,7 +93,7 @@ def _open_camera(folder: Path, name: str) -> tuple[RecordedCamera | None, list[F
     except EpisodeError as error:
         findings.append(Finding("fault", "camera", f"cameras/{name}/camera.json", str(error)))
     try:
-        frames, times = read_timestamps(folder / "timestamps.csv")
+        frames, times = read_timestamps(folder / "timestamps.csv", torn=True)
     except EpisodeError as error:
         return None, [*findings, Finding("fault", "timestamps", f"cameras/{name}/timestamps.csv", str(error))]
     if not len(frames):
@@ -278,31 +276,24 @@ def _robot(log: RobotLog) -> Iterator[Finding]:
         yield Finding("fault", "clock_backwards", place, message)
     largest = float(np.abs(log.joints_rad).max())
     if largest > 2.5 * np.pi:
-        unit = "these are degrees" if largest <= 450 else "no joint turns that far"
         yield Finding(
             "fault",
             "angle_unit",
             place,
-            f"A joint angle of {largest:.1f} in radians: {unit}. Multiply by pi / 180 (the arm itself reports degrees).",
+            f"A joint angle of {largest:.1f} in radians: these are degrees. Multiply by pi / 180 (the arm itself reports "
+            "degrees).",
         )
-    reach = _largest(log.tool_position_m)
-    if reach > _LONGEST_REACH_M:
-        yield Finding(
-            "fault",
-            "length_unit",
-            place,
-            f"The tool is {reach:.0f} m from the base: these are millimetres. Divide by 1000.",
-        )
+    reach = unreachable(log.tool_position_m)
+    if reach is not None:
+        yield Finding("fault", "length_unit", place, reach)
     grip = log.gripper[np.isfinite(log.gripper)]
     if len(grip) and (grip.min() < -0.05 or grip.max() > 1.05):
         unit = "percent" if grip.max() <= 105 else "another unit"
         message = f"The gripper lies between {grip.min():g} and {grip.max():g}; it is 0 (open) to 1 (closed), not {unit}."
         yield Finding("fault", "gripper_unit", place, message)
-    length = np.linalg.norm(log.tool_quaternion, axis=1)
-    length = length[np.isfinite(length)]
-    if len(length) and np.abs(length - 1).max() > 0.01:
-        message = f"A tool quaternion has length {length[np.abs(length - 1).argmax()]:.3f}, not 1; order is w, x, y, z."
-        yield Finding("fault", "quaternion", place, message)
+    orientation = not_unit(log.tool_quaternion)
+    if orientation is not None:
+        yield Finding("fault", "quaternion", place, orientation)
     if bad is None and len(log.times) > 3:
         intervals = np.diff(log.times)
         usual = float(np.median(intervals))
@@ -340,11 +331,6 @@ def _coverage(log: RobotLog, cameras: list[RecordedCamera]) -> Iterator[Finding]
                 f"{camera.times.min():.2f} to {camera.times.max():.2f} s: {int(outside.sum())} of {len(outside)} frames "
                 "have no joint angles. Start the log before the cameras and stop it after; check that both use one clock.",
             )
-
-
-def _largest(values: NDArray[np.float64]) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.abs(finite).max()) if len(finite) else 0.0
 
 
 def _numbers(frames: list[int]) -> str:

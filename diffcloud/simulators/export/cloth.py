@@ -23,7 +23,7 @@ from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.simulators import ours
 from diffcloud.simulators.problem import Problem, Sheet, Track, distances
 
-_WORTH_SAYING = 0.01
+WORTH_SAYING = 0.01
 """Relative difference of a stiffness, or strain of the start, above which it is said."""
 _LEVEL = np.deg2rad(0.1)
 _STRAINED = (0.0, 0.25, 0.5, 1.0)
@@ -88,7 +88,7 @@ def fitted_cloth(
     size = recording.nuisance.get("size")
     if size is not None:
         scene = replace(scene, mesh=replace(scene.mesh, verts=math.exp(size.value) * scene.mesh.verts))
-    linear = bool(np.allclose(scene.material.stretching, scene.material.stretching[0], rtol=_WORTH_SAYING))
+    linear = bool(np.allclose(scene.material.stretching, scene.material.stretching[0], rtol=WORTH_SAYING))
     tried = [_cloth(recording, motion, scene, strained) for strained in ((0.0,) if linear else _STRAINED)]
     return tried[0] if linear else min(tried, key=lambda cloth: float(cloth.simplified_m.mean()))
 
@@ -124,7 +124,7 @@ def _cloth(recording: RecordingFit, motion: FittedMotion, scene: Scene, strained
         left_out.append(f"Of {len(tables)} tables only the first is exported.")
     if around.moving or around.bodies:
         left_out.append("Obstacles that move are not exported.")
-    simplified = (*said, *_simplified(scene, problem.mesh))
+    simplified = (*said, *_simplified(scene))
     return ExportedCloth(problem, _whole(scene, problem), nodes, tuple(left_out), simplified)
 
 
@@ -135,7 +135,7 @@ def _whole(scene: Scene, problem: Problem) -> Scene:
     return replace(scene, mesh=problem.mesh, handles=alike.handles, surrounding=around, end_time=problem.seconds)
 
 
-def _simplified(scene: Scene, mesh: ClothMesh) -> list[str]:
+def _simplified(scene: Scene) -> list[str]:
     around, said = scene.surrounding, []
     if any(around.gravity[:2]):
         said.append(f"Gravity is vertical; in the fit it is {list(around.gravity)} m/s².")
@@ -143,11 +143,6 @@ def _simplified(scene: Scene, mesh: ClothMesh) -> list[str]:
         said.append(f"There is no air; the fit has air of {around.air_density:.3g} kg/m³.")
     if not scene.handles.hard:
         said.append(f"Held nodes follow exactly; in the fit, springs of {scene.handles.stiffness:g} N/m hold them.")
-    strain = start_strain(mesh)
-    if strain > _WORTH_SAYING:
-        said.append(
-            f"The exported cloth is unstrained at the start; in the fit it is strained there by up to {strain:.0%}."
-        )
     return said
 
 
@@ -173,7 +168,7 @@ def isotropic_sheet(material: Material, strained: float = 0.0) -> tuple[Sheet, l
         bias = 4 / (inverse.sum() + 1 / shear)
         strips = {"along the cloth's first side": warp, "along its second side": weft, "at 45°": bias}
         off = {name: stretching / value - 1 for name, value in strips.items()}
-        if max(abs(part) for part in off.values()) > _WORTH_SAYING:
+        if max(abs(part) for part in off.values()) > WORTH_SAYING:
             told = ", ".join(f"{strips[name]:.3g} N/m {name} (export: {off[name]:+.0%})" for name in strips)
             said.append(f"The material is isotropic with {stretching:.3g} N/m; in the fit, a strip has {told}.")
     else:
@@ -181,14 +176,14 @@ def isotropic_sheet(material: Material, strained: float = 0.0) -> tuple[Sheet, l
             f"The material is isotropic with {stretching:.3g} N/m; in the fit, it does not resist every deformation."
         )
     stiffening = float(reference[[0, 2]].mean() / rest[[0, 2]].mean())
-    if abs(stiffening - 1) > _WORTH_SAYING:
+    if abs(stiffening - 1) > WORTH_SAYING:
         part = f"{strained:.0%} of the way from rest to that strain"
         where = {0.0: "at rest", 1.0: "at that strain"}.get(strained, part)
         said.append(
             f"Stretching is linear; in the fit, its stiffness at 12.5 % strain is {stiffening:.3g} times that at rest. The "
             f"exported stiffness is the one {where}."
         )
-    if material.compression < 1 - _WORTH_SAYING:
+    if material.compression < 1 - WORTH_SAYING:
         said.append(
             "Compression in the plane is resisted as stretching is; in the fit, the cloth wrinkles finer than its mesh "
             f"instead, and {material.compression:.1%} of the stiffness stays."
@@ -196,7 +191,7 @@ def isotropic_sheet(material: Material, strained: float = 0.0) -> tuple[Sheet, l
     flat = TABLE_ENTRY_TO_BENDING * material.bending
     bending = material.resting_bending_stiffness
     apart = float(np.abs(flat / bending - 1).max())
-    if apart > _WORTH_SAYING:
+    if apart > WORTH_SAYING:
         said.append(
             f"Bending has one stiffness, {bending:.3g} N·m; in the fit it is {flat.min():.3g} to {flat.max():.3g} N·m by "
             "direction and curvature."

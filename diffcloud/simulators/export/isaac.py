@@ -20,6 +20,7 @@ def layer(problem: Problem, head: str, left_out: Iterable[str]) -> str:
     """The text of a .usda file.
 
     Args:
+        problem: with a Poisson's ratio below 0.5.
         head: what the file is.
         left_out: what it leaves out, sentences.
     """
@@ -99,7 +100,7 @@ def _material(problem: Problem) -> list[str]:
         "omniphysics:staticFriction": problem.friction,
         "omniphysics:dynamicFriction": problem.friction,
         "omniphysics:youngsModulus": sheet.stretching / thick,
-        "omniphysics:poissonsRatio": min(sheet.poisson, 0.49),
+        "omniphysics:poissonsRatio": sheet.poisson,
         "omniphysics:surfaceThickness": thick,
         "omniphysics:surfaceBendStiffness": sheet.bending / thick**3,
         "physxDeformableMaterial:elasticityDamping": sheet.damping,

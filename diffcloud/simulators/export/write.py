@@ -11,12 +11,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from diffcloud import __version__
-from diffcloud.io.files import together, write_json, write_npz, write_text
+from diffcloud.errors import DiffCloudError
+from diffcloud.io.files import read_json, together, write_json, write_npz, write_text
 from diffcloud.io.obj import write_cloth, write_surface
 from diffcloud.scene.write import write_scene
 from diffcloud.simulators import mujoco
 from diffcloud.simulators.explicit import neo_hookean_gain
-from diffcloud.simulators.export.cloth import ExportedCloth
+from diffcloud.simulators.export.cloth import WORTH_SAYING, ExportedCloth, start_strain
 from diffcloud.simulators.export.isaac import layer
 from diffcloud.simulators.problem import Problem
 
@@ -29,6 +30,8 @@ WRITTEN_FOR: dict[Target, str] = {
     "arcsim": "ARCSim 0.2 and DiffSim",
     "obj": "Wavefront OBJ and CSV",
 }
+_MOST_POISSON = 0.49
+"""MuJoCo and Isaac Sim make a membrane of a solid, whose ratio is below 0.5; a sheet's may be larger."""
 
 
 def write_export(
@@ -72,9 +75,23 @@ def write_export(
     return [*names, "cloth.json"], left_out
 
 
+def exported_files(folder: Path) -> set[str]:
+    """Files of the exports that a folder and its samples hold: what a new one may take the place of. None of any other."""
+    names = set[str]()
+    for record in [folder / "cloth.json", *folder.glob("sample_[0-9][0-9][0-9][0-9]/cloth.json")]:
+        try:
+            told = read_json(record)
+        except DiffCloudError:
+            continue
+        listed = told.get("files") if isinstance(told, dict) and "written_for" in told else None
+        if isinstance(listed, list) and all(isinstance(name, str) for name in listed):
+            names |= {(record.parent.relative_to(folder) / name).as_posix() for name in [*listed, record.name]}
+    return names
+
+
 def for_mujoco(problem: Problem) -> tuple[Problem, mujoco.Settings]:
     """The problem as MuJoCo's explicit steps bear it, and their settings."""
-    settings, sheet = mujoco.stable(problem)
+    settings, sheet = mujoco.stable(_as_solid(problem))
     return replace(problem, sheet=sheet), settings
 
 
@@ -88,7 +105,9 @@ def _mujoco(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[li
         )
     if problem.bodies:
         more.append("MuJoCo replaces each body that the cloth meets by its convex hull.")
-    more += _flat_hinges(problem)
+    if problem.shaped:
+        more.append("The exported hinges are flat at rest; in the fit, they rest in the shape in which the cloth starts.")
+    more += [*_less_contraction(cloth.problem), *_unstrained(cloth.problem)]
     remark = f"{_head(cloth, 'mujoco')} {' '.join([*left_out, *more])}".replace("--", "-")
     write_text(folder / "cloth.xml", mujoco.model_file(problem, settings, remark=remark))
     return ["cloth.xml", *_script("run_mujoco.py", problem, folder)], more
@@ -100,7 +119,7 @@ def _newton(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[li
         "Newton's membrane is neo-Hookean and too soft at large strains. To compensate, the stretching stiffness is "
         f"exported {gain:.3g} times as large, which brings its forces in the fitted motion closest to the sheet's.",
         *_one_friction(cloth.problem),
-        *_flat_hinges(cloth.problem),
+        *_unstrained(cloth.problem),
     ]
     return _script("run_newton.py", cloth.problem, folder, membrane_gain=gain), more
 
@@ -112,9 +131,20 @@ def _one_friction(problem: Problem) -> list[str]:
     return [f"There is one coefficient of friction, {among:.3g}; in the fit, the cloth has {itself:.3g} with itself."]
 
 
-def _flat_hinges(problem: Problem) -> list[str]:
-    told = "The exported hinges are flat at rest; in the fit, they rest in the shape in which the cloth starts."
-    return [told] if problem.shaped else []
+def _as_solid(problem: Problem) -> Problem:
+    return replace(problem, sheet=replace(problem.sheet, poisson=min(problem.sheet.poisson, _MOST_POISSON)))
+
+
+def _less_contraction(problem: Problem) -> list[str]:
+    poisson = problem.sheet.poisson
+    told = f"Poisson's ratio is {_MOST_POISSON:g}, the largest that can be exported; in the fit it is {poisson:.3g}."
+    return [told] if poisson > _MOST_POISSON else []
+
+
+def _unstrained(problem: Problem) -> list[str]:
+    strain = start_strain(problem.mesh)
+    told = f"The exported cloth is unstrained at the start; in the fit it is strained there by up to {strain:.0%}."
+    return [told] if strain > WORTH_SAYING else []
 
 
 def _script(name: str, problem: Problem, folder: Path, **changes: float) -> list[str]:
@@ -127,10 +157,12 @@ def _script(name: str, problem: Problem, folder: Path, **changes: float) -> list
 def _isaac(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
     more = [
         *_one_friction(cloth.problem),
+        *_less_contraction(cloth.problem),
+        *_unstrained(cloth.problem),
         "This file has not been run in Isaac Sim: attributes and units are those of its published schema. That PhysX "
         "multiplies the bending stiffness by the cube of the thickness is taken from its documentation.",
     ]
-    write_text(folder / "cloth.usda", layer(cloth.problem, _head(cloth, "isaac"), [*left_out, *more]))
+    write_text(folder / "cloth.usda", layer(_as_solid(cloth.problem), _head(cloth, "isaac"), [*left_out, *more]))
     return ["cloth.usda"], more
 
 

@@ -67,7 +67,7 @@ def add_cloth(builder, cloth, explicit=False):
 
 
 def finish_cloth(model, cloth, explicit=False):
-    """What a builder does not take: friction of the cloth, and the bending stiffness of each edge.
+    """What a builder does not take: friction of the cloth, and bending stiffness and angle at rest of each of its edges.
 
     An edge's energy is K θ²/2: VBD has k l θ²/2, so k = K/l; the explicit solver pushes with k l² θ where the gradient of θ
     asks for K θ/height, so k = K/(l (a0 + a1)) where both faces have one size.
@@ -76,12 +76,16 @@ def finish_cloth(model, cloth, explicit=False):
     model.soft_contact_mu, model.soft_contact_ke = float(cloth["friction"]), CONTACT_STIFFNESS
     model.soft_contact_kd, model.soft_contact_kf = CONTACT_DAMPING if explicit else 0.0, FRICTION_GAIN
     stiffness = cloth["hinge_stiffness"] / (cloth["hinge_length"] * (cloth["hinge_area"] if explicit else 1.0))
-    rows = {frozenset(pair): row for row, pair in enumerate(cloth["hinge_edges"].tolist())}
-    bending = np.zeros((model.edge_count, 2), dtype=np.float32)
-    for edge, pair in enumerate(model.edge_indices.numpy()[:, 2:].tolist()):
-        if frozenset(pair) in rows:  # else at the boundary
-            bending[edge] = stiffness[rows[frozenset(pair)]] * np.array([1.0, cloth["damping"]])
+    # an edge is found by its two nodes; those of other cloths, and at the boundary, stay as the builder has them
+    there, own = (np.sort(pairs, axis=1) for pairs in (model.edge_indices.numpy()[:, 2:], cloth["hinge_edges"]))
+    numbers = (pairs[:, 0].astype(np.int64) * model.particle_count + pairs[:, 1] for pairs in (there, own))
+    _, edges, rows = np.intersect1d(*numbers, return_indices=True)
+    bending, rest = model.edge_bending_properties.numpy().copy(), model.edge_rest_angle.numpy().copy()
+    bending[edges] = stiffness[rows, None] * np.array([1.0, float(cloth["damping"])])
     model.edge_bending_properties.assign(bending)
+    if not cloth["shaped"]:  # the builder takes the angles in which the cloth starts
+        rest[edges] = 0.0
+        model.edge_rest_angle.assign(rest)
 
 
 def build(cloth, explicit=False, gradient=False):

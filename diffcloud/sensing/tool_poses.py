@@ -1,0 +1,38 @@
+"""What is wrong with the poses of the tool in a joint log: its units, its frame, its quaternions."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+_LONGEST_REACH_M = 3.0
+"""No arm of this kind reaches farther."""
+_LENGTH_OFF = 0.01
+
+
+def unreachable(positions: Floats) -> str | None:
+    """Why tool positions [N, 3], some of them NaN, are none that an arm reaches; None where they are."""
+    known = positions[np.isfinite(positions).all(axis=1)]
+    farthest = float(np.linalg.norm(known, axis=1).max()) if len(known) else 0.0
+    if farthest <= _LONGEST_REACH_M:
+        return None
+    unit = "they look like millimetres: divide by 1000" if farthest > 50 else "check their unit and their frame"
+    return (
+        f"The gripper's positions lie up to {farthest:.0f} m from the robot's base, farther than an arm reaches. They are "
+        f"metres in the base frame; {unit}."
+    )
+
+
+def not_unit(quaternions: Floats) -> str | None:
+    """Why tool orientations [N, 4], some of them NaN, are no unit quaternions; None where they are."""
+    lengths = np.linalg.norm(quaternions, axis=1)
+    lengths = lengths[np.isfinite(lengths)]
+    if not len(lengths) or np.abs(lengths - 1).max() <= _LENGTH_OFF:
+        return None
+    worst = float(lengths[np.abs(lengths - 1).argmax()])
+    return (
+        f"A tool quaternion in robot.csv has a length of {worst:.3g} instead of 1: tool_qw..qz "
+        "are a unit quaternion (w, x, y, z), not angles in degrees or radians. Convert them."
+    )
