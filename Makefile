@@ -114,13 +114,13 @@ moved: venv
 
 # How often intervals hold the truth: drawn cloths, recorded, fitted, and held against what was drawn; truths that fits do not
 # expect; and fresh recordings of the same cloths. The same for a posterior trained on simulated lifts of uncertain material,
-# as those cameras see them. Three hours on two cores; what is finished is kept.
+# as those cameras see them. Four hours on two cores; what is finished is kept.
 POSTERIOR := build/coverage-posterior
 COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --out build/coverage --workers 2
-DRAWN := --seed 16210837
+DRAWN := --seed 82037895
 coverage: venv
-	$(COVERAGE) $(DRAWN) --recordings 60 --fix mass
-	$(COVERAGE) $(DRAWN) --recordings 60
+	$(COVERAGE) $(DRAWN) --recordings 200 --fix mass
+	$(COVERAGE) $(DRAWN) --recordings 200
 	$(COVERAGE) --fix mass --scenario lift --scenario fold --seed 16567761 --recordings 16 --truth refined
 	$(COVERAGE) --fix mass --scenario lift --seed 48393309 --recordings 12 --truth finer
 	$(COVERAGE) --fix mass --scenario fold --seed 48393309 --recordings 8 --truth finer

@@ -86,7 +86,8 @@ def main() -> None:
         say("Error:", str(error), style="bold red")
         sys.exit(1)
     except SystemExit as ended:
-        if ended.code == 130:  # a Ctrl-C, of which typer has kept the status alone
+        # typer ends a command at a Ctrl-C without a word; what ends with this status by itself has said why
+        if isinstance(getattr(ended.__context__, "__cause__", None), KeyboardInterrupt):
             errors.print("Interrupted.")
         raise
     except KeyboardInterrupt as pressed:
