@@ -33,7 +33,7 @@ from diffcloud.hardware.installed import Check
 from diffcloud.hardware.kinova import KinovaArm
 from diffcloud.hardware.motion import plan_motion
 from diffcloud.hardware.realsense import RealSenseCamera
-from diffcloud.hardware.trajectory import check_rate
+from diffcloud.hardware.trajectory import check_control_rate
 from diffcloud.io.calibrations import read_calibration
 from diffcloud.io.raw_episodes import exists_already
 from diffcloud.sensing.robot import Robot, gen3
@@ -186,7 +186,7 @@ def record(
     plan = _plan(path, serials, arm, limits)
     if path is not None:
         check_trajectory(path, limits)
-        check_rate(rate_hz)
+        check_control_rate(rate_hz)
     if dry_run:
         errors.print("Dry run: nothing was opened, nothing moved.")
         finish({"dry_run": True, "plan": plan}, json)

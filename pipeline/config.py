@@ -257,8 +257,8 @@ class FitConfig(Section):
             raise ValueError("halvings: of solver gauss_newton, and not of the published measure; leave it out")
         if self.solver == "adam" and self.screen and not 2 <= (self.starts or 1) <= self.screen:
             raise ValueError(
-                f"screen: adam chooses its further starts from so many candidates, {self.screen} are given for "
-                f"{self.starts or 1} start(s); give 2 or more starts and at least as many candidates, or leave it out"
+                f"screen: of adam, candidates that its further starts are chosen from; got {self.screen} for "
+                f"{self.starts or 1} start(s). Give at least 2 starts and as many candidates or more, or leave it out"
             )
         if foreign := [name for name in self._solver_options() if self.solver not in _solvers_with(name)]:
             told = "; ".join(f"{name}: of solver {' or '.join(_solvers_with(name))}" for name in foreign)

@@ -134,9 +134,7 @@ def summary(cells: Sequence[Cell]) -> list[list[str]]:
 
 
 def _together(cells: Sequence[Cell], level: float) -> list[list[str]]:
-    """Rows under `TOGETHER_HEAD`, of fits whose truths are of one kind. The band is that of the binomial distribution."""
-    from scipy.stats import binom  # slow to import
-
+    """Rows under `TOGETHER_HEAD`, of fits whose truths are of one kind."""
     kinds: dict[str, list[dict[str, Any]]] = {"same": [], "refined": [], "finer": []}
     for (_, known, _), count in cells:
         kind = known.split()[-1]
@@ -147,10 +145,18 @@ def _together(cells: Sequence[Cell], level: float) -> list[list[str]]:
     for kind, counts in kinds.items():
         if counts:
             cases, covered = np.array([(count["n"], count["covered"]) for count in counts]).T
-            least, most = binom.interval(0.99, cases, level)
+            least, most = _band(cases, level)
             inside = f"{((least <= covered) & (covered <= most)).sum()} of {len(cases)}"
             rows.append([kind, str(len(cases)), str(cases.sum()), _share(covered.sum(), cases.sum()), inside])
     return rows
+
+
+def _band(cases: Any, level: float) -> tuple[Any, Any]:
+    """Least and most of so many cases, a number or an array, that hold the truth in 99 of 100 rows of such intervals."""
+    from scipy.stats import binom  # slow to import
+
+    least, most = binom.interval(0.99, cases, level)
+    return least, most
 
 
 def _sources(cells: Sequence[Cell]) -> list[list[str]]:
@@ -223,8 +229,6 @@ def coverage_page(counts: Counts) -> str:
     Raises:
         ConfigError: no records, or of several levels.
     """
-    from scipy.stats import binom  # slow to import
-
     levels = sorted({told["level"] for told in counts.values()})
     if len(levels) != 1:
         raise ConfigError(f"A page is of records of one level of intervals, got {', '.join(map(str, levels)) or 'none'}.")
@@ -254,10 +258,10 @@ def coverage_page(counts: Counts) -> str:
         "",
     ]
     if together := _together(cells, levels[0]):
-        least, most = binom.interval(0.99, 200, levels[0])
+        least, most = _band(200, levels[0])
         lines += [
-            f"All rows together, without those of networks. Were each interval to hold the truth in exactly {level}, "
-            f"99 of 100 rows would be in the band, which for 200 recordings goes from {least:.0f} to {most:.0f}.",
+            f"All rows of fits together. If each interval held the truth with a probability of exactly {level}, 99 of 100 "
+            f"rows would be in the band, which depends on the row's recordings: {least:.0f} to {most:.0f} of 200.",
             "",
             *markdown_table(TOGETHER_HEAD, together),
             "",

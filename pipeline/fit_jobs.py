@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 from diffcloud.errors import ConfigError, DivergedError
@@ -229,10 +229,11 @@ class FitJob:
             except KeyboardInterrupt:
                 interrupted = True
         names, pressed = [one.name for one in self.recordings], False
+        described = partial(describe_fit, objective, space, settings, fits[-1], episodes=names)
         try:
-            result = describe_fit(objective, space, settings, fits[-1], episodes=names)
+            result = described()
         except KeyboardInterrupt:  # a fit that may have taken minutes is not given away for the second that this takes
-            result, pressed = describe_fit(objective, space, settings, fits[-1], episodes=names), True
+            result, pressed = described(), True
         record = result.record
         record.halvings, record.finer_loss = self.halvings + fitted.halvings, fitted.finer_loss
         record.failures += failures

@@ -190,7 +190,9 @@ def _unpacked(bag: Path, folder: Path) -> Path:
         write_recording(folder, ros_recording(bag, description=partial(robot_description, None)))
         write_json(told, source)
     elif not told.is_file() or read_json(told) != source:
-        raise EpisodeError(f"{folder} was made of another {bag.name} than {bag} is now. Remove it to have it made anew.")
+        raise EpisodeError(
+            f"{folder} was made of another {bag.name} than {bag} is now. Remove {folder} to have it made anew."
+        )
     return folder
 
 

@@ -91,7 +91,9 @@ def _poses(jobs: list[PoseJob], workers: int, out: Path, recorded: EpisodesConfi
             output.print(page)
     finish({"out": str(out), "recordings": done}, json)
     if failures:
-        raise DiffCloudError(f"{len(failures)} of {len(jobs)} are missing there. {'; '.join(failures)}")
+        raise DiffCloudError(
+            f"{len(failures)} of {len(jobs)} recordings failed and are not on the page. {'; '.join(failures)}"
+        )
 
 
 @dataclass(frozen=True)

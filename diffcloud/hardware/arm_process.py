@@ -296,7 +296,7 @@ class _Service:
             self._attend()
         except Exception as error:  # whatever went wrong here, the arm must not go on
             reason = f"the process that holds it failed ({type(error).__name__}: {error})"
-            _shout(f"The arm is let go: {reason}.")
+            _shout(f"The arm is stopped and its connection closed: {reason}.")
         self._requests.put(None)
         if self._moving:
             self._halt(reason)

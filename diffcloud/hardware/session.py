@@ -27,7 +27,7 @@ from diffcloud.hardware.interruption import Interruption
 from diffcloud.hardware.motion import Motion, ToolFollower, go_to_start, run
 from diffcloud.hardware.recorders import Clock, Recorders
 from diffcloud.hardware.settings import CaptureSettings
-from diffcloud.hardware.trajectory import Limits, ToolTrajectory, check_rate, check_trajectory
+from diffcloud.hardware.trajectory import Limits, ToolTrajectory, check_control_rate, check_trajectory
 from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter, exists_already
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def capture(
         raise exists_already(folder)
     if trajectory is not None:
         check_trajectory(trajectory, limits)
-        check_rate(settings.rate_hz, settings.gain)
+        check_control_rate(settings.rate_hz, settings.gain)
     import_module("cv2")  # encodes the images; imported at the first of them it would hold the control loop up
     opened: list[Camera] = []
     try:

@@ -151,7 +151,7 @@ def check_trajectory(trajectory: ToolTrajectory, limits: Limits) -> None:
         )
 
 
-def check_rate(rate_hz: float, gain: float = DEFAULT_GAIN) -> None:
+def check_control_rate(rate_hz: float, gain: float = DEFAULT_GAIN) -> None:
     """Refuse a control rate at which the correction of an error is larger than twice the error.
 
     Raises:
@@ -180,7 +180,7 @@ class VelocityController:
     """Closed loop: positions in, velocities out, one call per tick."""
 
     def __init__(self, trajectory: ToolTrajectory, limits: Limits, *, period_s: float, gain: float = DEFAULT_GAIN) -> None:
-        check_rate(1 / period_s, gain)
+        check_control_rate(1 / period_s, gain)
         self._trajectory, self._limits, self._period, self._gain = trajectory, limits, period_s, gain
         self._last = np.zeros(3)
 

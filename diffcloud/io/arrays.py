@@ -96,8 +96,7 @@ def _array(stream: BinaryIO, size: int, name: str) -> NDArray[Any]:
         shape, fortran, dtype = npy_header(stream)
     except ValueError as damage:
         raise ValueError(f"{name} has no header of an array ({damage})") from damage
-    # numpy takes memory for elements without any, as text of no letters has, which the file need not have
-    if dtype.hasobject or dtype.kind not in ELEMENTS or not dtype.itemsize:
+    if not readable(dtype):
         raise ValueError(f"{name} holds {dtype} elements, which may be numbers, or text of a letter or more")
     there = size - stream.tell()
     if len(shape) > MOST_DIMENSIONS or any(extent < 0 for extent in shape):
@@ -113,6 +112,12 @@ def _array(stream: BinaryIO, size: int, name: str) -> NDArray[Any]:
             raise ValueError(f"{name} ends after {done} of {there} bytes")
         done += got
     return flat.reshape(shape, order="F" if fortran else "C")
+
+
+def readable(dtype: np.dtype[Any]) -> bool:
+    """Whether elements are numbers, or text of a letter or more: a small file may state any number of elements without
+    bytes, and numpy takes memory for each."""
+    return not dtype.hasobject and dtype.kind in ELEMENTS and dtype.itemsize > 0
 
 
 def npy_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:

@@ -20,7 +20,7 @@ from diffcloud.io.camera_models import Intrinsics, IntrinsicsFile, Pixels
 from diffcloud.io.files import numbered_files, read_json
 from diffcloud.io.images import decode_color, read_depth
 from diffcloud.io.raw_episodes import CameraFile, CameraInfo, Name, first_backwards, read_timestamps
-from diffcloud.io.recordings import RecordedFrame, Recording, check_rate
+from diffcloud.io.recordings import RecordedFrame, Recording, check_frame_rate
 from diffcloud.io.schema import Component, explain
 
 _IMAGES = (".png", ".jpg", ".jpeg")
@@ -121,7 +121,7 @@ def _times(folder: Path, numbers: list[int], rate_hz: float | None) -> dict[int,
         return known
     if rate_hz is None:
         raise EpisodeError(f"{folder} has no timestamps.csv; give the frame rate with --rate-hz.")
-    check_rate(rate_hz)
+    check_frame_rate(rate_hz)
     return {number: (number - numbers[0]) / rate_hz for number in numbers}
 
 

@@ -28,7 +28,7 @@ def write_depth(path: Path, depth: NDArray[np.uint16], *, durable: bool = False)
 
     Raises:
         EpisodeError: not uint16 [H, W].
-        DiffCloudError: the system refused the write (a full disk).
+        OutputError: the system refused the write (a full disk).
     """
     if depth.dtype != np.uint16 or depth.ndim != 2:
         raise EpisodeError(f"Depth must be uint16 [rows, columns], got {depth.dtype} {list(depth.shape)}.")
@@ -40,7 +40,7 @@ def write_color(path: Path, color: NDArray[np.uint8], *, durable: bool = False) 
 
     Raises:
         EpisodeError: not uint8 [H, W, 3].
-        DiffCloudError: the system refused the write (a full disk).
+        OutputError: the system refused the write (a full disk).
     """
     if color.dtype != np.uint8 or color.ndim != 3 or color.shape[2] != 3:
         raise EpisodeError(f"Colour must be uint8 [rows, columns, 3], got {color.dtype} {list(color.shape)}.")

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
-from diffcloud.io.arrays import ELEMENTS, MOST_DIMENSIONS, npy_header
+from diffcloud.io.arrays import ELEMENTS, MOST_DIMENSIONS, npy_header, readable
 
 _LARGEST_BYTES = 256 * 2**20
 _LARGEST_PICKLE_BYTES = 4 * 2**20
@@ -75,8 +75,7 @@ class _Call:
 def _array(kind: np.dtype[Any], shape: Any, fortran: bool, content: bytes) -> NDArray[Any]:
     """An array of its own memory, if the content is exactly as long as it must be."""
     whole = isinstance(shape, tuple) and all(isinstance(length, int) and length >= 0 for length in shape)
-    # numpy takes memory for elements without any, as text of no letters has, which the file need not have
-    if not whole or len(shape) > MOST_DIMENSIONS or kind.kind not in ELEMENTS or not kind.itemsize:
+    if not whole or len(shape) > MOST_DIMENSIONS or not readable(kind):
         raise _Refused(
             f"holds an array of {kind} and shape {shape}; only numbers and strings are read, in at most {MOST_DIMENSIONS} "
             "dimensions"

@@ -29,7 +29,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from diffcloud.errors import DiffCloudError, EpisodeError
+from diffcloud.errors import DiffCloudError, EpisodeError, OutputError
 from diffcloud.io.camera_models import Intrinsics, IntrinsicsFile, RigidTransform
 from diffcloud.io.files import read_json, write_json
 from diffcloud.io.images import read_color, read_depth, write_color, write_depth
@@ -423,7 +423,7 @@ class RawEpisodeWriter:
 
     Raises:
         EpisodeError: the folder exists, or a name is no plain folder name.
-        DiffCloudError: the system refused a write (a full disk); says how many frames are kept.
+        OutputError: the system refused a write (a full disk); says how many frames are kept.
     """
 
     def __init__(
@@ -450,7 +450,7 @@ class RawEpisodeWriter:
         except FileExistsError as error:
             raise exists_already(folder) from error
         except OSError as error:
-            raise DiffCloudError(f"Cannot write {folder}: {error.strerror}.") from error
+            raise OutputError(f"Cannot write {folder}: {error.strerror}.") from error
         self._description: dict[str, Any] = {
             "schema_version": SCHEMA_VERSION,
             **(meta or {}),
@@ -559,7 +559,7 @@ class _CameraFiles:
                     _sync(self._folder)  # where the folders of images are new
             self.rows.append([self.count, t_s])
         except (OSError, DiffCloudError) as error:
-            raise DiffCloudError(
+            raise OutputError(
                 f"Frame {self.count} of camera {self._folder.name} could not be written: {str(error).rstrip('.')}. The "
                 f"{self.count} frames before it are kept."
             ) from error
@@ -576,7 +576,7 @@ class _Rows:
             # unbuffered: what a full disk refuses must not come back when the file is closed
             self._stream = path.open("xb", buffering=0)
         except OSError as error:
-            raise DiffCloudError(f"Cannot write {path}: {error.strerror}.") from error
+            raise OutputError(f"Cannot write {path}: {error.strerror}.") from error
         self._write(",".join(columns))
 
     def append(self, *rows: Sequence[float]) -> None:
@@ -593,7 +593,7 @@ class _Rows:
             if self._durable:
                 os.fsync(self._stream.fileno())
         except OSError as error:
-            raise DiffCloudError(f"Cannot write {self._path}: {error.strerror}.") from error
+            raise OutputError(f"Cannot write {self._path}: {error.strerror}.") from error
 
 
 def _sync(*paths: Path) -> None:
@@ -606,7 +606,7 @@ def _sync(*paths: Path) -> None:
             finally:
                 os.close(handle)
         except OSError as error:
-            raise DiffCloudError(f"Cannot write {path}: {error.strerror}.") from error
+            raise OutputError(f"Cannot write {path}: {error.strerror}.") from error
 
 
 def _plain(name: str) -> bool:

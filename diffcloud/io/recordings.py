@@ -69,7 +69,7 @@ def write_recording(
     Raises:
         EpisodeError: no frame at all, one that does not come after the camera's frame before it, or a rate that is none.
     """
-    check_rate(rate_hz)
+    check_frame_rate(rate_hz)
     frames = iter(recording.frames)
     first = next(frames, None)
     if first is None:
@@ -81,7 +81,7 @@ def write_recording(
         return _written(temporary, recording, chain([first], frames), start, rate_hz, meta)
 
 
-def check_rate(rate_hz: float | None) -> None:
+def check_frame_rate(rate_hz: float | None) -> None:
     """
     Raises:
         EpisodeError: no camera has it.

@@ -5,7 +5,7 @@ Kernels simulate one cloth at a time; here they are given batches, over threads,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -184,18 +184,13 @@ def _inputs(system: System, steps: int, properties: Properties, state: State, tr
             f"{list(track.shape)}."
         )
     nodes = (len(system.mesh.nodes), 3)
-    # kernels do not look where arrays end
-    _check_shapes({"positions": (positions, nodes), "velocities": (velocities, nodes)})
-    _check_shapes({"bodies": (poses, system.bodies.start.shape)})
-    own = zip(fields(properties), properties.tensors(), system.properties.tensors(), strict=True)
-    _check_shapes({field.name: (tensor, like.shape[1:]) for field, tensor, like in own})
-    return [positions, velocities, poses, track, *properties.tensors()]
-
-
-def _check_shapes(given: Mapping[str, tuple[Tensor, Sequence[int]]]) -> None:
-    for name, (tensor, shape) in given.items():
-        if tuple(tensor.shape[1:]) != tuple(shape):
+    expected = {"positions": nodes, "velocities": nodes, "bodies": system.bodies.start.shape}
+    expected |= {field.name: getattr(system.properties, field.name).shape[1:] for field in fields(properties)}
+    given = [positions, velocities, poses, *properties.tensors()]
+    for (name, shape), tensor in zip(expected.items(), given, strict=True):
+        if tuple(tensor.shape[1:]) != tuple(shape):  # kernels do not look where arrays end
             raise SceneError(f"{name} has shape [batch, {', '.join(map(str, shape))}] here, got {list(tensor.shape)}.")
+    return [positions, velocities, poses, track, *properties.tensors()]
 
 
 def _packed(state: State) -> tuple[Tensor, Tensor, Tensor | None]:
