@@ -63,9 +63,7 @@ def calibrate(
     picture: Annotated[Path | None, typer.Option(help="PNG of detected and reprojected corners.")] = None,
     serial: Annotated[list[str] | None, typer.Option(help="checkerboard: NAME=SERIAL; the name if not given.")] = None,
     size: Annotated[str, typer.Option(help="checkerboard: size of the images.")] = "640x480",
-    force: Annotated[
-        bool, typer.Option("--force", help="Write it whatever speaks against it; the file will say so.")
-    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Write the file despite objections; it will list them.")] = False,
     json: JsonFlag = False,
 ) -> None:
     """Calibrate all cameras of a set-up into one file."""

@@ -71,9 +71,12 @@ def make_camera(
     return RealSenseCamera(name, serial, record_to=record_to, warm_up=options["fps"] // 2, settings=settings, **options)
 
 
+_BOX = ",".join(f"{value:g}" for value in (*Limits.box_low_m, *Limits.box_high_m))
+
+
 def record(
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the episode, such as raw/episodes/lift_tan1; must not exist.")
+        Path | None, typer.Option(help="Folder of the episode, such as raw/episodes/lift/tan1; must not exist.")
     ] = None,
     camera: Annotated[list[str] | None, typer.Option(help="NAME=SERIAL; one or more.")] = None,
     trajectory: Annotated[
@@ -107,7 +110,9 @@ def record(
         bool, typer.Option("--auto-exposure", help="Do not hold exposure, gain and white balance while recording.")
     ] = False,
     calibration: Annotated[Path | None, typer.Option(help="Calibration file; its poses go into camera.json.")] = None,
-    box: Annotated[str | None, typer.Option(help="Workspace: x0,y0,z0,x1,y1,z1 in metres.")] = None,
+    box: Annotated[
+        str | None, typer.Option(help=f"Workspace: x0,y0,z0,x1,y1,z1 in metres, in the base frame; {_BOX} if not given.")
+    ] = None,
     speed: Annotated[float, typer.Option(help="Limit of the tool's speed, m/s.")] = Limits.speed_m_s,
     acceleration: Annotated[float, typer.Option(help="Limit of its acceleration, m/s².")] = Limits.acceleration_m_s2,
     force: Annotated[float, typer.Option(help="Limit of the change of the force at the tool, N.")] = Limits.force_N,
@@ -156,8 +161,17 @@ def record(
     if not rate_hz > 0:
         raise ConfigError(f"--rate is in Hz, above 0, got {rate_hz:g}.")
     options: dict[str, Any] = {"width": width, "height": height, "fps": fps}
-    if camera_driver is not None and (preset, laser, master, auto_exposure) != (None, None, None, False):
-        raise ConfigError("--preset, --laser, --master and --auto-exposure are settings of RealSense cameras.")
+    if camera_driver is not None and (preset, laser, master, auto_exposure, keep_recording) != (
+        None,
+        None,
+        None,
+        False,
+        False,
+    ):
+        raise ConfigError(
+            "--preset, --laser, --master, --auto-exposure and --keep-recording are for RealSense cameras, without "
+            "--camera-driver."
+        )
     if master is not None and master not in serials:
         raise ConfigError(unknown_name("--master", master, serials))
 

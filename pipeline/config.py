@@ -143,7 +143,8 @@ class PreprocessConfig(Section):
     crop_m: tuple[Point, Point] | None = None
     """Lowest and highest corner of a box in the scene's frame."""
     outlier_neighbours: CountOrNone = 20
-    outlier_deviations: Positive = 2.5
+    outlier_deviations: Positive = 5.0
+    """A merged cloud is of uneven density: 2.5, the paper's, takes thin parts of the cloth."""
     radius_m: Positive | None = None
     """Points with fewer than `radius_neighbours` others within it are outliers too; in the scene's unit."""
     radius_neighbours: Count = 4

@@ -258,10 +258,11 @@ def coverage_page(counts: Counts) -> str:
         "",
     ]
     if together := _together(cells, levels[0]):
-        least, most = _band(200, levels[0])
+        usual = int(np.median([count["n"] for _, count in cells]))
+        least, most = _band(usual, levels[0])
         lines += [
             f"All rows of fits together. If each interval held the truth with a probability of exactly {level}, 99 of 100 "
-            f"rows would be in the band, which depends on the row's recordings: {least:.0f} to {most:.0f} of 200.",
+            f"rows would be in the band, which depends on the row's recordings: {least:.0f} to {most:.0f} of {usual}.",
             "",
             *markdown_table(TOGETHER_HEAD, together),
             "",

@@ -233,7 +233,7 @@ def write_evaluation(
         write_json(out / "tables" / "comparison.json", whole)
         write_json(out / "timings.json", {"fit_seconds": seconds, "methods": by_episode})
         if markdown is not None:
-            write_text(markdown, comparison_page(told, comparison.missing))
+            write_text(markdown, comparison_page(told, comparison.missing, config.report.title))
         write_json(out / "metrics.json", metrics)
     for table in printed(told):
         show(table, as_json)

@@ -163,7 +163,9 @@ def _read(path: Path, name: str, out: Path) -> Episode:
     if path.is_file():
         episode = read_episode(path)
     elif (path / "episode.json").is_file():
-        PreprocessJob("episodes", path.resolve(), out, Config().preprocess, None).run(lambda done, text: None)
+        job = PreprocessJob("episodes", path.resolve(), out, Config().preprocess, None)
+        if (doubt := job.run(lambda done, text: None).doubt) is not None:
+            warn(f"{name}: {doubt}")
         return read_episode(kept)
     else:
         track = path / "gripper.csv"

@@ -1,4 +1,4 @@
-"""`diffcloud import`: recordings of others become episodes."""
+"""`diffcloud import`: existing recordings become episodes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from pipeline.console import JsonFlag, errors, finish, warn, writes
 
 _FARTHEST_M = 50.0
 """From the robot's base: no cloth hangs there."""
-app = typer.Typer(no_args_is_help=True, help="Turn recordings of others into episodes.")
+app = typer.Typer(no_args_is_help=True, help="Turn existing recordings into episodes.")
 
 
 @app.command()
@@ -72,15 +72,16 @@ def clouds(
     gripper: Annotated[
         list[str] | None,
         typer.Option(
-            help="CSV with x, y, z [m] and optionally t_s, one row a frame. Of several grippers: one with a column gripper "
-            "that names them, or NAME=PATH, repeated."
+            help="CSV with x, y, z in metres and optionally t_s, one row a frame. Of several grippers: one with a column "
+            "gripper that names them, or NAME=PATH, repeated."
         ),
     ] = None,
     rate_hz: Annotated[float | None, typer.Option(help="Frame rate, if the CSV has no t_s.")] = None,
     camera: Annotated[
         list[str] | None,
         typer.Option(
-            help="NAME=X,Y,Z [m] in the frame of the clouds, for every camera: fits leave out what none of them could see."
+            help="NAME=X,Y,Z in metres, in the frame of the clouds, for every camera: fits leave out what none of them "
+            "could see."
         ),
     ] = None,
     scenario: Annotated[str | None, typer.Option(help="Name kept in the episode's metadata.")] = None,
@@ -103,6 +104,7 @@ def clouds(
 
 
 @app.command()
+@writes()
 def recording(
     source: Annotated[
         list[Path],
@@ -123,8 +125,9 @@ def recording(
     gripper_joint: Annotated[
         str, typer.Option(help="ROS: in joint_states; none for an arm without gripper.")
     ] = GRIPPER_JOINT,
+    gripper_open: Annotated[float, typer.Option(help="ROS: its position when open, rad or m.")] = 0.0,
     gripper_closed: Annotated[
-        float | None, typer.Option(help=f"ROS: its angle when closed, rad; {GRIPPER_CLOSED_RAD} if not given.")
+        float | None, typer.Option(help=f"ROS: its position when closed, rad or m; {GRIPPER_CLOSED_RAD} if not given.")
     ] = None,
     urdf: Annotated[
         Path | None,
@@ -136,7 +139,7 @@ def recording(
     fabric: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Import depth recordings of others as a raw episode. Check it with `diffcloud episode validate`."""
+    """Import existing depth recordings as a raw episode. Check it with `diffcloud episode validate`."""
     named = _named(source)
     kinds = {recording_kind(path) for path in named.values()}
     if len(kinds) > 1:
@@ -149,7 +152,8 @@ def recording(
                 tool_frame=tool_frame,
                 joint_names=joint or None,
                 gripper_joint=None if gripper_joint == "none" else gripper_joint,
-                gripper_closed_rad=gripper_closed,
+                gripper_open=gripper_open,
+                gripper_closed=gripper_closed,
                 description=partial(robot_description, urdf),
             )
         elif kinds == {"realsense"}:

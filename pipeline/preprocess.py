@@ -22,8 +22,9 @@ from diffcloud.sensing.fusion import Seen, fuse
 from diffcloud.sensing.masking import RobotMask
 from diffcloud.sensing.pictures import cloud_picture, mask_picture
 from diffcloud.sensing.robot import Robot, gen3
+from diffcloud.sensing.tool_poses import turning
 from pipeline.config import PreprocessConfig, RawConfig, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, episode_files, errors, finish, writes
+from pipeline.console import JsonFlag, ParamsFile, episode_files, errors, finish, warn, writes
 from pipeline.workers import Tell, run_all
 
 
@@ -41,7 +42,7 @@ def preprocess(
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
-    """Raw episodes: depth to points, robot and table out, views merged. Then all: crop, remove outliers, thin."""
+    """Raw episodes: depth to points, robot and table out, views merged. All episodes: crop, remove outliers, thin."""
     config = load_config(params)
     raw = updated(config.preprocess.raw, robot=None if urdf is None else str(urdf))
     settings = updated(config.preprocess, raw=raw, workers=workers)
@@ -54,15 +55,27 @@ def preprocess(
     jobs = [PreprocessJob(scenario, path, out, settings, calibrated) for scenario, path in sources]
     kept: dict[str, Any] = {}
     failures: list[str] = []
-    for job, counts, error in run_all("preprocess", jobs, settings.workers):
+    for job, done, error in run_all("preprocess", jobs, settings.workers):
         if error is None:
-            kept[f"{job.scenario}/{job.name}"] = counts
+            kept[f"{job.scenario}/{job.name}"] = done.points
+            if done.doubt is not None:
+                warn(f"{job.label}: {done.doubt}")
         else:
             failures.append(error)
     errors.print(f"Cleaned {len(kept)} episodes into {out}.")
     finish({"out": str(out), "points": kept}, json)
     if failures:
         raise EpisodeError("\n".join(failures))
+
+
+@dataclass(frozen=True)
+class Cleaned:
+    """What became of an episode."""
+
+    points: dict[str, list[int]]
+    """Per frame, recorded and kept."""
+    doubt: str | None
+    """About the gripper's track."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +97,8 @@ class PreprocessJob:
     def label(self) -> str:
         return self.path.name
 
-    def run(self, tell: Tell) -> dict[str, list[int]]:
-        """Write the clean episode, with pictures of a raw one; points per frame, recorded and kept.
+    def run(self, tell: Tell) -> Cleaned:
+        """Write the clean episode, with pictures of a raw one.
 
         Raises:
             EpisodeError: a damaged episode, or one of which nothing is left.
@@ -111,7 +124,9 @@ class PreprocessJob:
             if pictures is not None:
                 pictures.write(self.out / self.scenario, self.name, episode)
             write_episode(self.out / self.scenario / f"{self.name}.npz", episode)
-        return {key: episode.meta["quality"][key] for key in ("recorded", "kept")}
+        log = None if pictures is None else pictures.raw.robot
+        turned = None if log is None else turning(log.tool_quaternion)
+        return Cleaned({key: episode.meta["quality"][key] for key in ("recorded", "kept")}, turned)
 
 
 def _sources(recorded: Path, scenarios: list[str]) -> list[tuple[str, Path]]:
@@ -148,6 +163,7 @@ def _scenario(raw: Path) -> str:
 
 
 def _stem(path: Path) -> str:
+    path = path.resolve()  # of "." too
     return path.name if path.is_dir() else path.stem
 
 

@@ -174,7 +174,7 @@ def pose_page(rows: Sequence[Sequence[str]], recordings: Sequence[dict[str, Any]
     late = [abs(one["log_late_ms"] - 1e3 * recorded.lag_s) for one in recordings]
     (together, turned), (apart, twisted), (beside, yaw) = recorded.cameras_moved, recorded.extrinsic_error, recorded.beside
     lines = [
-        "# Recordings whose cameras and cloth are not where they are said to be",
+        f"# Cameras moved {'together' if together else 'apart'}, cloth beside its place",
         "",
         f"Synthetic raw recordings (`make moved`). The cameras' stated places are off by {together:g} mm and {turned:g}° "
         f"together, the second camera's by {apart:g} mm and {twisted:g}° more; cloth and gripper are shifted by {beside:g} "

@@ -20,7 +20,7 @@ _INTERRUPTED = 130
 
 @writes()
 def simulate(
-    out: Annotated[Path, typer.Option(help="Folder of the set; an interrupted call is taken up again from OUT.partial.")],
+    out: Annotated[Path, typer.Option(help="Folder of the set; an interrupted run resumes from OUT.partial.")],
     scenario: ScenarioName = None,
     scene: SceneFile = None,
     params: ParamsFile = None,

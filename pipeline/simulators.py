@@ -213,8 +213,8 @@ def _separated(pairs: Sequence[Pair], third: Sequence[Pair], separate: Sequence[
         "",
         *markdown_table(["changed", *head], changes),
         "",
-        "What cannot be changed from outside a third opinion tells: explicit steps of 0.1 ms, their forces written anew in "
-        "NumPy, with this simulator's table, and with the choices of the one or the other.",
+        "A third implementation shows the effect of what cannot be changed from outside: explicit steps of 0.1 ms, their "
+        "forces written anew in NumPy, with this simulator's table, and with the choices of the one or the other.",
         "",
         *markdown_table(["third opinion", "against", *head], opinion),
         "",

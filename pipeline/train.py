@@ -42,7 +42,9 @@ def train(
             help="Folder; <model>.safetensors, and <model>/ of curves and errors, without a scenario in <scenario>/."
         ),
     ],
-    scenario: Annotated[str | None, typer.Option(help="That was simulated. Default: all of train.scenarios.")] = None,
+    scenario: Annotated[
+        str | None, typer.Option(help="Scenario of the simulated set. Default: all of train.scenarios.")
+    ] = None,
     model: Annotated[
         list[str] | None,
         typer.Option(help="mlp, pointnet2, meteornet, or posterior (an extra); repeatable. Default: the first three."),

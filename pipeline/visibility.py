@@ -24,7 +24,7 @@ def visibility(
     linear: Annotated[bool, typer.Option(help="Linear instead of logarithmic spacing.")] = False,
     json: JsonFlag = False,
 ) -> None:
-    """Map of stretch x mass: RMS node distance [mm] between neighbours at the loss frame, or over a recorded motion."""
+    """Map of stretch x mass: RMS node distance in mm between neighbours at the loss frame, or over a recorded motion."""
     chosen = choose_scenario(scenario, scene)
     recorded = None if episode is None else read_episode(episode)
     found = visibility_map(chosen, episode=recorded, size=size, linear=linear)

@@ -10,14 +10,14 @@ from diffcloud.evaluation.methods import PHASES
 from diffcloud.evaluation.summary import Tables, label, sentences
 
 
-def comparison_page(told: Tables, missing: Sequence[str]) -> str:
+def comparison_page(told: Tables, missing: Sequence[str], title: str) -> str:
     """Sentences first, then tables: losses per episode, means per method, seconds, intervals, repeats.
 
     Args:
         told: of `summary.tables`.
         missing: what should be there and is not.
     """
-    parts = ["# Comparison of methods", "", *(f"- {line}" for lines in sentences(told).values() for line in lines), ""]
+    parts = [f"# {title}", "", *(f"- {line}" for lines in sentences(told).values() for line in lines), ""]
     parts += [
         "## Loss per episode",
         "",

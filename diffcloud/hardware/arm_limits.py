@@ -11,6 +11,7 @@ joints and the description put it. That shows a wrong tool frame, a wrong descri
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -104,7 +105,8 @@ class ArmChecker:
         limits: of the tool; the workspace box is also the core of the space that the links may use.
 
     Raises:
-        LimitError: the description has no surfaces of links that move.
+        LimitError: the description has no surfaces of links that move, or a joint of the arm without limits that is not
+            one that turns without end.
     """
 
     def __init__(self, robot: Robot, limits: Limits, arm_limits: ArmLimits) -> None:
@@ -115,6 +117,12 @@ class ArmChecker:
                 "against table and box. Give a URDF whose links have visual or collision meshes, with --urdf."
             )
         joints = [robot.moving[index] for index in robot.arm]
+        unlimited = [joint.name for joint in joints if joint.kind != "continuous" and not math.isfinite(joint.lower)]
+        if unlimited:
+            raise LimitError(
+                f"The description {robot.description.name} states no limits of {', '.join(unlimited)}, so that nothing can "
+                "keep them from their ends. Add <limit lower= upper=>, or make a joint that turns without end continuous."
+            )
         self._ends = np.array([[joint.lower, joint.upper] for joint in joints])
         low, high = np.array(limits.box_low_m), np.array(limits.box_high_m)
         margin = arm_limits.margin_m
@@ -325,10 +333,10 @@ class ArmChecker:
             )
 
     def _nearest(self, target_rad: Floats, joints_rad: Floats) -> Floats:
-        """The target's turns that are nearest, for joints that turn without end; others within their range."""
-        endless = ~np.isfinite(self._ends).any(axis=1)
-        centre = np.where(endless, joints_rad, 0.0)
-        return centre + (target_rad - centre + np.pi) % (2 * np.pi) - np.pi
+        """[J] of all whole turns of each joint's target within its ends, the nearest; the lowest above where none is."""
+        low, high = (self._ends - target_rad[:, None]).T / (2 * np.pi)
+        turns = np.round((joints_rad - target_rad) / (2 * np.pi))
+        return np.asarray(target_rad + 2 * np.pi * np.maximum(np.minimum(turns, np.floor(high)), np.ceil(low)))
 
     def _points(self, joints_rad: Floats, gripper: Floats) -> dict[str, Floats]:
         """[T, V, 3] corners of each link that moves [m]."""

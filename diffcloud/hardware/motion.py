@@ -215,17 +215,18 @@ def plan_motion(
 
 
 def _set_gripper(motion: Motion, position: float) -> None:
-    """Set it, and wait until it has arrived or stands still."""
+    """Set it, and wait until it has arrived or stands still; as long as it may take, where the arm does not say."""
     motion.arm.set_gripper(position)
     last, still = np.nan, 0
     end = time.monotonic() + _GRIPPER_WAIT_S
     while time.monotonic() < end and still < _GRIPPER_STILL:
         motion.check()
         value = motion.arm.read().gripper
-        if value is None or abs(value - position) < 0.02:
-            return
-        still = still + 1 if abs(value - last) < 0.005 else 0
-        last = value
+        if value is not None:
+            if abs(value - position) < 0.02:
+                return
+            still = still + 1 if abs(value - last) < 0.005 else 0
+            last = value
         time.sleep(1 / _LOG_RATE_HZ)
 
 

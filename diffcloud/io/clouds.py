@@ -5,6 +5,7 @@ PLY goes through trimesh and PCD through open3d, which is imported only when a P
 
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from diffcloud.io.libusb import load_libusb
 from diffcloud.io.pickles import load_npy
 
 FORMATS = (".npy", ".ply", ".xyz", ".pcd")
-_PCD_HEADER = 65_536
+_HEADER = 65_536
 """[B] A longer one is none."""
 
 
@@ -63,7 +64,12 @@ def _read_ply(path: Path) -> NDArray[Any]:
         loaded = trimesh.load(path, process=False)
     except Exception as error:  # trimesh raises many kinds on damaged files
         raise EpisodeError(f"{path} is not a readable PLY file: {error}.") from error
-    return np.asarray(getattr(loaded, "vertices", np.zeros((0, 3))))
+    found = np.asarray(getattr(loaded, "vertices", np.zeros((0, 3))))
+    with path.open("rb") as stream:  # of text that was cut off at a line's end trimesh takes what is there
+        stated = re.search(rb"^element vertex (\d+)\s*$", stream.read(_HEADER), re.MULTILINE)
+    if stated is not None and int(stated[1]) != len(found):
+        raise EpisodeError(f"{path} states {int(stated[1])} points and holds {len(found)}: it was cut off.")
+    return found
 
 
 def _read_xyz(path: Path) -> NDArray[Any]:
@@ -92,7 +98,7 @@ def _check_pcd(path: Path) -> None:
     """
     with path.open("rb") as stream:
         head: dict[str, list[str]] = {}
-        while "DATA" not in head and stream.tell() < _PCD_HEADER and (line := stream.readline(_PCD_HEADER)):
+        while "DATA" not in head and stream.tell() < _HEADER and (line := stream.readline(_HEADER)):
             name, *words = [*line.decode("ascii", errors="replace").split(), ""]
             head[name.upper()] = words[:-1]
         try:

@@ -17,8 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.camera_models import Intrinsics, IntrinsicsFile, Pixels
-from diffcloud.io.files import numbered_files, read_json
-from diffcloud.io.images import decode_color, read_depth
+from diffcloud.io.files import files_in, numbered_files, read_json
+from diffcloud.io.images import read_color, read_depth
 from diffcloud.io.raw_episodes import CameraFile, CameraInfo, Name, first_backwards, read_timestamps
 from diffcloud.io.recordings import RecordedFrame, Recording, check_frame_rate
 from diffcloud.io.schema import Component, explain
@@ -44,15 +44,16 @@ def depth_folders(folders: Mapping[str, Path], *, rate_hz: float | None = None) 
     order = sorted((times[name][number], name, number) for name in folders for number in images[name])
 
     colors = {name: _colors(Path(folder)) for name, folder in folders.items()}
+    warnings = [*_unaligned_colors(cameras, colors), *_lost_colors(images, colors)]
 
     def frames() -> Iterator[RecordedFrame]:
         for t, name, number in order:
             path = colors[name].get(number)
-            color = None if path is None else decode_color(path.read_bytes(), str(path))
+            color = None if path is None else read_color(path)
             yield RecordedFrame(name, t, read_depth(images[name][number]), color)
 
     source = f"depth images {', '.join(Path(folder).name for folder in folders.values())}"
-    return Recording(cameras, frames(), source, warnings=tuple(_lost_colors(images, colors)))
+    return Recording(cameras, frames(), source, warnings=tuple(warnings))
 
 
 def _camera(folder: Path, name: str) -> CameraInfo:
@@ -126,7 +127,22 @@ def _times(folder: Path, numbers: list[int], rate_hz: float | None) -> dict[int,
 
 
 def _colors(folder: Path) -> dict[int, Path]:
-    return numbered_files(folder / "color", _IMAGES, kind="images") if (folder / "color").is_dir() else {}
+    """Number -> image; some, or all, may be missing."""
+    held = files_in(folder / "color", *_IMAGES) if (folder / "color").is_dir() else []
+    return numbered_files(folder / "color", _IMAGES, kind="images", gaps=True) if held else {}
+
+
+def _unaligned_colors(cameras: Mapping[str, CameraInfo], colors: dict[str, dict[int, Path]]) -> Iterator[str]:
+    """Leaves out colour images of another size than depth, by the first of each camera."""
+    for name, images in colors.items():
+        size = (cameras[name].intrinsics.height, cameras[name].intrinsics.width)
+        own = next((read_color(path).shape[:2] for path in images.values()), size)
+        if own != size:
+            images.clear()
+            yield (
+                f"Camera {name}: colour is left out, as it is not aligned to depth: it has {own[1]} x {own[0]} pixels, "
+                f"depth {size[1]} x {size[0]}."
+            )
 
 
 def _lost_colors(images: Mapping[str, dict[int, Path]], colors: Mapping[str, dict[int, Path]]) -> Iterator[str]:

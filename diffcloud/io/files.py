@@ -325,11 +325,12 @@ def files_in(folder: Path, *suffixes: str) -> list[Path]:
     )
 
 
-def numbered_files(folder: Path, formats: tuple[str, ...], *, kind: str) -> dict[int, Path]:
-    """Data files whose names end in numbers without a gap, by number.
+def numbered_files(folder: Path, formats: tuple[str, ...], *, kind: str, gaps: bool = False) -> dict[int, Path]:
+    """Data files whose names end in numbers, by number.
 
     Args:
         kind: of file, for messages, such as "clouds".
+        gaps: whether numbers may be missing.
 
     Raises:
         EpisodeError: no such folder or file, two files of one number, numbers that are missing, or that are times.
@@ -348,14 +349,18 @@ def numbered_files(folder: Path, formats: tuple[str, ...], *, kind: str) -> dict
     if not found:
         raise EpisodeError(f"{folder} holds no numbered {kind} ({', '.join(formats)}), such as 000{formats[0]}.")
     numbers = sorted(found)
-    gaps = [(before, after) for before, after in pairwise(numbers) if after > before + 1]  # not each number in them
+    missing_between = [
+        (before, after) for before, after in pairwise(numbers) if after > before + 1
+    ]  # not each number in them
     if numbers[-1] > _MOST_FRAMES:
         raise EpisodeError(
             f"{folder}: its files end in numbers such as {numbers[0]} and {numbers[-1]}, which are times and not frames. "
             "Number them in order from 0, and give the times by --rate-hz or in a CSV with t_s."
         )
-    if gaps:
-        missing = [number for before, after in gaps[:10] for number in range(before + 1, min(after, before + 11))][:10]
+    if missing_between and not gaps:
+        missing = [
+            number for before, after in missing_between[:10] for number in range(before + 1, min(after, before + 11))
+        ][:10]
         raise EpisodeError(
             f"{folder}: frames {missing} are missing between {numbers[0]} and {numbers[-1]}; renumber or record again."
         )

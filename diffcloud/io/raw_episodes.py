@@ -544,8 +544,12 @@ class _CameraFiles:
             _sync(folder / "camera.json", folder)
 
     def add(self, t_s: float, depth: NDArray[np.uint16], color: NDArray[np.uint8] | None) -> None:
-        if depth.shape != self._shape or (color is not None and color.shape[:2] != self._shape):
-            raise EpisodeError(f"{self._folder.name}: an image of {list(depth.shape)} where {list(self._shape)} is stated.")
+        for kind, image in (("depth", depth), ("colour", color)):
+            if image is not None and image.shape[:2] != self._shape:
+                raise EpisodeError(
+                    f"{self._folder.name}: a {kind} image has {image.shape[1]} x {image.shape[0]} pixels where the camera "
+                    f"has {self._shape[1]} x {self._shape[0]}."
+                )
         try:
             name = f"{self.count:06d}.png"
             write_depth(self._folder / "depth" / name, depth, durable=self._durable)
@@ -559,9 +563,9 @@ class _CameraFiles:
                     _sync(self._folder)  # where the folders of images are new
             self.rows.append([self.count, t_s])
         except (OSError, DiffCloudError) as error:
+            kept = f" The {self.count} frames before it are kept." if self._durable else ""
             raise OutputError(
-                f"Frame {self.count} of camera {self._folder.name} could not be written: {str(error).rstrip('.')}. The "
-                f"{self.count} frames before it are kept."
+                f"Frame {self.count} of camera {self._folder.name} could not be written: {str(error).rstrip('.')}.{kept}"
             ) from error
         self.count += 1
 

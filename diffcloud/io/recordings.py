@@ -70,7 +70,7 @@ def write_recording(
         EpisodeError: no frame at all, one that does not come after the camera's frame before it, or a rate that is none.
     """
     check_frame_rate(rate_hz)
-    frames = iter(recording.frames)
+    frames = _read(recording)
     first = next(frames, None)
     if first is None:
         raise EpisodeError(f"{recording.source}: no depth image was found.")
@@ -79,6 +79,18 @@ def write_recording(
         raise exists_already(folder)
     with staged(folder) as temporary:
         return _written(temporary, recording, chain([first], frames), start, rate_hz, meta)
+
+
+def _read(recording: Recording) -> Iterator[RecordedFrame]:
+    """Its frames.
+
+    Raises:
+        EpisodeError: the system cannot read one.
+    """
+    try:
+        yield from recording.frames
+    except OSError as error:
+        raise EpisodeError(f"{recording.source} cannot be read: {error}.") from error
 
 
 def check_frame_rate(rate_hz: float | None) -> None:
@@ -158,9 +170,9 @@ def read_joint_log(path: Path, *, offset_s: float = 0.0, recording_start_s: floa
         )
     own_clock = log.times[0] < _EPOCH_S <= recording_start_s
     times = log.times + offset_s + (recording_start_s if own_clock else 0.0)
-    if recording_start_s > times[-1] or (log.times[0] >= _EPOCH_S > recording_start_s):
+    if recording_start_s > times[-1] or (times[0] >= _EPOCH_S > recording_start_s):
         raise EpisodeError(
-            f"{path} covers {log.times[0]:.2f} to {log.times[-1]:.2f} s and the recording starts at "
+            f"{path} covers {times[0]:.2f} to {times[-1]:.2f} s and the recording starts at "
             f"{recording_start_s:.2f} s: they are on different clocks. Give the difference with --log-offset."
         )
     return replace(log, times=times)

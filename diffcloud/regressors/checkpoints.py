@@ -37,6 +37,8 @@ SAMPLES = 1000
 _SEED = 0
 """Of these draws: the same clouds give the same prediction."""
 Count = Annotated[int, Field(ge=1, le=10**6)]
+_MOST_POINTS = 10**7
+"""Of all frames together."""
 
 
 class BackgroundBody(BaseModel):
@@ -103,6 +105,8 @@ class Description(BaseModel):
             raise ValueError(
                 f"{len(self.names)} names need as many bounds and spreads, got {len(self.bounds)} and {len(self.spread)}"
             )
+        if self.points * len(self.times) > _MOST_POINTS:
+            raise ValueError(f"{self.points} points in {len(self.times)} frames are more than {_MOST_POINTS} together")
         if self.model == "posterior" and self.heteroscedastic:
             raise ValueError("a posterior has widths of its own, and no second output for them")
         for name, (low, high) in zip(self.names, self.bounds, strict=True):

@@ -24,6 +24,7 @@ TOOL_LINK = "tool_frame"
 GEN3_HOME_RAD = np.deg2rad([0.0, 15.0, 180.0, -130.0, 0.0, 55.0, 90.0])
 """Kinova's home pose of the Gen3 arm."""
 _DAMPING = 1e-3
+_ROUNDING_M = 1e-6
 _LONGEST_STEP_RAD = 0.3
 """Beyond, the linear model of the arm no longer holds."""
 
@@ -83,8 +84,8 @@ class Robot:
 
         Args:
             joints_rad: [..., J] of the arm, from the base to the tool.
-            gripper: [...] 0 open to 1 closed; spans the limits of the other joints. NaN (not known) is taken as open, when
-                the fingers reach farthest.
+            gripper: [...] 0 open to 1 closed; spans the limits of the other joints (`fingers`). NaN (not known) is taken as
+                open, when the fingers reach farthest.
 
         Raises:
             RobotError: another number of joints than the arm has.
@@ -95,13 +96,43 @@ class Robot:
                 f"{self.description.name} has {len(self.arm)} joints between its base and {self.tool}, the joint log "
                 f"{joints_rad.shape[-1]}: it is the log, or the description, of another arm."
             )
+        opened, closed = self.fingers
+        state = np.nan_to_num(np.broadcast_to(gripper, joints_rad.shape[:-1]))[..., None]
+        angles = opened + (closed - opened) * np.clip(state, 0.0, 1.0)
+        angles[..., self.arm] = joints_rad
+        return angles
+
+    @cached_property
+    def fingers(self) -> tuple[Floats, Floats]:
+        """[A] of all moving joints where the gripper is open, and closed: the ends of their limits; zero without limits.
+
+        A description does not say which end is which. A Robotiq 2F-85 is open at the lower one, a Franka Hand at the upper:
+        at the one where the surfaces that fingers move are spread wider.
+        """
         low, high = (np.array([getattr(joint, end) for joint in self.moving]) for end in ("lower", "upper"))
         bounded = np.isfinite(low) & np.isfinite(high)
         low, high = np.where(bounded, low, 0.0), np.where(bounded, high, 0.0)
-        state = np.nan_to_num(np.broadcast_to(gripper, joints_rad.shape[:-1]))[..., None]
-        angles = low + (high - low) * np.clip(state, 0.0, 1.0)
-        angles[..., self.arm] = joints_rad
-        return angles
+        low[self.arm] = high[self.arm] = 0.0
+        return (high, low) if self._spread(high) > self._spread(low) + _ROUNDING_M else (low, high)
+
+    def _spread(self, configuration: Floats) -> float:
+        """[m] RMS distance from their middle of the corners of all links that fingers move; 0 where there is none."""
+        poses = self.forward_kinematics(configuration)
+        own = {self.moving[index].name for index in range(len(self.moving)) if index not in self.arm}
+        moved = set[str]()
+        for joint in self.description.joints:  # from the root outwards
+            leader = joint.name if joint.mimic is None else joint.mimic.joint
+            if leader in own or joint.parent in moved:
+                moved.add(joint.child)
+        corners = [
+            mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+            for name in sorted(moved & self.description.meshes.keys())
+            for mesh, pose in [(self.description.meshes[name], poses[self.links.index(name)])]
+        ]
+        if not corners:
+            return 0.0
+        points = np.concatenate(corners)
+        return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
     def forward_kinematics(self, configuration: Floats) -> Floats:
         """[..., L, 4, 4] T_world_link of all links for configurations [..., A] [rad or m]."""

@@ -10,6 +10,7 @@ Floats = NDArray[np.float64]
 _LONGEST_REACH_M = 3.0
 """No arm of this kind reaches farther."""
 _LENGTH_OFF = 0.01
+_TURNED = np.deg2rad(10.0)
 
 
 def unreachable(positions: Floats) -> str | None:
@@ -35,4 +36,19 @@ def not_unit(quaternions: Floats) -> str | None:
     return (
         f"A tool quaternion in robot.csv has a length of {worst:.3g} instead of 1: tool_qw..qz "
         "are a unit quaternion (w, x, y, z), not angles in degrees or radians. Convert them."
+    )
+
+
+def turning(quaternions: Floats) -> str | None:
+    """Why the track of the tool is not that of its fingertips, from its orientations [N, 4] (w, x, y, z), some of them NaN;
+    None where it hardly turns."""
+    known = quaternions[np.isfinite(quaternions).all(axis=1)]
+    if not len(known):
+        return None
+    turned = 2 * float(np.arccos(np.abs(known @ known[0]).clip(max=1.0)).max())
+    if turned <= _TURNED:
+        return None
+    return (
+        f"The tool turns by {np.rad2deg(turned):.0f} degrees. The cloth follows the origin of the tool's frame: if that is "
+        "not between the fingertips, they move otherwise. Record, or import (--tool-frame), the pose of a frame that is."
     )

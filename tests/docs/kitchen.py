@@ -95,7 +95,7 @@ def lab(folder: Path) -> None:
         for serial, (name, pose) in {**table, **cloth}.items()
     }
     write_calibration(folder / "raw/calibration/lab.json", Calibration(cameras, "charuco"))
-    write_cloth_episode(folder / "raw/episodes/lift_tan1")
+    write_cloth_episode(folder / "raw/episodes/lift/tan1")
     bag(folder, "mcap").rename(folder / "run.mcap")
     source = write_table_episode(folder / "elsewhere")
     for name, place in (("overhead", "a"), ("side", "b")):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import re
 import time
 from dataclasses import replace
+from importlib.resources import as_file, files
 
 import numpy as np
 import pytest
@@ -165,6 +167,14 @@ class TestPlan:
             held.check_trajectory("trajectory", path, start)
 
 
+def test_a_joint_without_limits_is_refused(tmp_path):
+    text = (files("diffcloud.sensing") / "gen3_robotiq_2f_85.urdf").read_text()
+    name = re.search(r'<joint name="(joint_2)" type="revolute">.*?(<limit[^>]*/>)', text, re.DOTALL)
+    (tmp_path / "arm.urdf").write_text(text.replace(name[2], "", 1))
+    with pytest.raises(LimitError, match="states no limits of joint_2"):
+        ArmChecker(Robot.from_urdf(tmp_path / "arm.urdf"), Limits(), ArmLimits())
+
+
 def test_a_description_without_surfaces_is_refused():
     bare = replace(robot().description, meshes={})
     with pytest.raises(LimitError, match=r"has no surfaces of links that move.*--urdf"):
@@ -227,6 +237,17 @@ class TestWayHome:
         _, path = self.plan(reading(start))
         assert np.abs(path.joints_rad[-1] - start).max() == pytest.approx(np.pi / 2)
         np.testing.assert_allclose(robot().tool_pose(path.joints_rad[-1])[:3, 3], HOME_M, atol=1e-9)
+
+    @pytest.mark.parametrize(
+        ("now", "target", "expected"), [(190, 200, 200), (190, -160, 200), (-170, 185, -175), (350, 20, 20)]
+    )
+    def test_joints_with_ends_take_the_nearest_turn_within_them(self, tmp_path, now, target, expected):
+        """Of 360 degrees to either side, as those of many arms; a turn beyond the end is none."""
+        with as_file(files("diffcloud.hardware.examples") / "ur5e.urdf") as path:
+            arm = ArmChecker(Robot.from_urdf(path), Limits(), ArmLimits())
+        joints, home = np.zeros(6), np.zeros(6)
+        joints[5], home[5] = np.deg2rad([now, target])
+        assert np.rad2deg(arm._nearest(home, joints)[5]) == pytest.approx(expected)
 
     def test_a_way_through_the_table_is_refused(self):
         with pytest.raises(

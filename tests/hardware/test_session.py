@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from diffcloud.errors import DiffCloudError, EpisodeError, HardwareError, LimitError, UnconfirmedStopError
-from diffcloud.hardware import CaptureSettings, Limits, capture, session
+from diffcloud.hardware import CaptureSettings, Limits, capture, motion, session
 from diffcloud.hardware.trajectory import ToolTrajectory
 from diffcloud.io.raw_episodes import RawEpisodeWriter, read_raw_episode
 from diffcloud.sensing.validation.episode import validate_raw_episode
@@ -91,6 +91,26 @@ def test_the_gripper_waits_for_the_end_of_the_way(tmp_path):
     events = [event for event, _ in itertools.groupby(arm.events)]
     home, approach, rest = ["prepare", "turn", "stop"], ["prepare", "twist", "stop"], ["gripper 0", "prepare"]
     assert events == [*home, *approach, *rest, "gripper 0", "twist", "gripper 1", "twist", "stop"]
+
+
+def test_a_gripper_that_says_nothing_is_given_its_time(tmp_path, monkeypatch):
+    class Silent(PointArm):
+        def set_gripper(self, position):
+            super().set_gripper(position)
+            self.gripper = None
+            asked.append(time.monotonic())
+
+        def send_velocity(self, linear_m_s):
+            super().send_velocity(linear_m_s)
+            if asked:
+                moved.append(time.monotonic())
+
+    asked, moved = [], []
+    monkeypatch.setattr(motion, "_GRIPPER_WAIT_S", 0.8)
+    base = short_path()
+    path = ToolTrajectory(base.times, np.add(base.positions, [0.01, 0, 0]), np.zeros(len(base.times)))
+    run(tmp_path / "e", Silent(), path=path)
+    assert moved[0] - asked[0] > 0.8
 
 
 @pytest.mark.parametrize(

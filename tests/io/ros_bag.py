@@ -42,6 +42,10 @@ class Habits:
     depth_frame: str = "{name}_optical"
     color_info: float | None = None
     """Focal length in the colour's own camera_info [px]; None: there is none."""
+    lens: tuple[float, ...] = (0.0,) * 5
+    """D of every camera_info."""
+    rectified_focal: float | None = None
+    """Focal length in P [px]; None: P is zero."""
     color_late_s: Callable[[int], float] = lambda number: -0.002
     """Stamp of a frame's colour after that of its depth."""
     stamps_s: Callable[[int], float] = lambda number: number / 10
@@ -118,7 +122,11 @@ class Bag:
     def _info(self, topic, t, arrival, frame, focal):
         matrix = INTRINSICS.matrix
         matrix[0, 0] = matrix[1, 1] = focal
-        upper = {"D": np.zeros(5), "K": matrix.ravel(), "R": np.eye(3).ravel(), "P": np.zeros(12)}
+        rectified = np.zeros((3, 4))
+        if self._habits.rectified_focal is not None:
+            rectified[:, :3] = matrix
+            rectified[0, 0] = rectified[1, 1] = self._habits.rectified_focal
+        upper = {"D": np.array(self._habits.lens), "K": matrix.ravel(), "R": np.eye(3).ravel(), "P": rectified.ravel()}
         lens = upper if self._ros1 else {key.lower(): value for key, value in upper.items()}
         region = self._type("sensor_msgs/msg/RegionOfInterest")(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
         size = {"height": INTRINSICS.height, "width": INTRINSICS.width}

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from diffcloud.errors import EpisodeError
+from diffcloud.io.clouds import read_cloud
 from diffcloud.io.episodes import read_episode, write_episode
 from diffcloud.io.grippers import named_files
 from diffcloud.io.imports import cloud_folder, release_episodes
@@ -49,6 +50,18 @@ def test_missing_frames_and_folders(tmp_path):
     (folder / "001.npy").unlink()
     with pytest.raises(EpisodeError, match=r"frames \[1\] are missing between 0 and 3"):
         list(release_episodes(tmp_path))
+
+
+@pytest.mark.parametrize("kept", [20, 99])
+def test_a_text_ply_that_was_cut_off_is_refused(tmp_path, kept):
+    head = "ply\nformat ascii 1.0\nelement vertex 100\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    rows = [f"{0.01 * index} 0.0 0.0\n" for index in range(100)]
+    path = tmp_path / "000.ply"
+    path.write_text(head + "".join(rows))
+    assert len(read_cloud(path)) == 100
+    path.write_text(head + "".join(rows[:kept]))
+    with pytest.raises(EpisodeError, match=r"000\.ply"):
+        read_cloud(path)
 
 
 def test_own_clouds_with_a_gripper_track(tmp_path):

@@ -20,6 +20,7 @@ from diffcloud.io.calibrations import Calibration, CameraCalibration, read_calib
 from diffcloud.io.camera_models import IntrinsicsFile
 from diffcloud.io.images import read_color, read_depth, write_color, write_depth
 from diffcloud.io.raw_episodes import CameraInfo, RawEpisode, RawEpisodeWriter, ScenePlacement, read_raw_episode
+from diffcloud.io.recordings import RecordedFrame, Recording, write_recording
 from tests.sensing.table_scene import INTRINSICS, camera_infos, poses, robot_sample, table_depth, write_table_episode
 
 
@@ -200,6 +201,24 @@ def test_a_full_disk_ends_cleanly(tmp_path, monkeypatch):
     for index in range(count):
         np.testing.assert_array_equal(episode.cameras["side"].depth(index), depth)
     assert not list((tmp_path / "e").rglob(".*"))
+
+
+def test_of_an_import_nothing_is_said_to_be_kept(tmp_path, monkeypatch):
+    """Its folder is temporary, and goes."""
+    written = raw_episodes.write_depth
+
+    def full(path, depth, **options):
+        if path.name == "000002.png":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written(path, depth, **options)
+
+    monkeypatch.setattr(raw_episodes, "write_depth", full)
+    frames = [RecordedFrame("side", float(index), np.ones((120, 160), np.uint16)) for index in range(4)]
+    recording = Recording({"side": camera_infos()["side"]}, frames, "test")
+    with pytest.raises(DiffCloudError, match="Frame 2 of camera side could not be written") as caught:
+        write_recording(tmp_path / "e", recording)
+    assert "kept" not in str(caught.value)
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_write_the_kernel_refuses_keeps_what_is_there(tmp_path):

@@ -10,13 +10,56 @@ import numpy as np
 import pytest
 
 from diffcloud.errors import EpisodeError, HardwareError
-from diffcloud.io.files import write_json
+from diffcloud.io.files import claimed, write_json
+from diffcloud.io.images import write_color
 from diffcloud.io.raw_episodes import CameraInfo, read_raw_episode
 from diffcloud.io.recordings import RecordedFrame, Recording, read_joint_log, write_recording
 from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.io.ros_bag import FRAMES, START, TOOL, bag
 from tests.pipeline.invoke import invoke
 from tests.sensing.table_scene import HOME_RAD, INTRINSICS, poses, table_depth, write_table_episode
+
+
+def test_a_log_of_the_time_of_day_is_shifted_to_a_recording_from_zero(tmp_path):
+    folders, log = as_folders(tmp_path)
+    rows = log.read_text().splitlines()
+    late = [f"{START + float(row.split(',')[0])},{row.split(',', 1)[1]}" for row in rows[1:]]
+    log.write_text("\n".join([rows[0], *late]) + "\n")
+    options = ("--out", tmp_path / "e", "--rate-hz", 10, "--joint-log", log)
+    (folders[0] / "timestamps.csv").unlink()
+    assert "different clocks" in invoke("import", "recording", folders[0], *options, code=1).errors
+    invoke("import", "recording", folders[0], *options, f"--log-offset={-START}")
+    times = read_raw_episode(tmp_path / "e").robot.times
+    np.testing.assert_allclose(times, [float(row.split(",")[0]) for row in rows[1:]], atol=1e-6)
+
+
+def test_colour_of_another_size_is_left_out(tmp_path):
+    folders, _ = as_folders(tmp_path)
+    for path in (folders[0] / "color").iterdir():
+        write_color(path, np.zeros((200, 300, 3), np.uint8))
+    done = invoke("import", "recording", folders[0], "--out", tmp_path / "e")
+    assert "not aligned to depth: it has 300 x 200 pixels, depth 160 x 120" in done.errors
+    assert read_raw_episode(tmp_path / "e").cameras["overhead"].color(0) is None
+
+
+def test_images_that_cannot_be_read_are_no_fault_of_the_output(tmp_path):
+    def frames():
+        yield RecordedFrame("side", 0.0, np.ones((120, 160), np.uint16))
+        raise OSError(5, "Input/output error")
+
+    recording = Recording({"side": CameraInfo("side", "1", INTRINSICS, 0.001)}, frames(), "a stick")
+    with pytest.raises(EpisodeError, match=r"a stick cannot be read: .*Input/output error"):
+        write_recording(tmp_path / "e", recording)
+    assert not any(tmp_path.iterdir())
+
+
+def test_two_imports_to_one_place_do_not_mix(tmp_path):
+    folders, _ = as_folders(tmp_path)
+    with claimed(tmp_path / "e"):
+        assert (
+            "is being written by process"
+            in invoke("import", "recording", folders[0], "--out", tmp_path / "e", code=1).errors
+        )
 
 
 @pytest.mark.parametrize("kind", ["rosbag1", "rosbag2", "mcap"])
@@ -163,11 +206,19 @@ def test_a_joint_log_that_runs_backwards_is_refused_with_the_row(tmp_path):
 
 def test_colour_that_a_folder_lacks_is_counted(tmp_path):
     folders, log = as_folders(tmp_path)
-    for number in (2, 3):  # the colour recording stopped early
+    for number in (1, 3):
         (folders[0] / "color" / f"{number:06d}.png").unlink()
     done = invoke("import", "recording", folders[0], "--out", tmp_path / "e", "--joint-log", log)
     (message,) = done.result["warnings"]
-    assert "Camera overhead: 2 of 4 frames have no colour image of their number, such as frame 2" in message
+    assert "Camera overhead: 2 of 4 frames have no colour image of their number, such as frame 1" in message
+    assert [camera_color(tmp_path, number) is not None for number in range(4)] == [True, False, True, False]
+    for path in (folders[0] / "color").iterdir():
+        path.unlink()
+    assert invoke("import", "recording", folders[0], "--out", tmp_path / "f", "--joint-log", log).result["warnings"] == []
+
+
+def camera_color(tmp_path, number):
+    return read_raw_episode(tmp_path / "e").cameras["overhead"].color(number)
 
 
 @pytest.mark.parametrize("rate", [0, -5])

@@ -297,6 +297,49 @@ class TestTransforms:
         assert read_raw_episode(tmp_path / "e").cameras["side"].info.T_world_camera is None
         assert any("puts 'side_link' into both 'base_link' and 'elsewhere'" in text for text in done.result["warnings"])
 
+    def test_what_is_no_place_is_left_out(self, tmp_path):
+        """A zero quaternion, of a frame that nobody asks for and once of a camera's."""
+
+        class Empty(Bag):
+            def _type(self, name):
+                made = super()._type(name)
+                return made if name != "geometry_msgs/msg/Quaternion" else self._first_is_zero(made)
+
+            def _first_is_zero(self, made):
+                self.seen = getattr(self, "seen", 0) + 1
+                return made if self.seen > 1 else lambda **_: made(x=0.0, y=0.0, z=0.0, w=0.0)
+
+        Empty(tmp_path / "bag", "rosbag2", Habits()).write()
+        done = imported(tmp_path, tmp_path / "bag")
+        assert any(
+            text.startswith("1 of 14 transforms of 'overhead_link' in tf are no places") for text in done.result["warnings"]
+        )
+        for name, pose in poses().items():
+            np.testing.assert_allclose(read_raw_episode(tmp_path / "e").cameras[name].info.T_world_camera, pose, atol=1e-9)
+
+
+class TestLenses:
+    LENS = (0.1, -0.2, 0.001, 0.002, 0.05)
+
+    def intrinsics(self, tmp_path, **habits):
+        imported(tmp_path, bag(tmp_path, "rosbag2", lens=self.LENS, rectified_focal=58.0, unaligned=False, **habits))
+        return read_raw_episode(tmp_path / "e").cameras["side"].info.intrinsics
+
+    def test_images_as_they_are_have_K_and_D(self, tmp_path):
+        held = self.intrinsics(tmp_path)
+        assert (held.fx, held.coefficients) == (INTRINSICS.fx, self.LENS)
+
+    @pytest.mark.parametrize("name", ["image_rect", "image_rect_raw", "image_rectified"])
+    def test_rectified_images_have_P_alone(self, tmp_path, name):
+        held = self.intrinsics(tmp_path, depth=f"depth_registered/{name}")
+        assert (held.fx, held.distortion, held.coefficients) == (58.0, "none", ())
+
+    def test_without_P_they_have_K(self, tmp_path):
+        path = bag(tmp_path, "rosbag2", lens=self.LENS, depth="depth_registered/image_rect", unaligned=False)
+        imported(tmp_path, path)
+        held = read_raw_episode(tmp_path / "e").cameras["side"].info.intrinsics
+        assert (held.fx, held.distortion) == (INTRINSICS.fx, "none")
+
 
 class TestLinksInTf:
     """Of a recording without joint_states."""
@@ -349,6 +392,19 @@ class TestGripper:
         done = imported(tmp_path, path, options=("--gripper-joint", "claw", "--gripper-closed", 0.04))
         np.testing.assert_allclose(self.gripper(tmp_path), 0.75)
         assert done.result["warnings"] == []
+
+    def test_one_that_is_closed_at_zero(self, tmp_path):
+        path = bag(tmp_path, "rosbag2", joints={"finger": 0.03})
+        where = ("--gripper-joint", "finger", "--gripper-open", 0.04, "--gripper-closed", 0)
+        imported(tmp_path, path, options=where)
+        np.testing.assert_allclose(self.gripper(tmp_path), 0.25)
+
+    @pytest.mark.parametrize(("open_", "closed"), [(0, 0), (0.8, 0.8), (0, "nan"), ("inf", 0)])
+    def test_positions_that_tell_nothing_are_refused(self, tmp_path, open_, closed):
+        path = bag(tmp_path, "rosbag2")
+        done = imported(tmp_path, path, options=("--gripper-open", open_, "--gripper-closed", closed), code=1)
+        assert "two different positions" in done.errors
+        assert not (tmp_path / "e").exists()
 
     def test_a_name_that_was_given_must_be_there(self, tmp_path):
         bad = imported(tmp_path, bag(tmp_path, "rosbag2", joints={}), options=("--gripper-joint", "claw"), code=1)

@@ -5,12 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
 from diffcloud.io.episodes import read_episode
+from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.pipeline.invoke import invoke
 from tests.sensing.cloth_scene import SETTINGS, write_cloth_episode
+from tests.sensing.test_validation import edit_json
 
 
 @pytest.fixture
@@ -42,6 +45,21 @@ def test_raw_episode_to_episode(tmp_path, params):
     assert single.result["points"] == done.result["points"]
     same = (tmp_path / "single" / "lift" / "blue1.npz").read_bytes()
     assert same == (tmp_path / "episodes" / "lift" / "blue1.npz").read_bytes()
+
+
+def test_a_raw_episode_from_within_and_a_tool_that_turns(tmp_path, params, monkeypatch):
+    raw = write_cloth_episode(tmp_path / "blue1", frames=2).folder
+    edit_json(raw / "episode.json", scenario="lift")
+    table = pd.read_csv(raw / "robot.csv")
+    half = np.linspace(0, np.deg2rad(30), len(table))
+    table["tool_qw"], table["tool_qx"], table["tool_qy"], table["tool_qz"] = np.cos(half), np.sin(half), 0.0, 0.0
+    table.to_csv(raw / "robot.csv", index=False)
+    monkeypatch.chdir(raw)
+    done = invoke("preprocess", ".", "--out", tmp_path / "out", "--params", params)
+    assert done.result["points"].keys() == {"lift/blue1"}
+    assert read_episode(tmp_path / "out" / "lift" / "blue1.npz").frame_count == 2
+    assert "The tool turns by 60 degrees" in done.errors
+    assert any(finding.code == "tool_turns" for finding in validate_raw_episode(raw))
 
 
 @pytest.mark.slow

@@ -295,6 +295,18 @@ class TestScenarios:
         assert vest.scene.mesh.nodes[:, 1].max() == pytest.approx(0.2)  # the hem
         assert vest.scene.surrounding.obstacles[0].nodes[:, 2].mean() == pytest.approx(2.0)
 
+    @pytest.mark.parametrize("base", ["lift", "band_stretch", "vest_hang"])
+    def test_a_material_in_si(self, tmp_path, base):
+        sheet = "{density_kg_m2: 0.5, stretching_n_m: 120, bending_n_m: 1.0e-4}"
+        (tmp_path / "s.yaml").write_text(f"base: {base}\nmaterial: {sheet}\n")
+        assert load_scenario(tmp_path / "s.yaml").scene.material.density == pytest.approx(0.5)
+
+    @pytest.mark.parametrize("name", ["../outside", "a/b", "..", "", "a\\\\b", ".hidden"])
+    def test_a_name_that_is_no_name_of_a_folder(self, tmp_path, name):
+        (tmp_path / "s.yaml").write_text(f'base: lift\nname: "{name}"\n')
+        with pytest.raises(SceneError, match="name"):
+            load_scenario(tmp_path / "s.yaml")
+
     @pytest.mark.parametrize(
         ("text", "message"),
         [

@@ -96,6 +96,31 @@ def test_fingers_close():
     assert gaps[0] > gaps[1] > gaps[2]
 
 
+@pytest.mark.parametrize("limits", ["0.0 0.04", "-0.04 0.0"])
+def test_open_is_where_fingers_are_farther_apart(tmp_path, limits):
+    """Of a hand whose joint is at its upper end when it is open, and of one at its lower end."""
+    lower, upper = map(float, limits.split())
+    outwards = 1 if upper else -1
+    finger = """<joint name="{name}" type="prismatic"><parent link="tool_frame"/><child link="{name}_link"/>
+        <axis xyz="0 {way} 0"/><limit lower="{lower}" upper="{upper}"/>{mimic}</joint>"""
+    path = write(
+        tmp_path,
+        f"""<link name="base"/><link name="tool_frame">{BOX}</link>
+        <joint name="a" type="continuous"><parent link="base"/><child link="tool_frame"/><axis xyz="0 0 1"/></joint>"""
+        + "".join(
+            f'<link name="{name}_link"><visual><geometry><box size="0.01 0.01 0.03"/></geometry></visual></link>'
+            for name in ("l", "r")
+        )
+        + finger.format(name="l", way=outwards, lower=lower, upper=upper, mimic="")
+        + finger.format(name="r", way=-outwards, lower=lower, upper=upper, mimic='<mimic joint="l"/>'),
+    )
+    robot = Robot.from_urdf(path)
+    for gripper, expected in ((0.0, 0.04), (1.0, 0.0), (0.5, 0.02), (np.nan, 0.04)):
+        poses = robot.forward_kinematics(robot.configuration(np.zeros(1), gripper))
+        assert poses[robot.links.index("l_link"), 1, 3] == pytest.approx(expected)
+        assert poses[robot.links.index("r_link"), 1, 3] == pytest.approx(-expected)
+
+
 def test_bad_poses(tmp_path):
     robot = gen3()
     with pytest.raises(RobotError, match="does not reach"):

@@ -99,7 +99,12 @@ def test_degrees_for_radians(episode):
     for joint in range(1, 8):
         edit_column(episode / "robot.csv", f"joint_{joint}", np.rad2deg)
     assert codes(episode) == {"angle_unit"}
-    assert "these are degrees" in message(episode, "angle_unit")
+    assert "If these are degrees" in message(episode, "angle_unit")
+
+
+def test_a_joint_that_goes_on_turning(episode):
+    edit_column(episode / "robot.csv", "joint_7", lambda angles: angles + np.linspace(0, 12, len(angles)))
+    assert codes(episode) == set()
 
 
 def test_millimetres_for_metres(episode):

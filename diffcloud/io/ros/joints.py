@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from diffcloud.errors import EpisodeError
+from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.io.raw_episodes import RobotLog
 from diffcloud.io.ros.transforms import TransformTree
 from diffcloud.io.urdf import Joint, RobotDescription
@@ -23,6 +25,41 @@ _OFF_M, _OFF_RAD = 0.005, np.deg2rad(1.0)
 """How far a link in tf may lie from where the robot's description puts it."""
 
 
+@dataclass(frozen=True)
+class Grip:
+    """Which joint tells how far a gripper is closed."""
+
+    joint: str | None
+    """None: the arm has no gripper."""
+    open: float
+    """Its position [rad or m]."""
+    closed: float
+    guessed: bool
+    """Whether nobody said when it is closed."""
+
+    @staticmethod
+    def of(joint: str | None, open_: float, closed: float | None) -> Grip:
+        """
+        Args:
+            closed: None takes that of a Robotiq 2F-85.
+
+        Raises:
+            ConfigError: equal positions, or no numbers.
+        """
+        at = GRIPPER_CLOSED_RAD if closed is None else closed
+        if not (math.isfinite(open_) and math.isfinite(at) and open_ != at):
+            raise ConfigError(
+                f"A gripper that is open at {open_:g} and closed at {at:g} tells nothing: --gripper-open and "
+                "--gripper-closed are two different positions of its joint. A Franka Hand's finger is open at 0.04 and "
+                "closed at 0."
+            )
+        return Grip(joint, open_, at, guessed=closed is None)
+
+    def state(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """0 open to 1 closed."""
+        return (positions - self.open) / (self.closed - self.open)
+
+
 def joint_log(
     where: str,
     messages: Sequence[tuple[float, Any]],
@@ -31,8 +68,7 @@ def joint_log(
     world_frame: str,
     tool_frame: str,
     joint_names: Sequence[str] | None,
-    gripper_joint: str | None,
-    gripper_closed_rad: float | None,
+    grip: Grip,
 ) -> tuple[RobotLog, tuple[str, ...]]:
     """(rows in order of time, warnings about what stays unknown).
 
@@ -40,8 +76,6 @@ def joint_log(
         where: the recording, for messages.
         messages: (time [s], sensor_msgs/JointState), one or more.
         joint_names: of the arm, in order; None takes joint_1, joint_2, ...
-        gripper_joint: None for an arm without one.
-        gripper_closed_rad: None for that of a Robotiq 2F-85.
 
     Raises:
         EpisodeError: a joint of the arm, or the gripper's, is not in joint_states (lists those that are), or the clock was
@@ -62,15 +96,15 @@ def joint_log(
     warnings: list[str] = []
     gripper = np.full(len(rows), np.nan)
     others = sorted(seen - set(joint_names))
+    gripper_joint = grip.joint
     if gripper_joint is not None and gripper_joint in seen:
         # often sent by another driver than the arm's joints, in messages of its own
         times, values = _series(where, messages, [gripper_joint])
-        closed = GRIPPER_CLOSED_RAD if gripper_closed_rad is None else gripper_closed_rad
-        gripper = np.interp(rows, times, values[:, 0]) / closed if len(times) else gripper
-        if gripper_closed_rad is None and gripper_joint != GRIPPER_JOINT:
+        gripper = grip.state(np.interp(rows, times, values[:, 0])) if len(times) else gripper
+        if grip.guessed and gripper_joint != GRIPPER_JOINT:
             warnings.append(
-                f"The gripper is taken to be closed where {gripper_joint} is {closed:g} rad, as a Robotiq 2F-85 is; say "
-                "where it is with --gripper-closed."
+                f"The gripper is taken to be closed where {gripper_joint} is {grip.closed:g} rad, as a Robotiq 2F-85 is; "
+                "say where it is with --gripper-closed."
             )
     elif gripper_joint is not None and (others or gripper_joint != GRIPPER_JOINT):
         raise EpisodeError(
@@ -97,8 +131,7 @@ def log_from_links(
     *,
     world_frame: str,
     tool_frame: str,
-    gripper_joint: str | None,
-    gripper_closed_rad: float | None,
+    grip: Grip,
 ) -> tuple[RobotLog, tuple[str, ...]]:
     """The joint log of a recording without joint_states whose tf has the robot's links: each joint's angle is how far its
     child is turned about its axis from its zero in the description.
@@ -123,13 +156,12 @@ def log_from_links(
     if not np.ptp(angles, axis=0).any():
         raise EpisodeError(f"no link of {', '.join(joint.child for joint in arm)} moves in tf")
     gripper, warnings = np.full(len(rows), np.nan), list[str]()
-    finger = next((joint for joint in description.joints if joint.name == gripper_joint), None)
-    if gripper_joint is not None:
+    finger = next((joint for joint in description.joints if joint.name == grip.joint), None)
+    if grip.joint is not None:
         try:
             if finger is None:
-                raise EpisodeError(f"the description has no joint {gripper_joint!r}")
-            closed = GRIPPER_CLOSED_RAD if gripper_closed_rad is None else gripper_closed_rad
-            gripper = _angle(tree, finger, rows) / closed
+                raise EpisodeError(f"the description has no joint {grip.joint!r}")
+            gripper = grip.state(_angle(tree, finger, rows))
         except EpisodeError as error:
             warnings.append(f"How far the gripper is open stays unknown, and it is masked as open: {error}.")
     position, quaternion = _placed(tree.lookup(world_frame, tool_frame, rows))

@@ -113,15 +113,21 @@ def color_image(message: Any, topic: str) -> NDArray[np.uint8]:
     return np.ascontiguousarray(_pixels(message, np.dtype(np.uint8))[..., _COLOR_CHANNELS[message.encoding]])
 
 
-def camera_intrinsics(message: Any, name: str) -> Intrinsics:
+def camera_intrinsics(message: Any, name: str, *, rectified: bool = False) -> Intrinsics:
     """Of a CameraInfo message.
+
+    Args:
+        rectified: of images without distortion, whose camera is the left part of P; K and D are of those with it.
 
     Raises:
         EpisodeError: a lens model that is not read, or numbers that no camera has.
     """
-    # ROS 1 writes D and K, ROS 2 d and k
+    # ROS 1 writes D, K and P, ROS 2 d, k and p
     matrix = np.asarray(message.k if hasattr(message, "k") else message.K, dtype=np.float64).reshape(3, 3)
     lens = [float(value) for value in (message.d if hasattr(message, "d") else message.D)]
+    if rectified:
+        projection = np.asarray(message.p if hasattr(message, "p") else message.P, dtype=np.float64).reshape(3, 4)[:, :3]
+        matrix, lens = projection if projection.any() else matrix, []
     distorted = any(lens)
     if message.distortion_model not in ("", "plumb_bob") and distorted:
         raise EpisodeError(f"Camera {name} has the distortion model {message.distortion_model!r}; plumb_bob is read.")

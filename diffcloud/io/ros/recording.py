@@ -23,7 +23,7 @@ from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import CameraInfo
 from diffcloud.io.recordings import RecordedFrame, Recording
 from diffcloud.io.ros.files import opened, refuse_lone_parts
-from diffcloud.io.ros.joints import GRIPPER_JOINT, joint_log, log_from_links
+from diffcloud.io.ros.joints import GRIPPER_JOINT, Grip, joint_log, log_from_links
 from diffcloud.io.ros.messages import (
     DEPTH_UNITS_M,
     DepthEncoding,
@@ -34,7 +34,15 @@ from diffcloud.io.ros.messages import (
     stamp_s,
 )
 from diffcloud.io.ros.pairing import Pairing, pair
-from diffcloud.io.ros.topics import CAMERA_INFO, CameraTopics, aligned_by_name, depth_cameras, info_topic, same_camera
+from diffcloud.io.ros.topics import (
+    CAMERA_INFO,
+    CameraTopics,
+    aligned_by_name,
+    depth_cameras,
+    info_topic,
+    is_rectified,
+    same_camera,
+)
 from diffcloud.io.ros.transforms import TransformTree
 from diffcloud.io.urdf import RobotDescription
 
@@ -48,7 +56,8 @@ def ros_recording(
     tool_frame: str = "tool_frame",
     joint_names: list[str] | None = None,
     gripper_joint: str | None = GRIPPER_JOINT,
-    gripper_closed_rad: float | None = None,
+    gripper_open: float = 0.0,
+    gripper_closed: float | None = None,
     description: Callable[[], RobotDescription] | None = None,
 ) -> Recording:
     """A recording of ROS; images are read lazily.
@@ -57,22 +66,24 @@ def ros_recording(
         paths: one file or rosbag2 folder, or all parts of a split recording.
         world_frame, tool_frame: tf frames; poses that tf does not have stay open, with a warning.
         joint_names: of the arm, in order; None takes joint_1, joint_2, ... of joint_states.
-        gripper_joint: its angle becomes 0 (open, at 0) to 1 (closed). None: the arm has no gripper.
-        gripper_closed_rad: that angle when closed; None takes that of a Robotiq 2F-85.
+        gripper_joint: its position becomes 0 (open) to 1 (closed). None: the arm has no gripper.
+        gripper_open, gripper_closed: that position [rad or m]; None takes that of a Robotiq 2F-85.
         description: returns the robot's description, for a recording without joint_states whose tf has the robot's
             links; None: such a recording gets no joint log.
 
     Raises:
+        ConfigError: a gripper whose positions, open and closed, are equal or no numbers.
         EpisodeError: unreadable, one part of a split recording, without depth and camera_info, stamps that run backwards,
             or without the named joints; lists what there is.
     """
+    grip = Grip.of(gripper_joint, gripper_open, gripper_closed)
     split = refuse_lone_parts(paths)
     shown = ", ".join(path.name for path in map(Path, paths))
     scan = _scan(paths, shown)
     tree = TransformTree(scan.transforms)
     cameras: dict[str, CameraInfo] = {}
     sources: dict[str, _Source] = {}
-    warnings = [*split]
+    warnings = [*split, *tree.warnings]
     for name, topics in scan.cameras.items():
         info, depth = scan.infos.get(topics.info), scan.images.get(topics.depth)
         if info is None or depth is None:
@@ -90,7 +101,7 @@ def ros_recording(
             warnings.append(
                 f"Camera {name}: its place stays open, as {error}. Name the robot's base with --world-frame, or calibrate."
             )
-        intrinsics = camera_intrinsics(info, name)
+        intrinsics = camera_intrinsics(info, name, rectified=is_rectified(topics.depth))
         cameras[name] = CameraInfo(name, f"ros{topics.depth}", intrinsics, DEPTH_UNITS_M[depth.encoding], place)
     robot = None
     if scan.joints:
@@ -101,8 +112,7 @@ def ros_recording(
             world_frame=world_frame,
             tool_frame=tool_frame,
             joint_names=joint_names,
-            gripper_joint=gripper_joint,
-            gripper_closed_rad=gripper_closed_rad,
+            grip=grip,
         )
         warnings += unknown
     elif description is not None and scan.transforms:
@@ -112,8 +122,7 @@ def ros_recording(
                 description(),
                 world_frame=world_frame,
                 tool_frame=tool_frame,
-                gripper_joint=gripper_joint,
-                gripper_closed_rad=gripper_closed_rad,
+                grip=grip,
             )
             warnings += unknown
         except EpisodeError as error:
@@ -224,9 +233,9 @@ def _unaligned(scan: _Scan, camera: CameraTopics, color: str) -> str | None:
     held = scan.infos.get(info_topic(color, scan.topics) or "")
     if held is None:
         return "has no camera_info that would show that it shares depth's intrinsics"
-    depth = camera_intrinsics(depth_info, camera.name)
+    depth = camera_intrinsics(depth_info, camera.name, rectified=is_rectified(camera.depth))
     try:
-        own = camera_intrinsics(held, color)
+        own = camera_intrinsics(held, color, rectified=is_rectified(color))
     except EpisodeError as error:
         return f"has intrinsics that cannot be compared ({error})"
     return None if _equal(own, depth) else f"has {_brief(own)}, depth {_brief(depth)}"

@@ -53,6 +53,13 @@ def aligned_by_name(depth_topic: str) -> bool:
     return "align" in topic or "registered" in topic
 
 
+def is_rectified(topic: str) -> bool:
+    """Whether the lens has been taken out of a topic's images, as image_proc and depth_image_proc say it in the name."""
+    return any(word in ("rect", "rectified") for word in topic.lower().rsplit("/", 1)[-1].split("_")) or bool(
+        re.search(r"/image_rect(_\w+)?(/|$)", topic.lower())
+    )
+
+
 def same_camera(first: str, second: str) -> bool:
     """Whether two topics name the same camera, as far as they name one."""
     return _without_holders(_key(first)) == _without_holders(_key(second))

@@ -19,6 +19,8 @@ Floats = NDArray[np.float64]
 
 _MOVED_M, _MOVED_RAD = 0.002, np.deg2rad(0.2)
 """A camera that moves by more does not stand."""
+_LEAST_NORM = 1e-3
+"""Of a quaternion."""
 _LOOKED_AT = 1000
 """Times at most."""
 
@@ -54,7 +56,14 @@ class TransformTree:
             grouped.setdefault(_plain(item.child_frame_id), []).append((t, item))
         self._edges: dict[str, _Edge] = {}
         self._doubtful: dict[str, list[str]] = {}
-        for child, entries in grouped.items():
+        self.warnings: list[str] = []
+        for child, every in grouped.items():
+            entries = [(t, item) for t, item in every if _is_a_place(item.transform)]
+            if len(entries) < len(every):
+                left = f"{len(every) - len(entries)} of {len(every)} transforms of {child!r}"
+                self.warnings.append(f"{left} in tf are no places (zero quaternions, or not finite), and were left out.")
+            if not entries:
+                continue
             parents = sorted({_plain(item.header.frame_id) for _, item in entries})
             if len(parents) > 1:
                 self._doubtful[child] = parents
@@ -126,6 +135,12 @@ class TransformTree:
         for frame in frames:
             result = self._edges[frame].at(times) @ result
         return result
+
+
+def _is_a_place(transform: Any) -> bool:
+    turn, shift = transform.rotation, transform.translation
+    quaternion, numbers = [turn.x, turn.y, turn.z, turn.w], [shift.x, shift.y, shift.z]
+    return bool(np.isfinite([*quaternion, *numbers]).all() and np.linalg.norm(quaternion) > _LEAST_NORM)
 
 
 def _plain(frame: str) -> str:

@@ -16,6 +16,7 @@ from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios.options import Coordinate, Length, ScenarioOptions, assemble
 from diffcloud.scene.scenarios.release import PAPER_THRESHOLD
 from diffcloud.scene.scenarios.scenario import Scenario
+from diffcloud.scene.scenarios.sheet import Sheet
 
 
 class BandScenario(ScenarioOptions):
@@ -25,7 +26,7 @@ class BandScenario(ScenarioOptions):
     Everything here may change in a YAML file.
     """
 
-    material: str = "basis-soft-foam"
+    material: str | Sheet = "basis-soft-foam"
     contact_thickness_m: Length = 0.008
     contact_stiffness: NonNegative = 1e6
     circumference_m: Length = 1.75

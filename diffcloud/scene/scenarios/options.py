@@ -36,7 +36,8 @@ Keyframes = Annotated[list[tuple[_Time, Coordinate, Coordinate, Coordinate]], Fi
 class ScenarioOptions(Checked):
     """The fields that all built-in scenarios share (SI units)."""
 
-    name: str
+    name: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^./\\\s][^/\\]*$")]
+    """Folders and files are named after it."""
     material: str | Sheet = "basis-knit"
     """A preset, the path of an ARCSim material JSON, or an isotropic sheet in SI units."""
     compression: Annotated[float, Field(ge=0, le=1)] = 1.0

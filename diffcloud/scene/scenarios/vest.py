@@ -15,6 +15,7 @@ from diffcloud.mesh.shapes import cylinder_surface, vest_cloth, vest_shoulder
 from diffcloud.scene.scenarios.options import Coordinate, Length, ScenarioOptions, assemble
 from diffcloud.scene.scenarios.release import PAPER_THRESHOLD
 from diffcloud.scene.scenarios.scenario import Scenario
+from diffcloud.scene.scenarios.sheet import Sheet
 
 _CLEARANCE = 0.015
 """Least distance between the shoulder and the hook at the start [m]: below it the straps converge on the hook."""
@@ -27,7 +28,7 @@ class VestScenario(ScenarioOptions):
     vest, and ends under that shoulder's neck end. Everything here may change in a YAML file.
     """
 
-    material: str = "basis-foam"
+    material: str | Sheet = "basis-foam"
     shaped: bool = True
     contact_thickness_m: Length = 0.008
     contact_stiffness: NonNegative = 3e6

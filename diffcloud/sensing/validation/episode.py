@@ -21,7 +21,7 @@ from diffcloud.io.raw_episodes import (
     read_robot_log,
     read_timestamps,
 )
-from diffcloud.sensing.tool_poses import not_unit, unreachable
+from diffcloud.sensing.tool_poses import not_unit, turning, unreachable
 from diffcloud.sensing.validation.calibration import calibration_findings, exchanged_cameras
 from diffcloud.sensing.validation.findings import Finding, RecordedCamera
 
@@ -274,14 +274,14 @@ def _robot(log: RobotLog) -> Iterator[Finding]:
     if bad is not None:
         message = f"Row {bad + 1}: the time runs backwards ({log.times[bad]:.6f} s after {log.times[bad - 1]:.6f} s)."
         yield Finding("fault", "clock_backwards", place, message)
-    largest = float(np.abs(log.joints_rad).max())
-    if largest > 2.5 * np.pi:
+    first = float(np.abs(log.joints_rad[0]).max())  # later ones may go on for turns, of a joint without end
+    if first > 2.5 * np.pi:
         yield Finding(
             "fault",
             "angle_unit",
             place,
-            f"A joint angle of {largest:.1f} in radians: these are degrees. Multiply by pi / 180 (the arm itself reports "
-            "degrees).",
+            f"The log begins with a joint angle of {first:.1f}, in radians. If these are degrees, as the arm itself "
+            "reports them, multiply by pi / 180; if a joint without end had turned before, subtract its whole turns.",
         )
     reach = unreachable(log.tool_position_m)
     if reach is not None:
@@ -294,6 +294,8 @@ def _robot(log: RobotLog) -> Iterator[Finding]:
     orientation = not_unit(log.tool_quaternion)
     if orientation is not None:
         yield Finding("fault", "quaternion", place, orientation)
+    elif (turned := turning(log.tool_quaternion)) is not None:
+        yield Finding("warning", "tool_turns", place, turned)
     if bad is None and len(log.times) > 3:
         intervals = np.diff(log.times)
         usual = float(np.median(intervals))
