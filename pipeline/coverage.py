@@ -19,10 +19,11 @@ from diffcloud.evaluation.intervals import LEVEL, RESTARTS, state_intervals
 from diffcloud.fit.pose import SET_UP, PoseSpace
 from diffcloud.fit.uncertainty import finer_steps
 from diffcloud.io.episodes import Episode, read_episode, write_episode
-from diffcloud.io.files import files_in, write_json, write_text
+from diffcloud.io.files import files_in, read_json, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint, kept_record
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.depth_camera import DepthNoise
+from diffcloud.sim.properties import PARAMETERS
 from pipeline.config import Config, EpisodesConfig, load_config
 from pipeline.console import JsonFlag, ParamsFile, errors, finish, show, warn, writes
 from pipeline.coverage_page import (
@@ -115,6 +116,8 @@ def coverage(
         for refit in (range(refits) if refits else (None,))
     ]
     readers = _regressors(checkpoint or (), jobs)
+    for job in jobs:
+        job.check()
     failures = []
     for job, _, error in run_all("coverage", jobs, workers):
         if error is not None:
@@ -191,6 +194,7 @@ class CoverageJob:
         path = self.path
         truth, set_up = self.truth(), self.set_up()
         plan = [self.scenario, self.index, self.refit, self.seed, self.known, self.level, self.kind]
+        plan += [self.config.evaluate.within]
         plan += [truth, set_up, self._noise]
         sections = [self.config.episodes, self.config.preprocess, self.config.fit]
         mark = fingerprint([*plan, [str(section) for section in sections]], packages=_CODE)
@@ -208,6 +212,26 @@ class CoverageJob:
             raise DiffCloudError(str(record["error"]))
         return record
 
+    def check(self) -> None:
+        """
+        Raises:
+            ConfigError: a fitted parameter that is not drawn, or may be zero; or records of another level in its folder.
+        """
+        drawn, bounds = self.truth(), self.scenario.bounds
+        for name in self.config.fit.parameters:
+            low, _ = self.config.fit.bounds.get(name, bounds.get(name, PARAMETERS[name].bounds))
+            if name not in drawn or low <= 0:
+                known = sorted(one for one in drawn if PARAMETERS[one].bounds[0] > 0)
+                raise ConfigError(
+                    f"fit.parameters: coverage counts errors of the logarithm of what it draws, {', '.join(known)} in "
+                    f"{self.scenario.name}, not {name}."
+                )
+        if self.path.is_file():
+            told = read_json(self.path)
+            level = told.get("intervals", {}).get("level", self.level) if isinstance(told, dict) else self.level
+            if level != self.level:
+                raise ConfigError(f"{self.folder} holds intervals of the level {level:g}. Choose another --out.")
+
     def truth(self) -> dict[str, float]:
         """All that is drawn, name -> value."""
         rng = np.random.default_rng([self.seed, self.index])
@@ -215,7 +239,9 @@ class CoverageJob:
         if self.refit is not None:
             rng = self._random(3)
         found = {name: float(value[0]) for name, value in drawn.items()}
-        for name, factor in self.config.fit.known_within([self.scenario]).items():
+        fit = self.config.fit
+        drawn_too = fit.model_copy(update={"parameters": [name for name in fit.parameters if name in found]})
+        for name, factor in drawn_too.known_within([self.scenario]).items():
             off, value = rng.lognormal(0.0, math.log(factor)), self.scenario.value(name)
             if name not in found and value:
                 found[name] = value * off
@@ -345,6 +371,11 @@ def _regressors(checkpoints: Sequence[Path], jobs: Sequence[CoverageJob]) -> lis
     for path, regressor in zip(checkpoints, found, strict=True):
         if (scenario := regressor.description.scenario) not in {job.scenario.name for job in jobs}:
             raise ConfigError(f"{path} was trained for {scenario}, which is not among the scenarios.")
+    kinds = [(one.description.scenario, one.description.model) for one in found]
+    if len(set(kinds)) < len(kinds):
+        raise ConfigError(
+            "Two checkpoints are of one kind of network and one scenario: count them in folders of their own."
+        )
     return found
 
 

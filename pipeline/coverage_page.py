@@ -137,10 +137,9 @@ def _together(cells: Sequence[Cell], level: float) -> list[list[str]]:
     """Rows under `TOGETHER_HEAD`, of fits whose truths are of one kind."""
     kinds: dict[str, list[dict[str, Any]]] = {"same": [], "refined": [], "finer": []}
     for (_, known, _), count in cells:
-        kind = known.split()[-1]
-        kind = "same" if kind in ("free", "known") else kind
-        if kind in kinds:  # not a network
-            kinds[kind].append(count)
+        words = known.split()
+        if words[0] == "free" or "known" in words:  # not a network
+            kinds["same" if words[-1] in ("free", "known") else words[-1]].append(count)
     rows = []
     for kind, counts in kinds.items():
         if counts:

@@ -311,7 +311,7 @@ def _columns(predictions: list[dict[str, Any]]) -> list[str]:
 
 def _metrics(fits: pd.DataFrame, predictions: list[dict[str, Any]]) -> dict[str, Any]:
     by_scenario: dict[str, Any] = {}
-    for name, group in fits.groupby("scenario", sort=False):
+    for name, group in fits.groupby("scenario", sort=False) if len(fits) else ():
         columns = ("loss_start", "loss", "rms_mm", "rms_other_frames_mm")  # starts may diverge, other frames be missing
         by_scenario[str(name)] = {column: float(group[column].mean()) for column in columns if group[column].notna().any()}
     episodes = {

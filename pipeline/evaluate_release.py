@@ -57,7 +57,7 @@ def release(
     scenes = {name: folder / "conf" / "rigidcloth" / SCENES[name] for name in config.scenarios}
     scenarios = {name: choose_scenario(name, scene) for name, scene in scenes.items()}
     _import(chosen, data / "episodes")
-    failures = _fit(config, chosen, scenarios, data / "fits")
+    fitted, failures = _fit(config, chosen, scenarios, data / "fits")
     jobs = [
         job
         for name, scenario in scenarios.items()
@@ -71,7 +71,7 @@ def release(
             simulated=data / "simulated",
             kept=out / "episodes",
         )
-        if fnmatch.fnmatch(f"{name}/{job.name}", only)
+        if f"{name}/{job.name}" in fitted  # not what is left of an earlier profile
     ]
     comparison = compare(jobs, config.evaluate.workers)
     comparison.failures[:0] = failures
@@ -103,18 +103,22 @@ def _import(chosen: list[tuple[str, str, Episode]], folder: Path) -> None:
         write_episode(folder / name / f"{label}.npz", episode)
 
 
-def _fit(config: Config, chosen: list[tuple[str, str, Episode]], scenarios: dict[str, Scenario], folder: Path) -> list[str]:
-    """Fit what is not fitted yet; messages of those that failed."""
+def _fit(
+    config: Config, chosen: list[tuple[str, str, Episode]], scenarios: dict[str, Scenario], folder: Path
+) -> tuple[set[str], list[str]]:
+    """Fit what is not fitted yet: <scenario>/<episode> of the fits, and messages of those that failed."""
     jobs = [
         FitJob(label, [Recording(scenarios[name], label, episode)], config.fit, folder / name)
         for name, label, episode in chosen
     ]
-    failures = []
+    fitted, failures = set[str](), list[str]()
     for job, _, error in run_all("fit", jobs, config.evaluate.workers, patient=True):
         errors.print(f"fitted {job.label}" if error is None else f"{job.label}: {error}")
-        if error is not None:
+        if error is None:
+            fitted.add(job.label)
+        else:
             failures.append(f"{job.label}: {error}")
-    return failures
+    return fitted, failures
 
 
 def _references(path: Path) -> dict[tuple[str, str], float]:

@@ -159,8 +159,8 @@ def fit(
     settings = updated(
         config.fit,
         parameters=None if parameters is None else [name.strip() for name in parameters.split(",")],
-        fixed=assignments(fix, "--fix") or None,
-        bounds=_bounds(bound) or None,
+        fixed=config.fit.fixed | assignments(fix, "--fix"),
+        bounds=config.fit.bounds | _bounds(bound),
         solver=solver,
         iterations=iterations,
         simulations=simulations,

@@ -16,13 +16,14 @@ from rich.table import Table
 from diffcloud.errors import ConfigError
 from diffcloud.fit.agreement import NAMES, Agreement, gradient_agreement, random_parameters
 from diffcloud.io.files import write_text
+from diffcloud.io.fingerprints import fingerprint
 from diffcloud.sim.threads import use_threads
 from pipeline.console import JsonFlag, Threads, finish, progress_bar, show, writes
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 
 _COLUMNS = [f"{kind}{name}" for kind in ("", "gradient_", "difference_") for name in NAMES]
-_OF = ["scenario", "integrator"]
-"""Columns that tell what was simulated."""
+_OF = ["scenario", "integrator", "simulator"]
+"""Columns that tell what was simulated, and by what."""
 
 
 @writes(".csv")
@@ -45,7 +46,8 @@ def gradients(
     if integrator is not None:
         chosen = replace(chosen, scene=chosen.scene.stepped(integrator))
     drawn = random_parameters(chosen, pairs, seed=seed)
-    simulated = {"scenario": chosen.name, "integrator": chosen.scene.integrator}
+    mark = fingerprint([chosen], packages=("mesh", "scene", "sim"))[:16]
+    simulated = {"scenario": chosen.name, "integrator": chosen.scene.integrator, "simulator": mark}
     done = _read(out, drawn, simulated)
     with progress_bar("gradients", pairs) as update:
         update(len(done), "")
@@ -82,7 +84,10 @@ def _read(path: Path | None, drawn: NDArray[np.float64], simulated: Mapping[str,
     common = min(len(rows), len(drawn))
     if others not in ([], [dict(simulated)]):
         told = "; ".join(" ".join(map(str, one.values())) for one in others)
-        raise ConfigError(f"{path} holds pairs of {told}, not of {' '.join(simulated.values())}. Choose another --out.")
+        raise ConfigError(
+            f"{path} holds pairs of {told}, not of {' '.join(simulated.values())} (scenario, integrator, and a mark of "
+            "both and the simulator's code). Choose another --out."
+        )
     if not np.allclose(rows[:common, : len(NAMES)], drawn[:common], rtol=1e-12):
         raise ConfigError(f"{path} holds other pairs (another seed, or other bounds). Choose another --out.")
     return rows[: len(drawn)]

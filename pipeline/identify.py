@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +23,7 @@ from diffcloud.fit.result import read_motion
 from diffcloud.fit.uncertainty import distance_to_finer_mm, finer_steps
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import claimed, read_json, read_yaml, together, write_bytes, write_json, write_text
+from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.imports import cloud_folder
 from diffcloud.io.recordings import write_recording
 from diffcloud.io.ros.recording import ros_recording
@@ -93,12 +93,14 @@ def identify(
         chosen = _chosen(parameters, cloth, mass)
         fit = partial(_fitted, out, episodes, cloth, layouts)
         steps = int(cloth.get("steps_per_frame", _STEPS))
-        record, objective, job, found = _stated(fit, chosen, steps, level=level, within=within)
+        record, objective, job, ended, found = _stated(fit, chosen, steps, level=level, within=within)
         mesh = _finer_mesh(objective, record)
         findings = _findings(record, objective, found, mesh)
         with together():
             for path in job.files:
                 _copy(path, out / f"fit{path.suffix}")
+            for name in episodes:
+                _copy(out / "stages" / f"steps{ended}" / f"{name}.yaml", out / "scenarios" / f"{name}.yaml")
             write_text(out / "report.html", _page(record, found, findings, episodes, job))
             write_json(out / "intervals.json", found.model_dump(mode="json"))
     for line in findings:
@@ -129,7 +131,11 @@ def find_scene(
     names = _names(recordings)
     episodes = {name: _read(path, name, out) for name, path in names.items()}
     cloth = _cloth(out, episodes, size, mass)
-    return episodes, cloth, _layouts(out, episodes, names, cloth)
+    path = out / "recordings.yaml"
+    stated = _fields(path).keys() if path.is_file() else set[str]()
+    layouts = _layouts(out, episodes, names, cloth)
+    _warn_of_changes(out, episodes, stated)
+    return episodes, cloth, layouts
 
 
 def _sides(text: str) -> tuple[float, float]:
@@ -267,6 +273,25 @@ def _layouts(
     return layouts
 
 
+def _warn_of_changes(out: Path, episodes: Mapping[str, Episode], stated: Collection[str]) -> None:
+    """Say which recordings are not those any more that their blocks in recordings.yaml were made for, which count.
+
+    Args:
+        stated: those whose blocks were there before.
+    """
+    path = out / "stages" / "recordings.json"
+    told = read_json(path) if path.is_file() else {}
+    known = {name: mark for name, mark in told.items() if name in stated} if isinstance(told, dict) else {}
+    for name, one in episodes.items():
+        mark = fingerprint([one.points, one.times, one.gripper], packages=())
+        if known.setdefault(name, mark) != mark:
+            warn(
+                f"{name} is another recording than that which its block in {out / 'recordings.yaml'} was made for, and the "
+                "block counts. Remove it to have the layout found anew."
+            )
+    write_json(path, known)
+
+
 def _refuse_missing(fields: Mapping[str, Any], needed: Sequence[str], where: str) -> None:
     """A built-in's own value would stand in for what is missing, and nobody would know."""
     missing = [name for name in needed if name not in fields]
@@ -310,10 +335,10 @@ def _chosen(parameters: str | None, cloth: Mapping[str, Any], mass: float | None
 def _scenarios(
     out: Path, cloth: Mapping[str, Any], layouts: Mapping[str, Mapping[str, Any]], steps: int
 ) -> dict[str, Scenario]:
-    """One per recording, each written to OUT/scenarios/ for other commands."""
+    """One per recording, each written to OUT/stages/steps<steps>/: other commands read those of the finished fit."""
     found = {}
     for name, fields in layouts.items():
-        path = out / "scenarios" / f"{name}.yaml"
+        path = out / "stages" / f"steps{steps}" / f"{name}.yaml"
         write_text(path, yaml.safe_dump({**cloth, **fields, "steps_per_frame": steps}, sort_keys=False))
         found[name] = load_scenario(path)
     return found
@@ -326,8 +351,8 @@ def _stated(
     *,
     level: float,
     within: float,
-) -> tuple[FitRecord, AnyObjective, FitJob, Intervals]:
-    """Fit and state intervals; where these meet a lower loss, fit again from there.
+) -> tuple[FitRecord, AnyObjective, FitJob, int, Intervals]:
+    """Fit and state intervals; where these meet a lower loss, fit again from there. Also the scenario's steps a frame.
 
     Not `state_intervals`' own restarts: here the record belongs to the intervals, and finer steps may be asked for anew.
 
@@ -346,7 +371,7 @@ def _stated(
         near = ", ".join(f"{name} {found.lower[name]:.3g}" for name in space.asked.names)
         errors.print(f"The loss is lower at {near}; fitting again from there.")
         init, settings, halvings = found.lower, _single_start(settings), record.halvings
-    return record, objective, job, found
+    return record, objective, job, steps, found
 
 
 def _single_start(settings: FitConfig) -> FitConfig:
@@ -377,7 +402,7 @@ def _fitted(
         job = FitJob(f"{name}_steps{steps}", members, settings, out / "stages", init, halvings)
         with progress_bar("identify", 1) as update:
             record = job.run(partial(_tell, update, steps))
-        objective = replace(job, halvings=record.halvings).objective()
+        objective = _compared(record, members)
         apart, noise = distance_to_finer_mm(objective, record.simulated, finer_steps)
         errors.print(
             f"{steps * 2**record.halvings} steps a frame: {record.rms_mm:.1f} mm RMS; four times the steps move the cloth "
@@ -388,6 +413,15 @@ def _fitted(
                 warn(f"finer steps still move the cloth by {apart:.1f} mm: what is found includes an error of that size.")
             return record, objective, job, steps
         steps, init, settings, halvings = 2 * steps, record.free, _single_start(settings), record.halvings
+
+
+def _compared(record: FitRecord, members: Sequence[Recording]) -> AnyObjective:
+    """What the fit has minimised at its end: of the mesh that it ended with, at the frames that it began with."""
+    found = [
+        Objective(one.scenario.halved(record.halvings), one.episode, **record.measured_by(place))
+        for place, one in enumerate(members)
+    ]
+    return found[0] if len(found) == 1 else JointObjective(found)
 
 
 def _tell(update: Callable[[float, str], None], steps: int, done: float, text: str) -> None:

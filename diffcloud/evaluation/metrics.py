@@ -65,22 +65,33 @@ class EpisodeMeter:
             loss, loss_deviation: by the fit's measure at its frames [squared length unit], the mean over the draws and
                 their standard deviation (of one draw);
             rms_mm: its root in millimetres;
-            loss_other_frames, rms_other_frames_mm: at the frames that the fit did not use, of one draw; absent without any;
+            loss_other_frames, rms_other_frames_mm: at the frames that the fit did not use, of one draw; absent without any,
+                and where the motion diverges after the fit's frames;
             two_sided: Chamfer in both directions at the fit's frames, of one draw;
             and of episodes with known parameters: success, error_<parameter> (relative), error_ratio (of stretch to mass).
         """
         with torch.no_grad():
-            found, kept, diverged = without_diverged(len(sets), lambda index: self._distances([sets[i] for i in index]))
+            found, kept, late = without_diverged(len(sets), lambda index: self._distances([sets[i] for i in index]))
+            of_all, rest = kept.tolist(), list(late)
+            # what diverges after the fit's own frames is measured at these
+            at_own, kept, lost = without_diverged(
+                len(rest), lambda index: self._distances([sets[rest[i]] for i in index], others=False)
+            )
         rows: list[dict[str, Any]] = [{} for _ in sets]
-        for index, distances in zip(kept.tolist(), found or [], strict=True):
+        every = [*of_all, *(rest[index] for index in kept.tolist())]
+        for index, distances in zip(every, [*(found or []), *(at_own or [])], strict=True):
             rows[index] = distances | self._against_truth(sets[index], distances["loss"])
-        return Measured(rows, diverged)
+        return Measured(rows, {rest[index]: message for index, message in lost.items()})
 
-    def _distances(self, sets: Sequence[Mapping[str, float]]) -> list[dict[str, Any]]:
+    def _distances(self, sets: Sequence[Mapping[str, float]], *, others: bool = True) -> list[dict[str, Any]]:
+        """
+        Args:
+            others: at the frames that the fit did not use too.
+        """
         own = self._own
         names = dict.fromkeys(name for values in sets for name in values)
         tensors = {name: torch.tensor([values.get(name, 0.0) for values in sets], dtype=torch.float64) for name in names}
-        run = own.simulate(tensors)
+        run = own.simulate(tensors, steps=None if others else own.loss_steps)
         own.reseed(self._seeds[0])
         pose = own.pose(run)
         points = own.points(run, pose=pose)  # [B, L, N, 3]
@@ -97,9 +108,9 @@ class EpisodeMeter:
             "rms_mm": to_mm * every.mean(0).sqrt(),
             "two_sided": torch.stack(both).mean(0),
         }
-        if self._others is not None:
-            others = self._others.frame_losses(run, pose=pose).mean(-1)
-            columns |= {"loss_other_frames": others, "rms_other_frames_mm": to_mm * others.sqrt()}
+        if others and self._others is not None:
+            elsewhere = self._others.frame_losses(run, pose=pose).mean(-1)
+            columns |= {"loss_other_frames": elsewhere, "rms_other_frames_mm": to_mm * elsewhere.sqrt()}
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
         return [dict(zip(columns, row, strict=True)) for row in rows]
 

@@ -25,6 +25,8 @@ MATERIAL_DOUBTS = {
     "friction_cloth": 1.3,
 }
 """One standard deviation of each material, as a factor."""
+MOST_DOUBT = 100.0
+"""A larger factor is no knowledge of a material."""
 _FARTHEST = 4.0
 """Bounds, in standard deviations."""
 
@@ -46,7 +48,7 @@ def parse_doubts(text: str) -> dict[str, float]:
         if name in found:
             raise ConfigError(f"doubts name {name} twice.")
         told = f"doubts {item.strip()!r}: {name} takes the factor within which it is known"
-        found[name] = parse_factor(value, told, f"{name}=1.5x")
+        found[name] = parse_factor(value, told, f"{name}=1.5x", MOST_DOUBT)
     return found
 
 

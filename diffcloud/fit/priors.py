@@ -19,6 +19,7 @@ from diffcloud.sim.properties import PARAMETERS
 
 DEFAULT_FACTOR = 10.0
 """One deviation of a multiplier."""
+_MOST = 1e6
 INDEPENDENT = 100
 """Residuals of a recording that count as independent."""
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180, "s": 1.0, "ms": 1e-3, "%": 1e-2}
@@ -49,7 +50,7 @@ def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str
         if PARAMETERS[name].basis is None:
             raise ConfigError(f"prior: {name} is no multiplier; what is known of it are its bounds, {list(bounds[name])}.")
         told = f"prior {item.strip()!r}: {name} takes the factor within which it probably lies"
-        factor = parse_factor(value, told, f"{name}=3x")
+        factor = parse_factor(value, told, f"{name}=3x", _MOST)
         if not inside[name]:
             raise ConfigError(
                 f"prior {item.strip()!r}: it is about 1, the basis material, and the bounds of {name} are "
@@ -59,15 +60,16 @@ def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str
     return found
 
 
-def parse_factor(text: str, told: str, example: str) -> float:
+def parse_factor(text: str, told: str, example: str, most: float) -> float:
     """Of "1.5x".
 
     Args:
         told: what it is of, with which the message begins.
         example: a right one, with its parameter.
+        most: the largest that means anything.
 
     Raises:
-        ConfigError: no factor above 1.
+        ConfigError: no factor above 1, or a larger one.
     """
     match = re.fullmatch(r"([0-9.eE+-]+)\s*x", text)
     try:
@@ -76,6 +78,8 @@ def parse_factor(text: str, told: str, example: str) -> float:
         factor = math.nan
     if not (factor > 1 and math.isfinite(factor)):
         raise ConfigError(f"{told}, above 1 and with an x, such as {example}; or write none.")
+    if factor > most:
+        raise ConfigError(f"{told}, at most {most:g}x; where nothing is known, write none.")
     return factor
 
 

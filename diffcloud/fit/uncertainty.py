@@ -58,6 +58,8 @@ _ROUGH = 4.0
 """The largest factor between measured and Gauss and Newton's curvature that is believed."""
 _CHUNK = 16
 """Motions matched together."""
+_UNSEEN = 1e-9
+"""Part of the largest curvature: what has less is rounding, of what no point moves by and no prior knows."""
 _PATCHES = 16
 _NOISE_M = 0.002
 """Of recorded points whose own uncertainty is not stated."""
@@ -130,6 +132,8 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
     clusters = np.concatenate([w * part.scores for w, part in zip(weights, parts, strict=True)])
     clusters = clusters[np.abs(clusters).max(axis=1) > 0]
     sources = {"noise": spread(clusters) * len(clusters) / max(len(clusters) - 1, 1)}
+    if (unseen := _unseen(normal)[asked]).size:
+        sources["unseen"] = float((axis.ends[1] - axis.ends[0]).max()) ** 2 * unseen @ unseen.T  # to the bounds
     of_priors = np.diag(prior * space.prior_steps().numpy())
     if prior[asked].any():
         sources["prior"] = spread(of_priors[asked])
@@ -155,6 +159,12 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
         curvature=normal * whole / max(loss, 1e-300),
         besides=frozenset(doubts).union(*(m.nuisance for m in objective.members)),
     )
+
+
+def _unseen(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[k, u] directions of which neither recording nor prior knows, of the curvature [k, k]."""
+    values, vectors = np.linalg.eigh(normal)
+    return np.asarray(vectors[:, values < _UNSEEN * values.max()])
 
 
 def finer_steps(scenario: Scenario) -> Scenario:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from diffcloud.clouds import NeighbourIndex, chamfer
+from diffcloud.errors import DivergedError
 from diffcloud.evaluation import ComparisonSettings, EpisodeMeter, Estimate, Gap, compare_episode, loss_landscape
 from diffcloud.evaluation.metrics import success_threshold
 from diffcloud.fit import AdamSettings, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
@@ -70,6 +71,25 @@ class TestMeter:
     def test_success_is_below_the_papers_threshold(self, scenario, rows):
         assert success_threshold(scenario) == pytest.approx(0.0005 * 0.35**2)
         assert [row["success"] for row in rows] == [row["loss"] < success_threshold(scenario) for row in rows]
+
+    def test_one_that_diverges_after_the_fits_frames_is_measured_at_these(self, scenario, episode, monkeypatch):
+        objective = Objective(scenario, episode, frames=[2], paper=True)
+        whole = EpisodeMeter(objective, draws=2, seed=7).measure([TRUTH, OTHER])
+
+        def until(self, parameters, *, steps=None):
+            if steps is None or steps > self.loss_steps:
+                late = (parameters["stretch"] > 3).nonzero().flatten().tolist()
+                if late:
+                    raise DivergedError(self.loss_steps + 1, late, "later")
+            return simulate(self, parameters, steps=steps)
+
+        simulate = Objective.simulate
+        monkeypatch.setattr(Objective, "simulate", until)
+        found = EpisodeMeter(objective, draws=2, seed=7).measure([TRUTH, OTHER])
+        assert found.diverged == {}
+        assert found.rows[0] == pytest.approx(whole.rows[0])
+        assert found.rows[1]["loss"] == pytest.approx(whole.rows[1]["loss"])
+        assert whole.rows[1].keys() - found.rows[1].keys() == {"loss_other_frames", "rms_other_frames_mm"}
 
     def test_one_that_diverges_costs_only_itself(self, scenario, episode, rows):
         meter = EpisodeMeter(Objective(scenario, episode, frames=[-1], paper=True), draws=2, seed=7)

@@ -39,6 +39,7 @@ def test_option():
         ("bending=2", "above 1 and with an x, such as bending=1.5x"),
         ("bending=0.5x", "above 1"),
         ("bending=infx", "above 1"),
+        ("bending=1500x", "at most 100x"),
         ("bending", "above 1"),
         ("drag=2x,drag=3x", "drag twice"),
         ("", "Unknown parameter"),

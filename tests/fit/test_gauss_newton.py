@@ -17,6 +17,7 @@ from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.doubts import MATERIAL_DOUBTS, with_doubts
 from diffcloud.fit.priors import INDEPENDENT
 from diffcloud.fit.residuals import Axis, Linearisation, linearise
+from diffcloud.fit.scan import scan
 from diffcloud.fit.solvers import gauss_newton
 from diffcloud.scene import load_scenario
 from tests.conftest import paper_objective, small_lift
@@ -530,6 +531,36 @@ class TestFits:
         assert beyond.scan is None
         assert 1 < len(beyond.history.losses) < len(losses)
         assert beyond.loss < losses[0]
+
+    @pytest.mark.parametrize("there", [math.inf, 1.5])
+    def test_a_lower_place_that_derivatives_do_not_confirm_costs_nothing(self, monkeypatch, there):
+        """Of a scan, which takes motions alone: one beside them diverges, or the loss there is higher after all."""
+        settings = GaussNewtonSettings(starts=1, screen=0)
+        plain = fit_gauss_newton(lifted(), SPACE, settings)
+
+        def seen(objective, space, place, curvature):
+            found, spent = scan(objective, space, place, curvature)
+            return replace(
+                found, losses=torch.where(found.losses == found.losses.min(), 0.5 * plain.loss, found.losses)
+            ), spent
+
+        def failing(objective, space, places):
+            found = linearise(objective, space, places)
+            beside = float(
+                (places[0] - Axis.of(space).places(torch.tensor(list(plain.values.values())).double())).abs().max()
+            )
+            return replace(found, losses=there * found.losses) if beside > 0.03 and scanned else found
+
+        def scanning(*given):
+            scanned.append(True)
+            return seen(*given)
+
+        scanned = []
+        monkeypatch.setattr(gauss_newton, "scan", scanning)
+        monkeypatch.setattr(gauss_newton, "linearise", failing)
+        found = fit_gauss_newton(lifted(), SPACE, settings)
+        assert scanned
+        assert (found.values, found.loss) == (plain.values, plain.loss)
 
     @pytest.mark.parametrize(
         ("second", "witnesses", "misfit", "order"),

@@ -34,6 +34,7 @@ class TestOption:
             ("mass=1x", "above 1"),
             ("mass=0.5x", "above 1"),
             ("mass=infx", "above 1"),
+            ("mass=1e7x", "at most 1e"),
             ("mass", "above 1"),
             ("drag=3x", "fitted parameter"),
             ("damping=3x", "no multiplier"),

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from diffcloud.evaluation.discretisation import mesh_study, pairs
+from diffcloud.evaluation.intervals import state_intervals
 from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton
 from diffcloud.fit.parameters import Variable
 from diffcloud.fit.pose import SET_UP
@@ -188,6 +189,23 @@ class TestPrior:
         space = FitSpace.build(["drag"], fixed=TRUTH, priors={"drag": 3.0})
         found = uncertainty(Objective(still, recorded(still), nuisance={}), space, {"drag": 1.0})
         assert np.sqrt(found.covariance[0, 0]) == pytest.approx(np.log(3.0), rel=1e-6)
+
+    def test_without_one_nothing_is_known(self, scenario):
+        """Beside what is shown: the interval of the friction ends at the bounds, that of the stretch stays."""
+        alone = replace(
+            scenario,
+            scene=replace(scenario.scene, surrounding=replace(scenario.scene.surrounding, self_contact=False)),
+        )
+        space = FitSpace.build(["stretch", "friction_cloth"], fixed={"mass": TRUTH["mass"]})
+        objective = Objective(alone, recorded(alone), nuisance={})
+        for stretch, friction in ((0.6, 0.3), (0.604, 0.75), (0.597, 1.2)):
+            values = {"stretch": stretch, "friction_cloth": friction, "mass": TRUTH["mass"]}
+            found = state_intervals(objective, space, values)
+            entry = found.parameters["friction_cloth"]
+            assert (entry.low, entry.high, entry.verdict) == (0.0, 1.5, "not identified")
+            assert found.parameters["stretch"].verdict == "identified"
+        known = uncertainty(objective, SPACE, TRUTH)
+        assert "unseen" not in known.sources
 
     def test_where_much_is_shown_it_says_little(self, scenario):
         space = FitSpace.build(["stretch"], fixed={"mass": 1.7}, priors={"stretch": 10.0})

@@ -12,7 +12,9 @@ import yaml
 from diffcloud.errors import ConfigError, DivergedError, OutputError
 from diffcloud.io.episodes import read_episode, write_episode
 from pipeline import coverage
+from pipeline.config import load_config
 from pipeline.coverage_page import counted, counts_of, coverage_page
+from pipeline.scenario_options import choose_scenario
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
 from tests.pipeline.invoke import invoke
@@ -160,14 +162,51 @@ class TestCoverage:
         [
             (("--checkpoint", "of_lift.safetensors"), "was trained for lift, which is not among the scenarios"),
             (("--refits", 2, "--checkpoint", "of_lift.safetensors"), "leave out --checkpoint or --refits"),
+            (
+                ("--checkpoint", "one.safetensors", "--checkpoint", "other.safetensors"),
+                "one kind of network and one scenario",
+            ),
             (("--fix", "drag"), "--fix names a fitted parameter"),
             (("--fix", "mass", "--fix", "stretch"), "Nothing is left to fit"),
         ],
     )
     def test_what_is_asked_for_must_make_sense(self, work, options, message):
+        regressor("posterior", scenario="small").write(work / "one.safetensors")
+        regressor("posterior", scenario="small").write(work / "other.safetensors")
         regressor("mlp", scenario="lift").write(work / "of_lift.safetensors")
         assert message in invoke(*COVERAGE, *options, code=1).errors
         assert not list((work / "out").rglob("*.json"))
+
+    @pytest.mark.parametrize("name", ["friction_cloth", "shear"])
+    def test_what_is_not_drawn_or_may_be_zero_is_refused_before_anything_is_fitted(self, work, name):
+        told = {"fit": {**PARAMS["fit"], "doubts": None, "parameters": ["stretch", name]}}
+        (work / "params.yaml").write_text(yaml.safe_dump(told))
+        assert f"not {name}" in invoke(*COVERAGE, code=1).errors
+        assert not list((work / "out").rglob("*.json"))
+
+    def test_further_material_is_drawn_as_it_is_doubted(self, work):
+        before = coverage_truth(work)
+        told = {"fit": {**PARAMS["fit"], "doubts": None, "parameters": ["stretch", "mass", "bending"]}}
+        (work / "params.yaml").write_text(yaml.safe_dump(told))
+        after = coverage_truth(work)
+        assert after == before
+        done = invoke(*COVERAGE, "--recordings", 1)
+        assert set(done.result["parameters"]) == {"stretch", "mass", "bending"}
+
+    def test_another_level_or_factor_does_not_mix(self, work):
+        invoke(*COVERAGE, "--recordings", 1)
+        assert "level 0.9" in invoke(*COVERAGE, "--recordings", 1, "--level", 0.8, code=1).errors
+        path = work / "out/small/free/0000.json"
+        assert json.loads(path.read_text())["intervals"]["within"] == 1.5
+        (work / "params.yaml").write_text(yaml.safe_dump({**PARAMS, "evaluate": {"within": 1.2}}))
+        invoke(*COVERAGE, "--recordings", 1)
+        assert json.loads(path.read_text())["intervals"]["within"] == 1.2
+
+
+def coverage_truth(folder):
+    config = load_config(folder / "params.yaml")
+    config = config.model_copy(update={"fit": config.fit.model_copy(update={"doubts": None})})
+    return coverage.CoverageJob(choose_scenario("lift"), 3, 5, (), 0.9, "same", config, folder / "out").truth()
 
 
 def test_refusals_and_failures_count_as_misses(tmp_path):
@@ -200,7 +239,14 @@ def test_refusals_and_failures_count_as_misses(tmp_path):
 
 def test_rows_of_one_kind_of_truth_are_counted_together(tmp_path):
     """Of twenty recordings, 14 to 20 are in the band of 90 %; networks and refits do not count."""
-    for folder, held in {"free": 16, "mass_known": 13, "mass_known_finer": 15, "posterior": 0, "free_refits": 20}.items():
+    for folder, held in {
+        "free": 16,
+        "mass_known": 13,
+        "mass_known_finer": 15,
+        "posterior": 0,
+        "mlp_finer": 0,
+        "free_refits": 20,
+    }.items():
         (tmp_path / "lift" / folder).mkdir(parents=True)
         for index in range(20):
             entry = {"value": 1.0, "low": 0.9 if index < held else 1.1, "high": 1.2, "verdict": "identified"}

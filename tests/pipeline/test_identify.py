@@ -19,12 +19,14 @@ import yaml
 
 from diffcloud.clouds import SurfaceSampler
 from diffcloud.fit import read_fit
+from diffcloud.fit.result import read_motion
 from diffcloud.io.clouds import write_ply
 from diffcloud.io.raw_episodes import read_raw_episode
 from diffcloud.scene.scenarios import built_in, make_scenario
 from diffcloud.sim.simulate import rollout
 from pipeline import identify
 from pipeline.config import FitConfig
+from pipeline.fit_jobs import FitJob
 from pipeline.identify import finer_mesh_sentences, mesh_sentence
 from tests.fit.records import record_of, recording_of
 from tests.io.ros_bag import bag
@@ -123,11 +125,52 @@ class TestNewUser:
         with contextlib.chdir(folder):
             record = read_fit(folder / "found" / "fit.json")
             assert [one.name for one in record.episodes] == ["first", "second"]
-            done = invoke(
-                "rollout", "--scenario", "found/scenarios/second.yaml", "--fit", "found/fit.json",
-                "--episode", "found/episodes/second.npz", "--out", "run.npz",
-            )  # fmt: skip
+            options = ("--fit", "found/fit.json", "--episode", "found/episodes/second.npz", "--out", "run.npz")
+            done = invoke("rollout", *options)
             assert done.result["parameters"] == record.values
+            assert "not among the fit's recordings" not in done.errors
+            moved = np.load("run.npz")["nodes"]
+            np.testing.assert_allclose(moved, read_motion(Path("found/fit.npz"), 1).nodes, atol=1e-6)
+
+    def test_what_belongs_to_a_fit_stays_until_another_is_done(self, found, tmp_path, monkeypatch):
+        """A run that is stopped leaves fit and scenarios of the one before."""
+        folder = shutil.copytree(found[0], tmp_path, dirs_exist_ok=True)
+
+        def stopped(self, tell):
+            raise KeyboardInterrupt
+
+        with contextlib.chdir(folder):
+            path = Path("found/cloth.yaml")
+            path.write_text(path.read_text().replace("steps_per_frame: 8", "steps_per_frame: 16"))
+            before = {one: one.read_bytes() for one in [*Path("found/scenarios").iterdir(), Path("found/fit.json")]}
+            monkeypatch.setattr(FitJob, "run", stopped)
+            with pytest.raises(KeyboardInterrupt):
+                identify.identify(
+                    [Path("recorded/first"), Path("recorded/second")], Path("found"), parameters="stretch", mass=0.25
+                )
+            assert before == {one: one.read_bytes() for one in before}
+
+    def test_another_recording_of_that_name_is_told(self, found, tmp_path):
+        folder = shutil.copytree(found[0], tmp_path, dirs_exist_ok=True)
+        out, recordings = folder / "found", [folder / "recorded" / name for name in ("first", "second")]
+        told = []
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(identify, "warn", told.append)
+            identify.find_scene(recordings, out, None, None)
+            assert told == []
+            track = folder / "recorded" / "first" / "gripper.csv"
+            rows = np.loadtxt(track, delimiter=",", skiprows=1)
+            rows[-1, 3] += 0.01
+            np.savetxt(track, rows, delimiter=",", header="t_s,x,y,z", comments="")
+            identify.find_scene(recordings, out, None, None)
+            assert len(told) == 1
+            assert told[0].startswith("first is another recording than that")
+            notes = out / "recordings.yaml"
+            text = notes.read_text()
+            notes.write_text(text[: text.index("first:")] + text[text.index("second:") :])
+            identify.find_scene(recordings, out, None, None)
+            identify.find_scene(recordings, out, None, None)
+        assert len(told) == 1
 
     @pytest.mark.slow
     def test_an_edited_value_overrules_and_a_finished_fit_is_kept(self, found, tmp_path):

@@ -140,6 +140,8 @@ def fit_adam(
         if not history.losses:
             raise
         reason = "interrupted"
+    if settings.resample:
+        objective.reseed(settings.seed)  # as the record says
     return FitOutcome(
         values=dict(zip(space.names, best.values.tolist(), strict=True)),
         loss=best.loss,

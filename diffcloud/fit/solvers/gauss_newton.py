@@ -191,6 +191,9 @@ def fit_gauss_newton(
                     break
                 found = linearise(objective, space, lower[None])
                 simulations += found.simulations
+                if not float(found.losses[0]) < ways.best.loss:  # where derivatives are taken, a motion may diverge
+                    looked = seen
+                    break
                 ways.go_on(lower, found)
             if not math.isfinite(ways.best.loss):
                 if others and not ways.waiting:  # they diverge after the frames that they were chosen by

@@ -43,7 +43,7 @@ class ScenarioOptions(Checked):
     compression: Annotated[float, Field(ge=0, le=1)] = 1.0
     """The part of its stretching stiffness with which the cloth resists compression in its plane. Fabric wrinkles instead,
     finer than most meshes (docs/physics.md, wrinkles)."""
-    doubts: dict[str, Annotated[float, Field(gt=1, le=1e6)]] = Field(default_factory=dict)
+    doubts: dict[str, Annotated[float, Field(gt=1, le=100)]] = Field(default_factory=dict)
     """Material that is known less well, or better, than usual: parameter -> factor of one deviation (`fit.doubts`)."""
     path: Keyframes
     """The gripper's displacement."""
