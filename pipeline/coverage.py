@@ -217,14 +217,13 @@ class CoverageJob:
         Raises:
             ConfigError: a fitted parameter that is not drawn, or may be zero; or records of another level in its folder.
         """
-        drawn, bounds = self.truth(), self.scenario.bounds
+        stated = {**self.scenario.bounds, **self.config.fit.bounds}
+        drawn = [name for name in self.truth() if stated.get(name, PARAMETERS[name].bounds)[0] > 0]
         for name in self.config.fit.parameters:
-            low, _ = self.config.fit.bounds.get(name, bounds.get(name, PARAMETERS[name].bounds))
-            if name not in drawn or low <= 0:
-                known = sorted(one for one in drawn if PARAMETERS[one].bounds[0] > 0)
+            if name not in drawn:
                 raise ConfigError(
-                    f"fit.parameters: coverage counts errors of the logarithm of what it draws, {', '.join(known)} in "
-                    f"{self.scenario.name}, not {name}."
+                    f"fit.parameters: coverage counts errors of the logarithm of what it draws and bounds keep above zero: "
+                    f"{', '.join(drawn)} in {self.scenario.name}, not {name}."
                 )
         if self.path.is_file():
             told = read_json(self.path)

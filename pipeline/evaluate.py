@@ -18,7 +18,7 @@ from diffcloud.evaluation.markdown import comparison_page
 from diffcloud.evaluation.methods import scan_of, space_of
 from diffcloud.evaluation.summary import PREDICTORS, label, largest_sources, sentences, tables
 from diffcloud.evaluation.summary import metrics as summary_metrics
-from diffcloud.fit import JointObjective, Objective, read_fit
+from diffcloud.fit import Objective, read_fit
 from diffcloud.fit.pose import parse_priors
 from diffcloud.fit.result import describe_recording
 from diffcloud.io.episodes import read_episode
@@ -28,7 +28,7 @@ from diffcloud.sim.threads import use_threads
 from pipeline.comparison import Comparison, compare, comparison_jobs, write_tables
 from pipeline.config import Config, load_config
 from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, errors, finish, output, say, show, with_suffix
-from pipeline.fit_jobs import joint_fit
+from pipeline.fit_jobs import Recording, compared, joint_fit
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario
 
 app = typer.Typer(help="Measure parameters, and compare methods.")
@@ -64,8 +64,7 @@ def loss(
     if fit is not None:
         record = read_fit(fit)
         values = dict(record.values)
-        known = episode.stem in {one.name for one in record.episodes}
-        place = record.place_of(episode.stem, scenario) if known else None
+        place = record.known_place(episode.stem, scenario)
         laid = record.laid_in(None if place is None else record.episodes[place])
         measure = record.measure.model_dump() if place is None else record.measured_by(place)
         if scenario is None and scene is None:
@@ -113,15 +112,15 @@ def intervals(
         raise ConfigError(f"{fit} is a fit to {len(record.episodes)} episodes ({names}), {len(episodes)} were given.")
     if within <= 1:
         raise ConfigError(f"--within takes a factor above 1, got {within:g}.")
-    members = []
+    recordings = []
     for place, (path, one) in enumerate(zip(episodes, record.episodes, strict=True)):
         if path.stem != one.name:
             raise ConfigError(f"Recording {place + 1} of {fit} is {one.name}, and {path} was given in its place.")
         single = len(episodes) == 1 or one.scenario == record.scenario
         stated = scenario if scenario is not None and single else None
         chosen = choose_scenario(stated or fitted_scenario(fit, one.scenario), scene)
-        members.append(Objective(chosen.halved(record.halvings), read_episode(path), **record.measured_by(place)))
-    objective = members[0] if len(members) == 1 else JointObjective(members)
+        recordings.append(Recording(chosen, one.name, read_episode(path)))
+    objective = compared(record, recordings)
     found = state_intervals(
         objective, space_of(record), record.free,
         level=level, within=within, restarts=RESTARTS, seen=scan_of(record),

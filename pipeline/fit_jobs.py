@@ -102,6 +102,22 @@ def read_recordings(pairs: Sequence[tuple[str, Path]]) -> list[Recording]:
     return [Recording(scenarios[name], path.stem, read_episode(path)) for name, path in pairs]
 
 
+def compared(record: FitRecord, recordings: Sequence[Recording]) -> AnyObjective:
+    """What a fit has minimised at its end: of the mesh that it ended with, at the frames that it began with.
+
+    Args:
+        recordings: of the fit, in their order.
+
+    Raises:
+        ConfigError, EpisodeError: the episodes lack these frames, or are of different cloths.
+    """
+    members = [
+        Objective(one.scenario.halved(record.halvings), one.episode, **record.measured_by(place))
+        for place, one in enumerate(recordings)
+    ]
+    return members[0] if len(members) == 1 else JointObjective(members)
+
+
 @dataclass(frozen=True)
 class FitJob:
     """One parameter set for one or several recordings. A finished fit of the same inputs by the same code is kept."""

@@ -35,7 +35,7 @@ from diffcloud.sim.properties import one_set
 from diffcloud.sim.threads import use_threads
 from pipeline.config import Config, FitConfig
 from pipeline.console import JsonFlag, Threads, errors, finish, progress_bar, warn
-from pipeline.fit_jobs import FitJob, Recording
+from pipeline.fit_jobs import FitJob, Recording, compared
 from pipeline.preprocess import PreprocessJob
 
 _DENSITY = 0.16
@@ -154,7 +154,7 @@ def _names(recordings: Sequence[Path]) -> dict[str, Path]:
     for path in recordings:
         if not path.exists():
             raise ConfigError(f"No such recording: {path}.")
-        name = path.stem if path.is_file() else path.resolve().name
+        name = path.stem if path.is_file() else path.absolute().name
         if name in named:
             raise ConfigError(f"Two recordings are named {name}; rename one.")
         named[name] = path
@@ -170,8 +170,8 @@ def _read(path: Path, name: str, out: Path) -> Episode:
         episode = read_episode(path)
     elif (path / "episode.json").is_file():
         job = PreprocessJob("episodes", path.resolve(), out, Config().preprocess, None)
-        if (doubt := job.run(lambda done, text: None).doubt) is not None:
-            warn(f"{name}: {doubt}")
+        for message in job.run(lambda done, text: None).warnings:
+            warn(f"{name}: {message}")
         return read_episode(kept)
     else:
         track = path / "gripper.csv"
@@ -402,7 +402,7 @@ def _fitted(
         job = FitJob(f"{name}_steps{steps}", members, settings, out / "stages", init, halvings)
         with progress_bar("identify", 1) as update:
             record = job.run(partial(_tell, update, steps))
-        objective = _compared(record, members)
+        objective = compared(record, members)
         apart, noise = distance_to_finer_mm(objective, record.simulated, finer_steps)
         errors.print(
             f"{steps * 2**record.halvings} steps a frame: {record.rms_mm:.1f} mm RMS; four times the steps move the cloth "
@@ -413,15 +413,6 @@ def _fitted(
                 warn(f"finer steps still move the cloth by {apart:.1f} mm: what is found includes an error of that size.")
             return record, objective, job, steps
         steps, init, settings, halvings = 2 * steps, record.free, _single_start(settings), record.halvings
-
-
-def _compared(record: FitRecord, members: Sequence[Recording]) -> AnyObjective:
-    """What the fit has minimised at its end: of the mesh that it ended with, at the frames that it began with."""
-    found = [
-        Objective(one.scenario.halved(record.halvings), one.episode, **record.measured_by(place))
-        for place, one in enumerate(members)
-    ]
-    return found[0] if len(found) == 1 else JointObjective(found)
 
 
 def _tell(update: Callable[[float, str], None], steps: int, done: float, text: str) -> None:

@@ -191,7 +191,7 @@ def _named(sources: list[Path]) -> dict[str, Path]:
     named: dict[str, Path] = {}
     for source in sources:
         name, equals, path = str(source).partition("=")
-        entry = (name, Path(path)) if equals else (source.stem, source)
+        entry = (name, Path(path)) if equals else (source.absolute().stem, source)
         if entry[0] in named:
             raise ConfigError(f"Two sources are named {entry[0]!r}; name them with NAME=PATH.")
         if not entry[1].exists():

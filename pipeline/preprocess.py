@@ -22,7 +22,6 @@ from diffcloud.sensing.fusion import Seen, fuse
 from diffcloud.sensing.masking import RobotMask
 from diffcloud.sensing.pictures import cloud_picture, mask_picture
 from diffcloud.sensing.robot import Robot, gen3
-from diffcloud.sensing.tool_poses import turning
 from pipeline.config import PreprocessConfig, RawConfig, load_config, updated
 from pipeline.console import JsonFlag, ParamsFile, episode_files, errors, finish, warn, writes
 from pipeline.workers import Tell, run_all
@@ -48,22 +47,23 @@ def preprocess(
     settings = updated(config.preprocess, raw=raw, workers=workers)
     if not mask:
         settings = settings.model_copy(update={"raw": settings.raw.model_copy(update={"robot": None})})
-    sources = _sources(recorded, config.scenarios)
+    sources = _sources(recorded.absolute(), config.scenarios)  # "." has no name
     calibrated = None if calibration is None else read_calibration(calibration)
     if any(path.is_dir() for _, path in sources):
         robot_mask(settings.raw)  # a robot that cannot be read must not cost an episode's time
     jobs = [PreprocessJob(scenario, path, out, settings, calibrated) for scenario, path in sources]
     kept: dict[str, Any] = {}
-    failures: list[str] = []
+    failures, warnings = list[str](), list[str]()
     for job, done, error in run_all("preprocess", jobs, settings.workers):
         if error is None:
             kept[f"{job.scenario}/{job.name}"] = done.points
-            if done.doubt is not None:
-                warn(f"{job.label}: {done.doubt}")
+            warnings += [f"{job.label}: {message}" for message in done.warnings]
         else:
             failures.append(error)
+    for message in warnings:
+        warn(message)
     errors.print(f"Cleaned {len(kept)} episodes into {out}.")
-    finish({"out": str(out), "points": kept}, json)
+    finish({"out": str(out), "points": kept, "warnings": warnings}, json)
     if failures:
         raise EpisodeError("\n".join(failures))
 
@@ -74,8 +74,7 @@ class Cleaned:
 
     points: dict[str, list[int]]
     """Per frame, recorded and kept."""
-    doubt: str | None
-    """About the gripper's track."""
+    warnings: list[str]
 
 
 @dataclass(frozen=True)
@@ -124,9 +123,8 @@ class PreprocessJob:
             if pictures is not None:
                 pictures.write(self.out / self.scenario, self.name, episode)
             write_episode(self.out / self.scenario / f"{self.name}.npz", episode)
-        log = None if pictures is None else pictures.raw.robot
-        turned = None if log is None else turning(log.tool_quaternion)
-        return Cleaned({key: episode.meta["quality"][key] for key in ("recorded", "kept")}, turned)
+        quality = episode.meta["quality"]
+        return Cleaned({key: quality[key] for key in ("recorded", "kept")}, quality.get("warnings", []))
 
 
 def _sources(recorded: Path, scenarios: list[str]) -> list[tuple[str, Path]]:
@@ -163,7 +161,6 @@ def _scenario(raw: Path) -> str:
 
 
 def _stem(path: Path) -> str:
-    path = path.resolve()  # of "." too
     return path.name if path.is_dir() else path.stem
 
 

@@ -50,9 +50,8 @@ def rollout(
     """Simulate and export a motion."""
     fitted = None if fit is None else read_fit(fit)
     if fit is not None and fitted is not None and scenario is None and scene is None:
-        known = episode is not None and episode.stem in {one.name for one in fitted.episodes}
-        place = fitted.place_of(episode.stem) if episode is not None and known else 0
-        scenario = fitted_scenario(fit, fitted.episodes[place].scenario)
+        place = None if episode is None else fitted.known_place(episode.stem)
+        scenario = fitted_scenario(fit, fitted.episodes[place or 0].scenario)
     chosen = choose_scenario(scenario, scene).halved(0 if fitted is None else fitted.halvings)
     values: dict[str, float] = {}
     if fitted is not None:

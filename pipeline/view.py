@@ -50,14 +50,14 @@ def view(
     record = None if fit is None else read_fit(fit)
     overlays, facts = [], []
     paths = [path for given in episodes for path in ([given] if _is_raw(given) else episode_files([given]))]
-    for path in paths:
+    for path in map(Path.absolute, paths):  # "." has no name
         seen = _raw(path, params) if _is_raw(path) else _Shown(read_episode(path), {})
         chosen = _spread(seen.episode.frame_count, frames)
         layers, told = _layers(path, seen.episode, chosen, points, (scenario, scene), fit, record)
         overlays.append(_overlay(path.stem, seen, chosen, layers))
         facts += [(path.stem, line) for line in (_about(seen.episode), *told)]
     note = "Masked pixels are red, what was kept as cloth is green." if any(one.photographs for one in overlays) else ""
-    title = paths[0].stem if len(paths) == 1 else f"{len(paths)} episodes"
+    title = paths[0].absolute().stem if len(paths) == 1 else f"{len(paths)} episodes"
     page = build_view(overlays, title=title, note=note, facts=facts)
     write_text(out, page)
     errors.print(f"Wrote {out} ({len(page) / 1e6:.1f} MB).", soft_wrap=True)

@@ -14,6 +14,7 @@ from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.fit.parameters import FitSpace, Variable
 from diffcloud.fit.priors import parse_factor
 from diffcloud.scene.scenarios import Scenario
+from diffcloud.scene.scenarios.options import MOST_DOUBT
 from diffcloud.sim.properties import PARAMETERS
 
 MATERIAL_DOUBTS = {
@@ -25,8 +26,6 @@ MATERIAL_DOUBTS = {
     "friction_cloth": 1.3,
 }
 """One standard deviation of each material, as a factor."""
-MOST_DOUBT = 100.0
-"""A larger factor is no knowledge of a material."""
 _FARTHEST = 4.0
 """Bounds, in standard deviations."""
 
@@ -48,7 +47,13 @@ def parse_doubts(text: str) -> dict[str, float]:
         if name in found:
             raise ConfigError(f"doubts name {name} twice.")
         told = f"doubts {item.strip()!r}: {name} takes the factor within which it is known"
-        found[name] = parse_factor(value, told, f"{name}=1.5x", MOST_DOUBT)
+        found[name] = parse_factor(
+            value,
+            told,
+            f"{name}=1.5x",
+            most=MOST_DOUBT,
+            instead=f"where less is known, fit it: name {name} in --parameters",
+        )
     return found
 
 

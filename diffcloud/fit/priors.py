@@ -19,7 +19,8 @@ from diffcloud.sim.properties import PARAMETERS
 
 DEFAULT_FACTOR = 10.0
 """One deviation of a multiplier."""
-_MOST = 1e6
+_MOST_FACTOR = 1e6
+"""A prior as wide says nothing."""
 INDEPENDENT = 100
 """Residuals of a recording that count as independent."""
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "deg": math.pi / 180, "s": 1.0, "ms": 1e-3, "%": 1e-2}
@@ -50,7 +51,7 @@ def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str
         if PARAMETERS[name].basis is None:
             raise ConfigError(f"prior: {name} is no multiplier; what is known of it are its bounds, {list(bounds[name])}.")
         told = f"prior {item.strip()!r}: {name} takes the factor within which it probably lies"
-        factor = parse_factor(value, told, f"{name}=3x", _MOST)
+        factor = parse_factor(value, told, f"{name}=3x", most=_MOST_FACTOR, instead="where nothing is known, write none")
         if not inside[name]:
             raise ConfigError(
                 f"prior {item.strip()!r}: it is about 1, the basis material, and the bounds of {name} are "
@@ -60,13 +61,13 @@ def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str
     return found
 
 
-def parse_factor(text: str, told: str, example: str, most: float) -> float:
+def parse_factor(text: str, told: str, example: str, *, most: float, instead: str) -> float:
     """Of "1.5x".
 
     Args:
         told: what it is of, with which the message begins.
         example: a right one, with its parameter.
-        most: the largest that means anything.
+        most: the largest that means anything; and what to do instead of a larger one.
 
     Raises:
         ConfigError: no factor above 1, or a larger one.
@@ -79,7 +80,7 @@ def parse_factor(text: str, told: str, example: str, most: float) -> float:
     if not (factor > 1 and math.isfinite(factor)):
         raise ConfigError(f"{told}, above 1 and with an x, such as {example}; or write none.")
     if factor > most:
-        raise ConfigError(f"{told}, at most {most:g}x; where nothing is known, write none.")
+        raise ConfigError(f"{told}, at most {most:g}x; {instead}.")
     return factor
 
 

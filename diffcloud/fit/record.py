@@ -279,6 +279,14 @@ class FitRecord(_Model):
             raise ConfigError(f"The fit knows {name} in {' and '.join(sorted(found))}; choose one by --scenario.")
         return next(iter(found.values()))
 
+    def known_place(self, name: str, scenario: str | None = None) -> int | None:
+        """As `place_of`; None where the fit knows no recording of this name.
+
+        Raises:
+            ConfigError: several.
+        """
+        return self.place_of(name, scenario) if name in {one.name for one in self.episodes} else None
+
     def measured_by(self, recording: int) -> dict[str, Any]:
         """Keyword arguments of `Objective` with which a recording was compared, with its own pose and frames.
 

@@ -6,7 +6,7 @@ in, and its curvature only how sharp that one is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -42,6 +42,12 @@ class Scan:
         """Where the loss is lowest [k], and that loss."""
         axis, index = divmod(int(self.losses.argmin()), self.losses.shape[1])
         return centre + self.lengths[axis, index] * self.directions[axis], float(self.losses[axis, index])
+
+    def corrected(self, loss: float) -> Scan:
+        """With another loss where it is lowest."""
+        losses = self.losses.clone()
+        losses.view(-1)[int(losses.argmin())] = loss
+        return replace(self, losses=losses)
 
     @staticmethod
     def of(record: ScanRecord) -> Scan:

@@ -16,6 +16,9 @@ Doubtful material (`fit.doubts`) and the pose (`fit.pose`) are fitted too, and t
 are what the fit takes for known: what of the pose is not free. The size of the simulator's step moves the fit to one side;
 for it, h is the slope's change between this motion and the one with four times the steps.
 
+What has no curvature at all, because nothing that was recorded moves by it and no prior knows of it, is `unseen`: one
+deviation is as long as the longest range.
+
 Changes of the slope are differences between motions to both sides, each matched with the recording anew, with nodes moved
 along the derivatives of one simulation: as a surface moves, its points find other partners, which Gauss and Newton's
 curvature of fixed pairs knows only roughly.
@@ -58,8 +61,8 @@ _ROUGH = 4.0
 """The largest factor between measured and Gauss and Newton's curvature that is believed."""
 _CHUNK = 16
 """Motions matched together."""
-_UNSEEN = 1e-9
-"""Part of the largest curvature: what has less is rounding, of what no point moves by and no prior knows."""
+_ROUNDING, _UNSEEN = 1e-12, 1e-9
+"""Parts of the largest curvature: what has less is rounding, before and after pose and priors."""
 _PATCHES = 16
 _NOISE_M = 0.002
 """Of recorded points whose own uncertainty is not stated."""
@@ -133,7 +136,7 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
     clusters = clusters[np.abs(clusters).max(axis=1) > 0]
     sources = {"noise": spread(clusters) * len(clusters) / max(len(clusters) - 1, 1)}
     if (unseen := _unseen(normal)[asked]).size:
-        sources["unseen"] = float((axis.ends[1] - axis.ends[0]).max()) ** 2 * unseen @ unseen.T  # to the bounds
+        sources["unseen"] = float((axis.ends[1] - axis.ends[0]).max()) ** 2 * unseen @ unseen.T
     of_priors = np.diag(prior * space.prior_steps().numpy())
     if prior[asked].any():
         sources["prior"] = spread(of_priors[asked])
@@ -164,7 +167,7 @@ def uncertainty(objective: AnyObjective, space: FitSpace, values: Mapping[str, f
 def _unseen(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """[k, u] directions of which neither recording nor prior knows, of the curvature [k, k]."""
     values, vectors = np.linalg.eigh(normal)
-    return np.asarray(vectors[:, values < _UNSEEN * values.max()])
+    return np.asarray(vectors[:, values <= _UNSEEN * values.max()])
 
 
 def finer_steps(scenario: Scenario) -> Scenario:
@@ -300,9 +303,9 @@ def _slopes(
 
 def _between(measured: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """The measured curvature, which knows that pairs change, but no more than a stated factor off Gauss and Newton's along
-    any direction: where a loss is rough, its measured one may be anything."""
+    any direction: where a loss is rough, its measured one may be anything. Zero where Gauss and Newton's is rounding."""
     values, vectors = np.linalg.eigh(normal)
-    root = vectors * np.sqrt(np.maximum(values, 1e-12 * max(values.max(), 1e-300)))
+    root = vectors * np.sqrt(np.where(values > _ROUNDING * values.max(), values, 0.0))
     inverse = np.linalg.pinv(root)
     factors, axes = np.linalg.eigh(inverse @ ((measured + measured.T) / 2) @ inverse.T)
     clipped = np.clip(factors, 1 / _ROUGH, _ROUGH)

@@ -259,7 +259,7 @@ class ArmChecker:
             slack: 0 for a planned path, 1 for a measured one, which may use the margins (half of a joint's).
         """
         limits = self.arm_limits
-        ends = self._ends + np.array([1.0, -1.0]) * limits.joint_margin_rad * (1 - slack / 2)
+        ends = self._kept_ends(slack)
         joint = np.maximum(ends[:, 0] - joints_rad, joints_rad - ends[:, 1])
         parts = self._points(joints_rad, gripper)
         lowest = np.min([points.min(axis=1) for points in parts.values()], axis=0)
@@ -269,6 +269,10 @@ class ArmChecker:
         low, high, box_slack = self.limits.box_low_m, self.limits.box_high_m, self.limits.box_slack_m
         tool = np.concatenate([np.array(low) - box_slack - positions, positions - high - box_slack], axis=1)
         return np.concatenate([tool, links, joint], axis=1)
+
+    def _kept_ends(self, slack: float) -> Floats:
+        """[J, 2] of the joints, with the margins of `excess`."""
+        return self._ends + np.array([1.0, -1.0]) * self.arm_limits.joint_margin_rad * (1 - slack / 2)
 
     def describe(self, criterion: int, joints_rad: Floats, gripper: float, position: Floats) -> str:
         """What is wrong at one state [J], where `excess` says that this criterion is exceeded."""
@@ -333,8 +337,9 @@ class ArmChecker:
             )
 
     def _nearest(self, target_rad: Floats, joints_rad: Floats) -> Floats:
-        """[J] of all whole turns of each joint's target within its ends, the nearest; the lowest above where none is."""
-        low, high = (self._ends - target_rad[:, None]).T / (2 * np.pi)
+        """[J] of each joint's target, the turn nearest to where the joint is that a planned path may go to; where there is
+        none, the first one above the lower end, which `_check` then refuses."""
+        low, high = (self._kept_ends(slack=0.0) - target_rad[:, None]).T / (2 * np.pi)
         turns = np.round((joints_rad - target_rad) / (2 * np.pi))
         return np.asarray(target_rad + 2 * np.pi * np.maximum(np.minimum(turns, np.floor(high)), np.ceil(low)))
 

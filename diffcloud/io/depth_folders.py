@@ -43,8 +43,8 @@ def depth_folders(folders: Mapping[str, Path], *, rate_hz: float | None = None) 
     times = {name: _times(Path(folder), sorted(images[name]), rate_hz) for name, folder in folders.items()}
     order = sorted((times[name][number], name, number) for name in folders for number in images[name])
 
-    colors = {name: _colors(Path(folder)) for name, folder in folders.items()}
-    warnings = [*_unaligned_colors(cameras, colors), *_lost_colors(images, colors)]
+    colors, warnings = _aligned_colors(cameras, {name: _colors(Path(folder)) for name, folder in folders.items()})
+    warnings += _lost_colors(images, colors)
 
     def frames() -> Iterator[RecordedFrame]:
         for t, name, number in order:
@@ -132,17 +132,21 @@ def _colors(folder: Path) -> dict[int, Path]:
     return numbered_files(folder / "color", _IMAGES, kind="images", gaps=True) if held else {}
 
 
-def _unaligned_colors(cameras: Mapping[str, CameraInfo], colors: dict[str, dict[int, Path]]) -> Iterator[str]:
-    """Leaves out colour images of another size than depth, by the first of each camera."""
+def _aligned_colors(
+    cameras: Mapping[str, CameraInfo], colors: Mapping[str, dict[int, Path]]
+) -> tuple[dict[str, dict[int, Path]], list[str]]:
+    """Colour images of depth's size, by the first of each camera, and a warning of each camera that has others."""
+    aligned, warnings = dict(colors), list[str]()
     for name, images in colors.items():
         size = (cameras[name].intrinsics.height, cameras[name].intrinsics.width)
         own = next((read_color(path).shape[:2] for path in images.values()), size)
         if own != size:
-            images.clear()
-            yield (
+            aligned[name] = {}
+            warnings.append(
                 f"Camera {name}: colour is left out, as it is not aligned to depth: it has {own[1]} x {own[0]} pixels, "
                 f"depth {size[1]} x {size[0]}."
             )
+    return aligned, warnings
 
 
 def _lost_colors(images: Mapping[str, dict[int, Path]], colors: Mapping[str, dict[int, Path]]) -> Iterator[str]:

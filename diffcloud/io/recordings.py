@@ -168,8 +168,9 @@ def read_joint_log(path: Path, *, offset_s: float = 0.0, recording_start_s: floa
             f"{path}: row {bad + 1}: the time runs backwards ({log.times[bad]:.6f} s after {log.times[bad - 1]:.6f} s); "
             "the clock was set while recording, or rows were mixed up. Sort or cut the log."
         )
-    own_clock = log.times[0] < _EPOCH_S <= recording_start_s
-    times = log.times + offset_s + (recording_start_s if own_clock else 0.0)
+    times = log.times + offset_s
+    if times[0] < _EPOCH_S <= recording_start_s:  # a clock of its own
+        times = times + recording_start_s
     if recording_start_s > times[-1] or (times[0] >= _EPOCH_S > recording_start_s):
         raise EpisodeError(
             f"{path} covers {times[0]:.2f} to {times[-1]:.2f} s and the recording starts at "

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.calibrations import Calibration, read_calibration
@@ -27,6 +28,7 @@ from diffcloud.sensing.filters import in_large_clusters
 from diffcloud.sensing.masking import RobotMask, Spoilt, View, joints_at, spoilt_pixels
 from diffcloud.sensing.refinement import Sight, refine_extrinsics
 from diffcloud.sensing.smoothing import smooth_depth
+from diffcloud.sensing.tool_poses import turning
 
 Floats = NDArray[np.float64]
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -446,6 +448,7 @@ def _episode(
     placement = settings.placement or raw.placement
     times = raw.cameras[names[0]].times
     tool = _tool(raw, times, mask, settings)
+    warnings = [] if tool is None or tool[1] is None else [tool[1]]
     labels = {
         key: raw.description[key] for key in ("scenario", "fabric", "category", "repeat", "truth") if key in raw.description
     }
@@ -453,7 +456,7 @@ def _episode(
         points=placement.to_scene(np.concatenate([part.points for _, part in parts])).astype(np.float32),
         offsets=np.cumsum([0, *sizes], dtype=np.int64),
         times=times - times[0],
-        gripper=None if tool is None else placement.to_scene(tool)[:, None],
+        gripper=None if tool is None else placement.to_scene(tool[0])[:, None],
         camera=np.concatenate([np.full(len(part.points), index, dtype=np.uint8) for index, part in parts]),
         pixel=np.concatenate([part.pixels for _, part in parts]).astype(np.uint16),
         sigma=np.concatenate([part.depth_m**2 * settings.sigma_per_m for _, part in parts]).astype(np.float32),
@@ -464,7 +467,7 @@ def _episode(
             "cameras": names,
             "viewpoints": {name: placement.to_scene(views[name].T_world_camera[:3, 3]).tolist() for name in names},
             "pinholes": {name: _pinhole(views[name], placement).described() for name in names},
-            "quality": quality.figures,
+            "quality": {**quality.figures, "warnings": warnings},
         },
     )
 
@@ -501,16 +504,21 @@ def _pinhole(view: View, placement: ScenePlacement) -> Pinhole:
     return Pinhole(told.width, told.height, (told.fx, told.fy), (told.cx, told.cy), pose)
 
 
-def _tool(raw: RawEpisode, times: Floats, mask: RobotMask | None, settings: FusionSettings) -> Floats | None:
-    """[T, 3] of the tool in the base frame: as the arm reported it, else by its joints; None where neither is known."""
+def _tool(
+    raw: RawEpisode, times: Floats, mask: RobotMask | None, settings: FusionSettings
+) -> tuple[Floats, str | None] | None:
+    """[T, 3] of the tool in the base frame, as the arm reported it, else by its joints, and why that may not be where its
+    fingertips are; None where neither is known."""
     log = raw.robot
     if log is None or not len(log.times):
         return None
     if np.isfinite(log.tool_position_m).all():
         clock = log.times - settings.lag_s
-        return np.stack([np.interp(times, clock, column) for column in log.tool_position_m.T], axis=1)
+        track = np.stack([np.interp(times, clock, column) for column in log.tool_position_m.T], axis=1)
+        return track, turning(log.tool_quaternion)
     if mask is not None:
-        return mask.robot.tool_pose(joints_at(log, times, lag_s=settings.lag_s)[0])[:, :3, 3]
+        poses = mask.robot.tool_pose(joints_at(log, times, lag_s=settings.lag_s)[0])
+        return poses[:, :3, 3], turning(np.roll(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), 1, axis=1))
     return None
 
 

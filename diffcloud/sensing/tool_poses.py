@@ -40,9 +40,10 @@ def not_unit(quaternions: Floats) -> str | None:
 
 
 def turning(quaternions: Floats) -> str | None:
-    """Why the track of the tool is not that of its fingertips, from its orientations [N, 4] (w, x, y, z), some of them NaN;
-    None where it hardly turns."""
-    known = quaternions[np.isfinite(quaternions).all(axis=1)]
+    """Why the track of the tool may not be that of its fingertips, from its orientations [N, 4] (w, x, y, z), some of them
+    NaN; None where it hardly turns."""
+    lengths = np.linalg.norm(quaternions, axis=1)
+    known = quaternions[np.abs(lengths - 1) <= _LENGTH_OFF]
     if not len(known):
         return None
     turned = 2 * float(np.arccos(np.abs(known @ known[0]).clip(max=1.0)).max())

@@ -561,6 +561,8 @@ class TestFits:
         found = fit_gauss_newton(lifted(), SPACE, settings)
         assert scanned
         assert (found.values, found.loss) == (plain.values, plain.loss)
+        centre = Axis.of(SPACE).places(torch.tensor(list(plain.values.values())).double())
+        assert found.scan.lower(centre, found.loss) is None
 
     @pytest.mark.parametrize(
         ("second", "witnesses", "misfit", "order"),

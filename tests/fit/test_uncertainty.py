@@ -190,20 +190,22 @@ class TestPrior:
         found = uncertainty(Objective(still, recorded(still), nuisance={}), space, {"drag": 1.0})
         assert np.sqrt(found.covariance[0, 0]) == pytest.approx(np.log(3.0), rel=1e-6)
 
-    def test_without_one_nothing_is_known(self, scenario):
+    @pytest.mark.parametrize("names", [("stretch", "friction_cloth"), ("friction_cloth",)])
+    @pytest.mark.parametrize("nuisance", [{}, None])
+    def test_without_one_nothing_is_known(self, scenario, nuisance, names):
         """Beside what is shown: the interval of the friction ends at the bounds, that of the stretch stays."""
         alone = replace(
             scenario,
             scene=replace(scenario.scene, surrounding=replace(scenario.scene.surrounding, self_contact=False)),
         )
-        space = FitSpace.build(["stretch", "friction_cloth"], fixed={"mass": TRUTH["mass"]})
-        objective = Objective(alone, recorded(alone), nuisance={})
+        space = FitSpace.build(names, fixed={name: TRUTH[name] for name in TRUTH if name not in names})
+        objective = Objective(alone, recorded(alone), nuisance=nuisance)
         for stretch, friction in ((0.6, 0.3), (0.604, 0.75), (0.597, 1.2)):
             values = {"stretch": stretch, "friction_cloth": friction, "mass": TRUTH["mass"]}
             found = state_intervals(objective, space, values)
             entry = found.parameters["friction_cloth"]
             assert (entry.low, entry.high, entry.verdict) == (0.0, 1.5, "not identified")
-            assert found.parameters["stretch"].verdict == "identified"
+            assert "stretch" not in names or found.parameters["stretch"].verdict == "identified"
         known = uncertainty(objective, SPACE, TRUTH)
         assert "unseen" not in known.sources
 

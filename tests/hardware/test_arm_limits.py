@@ -249,6 +249,18 @@ class TestWayHome:
         joints[5], home[5] = np.deg2rad([now, target])
         assert np.rad2deg(arm._nearest(home, joints)[5]) == pytest.approx(expected)
 
+    @pytest.mark.parametrize("now", [-300, -181, 200, 300, 350])
+    def test_a_home_is_no_turn_at_a_joints_end(self, now):
+        with as_file(files("diffcloud.hardware.examples") / "ur5e.urdf") as path:
+            arm = Robot.from_urdf(path)
+        checker = ArmChecker(arm, Limits(box_low_m=(-1, -1, -1), box_high_m=(1, 1, 1)), ArmLimits(table_m=-1.0))
+        home = np.deg2rad([0, -100, 100, -90, -90, 0])
+        joints = home + np.deg2rad([0, 0, 0, 0, 0, now])
+        pose = arm.tool_pose(joints)
+        reading = ArmReading(joints, pose[:3, 3], quaternion(pose[:3, :3]), 0.0, np.zeros(6))
+        path = checker.plan_home(home, reading, speed_m_s=0.1)
+        np.testing.assert_allclose(path.joints_rad[-1], home, atol=1e-9)
+
     def test_a_way_through_the_table_is_refused(self):
         with pytest.raises(
             LimitError, match=r"way home would break a limit at 0%: .* reaches down to z = 0\.1\d\d m; the table is at"

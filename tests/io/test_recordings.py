@@ -33,6 +33,14 @@ def test_a_log_of_the_time_of_day_is_shifted_to_a_recording_from_zero(tmp_path):
     np.testing.assert_allclose(times, [float(row.split(",")[0]) for row in rows[1:]], atol=1e-6)
 
 
+def test_a_log_of_a_clock_of_its_own_is_shifted_once(tmp_path):
+    """Of a recording with the time of day: from its first frame, unless the offset takes it there already."""
+    _, log = as_folders(tmp_path)
+    own = read_joint_log(log).times
+    np.testing.assert_allclose(read_joint_log(log, offset_s=0.5, recording_start_s=START).times, START + own + 0.5)
+    np.testing.assert_allclose(read_joint_log(log, offset_s=START + 0.5, recording_start_s=START).times, START + own + 0.5)
+
+
 def test_colour_of_another_size_is_left_out(tmp_path):
     folders, _ = as_folders(tmp_path)
     for path in (folders[0] / "color").iterdir():

@@ -312,7 +312,7 @@ class TestTransforms:
         Empty(tmp_path / "bag", "rosbag2", Habits()).write()
         done = imported(tmp_path, tmp_path / "bag")
         assert any(
-            text.startswith("1 of 14 transforms of 'overhead_link' in tf are no places") for text in done.result["warnings"]
+            text.startswith("1 of 14 transforms of 'overhead_link' in tf are invalid") for text in done.result["warnings"]
         )
         for name, pose in poses().items():
             np.testing.assert_allclose(read_raw_episode(tmp_path / "e").cameras[name].info.T_world_camera, pose, atol=1e-9)
@@ -329,9 +329,11 @@ class TestLenses:
         held = self.intrinsics(tmp_path)
         assert (held.fx, held.coefficients) == (INTRINSICS.fx, self.LENS)
 
-    @pytest.mark.parametrize("name", ["image_rect", "image_rect_raw", "image_rectified"])
-    def test_rectified_images_have_P_alone(self, tmp_path, name):
-        held = self.intrinsics(tmp_path, depth=f"depth_registered/{name}")
+    @pytest.mark.parametrize(
+        "topic", ["depth_registered/image_rect", "depth/image_rect_raw", "depth/rectified/image", "depth_rect/image"]
+    )
+    def test_rectified_images_have_P_alone(self, tmp_path, topic):
+        held = self.intrinsics(tmp_path, depth=topic)
         assert (held.fx, held.distortion, held.coefficients) == (58.0, "none", ())
 
     def test_without_P_they_have_K(self, tmp_path):
@@ -385,7 +387,10 @@ class TestGripper:
         assert "--gripper-joint" in bad.errors
         done = imported(tmp_path, path, options=("--gripper-joint", "robotiq_85_left_knuckle_joint"))
         np.testing.assert_allclose(self.gripper(tmp_path), 0.5)
-        assert "taken to be closed where robotiq_85_left_knuckle_joint is 0.8 rad" in done.result["warnings"][0]
+        assert (
+            "taken to be open where robotiq_85_left_knuckle_joint is 0 and closed where it is 0.8"
+            in done.result["warnings"][0]
+        )
 
     def test_where_it_is_closed_may_be_given(self, tmp_path):
         path = bag(tmp_path, "rosbag2", joints={"claw": 0.03})

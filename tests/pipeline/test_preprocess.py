@@ -53,12 +53,14 @@ def test_a_raw_episode_from_within_and_a_tool_that_turns(tmp_path, params, monke
     table = pd.read_csv(raw / "robot.csv")
     half = np.linspace(0, np.deg2rad(30), len(table))
     table["tool_qw"], table["tool_qx"], table["tool_qy"], table["tool_qz"] = np.cos(half), np.sin(half), 0.0, 0.0
+    table["tool_x"], table["tool_y"], table["tool_z"] = 0.5, 0.0, 0.3
     table.to_csv(raw / "robot.csv", index=False)
     monkeypatch.chdir(raw)
     done = invoke("preprocess", ".", "--out", tmp_path / "out", "--params", params)
     assert done.result["points"].keys() == {"lift/blue1"}
     assert read_episode(tmp_path / "out" / "lift" / "blue1.npz").frame_count == 2
     assert "The tool turns by 60 degrees" in done.errors
+    assert done.result["warnings"][0].startswith("blue1: The tool turns")
     assert any(finding.code == "tool_turns" for finding in validate_raw_episode(raw))
 
 

@@ -103,8 +103,16 @@ def test_degrees_for_radians(episode):
 
 
 def test_a_joint_that_goes_on_turning(episode):
-    edit_column(episode / "robot.csv", "joint_7", lambda angles: angles + np.linspace(0, 12, len(angles)))
+    edit_column(episode / "robot.csv", "joint_7", lambda angles: angles + 6.0 + np.linspace(0, 0.8, len(angles)))
     assert codes(episode) == set()
+    edit_column(episode / "robot.csv", "joint_7", lambda angles: angles + 1.0)
+    assert codes(episode) == {"angle_unit"}
+
+
+def test_degrees_that_begin_at_zero(episode):
+    for joint in range(1, 8):
+        edit_column(episode / "robot.csv", f"joint_{joint}", lambda angles: np.linspace(0, 12, len(angles)))
+    assert codes(episode) == {"angle_unit"}
 
 
 def test_millimetres_for_metres(episode):

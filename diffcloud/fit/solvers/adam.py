@@ -141,7 +141,7 @@ def fit_adam(
             raise
         reason = "interrupted"
     if settings.resample:
-        objective.reseed(settings.seed)  # as the record says
+        objective.reseed(settings.seed)  # the record states this seed: what follows must compare the same points
     return FitOutcome(
         values=dict(zip(space.names, best.values.tolist(), strict=True)),
         loss=best.loss,

@@ -185,16 +185,18 @@ def fit_gauss_newton(
                 scans += 1
                 seen, spent = scan(objective, space, ways.best.place, ways.best.normal)
                 simulations += spent
-                lower = seen.lower(ways.best.place, ways.best.loss)
-                if lower is None:
+                held = False
+                while not held and (lower := seen.lower(ways.best.place, ways.best.loss)) is not None:
+                    found = linearise(objective, space, lower[None])
+                    simulations += found.simulations
+                    held = float(found.losses[0]) < ways.best.loss  # beside a motion, one of its derivatives may diverge
+                    if held:
+                        ways.go_on(lower, found)
+                    else:
+                        seen = seen.corrected(float(found.losses[0]))
+                if not held:
                     looked = seen
                     break
-                found = linearise(objective, space, lower[None])
-                simulations += found.simulations
-                if not float(found.losses[0]) < ways.best.loss:  # where derivatives are taken, a motion may diverge
-                    looked = seen
-                    break
-                ways.go_on(lower, found)
             if not math.isfinite(ways.best.loss):
                 if others and not ways.waiting:  # they diverge after the frames that they were chosen by
                     ways.waiting.append(others.pop(0))

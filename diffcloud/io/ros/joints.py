@@ -55,6 +55,16 @@ class Grip:
             )
         return Grip(joint, open_, at, guessed=closed is None)
 
+    @property
+    def warnings(self) -> list[str]:
+        """What is taken of its positions because nobody said it."""
+        if self.joint == GRIPPER_JOINT or not self.guessed:
+            return []
+        return [
+            f"The gripper is taken to be open where {self.joint} is {self.open:g} and closed where it is {self.closed:g}, "
+            "as a Robotiq 2F-85 is; say where it is with --gripper-open and --gripper-closed."
+        ]
+
     def state(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
         """0 open to 1 closed."""
         return (positions - self.open) / (self.closed - self.open)
@@ -101,16 +111,12 @@ def joint_log(
         # often sent by another driver than the arm's joints, in messages of its own
         times, values = _series(where, messages, [gripper_joint])
         gripper = grip.state(np.interp(rows, times, values[:, 0])) if len(times) else gripper
-        if grip.guessed and gripper_joint != GRIPPER_JOINT:
-            warnings.append(
-                f"The gripper is taken to be closed where {gripper_joint} is {grip.closed:g} rad, as a Robotiq 2F-85 is; "
-                "say where it is with --gripper-closed."
-            )
+        warnings += grip.warnings
     elif gripper_joint is not None and (others or gripper_joint != GRIPPER_JOINT):
         raise EpisodeError(
             f"{where}: joint_states has no {gripper_joint!r}, so how far the gripper is open is not known; besides the "
             f"arm's joints there are {', '.join(others) or 'none'}. Name the gripper's joint with --gripper-joint (and its "
-            "angle when closed with --gripper-closed), or give --gripper-joint none."
+            "positions with --gripper-open and --gripper-closed), or give --gripper-joint none."
         )
     elif gripper_joint is not None:
         warnings.append(
@@ -162,6 +168,7 @@ def log_from_links(
             if finger is None:
                 raise EpisodeError(f"the description has no joint {grip.joint!r}")
             gripper = grip.state(_angle(tree, finger, rows))
+            warnings += grip.warnings
         except EpisodeError as error:
             warnings.append(f"How far the gripper is open stays unknown, and it is masked as open: {error}.")
     position, quaternion = _placed(tree.lookup(world_frame, tool_frame, rows))

@@ -55,9 +55,7 @@ def aligned_by_name(depth_topic: str) -> bool:
 
 def is_rectified(topic: str) -> bool:
     """Whether the lens has been taken out of a topic's images, as image_proc and depth_image_proc say it in the name."""
-    return any(word in ("rect", "rectified") for word in topic.lower().rsplit("/", 1)[-1].split("_")) or bool(
-        re.search(r"/image_rect(_\w+)?(/|$)", topic.lower())
-    )
+    return any({"rect", "rectified"} & set(part.split("_")) for part in topic.lower().split("/"))
 
 
 def same_camera(first: str, second: str) -> bool:

@@ -58,10 +58,10 @@ class TransformTree:
         self._doubtful: dict[str, list[str]] = {}
         self.warnings: list[str] = []
         for child, every in grouped.items():
-            entries = [(t, item) for t, item in every if _is_a_place(item.transform)]
+            entries = [(t, item) for t, item in every if _is_valid(item.transform)]
             if len(entries) < len(every):
                 left = f"{len(every) - len(entries)} of {len(every)} transforms of {child!r}"
-                self.warnings.append(f"{left} in tf are no places (zero quaternions, or not finite), and were left out.")
+                self.warnings.append(f"{left} in tf are invalid (a zero quaternion, or not finite), and were left out.")
             if not entries:
                 continue
             parents = sorted({_plain(item.header.frame_id) for _, item in entries})
@@ -137,7 +137,7 @@ class TransformTree:
         return result
 
 
-def _is_a_place(transform: Any) -> bool:
+def _is_valid(transform: Any) -> bool:
     turn, shift = transform.rotation, transform.translation
     quaternion, numbers = [turn.x, turn.y, turn.z, turn.w], [shift.x, shift.y, shift.z]
     return bool(np.isfinite([*quaternion, *numbers]).all() and np.linalg.norm(quaternion) > _LEAST_NORM)

@@ -28,6 +28,8 @@ Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 """[m] Whatever lies farther off is a mistake."""
 Length = Annotated[float, Field(gt=0, le=100)]
 """[m] Of a cloth, or of what it meets."""
+MOST_DOUBT = 100.0
+"""A larger factor is no knowledge of a material."""
 _Time = Annotated[float, Field(ge=-1e6, le=1e6)]
 Keyframes = Annotated[list[tuple[_Time, Coordinate, Coordinate, Coordinate]], Field(min_length=2)]
 """Keyframes (time s, dx, dy, dz m) of a displacement, in the world's axes."""
@@ -37,13 +39,14 @@ class ScenarioOptions(Checked):
     """The fields that all built-in scenarios share (SI units)."""
 
     name: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^./\\\s][^/\\]*$")]
-    """Folders and files are named after it."""
+    """Folders and files are named after it. A recording may have any name that one of these can have, and `identify` names
+    its scenario so."""
     material: str | Sheet = "basis-knit"
     """A preset, the path of an ARCSim material JSON, or an isotropic sheet in SI units."""
     compression: Annotated[float, Field(ge=0, le=1)] = 1.0
     """The part of its stretching stiffness with which the cloth resists compression in its plane. Fabric wrinkles instead,
     finer than most meshes (docs/physics.md, wrinkles)."""
-    doubts: dict[str, Annotated[float, Field(gt=1, le=100)]] = Field(default_factory=dict)
+    doubts: dict[str, Annotated[float, Field(gt=1, le=MOST_DOUBT)]] = Field(default_factory=dict)
     """Material that is known less well, or better, than usual: parameter -> factor of one deviation (`fit.doubts`)."""
     path: Keyframes
     """The gripper's displacement."""

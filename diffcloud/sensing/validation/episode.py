@@ -33,6 +33,8 @@ _GAP = 2.5
 NEAREST_M, FARTHEST_M = 0.1, 8.0
 """Median depth of a table-top scene lies between."""
 _GEN3_JOINTS = 7
+_FAR_RAD, _WINDOW_S = 2.5 * np.pi, 0.5
+"""A joint angle beyond is in degrees, or of a joint that has gone on turning; how fast it is is told by windows so long."""
 _ALIKE = ("depth.emitter_enabled", "depth.laser_power", "depth.visual_preset")
 _PACE = "depth.inter_cam_sync_mode"
 _SPARSE = 0.02
@@ -274,14 +276,15 @@ def _robot(log: RobotLog) -> Iterator[Finding]:
     if bad is not None:
         message = f"Row {bad + 1}: the time runs backwards ({log.times[bad]:.6f} s after {log.times[bad - 1]:.6f} s)."
         yield Finding("fault", "clock_backwards", place, message)
-    first = float(np.abs(log.joints_rad[0]).max())  # later ones may go on for turns, of a joint without end
-    if first > 2.5 * np.pi:
+    first, largest = float(np.abs(log.joints_rad[0]).max()), float(np.abs(log.joints_rad).max())
+    # a joint without end may go on for turns, but not for one each second
+    if first > _FAR_RAD or (largest > _FAR_RAD and bad is None and _fastest(log) > 2 * np.pi):
         yield Finding(
             "fault",
             "angle_unit",
             place,
-            f"The log begins with a joint angle of {first:.1f}, in radians. If these are degrees, as the arm itself "
-            "reports them, multiply by pi / 180; if a joint without end had turned before, subtract its whole turns.",
+            f"A joint angle is {largest:.1f} in radians. If these are degrees, as the arm itself reports them, multiply by "
+            "pi / 180; if a joint without end had turned before, subtract its whole turns.",
         )
     reach = unreachable(log.tool_position_m)
     if reach is not None:
@@ -303,6 +306,13 @@ def _robot(log: RobotLog) -> Iterator[Finding]:
             worst = int(intervals.argmax())
             message = f"A gap of {intervals[worst]:.3f} s after {log.times[worst]:.3f} s, where {usual:.3f} s is usual."
             yield Finding("warning", "clock_gap", place, message)
+
+
+def _fastest(log: RobotLog) -> float:
+    """[rad/s] of any joint, over any half of a second."""
+    later = np.minimum(log.times + _WINDOW_S, log.times[-1])
+    ahead = np.stack([np.interp(later, log.times, column) for column in log.joints_rad.T], axis=1)
+    return float(np.abs(ahead - log.joints_rad).max()) / _WINDOW_S
 
 
 def _joint_count(log: RobotLog, robot: Robot | None) -> Iterator[Finding]:
