@@ -121,9 +121,10 @@ DRAWN := --seed 82037895
 coverage: venv
 	$(COVERAGE) $(DRAWN) --recordings 200 --fix mass
 	$(COVERAGE) $(DRAWN) --recordings 200
-	$(COVERAGE) --fix mass --scenario lift --scenario fold --seed 16567761 --recordings 16 --truth refined
-	$(COVERAGE) --fix mass --scenario lift --seed 48393309 --recordings 12 --truth finer
-	$(COVERAGE) --fix mass --scenario fold --seed 48393309 --recordings 8 --truth finer
+	$(COVERAGE) --fix mass --scenario lift --scenario fold --seed 7775397 --recordings 16 --truth refined
+	$(COVERAGE) --fix mass --scenario band_stretch --scenario vest_hang --seed 7775397 --recordings 8 --truth refined
+	$(COVERAGE) --fix mass --scenario lift --seed 7775397 --recordings 12 --truth finer
+	$(COVERAGE) --fix mass --scenario fold --seed 7775397 --recordings 6 --truth finer
 	$(COVERAGE) --seed 87294376 --recordings 3 --refits 20
 	diffcloud simulate --scenario lift --draws logarithmic --train 1500 --test 375 --seed 5 --out $(POSTERIOR)/lift \
 	    --doubts bending=1.5x,drag=1.3x,damping=1.5x,friction_obstacle=1.3x,friction_cloth=1.3x
