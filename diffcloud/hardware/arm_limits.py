@@ -338,10 +338,14 @@ class ArmChecker:
 
     def _nearest(self, target_rad: Floats, joints_rad: Floats) -> Floats:
         """[J] of each joint's target, the turn nearest to where the joint is that a planned path may go to; where there is
-        none, the first one above the lower end, which `_check` then refuses."""
-        low, high = (self._kept_ends(slack=0.0) - target_rad[:, None]).T / (2 * np.pi)
-        turns = np.round((joints_rad - target_rad) / (2 * np.pi))
-        return np.asarray(target_rad + 2 * np.pi * np.maximum(np.minimum(turns, np.floor(high)), np.ceil(low)))
+        none, one between the joint's ends, or else any: `_check` refuses those."""
+        nearest = np.round((joints_rad - target_rad) / (2 * np.pi))
+        turns = nearest
+        for ends in (self._ends, self._kept_ends(slack=0.0)):
+            low, high = (ends - target_rad[:, None]).T / (2 * np.pi)
+            least, most = np.ceil(low), np.floor(high)
+            turns = np.where(least <= most, np.clip(nearest, least, most), turns)
+        return np.asarray(target_rad + 2 * np.pi * turns)
 
     def _points(self, joints_rad: Floats, gripper: Floats) -> dict[str, Floats]:
         """[T, V, 3] corners of each link that moves [m]."""

@@ -169,7 +169,8 @@ class TestWords:
         assert (row["first"], row["second"], row["verdict_stretch"]) == ("DiffCloud", "MLP", "only the ratio (2/2)")
 
     def test_markdown_has_every_table_and_what_is_missing(self, told):
-        page = comparison_page(told, ["lift/tan1: meteornet: no checkpoint"])
+        page = comparison_page(told, ["lift/tan1: meteornet: no checkpoint"], "Tea towels")
+        assert page.startswith("# Tea towels\n")
         for heading in ("Loss per episode", "Means", "What is identified", "Transfer between repeats", "What is missing"):
             assert f"## {heading}" in page
         assert "nan" not in page.lower()
@@ -178,7 +179,7 @@ class TestWords:
         told = tables([record("lift", "e", methods={"diffcloud": 0.1}, stated=False)], {})
         assert sentences(told)["repeats"] == []
         assert isinstance(overview(told), pd.DataFrame)
-        assert "None." in comparison_page(told, [])
+        assert "None." in comparison_page(told, [], "Tea towels")
 
 
 def test_fingerprints_tell_inputs_apart():
