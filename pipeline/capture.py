@@ -39,6 +39,7 @@ from diffcloud.io.raw_episodes import exists_already
 from diffcloud.sensing.robot import Robot, gen3
 from pipeline.console import JsonFlag, errors, finish, named_serials, show_checks, warn, whole_numbers
 
+_BOX = ",".join(f"{value:g}" for value in (*Limits.box_low_m, *Limits.box_high_m))
 _CLEAR = "Is the workspace clear, and a hand on the emergency stop? The arm will move"
 
 
@@ -69,9 +70,6 @@ def make_camera(
     if driver is not None:
         return drivers.make_camera(driver, name, serial, **options)
     return RealSenseCamera(name, serial, record_to=record_to, warm_up=options["fps"] // 2, settings=settings, **options)
-
-
-_BOX = ",".join(f"{value:g}" for value in (*Limits.box_low_m, *Limits.box_high_m))
 
 
 def record(
@@ -161,13 +159,8 @@ def record(
     if not rate_hz > 0:
         raise ConfigError(f"--rate is in Hz, above 0, got {rate_hz:g}.")
     options: dict[str, Any] = {"width": width, "height": height, "fps": fps}
-    if camera_driver is not None and (preset, laser, master, auto_exposure, keep_recording) != (
-        None,
-        None,
-        None,
-        False,
-        False,
-    ):
+    of_realsense = any(option is not None for option in (preset, laser, master)) or auto_exposure or keep_recording
+    if camera_driver is not None and of_realsense:
         raise ConfigError(
             "--preset, --laser, --master, --auto-exposure and --keep-recording are for RealSense cameras, without "
             "--camera-driver."

@@ -33,6 +33,7 @@ from pipeline.coverage_page import (
     cells_of,
     counts_of,
     coverage_page,
+    level_of,
     refit_rows,
     summary,
 )
@@ -116,7 +117,7 @@ def coverage(
         for refit in (range(refits) if refits else (None,))
     ]
     readers = _regressors(checkpoint or (), jobs)
-    for job in jobs:
+    for job in {job.folder: job for job in jobs}.values():
         job.check()
     failures = []
     for job, _, error in run_all("coverage", jobs, workers):
@@ -215,7 +216,7 @@ class CoverageJob:
     def check(self) -> None:
         """
         Raises:
-            ConfigError: a fitted parameter that is not drawn, or may be zero; or records of another level in its folder.
+            ConfigError: a fitted parameter that is not drawn, or may be zero; or records of another level in the folder.
         """
         stated = {**self.scenario.bounds, **self.config.fit.bounds}
         drawn = [name for name in self.truth() if stated.get(name, PARAMETERS[name].bounds)[0] > 0]
@@ -225,11 +226,9 @@ class CoverageJob:
                     f"fit.parameters: coverage counts errors of the logarithm of what it draws and bounds keep above zero: "
                     f"{', '.join(drawn)} in {self.scenario.name}, not {name}."
                 )
-        if self.path.is_file():
-            told = read_json(self.path)
-            level = told.get("intervals", {}).get("level", self.level) if isinstance(told, dict) else self.level
-            if level != self.level:
-                raise ConfigError(f"{self.folder} holds intervals of the level {level:g}. Choose another --out.")
+        level = level_of(self.folder, [read_json(path) for path in files_in(self.folder, ".json")])
+        if level not in (None, self.level):
+            raise ConfigError(f"{self.folder} holds intervals of the level {level:g}. Choose another --out.")
 
     def truth(self) -> dict[str, float]:
         """All that is drawn, name -> value."""

@@ -65,17 +65,26 @@ def counted(folder: Path) -> dict[str, Any]:
     records = list(named.values())
     fitted = next((list(one["intervals"]["parameters"]) for one in records if "intervals" in one), [])
     parameters = {name: _count(records, name) for name in fitted}
-    levels = sorted({one["intervals"]["level"] for one in records if "intervals" in one})
-    if len(levels) > 1:
-        raise ConfigError(
-            f"{folder} holds intervals of several levels, {', '.join(map(str, levels))}. Choose another --out."
-        )
-    told: dict[str, Any] = {"parameters": parameters, "level": levels[0] if levels else LEVEL}
+    told: dict[str, Any] = {"parameters": parameters, "level": level_of(folder, records) or LEVEL}
     if any("ratio" in one.get("intervals", {}) for one in records) and {"stretch", "mass"} <= set(fitted):
         told["ratio"] = _count(records, "ratio")
     if folder.name.endswith(REFITS):
         told["refits"] = _held_by_refits(named)
     return told
+
+
+def level_of(folder: Path, records: Sequence[Mapping[str, Any]]) -> float | None:
+    """Of the intervals that a folder's records state; None where none does.
+
+    Raises:
+        ConfigError: they are several.
+    """
+    levels = {one["intervals"]["level"] for one in records if "intervals" in one}
+    if len(levels) > 1:
+        raise ConfigError(
+            f"{folder} holds intervals of several levels, {', '.join(map(str, sorted(levels)))}. Choose another --out."
+        )
+    return next(iter(levels), None)
 
 
 def _count(records: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:

@@ -111,10 +111,16 @@ def compared(record: FitRecord, recordings: Sequence[Recording]) -> AnyObjective
     Raises:
         ConfigError, EpisodeError: the episodes lack these frames, or are of different cloths.
     """
-    members = [
-        Objective(one.scenario.halved(record.halvings), one.episode, **record.measured_by(place))
-        for place, one in enumerate(recordings)
-    ]
+    return _joined(
+        [
+            Objective(one.scenario.halved(record.halvings), one.episode, **record.measured_by(place))
+            for place, one in enumerate(recordings)
+        ]
+    )
+
+
+def _joined(members: Sequence[Objective]) -> AnyObjective:
+    """One recording's objective is that of a fit, several are a joint one's."""
     return members[0] if len(members) == 1 else JointObjective(members)
 
 
@@ -171,8 +177,7 @@ class FitJob:
             ConfigError, EpisodeError: the episodes lack the frames of the loss, an unknown frame, or different cloths.
         """
         measure = self.settings.measure()
-        members = [Objective(one.scenario.halved(self.halvings), one.episode, **measure) for one in self.recordings]
-        return members[0] if len(members) == 1 else JointObjective(members)
+        return _joined([Objective(one.scenario.halved(self.halvings), one.episode, **measure) for one in self.recordings])
 
     @property
     def solver_settings(self) -> Settings:

@@ -100,7 +100,7 @@ def identify(
             for path in job.files:
                 _copy(path, out / f"fit{path.suffix}")
             for name in episodes:
-                _copy(out / "stages" / f"steps{ended}" / f"{name}.yaml", out / "scenarios" / f"{name}.yaml")
+                _copy(_stage(out, ended) / f"{name}.yaml", out / "scenarios" / f"{name}.yaml")
             write_text(out / "report.html", _page(record, found, findings, episodes, job))
             write_json(out / "intervals.json", found.model_dump(mode="json"))
     for line in findings:
@@ -169,7 +169,7 @@ def _read(path: Path, name: str, out: Path) -> Episode:
     if path.is_file():
         episode = read_episode(path)
     elif (path / "episode.json").is_file():
-        job = PreprocessJob("episodes", path.resolve(), out, Config().preprocess, None)
+        job = PreprocessJob("episodes", path.absolute(), out, Config().preprocess, None)
         for message in job.run(lambda done, text: None).warnings:
             warn(f"{name}: {message}")
         return read_episode(kept)
@@ -332,13 +332,18 @@ def _chosen(parameters: str | None, cloth: Mapping[str, Any], mass: float | None
     return FitConfig.model_validate({"parameters": names, "fixed": fixed, "bounds": bounds, "starts": 2, "screen": 14})
 
 
+def _stage(out: Path, steps: int) -> Path:
+    """The folder of the scenarios with so many steps a frame."""
+    return out / "stages" / f"steps{steps}"
+
+
 def _scenarios(
     out: Path, cloth: Mapping[str, Any], layouts: Mapping[str, Mapping[str, Any]], steps: int
 ) -> dict[str, Scenario]:
-    """One per recording, each written to OUT/stages/steps<steps>/: other commands read those of the finished fit."""
+    """One per recording, each written to the folder of its stage: other commands read those of the finished fit."""
     found = {}
     for name, fields in layouts.items():
-        path = out / "stages" / f"steps{steps}" / f"{name}.yaml"
+        path = _stage(out, steps) / f"{name}.yaml"
         write_text(path, yaml.safe_dump({**cloth, **fields, "steps_per_frame": steps}, sort_keys=False))
         found[name] = load_scenario(path)
     return found

@@ -239,7 +239,7 @@ class ArmChecker:
     def at(self, joints_rad: Floats, reading: ArmReading) -> ArmReading:
         """What the arm will measure with joints [J], if all else stays as in `reading`."""
         tool = self.robot.tool_pose(joints_rad)
-        quaternion = np.roll(Rotation.from_matrix(tool[:3, :3]).as_quat(), 1)
+        quaternion = Rotation.from_matrix(tool[:3, :3]).as_quat(scalar_first=True)
         return ArmReading(joints_rad, tool[:3, 3], quaternion, reading.gripper, reading.wrench)
 
     def watch(self, name: str, start: ArmReading, *, returning: bool = False) -> ArmWatch:

@@ -218,7 +218,7 @@ class KinovaArm:
             self._continued(np.deg2rad([actuator.position for actuator in feedback.actuators])),
             np.array([base.tool_pose_x, base.tool_pose_y, base.tool_pose_z]),
             # theta: rotations about the fixed x, y, z axes, in this order
-            np.roll(Rotation.from_euler("xyz", angles, degrees=True).as_quat(), 1),
+            Rotation.from_euler("xyz", angles, degrees=True).as_quat(scalar_first=True),
             self._gripper(),
             np.array(forces + torques),
         )

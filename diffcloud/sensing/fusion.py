@@ -447,8 +447,7 @@ def _episode(
     sizes = [sum(len(part.points) for part in frame.values()) for frame in frames]
     placement = settings.placement or raw.placement
     times = raw.cameras[names[0]].times
-    tool = _tool(raw, times, mask, settings)
-    warnings = [] if tool is None or tool[1] is None else [tool[1]]
+    tool, turned = _tool(raw, times, mask, settings)
     labels = {
         key: raw.description[key] for key in ("scenario", "fabric", "category", "repeat", "truth") if key in raw.description
     }
@@ -456,7 +455,7 @@ def _episode(
         points=placement.to_scene(np.concatenate([part.points for _, part in parts])).astype(np.float32),
         offsets=np.cumsum([0, *sizes], dtype=np.int64),
         times=times - times[0],
-        gripper=None if tool is None else placement.to_scene(tool[0])[:, None],
+        gripper=None if tool is None else placement.to_scene(tool)[:, None],
         camera=np.concatenate([np.full(len(part.points), index, dtype=np.uint8) for index, part in parts]),
         pixel=np.concatenate([part.pixels for _, part in parts]).astype(np.uint16),
         sigma=np.concatenate([part.depth_m**2 * settings.sigma_per_m for _, part in parts]).astype(np.float32),
@@ -467,7 +466,7 @@ def _episode(
             "cameras": names,
             "viewpoints": {name: placement.to_scene(views[name].T_world_camera[:3, 3]).tolist() for name in names},
             "pinholes": {name: _pinhole(views[name], placement).described() for name in names},
-            "quality": {**quality.figures, "warnings": warnings},
+            "quality": {**quality.figures, "warnings": [] if turned is None else [turned]},
         },
     )
 
@@ -506,20 +505,20 @@ def _pinhole(view: View, placement: ScenePlacement) -> Pinhole:
 
 def _tool(
     raw: RawEpisode, times: Floats, mask: RobotMask | None, settings: FusionSettings
-) -> tuple[Floats, str | None] | None:
-    """[T, 3] of the tool in the base frame, as the arm reported it, else by its joints, and why that may not be where its
-    fingertips are; None where neither is known."""
+) -> tuple[Floats | None, str | None]:
+    """[T, 3] of the tool in the base frame, as the arm reported it, else by its joints, None where neither is known; and
+    why that may not be where its fingertips are."""
     log = raw.robot
     if log is None or not len(log.times):
-        return None
+        return None, None
     if np.isfinite(log.tool_position_m).all():
         clock = log.times - settings.lag_s
         track = np.stack([np.interp(times, clock, column) for column in log.tool_position_m.T], axis=1)
         return track, turning(log.tool_quaternion)
     if mask is not None:
         poses = mask.robot.tool_pose(joints_at(log, times, lag_s=settings.lag_s)[0])
-        return poses[:, :3, 3], turning(np.roll(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), 1, axis=1))
-    return None
+        return poses[:, :3, 3], turning(Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True))
+    return None, None
 
 
 def camera_pose(info: CameraInfo, folder: Path, calibration: Calibration | None) -> Floats:

@@ -381,6 +381,6 @@ def _write_log(writer: RawEpisodeWriter, robot: Robot, times: Floats, joints: Fl
     else:
         logged = np.repeat(continuous, len(clock), axis=0)
     tool = robot.tool_pose(logged)
-    quaternion = np.roll(Rotation.from_matrix(tool[:, :3, :3]).as_quat(), 1, axis=-1)
+    quaternion = Rotation.from_matrix(tool[:, :3, :3]).as_quat(scalar_first=True)
     for row in range(len(clock)):  # a file is written row by row
         writer.add_robot(RobotSample(clock[row], logged[row], _GRIPPER_CLOSED, tool[row, :3, 3], quaternion[row]))

@@ -196,6 +196,9 @@ class TestCoverage:
     def test_another_level_or_factor_does_not_mix(self, work):
         invoke(*COVERAGE, "--recordings", 1)
         assert "level 0.9" in invoke(*COVERAGE, "--recordings", 1, "--level", 0.8, code=1).errors
+        (work / "out/small/free/0000.json").rename(work / "out/small/free/0007.json")  # whichever cloths they are of
+        assert "level 0.9" in invoke(*COVERAGE, "--recordings", 1, "--level", 0.8, code=1).errors
+        (work / "out/small/free/0007.json").rename(work / "out/small/free/0000.json")
         path = work / "out/small/free/0000.json"
         assert json.loads(path.read_text())["intervals"]["within"] == 1.5
         (work / "params.yaml").write_text(yaml.safe_dump({**PARAMS, "evaluate": {"within": 1.2}}))

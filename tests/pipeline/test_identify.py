@@ -21,6 +21,7 @@ from diffcloud.clouds import SurfaceSampler
 from diffcloud.fit import read_fit
 from diffcloud.fit.result import read_motion
 from diffcloud.io.clouds import write_ply
+from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.raw_episodes import read_raw_episode
 from diffcloud.scene.scenarios import built_in, make_scenario
 from diffcloud.sim.simulate import rollout
@@ -28,9 +29,11 @@ from pipeline import identify
 from pipeline.config import FitConfig
 from pipeline.fit_jobs import FitJob
 from pipeline.identify import finer_mesh_sentences, mesh_sentence
+from pipeline.preprocess import Cleaned, PreprocessJob
 from tests.fit.records import record_of, recording_of
 from tests.io.ros_bag import bag
 from tests.pipeline.invoke import invoke
+from tests.sensing.table_scene import write_table_episode
 from tests.test_architecture import check_commands
 
 SIZE = (0.16, 0.12)
@@ -149,6 +152,19 @@ class TestNewUser:
                     [Path("recorded/first"), Path("recorded/second")], Path("found"), parameters="stretch", mass=0.25
                 )
             assert before == {one: one.read_bytes() for one in before}
+
+    def test_a_link_to_a_raw_episode_keeps_its_name(self, tmp_path, monkeypatch):
+        write_table_episode(tmp_path / "kept" / "0f3e", frames=1)
+        (tmp_path / "tan1").symlink_to(tmp_path / "kept" / "0f3e")
+
+        def cleaned(self, tell):
+            write_episode(
+                self.out / self.scenario / f"{self.name}.npz", Episode.from_frames([np.ones((3, 3))], np.zeros(1))
+            )
+            return Cleaned({}, [])
+
+        monkeypatch.setattr(PreprocessJob, "run", cleaned)
+        assert identify._read(tmp_path / "tan1", "tan1", tmp_path / "found").frame_count == 1
 
     def test_another_recording_of_that_name_is_told(self, found, tmp_path):
         folder = shutil.copytree(found[0], tmp_path, dirs_exist_ok=True)

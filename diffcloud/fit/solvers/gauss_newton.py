@@ -41,7 +41,7 @@ from diffcloud.fit.names import plain_name
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.priors import INDEPENDENT
 from diffcloud.fit.residuals import Axis, Linearisation, linearise
-from diffcloud.fit.scan import scan
+from diffcloud.fit.scan import Scan, scan
 from diffcloud.fit.solvers.cma_es import CmaEsSettings, fit_cma_es
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
 
@@ -185,18 +185,12 @@ def fit_gauss_newton(
                 scans += 1
                 seen, spent = scan(objective, space, ways.best.place, ways.best.normal)
                 simulations += spent
-                held = False
-                while not held and (lower := seen.lower(ways.best.place, ways.best.loss)) is not None:
-                    found = linearise(objective, space, lower[None])
-                    simulations += found.simulations
-                    held = float(found.losses[0]) < ways.best.loss  # beside a motion, one of its derivatives may diverge
-                    if held:
-                        ways.go_on(lower, found)
-                    else:
-                        seen = seen.corrected(float(found.losses[0]))
-                if not held:
+                seen, lower, spent = _confirmed(objective, space, ways.best, seen)
+                simulations += spent
+                if lower is None:
                     looked = seen
                     break
+                ways.go_on(*lower)
             if not math.isfinite(ways.best.loss):
                 if others and not ways.waiting:  # they diverge after the frames that they were chosen by
                     ways.waiting.append(others.pop(0))
@@ -417,6 +411,21 @@ class _Ways:
     def go_on(self, place: Tensor, found: Linearisation) -> None:
         """From a lower place [k] than the best one's."""
         self.every[self.every.index(self.best)] = _Way(place, found, self._steps, self.best.origin)
+
+
+def _confirmed(
+    objective: AnyObjective, space: FitSpace, best: _Way, seen: Scan
+) -> tuple[Scan, tuple[Tensor, Linearisation] | None, int]:
+    """The lowest place of a scan around the best one that is lower with its derivatives too, beside which no motion
+    diverges: the scan without those that are not, that place [k] with what was found there, and the simulations taken."""
+    spent = 0
+    while (lower := seen.lower(best.place, best.loss)) is not None:
+        found = linearise(objective, space, lower[None])
+        spent += found.simulations
+        if float(found.losses[0]) < best.loss:
+            return seen, (lower, found), spent
+        seen = seen.corrected(float(found.losses[0]))
+    return seen, None, spent
 
 
 def _starts(

@@ -198,7 +198,7 @@ def _angle(tree: TransformTree, joint: Joint, times: NDArray[np.float64]) -> NDA
 
 def _placed(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Positions [T, 3] and quaternions [T, 4] (w, x, y, z) of poses [T, 4, 4]."""
-    return poses[:, :3, 3], np.roll(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), 1, axis=1)
+    return poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
 
 
 def _series(
