@@ -193,10 +193,10 @@ class FitConfig(Section):
     iterations: Count | None = None
     """Of gauss_newton and adam: steps at most; by default 20 and 50."""
     starts: Count | None = None
-    """Of gauss_newton (at most) and adam: number of descents, from different places; by default 8 (3 with the linearised
+    """Of gauss_newton (at most) and adam: number of descents, from different places; by default 8 (2 with the linearised
     integrator) and 1. Only by default does gauss_newton also let the recording grow, and search."""
     screen: CountOrNone | None = None
-    """Of gauss_newton and adam: candidates simulated once to choose the starts from; by default 24 of gauss_newton (96 with
+    """Of gauss_newton and adam: candidates simulated once to choose the starts from; by default 24 of gauss_newton (48 with
     the linearised integrator), none of adam, whose further starts are then spread over the box."""
     learning_rate: Positive | None = None
     """Of adam; the scenario's own if not given."""

@@ -70,14 +70,14 @@ def fit(
         int | None,
         typer.Option(
             help="Descents from as many places; of gauss_newton at most, from the best candidates only. Default of "
-            "gauss_newton: 8, three that grow with the recording, and one from a search (linearised: 3, and no others); of "
+            "gauss_newton: 8, three that grow with the recording, and one from a search (linearised: 2, and no others); of "
             "adam: 1."
         ),
     ] = None,
     screen: Annotated[
         int | None,
         typer.Option(
-            help="Simulate this many candidates, start from the best. Default of gauss_newton: 24; 96 if linearised."
+            help="Simulate this many candidates, start from the best. Default of gauss_newton: 24; 48 if linearised."
         ),
     ] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Of adam. Default: the scenario's.")] = None,

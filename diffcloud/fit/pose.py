@@ -155,6 +155,8 @@ class PoseSpace:
 
     def moved(self, points: Tensor, values: Tensor) -> Tensor:
         """[B, ..., 3] points of the scene at values [B, d] -> where the recording has them."""
+        if not self.names:
+            return points
         turned = self.carried(points - self.centre, values)
         return turned + _beside(self.centre + self._parts(values, _SHIFTS), turned)
 
@@ -173,6 +175,8 @@ class PoseSpace:
 
     def carried(self, vectors: Tensor, values: Tensor) -> Tensor:
         """[B, ..., 3] displacements in the scene at values [B, d] -> in the recording."""
+        if not self.names:
+            return vectors
         return _turned(vectors, self._growth(values)[..., None] * self.rotation(values))
 
     def back(self, points: Tensor, values: Tensor) -> Tensor:

@@ -3,7 +3,8 @@
 Variables are fitted on an axis of their own: the logarithm of a value whose lower bound is positive, the standard
 deviations off zero of one with a normal prior, else the part of its range. Where the integrator's derivatives hold over
 finite distances (the implicit one: docs/results/gradients.md), the motion is linearised by forward tangents, in one
-simulation. The linearised integrator's contact is rough: there, motions a finite step to both sides give the differences.
+simulation. The linearised integrator's contact is rough: there, motions a finite step to both sides give the differences,
+and losses there are known too.
 
 What a motion says at a pose stands in `matching`. The pose is not among the variables: it follows them, to where the loss
 is lowest. Of the whole system over variables p and pose q, what is left when q is solved for is (variable projection;
@@ -23,7 +24,7 @@ from torch import Tensor
 from diffcloud.errors import DivergedError
 from diffcloud.fit.batches import without_diverged
 from diffcloud.fit.inputs import Inputs
-from diffcloud.fit.joint import AnyObjective, mean_terms
+from diffcloud.fit.joint import AnyObjective, mean_loss, mean_terms
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.sim.simulate import Rollout
@@ -93,42 +94,66 @@ class Linearisation:
     curvature: Tensor
     """[B, k, k] half of the Gauss–Newton matrix."""
     simulations: int
+    beside: tuple[Tensor, Tensor] | None = None
+    """Where differences were taken, the places [n, B, k] to both sides and the loss at each [n, B]: not more than that, at
+    the pose of the place between; infinite where a motion diverges."""
 
 
 def linearise(objective: AnyObjective, space: FitSpace, places: Tensor) -> Linearisation:
     """The loss at [B, k] places, with the prior of the variables, by the rule that stands at the head of this module."""
     paper = objective.paper
 
-    def run(index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        parts = map_threads(lambda one: _part(objective, space, places[index], one), range(len(objective.members)))
-        loss, slope, curvature = mean_terms(parts, paper=paper)
-        values, count = Axis.of(space).values(places[index]), len(objective.members)
-        prior, factor = loss[:, None] * space.prior_weights(count), space.prior_factor(values, count)
+    axis, members = Axis.of(space), len(objective.members)
+    sides = None if any(map(by_tangents, objective.members)) else _sides(axis, places).flatten(0, 1)
+
+    def run(index: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        parts = map_threads(lambda one: _part(objective, space, places[index], one), range(members))
+        loss, slope, curvature = mean_terms([part[:3] for part in parts], paper=paper)
+        values = axis.values(places[index])
+        prior, factor = loss[:, None] * space.prior_weights(members), space.prior_factor(values, members)
         slope, curvature = slope + prior * space.off_centre(values), curvature + torch.diag_embed(prior)
-        return factor * loss, factor[:, None] * slope, factor[:, None, None] * curvature
+        beside = torch.stack([part[3] for part in parts]).flatten(1)
+        return (
+            factor * loss,
+            factor[:, None] * slope,
+            factor[:, None, None] * curvature,
+            mean_loss(beside, paper=paper).unflatten(0, (-1, len(index))),
+        )
 
     with torch.no_grad():
         found, kept, _ = without_diverged(len(places), run)
     count, variables = places.shape
     losses = torch.full((count,), torch.inf, dtype=torch.float64)
     slope, curvature = places.new_zeros(count, variables), places.new_zeros(count, variables, variables)
+    beside = None if sides is None else (sides, torch.full(sides.shape[:2], torch.inf, dtype=torch.float64))
     if found is not None:
-        losses[kept], slope[kept], curvature[kept] = found
+        losses[kept], slope[kept], curvature[kept] = found[:3]
+        if beside is not None:
+            beside[1][:, kept] = found[3] * space.prior_factor(axis.values(beside[0][:, kept]), members)
     each = sum(
         1 if by_tangents(one) else 1 + 2 * len(space.of_recording(index)[1]) for index, one in enumerate(objective.members)
     )
-    return Linearisation(losses, slope, curvature, each * count)
+    return Linearisation(losses, slope, curvature, each * count, beside)
 
 
-def _part(objective: AnyObjective, space: FitSpace, places: Tensor, recording: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Loss [B], slope [B, k] and curvature [B, k, k] of one recording, which only its own variables move."""
+def _part(
+    objective: AnyObjective, space: FitSpace, places: Tensor, recording: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Loss [B], slope [B, k] and curvature [B, k, k] of one recording, which only its own variables move; and the losses
+    [2 k, B] beside, as far as differences tell them."""
     own, columns = space.of_recording(recording)
     member = objective.members[recording]
-    loss, own_slope, own_curvature = _over_pose(member, *moved_by(member, own, places[:, columns]))
+    moved = moved_by(member, own, places[:, columns])
+    (loss, own_slope, own_curvature), pose = _over_pose(member, moved)
     batch, variables = places.shape
     slope, curvature = places.new_zeros(batch, variables), places.new_zeros(batch, variables, variables)
     slope[:, columns], curvature[:, columns[:, None], columns] = own_slope, own_curvature
-    return loss, slope, curvature
+    beside = loss.expand(2, variables, batch).clone()
+    if moved.beside is not None:
+        poses = pose.repeat(2 * len(columns), 1)
+        losses = member.frame_losses(moved.beside, pose=poses).mean(-1) * member.pose_space.prior_factor(poses)
+        beside[:, columns] = losses.reshape(2, len(columns), batch)
+    return loss, slope, curvature, beside.flatten(0, 1)
 
 
 def by_tangents(objective: Objective) -> bool:
@@ -136,12 +161,23 @@ def by_tangents(objective: Objective) -> bool:
     return objective.scenario.scene.integrator == "implicit"
 
 
-def moved_by(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rollout, Tensor]:
-    """Motions of B places, and the rates [k, B, L, V, 3] of their nodes at the compared frames."""
+@dataclass(frozen=True)
+class Moved:
+    """Motions of B places."""
+
+    run: Rollout
+    rates: Tensor
+    """[k, B, L, V, 3] of their nodes at the compared frames."""
+    beside: Rollout | None
+    """The [2 · k · B] motions that these are differences of."""
+
+
+def moved_by(objective: Objective, space: FitSpace, places: Tensor) -> Moved:
+    """Motions of B places [B, k], and how they change."""
     return (_by_tangents if by_tangents(objective) else _by_differences)(objective, space, places)
 
 
-def _by_tangents(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rollout, Tensor]:
+def _by_tangents(objective: Objective, space: FitSpace, places: Tensor) -> Moved:
     axis = Axis.of(space)
 
     def given(at: Tensor) -> Inputs:
@@ -153,37 +189,44 @@ def _by_tangents(objective: Objective, space: FitSpace, places: Tensor) -> tuple
     rates = [torch.cat(parts) for parts in zip(*_along(inputs, places, _ways(places)), strict=True)]
     run, moves = given(places).rollout_tangents(rates)
     times = objective.times
-    return run, torch.stack([replace(run, positions=move).at(times) for move in moves])
+    return Moved(run, torch.stack([replace(run, positions=move).at(times) for move in moves]), None)
 
 
-def _by_differences(objective: Objective, space: FitSpace, places: Tensor) -> tuple[Rollout, Tensor]:
+def _by_differences(objective: Objective, space: FitSpace, places: Tensor) -> Moved:
     """
     Raises:
         DivergedError: names the places beside which a motion diverges, or at which.
     """
-    axis = Axis.of(space)
-    low, high = axis.ends
-    ways = _ways(places)
-    above, below = (torch.minimum(torch.maximum(places + sign * STEP * ways, low), high) for sign in (1, -1))
+    axis, count = Axis.of(space), len(places)
+    above, below = _sides(axis, places)
     every = torch.cat([places[None], above, below]).flatten(0, 1)
     try:
         run = objective.simulate_to_loss(space.parameters(axis.values(every)))
     except DivergedError as error:
-        entries = sorted({entry % len(places) for entry in error.entries})
+        entries = sorted({entry % count for entry in error.entries})
         raise DivergedError(error.step, entries, error.reason, error.parameters) from error
-    there = run.at(objective.times)[len(places) :].unflatten(0, (2, -1, len(places)))
-    width = ((above - below) * ways).sum(-1)  # halved at a bound
-    return replace(run, positions=run.positions[: len(places)], velocities=run.velocities[: len(places)]), (
-        there[0] - there[1]
-    ) / width[..., None, None, None]
+    here, beside = (
+        replace(run, positions=run.positions[part], velocities=run.velocities[part])
+        for part in (slice(count), slice(count, None))
+    )
+    there = beside.at(objective.times).unflatten(0, (2, -1, count))
+    width = (above - below).sum(-1)  # halved at a bound
+    return Moved(here, (there[0] - there[1]) / width[..., None, None, None], beside)
 
 
-def _over_pose(objective: Objective, run: Rollout, rates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Loss [B], slope [B, k] and curvature [B, k, k] of one episode, the pose solved for."""
-    motion, count = objective.match(run), len(rates)
-    loss, slope, curvature = objective.terms(motion, rates)
+def _sides(axis: Axis, places: Tensor) -> Tensor:
+    """[2, k, B, k] places above and below each of B places [B, k], along each variable, between the bounds."""
+    low, high = axis.ends
+    steps = STEP * _ways(places)
+    return torch.stack([torch.minimum(torch.maximum(places + sign * steps, low), high) for sign in (1, -1)])
+
+
+def _over_pose(objective: Objective, moved: Moved) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+    """Loss [B], slope [B, k] and curvature [B, k, k] of one episode, the pose solved for; and that pose [B, d]."""
+    motion, count = objective.match(moved.run), len(moved.rates)
+    loss, slope, curvature = objective.terms(motion, moved.rates)
     if motion.pose.shape[1] == 0:
-        return loss, slope, curvature
+        return (loss, slope, curvature), motion.pose
     space = objective.pose_space
     prior, factor = loss[:, None] * space.prior_weights, space.prior_factor(motion.pose)
     of_pose = slope[:, count:] + prior * motion.pose
@@ -191,7 +234,7 @@ def _over_pose(objective: Objective, run: Rollout, rates: Tensor) -> tuple[Tenso
     solved = torch.linalg.solve(along, torch.cat([of_pose[..., None], mixed.mT], dim=-1))
     slope = slope[:, :count] - (mixed @ solved[..., :1]).squeeze(-1)
     curvature = curvature[:, :count, :count] - mixed @ solved[..., 1:]
-    return factor * loss, factor[:, None] * slope, factor[:, None, None] * curvature
+    return (factor * loss, factor[:, None] * slope, factor[:, None, None] * curvature), motion.pose
 
 
 def _ways(places: Tensor) -> Tensor:

@@ -225,7 +225,8 @@ class _Part:
     @staticmethod
     def of(objective: Objective, space: FitSpace, places: Tensor) -> _Part:
         k = len(space.names)
-        run, rates = moved_by(objective, space, places)
+        moved = moved_by(objective, space, places)
+        run, rates = moved.run, moved.rates
         refined = _refined(objective, space.parameters(Axis.of(space).values(places)), run)
         fitted_pose = objective.match(run).pose[0]
         set_up = set_up_of(objective.episode)

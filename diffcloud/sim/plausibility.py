@@ -74,14 +74,19 @@ def implausible(motion: Motion, stored: Callable[[int], float]) -> tuple[int, st
     Args:
         stored: elastic energy after so many steps; asked only where the other terms do not explain the motion.
     """
-    given, work, kinetic = _energies(motion)
-    found = [_too_far(motion, given, work - kinetic, stored), _too_quick(given, work, kinetic, stored)]
+    fallen = _fallen(motion)
+    given, work, kinetic = _energies(motion, fallen)
+    found = [_too_far(motion, fallen, given, work - kinetic, stored), _too_quick(given, work, kinetic, stored)]
     return min((fault for fault in found if fault is not None), default=None)
 
 
-def _energies(motion: Motion) -> tuple[Floats, Floats, Floats]:
+def _energies(motion: Motion, fallen: Floats) -> tuple[Floats, Floats, Floats]:
     """[S] each, after every step: what can have come into the cloth but for its weight (K), what that did (P), and the
-    kinetic energy (E)."""
+    kinetic energy (E).
+
+    Args:
+        fallen: [S] as of `_fallen`.
+    """
     step, mass = motion.time_step, float(motion.mass.sum())
     velocities = np.diff(motion.positions, axis=0) / step
     kinetic = 0.5 * np.einsum("svi,svi,v->s", velocities, velocities, motion.mass)
@@ -91,17 +96,19 @@ def _energies(motion: Motion) -> tuple[Floats, Floats, Floats]:
     speed = np.maximum(np.maximum.accumulate(moved) / step, motion.wind)
     rounding = _ROUNDING * float(np.abs(motion.positions).max(initial=0.0)) / step
     start = 0.5 * float(motion.mass @ (motion.velocities**2).sum(axis=-1)) + 0.5 * mass * rounding**2
-    given = start + motion.pull * (motion.size + np.cumsum(moved) + _fallen(motion)) + 0.5 * mass * speed**2
+    given = start + motion.pull * (motion.size + np.cumsum(moved) + fallen) + 0.5 * mass * speed**2
     work = np.einsum("svi,i,v->s", motion.positions[1:] - motion.positions[0], motion.gravity, motion.mass)
     return given, work, kinetic
 
 
-def _too_far(motion: Motion, given: Floats, spent: Floats, stored: Callable[[int], float]) -> tuple[int, str] | None:
-    """Args: given, spent: [S] K, and P - E."""
+def _too_far(
+    motion: Motion, fallen: Floats, given: Floats, spent: Floats, stored: Callable[[int], float]
+) -> tuple[int, str] | None:
+    """Args: fallen, given, spent: [S] as of `_fallen`, K, and P - E."""
     places = np.concatenate([motion.places[1:][motion.held], motion.others.reshape(-1, 3)])
     if not len(places):
         places = motion.positions[0]
-    allowed = _SIZES * motion.size + _fallen(motion)
+    allowed = _SIZES * motion.size + fallen
     offsets = motion.positions[1:] - places[0]
     if (np.abs(offsets).max(axis=(1, 2)) * np.sqrt(3) <= allowed).all():  # the common case, at little cost
         return None

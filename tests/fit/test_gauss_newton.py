@@ -15,6 +15,7 @@ from diffcloud.errors import DivergedError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton, residuals
 from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.doubts import MATERIAL_DOUBTS, with_doubts
+from diffcloud.fit.laid import with_laid
 from diffcloud.fit.priors import INDEPENDENT
 from diffcloud.fit.residuals import Axis, Linearisation, linearise
 from diffcloud.fit.scan import scan
@@ -91,6 +92,41 @@ class TestLinearisation:
         torch.testing.assert_close(by_differences.slope, by_tangents.slope, rtol=1e-3, atol=1e-10)
         torch.testing.assert_close(by_differences.curvature, by_tangents.curvature, rtol=1e-3, atol=1e-10)
 
+    @pytest.mark.parametrize("joint", [False, True], ids=["alone", "joint"])
+    @pytest.mark.parametrize("measure", [{"paper": True}, {"nuisance": {"x": 0.1, "yaw": 0.3}}], ids=["paper", "posed"])
+    def test_differences_tell_the_losses_beside(self, joint, measure):
+        """Not less than what a pose of their own leaves, with the priors; a bound is where it ends."""
+        one = lifted(integrator="linearised", **measure)
+        objective = JointObjective([one, lifted(integrator="linearised", **measure)]) if joint else one
+        space = FitSpace.build(SPACE.names, bounds={"stretch": (0.1, 1.0), "mass": (0.1, 1.5)}, priors={"stretch": 0.7})
+        axis = Axis.of(space)
+        places = torch.stack([axis.places(torch.tensor([0.9, 1.2]).double()), axis.ends[1]])
+        found = linearise(objective, space, places)
+        beside, losses = found.beside
+        up, down = torch.eye(2).double()[:, None] * residuals.STEP, -torch.eye(2).double()[:, None] * residuals.STEP
+        torch.testing.assert_close(beside, torch.cat([places + up, places + down]).minimum(axis.ends[1]))
+        expected = batch_losses(objective, space, axis.bounded(beside.flatten(0, 1))).reshape(losses.shape)
+        if measure.get("paper"):
+            torch.testing.assert_close(losses, expected)
+        else:
+            assert bool((losses > expected * (1 - 1e-4)).all())  # poses are solved for to that
+            torch.testing.assert_close(losses, expected, rtol=0.01, atol=0)
+        torch.testing.assert_close(losses[:2, 1], found.losses[1].expand(2))
+        assert linearise(lifted(**measure), space, places).beside is None
+
+    def test_beside_a_recording_of_its_own_variable_the_others_stay(self):
+        """Of a joint fit, whose mean loss changes by one of its parts alone."""
+        members = [lifted(integrator="linearised", nuisance={}) for _ in range(2)]
+        scenarios = [replace(one.scenario, laid={"turn": 0.1}) for one in members]
+        space = with_laid(SPACE, [{"turn": 0.1}] * 2, scenarios)
+        objective, axis = JointObjective(members), Axis.of(space)
+        place = axis.places(space.starts(1, seed=0)[0].double())
+        beside, losses = linearise(objective, space, place).beside
+        assert beside.shape == (2 * len(space.names), 1, len(space.names))
+        assert len(space.names) == 4
+        expected = batch_losses(objective, space, axis.bounded(beside[:, 0]))
+        torch.testing.assert_close(losses[:, 0], expected)
+
     @pytest.mark.parametrize("integrator", ["implicit", "linearised"])
     def test_a_bound_has_a_slope_too(self, integrator):
         """Differences are halved there, and nothing is simulated beyond."""
@@ -128,8 +164,12 @@ class TestLinearisation:
 
         monkeypatch.setattr(Objective, "simulate_to_loss", broken)
         places = Axis.of(SPACE).places(torch.tensor([[1.0, 1.0], [8.9, 1.0], [2.0, 1.0]], dtype=torch.float64))
-        assert linearise(objective, SPACE, places).losses.isfinite().tolist() == [True, False, True]
-        assert linearise(objective, SPACE, places[1:2]).losses.isfinite().tolist() == [False]
+        found = linearise(objective, SPACE, places)
+        assert found.losses.isfinite().tolist() == [True, False, True]
+        assert found.beside[1].isfinite().all(0).tolist() == [True, False, True]
+        alone = linearise(objective, SPACE, places[1:2])
+        assert alone.losses.isfinite().tolist() == [False]
+        assert alone.beside[1].isinf().all()
 
 
 class TestSurface:
@@ -518,6 +558,56 @@ class TestFits:
             way.judge(way.propose(-9 * end, 9 * end), replace(found, losses=torch.full((1,), 2.0).double()))
             steps += 1
         assert (way.end, steps) == ("rough", 4)
+
+    def test_a_rough_way_goes_on_from_the_lowest_place_that_it_passed_by(self):
+        """Down a slope with ripples that are wider than the last steps, and narrower than the differences."""
+
+        def loss(places):
+            return 1 + (places - 0.3).square() + 0.03 * (37 * places).sin()
+
+        def told(place, *, beside):
+            sides = place + residuals.STEP * torch.tensor([[1.0], [-1.0]]).double()
+            slope = (loss(sides[0]) - loss(sides[1])) / (4 * residuals.STEP)
+            return Linearisation(
+                loss(place), slope[None], torch.eye(1).double()[None], 1, (sides[:, None], loss(sides)) if beside else None
+            )
+
+        ends, starts, lower = torch.full((1,), 9.0).double(), torch.linspace(-2, 2, 9).double(), 0
+        for start in starts:
+            reached = []
+            for beside in (False, True):
+                place = start[None]
+                way, seen = gauss_newton._Way(place, told(place, beside=beside), 40), []
+                while way.end is None:
+                    tried = way.propose(-ends, ends)
+                    found = told(tried, beside=beside)
+                    seen += [] if found.beside is None else found.beside[1].flatten().tolist()
+                    way.judge(tried, found)
+                reached.append(way.loss)
+            assert way.end in ("converged", "rough")
+            assert way.loss <= min(seen) / (1 - 1e-3)
+            assert reached[1] <= reached[0]
+            lower += reached[1] < 0.99 * reached[0]
+        assert lower > 3
+
+    @pytest.mark.parametrize("there", [math.inf, 1.5])
+    def test_a_place_passed_by_that_is_not_lower_after_all_ends_it(self, there):
+        """Its motion goes astray, or its pose does; it is tried once."""
+        place, sides = torch.zeros(1).double(), torch.tensor([[[0.05]], [[-0.05]]]).double()
+        found = Linearisation(
+            torch.ones(1).double(),
+            torch.zeros(1, 1).double(),
+            torch.eye(1).double()[None],
+            1,
+            (sides, torch.tensor([[2.0], [0.5]]).double()),
+        )
+        way, end = gauss_newton._Way(place, found, 20), torch.full((1,), 9.0).double()
+        way.judge(way.propose(-end, end), found)
+        assert way.end is None
+        tried = way.propose(-end, end)
+        assert tried.tolist() == pytest.approx([-0.05])
+        way.judge(tried, replace(found, losses=torch.full((1,), there).double(), beside=None))
+        assert (way.end, way.loss, way.place.tolist()) == ("converged", 1.0, [0.0])
 
     def test_a_start_that_is_not_about_to_be_of_use_is_given_up(self):
         """Nothing is looked for around its end, either."""
