@@ -95,8 +95,9 @@ class Linearisation:
     """[B, k, k] half of the Gauss–Newton matrix."""
     simulations: int
     beside: tuple[Tensor, Tensor] | None = None
-    """Where differences were taken, the places [n, B, k] to both sides and the loss at each [n, B]: not more than that, at
-    the pose of the place between; infinite where a motion diverges."""
+    """The places [n, B, k] of the differences, and the loss at each [n, B], with the pose of the place in the middle: with
+    a pose of its own, it would be about as low or lower. All are infinite of a place at or beside which a motion diverges.
+    None where the derivatives of any recording are tangents."""
 
 
 def linearise(objective: AnyObjective, space: FitSpace, places: Tensor) -> Linearisation:
@@ -107,18 +108,13 @@ def linearise(objective: AnyObjective, space: FitSpace, places: Tensor) -> Linea
     sides = None if any(map(by_tangents, objective.members)) else _sides(axis, places).flatten(0, 1)
 
     def run(index: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        parts = map_threads(lambda one: _part(objective, space, places[index], one), range(members))
+        parts = map_threads(lambda one: _part(objective, space, places[index], one, sides is not None), range(members))
         loss, slope, curvature = mean_terms([part[:3] for part in parts], paper=paper)
         values = axis.values(places[index])
         prior, factor = loss[:, None] * space.prior_weights(members), space.prior_factor(values, members)
         slope, curvature = slope + prior * space.off_centre(values), curvature + torch.diag_embed(prior)
-        beside = torch.stack([part[3] for part in parts]).flatten(1)
-        return (
-            factor * loss,
-            factor[:, None] * slope,
-            factor[:, None, None] * curvature,
-            mean_loss(beside, paper=paper).unflatten(0, (-1, len(index))),
-        )
+        beside = mean_loss(torch.stack([part[3] for part in parts]).flatten(1), paper=paper).unflatten(0, (-1, len(index)))
+        return factor * loss, factor[:, None] * slope, factor[:, None, None] * curvature, beside
 
     with torch.no_grad():
         found, kept, _ = without_diverged(len(places), run)
@@ -137,23 +133,24 @@ def linearise(objective: AnyObjective, space: FitSpace, places: Tensor) -> Linea
 
 
 def _part(
-    objective: AnyObjective, space: FitSpace, places: Tensor, recording: int
+    objective: AnyObjective, space: FitSpace, places: Tensor, recording: int, beside: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Loss [B], slope [B, k] and curvature [B, k, k] of one recording, which only its own variables move; and the losses
-    [2 k, B] beside, as far as differences tell them."""
+    [2 k, B] at the places of the differences. Where a variable is another recording's, or nobody asks for them, that of the
+    place itself."""
     own, columns = space.of_recording(recording)
     member = objective.members[recording]
     moved = moved_by(member, own, places[:, columns])
-    (loss, own_slope, own_curvature), pose = _over_pose(member, moved)
+    loss, own_slope, own_curvature, pose = _over_pose(member, moved)
     batch, variables = places.shape
     slope, curvature = places.new_zeros(batch, variables), places.new_zeros(batch, variables, variables)
     slope[:, columns], curvature[:, columns[:, None], columns] = own_slope, own_curvature
-    beside = loss.expand(2, variables, batch).clone()
-    if moved.beside is not None:
+    around = loss.expand(2, variables, batch).clone()
+    if beside and moved.beside is not None:
         poses = pose.repeat(2 * len(columns), 1)
         losses = member.frame_losses(moved.beside, pose=poses).mean(-1) * member.pose_space.prior_factor(poses)
-        beside[:, columns] = losses.reshape(2, len(columns), batch)
-    return loss, slope, curvature, beside.flatten(0, 1)
+        around[:, columns] = losses.reshape(2, len(columns), batch)
+    return loss, slope, curvature, around.flatten(0, 1)
 
 
 def by_tangents(objective: Objective) -> bool:
@@ -221,12 +218,12 @@ def _sides(axis: Axis, places: Tensor) -> Tensor:
     return torch.stack([torch.minimum(torch.maximum(places + sign * steps, low), high) for sign in (1, -1)])
 
 
-def _over_pose(objective: Objective, moved: Moved) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+def _over_pose(objective: Objective, moved: Moved) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Loss [B], slope [B, k] and curvature [B, k, k] of one episode, the pose solved for; and that pose [B, d]."""
     motion, count = objective.match(moved.run), len(moved.rates)
     loss, slope, curvature = objective.terms(motion, moved.rates)
     if motion.pose.shape[1] == 0:
-        return (loss, slope, curvature), motion.pose
+        return loss, slope, curvature, motion.pose
     space = objective.pose_space
     prior, factor = loss[:, None] * space.prior_weights, space.prior_factor(motion.pose)
     of_pose = slope[:, count:] + prior * motion.pose
@@ -234,7 +231,7 @@ def _over_pose(objective: Objective, moved: Moved) -> tuple[tuple[Tensor, Tensor
     solved = torch.linalg.solve(along, torch.cat([of_pose[..., None], mixed.mT], dim=-1))
     slope = slope[:, :count] - (mixed @ solved[..., :1]).squeeze(-1)
     curvature = curvature[:, :count, :count] - mixed @ solved[..., 1:]
-    return (factor * loss, factor[:, None] * slope, factor[:, None, None] * curvature), motion.pose
+    return factor * loss, factor[:, None] * slope, factor[:, None, None] * curvature, motion.pose
 
 
 def _ways(places: Tensor) -> Tensor:

@@ -35,8 +35,33 @@ def lifted(*, integrator="implicit", **measure):
     return Objective(scenario, clouds_of(scenario, points=8000, **TRUTH), **(measure or {"paper": True}))
 
 
+def rough_pair(**measure):
+    """Two recordings of different cloths with the linearised integrator, the first one shifted and turned."""
+    scenario = small_lift(**{**GENTLE, "integrator": "linearised", "points": 500})
+    episodes = [
+        clouds_of(scenario, points=8000, shift=(0.1, 0, 0), yaw=0.2, **TRUTH),
+        clouds_of(scenario, points=6000, seed=6, stretch=1.4, mass=0.8),
+    ]
+    return [Objective(scenario, episode, **measure) for episode in episodes]
+
+
 def at(objective, space, places):
     return objective(space.parameters(Axis.of(space).values(places)))
+
+
+ZERO = torch.zeros(1, dtype=torch.float64)
+
+
+def beside(loss, *, slope=0.0, lowest=0.5):
+    """What is found at a place of one variable, with a lower loss below it."""
+    sides = torch.tensor([[[0.05]], [[-0.05]]]).double()
+    return Linearisation(
+        torch.tensor([loss]).double(),
+        torch.tensor([[slope]]).double(),
+        torch.eye(1).double()[None],
+        1,
+        (sides, torch.tensor([[2.0], [lowest]]).double()),
+    )
 
 
 class TestAxis:
@@ -95,9 +120,9 @@ class TestLinearisation:
     @pytest.mark.parametrize("joint", [False, True], ids=["alone", "joint"])
     @pytest.mark.parametrize("measure", [{"paper": True}, {"nuisance": {"x": 0.1, "yaw": 0.3}}], ids=["paper", "posed"])
     def test_differences_tell_the_losses_beside(self, joint, measure):
-        """Not less than what a pose of their own leaves, with the priors; a bound is where it ends."""
-        one = lifted(integrator="linearised", **measure)
-        objective = JointObjective([one, lifted(integrator="linearised", **measure)]) if joint else one
+        """With the priors, at the pose of the place in the middle; a bound is where it ends."""
+        members = rough_pair(**measure)[: 1 + joint]
+        objective = JointObjective(members) if joint else members[0]
         space = FitSpace.build(SPACE.names, bounds={"stretch": (0.1, 1.0), "mass": (0.1, 1.5)}, priors={"stretch": 0.7})
         axis = Axis.of(space)
         places = torch.stack([axis.places(torch.tensor([0.9, 1.2]).double()), axis.ends[1]])
@@ -105,27 +130,35 @@ class TestLinearisation:
         beside, losses = found.beside
         up, down = torch.eye(2).double()[:, None] * residuals.STEP, -torch.eye(2).double()[:, None] * residuals.STEP
         torch.testing.assert_close(beside, torch.cat([places + up, places + down]).minimum(axis.ends[1]))
-        expected = batch_losses(objective, space, axis.bounded(beside.flatten(0, 1))).reshape(losses.shape)
-        if measure.get("paper"):
-            torch.testing.assert_close(losses, expected)
-        else:
-            assert bool((losses > expected * (1 - 1e-4)).all())  # poses are solved for to that
-            torch.testing.assert_close(losses, expected, rtol=0.01, atol=0)
-        torch.testing.assert_close(losses[:2, 1], found.losses[1].expand(2))
-        assert linearise(lifted(**measure), space, places).beside is None
 
-    def test_beside_a_recording_of_its_own_variable_the_others_stay(self):
-        """Of a joint fit, whose mean loss changes by one of its parts alone."""
-        members = [lifted(integrator="linearised", nuisance={}) for _ in range(2)]
-        scenarios = [replace(one.scenario, laid={"turn": 0.1}) for one in members]
-        space = with_laid(SPACE, [{"turn": 0.1}] * 2, scenarios)
+        def at_pose(member):
+            pose = member.match(member.simulate_to_loss(space.parameters(axis.values(places)))).pose.repeat(4, 1)
+            run = member.simulate_to_loss(space.parameters(axis.values(beside.flatten(0, 1))))
+            return member.frame_losses(run, pose=pose).mean(-1) * member.pose_space.prior_factor(pose)
+
+        of_each = torch.stack([at_pose(one) for one in members])
+        mean = of_each.mean(0) if objective.paper else of_each.log().mean(0).exp()
+        expected = mean * space.prior_factor(axis.values(beside.flatten(0, 1)), len(members))
+        torch.testing.assert_close(losses, expected.reshape(losses.shape))
+        own = batch_losses(objective, space, axis.bounded(beside.flatten(0, 1))).reshape(losses.shape)
+        assert bool((losses > own * (1 - 1e-4)).all())  # poses are solved for to that
+        torch.testing.assert_close(losses[:2, 1], found.losses[1].expand(2))
+        implicit = lifted(**measure)
+        for one in (implicit, JointObjective([implicit, lifted(**measure)])):
+            assert linearise(one, space, places).beside is None
+
+    def test_a_variable_of_one_recording_moves_its_loss_alone(self):
+        """The mean loss beside has the other recordings' losses as they are."""
+        members = rough_pair(nuisance={})
+        space = with_laid(SPACE, [{"turn": 0.1}] * 2, [one.scenario for one in members])
         objective, axis = JointObjective(members), Axis.of(space)
-        place = axis.places(space.starts(1, seed=0)[0].double())
+        place = torch.cat(
+            [axis.places(space.starts(1, seed=0)[0].double())[:, :2], torch.tensor([[0.8, -1.5]]).double()], 1
+        )
         beside, losses = linearise(objective, space, place).beside
-        assert beside.shape == (2 * len(space.names), 1, len(space.names))
-        assert len(space.names) == 4
-        expected = batch_losses(objective, space, axis.bounded(beside[:, 0]))
-        torch.testing.assert_close(losses[:, 0], expected)
+        assert beside.shape == (8, 1, 4)
+        torch.testing.assert_close(losses[:, 0], batch_losses(objective, space, axis.bounded(beside[:, 0])))
+        assert len(losses.round(decimals=9).unique()) == 8
 
     @pytest.mark.parametrize("integrator", ["implicit", "linearised"])
     def test_a_bound_has_a_slope_too(self, integrator):
@@ -577,7 +610,8 @@ class TestFits:
             reached = []
             for beside in (False, True):
                 place = start[None]
-                way, seen = gauss_newton._Way(place, told(place, beside=beside), 40), []
+                first = told(place, beside=beside)
+                way, seen = gauss_newton._Way(place, first, 40), first.beside[1].flatten().tolist() if beside else []
                 while way.end is None:
                     tried = way.propose(-ends, ends)
                     found = told(tried, beside=beside)
@@ -591,23 +625,36 @@ class TestFits:
         assert lower > 3
 
     @pytest.mark.parametrize("there", [math.inf, 1.5])
-    def test_a_place_passed_by_that_is_not_lower_after_all_ends_it(self, there):
-        """Its motion goes astray, or its pose does; it is tried once."""
-        place, sides = torch.zeros(1).double(), torch.tensor([[[0.05]], [[-0.05]]]).double()
-        found = Linearisation(
-            torch.ones(1).double(),
-            torch.zeros(1, 1).double(),
-            torch.eye(1).double()[None],
-            1,
-            (sides, torch.tensor([[2.0], [0.5]]).double()),
-        )
-        way, end = gauss_newton._Way(place, found, 20), torch.full((1,), 9.0).double()
-        way.judge(way.propose(-end, end), found)
+    @pytest.mark.parametrize("end", ["converged", "rough"])
+    def test_a_place_passed_by_that_is_not_lower_after_all_is_tried_once(self, end, there):
+        """Its motion goes astray, or its pose does: the way ends where it stands, and why it stands stays true."""
+        way, ends = gauss_newton._Way(ZERO, beside(1.0, slope=0.0 if end == "converged" else 0.5), 20), 9 + 0 * ZERO
+        while not way._aside:
+            way.judge(way.propose(-ends, ends), beside(2.0))
         assert way.end is None
-        tried = way.propose(-end, end)
-        assert tried.tolist() == pytest.approx([-0.05])
-        way.judge(tried, replace(found, losses=torch.full((1,), there).double(), beside=None))
-        assert (way.end, way.loss, way.place.tolist()) == ("converged", 1.0, [0.0])
+        assert way.propose(-ends, ends).tolist() == pytest.approx([-0.05])
+        way.judge(way.propose(-ends, ends), replace(beside(there), beside=None))
+        assert (way.end, way.loss, way.place.tolist()) == (end, 1.0, [0.0])
+
+    def test_a_way_without_steps_has_not_arrived_while_a_lower_place_is_known(self):
+        way, ends = gauss_newton._Way(ZERO, beside(1.0), 1), 9 + 0 * ZERO
+        way.judge(way.propose(-ends, ends), beside(1.0))
+        assert way.end == "iterations"
+
+    def test_what_is_held_goes_free_before_a_lower_place_is_tried(self):
+        way, ends = gauss_newton._Way(ZERO, beside(1.0), 20, held=torch.tensor([True])), 9 + 0 * ZERO
+        way.judge(way.propose(-ends, ends), beside(1.0))
+        assert way.propose(-ends, ends).tolist() == [0.0]  # free now, and nowhere to go
+        way.judge(way.propose(-ends, ends), beside(1.0))
+        assert way.propose(-ends, ends).tolist() == pytest.approx([-0.05])
+
+    @pytest.mark.parametrize(("passed", "end"), [(0.5, None), (1.2, "converged")])
+    def test_near_a_better_one_a_way_goes_on_to_a_lower_place_alone(self, passed, end):
+        ways = gauss_newton._Ways([], 9, torch.zeros(1, dtype=torch.bool))
+        ways.begin(gauss_newton._Start(ZERO, 0), ZERO, beside(1.0, lowest=1.5))
+        ways.begin(gauss_newton._Start(ZERO + 0.3, 1), ZERO + 0.3, beside(2.0, lowest=passed))
+        ways.judge(ways.every[1], ZERO + 0.015, beside(1.05, lowest=passed))
+        assert ways.every[1].end == end
 
     def test_a_start_that_is_not_about_to_be_of_use_is_given_up(self):
         """Nothing is looked for around its end, either."""

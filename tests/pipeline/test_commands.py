@@ -126,7 +126,7 @@ def test_fit_then_replay_and_measure(work):
 
 @pytest.mark.parametrize(
     ("integrator", "options", "screen"),
-    [("implicit", (), 24), ("linearised", (), 96), ("linearised", ("--screen", 5), 5)],
+    [("implicit", (), 24), ("linearised", (), 48), ("linearised", ("--screen", 5), 5)],
 )
 def test_a_rough_loss_is_searched_with_more_candidates(work, integrator, options, screen):
     """The linearised integrator's, unless the user says how many; the record says it, and as many are simulated."""
