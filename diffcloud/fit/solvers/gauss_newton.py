@@ -266,7 +266,7 @@ class _Way:
     def _begin(self) -> None:
         self._steps, self._radius, self._in_vain = self._most, _LARGEST_STEP, False
         self._predicted = 0.0
-        self.arrived = self._aside = False
+        self.arrived = False
 
     def _take(self, place: Tensor, found: Linearisation) -> None:
         self.place, self.loss = place, float(found.losses[0])
@@ -289,6 +289,12 @@ class _Way:
         return "rough" if self._radius < _SMALLEST_STEP or not math.isfinite(self.loss) else None
 
     @property
+    def _aside(self) -> bool:
+        """Whether it stands, but has passed by a lower place, where the next step goes."""
+        lower = self.beside_loss < (1 - _SMALLEST_IN_VAIN) * self.loss
+        return lower and self._held is None and self._stands is not None
+
+    @property
     def end(self) -> StopReason | None:
         """Why it goes no further; None while it does."""
         if not self._aside and self._stands is not None:
@@ -302,7 +308,7 @@ class _Way:
 
     def give_up(self) -> None:
         """Go no further."""
-        self.arrived, self._aside = True, False
+        self.arrived, self.beside_loss = True, math.inf
 
     def propose(self, low: Tensor, high: Tensor) -> Tensor:
         """[k] the next place, between the bounds [k]."""
@@ -323,7 +329,7 @@ class _Way:
 
     def judge(self, tried: Tensor, found: Linearisation) -> None:
         """Take the step if it lowered the loss, and set the radius for the next."""
-        stood = self.arrived, self._radius
+        aside, stood = self._aside, (self.arrived, self._radius)
         self._steps -= 1
         step, decrease = float((tried - self.place).abs().max()), self.loss - float(found.losses[0])
         self._in_vain = not decrease > 0
@@ -337,12 +343,10 @@ class _Way:
             self._radius = min(max(self._radius, _GROWS * step), _LARGEST_STEP)
         if not self._in_vain:
             self._take(tried, found)
-        if self._aside:  # that was the step to the place beside: it goes on from there, or stands as it did
+        if aside:  # that was the step to the place beside: it goes on from there, or stands as it did
             self.arrived, self._radius = stood if self._in_vain else (False, max(self._radius, _REACH))
             self.beside_loss = math.inf
         self._look_beside(found)
-        lower = self.beside_loss < (1 - _SMALLEST_IN_VAIN) * self.loss
-        self._aside = lower and self._held is None and self._stands is not None
         if self._held is not None and self.end is not None and math.isfinite(self.loss):
             self._held = None
             self._begin()
