@@ -43,7 +43,7 @@ def fit(
         list[Path],
         typer.Argument(
             help="Episode files, or folders of them; without --scenario, a folder with <scenario>/<episode>.npz, "
-            "SCENARIO=EPISODE for each, or a YAML file that lists episodes by scenario."
+            "SCENARIO=EPISODE for each (or SCENARIO=FOLDER), or a YAML file that lists episodes by scenario."
         ),
     ],
     out: Annotated[

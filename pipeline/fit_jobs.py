@@ -59,8 +59,8 @@ def joint_fit(fits: Path) -> list[Path]:
 
 
 def stated_recordings(arguments: Sequence[Path]) -> list[tuple[str, Path]] | None:
-    """(scenario, episode file) of arguments SCENARIO=EPISODE, or of a YAML file that maps scenarios to episodes; None if
-    they are neither.
+    """(scenario, episode file or folder) of arguments SCENARIO=EPISODES, or of a YAML file that maps scenarios to episodes;
+    None if they are neither.
 
     Raises:
         ConfigError: some are and others are not, or the file is no such list.
@@ -93,13 +93,18 @@ def _listed(path: Path) -> list[tuple[str, Path]]:
 
 def read_recordings(pairs: Sequence[tuple[str, Path]]) -> list[Recording]:
     """
+    Args:
+        pairs: scenario, and an episode file, or a folder that stands for every episode in it.
+
     Raises:
-        ConfigError, EpisodeError: an unknown scenario, a damaged episode, or two of one name in a scenario.
+        ConfigError, EpisodeError: an unknown scenario, a folder without episodes, a damaged episode, or two of one name in
+            a scenario.
     """
     scenarios = {name: choose_scenario(name) for name in dict.fromkeys(name for name, _ in pairs)}
     for name in scenarios:
         episode_files([path for one, path in pairs if one == name])
-    return [Recording(scenarios[name], path.stem, read_episode(path)) for name, path in pairs]
+    files = [(name, file) for name, path in pairs for file in episode_files([path])]
+    return [Recording(scenarios[name], file.stem, read_episode(file)) for name, file in files]
 
 
 def compared(record: FitRecord, recordings: Sequence[Recording]) -> AnyObjective:

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import subprocess
 import time
@@ -209,12 +210,22 @@ class TestJointFitOverMotions:
         run("fit", "cloth.yaml", "--out", "single", "--iterations", 1, cwd=motions)
         assert (motions / "single" / "side" / "s1.json").is_file()
 
+    def test_a_folder_stands_for_its_episodes(self, motions):
+        (motions / "lifts").mkdir()
+        for name in ("e1.npz", "e2.npz"):
+            shutil.copy(motions / "e1.npz", motions / "lifts" / name)
+        run("fit", "--joint", "small.yaml=lifts", "side.yaml=s1.npz", "--out", "fits", "--iterations", 1, cwd=motions)
+        joint = json.loads((motions / "fits" / "joint.json").read_text())
+        assert [(one["scenario"], one["name"]) for one in joint["episodes"]] == [("small", "e1"), ("small", "e2"), ("side", "s1")]
+
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
             (("small.yaml=e1.npz", "e1.npz"), "Give each episode its scenario, as in lift=a.npz fold=b.npz"),
             (("small.yaml=e1.npz", "--scenario", "small.yaml"), "leave out --scenario"),
             (("small.yaml=e1.npz", "small.yaml=e1.npz"), "Two episodes have the same name"),
+            (("small.yaml=e1.npz", "small.yaml=."), "Two episodes have the same name"),
+            (("small.yaml=nothing",), "nothing holds no episodes"),
             (("small.yaml=e1.npz", "denim.yaml=s1.npz"), "is of one cloth"),
             (("empty.yaml",), "lists 0 episodes"),
             (("number.yaml",), "small takes the path of an episode"),
@@ -224,6 +235,7 @@ class TestJointFitOverMotions:
         (motions / "denim.yaml").write_text(yaml.safe_dump({**SMALL, "material": "denim"}))
         (motions / "empty.yaml").write_text("[]")
         (motions / "number.yaml").write_text("small: 3")
+        (motions / "nothing").mkdir()
         assert message in run("fit", "--joint", *arguments, "--out", "fits", cwd=motions, code=1).errors
         assert not (motions / "fits").exists() or not list((motions / "fits").iterdir())
 
