@@ -725,6 +725,37 @@ class TestFits:
                 taken.append(starts[start])
         assert taken == (order or list(names))
 
+    @pytest.mark.parametrize(
+        ("motions", "settings", "grows"),
+        [
+            (2, {}, True),
+            (1, {}, False),
+            (2, {"init": {"stretch": 1.2}}, False),
+            (2, {"starts": 1}, False),
+            (2, {"threshold": 1e-9}, False),
+        ],
+        ids=["motions differ", "one motion", "a start is given", "candidates only", "a threshold is given"],
+    )
+    def test_of_different_motions_a_start_that_grows_comes_first(self, monkeypatch, motions, settings, grows):
+        """Before anything else is simulated with derivatives."""
+
+        def stop(name):
+            def stopped(*given):
+                begun.append(name)
+                raise KeyboardInterrupt
+
+            return stopped
+
+        begun = []
+        monkeypatch.setattr(gauss_newton, "_grown", stop("grown"))
+        monkeypatch.setattr(gauss_newton, "linearise", stop("candidate"))
+        first, other = lifted(nuisance={}), lifted(nuisance={})
+        other.scenario = replace(other.scenario, name="lift" if motions == 1 else "another")
+        first.scenario = replace(first.scenario, name="lift")
+        with pytest.raises(KeyboardInterrupt):
+            fit_gauss_newton(JointObjective([first, other]), SPACE, GaussNewtonSettings(screen=3, **settings))
+        assert begun == ["grown" if grows else "candidate"]
+
     def test_a_start_that_grows_tells_of_its_progress(self, monkeypatch):
         """So that Ctrl-C ends it, also in a worker."""
         monkeypatch.setattr(Objective, "knows_gaps", True)

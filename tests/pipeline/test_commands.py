@@ -216,7 +216,11 @@ class TestJointFitOverMotions:
             shutil.copy(motions / "e1.npz", motions / "lifts" / name)
         run("fit", "--joint", "small.yaml=lifts", "side.yaml=s1.npz", "--out", "fits", "--iterations", 1, cwd=motions)
         joint = json.loads((motions / "fits" / "joint.json").read_text())
-        assert [(one["scenario"], one["name"]) for one in joint["episodes"]] == [("small", "e1"), ("small", "e2"), ("side", "s1")]
+        assert [(one["scenario"], one["name"]) for one in joint["episodes"]] == [
+            ("small", "e1"),
+            ("small", "e2"),
+            ("side", "s1"),
+        ]
 
     @pytest.mark.parametrize(
         ("arguments", "message"),

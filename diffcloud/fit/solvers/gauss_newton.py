@@ -17,8 +17,8 @@ each other, and their ends would say little of each other. The remaining ones ar
 made, once one explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and
 more of it; the other is a derivative-free search, from the best place so far, over the parameters asked for only. The
 search comes after three candidates. So do growing starts, but the first of them comes after two where the best end is low
-enough for the model to be right (with a threshold, all of them come right after the first candidate). They also wait while
-an end from another candidate is as low as the best one.
+enough for the model to be right, and before all candidates where recordings show different motions (with a threshold, all
+of them come right after the first candidate). They also wait while an end from another candidate is as low as the best one.
 
 Four equally low ends are taken for the minimum although they do not explain the recording; two are, where their loss is so
 high that the model must be wrong, or where it is not known what cameras missed. Unless the recording is explained, losses
@@ -166,7 +166,8 @@ def fit_gauss_newton(
             grown = partial(_grown, stages, draws, space, places[best], settings, index, axis, tell)
             waiting.insert(best + 1, _Start(places[best], best, grown, grows=True))
     scans, looked = 0, None
-    ways = _Ways(waiting, settings.iterations, _laid(space, settings.init))
+    grows_first = len({one.scenario.name for one in objective.members}) > 1 and not settings.init
+    ways = _Ways(waiting, settings.iterations, _laid(space, settings.init), grows_first=grows_first)
     try:
         while True:
             way = ways.going
@@ -390,16 +391,20 @@ class _Enough:
 class _Ways:
     """From B starts, one after the other."""
 
-    def __init__(self, starts: Sequence[_Start], steps: int, held: Tensor) -> None:
+    def __init__(self, starts: Sequence[_Start], steps: int, held: Tensor, *, grows_first: bool = False) -> None:
         """
         Args:
             starts: B, in their order.
             steps: each may take.
             held: bool [k] what the first one leaves as it is at first.
+            grows_first: whether a start that grows comes before all others: from a candidate that is near for one motion,
+                the other may go astray, and then all have been simulated in vain. Of six cloths, each lifted and folded,
+                descents from the first candidate found three, and growing starts all; so they did with four recordings and
+                eight unknown parameters.
         """
         self.waiting, self.every, self._steps = list(starts), list[_Way](), steps
         self._held = held if bool(held.any()) else None
-        self._grown = 0
+        self._grown, self._grows_first = 0, grows_first
 
     @property
     def best(self) -> _Way:
@@ -421,10 +426,13 @@ class _Ways:
     def following(self, when: _Enough) -> _Start:
         """The next start. Where some equal ends would be enough, those that grow wait until three others were followed, and
         while the best end is not alone. The first of them needs to wait for only two where the best end is low enough for
-        the model to be right."""
-        soon = bool(self.every) and not self._grown and self.best.loss <= when.misfit
-        early = len(self.every) - self._grown < (_SOON if soon else _BEFORE)
-        grows = not (early or len(self._witnesses(when)) > 1)
+        the model to be right, or may come before all."""
+        if not self.every:
+            grows = self._grows_first
+        else:
+            soon = not self._grown and self.best.loss <= when.misfit
+            early = len(self.every) - self._grown < (_SOON if soon else _BEFORE)
+            grows = not (early or len(self._witnesses(when)) > 1)
         fitting = (place for place, start in enumerate(self.waiting) if start.grows == grows)
         start = self.waiting.pop(next(fitting, 0) if math.isfinite(when.witnesses) else 0)
         self._grown += start.grows
