@@ -726,7 +726,7 @@ class TestFits:
         assert taken == (order or list(names))
 
     @pytest.mark.parametrize(
-        ("motions", "settings", "grows"),
+        ("recordings", "settings", "grows"),
         [
             (2, {}, True),
             (1, {}, False),
@@ -734,9 +734,9 @@ class TestFits:
             (2, {"starts": 1}, False),
             (2, {"threshold": 1e-9}, False),
         ],
-        ids=["motions differ", "one motion", "a start is given", "candidates only", "a threshold is given"],
+        ids=["joint", "one recording", "a start is given", "candidates only", "a threshold is given"],
     )
-    def test_of_different_motions_a_start_that_grows_comes_first(self, monkeypatch, motions, settings, grows):
+    def test_in_a_joint_fit_a_start_that_grows_comes_first(self, monkeypatch, recordings, settings, grows):
         """Before anything else is simulated with derivatives."""
 
         def stop(name):
@@ -749,11 +749,9 @@ class TestFits:
         begun = []
         monkeypatch.setattr(gauss_newton, "_grown", stop("grown"))
         monkeypatch.setattr(gauss_newton, "linearise", stop("candidate"))
-        first, other = lifted(nuisance={}), lifted(nuisance={})
-        other.scenario = replace(other.scenario, name="lift" if motions == 1 else "another")
-        first.scenario = replace(first.scenario, name="lift")
+        joint = JointObjective([lifted(nuisance={})] * recordings)
         with pytest.raises(KeyboardInterrupt):
-            fit_gauss_newton(JointObjective([first, other]), SPACE, GaussNewtonSettings(screen=3, **settings))
+            fit_gauss_newton(joint, SPACE, GaussNewtonSettings(screen=3, **settings))
         assert begun == ["grown" if grows else "candidate"]
 
     def test_a_start_that_grows_tells_of_its_progress(self, monkeypatch):

@@ -17,8 +17,8 @@ each other, and their ends would say little of each other. The remaining ones ar
 made, once one explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and
 more of it; the other is a derivative-free search, from the best place so far, over the parameters asked for only. The
 search comes after three candidates. So do growing starts, but the first of them comes after two where the best end is low
-enough for the model to be right, and before all candidates where recordings show different motions (with a threshold, all
-of them come right after the first candidate). They also wait while an end from another candidate is as low as the best one.
+enough for the model to be right, and before all candidates in a joint fit (with a threshold, all of them come right after
+the first candidate). They also wait while an end from another candidate is as low as the best one.
 
 Four equally low ends are taken for the minimum although they do not explain the recording; two are, where their loss is so
 high that the model must be wrong, or where it is not known what cameras missed. Unless the recording is explained, losses
@@ -166,7 +166,7 @@ def fit_gauss_newton(
             grown = partial(_grown, stages, draws, space, places[best], settings, index, axis, tell)
             waiting.insert(best + 1, _Start(places[best], best, grown, grows=True))
     scans, looked = 0, None
-    grows_first = len({one.scenario.name for one in objective.members}) > 1 and not settings.init
+    grows_first = len(objective.members) > 1 and not settings.init
     ways = _Ways(waiting, settings.iterations, _laid(space, settings.init), grows_first=grows_first)
     try:
         while True:
@@ -397,10 +397,10 @@ class _Ways:
             starts: B, in their order.
             steps: each may take.
             held: bool [k] what the first one leaves as it is at first.
-            grows_first: whether a start that grows comes before all others: from a candidate that is near for one motion,
-                the other may go astray, and then all have been simulated in vain. Of six cloths, each lifted and folded,
-                descents from the first candidate found three, and growing starts all; so they did with four recordings and
-                eight unknown parameters.
+            grows_first: whether a start that grows comes before all others. In a joint fit, a descent in vain costs as many
+                simulations as there are recordings in each step. Of six cloths, descents from the first candidate found
+                one in two folds, three in a lift and a fold, and three in two of both with eight unknown parameters;
+                growing starts found all of them. In two lifts, both did.
         """
         self.waiting, self.every, self._steps = list(starts), list[_Way](), steps
         self._held = held if bool(held.any()) else None
