@@ -75,6 +75,10 @@ class JointObjective:
         """As of `Objective`, of every one."""
         return JointObjective([one.until(part) for one in self.members])
 
+    def thinned(self, most: int) -> JointObjective:
+        """As of `Objective`, of every one."""
+        return JointObjective([one.thinned(most) for one in self.members])
+
     def halved(self) -> JointObjective:
         """As of `Objective`, of every one."""
         return JointObjective([one.halved() for one in self.members])

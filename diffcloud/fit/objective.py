@@ -417,6 +417,16 @@ class Objective:
         other.loss_steps = other._steps_to_loss()
         return other
 
+    def thinned(self, most: int) -> Objective:
+        """The same with at most so many points sampled per frame. Where no pose is solved for, points cost little beside
+        the simulation: then all of them stay."""
+        if len(self.sampler.choice) <= most or not self.pose_space.names:
+            return self
+        other = copy(self)
+        other.asked_points = most
+        other.reseed(self._seed)
+        return other
+
     def with_bodies(self, positions: Tensor) -> Tensor:
         """[..., V, 3] nodes of the cloth -> with those of the bodies beside it, in the default measure."""
         if self.paper or not len(self._bodies):

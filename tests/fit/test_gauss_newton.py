@@ -725,6 +725,21 @@ class TestFits:
                 taken.append(starts[start])
         assert taken == (order or list(names))
 
+    def test_candidates_are_compared_by_fewer_points(self, monkeypatch):
+        """One frame has all of a scenario's."""
+
+        def losses(objective, *given):
+            screened.append(len(objective.sampler.choice))
+            return batch_losses(objective, *given)
+
+        screened = []
+        monkeypatch.setattr(gauss_newton, "batch_losses", losses)
+        monkeypatch.setattr(gauss_newton, "_SCREENED_POINTS", 100)
+        fit_gauss_newton(
+            lifted(nuisance={"x": 0.1}, frames=[-1]), SPACE, GaussNewtonSettings(screen=3, starts=1, iterations=1)
+        )
+        assert screened == [100]
+
     @pytest.mark.parametrize(
         ("recordings", "settings", "grows"),
         [

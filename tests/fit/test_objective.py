@@ -166,6 +166,23 @@ class TestWhatCounts:
         both = JointObjective([whole, whole]).until(0.5)
         assert [one.frames for one in both.members] == [early.frames] * 2
 
+    def test_with_fewer_points_it_tells_about_the_same(self, scenario, episode):
+        whole = Objective(scenario, episode, points=1500)
+        few = whole.thinned(300)
+        assert (few.point_count, len(few.sampler.choice), few.frames) == (300, 300, whole.frames)
+        assert len(whole.sampler.choice) == 1500
+        values = {"stretch": torch.tensor([0.3, 1.0, 3.0]).double()}
+        with torch.no_grad():
+            losses, about = whole(values), few(values)
+            again = Objective(scenario, episode, points=300)(values)
+        torch.testing.assert_close(about, losses, rtol=0.2, atol=0.0)
+        assert about.argsort().tolist() == losses.argsort().tolist()
+        torch.testing.assert_close(about, again, rtol=0.0, atol=0.0)
+        assert [len(one.sampler.choice) for one in JointObjective([whole, few]).thinned(300).members] == [300, 300]
+        assert whole.thinned(1500) is whole
+        still = Objective(scenario, episode, points=1500, nuisance={})
+        assert still.thinned(300) is still  # no pose is solved for
+
     def test_a_whole_recording_has_no_cut(self, scenario, episode):
         assert Objective(scenario, episode).cut is None
 

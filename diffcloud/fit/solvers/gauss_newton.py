@@ -95,8 +95,9 @@ weighs more than such a difference."""
 _WITNESSES, _FEW_WITNESSES = _BEFORE + 1, 2
 """Equally low ends of different candidates that are taken for the minimum although they do not explain the recording; fewer
 where it is not known what cameras missed, or where the model must be wrong."""
-_SCREENED = 0.5
-"""Part of the frames on which candidates are compared: the rest costs as much again, and has more wrong minima."""
+_SCREENED, _SCREENED_POINTS = 0.5, 500
+"""Part of the frames on which candidates are compared: the rest costs as much again, and has more wrong minima. And the
+most points of a frame: of a published scene's 3,500, they find the same best candidates in a seventh of the time."""
 _HOPE = 10.0
 """Steps like the next one; where not even so many would get below what is of use, a start is given up."""
 
@@ -498,7 +499,7 @@ def _starts(
         return axis.places(values), 0
     values = values[1:] if doubted else torch.where(_spread_doubts(space), values[0], values)
     count = len(values)
-    losses = batch_losses(objective.until(_SCREENED), space, values)
+    losses = batch_losses(objective.until(_SCREENED).thinned(_SCREENED_POINTS), space, values)
     if not (doubted or math.isfinite(float(losses.min()))):
         raise DivergedError(0, [], f"all {count} candidates diverged")
     order = losses.argsort()
