@@ -113,10 +113,11 @@ moved: venv
 	done
 
 # How often intervals hold the truth: drawn cloths, recorded, fitted, and held against what was drawn; truths that fits do not
-# expect; and fresh recordings of the same cloths. The same for a posterior trained on simulated lifts of uncertain material,
-# as those cameras see them. Five hours on two cores; what is finished is kept.
+# expect; and fresh recordings of the same cloths. Then, in a folder of its own, the same for a posterior trained on simulated
+# lifts of uncertain material, as those cameras see them, beside fits. Five hours on two cores; what is finished is kept.
 POSTERIOR := build/coverage-posterior
-COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --out build/coverage --workers 2
+COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --workers 2 --out build/coverage
+BESIDE := diffcloud coverage --params docs/results/coverage.yaml --workers 2 --out $(POSTERIOR)/coverage --seed 6985324 --recordings 24 --scenario lift
 DRAWN := --seed 82037895
 coverage: venv
 	$(COVERAGE) $(DRAWN) --recordings 200 --fix mass
@@ -126,12 +127,13 @@ coverage: venv
 	$(COVERAGE) --fix mass --scenario lift --seed 7775397 --recordings 12 --truth finer
 	$(COVERAGE) --fix mass --scenario fold --seed 7775397 --recordings 6 --truth finer
 	$(COVERAGE) --seed 5448382 --recordings 3 --refits 20 --fix mass
-	$(COVERAGE) --seed 5448382 --recordings 3 --refits 20
-	diffcloud simulate --scenario lift --draws logarithmic --train 1500 --test 375 --seed 5 --out $(POSTERIOR)/lift \
+	$(COVERAGE) --seed 5448382 --recordings 3 --refits 20 --markdown docs/results/coverage.md
+	$(BESIDE)
+	diffcloud simulate --scenario lift --draws logarithmic --train 1500 --test 375 --seed 75498966 --out $(POSTERIOR)/lift \
 	    --doubts bending=1.5x,drag=1.3x,damping=1.5x,friction_obstacle=1.3x,friction_cloth=1.3x
 	diffcloud train --scenario lift --model posterior --profile quick --target logarithmic --data $(POSTERIOR)/lift \
-	    --like build/coverage/lift/episodes/0000.npz --out $(POSTERIOR)/regressors
-	$(COVERAGE) $(DRAWN) --recordings 24 --scenario lift --checkpoint $(POSTERIOR)/regressors/posterior.safetensors --markdown docs/results/coverage.md
+	    --like $(POSTERIOR)/coverage/lift/episodes/0000.npz --out $(POSTERIOR)/regressors
+	$(BESIDE) --checkpoint $(POSTERIOR)/regressors/posterior.safetensors --markdown $(POSTERIOR)/coverage.md
 
 # Every damaged file and every fault; a sample of both is part of test-slow.
 robustness: venv
