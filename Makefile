@@ -133,7 +133,7 @@ coverage: venv
 	    --doubts bending=1.5x,drag=1.3x,damping=1.5x,friction_obstacle=1.3x,friction_cloth=1.3x
 	diffcloud train --scenario lift --model posterior --profile quick --target logarithmic --data $(POSTERIOR)/lift \
 	    --like $(POSTERIOR)/coverage/lift/episodes/0000.npz --out $(POSTERIOR)/regressors
-	$(BESIDE) --checkpoint $(POSTERIOR)/regressors/posterior.safetensors --markdown $(POSTERIOR)/coverage.md
+	$(BESIDE) --checkpoint $(POSTERIOR)/regressors/posterior.safetensors --markdown docs/results/coverage-posterior.md
 
 # Every damaged file and every fault; a sample of both is part of test-slow.
 robustness: venv

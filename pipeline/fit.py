@@ -43,7 +43,7 @@ def fit(
         list[Path],
         typer.Argument(
             help="Episode files, or folders of them; without --scenario, a folder with <scenario>/<episode>.npz, "
-            "SCENARIO=EPISODE for each (or SCENARIO=FOLDER), or a YAML file that lists episodes by scenario."
+            "SCENARIO=EPISODE for each (or SCENARIO=FOLDER), or a YAML file that lists episodes or folders by scenario."
         ),
     ],
     out: Annotated[
@@ -97,7 +97,7 @@ def fit(
     threshold: Annotated[
         float | None, typer.Option(help="Stop below this loss; default: never, with --paper the scenario's.")
     ] = None,
-    points: Annotated[int | None, typer.Option(help="Sampled per frame.")] = None,
+    points: Annotated[int | None, typer.Option(help="Sampled per frame; to compare candidates, 500 at most.")] = None,
     frame: Annotated[list[int] | None, typer.Option(help="Frame to compare, repeatable; default: all usable ones.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of all random numbers.")] = None,
     resample: Annotated[bool | None, typer.Option(help="Of adam: new points in each iteration.")] = None,

@@ -59,7 +59,7 @@ def joint_fit(fits: Path) -> list[Path]:
 
 
 def stated_recordings(arguments: Sequence[Path]) -> list[tuple[str, Path]] | None:
-    """(scenario, episode file or folder) of arguments SCENARIO=EPISODES, or of a YAML file that maps scenarios to episodes;
+    """(scenario, episode file or folder) of arguments SCENARIO=PATH, or of a YAML file that maps scenarios to such paths;
     None if they are neither.
 
     Raises:
@@ -81,13 +81,14 @@ def _listed(path: Path) -> list[tuple[str, Path]]:
     told, found = read_yaml(path, error=ConfigError), []
     for scenario, files in told.items() if isinstance(told, dict) else ():
         for file in files if isinstance(files, list) else [files]:
-            if not isinstance(file, str):
-                raise ConfigError(f"{path}: {scenario} takes the path of an episode, or a list of paths, got {files!r}.")
+            if not (isinstance(file, str) and file):
+                raise ConfigError(
+                    f"{path}: {scenario} takes the path of an episode or of a folder of them, or a list of such paths, "
+                    f"got {files!r}."
+                )
             found.append((str(scenario), path.parent / file))
-    if not 0 < len(found) <= _MOST_RECORDINGS:
-        raise ConfigError(
-            f"{path} lists {len(found)} episodes; it takes 1 to {_MOST_RECORDINGS}, by scenario: `lift: [a.npz, b.npz]`."
-        )
+    if not found:
+        raise ConfigError(f"{path} lists no episodes; it takes them by scenario: `lift: [a.npz, b.npz]`.")
     return found
 
 
@@ -97,13 +98,15 @@ def read_recordings(pairs: Sequence[tuple[str, Path]]) -> list[Recording]:
         pairs: scenario, and an episode file, or a folder that stands for every episode in it.
 
     Raises:
-        ConfigError, EpisodeError: an unknown scenario, a folder without episodes, a damaged episode, or two of one name in
-            a scenario.
+        ConfigError, EpisodeError: an unknown scenario, a folder without episodes, a damaged episode, two of one name in a
+            scenario, or too many.
     """
     scenarios = {name: choose_scenario(name) for name in dict.fromkeys(name for name, _ in pairs)}
-    for name in scenarios:
-        episode_files([path for one, path in pairs if one == name])
     files = [(name, file) for name, path in pairs for file in episode_files([path])]
+    if len(files) > _MOST_RECORDINGS:
+        raise ConfigError(f"{len(files)} episodes are too many for one command; it takes {_MOST_RECORDINGS} at most.")
+    for name in scenarios:
+        episode_files([file for one, file in files if one == name])
     return [Recording(scenarios[name], file.stem, read_episode(file)) for name, file in files]
 
 

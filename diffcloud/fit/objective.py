@@ -419,7 +419,7 @@ class Objective:
 
     def thinned(self, most: int) -> Objective:
         """The same with at most so many points sampled per frame. Where no pose is solved for, points cost little beside
-        the simulation: then all of them stay."""
+        the simulation, so all of them stay."""
         if len(self.sampler.choice) <= most or not self.pose_space.names:
             return self
         other = copy(self)

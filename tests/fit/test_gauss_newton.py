@@ -482,8 +482,8 @@ class TestFits:
         for early, later in ((1.0, 1.0), (1.0, 0.01), (0.01, 0.01)):  # a wrong beginning says little of what goes on
             levels = {len(stages[0].frames): early * known, len(stages[1].frames): later * known}
             monkeypatch.setattr(Objective, "explained", property(lambda self, levels=levels: levels[len(self.frames)]))
-            spent.append(gauss_newton._grown(stages, 16, SPACE, place, settings, 0, Axis.of(SPACE), lambda: None)[1])
-        gauss_newton._grown(stages, 0, SPACE, place, settings, 0, Axis.of(SPACE), lambda: None)  # draws none
+            spent.append(gauss_newton._grown(stages, 16, SPACE, place, settings, 0, Axis.of(SPACE), lambda _: None)[1])
+        gauss_newton._grown(stages, 0, SPACE, place, settings, 0, Axis.of(SPACE), lambda _: None)  # draws none
         assert widths == [1.0, 1.0, 2.0, 4.0, 1.0]
         assert spent[1] - spent[0] == 2 * 16
         assert spent[2] == spent[0]
@@ -768,6 +768,47 @@ class TestFits:
         with pytest.raises(KeyboardInterrupt):
             fit_gauss_newton(joint, SPACE, GaussNewtonSettings(screen=3, **settings))
         assert begun == ["grown" if grows else "candidate"]
+
+    def test_a_joint_fit_tells_of_its_progress_from_the_first_frames_on(self):
+        pair, told = JointObjective([lifted(nuisance={}), lifted(nuisance={})]), []
+        found = fit_gauss_newton(pair, SPACE, GaussNewtonSettings(screen=3), progress=told.append)
+        assert found.values["stretch"] == pytest.approx(TRUTH["stretch"], rel=0.05)
+        assert [one.iteration for one in told[:2]] == [0, 0]
+        assert len(told) > found.iterations + 1  # while it grows, too
+        assert told[0].values.keys() == found.values.keys()
+        assert told[-1].best == found.loss
+
+    @pytest.mark.parametrize("after", [1, 3])
+    def test_what_has_grown_first_is_kept_when_interrupted(self, after):
+        pair, told = JointObjective([lifted(nuisance={}), lifted(nuisance={})]), []
+
+        def interrupt(progress):
+            told.append(progress)
+            if len(told) == after:
+                raise KeyboardInterrupt
+
+        found = fit_gauss_newton(pair, SPACE, GaussNewtonSettings(screen=3), progress=interrupt)
+        assert len(told) == after
+        assert found.stop_reason == "interrupted"
+        assert found.values == pytest.approx(dict(told[-1].values))
+        place = torch.tensor([list(found.values.values())], dtype=torch.float64)
+        assert found.loss == pytest.approx(float(batch_losses(pair, SPACE, place)))
+
+    def test_how_the_cloth_lies_waits_in_the_first_candidate(self):
+        place, curvature = torch.zeros(2, dtype=torch.float64), torch.eye(2).double()[None]
+        held = torch.tensor([False, True])
+        kinds = [True, False, True, False]  # whether a start grows
+        starts = [gauss_newton._Start(place.clone(), 0, grows=grows) for grows in kinds]
+        ways = gauss_newton._Ways(starts, 3, held, grows_first=True)
+        when = gauss_newton._Enough(0.1, 0.9, 4)
+        order = []
+        while ways.waiting:
+            start = ways.following(when)
+            found = Linearisation(torch.ones(1).double(), torch.zeros(1, 2).double(), curvature, 1)
+            ways.begin(start, place, found)
+            order.append((start.grows, ways.every[-1]._held is not None))
+        assert order[:2] == [(True, False), (False, True)]
+        assert not any(waits for _, waits in order[2:])
 
     def test_a_start_that_grows_tells_of_its_progress(self, monkeypatch):
         """So that Ctrl-C ends it, also in a worker."""

@@ -210,17 +210,24 @@ class TestJointFitOverMotions:
         run("fit", "cloth.yaml", "--out", "single", "--iterations", 1, cwd=motions)
         assert (motions / "single" / "side" / "s1.json").is_file()
 
-    def test_a_folder_stands_for_its_episodes(self, motions):
+    @pytest.mark.parametrize("arguments", [("small.yaml=lifts", "side.yaml=s1.npz"), ("cloth.yaml",)])
+    def test_a_folder_stands_for_its_episodes(self, motions, arguments):
         (motions / "lifts").mkdir()
         for name in ("e1.npz", "e2.npz"):
             shutil.copy(motions / "e1.npz", motions / "lifts" / name)
-        run("fit", "--joint", "small.yaml=lifts", "side.yaml=s1.npz", "--out", "fits", "--iterations", 1, cwd=motions)
+        (motions / "cloth.yaml").write_text("small.yaml: lifts\nside.yaml: [s1.npz]\n")
+        run("fit", "--joint", *arguments, "--out", "fits", "--iterations", 1, cwd=motions)
         joint = json.loads((motions / "fits" / "joint.json").read_text())
         assert [(one["scenario"], one["name"]) for one in joint["episodes"]] == [
             ("small", "e1"),
             ("small", "e2"),
             ("side", "s1"),
         ]
+
+    def test_too_many_recordings(self, motions, monkeypatch):
+        monkeypatch.setattr(fit_jobs, "_MOST_RECORDINGS", 1)
+        done = run("fit", "small.yaml=e1.npz", "side.yaml=s1.npz", "--out", "fits", cwd=motions, code=1)
+        assert "2 episodes are too many for one command; it takes 1 at most" in done.errors
 
     @pytest.mark.parametrize(
         ("arguments", "message"),
@@ -231,14 +238,16 @@ class TestJointFitOverMotions:
             (("small.yaml=e1.npz", "small.yaml=."), "Two episodes have the same name"),
             (("small.yaml=nothing",), "nothing holds no episodes"),
             (("small.yaml=e1.npz", "denim.yaml=s1.npz"), "is of one cloth"),
-            (("empty.yaml",), "lists 0 episodes"),
+            (("empty.yaml",), "lists no episodes"),
             (("number.yaml",), "small takes the path of an episode"),
+            (("nameless.yaml",), "small.yaml takes the path of an episode"),
         ],
     )
     def test_what_is_no_list_of_recordings(self, motions, arguments, message):
         (motions / "denim.yaml").write_text(yaml.safe_dump({**SMALL, "material": "denim"}))
         (motions / "empty.yaml").write_text("[]")
         (motions / "number.yaml").write_text("small: 3")
+        (motions / "nameless.yaml").write_text("small.yaml: ''")
         (motions / "nothing").mkdir()
         assert message in run("fit", "--joint", *arguments, "--out", "fits", cwd=motions, code=1).errors
         assert not (motions / "fits").exists() or not list((motions / "fits").iterdir())

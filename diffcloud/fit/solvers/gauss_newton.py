@@ -17,8 +17,8 @@ each other, and their ends would say little of each other. The remaining ones ar
 made, once one explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and
 more of it; the other is a derivative-free search, from the best place so far, over the parameters asked for only. The
 search comes after three candidates. So do growing starts, but the first of them comes after two where the best end is low
-enough for the model to be right, and before all candidates in a joint fit (with a threshold, all of them come right after
-the first candidate). They also wait while an end from another candidate is as low as the best one.
+enough for the model to be right, and before all candidates in a joint fit without a given start (with a threshold, all of
+them come right after the first candidate). They also wait while an end from another candidate is as low as the best one.
 
 Four equally low ends are taken for the minimum although they do not explain the recording; two are, where their loss is so
 high that the model must be wrong, or where it is not known what cameras missed. Unless the recording is explained, losses
@@ -97,7 +97,8 @@ _WITNESSES, _FEW_WITNESSES = _BEFORE + 1, 2
 where it is not known what cameras missed, or where the model must be wrong."""
 _SCREENED, _SCREENED_POINTS = 0.5, 500
 """Part of the frames on which candidates are compared: the rest costs as much again, and has more wrong minima. And the
-most points of a frame: of a published scene's 3,500, they find the same best candidates in a seventh of the time."""
+most points of a frame: compared by so few of a published scene's 3,500, the same candidates come out best, in a seventh of
+the time."""
 _HOPE = 10.0
 """Steps like the next one; where not even so many would get below what is of use, a start is given up."""
 
@@ -139,7 +140,7 @@ def fit_gauss_newton(
 
     Raises:
         DivergedError: every candidate diverged.
-        KeyboardInterrupt: interrupted before the first loss.
+        KeyboardInterrupt: interrupted before the first loss with derivatives.
     """
     began = time.perf_counter()
     axis = Axis.of(space)
@@ -150,10 +151,16 @@ def fit_gauss_newton(
     candidates = [_Start(place, origin) for origin, place in enumerate(places)]
     waiting, others = candidates[:most], candidates[most:]
 
-    def tell() -> None:
+    early: _Way | None = None
+
+    def tell(growing: _Way | None = None) -> None:
+        """Of the best way; until the first one has begun, of the one by which a recording grows."""
+        nonlocal early
+        early = growing
+        best = ways.best if ways.every or growing is None else growing
         if progress is not None:
-            values = dict(zip(space.names, axis.bounded(ways.best.place).tolist(), strict=True))
-            progress(Progress(len(history.losses) - 1, ways.best.loss, ways.best.loss, values))
+            values = dict(zip(space.names, axis.bounded(best.place).tolist(), strict=True))
+            progress(Progress(max(len(history.losses) - 1, 0), best.loss, best.loss, values))
 
     best = 1 if settings.init else 0  # of the screen; a first start that was given says little
     if settings.screen and bool(_spread_doubts(space).any()):
@@ -213,7 +220,14 @@ def fit_gauss_newton(
                 break
     except KeyboardInterrupt:
         if not history.losses:
-            raise
+            if early is None:
+                raise
+            found = linearise(objective, space, early.place[None])  # what has grown is not given away
+            simulations += found.simulations
+            ways.begin(_Start(early.place, best, grows=True), early.place, found)
+            if not math.isfinite(ways.best.loss):
+                raise
+            _remember(history, ways, axis)
         reason = "interrupted"
     return FitOutcome(
         values=dict(zip(space.names, axis.bounded(ways.best.place).tolist(), strict=True)),
@@ -397,11 +411,11 @@ class _Ways:
         Args:
             starts: B, in their order.
             steps: each may take.
-            held: bool [k] what the first one leaves as it is at first.
-            grows_first: whether a start that grows comes before all others. In a joint fit, a descent in vain costs as many
-                simulations as there are recordings in each step. Of six cloths, descents from the first candidate found
-                one in two folds, three in a lift and a fold, and three in two of both with eight unknown parameters;
-                growing starts found all of them. In two lifts, both did.
+            held: bool [k] what the first one that does not grow leaves as it is at first.
+            grows_first: whether a start that grows comes before all others, as in a joint fit: there, a descent in vain
+                costs more, and one from a candidate goes astray more often. Of six cloths, the first candidate led to the
+                truth for one (two folds), three (a lift and a fold) and three (two of each, eight unknown parameters),
+                growing starts for all six. For two lifts both did, and growing first takes 40 % more time.
         """
         self.waiting, self.every, self._steps = list(starts), list[_Way](), steps
         self._held = held if bool(held.any()) else None
@@ -427,7 +441,7 @@ class _Ways:
     def following(self, when: _Enough) -> _Start:
         """The next start. Where some equal ends would be enough, those that grow wait until three others were followed, and
         while the best end is not alone. The first of them needs to wait for only two where the best end is low enough for
-        the model to be right, or may come before all."""
+        the model to be right; with `grows_first`, it comes before everything else."""
         if not self.every:
             grows = self._grows_first
         else:
@@ -446,7 +460,8 @@ class _Ways:
 
     def begin(self, start: _Start, place: Tensor, found: Linearisation) -> None:
         """A start, at its place [k], with what was found there."""
-        self.every.append(_Way(place, found, self._steps, start.origin, None if self.every else self._held))
+        first = not start.grows and len(self.every) == self._grown
+        self.every.append(_Way(place, found, self._steps, start.origin, self._held if first else None))
 
     def judge(self, way: _Way, tried: Tensor, found: Linearisation) -> None:
         """As of the way; one that comes close to a better one leaves it the rest, unless it has passed by a lower place."""
@@ -557,7 +572,7 @@ def _grown(
     settings: GaussNewtonSettings,
     stream: int,
     axis: Axis,
-    tell: Callable[[], None],
+    tell: Callable[[_Way], None],
 ) -> tuple[Tensor, int]:
     """The place [k] that a descent from this one comes to on the first frames alone, then on more of them; and how many
     simulations it took. What a cloth does early, before it has folded over or touched something, depends on the parameters
@@ -576,7 +591,7 @@ def _grown(
         found = linearise(early, space, place[None])
         way, simulations = _Way(place, found, settings.iterations), simulations + found.simulations
         while way.end is None:
-            tell()
+            tell(way)
             tried = way.propose(*axis.ends)
             found = linearise(early, space, tried[None])
             simulations += found.simulations
@@ -598,7 +613,7 @@ def _goes_on(
     axis: Axis,
     draws: int,
     generator: torch.Generator,
-    tell: Callable[[], None],
+    tell: Callable[[_Way], None],
 ) -> tuple[Tensor, int]:
     """The place [k] at which to continue with the later frames, the lowest of the way's end and of places drawn around it,
     ever farther from it while none is low enough; and how many simulations that took.
@@ -610,7 +625,7 @@ def _goes_on(
     enough = later.explained if explains else _AS_LOW * way.loss
     place, lowest, simulations, tried = way.place, math.inf, 0, way.place[None]
     for widening in _WIDENING:
-        tell()
+        tell(way)
         tried = torch.cat([tried, _drawn(way, draws, len(early.members), axis, widening, generator)])
         losses = batch_losses(later, space, axis.bounded(tried))
         simulations += len(tried) * len(early.members)
