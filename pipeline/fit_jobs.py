@@ -87,8 +87,11 @@ def _listed(path: Path) -> list[tuple[str, Path]]:
                     f"got {files!r}."
                 )
             found.append((str(scenario), path.parent / file))
-    if not found:
-        raise ConfigError(f"{path} lists no episodes; it takes them by scenario: `lift: [a.npz, b.npz]`.")
+    if not 0 < len(found) <= _MOST_RECORDINGS:
+        raise ConfigError(
+            f"{path} lists {len(found)} episodes or folders; it takes 1 to {_MOST_RECORDINGS}, by scenario: "
+            "`lift: [a.npz, b.npz]`."
+        )
     return found
 
 
@@ -98,13 +101,11 @@ def read_recordings(pairs: Sequence[tuple[str, Path]]) -> list[Recording]:
         pairs: scenario, and an episode file, or a folder that stands for every episode in it.
 
     Raises:
-        ConfigError, EpisodeError: an unknown scenario, a folder without episodes, a damaged episode, two of one name in a
-            scenario, or too many.
+        ConfigError, EpisodeError: an unknown scenario, a folder without episodes, a damaged episode, or two of one name in
+            a scenario.
     """
     scenarios = {name: choose_scenario(name) for name in dict.fromkeys(name for name, _ in pairs)}
     files = [(name, file) for name, path in pairs for file in episode_files([path])]
-    if len(files) > _MOST_RECORDINGS:
-        raise ConfigError(f"{len(files)} episodes are too many for one command; it takes {_MOST_RECORDINGS} at most.")
     for name in scenarios:
         episode_files([file for one, file in files if one == name])
     return [Recording(scenarios[name], file.stem, read_episode(file)) for name, file in files]

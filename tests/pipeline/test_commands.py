@@ -224,11 +224,6 @@ class TestJointFitOverMotions:
             ("side", "s1"),
         ]
 
-    def test_too_many_recordings(self, motions, monkeypatch):
-        monkeypatch.setattr(fit_jobs, "_MOST_RECORDINGS", 1)
-        done = run("fit", "small.yaml=e1.npz", "side.yaml=s1.npz", "--out", "fits", cwd=motions, code=1)
-        assert "2 episodes are too many for one command; it takes 1 at most" in done.errors
-
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
@@ -238,7 +233,7 @@ class TestJointFitOverMotions:
             (("small.yaml=e1.npz", "small.yaml=."), "Two episodes have the same name"),
             (("small.yaml=nothing",), "nothing holds no episodes"),
             (("small.yaml=e1.npz", "denim.yaml=s1.npz"), "is of one cloth"),
-            (("empty.yaml",), "lists no episodes"),
+            (("empty.yaml",), "lists 0 episodes or folders"),
             (("number.yaml",), "small takes the path of an episode"),
             (("nameless.yaml",), "small.yaml takes the path of an episode"),
         ],
