@@ -69,9 +69,9 @@ def fit(
     starts: Annotated[
         int | None,
         typer.Option(
-            help="Descents from as many places; of gauss_newton at most, from the best candidates only. Default of "
-            "gauss_newton: 8, three that grow with the recording, and one from a search (linearised: 2, and no others); of "
-            "adam: 1."
+            help="Descents from as many places; of gauss_newton at most, from the best candidates only (of a joint fit, "
+            "the first one grows with the recordings). Default of gauss_newton: 8, three that grow with the recording, and "
+            "one from a search (linearised: 2, and no others); of adam: 1."
         ),
     ] = None,
     screen: Annotated[

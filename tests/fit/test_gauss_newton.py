@@ -744,12 +744,13 @@ class TestFits:
         ("recordings", "settings", "grows"),
         [
             (2, {}, True),
-            (1, {}, False),
+            (2, {"starts": 1}, True),
+            (2, {"threshold": 1e-9}, True),
             (2, {"init": {"stretch": 1.2}}, False),
-            (2, {"starts": 1}, False),
-            (2, {"threshold": 1e-9}, False),
+            (1, {}, False),
+            (1, {"starts": 1}, False),
         ],
-        ids=["joint", "one recording", "a start is given", "candidates only", "a threshold is given"],
+        ids=["joint", "of one start", "with a threshold", "a start is given", "one recording", "and one start"],
     )
     def test_in_a_joint_fit_a_start_that_grows_comes_first(self, monkeypatch, recordings, settings, grows):
         """Before anything else is simulated with derivatives."""
@@ -768,6 +769,16 @@ class TestFits:
         with pytest.raises(KeyboardInterrupt):
             fit_gauss_newton(joint, SPACE, GaussNewtonSettings(screen=3, **settings))
         assert begun == ["grown" if grows else "candidate"]
+
+    def test_a_joint_fit_follows_as_many_starts_as_are_asked_for(self):
+        pair = JointObjective([lifted(nuisance={}), lifted(nuisance={})])
+        settings = GaussNewtonSettings(screen=3, iterations=1, starts=2)
+        assert len(fit_gauss_newton(pair, SPACE, settings).history.losses[-1]) == 2
+
+    def test_rough_losses_never_grow(self, monkeypatch):
+        monkeypatch.setattr(gauss_newton, "_growths", lambda _: pytest.fail("it grows"))
+        pair = JointObjective(rough_pair(nuisance={}))
+        fit_gauss_newton(pair, SPACE, GaussNewtonSettings(screen=3, iterations=1, starts=2))
 
     def test_a_joint_fit_tells_of_its_progress_from_the_first_frames_on(self):
         pair, told = JointObjective([lifted(nuisance={}), lifted(nuisance={})]), []
@@ -799,7 +810,7 @@ class TestFits:
         held = torch.tensor([False, True])
         kinds = [True, False, True, False]  # whether a start grows
         starts = [gauss_newton._Start(place.clone(), 0, grows=grows) for grows in kinds]
-        ways = gauss_newton._Ways(starts, 3, held, grows_first=True)
+        ways = gauss_newton._Ways(starts, 3, held)
         when = gauss_newton._Enough(0.1, 0.9, 4)
         order = []
         while ways.waiting:

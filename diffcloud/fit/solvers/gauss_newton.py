@@ -17,8 +17,13 @@ each other, and their ends would say little of each other. The remaining ones ar
 made, once one explains the recording. Two further ways lead to starts: one fits the recording's beginning, then more and
 more of it; the other is a derivative-free search, from the best place so far, over the parameters asked for only. The
 search comes after three candidates. So do growing starts, but the first of them comes after two where the best end is low
-enough for the model to be right, and before all candidates in a joint fit without a given start (with a threshold, all of
-them come right after the first candidate). They also wait while an end from another candidate is as low as the best one.
+enough for the model to be right (with a threshold, all of them come right after the first candidate). They also wait while
+an end from another candidate is as low as the best one.
+
+In a joint fit without a given start, a growing start comes before all others: a descent in vain costs more there, and one
+from a candidate goes astray more often. Of six cloths, the first candidate led to the truth for one (two folds), three (a
+lift and a fold) and three (two of each, eight unknown parameters), the first growing start for all six. For two lifts both
+did, and growing first takes 40 % more time.
 
 Four equally low ends are taken for the minimum although they do not explain the recording; two are, where their loss is so
 high that the model must be wrong, or where it is not known what cameras missed. Unless the recording is explained, losses
@@ -44,7 +49,7 @@ from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.names import plain_name
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.priors import INDEPENDENT
-from diffcloud.fit.residuals import STEP, Axis, Linearisation, linearise
+from diffcloud.fit.residuals import STEP, Axis, Linearisation, by_tangents, linearise
 from diffcloud.fit.scan import Scan, scan
 from diffcloud.fit.solvers.cma_es import CmaEsSettings, fit_cma_es
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
@@ -167,15 +172,21 @@ def fit_gauss_newton(
         screened = cache(lambda: _starts(objective, space, settings, axis, most, doubted=True))
         for index in range(best + 1, len(waiting)):
             waiting[index] = _Start(places[index], index, partial(_doubted, screened, index - best - 1))
+    joint = len(objective.members) > 1 and all(map(by_tangents, objective.members)) and not settings.init
+    growing = [
+        _Start(
+            places[best], best, partial(_grown, stages, draws, space, places[best], settings, index, axis, tell), grows=True
+        )
+        for index, (stages, draws) in enumerate(_growths(objective) if joint or settings.starts is None else [])
+    ]
+    first = growing[:1] if joint else []
     if settings.starts is None:
         search = _Start(places[0], -1, lambda: _searched(objective, space, ways.best, settings.seed, axis, tell))
         waiting.insert(_BEFORE, search)
-        for index, (stages, draws) in reversed(list(enumerate(_growths(objective)))):
-            grown = partial(_grown, stages, draws, space, places[best], settings, index, axis, tell)
-            waiting.insert(best + 1, _Start(places[best], best, grown, grows=True))
+        waiting[best + 1 : best + 1] = growing[len(first) :]
+    waiting = [*first, *waiting][: settings.starts]
     scans, looked = 0, None
-    grows_first = len(objective.members) > 1 and not settings.init
-    ways = _Ways(waiting, settings.iterations, _laid(space, settings.init), grows_first=grows_first)
+    ways = _Ways(waiting, settings.iterations, _laid(space, settings.init))
     try:
         while True:
             way = ways.going
@@ -406,20 +417,16 @@ class _Enough:
 class _Ways:
     """From B starts, one after the other."""
 
-    def __init__(self, starts: Sequence[_Start], steps: int, held: Tensor, *, grows_first: bool = False) -> None:
+    def __init__(self, starts: Sequence[_Start], steps: int, held: Tensor) -> None:
         """
         Args:
             starts: B, in their order.
             steps: each may take.
             held: bool [k] what the first one that does not grow leaves as it is at first.
-            grows_first: whether a start that grows comes before all others, as in a joint fit: there, a descent in vain
-                costs more, and one from a candidate goes astray more often. Of six cloths, the first candidate led to the
-                truth for one (two folds), three (a lift and a fold) and three (two of each, eight unknown parameters),
-                growing starts for all six. For two lifts both did, and growing first takes 40 % more time.
         """
         self.waiting, self.every, self._steps = list(starts), list[_Way](), steps
         self._held = held if bool(held.any()) else None
-        self._grown, self._grows_first = 0, grows_first
+        self._grown = 0
 
     @property
     def best(self) -> _Way:
@@ -439,17 +446,16 @@ class _Ways:
         return self.best.loss <= when.explained or len(self._witnesses(when)) >= needed
 
     def following(self, when: _Enough) -> _Start:
-        """The next start. Where some equal ends would be enough, those that grow wait until three others were followed, and
-        while the best end is not alone. The first of them needs to wait for only two where the best end is low enough for
-        the model to be right; with `grows_first`, it comes before everything else."""
-        if not self.every:
-            grows = self._grows_first
-        else:
+        """The next start: at first, and where no number of equal ends would be enough, in their order. Else those that grow
+        wait until three others were followed, and while the best end is not alone. The first of them needs to wait for only
+        two where the best end is low enough for the model to be right."""
+        place = 0
+        if self.every and math.isfinite(when.witnesses):
             soon = not self._grown and self.best.loss <= when.misfit
             early = len(self.every) - self._grown < (_SOON if soon else _BEFORE)
             grows = not (early or len(self._witnesses(when)) > 1)
-        fitting = (place for place, start in enumerate(self.waiting) if start.grows == grows)
-        start = self.waiting.pop(next(fitting, 0) if math.isfinite(when.witnesses) else 0)
+            place = next((place for place, start in enumerate(self.waiting) if start.grows == grows), 0)
+        start = self.waiting.pop(place)
         self._grown += start.grows
         return start
 
