@@ -116,8 +116,9 @@ moved: venv
 # expect; and fresh recordings of the same cloths. Then, in a folder of its own, the same for a posterior trained on simulated
 # lifts of uncertain material, as those cameras see them, beside fits. Five hours on two cores; what is finished is kept.
 POSTERIOR := build/coverage-posterior
-COVERAGE := diffcloud coverage --params docs/results/coverage.yaml --workers 2 --out build/coverage
-BESIDE := diffcloud coverage --params docs/results/coverage.yaml --workers 2 --out $(POSTERIOR)/coverage --seed 6985324 --recordings 24 --scenario lift
+COUNTED := diffcloud coverage --params docs/results/coverage.yaml --workers 2
+COVERAGE := $(COUNTED) --out build/coverage
+BESIDE := $(COUNTED) --out $(POSTERIOR)/coverage --seed 6985324 --recordings 24 --scenario lift
 DRAWN := --seed 82037895
 coverage: venv
 	$(COVERAGE) $(DRAWN) --recordings 200 --fix mass

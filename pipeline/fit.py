@@ -69,9 +69,9 @@ def fit(
     starts: Annotated[
         int | None,
         typer.Option(
-            help="Descents from as many places; of gauss_newton at most, from the best candidates only (of a joint fit, "
-            "the first one grows with the recordings). Default of gauss_newton: 8, three that grow with the recording, and "
-            "one from a search (linearised: 2, and no others); of adam: 1."
+            help="Places to descend from. Of gauss_newton at most so many, the best candidates only (in a joint fit, the "
+            "first one fits the first frames, then more and more of them). Default of gauss_newton: 8, also three "
+            "that begin with the first frames, and one from a search (linearised: 2 and no others); of adam: 1."
         ),
     ] = None,
     screen: Annotated[
@@ -97,7 +97,9 @@ def fit(
     threshold: Annotated[
         float | None, typer.Option(help="Stop below this loss; default: never, with --paper the scenario's.")
     ] = None,
-    points: Annotated[int | None, typer.Option(help="Sampled per frame; to compare candidates, 500 at most.")] = None,
+    points: Annotated[
+        int | None, typer.Option(help="Sampled per frame (500 at most when candidates are compared).")
+    ] = None,
     frame: Annotated[list[int] | None, typer.Option(help="Frame to compare, repeatable; default: all usable ones.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of all random numbers.")] = None,
     resample: Annotated[bool | None, typer.Option(help="Of adam: new points in each iteration.")] = None,
