@@ -15,27 +15,33 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from diffcloud.errors import DivergedError
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.fit import GaussNewtonSettings, JointObjective, Objective, solve
+from diffcloud.fit.inputs import Inputs
+from diffcloud.fit.laid import parse_laid
 from diffcloud.fit.solvers import SOLVERS, Settings
 from diffcloud.io.episodes import Episode
 from diffcloud.io.files import write_json
 from diffcloud.io.fingerprints import fingerprint, kept_record
-from diffcloud.scene.scenarios import Scenario
+from diffcloud.scene.scenarios import Scenario, built_in, make_scenario
 from diffcloud.sensing.whole_surface import sample_surface
-from diffcloud.sim.properties import PARAMETERS
+from diffcloud.sim.properties import PARAMETERS, one_set
 from pipeline.config import FitConfig
-from pipeline.episodes import simulated_frames
 from pipeline.fit_jobs import FitJob, Recording
-from pipeline.scenario_options import choose_scenario
 from pipeline.workers import Tell
 
 SCENARIOS = ("lift", "fold", "band_stretch", "vest_hang")
-ORDER = ("stretch", "mass", "bending", "drag", "damping", "friction_cloth", "friction_obstacle")
-"""The first two, four, and all of them are fitted."""
-COUNTS = (2, 4, 7)
+ORDER = ("stretch", "mass", "bending", "drag", "damping", "friction_cloth", "friction_obstacle", "shear", "compression")
+"""The first two, four, eight, or all of them are fitted."""
+COUNTS = (2, 4, 8, 12)
+"""Variables; twelve with `_LAID`, of a cloth that lies level."""
+_LEVEL = ("lift", "fold")
+_LAID = "turn=10deg,size=2%,track=2%"
+_COMPRESSION = 0.3
+"""Of the scenario's cloth where it is fitted: one that resists in full has no such parameter."""
 WITHIN = 1.05
 """A solver has arrived at this multiple of the reference's loss."""
 BUDGET = 200
@@ -64,7 +70,12 @@ class RaceJob:
 
     @property
     def names(self) -> list[str]:
+        """Of the material."""
         return list(ORDER[: self.count])
+
+    @property
+    def laid(self) -> str:
+        return _LAID if self.count > len(ORDER) else "none"
 
     def run(self, tell: Tell) -> dict[str, Any]:
         """The record: truth, the reference's loss, and of each solver the loss, seconds of processor time, simulations, and
@@ -81,7 +92,7 @@ class RaceJob:
         if (kept := kept_record(path, mark)) is not None:
             return kept
         recording = Recording(self.scenario, self.label, self._episode(truth))
-        job = FitJob(self.label, [recording], FitConfig(parameters=self.names, doubts="none", laid="none"), self.out)
+        job = FitJob(self.label, [recording], self._config(), self.out)
         objective, space = job.objective(), job.space
         tell(0.0, "reference")
         wide = GaussNewtonSettings(starts=6, screen=96, scans=3, seed=self.seed)
@@ -96,19 +107,23 @@ class RaceJob:
         return record
 
     def truth(self) -> dict[str, float]:
-        """Multipliers, log-uniform within a factor of three of 1; parameters that may be zero are uniform in the lower half
-        of their bounds."""
+        """Multipliers, log-uniform within a factor of three of 1; other parameters are uniform in the lower half of their
+        bounds. How the cloth lies is as the priors say."""
         rng = np.random.default_rng([self.seed, SCENARIOS.index(self.scenario.name), self.index])
         found = {}
-        for name in ORDER:  # more parameters leave the first as they are
+        for name in self.names:  # more of them leave the first as they are
             low, high = self.scenario.bounds.get(name, PARAMETERS[name].bounds)
             share = rng.uniform()
-            found[name] = 3.0 ** (2 * share - 1) if low > 0 else low + share * (high - low) / 2
-        return {name: found[name] for name in self.names}
+            multiplies = PARAMETERS[name].basis is not None
+            found[name] = 3.0 ** (2 * share - 1) if multiplies else low + share * (high - low) / 2
+        return found | {name: deviation * rng.normal() for name, deviation in parse_laid(self.laid).items()}
 
     def _episode(self, truth: dict[str, float]) -> Episode:
-        sets = {name: np.array([value]) for name, value in truth.items()}
-        system, (nodes,), times = simulated_frames(self.scenario, sets)
+        system, _ = self.scenario.scene.build()
+        with torch.no_grad():
+            run = Inputs.of(self.scenario, system, self.scenario.steps, one_set(truth), None).rollout()
+        steps = self.scenario.scene.frame_steps
+        nodes, times = run.positions[0, ::steps].numpy(), run.times[::steps].numpy()
         # what depth cameras record comes without its table
         obstacles = self.scenario.scene.surrounding.obstacles if self.scenario.recorder == "whole_surface" else ()
         seen = sample_surface(
@@ -124,14 +139,17 @@ class RaceJob:
 
     def _settings(self, solver: str, threshold: float) -> Settings:
         """What `diffcloud fit` takes, with the same budget for all; Adam gets three starts from Gauss–Newton's screen."""
-        given: dict[str, Any] = {"solver": solver, "threshold": threshold, "seed": self.seed}
+        given: dict[str, Any] = {"threshold": threshold, "seed": self.seed}
         if solver == "adam":
             like = GaussNewtonSettings()
             iterations = (BUDGET - 1 - like.screen) // _ADAM_STARTS - 1
             given |= {"starts": _ADAM_STARTS, "screen": like.screen, "iterations": iterations, "smoothing": 0.0}
         elif solver in ("cma_es", "random_search"):
             given["simulations"] = BUDGET
-        return FitConfig(parameters=self.names, doubts="none", **given).solver_settings(self.scenario)
+        return self._config(solver=solver, **given).solver_settings(self.scenario)
+
+    def _config(self, **given: Any) -> FitConfig:
+        return FitConfig(parameters=self.names, doubts="none", laid=self.laid, **given)
 
     def _timed(self, objective: Objective | JointObjective, space: Any, settings: Settings) -> dict[str, Any]:
         began = time.process_time()
@@ -147,14 +165,20 @@ class RaceJob:
 def race_jobs(targets: int, seed: int, out: Path) -> list[RaceJob]:
     """The first target of every cell, then the second of every cell, and so on."""
     return [
-        RaceJob(choose_scenario(name), count, index, seed, out)
+        RaceJob(_scenario(name, count), count, index, seed, out)
         for index in range(targets)
         for name in SCENARIOS
         for count in COUNTS
+        if count < COUNTS[-1] or name in _LEVEL
     ]
 
 
-HEAD = ("scenario", "parameters", "targets", *SOLVERS)
+def _scenario(name: str, count: int) -> Scenario:
+    known = {"compression": _COMPRESSION} if "compression" in ORDER[:count] else {}
+    return make_scenario(built_in(name).model_copy(update=known))
+
+
+HEAD = ("scenario", "variables", "targets", *SOLVERS)
 
 
 def race_rows(records: Sequence[dict[str, Any]]) -> list[list[str]]:
@@ -192,8 +216,10 @@ def race_page(rows: Sequence[Sequence[str]], seed: int) -> str:
         f"{_ADAM_STARTS} starts.",
         "",
         "Cells hold medians over all targets of processor time on one thread and of simulations (one with derivatives "
-        "counts once), and how many targets were reached. A dash: half of them or more were not. Two parameters are "
-        "stretch and mass; four, bending and drag too; seven, also damping and both frictions.",
+        "counts once), and how many targets were reached. A dash: half of them or more were not. Two variables are "
+        "stretch and mass; four, bending and drag too; eight, also damping, both frictions and shear. Twelve are these, "
+        "the compression of a cloth that gives way to it, and how it lies: its turn, its size, and how far the gripper goes "
+        f"(`--laid {_LAID}`). How it lies is fitted only where the cloth lies level.",
         "",
         *markdown_table(HEAD, rows),
         "",

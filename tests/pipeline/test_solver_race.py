@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,25 +12,47 @@ import torch
 from diffcloud.fit.solvers import SOLVERS
 from diffcloud.sim.properties import PARAMETERS
 from pipeline import solver_race
-from pipeline.scenario_options import choose_scenario
-from pipeline.solver_race import COUNTS, SCENARIOS, RaceJob, race_jobs, race_page, race_rows
+from pipeline.fit_jobs import FitJob, Recording
+from pipeline.solver_race import COUNTS, SCENARIOS, race_jobs, race_page, race_rows
 from tests.pipeline.invoke import invoke
 
 
 def job(tmp_path, scenario="lift", count=2, index=0, seed=1):
-    return RaceJob(choose_scenario(scenario), count, index, seed, tmp_path)
+    every = race_jobs(index + 1, seed, tmp_path)
+    return next(one for one in every if one.label == f"{scenario}/{count}/{index}")
 
 
-def test_truths_lie_within_the_bounds_and_more_parameters_leave_the_first_as_they_are(tmp_path):
-    few, all_of_them = (job(tmp_path, count=count).truth() for count in (COUNTS[0], COUNTS[-1]))
-    assert list(few) == ["stretch", "mass"]
-    assert few == {name: all_of_them[name] for name in few}
+def test_truths_lie_within_the_bounds_and_more_variables_leave_the_first_as_they_are(tmp_path):
+    truths = [job(tmp_path, count=count).truth() for count in COUNTS]
+    assert [len(truth) for truth in truths] == list(COUNTS)
+    assert list(truths[0]) == ["stretch", "mass"]
+    for fewer, more in pairwise(truths):
+        assert fewer == {name: more[name] for name in fewer}
     for index in range(20):
         for name, value in job(tmp_path, count=COUNTS[-1], index=index).truth().items():
-            low, high = PARAMETERS[name].bounds
-            assert low <= value <= high
-            assert PARAMETERS[name].basis is None or 1 / 3 <= value <= 3
-    assert job(tmp_path, index=1).truth() != few != job(tmp_path, scenario="fold").truth()
+            if name in PARAMETERS:
+                low, high = PARAMETERS[name].bounds
+                assert low <= value <= high
+                assert PARAMETERS[name].basis is None or 1 / 3 <= value <= 3
+    assert job(tmp_path, index=1).truth() != truths[0] != job(tmp_path, scenario="fold").truth()
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_a_fit_has_as_many_variables_as_the_target_and_starts_at_its_truth(tmp_path, count):
+    one = job(tmp_path, count=count)
+    fit = FitJob("", [Recording(one.scenario, "", one._episode(one.truth()))], one._config(), tmp_path)
+    assert set(fit.space.names) == set(one.truth())
+    axis = [(variable.low, variable.high) for variable in fit.space.variables]
+    assert all(low <= one.truth()[name] <= high for name, (low, high) in zip(fit.space.names, axis, strict=True))
+
+
+def test_the_target_moves_with_each_of_its_variables(tmp_path, monkeypatch):
+    monkeypatch.setattr(solver_race, "_NOISE_M", 0.0)
+    one = job(tmp_path, scenario="fold", count=COUNTS[-1])
+    truth = one.truth()
+    points = one._episode(truth).points
+    for name, value in truth.items():
+        assert not np.array_equal(one._episode({**truth, name: 0.9 * value}).points, points), name
 
 
 def test_a_target_is_its_cloth_turned_shifted_and_noisy(tmp_path, monkeypatch):
@@ -68,7 +91,11 @@ def test_cells_are_medians_in_which_a_solver_that_did_not_arrive_took_for_ever()
 
 def test_every_cell_has_its_targets(tmp_path):
     jobs = race_jobs(2, 0, tmp_path)
-    assert len({one.label for one in jobs}) == len(jobs) == 2 * len(SCENARIOS) * len(COUNTS)
+    assert len({one.label for one in jobs}) == len(jobs)
+    cells = {one.label.rpartition("/")[0] for one in jobs}
+    assert len(jobs) == 2 * len(cells)
+    level = {"lift/12", "fold/12"}  # elsewhere, the cloth does not lie level
+    assert cells == {f"{name}/{count}" for name in SCENARIOS for count in COUNTS[:-1]} | level
 
 
 @pytest.mark.slow
