@@ -51,7 +51,7 @@ class NeighbourIndex:
             return torch.zeros_like(self.points)
         return torch.from_numpy(flattest_directions(_as_array(self.points), index)).to(self.points)
 
-    @property
+    @cached_property
     def spacing(self) -> float:
         """Median distance between neighbours [m]; zero of fewer than three points."""
         distance = self._beside[0]

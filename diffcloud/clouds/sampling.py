@@ -31,12 +31,6 @@ class SurfacePoints:
         """[..., V, 3] positions of the nodes, or their rates -> [..., N, 3] those of the points. Differentiable."""
         return (self.barycentric[..., None, :] @ self.corners(values)).squeeze(-2)
 
-    def normals(self, positions: Tensor) -> Tensor:
-        """[..., N, 3] unit normals of the faces at node positions [..., V, 3]; zero on a face without area."""
-        corners = self.corners(positions)
-        normal = torch.linalg.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
-        return normal / normal.norm(dim=-1, keepdim=True).clamp(min=_TINY)
-
     def corners(self, values: Tensor) -> Tensor:
         """[..., N, 3, 3] of each one's face, of values [..., V, 3]."""
         flat = values.reshape(-1, *values.shape[-2:])

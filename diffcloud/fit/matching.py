@@ -37,8 +37,8 @@ class Pairs:
     """[B, L, N] on the surface."""
     partners: Tensor
     """[B, L, N, 3] recorded points, in the recording's frame."""
-    normals: Tensor
-    """[B, L, N, 3] of what is slid along, there too."""
+    normals: Tensor | None
+    """[B, L, N, 3] of what is slid along, there too; None: the faces on which the places lie."""
     spacing: Tensor
     """[L] between recorded points."""
     weights: Tensor
@@ -67,31 +67,6 @@ class Pairs:
         weights = torch.where(away.square().sum(-1) < cap**2, self.weights, 0.0)
         return weights * (rates * away).sum(-1)
 
-    def terms(self, moved: Tensor, rates: Tensor, cap: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Loss [B], half of its slope [B, k] and of its curvature [B, k, k].
-
-        Args:
-            rates: [k, B, L, N, 3] of the places.
-        """
-        from diffcloud.fit.curvature import sum_terms  # numba takes a moment to import
-
-        batch, count = len(moved), len(rates)
-        loss, slope, curvature = (moved.new_zeros(batch, *[count] * order) for order in range(3))
-        sum_terms(
-            _array(moved),
-            _array(self.partners),
-            _array(self.normals),
-            _array(self.spacing),
-            _array(self.weights),
-            _array(rates),
-            cap,
-            self.share * cap**2,
-            _array(loss),
-            _array(slope),
-            _array(curvature),
-        )
-        return loss, slope, curvature
-
 
 @dataclass(frozen=True)
 class Motion:
@@ -110,9 +85,38 @@ class Motion:
         """[B, L, V, 3] where the nodes are when the recording looks at them."""
         return _shown(self.nodes, self.velocities, self.pose, space)
 
+    def terms(self, space: PoseSpace, rates: Tensor | None, cap: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Loss [B], half of its slope [B, k + d] and of its curvature [B, k + d, k + d], by k variables and the pose.
 
-def _array(tensor: Tensor) -> Any:
-    """The numbers of a tensor as an array; where it is contiguous, they share its memory."""
+        Args:
+            rates: [k, B, L, V', 3] of the first V' nodes, the cloth's; None: k is 0.
+            cap: largest distance that counts as itself.
+        """
+        from diffcloud.fit.curvature import Partners, Placements, Surfaces, sum_terms  # numba takes a moment to import
+
+        nodes, none = self.nodes, self.nodes.new_zeros(0, 1, 1, 3)
+        moving = none if self.velocities is None else self.velocities
+        changes = none[:, None] if rates is None else rates
+        surfaces = Surfaces(_array(nodes), _array(moving, 0, 1), _array(changes, 1))
+        placements = Placements(*map(_array, space.placements(self.pose)))
+        count = len(surfaces.rates) + self.pose.shape[1]
+        loss, slope, curvature = (nodes.new_zeros(len(nodes), *[count] * order) for order in range(3))
+        sums = loss.numpy(), slope.numpy(), curvature.numpy()
+        for one in self.pairs:
+            normals = none if one.normals is None else one.normals
+            parts = one.places.nodes, one.places.barycentric, one.partners, normals, one.weights
+            corners, barycentric, points, normal, weights = (_array(part, 0, 1) for part in parts)
+            partners = Partners(corners, barycentric, points, normal, weights, _array(one.spacing))
+            sum_terms(surfaces, placements, partners, cap, one.share * cap**2, *sums)
+        return loss, slope, curvature
+
+
+def _array(tensor: Tensor, *axes: int) -> Any:
+    """The numbers of a tensor as an array; where it is contiguous, they share its memory. Any of these axes along which it
+    was expanded is one long."""
+    for axis in axes:
+        if tensor.stride(axis) == 0:
+            tensor = tensor.narrow(axis, 0, 1)
     return tensor.detach().contiguous().numpy()
 
 
@@ -264,11 +268,10 @@ def pairs_back(
         guesses: [B, L, Q] faces that may be near; they save time.
     """
     places, found = nearest_places(positions, faces, space.back(recorded, pose), guesses)
-    normals = space.turned(places.normals(positions), pose)
     weights = share * sure / sure.sum(-1, keepdim=True) / len(recorded)
     batch = len(positions)
     shares = weights.expand(batch, -1, -1)
-    return Pairs(places, recorded.expand(batch, -1, -1, -1), normals, spacing, shares, share / len(recorded)), found
+    return Pairs(places, recorded.expand(batch, -1, -1, -1), None, spacing, shares, share / len(recorded)), found
 
 
 def nearest_places(

@@ -363,14 +363,9 @@ class Objective:
             rates: [k, B, L, V, 3] of the cloth's nodes by k variables; None for none.
             factor: of the cap.
         """
-        found = [
-            pairs.terms(moved, columns, self.cap * factor)
-            for pairs, moved, columns in zip(motion.pairs, *self.columns(motion, rates), strict=True)
-        ]
-        loss, slope, curvature = (torch.stack(part).sum(0) for part in zip(*found, strict=True))
-        return loss, slope, curvature
+        return motion.terms(self.pose_space, rates, self.cap * factor)
 
-    def columns(self, motion: Motion, rates: Tensor | None) -> tuple[list[Tensor], list[Tensor]]:
+    def columns(self, motion: Motion, rates: Tensor) -> tuple[list[Tensor], list[Tensor]]:
         """For each kind of pairs, where its places lie in the recording [B, L, N, 3], and their rates [k + d, B, L, N, 3].
 
         Args:
@@ -378,18 +373,14 @@ class Objective:
         """
         space = self._target.space
         here = motion.shown(space)
-        if rates is not None:  # bodies stand still
-            rates = torch.nn.functional.pad(rates, (0, 0, 0, here.shape[-2] - rates.shape[-2]))
+        rates = torch.nn.functional.pad(rates, (0, 0, 0, here.shape[-2] - rates.shape[-2]))  # bodies stand still
         moved, every = [], []
         for pairs in motion.pairs:
             points = pairs.places.of(here)
             velocities = None if motion.velocities is None else pairs.places.of(motion.velocities)
-            columns = space.rates(points, motion.pose, velocities)
-            if rates is not None:
-                own = [space.carried(pairs.places.of(rate), motion.pose) for rate in rates]
-                columns = torch.cat([torch.stack(own), columns])
+            own = [space.carried(pairs.places.of(rate), motion.pose) for rate in rates]
             moved.append(space.moved(points, motion.pose))
-            every.append(columns)
+            every.append(torch.cat([torch.stack(own), space.rates(points, motion.pose, velocities)]))
         return moved, every
 
     def freed(self, nuisance: Mapping[str, float]) -> Objective:

@@ -169,10 +169,6 @@ class PoseSpace:
         lag = self.lag(values)
         return self.moved(at(times if lag is None else times + lag), values)[0]
 
-    def turned(self, vectors: Tensor, values: Tensor) -> Tensor:
-        """[B, ..., 3] directions in the scene at values [B, d] -> in the recording."""
-        return _turned(vectors, self.rotation(values))
-
     def carried(self, vectors: Tensor, values: Tensor) -> Tensor:
         """[B, ..., 3] displacements in the scene at values [B, d] -> in the recording."""
         if not self.names:
@@ -190,20 +186,36 @@ class PoseSpace:
         Args:
             velocities: [B, ..., 3] of the points; needed where `lag` is free.
         """
+        placements, centred = self.placements(values), points - self.centre
         found = points.new_zeros(len(self.names), *points.shape)
-        turnings = dict(zip(_ANGLES, _turnings(self._parts(values, _ANGLES)), strict=True))
-        centred = points - self.centre
-        for name, column in zip(self.names, found, strict=True):
-            if name == "lag":
+        for column, turn, shift, late in zip(found, *placements[4:], strict=True):
+            column += _turned(centred, turn) + shift
+            if late:
                 assert velocities is not None
-                column[:] = self.carried(velocities, values)
-            elif name == "scale":
-                column[:] = self.carried(centred, values)
-            elif name in _SHIFTS:
-                column[..., _SHIFTS.index(name)] = 1.0
-            else:
-                column[:] = _turned(centred, self._growth(values)[..., None] * turnings[name])
+                column += late * _turned(velocities, placements[1])
         return found
+
+    def placements(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """What x' consists of at values [B, d], matrix (x + lag v - centre) + shift, and its derivatives by them: the
+        centre [3], matrix [B, 3, 3], shift [B, 3] and lag [B]; [d, B, 3, 3], [d, 3] and [d]."""
+        count, free = len(values), len(self.names)
+        growth, angles = self._growth(values)[..., None], self._parts(values, _ANGLES)
+        matrix, shift = growth * _rotation(angles), self._parts(values, _SHIFTS)
+        lag = self.lag(values)
+        matrix_rates, shift_rates, lag_rates = (values.new_zeros(free, *each) for each in ((count, 3, 3), (3,), ()))
+        turnings = growth * _turnings(angles) if set(_ANGLES) & set(self.names) else None
+        for place, name in enumerate(self.names):
+            if name == "lag":
+                lag_rates[place] = 1.0
+            elif name == "scale":
+                matrix_rates[place] = matrix
+            elif name in _SHIFTS:
+                shift_rates[place, _SHIFTS.index(name)] = 1.0
+            elif turnings is not None:
+                matrix_rates[place] = turnings[_ANGLES.index(name)]
+        centre = self.centre if free else torch.zeros_like(self.centre)
+        late = values.new_zeros(count) if lag is None else lag
+        return centre, matrix, centre + shift, late, matrix_rates, shift_rates, lag_rates
 
     def _growth(self, values: Tensor) -> Tensor:
         """[B, 1] of values [B, d]: how many times as large the scene shows."""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 
 from diffcloud.clouds.neighbours import NeighbourIndex
-from diffcloud.clouds.sampling import SurfacePoints, SurfaceSampler
+from diffcloud.clouds.sampling import SurfacePoints
 from diffcloud.clouds.visibility import seen_places
-from diffcloud.fit.matching import Pairs, nearest_places, pairs_forth
+from diffcloud.fit.matching import Motion, Pairs, nearest_places, pairs_forth
+from diffcloud.fit.pose import NUISANCE, PoseSpace
 from diffcloud.fit.targets import LostPixels
 from diffcloud.mesh.shapes import grid_cloth
 
@@ -72,17 +75,6 @@ def test_faces_without_area_have_a_nearest_place():
     torch.testing.assert_close(found[0, 0, :, 0], torch.tensor([0.5, 0.0, 1.0], dtype=torch.float64))
 
 
-def test_normals_are_those_of_the_faces(sheet, generator):
-    nodes, faces = sheet
-    places = SurfaceSampler.build(faces, 50, generator=generator).draw(nodes)
-    corners = places.corners(nodes)
-    normals = places.normals(nodes)
-    torch.testing.assert_close(normals.norm(dim=-1), torch.ones(1, 2, 50, dtype=torch.float64))
-    for corner in (1, 2):
-        edge = corners[..., corner, :] - corners[..., 0, :]
-        assert float((edge * normals).sum(-1).abs().max()) < 1e-12
-
-
 def at_points(moved):
     """Places that are points by themselves: each its own node."""
     nodes = torch.arange(moved.shape[2]).reshape(1, 1, -1, 1).expand(*moved.shape[:3], 3)
@@ -106,20 +98,26 @@ class TestForth:
             torch.testing.assert_close((moved[:, frame] - pairs.partners[:, frame]).norm(dim=-1), expected)
 
 
-def some_pairs(generator, *, count=30):
+NO_POSE = PoseSpace.build({}, torch.zeros(3, dtype=torch.float64), length_unit_m=1.0)
+
+
+def some_motion(generator, *, count=30):
+    """Two motions at three frames, whose nodes are the places themselves."""
     moved, partners = torch.rand(2, 2, 3, count, 3, generator=generator, dtype=torch.float64)
     normals = torch.nn.functional.normalize(torch.randn(moved.shape, generator=generator, dtype=torch.float64), dim=-1)
     weights = torch.rand(moved.shape[:3], generator=generator, dtype=torch.float64)
-    return moved, Pairs(at_points(moved), partners, normals, torch.full((3,), 0.1, dtype=torch.float64), weights, 1.0)
+    pairs = Pairs(at_points(moved), partners, normals, torch.full((3,), 0.1, dtype=torch.float64), weights, 1.0)
+    return Motion(moved, None, torch.zeros(2, 0, dtype=torch.float64), (pairs,))
 
 
 class TestTerms:
     @pytest.mark.parametrize("cap", [0.5, torch.inf])
     def test_the_slope_is_half_of_the_gradient(self, generator, cap):
-        moved, pairs = some_pairs(generator)
-        rates = torch.randn(4, *moved.shape, generator=generator, dtype=torch.float64)
-        loss, slope, _ = pairs.terms(moved, rates, cap)
-        leaf = moved.clone().requires_grad_()
+        motion = some_motion(generator)
+        (pairs,) = motion.pairs
+        rates = torch.randn(4, *motion.nodes.shape, generator=generator, dtype=torch.float64)
+        loss, slope, _ = motion.terms(NO_POSE, rates, cap)
+        leaf = motion.nodes.clone().requires_grad_()
         found = pairs.losses(leaf, cap).sum(-1)
         (gradient,) = torch.autograd.grad(found.sum(), leaf)
         torch.testing.assert_close(loss, found.detach())
@@ -127,22 +125,111 @@ class TestTerms:
 
     def test_the_curvature_is_between_sliding_and_being_bound(self, generator):
         """A move along the normal counts in full, one along the surface less, and never more than if bound to a point."""
-        moved, pairs = some_pairs(generator)
-        rates = torch.randn(3, *moved.shape, generator=generator, dtype=torch.float64)
-        _, _, curvature = pairs.terms(moved, rates, torch.inf)
+        motion = some_motion(generator)
+        (pairs,) = motion.pairs
+        rates = torch.randn(3, *motion.nodes.shape, generator=generator, dtype=torch.float64)
+        _, _, curvature = motion.terms(NO_POSE, rates, torch.inf)
         bound = torch.einsum("jblni,kblni,bln->bjk", rates, rates, pairs.weights)
         assert bool((torch.linalg.eigvalsh(bound - curvature) > 0).all())
         assert bool((torch.linalg.eigvalsh(curvature) > 0).all())
-        along = pairs.normals[None]
-        _, _, whole = pairs.terms(moved, along, torch.inf)
+        _, _, whole = motion.terms(NO_POSE, pairs.normals[None], torch.inf)
         torch.testing.assert_close(whole[:, 0, 0], pairs.weights.sum((1, 2)))
 
     def test_what_is_farther_than_the_cap_draws_at_nothing(self, generator):
-        moved, pairs = some_pairs(generator)
-        rates = torch.randn(2, *moved.shape, generator=generator, dtype=torch.float64)
-        loss, slope, curvature = pairs.terms(moved, rates, 1e-6)
-        torch.testing.assert_close(loss, 1e-12 * pairs.weights.sum((1, 2)))
+        motion = some_motion(generator)
+        rates = torch.randn(2, *motion.nodes.shape, generator=generator, dtype=torch.float64)
+        loss, slope, curvature = motion.terms(NO_POSE, rates, 1e-6)
+        torch.testing.assert_close(loss, 1e-12 * motion.pairs[0].weights.sum((1, 2)))
         assert float(slope.abs().max()) == float(curvature.abs().max()) == 0.0
+
+
+@pytest.mark.parametrize("free", [[], ["x", "yaw"], list(NUISANCE)])
+class TestTermsOfPosedFaces:
+    """Places on the faces of a moving cloth, and on a body that stands still beside it, at poses."""
+
+    BODY = 7
+    """Nodes."""
+
+    @pytest.fixture
+    def motion(self, sheet, generator, free):
+        wavy, faces = sheet
+        cloth, body = len(wavy[0, 0]), len(wavy[0, 0]) + torch.arange(self.BODY)
+        nodes = wavy.expand(3, -1, -1, -1) + 0.01 * self.randn(generator, 3, 2, cloth, 3)
+        nodes = torch.cat([nodes, self.randn(generator, 3, 2, self.BODY, 3)], dim=2)
+        faces = torch.cat([faces, torch.stack([body[:-2], body[1:-1], body[2:]], dim=-1)])
+        chosen = faces[torch.randint(len(faces), (3, 2, 60), generator=generator)]
+        places = SurfacePoints(chosen, torch.rand(60, 3, generator=generator, dtype=torch.float64).expand(3, 2, -1, -1))
+        partners = nodes[:1].mean(2, keepdim=True) + 0.3 * self.randn(generator, 1, 2, 60, 3)
+        weights = torch.rand(2, 60, generator=generator, dtype=torch.float64).expand(3, -1, -1)
+        pairs = Pairs(places, partners.expand(3, -1, -1, -1), None, torch.tensor([0.1, 0.2]).double(), weights, 1.0)
+        return Motion(nodes, self.randn(generator, *nodes.shape), 0.1 * self.randn(generator, 3, len(free)), (pairs,))
+
+    @pytest.fixture
+    def space(self, free):
+        return PoseSpace.build(dict.fromkeys(free, 0.1), torch.tensor([0.3, -0.2, 0.1]).double(), length_unit_m=1.0)
+
+    @pytest.fixture
+    def rates(self, motion, generator):
+        return self.randn(generator, 2, *motion.nodes[:, :, : -self.BODY].shape)
+
+    @staticmethod
+    def randn(generator, *shape):
+        return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+    @staticmethod
+    def places(motion, space, nodes, pose):
+        return space.moved(motion.pairs[0].places.of(replace(motion, nodes=nodes, pose=pose).shown(space)), pose)
+
+    def columns(self, motion, space, rates):
+        """[B, L, N, 3, k + d] derivatives of the places in the recording by what moves the nodes, and by the pose."""
+
+        def at(own, pose):
+            still = torch.nn.functional.pad(rates, (0, 0, 0, self.BODY))
+            return self.places(motion, space, motion.nodes + torch.einsum("bk,kblni->blni", own, still), pose)
+
+        own = torch.zeros(3, len(rates), dtype=torch.float64)
+        found = torch.autograd.functional.jacobian(at, (own, motion.pose))
+        same = range(3)  # of the batch
+        return torch.cat([of[same, ..., same, :] for of in found], dim=-1)
+
+    def test_the_slope_is_half_of_the_gradient(self, motion, space, rates):
+        loss, slope, _ = motion.terms(space, rates, 0.4)
+        (pairs,) = motion.pairs
+        moved = self.places(motion, space, motion.nodes, motion.pose).requires_grad_()
+        found = pairs.losses(moved, 0.4).sum(-1)
+        (gradient,) = torch.autograd.grad(found.sum(), moved)
+        torch.testing.assert_close(loss, found.detach())
+        torch.testing.assert_close(2 * slope, torch.einsum("blnik,blni->bk", self.columns(motion, space, rates), gradient))
+        assert 0 < int((gradient == 0).all(-1).sum()) < 300  # some are beyond the cap
+
+    def test_they_slide_along_the_faces(self, motion, space, rates):
+        """As along stated normals that are the faces'."""
+        (pairs,) = motion.pairs
+        corners = pairs.places.corners(motion.shown(space))
+        across = torch.linalg.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
+        normals = torch.nn.functional.normalize(space.carried(across, motion.pose), dim=-1)
+        expected = replace(motion, pairs=(replace(pairs, normals=normals),)).terms(space, rates, 0.4)
+        for found, of in zip(motion.terms(space, rates, 0.4), expected, strict=True):
+            torch.testing.assert_close(found, of)
+
+    def test_the_curvature_is_that_of_the_columns(self, motion, space, rates):
+        (pairs,) = motion.pairs
+        normals = torch.nn.functional.normalize(torch.ones_like(pairs.partners), dim=-1)
+        _, _, curvature = replace(motion, pairs=(replace(pairs, normals=normals),)).terms(space, rates, torch.inf)
+        away = self.places(motion, space, motion.nodes, motion.pose) - pairs.partners
+        beside = away - (away * normals).sum(-1, keepdim=True) * normals
+        beside = beside / (beside.square().sum(-1, keepdim=True) + pairs.spacing[:, None, None] ** 2).sqrt()
+        columns = self.columns(motion, space, rates)
+        expected = 0.0
+        for way in (normals, beside):
+            along = torch.einsum("blnik,blni->blnk", columns, way)
+            expected = expected + torch.einsum("blnj,blnk,bln->bjk", along, along, pairs.weights)
+        torch.testing.assert_close(curvature, expected)
+
+    def test_all_pairs_count(self, motion, space, rates):
+        twice = replace(motion, pairs=(*motion.pairs, *motion.pairs)).terms(space, rates, 0.4)
+        for found, once in zip(twice, motion.terms(space, rates, 0.4), strict=True):
+            torch.testing.assert_close(found, 2 * once)
 
 
 def test_positions_that_are_no_numbers_have_some_place(sheet):
