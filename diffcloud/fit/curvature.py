@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diffcloud.compiled import kernel
+from diffcloud.fit.pose import Placements
 from diffcloud.sim.compiled.data import Floats, Ints
 
 
@@ -19,25 +20,6 @@ class Surfaces(NamedTuple):
     """Likewise; empty: none."""
     rates: Floats
     """[k, B, L, V', 3] of the first V' nodes by k variables; the others stand still."""
-
-
-class Placements(NamedTuple):
-    """How the recording has the scene: x -> matrix (x + lag v - centre) + shift (`fit.pose`)."""
-
-    centre: Floats
-    """[3]"""
-    matrix: Floats
-    """[B, 3, 3]"""
-    shift: Floats
-    """[B, 3]"""
-    lag: Floats
-    """[B]"""
-    matrix_rates: Floats
-    """[d, B, 3, 3] by the d variables of the pose."""
-    shift_rates: Floats
-    """[d, 3]"""
-    lag_rates: Floats
-    """[d]"""
 
 
 class Partners(NamedTuple):

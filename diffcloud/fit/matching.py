@@ -25,7 +25,7 @@ from torch import Tensor
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfacePoints
 from diffcloud.clouds.visibility import seen_places
-from diffcloud.fit.pose import PoseSpace
+from diffcloud.fit.pose import Placements, PoseSpace
 from diffcloud.fit.targets import Target
 
 
@@ -92,7 +92,7 @@ class Motion:
             rates: [k, B, L, V', 3] of the first V' nodes, the cloth's; None: k is 0.
             cap: largest distance that counts as itself.
         """
-        from diffcloud.fit.curvature import Partners, Placements, Surfaces, sum_terms  # numba takes a moment to import
+        from diffcloud.fit.curvature import Partners, Surfaces, sum_terms  # numba takes a moment to import
 
         nodes, none = self.nodes, self.nodes.new_zeros(0, 1, 1, 3)
         moving = none if self.velocities is None else self.velocities

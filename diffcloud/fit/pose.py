@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -83,6 +83,26 @@ def parse_priors(text: str) -> dict[str, float]:
         ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.
     """
     return parse_deviations(text, "nuisance", NUISANCE)
+
+
+class Placements(NamedTuple):
+    """How the recording has a scene at B poses: matrix (x + lag v - centre) + shift; and the derivatives of these by the d
+    variables of the pose. As tensors, or as arrays for a kernel."""
+
+    centre: Any
+    """[3]"""
+    matrix: Any
+    """[B, 3, 3]"""
+    shift: Any
+    """[B, 3]"""
+    lag: Any
+    """[B]"""
+    matrix_rates: Any
+    """[d, B, 3, 3]"""
+    shift_rates: Any
+    """[d, 3]"""
+    lag_rates: Any
+    """[d]"""
 
 
 @dataclass(frozen=True)
@@ -186,18 +206,17 @@ class PoseSpace:
         Args:
             velocities: [B, ..., 3] of the points; needed where `lag` is free.
         """
-        placements, centred = self.placements(values), points - self.centre
+        at, centred = self.placements(values), points - self.centre
         found = points.new_zeros(len(self.names), *points.shape)
-        for column, turn, shift, late in zip(found, *placements[4:], strict=True):
+        for column, turn, shift, late in zip(found, at.matrix_rates, at.shift_rates, at.lag_rates, strict=True):
             column += _turned(centred, turn) + shift
             if late:
                 assert velocities is not None
-                column += late * _turned(velocities, placements[1])
+                column += late * _turned(velocities, at.matrix)
         return found
 
-    def placements(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What x' consists of at values [B, d], matrix (x + lag v - centre) + shift, and its derivatives by them: the
-        centre [3], matrix [B, 3, 3], shift [B, 3] and lag [B]; [d, B, 3, 3], [d, 3] and [d]."""
+    def placements(self, values: Tensor) -> Placements:
+        """Of values [B, d]."""
         count, free = len(values), len(self.names)
         growth, angles = self._growth(values)[..., None], self._parts(values, _ANGLES)
         matrix, shift = growth * _rotation(angles), self._parts(values, _SHIFTS)
@@ -215,7 +234,7 @@ class PoseSpace:
                 matrix_rates[place] = turnings[_ANGLES.index(name)]
         centre = self.centre if free else torch.zeros_like(self.centre)
         late = values.new_zeros(count) if lag is None else lag
-        return centre, matrix, centre + shift, late, matrix_rates, shift_rates, lag_rates
+        return Placements(centre, matrix, centre + shift, late, matrix_rates, shift_rates, lag_rates)
 
     def _growth(self, values: Tensor) -> Tensor:
         """[B, 1] of values [B, d]: how many times as large the scene shows."""
