@@ -241,8 +241,19 @@ def fit(
 
 
 def _by_scenario(episodes: list[Path], scenarios: list[str]) -> bool:
-    """Whether there is one folder, and in it one for each scenario."""
-    return len(episodes) == 1 and all((episodes[0] / name).is_dir() for name in scenarios)
+    """Whether there is one folder, and in it one for each scenario.
+
+    Raises:
+        ConfigError: for some of them only.
+    """
+    missing = [name for name in scenarios if len(episodes) != 1 or not (episodes[0] / name).is_dir()]
+    there = [name for name in scenarios if name not in missing]
+    if there and missing:
+        raise ConfigError(
+            f"{episodes[0]} has folders for {', '.join(there)}, but none for {', '.join(missing)}, which the parameters "
+            f"file lists under `scenarios` too. Give --scenario {there[0]} {episodes[0] / there[0]}, or shorten that list."
+        )
+    return not missing
 
 
 def _recordings(

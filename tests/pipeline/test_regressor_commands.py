@@ -207,7 +207,10 @@ def test_without_a_scenario_those_of_the_parameters_are_fitted(work):
     params = yaml.safe_load((work / "params.yaml").read_text()) | {"scenarios": ["small", "other"]}
     (work / "params.yaml").write_text(yaml.safe_dump(params))
     fit = ("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
-    assert "Give --scenario" in str(run(*fit, code=1).exception)  # there is no folder of the other one
+    message = str(run(*fit, code=1).exception)
+    assert "folders for small, but none for other" in message
+    assert "Give --scenario small data/episodes/small" in message
+    assert not (work / "data/fits").exists()
     shutil.copytree(work / "data/episodes/small", work / "data/episodes/other")
     first = result(run(*fit, "--json"))["fits"]
     assert list(first) == ["small/e1", "small/e2", "other/e1", "other/e2"]
