@@ -250,8 +250,8 @@ def _by_scenario(episodes: list[Path], scenarios: list[str]) -> bool:
     there = [name for name in scenarios if name not in missing]
     if there and missing:
         raise ConfigError(
-            f"{episodes[0]} has folders for {', '.join(there)}, but none for {', '.join(missing)}, which the parameters "
-            f"file lists under `scenarios` too. Give --scenario {there[0]} {episodes[0] / there[0]}, or shorten that list."
+            f"{episodes[0]} has a folder for {', '.join(there)}, but none for {', '.join(missing)}. Give --scenario "
+            f"{there[0]} {episodes[0] / there[0]}, or a parameters file (--params) whose `scenarios` has no others."
         )
     return not missing
 

@@ -1,4 +1,4 @@
-"""`diffcloud bench --fits`: what each solver spends until it has found a cloth, over scenarios and numbers of parameters.
+"""`diffcloud bench --fits`: what each solver spends until it has found a cloth, over scenarios and numbers of variables.
 
 A target is a cloth of drawn parameters, seen as its whole surface with noise and put down a little beside its place. Every
 solver gets the same objective, priors and pose included, and stops at 1.05 times the reference loss: the lower one of a
@@ -75,6 +75,7 @@ class RaceJob:
 
     @property
     def laid(self) -> str:
+        """How the cloth may lie, as `--laid` takes it."""
         return _LAID if self.count > len(ORDER) else "none"
 
     def run(self, tell: Tell) -> dict[str, Any]:
@@ -108,7 +109,7 @@ class RaceJob:
 
     def truth(self) -> dict[str, float]:
         """Multipliers, log-uniform within a factor of three of 1; other parameters are uniform in the lower half of their
-        bounds. How the cloth lies is as the priors say."""
+        bounds. How the cloth lies is drawn from its priors."""
         rng = np.random.default_rng([self.seed, SCENARIOS.index(self.scenario.name), self.index])
         found = {}
         for name in self.names:  # more of them leave the first as they are
@@ -165,15 +166,16 @@ class RaceJob:
 def race_jobs(targets: int, seed: int, out: Path) -> list[RaceJob]:
     """The first target of every cell, then the second of every cell, and so on."""
     return [
-        RaceJob(_scenario(name, count), count, index, seed, out)
+        RaceJob(race_scenario(name, count), count, index, seed, out)
         for index in range(targets)
         for name in SCENARIOS
         for count in COUNTS
-        if count < COUNTS[-1] or name in _LEVEL
+        if count <= len(ORDER) or name in _LEVEL
     ]
 
 
-def _scenario(name: str, count: int) -> Scenario:
+def race_scenario(name: str, count: int) -> Scenario:
+    """In which a target of so many variables moves."""
     known = {"compression": _COMPRESSION} if "compression" in ORDER[:count] else {}
     return make_scenario(built_in(name).model_copy(update=known))
 

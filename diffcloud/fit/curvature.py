@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diffcloud.compiled import kernel
-from diffcloud.fit.pose import Placements
 from diffcloud.sim.compiled.data import Floats, Ints
 
 
 class Surfaces(NamedTuple):
-    """B motions of V nodes at L frames. Where all motions have the same velocities or rates, that axis is one long."""
+    """B motions of V nodes at L frames. Where all of them share velocities or rates, axis B of these has length one; axis L
+    of velocities, too, where all frames share them."""
 
     nodes: Floats
     """[B, L, V, 3]"""
@@ -22,8 +22,28 @@ class Surfaces(NamedTuple):
     """[k, B, L, V', 3] of the first V' nodes by k variables; the others stand still."""
 
 
+class Placements(NamedTuple):
+    """How the recording has a scene at B poses, matrix (x + lag v - centre) + shift, and the derivatives of these by the d
+    variables of the pose (`fit.pose`)."""
+
+    centre: Floats
+    """[3]"""
+    matrix: Floats
+    """[B, 3, 3]"""
+    shift: Floats
+    """[B, 3]"""
+    lag: Floats
+    """[B]"""
+    matrix_rates: Floats
+    """[d, B, 3, 3]"""
+    shift_rates: Floats
+    """[d, 3]"""
+    lag_rates: Floats
+    """[d]"""
+
+
 class Partners(NamedTuple):
-    """N pairs in each frame. Where all motions, or all frames, have the same, an axis is one long instead."""
+    """N pairs in each frame. Where all motions, or all frames, share them, axis B or L has length one."""
 
     corners: Ints
     """[B, L, N, 3] nodes of the face on which a place lies."""
@@ -32,7 +52,7 @@ class Partners(NamedTuple):
     points: Floats
     """[B, L, N, 3] recorded."""
     normals: Floats
-    """[B, L, N, 3] of what is slid along, in the recording; empty: the faces' own."""
+    """[B, L, N, 3] of the surface along which a pair may slide, in the recording; empty: those of the faces."""
     weights: Floats
     """[B, L, N]"""
     spacing: Floats
@@ -50,7 +70,8 @@ def sum_terms(
     slope: Floats,
     curvature: Floats,
 ) -> None:
-    """Add up the loss [B], half of its slope [B, k + d] and of its curvature [B, k + d, k + d].
+    """Add up the loss [B], half of its slope [B, k + d] and of its curvature [B, k + d, k + d], by what moves the nodes and
+    by the pose.
 
     Args:
         cap: largest distance that counts as itself.
@@ -58,11 +79,11 @@ def sum_terms(
     """
     own, cloth = surfaces.rates.shape[0], surfaces.rates.shape[3]
     count = own + len(placements.shift_rates)
-    moves, faces = surfaces.velocities.size > 0, pairs.normals.size == 0
+    moves, own_normals = surfaces.velocities.size > 0, pairs.normals.size == 0
     c0, c1, c2 = placements.centre[0], placements.centre[1], placements.centre[2]
     along, beside = np.empty(count), np.empty(count)
     for b in range(surfaces.nodes.shape[0]):
-        matrix, turned, lag = placements.matrix[b], placements.matrix_rates[:, b], placements.lag[b]
+        matrix, matrix_rates, lag = placements.matrix[b], placements.matrix_rates[:, b], placements.lag[b]
         m00, m01, m02 = matrix[0, 0], matrix[0, 1], matrix[0, 2]
         m10, m11, m12 = matrix[1, 0], matrix[1, 1], matrix[1, 2]
         m20, m21, m22 = matrix[2, 0], matrix[2, 1], matrix[2, 2]
@@ -71,7 +92,7 @@ def sum_terms(
             velocities = _of(surfaces.velocities, b, f) if moves else nodes
             corners, barycentric = _of(pairs.corners, b, f), _of(pairs.barycentric, b, f)
             points, weights = _of(pairs.points, b, f), _of(pairs.weights, b, f)
-            normals = points if faces else _of(pairs.normals, b, f)
+            normals = points if own_normals else _of(pairs.normals, b, f)
             total = found = 0.0
             for pair in range(len(weights)):
                 weight = weights[pair]
@@ -93,7 +114,7 @@ def sum_terms(
                     found += weight * (cap * cap if squared == squared else squared)
                     continue
                 found += weight * squared
-                if faces:
+                if own_normals:
                     f0, f1, f2 = _across(nodes, velocities, lag if moves else 0.0, i, j, k)
                     n0 = m00 * f0 + m01 * f1 + m02 * f2
                     n1 = m10 * f0 + m11 * f1 + m12 * f2
@@ -108,34 +129,31 @@ def sum_terms(
                 size = np.sqrt(t0 * t0 + t1 * t1 + t2 * t2 + pairs.spacing[f] * pairs.spacing[f])
                 if size > 0.0:
                     t0, t1, t2 = t0 / size, t1 / size, t2 / size
-                for one in range(count):
-                    if one < own:
+                for row in range(count):
+                    if row < own:
                         s0 = s1 = s2 = 0.0
                         if i < cloth:
-                            s0, s1, s2 = _inside(rates[one], i, j, k, u, v, w)
+                            s0, s1, s2 = _inside(rates[row], i, j, k, u, v, w)
                         r0 = m00 * s0 + m01 * s1 + m02 * s2
                         r1 = m10 * s0 + m11 * s1 + m12 * s2
                         r2 = m20 * s0 + m21 * s1 + m22 * s2
                     else:
-                        turn, shift, late = (
-                            turned[one - own],
-                            placements.shift_rates[one - own],
-                            placements.lag_rates[one - own],
-                        )
+                        turn, shift = matrix_rates[row - own], placements.shift_rates[row - own]
+                        late = placements.lag_rates[row - own]
                         r0 = turn[0, 0] * p0 + turn[0, 1] * p1 + turn[0, 2] * p2 + shift[0]
                         r1 = turn[1, 0] * p0 + turn[1, 1] * p1 + turn[1, 2] * p2 + shift[1]
                         r2 = turn[2, 0] * p0 + turn[2, 1] * p1 + turn[2, 2] * p2 + shift[2]
                         r0 += late * (m00 * v0 + m01 * v1 + m02 * v2)
                         r1 += late * (m10 * v0 + m11 * v1 + m12 * v2)
                         r2 += late * (m20 * v0 + m21 * v1 + m22 * v2)
-                    slope[b, one] += weight * (r0 * x + r1 * y + r2 * z)
-                    along[one], beside[one] = r0 * n0 + r1 * n1 + r2 * n2, r0 * t0 + r1 * t1 + r2 * t2
-                    for other in range(one + 1):
-                        curvature[b, one, other] += weight * (along[one] * along[other] + beside[one] * beside[other])
+                    slope[b, row] += weight * (r0 * x + r1 * y + r2 * z)
+                    along[row], beside[row] = r0 * n0 + r1 * n1 + r2 * n2, r0 * t0 + r1 * t1 + r2 * t2
+                    for column in range(row + 1):
+                        curvature[b, row, column] += weight * (along[row] * along[column] + beside[row] * beside[column])
             loss[b] += found if total > 0.0 else hidden
-        for one in range(count):
-            for other in range(one):
-                curvature[b, other, one] = curvature[b, one, other]
+        for row in range(count):
+            for column in range(row):
+                curvature[b, column, row] = curvature[b, row, column]
 
 
 @kernel

@@ -25,7 +25,7 @@ from torch import Tensor
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfacePoints
 from diffcloud.clouds.visibility import seen_places
-from diffcloud.fit.pose import Placements, PoseSpace
+from diffcloud.fit.pose import PoseSpace
 from diffcloud.fit.targets import Target
 
 
@@ -38,7 +38,7 @@ class Pairs:
     partners: Tensor
     """[B, L, N, 3] recorded points, in the recording's frame."""
     normals: Tensor | None
-    """[B, L, N, 3] of what is slid along, there too; None: the faces on which the places lie."""
+    """[B, L, N, 3] of the surface along which a pair may slide, there too; None: those of the faces on which places lie."""
     spacing: Tensor
     """[L] between recorded points."""
     weights: Tensor
@@ -92,11 +92,12 @@ class Motion:
             rates: [k, B, L, V', 3] of the first V' nodes, the cloth's; None: k is 0.
             cap: largest distance that counts as itself.
         """
-        from diffcloud.fit.curvature import Partners, Surfaces, sum_terms  # numba takes a moment to import
+        from diffcloud.fit.curvature import Partners, Placements, Surfaces, sum_terms  # numba takes a moment to import
 
         nodes, none = self.nodes, self.nodes.new_zeros(0, 1, 1, 3)
         moving = none if self.velocities is None else self.velocities
-        changes = none[:, None] if rates is None else rates
+        changes = nodes.new_zeros(0, 1, nodes.shape[1], 1, 3) if rates is None else rates
+        self._check(space, rates)
         surfaces = Surfaces(_array(nodes), _array(moving, 0, 1), _array(changes, 1))
         placements = Placements(*map(_array, space.placements(self.pose)))
         count = len(surfaces.rates) + self.pose.shape[1]
@@ -110,12 +111,26 @@ class Motion:
             sum_terms(surfaces, placements, partners, cap, one.share * cap**2, *sums)
         return loss, slope, curvature
 
+    def _check(self, space: PoseSpace, rates: Tensor | None) -> None:
+        """That a kernel, which looks at no bounds, finds all that it reads."""
+        batch, frames = self.nodes.shape[:2]
+        assert self.pose.shape == (batch, len(space.names))
+        assert "lag" not in space.names or self.velocities is not None
+        assert self.velocities is None or self.velocities.shape == self.nodes.shape
+        assert rates is None or rates.shape[1:3] == (batch, frames)
+        for one in self.pairs:
+            shape = (batch, frames, one.weights.shape[2])
+            each = [one.places.nodes, one.places.barycentric, one.partners, *([] if one.normals is None else [one.normals])]
+            assert one.weights.shape == shape
+            assert len(one.spacing) == frames
+            assert all(part.shape == (*shape, 3) for part in each)
+
 
 def _array(tensor: Tensor, *axes: int) -> Any:
-    """The numbers of a tensor as an array; where it is contiguous, they share its memory. Any of these axes along which it
-    was expanded is one long."""
+    """The numbers of a tensor as an array; where it is contiguous, they share its memory. Of these axes, those along which
+    it was expanded have length one."""
     for axis in axes:
-        if tensor.stride(axis) == 0:
+        if tensor.stride(axis) == 0 and tensor.shape[axis] > 1:
             tensor = tensor.narrow(axis, 0, 1)
     return tensor.detach().contiguous().numpy()
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -83,26 +83,6 @@ def parse_priors(text: str) -> dict[str, float]:
         ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.
     """
     return parse_deviations(text, "nuisance", NUISANCE)
-
-
-class Placements(NamedTuple):
-    """How the recording has a scene at B poses: matrix (x + lag v - centre) + shift; and the derivatives of these by the d
-    variables of the pose. As tensors, or as arrays for a kernel."""
-
-    centre: Any
-    """[3]"""
-    matrix: Any
-    """[B, 3, 3]"""
-    shift: Any
-    """[B, 3]"""
-    lag: Any
-    """[B]"""
-    matrix_rates: Any
-    """[d, B, 3, 3]"""
-    shift_rates: Any
-    """[d, 3]"""
-    lag_rates: Any
-    """[d]"""
 
 
 @dataclass(frozen=True)
@@ -206,23 +186,23 @@ class PoseSpace:
         Args:
             velocities: [B, ..., 3] of the points; needed where `lag` is free.
         """
-        at, centred = self.placements(values), points - self.centre
-        found = points.new_zeros(len(self.names), *points.shape)
-        for column, turn, shift, late in zip(found, at.matrix_rates, at.shift_rates, at.lag_rates, strict=True):
+        _, matrix, _, _, *rates = self.placements(values)
+        centred, found = points - self.centre, points.new_zeros(len(self.names), *points.shape)
+        for column, turn, shift, late in zip(found, *rates, strict=True):
             column += _turned(centred, turn) + shift
             if late:
                 assert velocities is not None
-                column += late * _turned(velocities, at.matrix)
+                column += late * _turned(velocities, matrix)
         return found
 
-    def placements(self, values: Tensor) -> Placements:
-        """Of values [B, d]."""
+    def placements(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """What x' = matrix (x + lag v - centre) + shift consists of at values [B, d]: centre [3], matrix [B, 3, 3], shift
+        [B, 3] and lag [B]; and how the last three change with the values, [d, B, 3, 3], [d, 3] and [d]."""
         count, free = len(values), len(self.names)
         growth, angles = self._growth(values)[..., None], self._parts(values, _ANGLES)
-        matrix, shift = growth * _rotation(angles), self._parts(values, _SHIFTS)
-        lag = self.lag(values)
+        matrix, shift, lag = growth * _rotation(angles), self._parts(values, _SHIFTS), self.lag(values)
         matrix_rates, shift_rates, lag_rates = (values.new_zeros(free, *each) for each in ((count, 3, 3), (3,), ()))
-        turnings = growth * _turnings(angles) if set(_ANGLES) & set(self.names) else None
+        turnings = growth * _turnings(angles)
         for place, name in enumerate(self.names):
             if name == "lag":
                 lag_rates[place] = 1.0
@@ -230,11 +210,11 @@ class PoseSpace:
                 matrix_rates[place] = matrix
             elif name in _SHIFTS:
                 shift_rates[place, _SHIFTS.index(name)] = 1.0
-            elif turnings is not None:
+            else:
                 matrix_rates[place] = turnings[_ANGLES.index(name)]
-        centre = self.centre if free else torch.zeros_like(self.centre)
-        late = values.new_zeros(count) if lag is None else lag
-        return Placements(centre, matrix, centre + shift, late, matrix_rates, shift_rates, lag_rates)
+        centre = self.centre if free else torch.zeros_like(self.centre)  # then `moved` leaves points as they are
+        lag = values.new_zeros(count) if lag is None else lag
+        return centre, matrix, centre + shift, lag, matrix_rates, shift_rates, lag_rates
 
     def _growth(self, values: Tensor) -> Tensor:
         """[B, 1] of values [B, d]: how many times as large the scene shows."""

@@ -200,7 +200,7 @@ class TestTermsOfPosedFaces:
         (gradient,) = torch.autograd.grad(found.sum(), moved)
         torch.testing.assert_close(loss, found.detach())
         torch.testing.assert_close(2 * slope, torch.einsum("blnik,blni->bk", self.columns(motion, space, rates), gradient))
-        assert 0 < int((gradient == 0).all(-1).sum()) < 300  # some are beyond the cap
+        assert 0 < int((gradient == 0).all(-1).sum()) < gradient[..., 0].numel()  # some are beyond the cap
 
     def test_they_slide_along_the_faces(self, motion, space, rates):
         """As along stated normals that are the faces'."""
@@ -225,6 +225,55 @@ class TestTermsOfPosedFaces:
             along = torch.einsum("blnik,blni->blnk", columns, way)
             expected = expected + torch.einsum("blnj,blnk,bln->bjk", along, along, pairs.weights)
         torch.testing.assert_close(curvature, expected)
+
+    def test_without_variables_of_the_motion_those_of_the_pose_are_left(self, motion, space, rates):
+        loss, slope, curvature = motion.terms(space, rates, 0.4)
+        found = motion.terms(space, None, 0.4)
+        for one, of in zip(found, (loss, slope[:, 2:], curvature[:, 2:, 2:]), strict=True):
+            torch.testing.assert_close(one, of)
+
+    def test_what_motions_and_frames_share_need_not_be_copied(self, motion, space, rates):
+        (pairs,) = motion.pairs
+        shared = motion.velocities[:1, :1].expand(3, 2, -1, -1)
+        partners, weights = pairs.partners[:, :1].expand(-1, 2, -1, -1), pairs.weights[:, :1].expand(-1, 2, -1)
+        whole = replace(motion, velocities=shared, pairs=(replace(pairs, partners=partners, weights=weights),))
+        (of,) = whole.pairs
+        places = SurfacePoints(of.places.nodes.clone(), of.places.barycentric.contiguous())
+        copied = replace(of, places=places, partners=of.partners.contiguous(), weights=of.weights.contiguous())
+        every = rates[:, :1].expand(-1, 3, -1, -1, -1)
+        expected = replace(whole, velocities=shared.contiguous(), pairs=(copied,)).terms(space, every.contiguous(), 0.4)
+        for found, one in zip(whole.terms(space, every, 0.4), expected, strict=True):
+            assert torch.equal(found, one)
+
+    def test_a_frame_in_which_nothing_counts_and_positions_that_are_no_numbers_lose_as_they_do(self, motion, space):
+        (pairs,) = motion.pairs
+        weights = pairs.weights.clone()
+        weights[0, 1] = 0.0
+        nodes = motion.nodes.clone()
+        nodes[1, 0, 3] = torch.nan
+        motion = replace(motion, nodes=nodes, pairs=(replace(pairs, weights=weights),))
+        loss, slope, _ = motion.terms(space, None, 0.4)
+        expected = motion.pairs[0].losses(self.places(motion, space, nodes, motion.pose), 0.4).sum(-1)
+        torch.testing.assert_close(loss, expected, equal_nan=True)
+        assert loss.isnan().tolist() == [False, True, False]
+        assert bool(slope.isfinite().all())
+
+    def test_a_face_without_area_has_no_normal(self, motion, space):
+        nodes = motion.nodes[..., :1, :].expand(motion.nodes.shape)
+        _, _, curvature = replace(motion, nodes=nodes, velocities=torch.zeros_like(nodes)).terms(space, None, torch.inf)
+        assert bool(curvature.isfinite().all())
+
+    def test_what_does_not_belong_together_is_refused(self, motion, space, rates, free):
+        (pairs,) = motion.pairs
+        with pytest.raises(AssertionError):
+            replace(motion, pose=motion.pose[:1]).terms(space, rates, 0.4)
+        with pytest.raises(AssertionError):
+            motion.terms(space, rates[:, :, :1], 0.4)
+        with pytest.raises(AssertionError):
+            replace(motion, pairs=(replace(pairs, partners=pairs.partners[:2]),)).terms(space, rates, 0.4)
+        if "lag" in free:
+            with pytest.raises(AssertionError):
+                replace(motion, velocities=None).terms(space, rates, 0.4)
 
     def test_all_pairs_count(self, motion, space, rates):
         twice = replace(motion, pairs=(*motion.pairs, *motion.pairs)).terms(space, rates, 0.4)

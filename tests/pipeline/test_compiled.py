@@ -104,3 +104,10 @@ def test_the_fingerprint_follows_kernels_and_the_simulator_alone(tmp_path):
     sources = {path.name for path in compiled.kernel_sources()}
     assert {"tree.py", "curve.py"} <= sources
     assert "losses.py" not in sources
+
+
+def test_the_fingerprint_follows_what_kernels_are_given():
+    """Fields of one type could change places, and machine code that is kept would read the wrong ones."""
+    given = {path for path in (ROOT / "diffcloud").rglob("*.py") if "(NamedTuple)" in path.read_text()}
+    assert len(given) > 10
+    assert given <= set(compiled.kernel_sources())

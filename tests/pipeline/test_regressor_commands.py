@@ -208,7 +208,7 @@ def test_without_a_scenario_those_of_the_parameters_are_fitted(work):
     (work / "params.yaml").write_text(yaml.safe_dump(params))
     fit = ("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
     message = str(run(*fit, code=1).exception)
-    assert "folders for small, but none for other" in message
+    assert "a folder for small, but none for other" in message
     assert "Give --scenario small data/episodes/small" in message
     assert not (work / "data/fits").exists()
     shutil.copytree(work / "data/episodes/small", work / "data/episodes/other")

@@ -13,13 +13,12 @@ from diffcloud.fit.solvers import SOLVERS
 from diffcloud.sim.properties import PARAMETERS
 from pipeline import solver_race
 from pipeline.fit_jobs import FitJob, Recording
-from pipeline.solver_race import COUNTS, SCENARIOS, race_jobs, race_page, race_rows
+from pipeline.solver_race import COUNTS, SCENARIOS, RaceJob, race_jobs, race_page, race_rows, race_scenario
 from tests.pipeline.invoke import invoke
 
 
 def job(tmp_path, scenario="lift", count=2, index=0, seed=1):
-    every = race_jobs(index + 1, seed, tmp_path)
-    return next(one for one in every if one.label == f"{scenario}/{count}/{index}")
+    return RaceJob(race_scenario(scenario, count), count, index, seed, tmp_path)
 
 
 def test_truths_lie_within_the_bounds_and_more_variables_leave_the_first_as_they_are(tmp_path):
@@ -37,13 +36,12 @@ def test_truths_lie_within_the_bounds_and_more_variables_leave_the_first_as_they
     assert job(tmp_path, index=1).truth() != truths[0] != job(tmp_path, scenario="fold").truth()
 
 
-@pytest.mark.parametrize("count", COUNTS)
-def test_a_fit_has_as_many_variables_as_the_target_and_starts_at_its_truth(tmp_path, count):
-    one = job(tmp_path, count=count)
+@pytest.mark.parametrize(("scenario", "count"), [*(("lift", count) for count in COUNTS), ("fold", COUNTS[-1])])
+def test_a_fit_has_the_variables_of_its_target_which_lies_within_their_bounds(tmp_path, scenario, count):
+    one = job(tmp_path, scenario=scenario, count=count)
     fit = FitJob("", [Recording(one.scenario, "", one._episode(one.truth()))], one._config(), tmp_path)
     assert set(fit.space.names) == set(one.truth())
-    axis = [(variable.low, variable.high) for variable in fit.space.variables]
-    assert all(low <= one.truth()[name] <= high for name, (low, high) in zip(fit.space.names, axis, strict=True))
+    assert all(variable.low <= one.truth()[variable.name] <= variable.high for variable in fit.space.variables)
 
 
 def test_the_target_moves_with_each_of_its_variables(tmp_path, monkeypatch):
