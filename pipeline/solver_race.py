@@ -219,9 +219,9 @@ def race_page(rows: Sequence[Sequence[str]], seed: int) -> str:
         "",
         "Cells hold medians over all targets of processor time on one thread and of simulations (one with derivatives "
         "counts once), and how many targets were reached. A dash: half of them or more were not. Two variables are "
-        "stretch and mass; four, bending and drag too; eight, also damping, both frictions and shear. With twelve, the "
-        "cloth gives way to compression, and how much is fitted, as is how it lies: its turn, its size, and how far the "
-        f"gripper goes (`--laid {_LAID}`). That needs a cloth that lies level, which bands and vests do not.",
+        "stretch and mass; four, bending and drag too; eight, also damping, both frictions and shear. Twelve add the "
+        "compression of a cloth that gives way to it, and how the cloth lies: its turn, its size, and how far the gripper "
+        f"goes (`--laid {_LAID}`). For that, it must lie level, as bands and vests do not.",
         "",
         *markdown_table(HEAD, rows),
         "",
