@@ -246,8 +246,10 @@ def _by_scenario(episodes: list[Path], scenarios: list[str]) -> bool:
     Raises:
         ConfigError: for some of them only.
     """
-    missing = [name for name in scenarios if len(episodes) != 1 or not (episodes[0] / name).is_dir()]
-    there = [name for name in scenarios if name not in missing]
+    if len(episodes) != 1:
+        return False
+    there = [name for name in scenarios if (episodes[0] / name).is_dir()]
+    missing = [name for name in scenarios if name not in there]
     if there and missing:
         raise ConfigError(
             f"{episodes[0]} has a folder for {', '.join(there)}, but none for {', '.join(missing)}. Give --scenario "

@@ -165,13 +165,13 @@ class RaceJob:
 
 def race_jobs(targets: int, seed: int, out: Path) -> list[RaceJob]:
     """The first target of every cell, then the second of every cell, and so on."""
-    return [
-        RaceJob(race_scenario(name, count), count, index, seed, out)
-        for index in range(targets)
+    cells = [
+        (race_scenario(name, count), count)
         for name in SCENARIOS
         for count in COUNTS
         if count <= len(ORDER) or name in _LEVEL
     ]
+    return [RaceJob(scenario, count, index, seed, out) for index in range(targets) for scenario, count in cells]
 
 
 def race_scenario(name: str, count: int) -> Scenario:

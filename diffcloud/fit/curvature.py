@@ -115,7 +115,7 @@ def sum_terms(
                     continue
                 found += weight * squared
                 if own_normals:
-                    f0, f1, f2 = _across(nodes, velocities, lag if moves else 0.0, i, j, k)
+                    f0, f1, f2 = _across(nodes, velocities, lag, i, j, k)
                     n0 = m00 * f0 + m01 * f1 + m02 * f2
                     n1 = m10 * f0 + m11 * f1 + m12 * f2
                     n2 = m20 * f0 + m21 * f1 + m22 * f2
@@ -174,7 +174,7 @@ def _inside(values: Floats, i: int, j: int, k: int, u: float, v: float, w: float
 
 @kernel
 def _across(nodes: Floats, velocities: Floats, lag: float, i: int, j: int, k: int) -> tuple[float, float, float]:
-    """Normal of a face, as long as twice its area."""
+    """Normal of a face after a lag, as long as twice its area. Without velocities, the lag is zero."""
     a0, a1, a2 = nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1], nodes[j, 2] - nodes[i, 2]
     b0, b1, b2 = nodes[k, 0] - nodes[i, 0], nodes[k, 1] - nodes[i, 1], nodes[k, 2] - nodes[i, 2]
     if lag != 0.0:

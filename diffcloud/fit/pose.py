@@ -173,7 +173,7 @@ class PoseSpace:
         """[B, ..., 3] displacements in the scene at values [B, d] -> in the recording."""
         if not self.names:
             return vectors
-        return _turned(vectors, self._growth(values)[..., None] * self.rotation(values))
+        return _turned(vectors, self._matrix(values))
 
     def back(self, points: Tensor, values: Tensor) -> Tensor:
         """[..., 3] points of the recording -> [B, ..., 3] where the scene at values [B, d] has them."""
@@ -200,7 +200,7 @@ class PoseSpace:
         [B, 3] and lag [B]; and how the last three change with the values, [d, B, 3, 3], [d, 3] and [d]."""
         count, free = len(values), len(self.names)
         growth, angles = self._growth(values)[..., None], self._parts(values, _ANGLES)
-        matrix, shift, lag = growth * _rotation(angles), self._parts(values, _SHIFTS), self.lag(values)
+        matrix, shift, lag = self._matrix(values), self._parts(values, _SHIFTS), self.lag(values)
         matrix_rates, shift_rates, lag_rates = (values.new_zeros(free, *each) for each in ((count, 3, 3), (3,), ()))
         turnings = growth * _turnings(angles)
         for place, name in enumerate(self.names):
@@ -215,6 +215,10 @@ class PoseSpace:
         centre = self.centre if free else torch.zeros_like(self.centre)  # then `moved` leaves points as they are
         lag = values.new_zeros(count) if lag is None else lag
         return centre, matrix, centre + shift, lag, matrix_rates, shift_rates, lag_rates
+
+    def _matrix(self, values: Tensor) -> Tensor:
+        """[B, 3, 3] of values [B, d]: turns and scales."""
+        return self._growth(values)[..., None] * self.rotation(values)
 
     def _growth(self, values: Tensor) -> Tensor:
         """[B, 1] of values [B, d]: how many times as large the scene shows."""
