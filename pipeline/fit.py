@@ -253,7 +253,7 @@ def _by_scenario(episodes: list[Path], scenarios: list[str]) -> bool:
     if there and missing:
         raise ConfigError(
             f"{episodes[0]} has a folder for {', '.join(there)}, but none for {', '.join(missing)}. Give --scenario "
-            f"{there[0]} {episodes[0] / there[0]}, or a parameters file (--params) whose `scenarios` has no others."
+            f"{there[0]} {episodes[0] / there[0]}, or a parameters file (--params) whose `scenarios` all have one."
         )
     return not missing
 

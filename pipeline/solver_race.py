@@ -210,18 +210,18 @@ def race_page(rows: Sequence[Sequence[str]], seed: int) -> str:
     lines = [
         "# Solvers on drawn cloths",
         "",
-        f"How long each solver takes until its loss is at most {WITHIN:g} times that of a reference fit: the lower one of "
+        f"How long each solver takes until its loss is at most {WITHIN:g} times that of a reference fit: the better of "
         "Gauss–Newton from the truth, and from the six best of 97 candidates. A target is a cloth of drawn parameters "
         f"(seed {seed}), its whole surface with {1e3 * _NOISE_M:g} mm of noise, shifted by about {1e2 * _BESIDE_M:g} cm "
         "and turned by about 5°. All solvers minimise the same objective, with priors and with the pose found "
-        f"for every parameter set, and may spend {BUDGET} simulations; Adam has the screen of Gauss–Newton and "
-        f"{_ADAM_STARTS} starts.",
+        f"for every parameter set, and may spend {BUDGET} simulations; Adam gets {_ADAM_STARTS} starts "
+        "from Gauss–Newton's screen.",
         "",
         "Cells hold medians over all targets of processor time on one thread and of simulations (one with derivatives "
         "counts once), and how many targets were reached. A dash: half of them or more were not. Two variables are "
-        "stretch and mass; four, bending and drag too; eight, also damping, both frictions and shear. Twelve add the "
-        "compression of a cloth that gives way to it, and how the cloth lies: its turn, its size, and how far the gripper "
-        f"goes (`--laid {_LAID}`). For that, it must lie level, as bands and vests do not.",
+        "stretch and mass; four, bending and drag too; eight, also damping, both frictions and shear. Twelve add "
+        "compression, of a cloth that wrinkles, the cloth's turn and size, and how far the gripper goes "
+        f"(`--laid {_LAID}`). That needs a cloth that lies level, so bands and vests have no such row.",
         "",
         *markdown_table(HEAD, rows),
         "",

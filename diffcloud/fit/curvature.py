@@ -11,8 +11,8 @@ from diffcloud.sim.compiled.data import Floats, Ints
 
 
 class Surfaces(NamedTuple):
-    """B motions of V nodes at L frames. Where all of them share velocities or rates, axis B of these has length one; axis L
-    of velocities, too, where all frames share them."""
+    """B motions of V nodes at L frames. Axis B of velocities or rates has length one where all motions share them; so has
+    axis L of velocities where all frames do."""
 
     nodes: Floats
     """[B, L, V, 3]"""
@@ -23,7 +23,7 @@ class Surfaces(NamedTuple):
 
 
 class Placements(NamedTuple):
-    """How the recording has a scene at B poses, matrix (x + lag v - centre) + shift, and the derivatives of these by the d
+    """Where B poses put a scene in the recording, matrix (x + lag v - centre) + shift, and its derivatives by the d
     variables of the pose (`fit.pose`)."""
 
     centre: Floats

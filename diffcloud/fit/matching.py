@@ -112,7 +112,7 @@ class Motion:
         return loss, slope, curvature
 
     def _check(self, space: PoseSpace, rates: Tensor | None) -> None:
-        """That a kernel, which looks at no bounds, finds all that it reads."""
+        """Assert the shapes on which the kernel, which checks no bounds, relies."""
         batch, frames = self.nodes.shape[:2]
         assert self.pose.shape == (batch, len(space.names))
         assert "lag" not in space.names or self.velocities is not None
