@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from diffcloud.mesh import grid_cloth
-from diffcloud.sim.compiled.sparse import add_assemble, cholesky, hold, pattern, slots, solve, widened
+from diffcloud.sim.compiled.sparse import add_assemble, cholesky, hold, pattern, reordered, slots, solve, widened
 
 SHAPES = pytest.mark.parametrize("shape", [(2, 2), (3, 7), (6, 6), (4, 15)])
 
@@ -69,7 +69,7 @@ def test_a_wider_pattern_keeps_what_was_there_and_takes_more(shape, rng):
     of, matrix, dense = random_system(mesh, rng)
     first, second = rng.integers(0, len(mesh.nodes), (2, 9))
     first, second = first[first != second], second[first != second]
-    wide, moved = widened(of, first, second)
+    wide, moved = widened(of, first, second, of.place)
     larger = np.zeros((len(wide.rows) + 1, 9))
     larger[moved] = matrix[:-1]
     np.testing.assert_array_equal(dense_of(wide, larger), dense_of(of, matrix))
@@ -88,6 +88,51 @@ def test_a_wider_pattern_keeps_what_was_there_and_takes_more(shape, rng):
     right = rng.normal(size=(len(mesh.nodes), 3))
     expected = np.linalg.solve(dense, right.ravel()).reshape(-1, 3)
     np.testing.assert_allclose(solved(wide, larger, right), expected, rtol=1e-9, atol=1e-11)
+
+
+@SHAPES
+def test_a_wider_pattern_may_be_eliminated_in_another_order(shape, rng):
+    """Blocks that are then above the diagonal are transposed, and the solution is the same."""
+    mesh = grid_cloth(*shape, 1.0, 1.0)
+    of, matrix, dense = random_system(mesh, rng)
+    nodes = len(mesh.nodes)
+    plain, _ = widened(of, np.arange(nodes - 1), np.full(nodes - 1, nodes - 1), of.place)
+    wide, moved = widened(of, np.arange(nodes - 1), np.full(nodes - 1, nodes - 1), reordered(plain))
+    assert (moved < 0).any() or nodes == 4
+    larger = np.zeros((len(wide.rows) + 1, 9))
+    for old, new in enumerate(moved):
+        larger[max(new, ~new)] = matrix[old] if new >= 0 else matrix[old].reshape(3, 3).T.ravel()
+    np.testing.assert_array_equal(dense_of(wide, larger), dense_of(of, matrix))
+    right = rng.normal(size=(nodes, 3))
+    expected = np.linalg.solve(dense, right.ravel()).reshape(-1, 3)
+    np.testing.assert_allclose(solved(wide, larger, right), expected, rtol=1e-9, atol=1e-11)
+
+
+def test_two_layers_that_touch_are_eliminated_with_little_fill():
+    """Without another order, the factor of coupled layers is several times as long as of two that are apart."""
+    one = grid_cloth(20, 20, 1.0, 1.0)
+    groups = [one.hinges.nodes, one.hinges.nodes + len(one.nodes)]
+    apart = pattern(2 * len(one.nodes), groups)
+    first = np.arange(len(one.nodes))
+    second = len(one.nodes) + np.random.default_rng(0).permutation(first.reshape(20, 20)[:, ::-1]).ravel()
+    turned = len(one.nodes) + first.reshape(20, 20)[:, ::-1].ravel()  # lies the other way round on the first one
+    for others in (turned, second):
+        kept, _ = widened(apart, first, others, apart.place)
+        found, _ = widened(apart, first, others, reordered(kept))
+        known = pattern(2 * len(one.nodes), [*groups, np.column_stack([first, others])])  # another library's order
+        assert len(found.factor_rows) < 1.25 * len(known.factor_rows)
+    assert len(kept.factor_rows) > 1.5 * len(found.factor_rows)
+
+
+@pytest.mark.parametrize("count", [1, 2, 17])
+def test_a_chain_is_eliminated_without_fill(count):
+    """From its ends, whatever the numbers of its nodes."""
+    order = np.random.default_rng(count).permutation(count)
+    chain = pattern(count, [np.column_stack([order[:-1], order[1:]])])
+    place = reordered(chain)
+    assert sorted(place) == list(range(count))
+    found, _ = widened(chain, np.empty(0, np.int64), np.empty(0, np.int64), place)
+    assert len(found.factor_rows) == 2 * count - 1
 
 
 def test_held_nodes_couple_with_nothing(rng):

@@ -2,9 +2,8 @@
 
 Nodes are numbered anew by their *place* in an order that keeps the factors small (minimum degree, as SuperLU finds it). The
 lower half is stored column by column; an element finds its blocks by *slots* that are worked out once. Contact
-between parts
-of the cloth that share no element adds blocks in single steps, and the pattern of the factor is then found again,
-which costs about as much as the factor.
+between parts of the cloth that share no element adds blocks in single steps. The pattern of the factor is then found
+again, and, where the order no longer suits it, another order (`ordering`).
 
 Cholesky for the linearised step. For the exact Jacobian of the implicit step, which is not symmetric but has a symmetric
 pattern, LU by blocks: the upper half is stored transposed, in the pattern of the lower. It does not exchange rows
@@ -24,6 +23,7 @@ from scipy.sparse.linalg import splu
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints
+from diffcloud.sim.compiled.ordering import minimum_degree
 from diffcloud.sim.compiled.sorting import sort_part
 
 
@@ -201,41 +201,77 @@ def hold(of: Pattern, holder: Ints, mass: Floats, matrix: Floats) -> None:
 
 
 @kernel
-def widened(of: Pattern, first: Ints, second: Ints) -> tuple[Pattern, Ints]:
-    """A pattern with more pairs of nodes, and where the blocks of the old one lie in it."""
-    count = len(of.place)
-    last, following = np.full(count, -1, np.int64), np.empty(len(first), np.int64)  # the pairs of each column
+def widened(of: Pattern, first: Ints, second: Ints, place: Ints) -> tuple[Pattern, Ints]:
+    """A pattern with more pairs of nodes, eliminated in a given order, and where the blocks of the old one lie in it.
+
+    Args:
+        first, second: nodes of the pairs to add; a pair may stand there several times.
+        place: [V] of each node in the order of elimination; `of.place` keeps the old one.
+
+    Returns:
+        The pattern, and [A] the place of each old block: s, or ~s where it is transposed.
+    """
+    count, known = len(place), len(of.rows)
+    node = np.empty(count, np.int64)
+    for i in range(count):
+        node[of.place[i]] = i
+    row, flipped = np.empty(known + len(first), np.int64), np.zeros(known, np.bool_)
+    last, following = np.full(count, -1, np.int64), np.empty(len(row), np.int64)  # the blocks of each column
+    for j in range(count):
+        for p in range(of.starts[j], of.starts[j + 1]):
+            a, b = place[node[of.rows[p]]], place[node[j]]
+            flipped[p], row[p] = a < b, max(a, b)
+            following[p], last[min(a, b)] = last[min(a, b)], p
     for e in range(len(first)):
-        column = min(of.place[first[e]], of.place[second[e]])
-        following[e], last[column] = last[column], e
-    starts, rows = np.zeros(count + 1, np.int64), np.empty(len(of.rows) + len(first), np.int64)
-    moved = np.empty(len(of.rows), np.int64)
+        a, b = place[first[e]], place[second[e]]
+        row[known + e] = max(a, b)
+        following[known + e], last[min(a, b)] = last[min(a, b)], known + e
+    starts, rows = np.zeros(count + 1, np.int64), np.empty(len(row), np.int64)
+    moved, at = np.empty(known, np.int64), np.full(count, -1, np.int64)
     used = 0
     for j in range(count):
-        begin = used
-        for p in range(of.starts[j], of.starts[j + 1]):
-            rows[used] = of.rows[p]
-            used += 1
-        e = last[j]
+        begin, e = used, last[j]
         while e >= 0:
-            row = max(of.place[first[e]], of.place[second[e]])
-            known = False
-            for p in range(begin, used):
-                known = known or rows[p] == row
-            if not known:
-                rows[used] = row
+            if at[row[e]] < begin:
+                at[row[e]], rows[used] = used, row[e]
                 used += 1
             e = following[e]
         sort_part(rows, begin, used)
+        for p in range(begin, used):
+            at[rows[p]] = p
+        e = last[j]
+        while e >= 0:
+            if e < known:
+                moved[e] = ~at[row[e]] if flipped[e] else at[row[e]]
+            e = following[e]
         starts[j + 1] = used
-        p = begin
-        for old in range(of.starts[j], of.starts[j + 1]):
-            while rows[p] != of.rows[old]:
-                p += 1
-            moved[old] = p
-    rows = rows[:used]
+    rows = rows[:used].copy()
     factor_starts, factor_rows = factor_pattern(starts, rows)
-    return Pattern(of.place, starts, rows, factor_starts, factor_rows), moved
+    return Pattern(place, starts, rows, factor_starts, factor_rows), moved
+
+
+@kernel
+def reordered(of: Pattern) -> Ints:
+    """The place [V] of each node in an order of elimination that suits this pattern, by `minimum_degree`."""
+    count = len(of.place)
+    starts = np.zeros(count + 1, np.int64)
+    for j in range(count):
+        for p in range(of.starts[j] + 1, of.starts[j + 1]):
+            starts[j + 1] += 1
+            starts[of.rows[p] + 1] += 1
+    for j in range(count):
+        starts[j + 1] += starts[j]
+    neighbours, filled = np.empty(starts[count], np.int64), starts[:count].copy()
+    for j in range(count):
+        for p in range(of.starts[j] + 1, of.starts[j + 1]):
+            i = of.rows[p]
+            neighbours[filled[i]], neighbours[filled[j]] = j, i
+            filled[i] += 1
+            filled[j] += 1
+    order, place = minimum_degree(starts, neighbours), np.empty(count, np.int64)
+    for i in range(count):
+        place[i] = order[of.place[i]]
+    return place
 
 
 @kernel

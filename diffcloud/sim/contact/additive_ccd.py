@@ -39,7 +39,7 @@ def safe_fraction(pairs: Ints, distances: Floats, start: Floats, end: Floats, li
         # most pairs move so little that they need no look, not even at what their points have in common
         if reach(pairs, c, ways) * limit <= (1 - _LEFT) * distances[c]:
             continue
-        bound = _bound(pairs, c, start, end, x, motion)
+        bound = approach(pairs, c, start, end, x, motion)
         # a pair that moves so little that it cannot touch needs no look
         if not bound * limit > (1 - _LEFT) * distances[c]:
             continue
@@ -82,7 +82,7 @@ def reach(pairs: Ints, c: int, lengths: Floats) -> float:
 
 
 @kernel
-def _bound(pairs: Ints, c: int, start: Floats, end: Floats, x: Floats, motion: Floats) -> float:
+def approach(pairs: Ints, c: int, start: Floats, end: Floats, x: Floats, motion: Floats) -> float:
     """How fast a pair can come closer [m]; x, motion [4, 3] take where its points start and how they go, without what
     they have in common."""
     for axis in range(3):

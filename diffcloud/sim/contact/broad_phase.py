@@ -13,6 +13,7 @@ from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Flags, Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.compiled.sorting import ascending
+from diffcloud.sim.contact.rest import listed_in
 from diffcloud.sim.contact.surface import SurfaceBox
 
 _FEW = 600
@@ -28,7 +29,8 @@ _ROUNDING = 1e-9
 def candidates(surface: SurfaceBox, places: Floats, others: Floats, margin: float) -> tuple[Ints, Ints]:
     """Pairs whose boxes come within `margin` of each other [m]: (point-face [C, 2], edge-edge [C, 2]) in no order.
 
-    Pairs that share a point, that lie on one obstacle, or of which neither can move are left out.
+    Pairs that share a point, that lie on one obstacle, of which neither can move, or that are near at rest (`rest`) are
+    left out.
 
     Args:
         places, others: [N, 3] positions of all points; a box holds a primitive at both (start and end of a motion).
@@ -37,8 +39,8 @@ def candidates(surface: SurfaceBox, places: Floats, others: Floats, margin: floa
         Indices into the surface's points and faces, and into its edges (twice): first one that can move.
     """
     points, faces, edges = boxes_of(surface, places, others, margin)
-    between = _pool(surface, surface.points.reshape(-1, 1), surface.faces)
-    among = _pool(surface, surface.edges, surface.edges)
+    between = _pool(surface, surface.points.reshape(-1, 1), surface.faces, surface.rest_face_starts, surface.rest_faces)
+    among = _pool(surface, surface.edges, surface.edges, surface.rest_edge_starts, surface.rest_edges)
     point_face = _swept_between(between, points, faces) if len(faces) < _FEW else _in_cells(between, points, faces)
     if len(edges) < _FEW:
         return point_face, _swept_among(among, edges)
@@ -62,13 +64,25 @@ class _Pool(NamedTuple):
     """[owners]"""
     touches_itself: bool
     """The cloth."""
+    rest_starts: Ints
+    """Of the lists of second primitives that are near each first one of the cloth at rest."""
+    rest: Ints
+    """Their members."""
 
 
 @kernel
-def _pool(surface: SurfaceBox, first: Ints, second: Ints) -> _Pool:
+def _pool(surface: SurfaceBox, first: Ints, second: Ints, rest_starts: Ints, rest: Ints) -> _Pool:
     owner, movable = surface.owner, surface.movable
     return _Pool(
-        first, second, movable[owner[first[:, 0]]], movable[owner[second[:, 0]]], owner, movable, surface.touches_itself
+        first,
+        second,
+        movable[owner[first[:, 0]]],
+        movable[owner[second[:, 0]]],
+        owner,
+        movable,
+        surface.touches_itself,
+        rest_starts,
+        rest,
     )
 
 
@@ -284,6 +298,10 @@ def _note(pool: _Pool, found: Ints, count: int, a: int, b: int) -> int:
         for l in range(second.shape[1]):
             if first[a, k] == second[b, l]:
                 return count
+    if owner_a == owner_b:
+        low, high = (min(a, b), max(a, b)) if first.shape[1] > 1 else (a, b)
+        if listed_in(pool.rest_starts, pool.rest, low, high):
+            return count
     if first.shape[1] > 1 and (not pool.movable[owner_a] or (pool.movable[owner_b] and b < a)):
         a, b = b, a
     found[count, 0], found[count, 1] = a, b

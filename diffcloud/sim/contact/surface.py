@@ -19,6 +19,7 @@ from diffcloud.compiled import kernel
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh, directed_edges
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints
+from diffcloud.sim.contact.rest import near_at_rest
 
 _FLAT = 1e-6
 """Sine of the dihedral angle below which an obstacle's edge counts as flat."""
@@ -57,6 +58,14 @@ class Surface(NamedTuple):
     """[owners]: the cloth, and bodies that contact can move."""
     touches_itself: bool
     """Whether the cloth's own parts are paired with each other."""
+    rest_faces: Ints
+    """Faces that are near each node of the cloth at rest, with which it is not paired (`rest.Lists.members`)."""
+    rest_face_starts: Ints
+    """[V + 1]"""
+    rest_edges: Ints
+    """Edges that are near each edge of the cloth at rest, those with a larger number."""
+    rest_edge_starts: Ints
+    """[edges of the cloth + 1]"""
 
 
 class SurfaceBoxType(BoxType):  # type: ignore[misc]
@@ -89,6 +98,10 @@ def boxed(surface: Surface) -> SurfaceBox:
         surface.corner_share,
         surface.movable,
         surface.touches_itself,
+        surface.rest_faces,
+        surface.rest_face_starts,
+        surface.rest_edges,
+        surface.rest_edge_starts,
     )
 
 
@@ -99,10 +112,12 @@ def contact_surface(
     movable: Sequence[bool] | None = None,
     all_edges: bool = False,
     touches_itself: bool = True,
+    apart_at_rest: float = 0.0,
 ) -> Surface:
     """Join a cloth and its obstacles.
 
     Args:
+        apart_at_rest: primitives of the cloth that are nearer than this at rest, measured on the cloth, are not paired [m].
         movable: of each obstacle; default none.
         touches_itself: whether the cloth's own parts are paired with each other.
         all_edges: keep the flat and concave edges and points of obstacles, as ARCSim does.
@@ -133,6 +148,8 @@ def contact_surface(
         owner.append(np.full(len(mesh.nodes), index + 1, dtype=np.int64))
         count, face_count = count + len(mesh.nodes), face_count + len(mesh.faces)
 
+    rest = near_at_rest(cloth, apart_at_rest if touches_itself else 0.0)
+
     def whole(parts: list[NDArray[np.int64]]) -> Ints:
         return np.ascontiguousarray(np.concatenate(parts), dtype=np.int64)
 
@@ -155,6 +172,10 @@ def contact_surface(
         corner_share=real([corner for _, corner in shares]),
         movable=np.array([True, *movable]),
         touches_itself=touches_itself,
+        rest_faces=rest.faces.members,
+        rest_face_starts=rest.faces.starts,
+        rest_edges=rest.edges.members,
+        rest_edge_starts=rest.edges.starts,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from diffcloud.sim.contact.places import Planes
+from diffcloud.sim.contact.rest import CREASE
 from diffcloud.sim.contact.surface import contact_surface
 from diffcloud.sim.implicit.scene import Rigid, Scene
 from diffcloud.sim.terms.elements import elements
@@ -22,6 +23,7 @@ def build_scene(setup: Setup, time_step: float) -> Scene:
         meshes,
         movable=[False] * len(fixed) + [True] * len(bodies),
         touches_itself=surrounding.self_contact,
+        apart_at_rest=CREASE * surrounding.contact.repulsion_thickness,
     )
     nodes, others = len(mesh.nodes), sum(len(obstacle.nodes) for obstacle in fixed)
     normals, offsets = half_spaces(mesh, surrounding)

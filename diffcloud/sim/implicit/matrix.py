@@ -7,7 +7,7 @@ import numpy as np
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Parameters, Timing
 from diffcloud.sim.compiled.lu import General, factorised
-from diffcloud.sim.compiled.sparse import find_slot, widened
+from diffcloud.sim.compiled.sparse import find_slot, reordered, widened
 from diffcloud.sim.contact.places import Touching, corners
 from diffcloud.sim.contact.resistance import resistance
 from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
@@ -18,6 +18,8 @@ _assemble, _jacobian, _spin_tangent = kernels.assemble, kernels.jacobian, kernel
 _pp_jacobian, _pe_jacobian = kernels.barrier_point_point_jacobian, kernels.barrier_point_edge_jacobian
 _pf_jacobian, _ee_jacobian = kernels.barrier_point_face_jacobian, kernels.barrier_edge_edge_jacobian
 _plane_jacobian = kernels.barrier_plane_jacobian
+_FILL = 1.15
+"""A factor so many times as long as when its order was found is worth another order, which costs less than the factor."""
 
 
 @kernel
@@ -43,11 +45,16 @@ def widen(work: Work, listed: Ints) -> None:
                     count += 1
     if count == 0:
         return
-    work.wide, places = widened(wide, first[:count], second[:count])
-    found = np.empty(len(moved), np.int64)
+    first, second = first[:count], second[:count]
+    found, places = widened(wide, first, second, work.order)
+    if len(found.factor_rows) > _FILL * work.fill:
+        work.order = reordered(found)
+        found, places = widened(wide, first, second, work.order)
+        work.fill = len(found.factor_rows)
+    together = np.empty(len(moved), np.int64)
     for p in range(len(moved)):
-        found[p] = places[moved[p]]
-    work.moved = found
+        together[p] = places[moved[p]] if moved[p] >= 0 else ~places[~moved[p]]
+    work.wide, work.moved = found, together
 
 
 @kernel
@@ -75,8 +82,12 @@ def newton_matrix(
     if len(wide.rows) > own:
         below, above = np.zeros((len(wide.rows) + 1, 9)), np.zeros((len(wide.rows) + 1, 9))
         for p in range(own):
-            for k in range(9):
-                below[moved[p], k], above[moved[p], k] = lower[p, k], upper[p, k]
+            for r in range(3):
+                for c in range(3):
+                    if moved[p] >= 0:
+                        below[moved[p], 3 * r + c], above[moved[p], 3 * r + c] = lower[p, 3 * r + c], upper[p, 3 * r + c]
+                    else:  # the halves change places, and the upper one is stored transposed
+                        below[~moved[p], 3 * r + c], above[~moved[p], 3 * r + c] = upper[p, 3 * c + r], lower[p, 3 * c + r]
         lower, upper = below, above
     nodes = len(start_positions)
     for i in range(nodes):

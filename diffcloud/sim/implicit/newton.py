@@ -114,7 +114,7 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
             expected = change * min(change / before, 1.0) if np.isfinite(before) else change
             settled = expected < _TOLERANCE or (fresh and change < _ROUNDING and change > 0.3 * before)
             if settled and _arrived(here.scenery, work.final_scenery):
-                work.last = matrix
+                work.last, work.left_path = matrix, away(room, here.points)
                 if not trouble:
                     work.serves = work.time_step
                 return True, here, room, change

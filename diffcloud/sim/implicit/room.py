@@ -1,20 +1,24 @@
-"""Pairs near each other while all points stay within a distance of the straight path of a step."""
+"""Pairs near each other while all points stay within a distance of their straight paths in a step."""
 
 from __future__ import annotations
+
+from math import sqrt
 
 import numpy as np
 
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints
-from diffcloud.sim.contact.additive_ccd import path_lengths, reach, safe_fraction
+from diffcloud.sim.contact.additive_ccd import approach, path_lengths, reach, safe_fraction
 from diffcloud.sim.contact.broad_phase import candidates, corners_of
 from diffcloud.sim.contact.distance import closest
 from diffcloud.sim.contact.places import gap_of
 from diffcloud.sim.implicit.scene import Work
 
-_ROOM = 0.5
+_ROOM = 0.15
 """First guess of how far points leave their predicted path, as part of the thickness and of the path."""
+_SPARE = 1.25
+"""Where points have left it, a room becomes so many times as wide as they need."""
 _LONGEST = 5.0
 """Newton's steps are kept within this many times the thickness and the path."""
 _CLOSEST = 1e-6
@@ -32,7 +36,7 @@ class Room(Box):  # type: ignore[misc]
 
     Fields:
         begin, predicted: [N, 3] [m]
-        size: how far from the path points may be [m].
+        size: how far from the path points may be, as `away` measures [m].
         longest: how far they may ever be [m].
         pairs: [C, 7] kind (1: two edges), points and primitives.
         distances: [C] at the beginning [m].
@@ -51,7 +55,7 @@ def room_around(work: Work, begin: Floats, predicted: Floats) -> Room:
         for axis in range(3):
             path = max(path, abs(begin[i, axis] - predicted[i, axis]))
     thickness = law[0, 1]
-    size = _ROOM * (thickness + 0.2 * path)
+    size = max(_ROOM * (thickness + 0.2 * path), _SPARE * work.left_path)
     none = np.empty((0, 7), np.int64)
     room = Room(begin, predicted, size, _LONGEST * (thickness + path), none, np.empty(0))
     _list(work, room)
@@ -61,19 +65,31 @@ def room_around(work: Work, begin: Floats, predicted: Floats) -> Room:
 @kernel
 def cover(work: Work, room: Room, distance: float) -> None:
     """Let points be so far from the path [m]."""
-    room.size = min(2 * distance, room.longest)
+    room.size = min(_SPARE * distance, room.longest)
     _list(work, room)
 
 
 @kernel
 def away(room: Room, points: Floats) -> float:
-    """How far the farthest point is from the path [m]."""
-    begin, predicted, most = room.begin, room.predicted, 0.0
+    """How far the farthest point is from where it would be, if all had gone the same part of their paths [m].
+
+    The part is that which fits best, so what lies between two such places is no farther away than both.
+    """
+    begin, predicted = room.begin, room.predicted
+    along, path = 0.0, 1e-300
     for i in range(len(points)):
         for axis in range(3):
-            a, b, x = begin[i, axis], predicted[i, axis], points[i, axis]
-            most = max(most, min(a, b) - x, x - max(a, b))
-    return most
+            way = predicted[i, axis] - begin[i, axis]
+            along += way * (points[i, axis] - begin[i, axis])
+            path += way * way
+    part, most = min(max(along / path, 0.0), 1.0), 0.0
+    for i in range(len(points)):
+        square = 0.0
+        for axis in range(3):
+            a = begin[i, axis]
+            square += (points[i, axis] - a - part * (predicted[i, axis] - a)) ** 2
+        most = max(most, square)
+    return sqrt(most)
 
 
 @kernel
@@ -96,14 +112,17 @@ def prescribed(
 
 @kernel
 def _list(work: Work, room: Room) -> None:
-    """Find the room's pairs; what only prescribed points could resolve is left out."""
+    """Find the room's pairs: those that come nearer than the thickness somewhere in it.
+
+    What only prescribed points could resolve is left out.
+    """
     surface, law = work.surface, work.law
-    begin = room.begin
-    point_face, edge_edge = candidates(surface, begin, room.predicted, 2 * room.size + law[0, 1])
+    begin, predicted, near = room.begin, room.predicted, 2 * room.size + law[0, 1]
+    point_face, edge_edge = candidates(surface, begin, predicted, near)
     pairs = np.empty((len(point_face) + len(edge_edge), 7), np.int64)
     distances = np.empty(len(pairs))
     fixed = prescribed(work)
-    x, found = np.empty((4, 3)), np.empty(6)
+    x, motion, found = np.empty((4, 3)), np.empty((4, 3)), np.empty(6)
     count = 0
     for kind in range(2):
         listed = edge_edge if kind > 0 else point_face
@@ -114,7 +133,9 @@ def _list(work: Work, room: Room) -> None:
             row = pairs[count]
             row[0], row[1], row[2], row[3], row[4], row[5], row[6] = kind, i, j, k, l, listed[c, 0], listed[c, 1]
             distances[count] = distance_of(pairs, count, begin, x, found)
-            count += 1
+            # what a pair has in common does not bring it together: neighbours on a moving cloth stay as far apart
+            if distances[count] - approach(pairs, count, begin, predicted, x, motion) < near:
+                count += 1
     room.pairs, room.distances = pairs[:count], distances[:count]
 
 

@@ -76,8 +76,11 @@ class Work(Box):  # type: ignore[misc]
         start_points: [N, 3] all points where the part starts [m].
         holder: [V] the handle that prescribes each node; -1: none.
         target: [H, 3] where prescribed nodes go [m].
-        wide, moved: the pattern that also couples what touches, and where the blocks of the scene's own lie in it.
+        wide, moved: the pattern that also couples what touches, and where the blocks of the scene's own lie in it, as
+            `sparse.widened` says.
+        order, fill: [V + 2 B] the order of elimination of wide patterns, and how many blocks a factor had when it was found.
         last: the factorised matrix with which the part before ended.
+        left_path: how far from its straight path that part ended [m]; the next one will not differ by much.
         serves: the `time_step` of that part [s]; 0: its matrix is of no use for this one.
     """
 
@@ -112,7 +115,10 @@ define(
         "target",
         "wide",
         "moved",
+        "order",
+        "fill",
         "last",
+        "left_path",
         "serves",
     ],
 )
@@ -157,7 +163,10 @@ def new_work(scene: Scene, parameters: Parameters, nodes: int, bodies: int) -> W
         np.empty((len(parameters.target), 3)),
         scene.pattern,
         np.arange(len(scene.pattern.rows)),
+        scene.pattern.place,
+        len(scene.pattern.factor_rows),
         General(scene.pattern, np.empty((0, 9)), np.empty((0, 9)), np.empty((0, 9)), np.empty((0, 9)), 0),
+        0.0,
         0.0,
     )
 

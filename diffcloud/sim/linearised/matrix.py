@@ -84,7 +84,7 @@ def pattern_with(base: Pattern, corners: Ints) -> tuple[Pattern, Ints]:
                     count += 1
     if count == 0:
         return base, np.empty(0, np.int64)
-    return widened(base, first[:count], second[:count])
+    return widened(base, first[:count], second[:count], base.place)
 
 
 @kernel
