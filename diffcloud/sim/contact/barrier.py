@@ -59,8 +59,9 @@ def _sliding(weights: Sequence[Scalar], normal: Vector, pair: Element) -> Vector
 
 
 def _law(pair: Element, number: int) -> Scalar:
-    """k_c [N/m³], d̂ [m] or v_s [m/s]."""
-    return pair.look_up("law", pair.graph.constant(0.0), number)
+    """k_c [N/m³], d̂ [m] or v_s [m/s] of pairs, and in the second row of pairs that are near at rest."""
+    row = pair.graph.constant(0.0) if "mixed" not in pair.constants else where(pair.constant("mixed") < 0.0, 1.0, 0.0)
+    return pair.look_up("law", row, number)
 
 
 def _pressure(pair: Element, distance: Scalar) -> Scalar:
@@ -152,8 +153,8 @@ BARRIER_POINT_POINT = _term("point_point", 2, _point_point)
 BARRIER_POINT_EDGE = _term("point_edge", 3, _point_edge)
 BARRIER_POINT_FACE = _term("point_face", 4, _point_face)
 BARRIER_EDGE_EDGE = _term("edge_edge", 4, _edge_edge, "s", "t")
-"""Constants: area that counts [m²]; 1 where an obstacle takes part; of two edges the fractions along them at which
-they are closest, 0 or 1, or below zero where that is between their ends. Tables: [1, 3] of the law (`_law`)."""
+"""Constants: area that counts [m²]; 1 where an obstacle takes part, -1 of a pair that is near at rest; of two edges the fractions along them at which
+they are closest, 0 or 1, or below zero where that is between their ends. Tables: [2, 3] of the law (`_law`)."""
 BARRIER_PLANE = Term(
     "barrier_plane",
     corners=1,

@@ -27,16 +27,16 @@ _ROUNDING = 1e-9
 
 @kernel
 def candidates(surface: SurfaceBox, places: Floats, others: Floats, margin: float) -> tuple[Ints, Ints]:
-    """Pairs whose boxes come within `margin` of each other [m]: (point-face [C, 2], edge-edge [C, 2]) in no order.
+    """Pairs whose boxes come within `margin` of each other [m]: (point-face [C, 3], edge-edge [C, 3]) in no order.
 
-    Pairs that share a point, that lie on one obstacle, of which neither can move, or that are near at rest (`rest`) are
-    left out.
+    Pairs that share a point, that lie on one obstacle, or of which neither can move are left out.
 
     Args:
         places, others: [N, 3] positions of all points; a box holds a primitive at both (start and end of a motion).
 
     Returns:
-        Indices into the surface's points and faces, and into its edges (twice): first one that can move.
+        Indices into the surface's points and faces, and into its edges (twice): first one that can move. Then 1 for pairs
+        that are near at rest (`rest`), else 0.
     """
     points, faces, edges = boxes_of(surface, places, others, margin)
     between = _pool(surface, surface.points.reshape(-1, 1), surface.faces, surface.rest_face_starts, surface.rest_faces)
@@ -112,11 +112,11 @@ def _boxes(places: Floats, others: Floats, primitives: Ints, margin: float) -> F
 
 @kernel
 def _swept_between(pool: _Pool, first: Floats, second: Floats) -> Ints:
-    """[C, 2] by sweeping along the axis on which boxes spread most: one of each pair begins within the other."""
+    """[C, 3] by sweeping along the axis on which boxes spread most: one of each pair begins within the other."""
     axis = _widest(second)
     order_a, order_b = ascending(first[:, axis]), ascending(second[:, axis])
     a, b, a_moves, b_moves = first[order_a], second[order_b], pool.first_moves[order_a], pool.second_moves[order_b]
-    found = np.empty((4 * len(first) + 64, 2), np.int64)
+    found = np.empty((4 * len(first) + 64, 3), np.int64)
     count = begin = 0
     for i in range(len(a)):
         found = with_room(found, count, len(b))
@@ -142,11 +142,11 @@ def _swept_between(pool: _Pool, first: Floats, second: Floats) -> Ints:
 
 @kernel
 def _swept_among(pool: _Pool, boxes: Floats) -> Ints:
-    """[C, 2] of one list of boxes in the same way."""
+    """[C, 3] of one list of boxes in the same way."""
     axis = _widest(boxes)
     order = ascending(boxes[:, axis])
     a, a_moves = boxes[order], pool.first_moves[order]
-    found = np.empty((4 * len(boxes) + 64, 2), np.int64)
+    found = np.empty((4 * len(boxes) + 64, 3), np.int64)
     count = 0
     for i in range(len(a)):
         found = with_room(found, count, len(a))
@@ -173,7 +173,7 @@ def _widest(boxes: Floats) -> int:
 
 @kernel
 def _in_cells(pool: _Pool, first: Floats, second: Floats) -> Ints:
-    """[C, 2] by grids, one for all second boxes up to the usual size and one for each doubling of it: boxes lie in the cell
+    """[C, 3] by grids, one for all second boxes up to the usual size and one for each doubling of it: boxes lie in the cell
     of their low corner, and another box meets those in the cells from which they can reach it."""
     same = pool.first.shape[1] == pool.second.shape[1]  # both lists are of edges: each pair once
     level, levels = np.full(len(second), -1, np.int64), 1  # what is not finite meets nothing
@@ -187,7 +187,7 @@ def _in_cells(pool: _Pool, first: Floats, second: Floats) -> Ints:
         if 0 <= _extent(second, m) < np.inf:
             level[m] = max(ceil(log(_extent(second, m) / usual) / log(2.0)), 0) if _extent(second, m) > 0 else 0
             levels = max(levels, level[m] + 1)
-    found = np.empty((4 * len(first) + 64, 2), np.int64)
+    found = np.empty((4 * len(first) + 64, 3), np.int64)
     begin, end = np.empty(3, np.int64), np.empty(3, np.int64)
     count = 0
     for grid in range(levels):
@@ -298,13 +298,13 @@ def _note(pool: _Pool, found: Ints, count: int, a: int, b: int) -> int:
         for l in range(second.shape[1]):
             if first[a, k] == second[b, l]:
                 return count
-    if owner_a == owner_b:
+    near = False
+    if owner_a == owner_b and len(pool.rest) > 0:
         low, high = (min(a, b), max(a, b)) if first.shape[1] > 1 else (a, b)
-        if listed_in(pool.rest_starts, pool.rest, low, high):
-            return count
+        near = listed_in(pool.rest_starts, pool.rest, low, high)
     if first.shape[1] > 1 and (not pool.movable[owner_a] or (pool.movable[owner_b] and b < a)):
         a, b = b, a
-    found[count, 0], found[count, 1] = a, b
+    found[count, 0], found[count, 1], found[count, 2] = a, b, near
     return count + 1
 
 

@@ -52,34 +52,36 @@ define(Touching, TouchingType, ["point_point", "point_edge", "point_face", "edge
 
 @kernel
 def places(
-    surface: SurfaceBox, planes: Planes, thickness: float, pairs: Ints, distances: Floats, points: Floats, holder: Ints
+    surface: SurfaceBox, planes: Planes, law: Floats, pairs: Ints, distances: Floats, points: Floats, holder: Ints
 ) -> tuple[Ints, Floats]:
     """The places nearer than the thickness, at points [N, 3].
 
     Args:
-        pairs: [C, 7] kind (1: two edges), points and primitives.
+        law: [2, 3] with the thickness in the second column, of pairs that are near at rest in the second row [m].
+        pairs: [C, 8] kind (1: two edges), points, primitives, and 1 if near at rest.
         distances: [C] [m].
         holder: [V] of the cloth's nodes; not negative of a prescribed one. These go through half-spaces, where the barrier
             has no value; no force on them counts.
 
     Returns:
-        (kind and points [E, 5], of a plane its number in the place of the second point; area [m²], whether an
-        obstacle takes part, and where along two edges, or of points the area before anything is taken off [E, 4]).
+        (kind and points [E, 5], of a plane its number in the place of the second point; area [m²], 1 if an obstacle
+        takes part and -1 if the pair is near at rest, and where along two edges, or of points the area before anything is taken off [E, 4]).
         Places whose area vanishes are listed too, for the cautious matrix; they are no elements.
     """
     room = len(planes.points) * len(planes.offsets)
     for c in range(len(pairs)):
-        if distances[c] < thickness:
+        if distances[c] < law[pairs[c, 7], 1]:
             room += 7
     listed, numbers = np.empty((room, 5), np.int64), np.zeros((room, 4))
     last, previous = np.full(len(points) if len(pairs) > 0 else 0, -1, np.int64), np.empty(room, np.int64)
     x, found = np.empty((4, 3)), np.empty(6)
     count = 0
     for c in range(len(pairs)):
+        thickness = law[pairs[c, 7], 1]
         if not distances[c] < thickness:
             continue
         p, second = pairs[c, 1], pairs[c, 3] if pairs[c, 0] > 0 else pairs[c, 2]
-        mixed = 1.0 if surface.owner[p] > 0 or surface.owner[second] > 0 else 0.0
+        mixed = 1.0 if surface.owner[p] > 0 or surface.owner[second] > 0 else -float(pairs[c, 7])
         for k in range(4):
             for axis in range(3):
                 x[k, axis] = points[pairs[c, 1 + k], axis]
@@ -115,7 +117,7 @@ def places(
         if i < len(holder) and holder[i] >= 0:
             continue
         for w in range(len(planes.offsets)):
-            if gap_of(planes, w, points, i) < thickness:
+            if gap_of(planes, w, points, i) < law[0, 1]:
                 listed[kept, 0], listed[kept, 1], listed[kept, 2], listed[kept, 3], listed[kept, 4] = PLANE, i, w, i, i
                 numbers[kept, 0], numbers[kept, 1], numbers[kept, 2] = planes.areas[q], 1.0, planes.areas[q]
                 kept += 1
@@ -164,7 +166,9 @@ def _point_face(  # type: ignore[no-untyped-def]
             a, b = pairs[c, 1 + here], pairs[c, 2 + here % 3]
             first, second, third = min(a, b), max(a, b), max(a, b)
         e = last[point] if kind != POINT_FACE else -1
-        while e >= 0 and not (listed[e, 0] == kind and listed[e, 2] == first and listed[e, 3] == second):
+        while e >= 0 and not (
+            listed[e, 0] == kind and listed[e, 2] == first and listed[e, 3] == second and numbers[e, 1] == mixed
+        ):
             e = previous[e]
         if e < 0:
             e = count
@@ -186,7 +190,7 @@ def corners(listed: Ints, e: int) -> int:
 
 @kernel
 def as_elements(planes: Planes, law: Floats, listed: Ints, numbers: Floats):  # type: ignore[no-untyped-def]
-    """Places as elements (`Touching`); law [1, 3] k_c, d̂ and v_s."""
+    """Places as elements (`Touching`); law [2, 3] k_c, d̂ and v_s."""
     none = np.empty((0, 0), np.int64)
     n0, _, c0 = _of_kind(listed, numbers, POINT_POINT, 2)
     n1, _, c1 = _of_kind(listed, numbers, POINT_EDGE, 3)

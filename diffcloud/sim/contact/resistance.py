@@ -67,7 +67,9 @@ def resistance(
     else:
         distance = sqrt(max(n0 * n0 + n1 * n1 + n2 * n2, _TINY))
         n0, n1, n2 = n0 / distance, n1 / distance, n2 / distance
-    ratio = distance / law[0, 1]
+    row = 1 if kind != PLANE and numbers[e, 1] < 0 else 0
+    thickness = law[row, 1]
+    ratio = distance / thickness
     if not ratio < 1:
         return False
     along = n0 * v0 + n1 * v1 + n2 * v2
@@ -75,7 +77,7 @@ def resistance(
     speed = sqrt(max(v0 * v0 + v1 * v1 + v2 * v2, _TINY))
     sticking, part = law[0, 2], (ratio - 1) / ratio
     per_speed = (2 - speed / sticking) / sticking if speed < sticking else 1 / speed
-    pressure = law[0, 0] / 6 * law[0, 1] * (2 * (ratio - 1) * log(ratio) + (ratio - 1) * part)
+    pressure = law[0, 0] / 6 * thickness * (2 * (ratio - 1) * log(ratio) + (ratio - 1) * part)
     stiffness = share * law[0, 0] / 6 * (part * part - 2 * log(ratio) - 4 * part)
     rubbing = share * pressure * (friction[0] if numbers[e, 1] > 0 else friction[1]) * per_speed
     normal3 = (n0, n1, n2)

@@ -1,9 +1,10 @@
-"""Pairs of a cloth's primitives that are near each other in its rest shape, which contact leaves alone.
+"""Pairs of a cloth's primitives that are near each other in its rest shape, for which contact is thinner.
 
 Contact keeps layers of a cloth apart. Parts of one layer that are nearer than the thickness at rest are no layers: a
 barrier between them would push a flat cloth apart, the more the finer its mesh. The tightest bend that contact allows is
-a half circle with the thickness as its diameter, so parts that are nearer on the cloth than half of its circumference,
-π/2 thicknesses, cannot meet as layers: `CREASE` of the thickness is left out.
+a half circle with the thickness as its diameter, so parts that are nearer on the cloth than half of its circumference
+cannot meet as layers. Their thickness is a part of the mesh's smallest height, which no two of them are nearer than at
+rest: they do not repel each other there, and do not pass through each other in a sharp crease.
 
 Distances are measured along the cloth, as the lengths of paths over its faces in material space, so charts, seams and
 the shape in which the cloth starts do not matter. Paths go through nodes and the middles of edges, straight over each
@@ -23,7 +24,10 @@ from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
 
 CREASE = np.pi / 2
-"""Distance on the cloth, in thicknesses, below which two of its parts cannot meet as layers."""
+"""Distance on the cloth, in thicknesses, below which two of its parts cannot meet as layers: half a circumference."""
+NEAR_PART = 0.5
+"""Thickness between them, as a part of the mesh's smallest height: below 1 no force acts at rest, and half leaves the cloth
+room to be compressed."""
 
 
 class Lists(NamedTuple):

@@ -59,7 +59,7 @@ class Surface(NamedTuple):
     touches_itself: bool
     """Whether the cloth's own parts are paired with each other."""
     rest_faces: Ints
-    """Faces that are near each node of the cloth at rest, with which it is not paired (`rest.Lists.members`)."""
+    """Faces that are near each node of the cloth at rest (`rest.Lists.members`)."""
     rest_face_starts: Ints
     """[V + 1]"""
     rest_edges: Ints
@@ -112,12 +112,13 @@ def contact_surface(
     movable: Sequence[bool] | None = None,
     all_edges: bool = False,
     touches_itself: bool = True,
-    apart_at_rest: float = 0.0,
+    near_at_rest_below: float = 0.0,
 ) -> Surface:
     """Join a cloth and its obstacles.
 
     Args:
-        apart_at_rest: primitives of the cloth that are nearer than this at rest, measured on the cloth, are not paired [m].
+        near_at_rest_below: primitives of the cloth that are nearer than this at rest, measured on the cloth, are listed as
+            near [m].
         movable: of each obstacle; default none.
         touches_itself: whether the cloth's own parts are paired with each other.
         all_edges: keep the flat and concave edges and points of obstacles, as ARCSim does.
@@ -148,7 +149,7 @@ def contact_surface(
         owner.append(np.full(len(mesh.nodes), index + 1, dtype=np.int64))
         count, face_count = count + len(mesh.nodes), face_count + len(mesh.faces)
 
-    rest = near_at_rest(cloth, apart_at_rest if touches_itself else 0.0)
+    rest = near_at_rest(cloth, near_at_rest_below if touches_itself else 0.0)
 
     def whole(parts: list[NDArray[np.int64]]) -> Ints:
         return np.ascontiguousarray(np.concatenate(parts), dtype=np.int64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from diffcloud.sim.contact.places import Planes
-from diffcloud.sim.contact.rest import CREASE
+from diffcloud.sim.contact.rest import CREASE, NEAR_PART
 from diffcloud.sim.contact.surface import contact_surface
 from diffcloud.sim.implicit.scene import Rigid, Scene
 from diffcloud.sim.terms.elements import elements
@@ -23,7 +23,7 @@ def build_scene(setup: Setup, time_step: float) -> Scene:
         meshes,
         movable=[False] * len(fixed) + [True] * len(bodies),
         touches_itself=surrounding.self_contact,
-        apart_at_rest=CREASE * surrounding.contact.repulsion_thickness,
+        near_at_rest_below=CREASE * surrounding.contact.repulsion_thickness,
     )
     nodes, others = len(mesh.nodes), sum(len(obstacle.nodes) for obstacle in fixed)
     normals, offsets = half_spaces(mesh, surrounding)
@@ -31,6 +31,7 @@ def build_scene(setup: Setup, time_step: float) -> Scene:
     if not len(offsets):
         meets[:] = False
     settings = surrounding.contact
+    thicknesses = (settings.repulsion_thickness, min(settings.repulsion_thickness, NEAR_PART * mesh.smallest_height))
     terms, of = elements(setup, len(bodies))
     return Scene(
         terms=terms,
@@ -42,7 +43,9 @@ def build_scene(setup: Setup, time_step: float) -> Scene:
         planes=Planes(
             np.ascontiguousarray(normals), np.ascontiguousarray(offsets), surface.points[meets], surface.point_area[meets]
         ),
-        law=np.array([[settings.stiffness, settings.repulsion_thickness, settings.sticking_speed]], dtype=np.float64),
+        law=np.array(
+            [[settings.stiffness, thickness, settings.sticking_speed] for thickness in thicknesses], dtype=np.float64
+        ),
         moves=surface.movable[surface.owner],
         rigid=Rigid(bodies.points, bodies.body, bodies.gyration.reshape(-1, 9)),
         obstacle_points=others,

@@ -70,7 +70,7 @@ def _place(work: Work, room: Room, velocity: Floats, scenery: Floats, points: Fl
     """The place with what touches there."""
     surface, planes, law = work.surface, work.planes, work.law
     distances = distances_at(work, room, points)
-    listed, numbers = places(surface, planes, law[0, 1], room.pairs, distances, points, work.holder)
+    listed, numbers = places(surface, planes, law, room.pairs, distances, points, work.holder)
     touching = as_elements(planes, law, listed, numbers)
     return Place(velocity, scenery, points, turned, distances, listed, numbers, touching)
 

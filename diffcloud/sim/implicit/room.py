@@ -15,7 +15,7 @@ from diffcloud.sim.contact.distance import closest
 from diffcloud.sim.contact.places import gap_of
 from diffcloud.sim.implicit.scene import Work
 
-_ROOM = 0.15
+_ROOM = 0.1
 """First guess of how far points leave their predicted path, as part of the thickness and of the path."""
 _SPARE = 1.25
 """Where points have left it, a room becomes so many times as wide as they need."""
@@ -38,7 +38,7 @@ class Room(Box):  # type: ignore[misc]
         begin, predicted: [N, 3] [m]
         size: how far from the path points may be, as `away` measures [m].
         longest: how far they may ever be [m].
-        pairs: [C, 7] kind (1: two edges), points and primitives.
+        pairs: [C, 8] kind (1: two edges), points, primitives, and 1 if they are near at rest.
         distances: [C] at the beginning [m].
     """
 
@@ -56,7 +56,7 @@ def room_around(work: Work, begin: Floats, predicted: Floats) -> Room:
             path = max(path, abs(begin[i, axis] - predicted[i, axis]))
     thickness = law[0, 1]
     size = max(_ROOM * (thickness + 0.2 * path), _SPARE * work.left_path)
-    none = np.empty((0, 7), np.int64)
+    none = np.empty((0, 8), np.int64)
     room = Room(begin, predicted, size, _LONGEST * (thickness + path), none, np.empty(0))
     _list(work, room)
     return room
@@ -117,9 +117,9 @@ def _list(work: Work, room: Room) -> None:
     What only prescribed points could resolve is left out.
     """
     surface, law = work.surface, work.law
-    begin, predicted, near = room.begin, room.predicted, 2 * room.size + law[0, 1]
-    point_face, edge_edge = candidates(surface, begin, predicted, near)
-    pairs = np.empty((len(point_face) + len(edge_edge), 7), np.int64)
+    begin, predicted, reached = room.begin, room.predicted, 2 * room.size
+    point_face, edge_edge = candidates(surface, begin, predicted, reached + law[0, 1])
+    pairs = np.empty((len(point_face) + len(edge_edge), 8), np.int64)
     distances = np.empty(len(pairs))
     fixed = prescribed(work)
     x, motion, found = np.empty((4, 3)), np.empty((4, 3)), np.empty(6)
@@ -131,10 +131,11 @@ def _list(work: Work, room: Room) -> None:
             if fixed[i] + fixed[j] + fixed[k] + fixed[l] == 4:
                 continue
             row = pairs[count]
-            row[0], row[1], row[2], row[3], row[4], row[5], row[6] = kind, i, j, k, l, listed[c, 0], listed[c, 1]
+            row[0], row[1], row[2], row[3], row[4] = kind, i, j, k, l
+            row[5], row[6], row[7] = listed[c, 0], listed[c, 1], listed[c, 2]
             distances[count] = distance_of(pairs, count, begin, x, found)
             # what a pair has in common does not bring it together: neighbours on a moving cloth stay as far apart
-            if distances[count] - approach(pairs, count, begin, predicted, x, motion) < near:
+            if distances[count] - approach(pairs, count, begin, predicted, x, motion) < reached + law[row[7], 1]:
                 count += 1
     room.pairs, room.distances = pairs[:count], distances[:count]
 
@@ -152,7 +153,7 @@ def distance_of(pairs: Ints, c: int, points: Floats, x: Floats, found: Floats) -
 def distances_at(work: Work, room: Room, points: Floats) -> Floats:
     """Distances [C] of the room's pairs at points [N, 3], or lower bounds where those are beyond the thickness [m]."""
     law = work.law
-    pairs, begin, old, thickness = room.pairs, room.begin, room.distances, law[0, 1]
+    pairs, begin, old = room.pairs, room.begin, room.distances
     distances = np.empty(len(pairs))
     if len(distances) == 0:
         return distances
@@ -161,7 +162,7 @@ def distances_at(work: Work, room: Room, points: Floats) -> Floats:
     for c in range(len(distances)):
         # a pair cannot have come closer than its points have moved: most need no look at their geometry
         distances[c] = old[c] - reach(pairs, c, moved)
-        if distances[c] < thickness:
+        if distances[c] < law[pairs[c, 7], 1]:
             distances[c] = distance_of(pairs, c, points, x, found)
     return distances
 

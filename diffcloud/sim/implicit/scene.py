@@ -48,7 +48,7 @@ class Scene(NamedTuple):
     surface: Surface
     planes: Planes
     law: Floats
-    """[1, 3] of contact: k_c [N/m³], d̂ [m], v_s [m/s]."""
+    """[2, 3] of contact, and of contact between what is near at rest (`rest`): k_c [N/m³], d̂ [m], v_s [m/s]."""
     moves: NDArray[np.bool_]
     """[N] of cloth nodes, obstacle points and body points: those that contact can move."""
     rigid: Rigid

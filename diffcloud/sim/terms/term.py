@@ -6,7 +6,7 @@ quantity of an element is asked for by name, so that a term's file is all there 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -110,6 +110,11 @@ class Element:
         """[s]"""
         self.ahead = graph.input("timing.ahead")
         """From the positions to the end of the step [s]: the time step, or zero."""
+
+    @property
+    def constants(self) -> Collection[str]:
+        """Names of the numbers of this element."""
+        return self._term.constants.keys()
 
     def constant(self, name: str, *index: int) -> Scalar:
         """A number of this element."""

@@ -9,12 +9,16 @@ from diffcloud.compiled import kernel
 from diffcloud.mesh import grid_cloth
 from diffcloud.mesh.shapes import loop_cloth
 from diffcloud.scene.scenarios.grid import FOLD, LIFT, grid_scenario
+from diffcloud.scene.scenarios.sheet import Sheet
+from diffcloud.sim.contact.places import places
 from diffcloud.sim.contact.rest import CREASE, near_at_rest
 from diffcloud.sim.implicit.build import build_scene
 from diffcloud.sim.implicit.room import room_around
 from diffcloud.sim.implicit.scene import new_work
+from diffcloud.sim.materials import preset
 from diffcloud.sim.simulate import rollout
-from tests.sim.contact.penetration import _edge_edge_distance, _point_face_distance, find_penetrations
+from diffcloud.sim.surrounding import ContactSettings, Surrounding
+from tests.sim.contact.penetration import _edge_edge_distance, _point_face_distance, minimal_distance
 from tests.sim.twins.forces import Forces
 
 LONGER = 1.09
@@ -88,6 +92,19 @@ def _pairs_at_rest(scene, parameters, points):
     return len(room_around(work, points, points).pairs)
 
 
+@kernel
+def _touching_at(scene, parameters, points):
+    """How many places touch at points, all of pairs that are near at rest."""
+    work = new_work(scene, parameters, len(points), 0)
+    room = room_around(work, points, points)
+    listed, numbers = places(work.surface, work.planes, work.law, room.pairs, room.distances, points, work.holder)
+    count = 0
+    for e in range(len(listed)):
+        if numbers[e, 0] != 0 and numbers[e, 1] == -1:
+            count += 1
+    return count
+
+
 @pytest.mark.parametrize("side", [13, 33, 64])
 def test_a_flat_cloth_at_rest_has_no_contact_with_itself(side):
     """Half a diagonal of the finest one is shorter than the contact thickness, and twice the edges of the second one
@@ -99,14 +116,32 @@ def test_a_flat_cloth_at_rest_has_no_contact_with_itself(side):
     assert _pairs_at_rest(scene, cloth.parameters, np.ascontiguousarray(lift.mesh.nodes)) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("self_contact", [True, False])
-def test_a_fold_of_a_mesh_finer_than_the_thickness_does_not_pass_through_itself(self_contact):
-    """Edges of 2.9 mm, a thickness of 3 mm: what is near at rest is left out, what comes near is not."""
-    options = FOLD.model_copy(update={"size_m": (0.05, 0.05), "nodes": (18, 18), "self_contact": self_contact})
-    path = [(time, 0.19 * x, 0.19 * y, 0.19 * z) for time, x, y, z in FOLD.path]
-    scenario = grid_scenario(options.model_copy(update={"path": path}))
+def test_a_fold_of_a_mesh_finer_than_the_thickness_keeps_its_layers_apart(self_contact):
+    """Half a diagonal is 2.8 mm, the thickness 3 mm: what is near at rest is let alone, what comes near is not. Away from the
+    crease layers rest on each other, a good part of the thickness apart; without contact they lie in each other."""
+    side, scale = 0.08, 0.08 / 0.2625
+    supple = Sheet(density_kg_m2=0.3, stretching_n_m=60.0, bending_n_m=1e-6)
+    options = {"size_m": (side, side), "nodes": (21, 21), "self_contact": self_contact, "material": supple}
+    path = [(0.0, 0.0, 0.0, 0.0), (1.25, 0.0, 0.12 * scale, 0.26 * scale), (2.5, 0.0, 0.28 * scale, 0.003)]
+    scenario = grid_scenario(FOLD.model_copy(update={**options, "path": path}))
     system, _ = scenario.scene.build()
     assert system.setup.surrounding.contact.repulsion_thickness > system.mesh.smallest_height
-    run = rollout(system, scenario.steps)
-    found = find_penetrations(run.positions[0].numpy(), system.mesh)
-    assert bool(found) != self_contact
+    nodes = rollout(system, scenario.steps).positions[0].numpy()
+    along = (nodes[0] - nodes[0].mean(axis=0))[:, 1][system.mesh.faces]  # the fold goes along +y
+    upper, lower = (system.mesh.faces[(sign * along > 0.008).all(axis=1)] for sign in (-1, 1))
+    apart = minimal_distance((nodes[-1], upper), (nodes[-1], lower))
+    assert apart > 1e-3 if self_contact else apart < 1e-4
+
+
+@pytest.mark.parametrize("squeezed", [1.0, 0.6, 0.3])
+def test_what_is_near_at_rest_repels_only_when_it_is_squeezed(squeezed):
+    """A flat cloth whose half diagonals are below the thickness: no force at rest, nor at three fifths of its size; below half,
+    the thickness of near pairs, there is one."""
+    mesh = grid_cloth(6, 6, 0.02, 0.02)
+    cloth = Forces(mesh, preset("basis-knit"), Surrounding(contact=ContactSettings(1e4, 0.003, 3e-4)))
+    scene = build_scene(cloth.system.setup, 0.0125)
+    assert scene.law[1, 1] == pytest.approx(0.5 * 0.004 / 2**0.5)
+    touching = _touching_at(scene, cloth.parameters, np.ascontiguousarray(squeezed * mesh.nodes))
+    assert bool(touching) == (squeezed < 0.5)
