@@ -8,7 +8,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
@@ -21,7 +21,7 @@ from diffcloud.fit.solvers import SOLVERS, Settings
 from diffcloud.fit.solvers.gauss_newton import ROUGH_SCREEN, ROUGH_STARTS
 from diffcloud.io.files import read_yaml
 from diffcloud.io.raw_episodes import ScenePlacement
-from diffcloud.io.schema import Component, NonNegative, Positive, Vector, explain
+from diffcloud.io.schema import Checked, Component, NonNegative, Positive, Vector, explain
 from diffcloud.regressors.settings import Loss, Profile, Target
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.depth_camera import DepthNoise
@@ -50,10 +50,8 @@ def _check_bounds(name: str, bounds: Bounds) -> None:
         raise ValueError(f"{name} must be in order (low < high), got {list(bounds)}")
 
 
-class Section(BaseModel):
+class Section(Checked, BaseModel):  # named again, for ruff to know that defaults are copied
     """One section of params.yaml."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class EpisodesConfig(Section):

@@ -28,7 +28,6 @@ ONLY_GRIPPER = ("gripper",)
 """The name of a single one."""
 _FARTHEST = 1e6
 """[m, s] Of a point, and of a time."""
-_LARGEST_BYTES = 4 * 2**30
 _MOST_PIXELS = 2**26
 
 
@@ -131,7 +130,7 @@ class Episode:
                     f"lost must be {list(shape)} bytes (frames, `pinholes` of the meta, bits of their pixels), got "
                     f"{list(self.lost.shape)}."
                 )
-        if max(float(np.abs(points).max()), float(times[-1])) > _FARTHEST:
+        if max(float(points.max()), -float(points.min()), float(times[-1])) > _FARTHEST:
             raise EpisodeError(f"Points or times lie beyond {_FARTHEST:g} m or s; they are in the wrong unit, or damaged.")
         if self.gripper is not None:
             names = self.grippers
@@ -273,7 +272,7 @@ def read_episode(path: Path) -> Episode:
         EpisodeError: missing, damaged, not an episode, or wrong inside; names the file and the field.
     """
     path = Path(path)
-    arrays = read_npz(path, kind="episode", error=EpisodeError, most_bytes=_LARGEST_BYTES)
+    arrays = read_npz(path, kind="episode", error=EpisodeError)
     names = set(arrays)
     if not names >= _REQUIRED or not names <= _REQUIRED | _OPTIONAL:
         raise EpisodeError(
@@ -286,7 +285,7 @@ def read_episode(path: Path) -> Episode:
     kinds = {"points": np.float32, "offsets": np.int64, "times": np.float64, "gripper": np.float64}
     kinds |= {"grippers": np.str_, "camera": np.uint8, "pixel": np.uint16, "sigma": np.float32, "lost": np.uint8}
     try:
-        converted = {name: array.astype(kinds[name], casting="same_kind") for name, array in arrays.items()}
+        converted = {name: array.astype(kinds[name], casting="same_kind", copy=False) for name, array in arrays.items()}
         if not isinstance(meta, dict):
             raise EpisodeError(f"meta must be a JSON object, got {type(meta).__name__}.")
         if converted.get("grippers", np.zeros(1)).ndim != 1:

@@ -9,10 +9,13 @@ import numpy as np
 
 from diffcloud.errors import MeshError
 from diffcloud.io.files import write_text
+from diffcloud.io.inputs import read_text
+from diffcloud.io.numbers import number, whole
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 
 _MOST_CORNERS = 100
 """Of a face: triangulating looks at each of its fans."""
+_MOST_BYTES = 100_000_000
 _IGNORED = {"#", "mtllib", "usemtl", "o", "g", "s", "vn", "l"}
 
 
@@ -104,23 +107,18 @@ def write_surface(path: Path, mesh: SurfaceMesh) -> None:
 
 def _parse(path: Path) -> _ObjFile:
     obj = _ObjFile()
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise MeshError(f"No such mesh: {path}.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise MeshError(f"{path} is not a readable OBJ text file: {error}.") from error
-    for number, line in enumerate(text.splitlines(), start=1):
+    text = read_text(path, kind="mesh", error=MeshError, most_bytes=_MOST_BYTES)
+    for row, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words or words[0] in _IGNORED or words[0].startswith("#"):
             continue
         try:
             if words[0] == "v":
-                obj.nodes.append([float(word) for word in words[1:4]])
+                obj.nodes.append([number(word) for word in words[1:4]])
                 if len(obj.nodes[-1]) != 3:
                     raise ValueError("a node has three coordinates")
             elif words[0] == "vt":
-                obj.verts.append([float(word) for word in words[1:3]])
+                obj.verts.append([number(word) for word in words[1:3]])
                 if len(obj.verts[-1]) != 2:
                     raise ValueError("a material-space vert has two coordinates")
             elif words[0] == "f":
@@ -132,7 +130,7 @@ def _parse(path: Path) -> _ObjFile:
             else:
                 raise ValueError(f"unsupported keyword {words[0]!r}")
         except ValueError as error:
-            raise MeshError(f"{path}, line {number}: {error}.") from error
+            raise MeshError(f"{path}, line {row}: {error}.") from error
     for polygon in obj.polygons:
         for node, vert in polygon:
             if not 0 <= node < len(obj.nodes) or vert >= len(obj.verts):
@@ -145,8 +143,8 @@ def _parse(path: Path) -> _ObjFile:
 
 def _corner(word: str) -> tuple[int, int]:
     parts = word.split("/")
-    node = int(parts[0])
-    vert = int(parts[1]) if len(parts) > 1 and parts[1] else 0
+    node = whole(parts[0])
+    vert = whole(parts[1]) if len(parts) > 1 and parts[1] else 0
     if node < 1 or vert < 0:
         raise ValueError(f"index {word!r}: indices start at 1, relative ones are not supported")
     return node - 1, vert - 1

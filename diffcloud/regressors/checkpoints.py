@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from diffcloud.clouds.background import Background
 from diffcloud.errors import CheckpointError, ConfigError
 from diffcloud.io.files import write_bytes
+from diffcloud.io.inputs import check_input
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.regressors.grouping import Order
 from diffcloud.regressors.networks import ModelName, build_network
@@ -29,7 +30,6 @@ from diffcloud.regressors.posterior import Posterior
 from diffcloud.regressors.settings import Target
 
 _KEY = "diffcloud"
-_LARGEST_BYTES = 2**30
 _WIDEST = 5.0
 """Bound of the logarithm of a predicted width: what is beyond is an accident of the last layer."""
 SAMPLES = 1000
@@ -256,10 +256,9 @@ class Regressor:
             CheckpointError: missing, damaged, or not a regressor of this project; names the file and the field.
         """
         path = Path(path)
-        if not path.is_file():
+        if not path.exists():
             raise CheckpointError(f"No such checkpoint: {path}. Make one with `diffcloud train`.")
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise CheckpointError(f"{path} has {path.stat().st_size} bytes; at most {_LARGEST_BYTES} are read.")
+        check_input(path, kind="checkpoint", error=CheckpointError)
         try:
             with safe_open(path, framework="pt") as file:
                 text = (file.metadata() or {}).get(_KEY)

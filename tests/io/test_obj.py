@@ -77,5 +77,5 @@ def test_missing_and_binary_files(tmp_path):
     with pytest.raises(MeshError, match="No such mesh"):
         read_cloth(tmp_path / "none.obj")
     (tmp_path / "b.obj").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(MeshError, match="not a readable OBJ"):
+    with pytest.raises(MeshError, match="not a readable mesh"):
         read_surface(tmp_path / "b.obj")
