@@ -101,9 +101,7 @@ def check_regular(path: Path, found: os.stat_result, kind: str, error: type[Diff
     """
     if not stat.S_ISREG(found.st_mode):
         what = _KINDS.get(stat.S_IFMT(found.st_mode), "not a regular file")
-        raise error(
-            f"{path} is {what}. {_a(kind)} must be a regular file. Write its content to a file, and give that file."
-        )
+        raise error(f"{path} is {what}. {_a(kind)} must be a regular file. Write its content to a file, and give that.")
 
 
 def check_size(

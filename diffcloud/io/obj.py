@@ -16,6 +16,10 @@ from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 _MOST_CORNERS = 100
 """Of a face: triangulating looks at each of its fans."""
 _MOST_BYTES = 100_000_000
+_MOST_STRETCH = 1.5
+"""The published jacket is worn 1.44 times as wide as its pattern, in the median face."""
+STRETCHED = 1.1
+"""Less than this a cloth that hangs may be; more is worth a warning."""
 _IGNORED = {"#", "mtllib", "usemtl", "o", "g", "s", "vn", "l"}
 
 
@@ -30,10 +34,12 @@ class _ObjFile:
 def read_cloth(path: Path) -> ClothMesh:
     """Read a cloth: nodes from `v`, rest shape from `vt`, seams kept (a node may own several verts).
 
-    A corner without `vt` takes the node's first vert, or a new one at (x, y) of the node.
+    `vt` is the flat rest shape in the unit of `v`, not the texture coordinates of a picture. A corner without `vt` takes
+    the node's first vert, or a new one at (x, y) of the node.
 
     Raises:
-        MeshError: an unreadable line, an index out of range, or a mesh that cannot be simulated.
+        MeshError: an unreadable line, an index out of range, a mesh that cannot be simulated, or edges whose lengths in
+            the rest shape and between the nodes differ by more than a factor of 1.5.
     """
     obj = _parse(path)
     verts = list(obj.verts)
@@ -62,14 +68,39 @@ def read_cloth(path: Path) -> ClothMesh:
     used = np.array(owners, dtype=np.int64) >= 0
     renumber = np.cumsum(used) - 1
     try:
-        return ClothMesh(
+        mesh = ClothMesh(
             nodes=np.array(obj.nodes, dtype=np.float64).reshape(-1, 3),
             verts=np.array(verts, dtype=np.float64).reshape(-1, 2)[used],
             vert_node=np.array(owners, dtype=np.int64)[used],
             face_verts=renumber[np.array(faces, dtype=np.int64).reshape(-1, 3)],
         )
+        factor, message = other_lengths(mesh)
+        if factor > _MOST_STRETCH:
+            raise MeshError(message)
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
+    return mesh
+
+
+def other_lengths(mesh: ClothMesh) -> tuple[float, str]:
+    """(factor, message): by how much edges between the nodes are longer or shorter than in the rest shape, and what to do.
+
+    The factor is that of the principal stretches in the median face, at least 1.
+    """
+    corner = mesh.nodes[mesh.faces]
+    edges = np.stack([corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]], axis=-1)  # [F, 3, 2]
+    gradient = edges @ np.linalg.inv(mesh.material_edges)
+    metric = np.swapaxes(gradient, 1, 2) @ gradient
+    stretch = np.median(np.sqrt(np.maximum(np.linalg.eigvalsh(metric), 0)), axis=0)
+    factor = float(np.maximum(stretch, 1 / np.maximum(stretch, 1e-9)).max())
+    along = np.median(np.sqrt(metric[:, [0, 1], [0, 1]]), axis=0)
+    area = 0.5 * np.linalg.norm(np.cross(edges[..., 0], edges[..., 1]), axis=-1).sum()
+    return factor, (
+        f"the material space (vt) has {mesh.face_area.sum():.3g} m², the faces between the nodes (v) have {area:.3g} m²; vt "
+        "looks like texture coordinates of a picture. It must be the flat rest shape in the unit of v, which a cloth that "
+        f"hangs stretches by some per cent. Scale u by {along[0]:.3g} and v by {along[1]:.3g} if the whole cloth is drawn to "
+        "one scale, or unfold it again in real size."
+    )
 
 
 def read_surface(path: Path) -> SurfaceMesh:

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from diffcloud.errors import DiffCloudError
 from diffcloud.io.arrays import read_npy, read_npz
 from diffcloud.io.clouds import read_cloud
-from diffcloud.io.episodes import Episode, read_episode, write_episode
+from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import read_json, read_yaml
 from diffcloud.io.images import png_size, read_color, read_depth
 from diffcloud.io.inputs import open_input, read_input
@@ -59,7 +59,7 @@ class TestNoFile:
     @pytest.mark.parametrize("reader", READERS)
     def test_a_pipe_is_refused_at_once(self, tmp_path, reader, in_time):
         os.mkfifo(tmp_path / "pipe")
-        with pytest.raises(DiffCloudError, match=r"pipe is a named pipe\. A .* must be a regular file\. Write its content"):
+        with pytest.raises(DiffCloudError, match=r"is a named pipe\. An? .* must be a regular file\. Write its"):
             READERS[reader](tmp_path / "pipe")
 
     @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz", ".npy"])
@@ -124,16 +124,6 @@ class TestArchives:
         with pytest.raises(DiffCloudError, match=r"is not a readable set|unpacks to 2\.15 GB"):
             read_npz(path, kind="set", error=DiffCloudError)
         assert tracemalloc.get_traced_memory()[1] < 4_000_000
-        tracemalloc.stop()
-
-    def test_an_episode_is_in_memory_once(self, tmp_path):
-        points = np.zeros((1_000_000, 3), np.float32)
-        whole = Episode.from_frames([points, points], np.array([0.0, 1.0]))
-        write_episode(tmp_path / "e.npz", whole)
-        size = whole.points.nbytes
-        tracemalloc.start()
-        read_episode(tmp_path / "e.npz")
-        assert tracemalloc.get_traced_memory()[1] < 1.9 * size  # with what the checks need
         tracemalloc.stop()
 
     def test_four_gigabytes_are_refused_by_their_directory(self, tmp_path):
