@@ -21,7 +21,7 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import partial
@@ -170,7 +170,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically (UTF-8)."""
-    write_bytes(path, text.encode("utf-8"))
+    write_bytes(path, text.encode("utf-8", errors="backslashreplace"))
 
 
 def write_shared(path: Path, text: str) -> None:
@@ -337,18 +337,37 @@ def _yaml_size(node: yaml.Node | None, known: dict[int, int]) -> int:
     return known.get(id(node), 1)
 
 
+def refuse_undecoded(names: Iterable[str | Path]) -> None:
+    """
+    Raises:
+        DiffCloudError: the name of a file is not in the system's encoding; records and reports could not hold it.
+    """
+    for name in map(str, names):
+        if any("\ud800" <= letter <= "\udfff" for letter in name):
+            raise DiffCloudError(
+                f"{name.encode('utf-8', 'backslashreplace').decode()} is a name that is not {sys.getfilesystemencoding()}. "
+                "Names of files and folders must be text in that encoding. Rename the file, or run in a UTF-8 locale "
+                "(LC_ALL=C.UTF-8)."
+            )
+
+
 def files_in(folder: Path, *suffixes: str) -> list[Path]:
     """Data files of a folder by name, with one of these suffixes (lower case; none given: any).
 
     Hidden files are never data: editors, operating systems and interrupted writes leave such behind (`._a.npz`).
+
+    Raises:
+        DiffCloudError: a name is not in the system's encoding.
     """
     if not Path(folder).is_dir():
         return []
-    return sorted(
+    found = sorted(
         path
         for path in Path(folder).iterdir()
         if not path.name.startswith(".") and (not suffixes or path.suffix.lower() in suffixes) and path.is_file()
     )
+    refuse_undecoded(found)
+    return found
 
 
 def numbered_files(folder: Path, formats: tuple[str, ...], *, kind: str, gaps: bool = False) -> dict[int, Path]:
@@ -397,7 +416,9 @@ def folders_in(folder: Path) -> list[Path]:
     """Folders of a folder by name, without hidden ones."""
     if not Path(folder).is_dir():
         return []
-    return sorted(path for path in Path(folder).iterdir() if not path.name.startswith(".") and path.is_dir())
+    found = sorted(path for path in Path(folder).iterdir() if not path.name.startswith(".") and path.is_dir())
+    refuse_undecoded(found)
+    return found
 
 
 @contextmanager

@@ -96,10 +96,10 @@ def other_lengths(mesh: ClothMesh) -> tuple[float, str]:
     along = np.median(np.sqrt(metric[:, [0, 1], [0, 1]]), axis=0)
     area = 0.5 * np.linalg.norm(np.cross(edges[..., 0], edges[..., 1]), axis=-1).sum()
     return factor, (
-        f"the material space (vt) has {mesh.face_area.sum():.3g} m², the faces between the nodes (v) have {area:.3g} m²; vt "
-        "looks like texture coordinates of a picture. It must be the flat rest shape in the unit of v, which a cloth that "
-        f"hangs stretches by some per cent. Scale u by {along[0]:.3g} and v by {along[1]:.3g} if the whole cloth is drawn to "
-        "one scale, or unfold it again in real size."
+        f"the material space (vt) has {mesh.face_area.sum():.3g} m², the faces between the nodes (v) have {area:.3g} m²; "
+        "vt looks like texture coordinates of a picture. It must be the flat rest shape in the unit of v, which a cloth "
+        f"that hangs stretches by some per cent. Scale u by {along[0]:.3g} and v by {along[1]:.3g} if the whole cloth is "
+        "drawn to one scale, or unfold it again in real size."
     )
 
 

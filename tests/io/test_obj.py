@@ -138,10 +138,10 @@ class TestRestShape:
         lift, jacket = built_in_mesh("lift"), built_in_mesh("vest_hang")
         for mesh in (lift, jacket):
             assert other_lengths(mesh)[0] < STRETCHED
-        wide = replace(lift, nodes=lift.nodes * [1.3, 1.0, 1.0])
+        wide = replace(lift, nodes=lift.nodes * 1.3)
         factor, message = other_lengths(wide)
         assert factor == pytest.approx(1.3)
-        assert "Scale u by 1.3 and v by 1 " in message
+        assert "Scale u by 1.3 and v by 1.3 " in message
         scenario = load_scenario("lift")
         assert limits(scenario) == []
         (told,) = limits(replace(scenario, scene=replace(scenario.scene, mesh=wide)))
