@@ -45,7 +45,8 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 JsonFlag = Annotated[bool, typer.Option("--json", help="End standard output with one JSON object.")]
 Threads = Annotated[
-    int | None, typer.Option(min=1, help="Threads that simulate; results are the same for any number. Default: all cores.")
+    int | None,
+    typer.Option(min=1, max=1024, help="Threads that simulate; results are the same for any number. Default: all cores."),
 ]
 ParamsFile = Annotated[
     Path | None, typer.Option("--params", help="YAML with a section for this stage; options given here win.")

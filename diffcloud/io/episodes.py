@@ -29,6 +29,10 @@ ONLY_GRIPPER = ("gripper",)
 _FARTHEST = 1e6
 """[m, s] Of a point, and of a time."""
 _MOST_PIXELS = 2**26
+_MOST_SIZES, _SMALLEST = 10.0, 0.5
+"""How far a gripper may be from the middle of the clouds, in their size, which counts as this much at least [m]."""
+_FASTEST = 100.0
+"""[m/s] Of a gripper; far more than an arm reaches, also where the scene's unit is a decimetre."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,31 @@ class Episode:
                 raise EpisodeError(
                     f"gripper must be finite positions {[count, len(names), 3]} (frames, grippers, axes), got "
                     f"{list(self.gripper.shape)}."
+                )
+            self._refuse_implausible_track(self.gripper)
+
+    def _refuse_implausible_track(self, gripper: NDArray[np.float64]) -> None:
+        """
+        Raises:
+            EpisodeError: a gripper that holds no cloth of these clouds: a simulation would follow it for hours.
+        """
+        low, high = self.points.min(axis=0).astype(np.float64), self.points.max(axis=0).astype(np.float64)
+        size = max(float(np.linalg.norm(high - low)), _SMALLEST)
+        away = np.linalg.norm(gripper - (low + high) / 2, axis=-1)
+        frame, which = np.unravel_index(away.argmax(), away.shape)
+        if away.max() > _MOST_SIZES * size:
+            raise EpisodeError(
+                f"In frame {frame} the gripper {self.grippers[which]!r} is {away.max():.3g} m away from the middle of the "
+                f"clouds, which are {size:.2g} m large. It may be {_MOST_SIZES:g} times their size away. Give its "
+                "positions in metres, not millimetres, in the frame of the clouds."
+            )
+        if len(gripper) > 1:
+            speed = np.linalg.norm(np.diff(gripper, axis=0), axis=-1) / np.diff(self.times)[:, None]
+            frame, which = np.unravel_index(speed.argmax(), speed.shape)
+            if speed.max() > _FASTEST:
+                raise EpisodeError(
+                    f"After frame {frame} the gripper {self.grippers[which]!r} moves at {speed.max():.3g} m/s. It may move "
+                    f"at {_FASTEST:g} m/s. Give times in seconds and positions in metres, and look for rows in disorder."
                 )
 
     @property

@@ -6,6 +6,8 @@ import os
 import signal
 import socket
 import struct
+import subprocess
+import sys
 import tracemalloc
 import zipfile
 from pathlib import Path
@@ -14,11 +16,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from diffcloud.errors import DiffCloudError
+from diffcloud.errors import DiffCloudError, EpisodeError
 from diffcloud.io.arrays import read_npy, read_npz
 from diffcloud.io.clouds import read_cloud
-from diffcloud.io.episodes import read_episode
-from diffcloud.io.files import read_json, read_yaml
+from diffcloud.io.episodes import Episode, read_episode
+from diffcloud.io.files import files_in, read_json, read_yaml, write_text
 from diffcloud.io.images import png_size, read_color, read_depth
 from diffcloud.io.inputs import open_input, read_input
 from diffcloud.io.numbers import disguised, number, whole
@@ -29,7 +31,8 @@ from diffcloud.io.tables import numbers, read_csv
 from diffcloud.io.urdf import read_urdf
 from diffcloud.regressors import Regressor
 from diffcloud.scene.scenarios import load_scenario
-from pipeline.config import load_config
+from pipeline.config import load_config, updated
+from tests.pipeline.invoke import environment
 
 READERS = {
     "yaml": read_yaml,
@@ -207,3 +210,54 @@ class TestNumbers:
         (tmp_path / "m.obj").write_text("v 0 0 0\nv 1_0 0 0\nv 0 1 0\nf 1 2 3\n")
         with pytest.raises(DiffCloudError, match="line 2: '1_0' is not a number"):
             read_cloth(tmp_path / "m.obj")
+
+
+class TestTracks:
+    """A simulation would follow a gripper that is nowhere near the cloth for hours."""
+
+    def episode(self, factor=1.0, seconds=1.0):
+        x = np.linspace(0, 0.4, 8)
+        cloud = np.stack([*np.meshgrid(x, x), np.zeros((8, 8))], -1).reshape(-1, 3)
+        track = np.stack([0.4 + 0 * x, 0.4 + 0 * x, x / 2], -1)
+        return Episode.from_frames([cloud] * 8, seconds * np.arange(8) / 10, gripper=factor * track[:, None])
+
+    def test_metres_are_taken(self):
+        assert self.episode().gripper[-1, 0, 2] == pytest.approx(0.2)
+
+    @pytest.mark.parametrize("factor", [100, 1000])
+    def test_centimetres_and_millimetres_are_refused(self, factor):
+        with pytest.raises(EpisodeError, match=r"m away from the middle of the clouds.*may be 10 times.*not millimetres"):
+            self.episode(factor)
+
+    def test_milliseconds_for_seconds(self):
+        assert self.episode(seconds=0.1).times[-1] == pytest.approx(0.07)
+        with pytest.raises(EpisodeError, match=r"moves at 286 m/s\. It may move at 100 m/s\. Give times in seconds"):
+            self.episode(seconds=1e-3)
+
+
+def test_a_name_that_is_not_in_the_systems_encoding(tmp_path):
+    """It could stand in no record, no table and no page."""
+    (tmp_path / os.fsdecode(b"a\xff.npz")).write_bytes(b"")
+    with pytest.raises(DiffCloudError, match=r"a\\udcff\.npz is a name that is not utf-8.*Rename the file"):
+        files_in(tmp_path, ".npz")
+    write_text(tmp_path / "t", "a\udcff µ")
+    assert (tmp_path / "t").read_text(encoding="utf-8") == "a\\udcff µ"
+
+
+@pytest.mark.parametrize("name", [b"a\xff.yaml", "ünï.yaml".encode()])
+@pytest.mark.parametrize("locale", [{"LC_ALL": "C"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}])
+def test_commands_in_any_locale(tmp_path, name, locale):
+    (tmp_path / os.fsdecode(name)).write_text("base: lift\nframes: 0\n")
+    command = [sys.executable, "-m", "pipeline.app", "rollout", "--scenario", name, "--out", "m.npz", "--json"]
+    told = subprocess.run(command, cwd=tmp_path, env=environment() | locale, capture_output=True, timeout=120, check=False)
+    assert told.returncode == 1
+    text = told.stderr.decode("ascii", errors="replace").strip()
+    assert text.startswith("Error: ")
+    assert "Traceback" not in text
+    assert ("frames: " in text) == (name[:1] != b"a" and "PYTHONUTF8" not in locale)
+
+
+@pytest.mark.parametrize(("option", "most"), [("starts", 100), ("screen", 10_000)])
+def test_counts_that_would_take_days_are_refused(option, most):
+    with pytest.raises(DiffCloudError, match=f"{option}: Input should be less than or equal to {most} "):
+        updated(load_config(None).fit, **{option: 100_000})
