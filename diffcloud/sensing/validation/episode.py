@@ -307,8 +307,8 @@ def _robot(log: RobotLog) -> Iterator[Finding]:
         if intervals.max() > max(_GAP * usual, 0.25):
             worst = int(intervals.argmax())
             message = (
-                f"A gap of {intervals[worst]:.3f} s after {log.times[worst]:.3f} s, where {usual:.3f} s is usual: where the "
-                "arm was meanwhile is not known. Log at the arm's own rate, and record again or cut the episode there."
+                f"A gap of {intervals[worst]:.3f} s after {log.times[worst]:.3f} s, where {usual:.3f} s is usual: where "
+                "the arm was meanwhile is not known. Log at the arm's own rate, and record again or cut the episode there."
             )
             yield Finding("fault", "clock_gap", place, message)
 
