@@ -202,9 +202,7 @@ def fit(
     )
     every, recordings = _recordings(episodes, scenario, scene, config)
     if settings.joint:
-        refuse_many(
-            recordings, _MOST_JOINT, "A joint fit takes", "Choose a part of them, or leave out --joint"
-        )
+        refuse_many(recordings, _MOST_JOINT, "A joint fit takes", "Choose a part of them, or leave out --joint")
     groups: dict[tuple[Path, str], list[Recording]] = {}
     for folder, recording in recordings:
         key = (out, JOINT) if settings.joint else (out / folder, recording.name)

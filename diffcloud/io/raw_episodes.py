@@ -632,4 +632,5 @@ def _read_table(path: Path, required: Sequence[str], *, torn: bool) -> pd.DataFr
     table = read_csv(path, kind="table", error=EpisodeError, torn=torn)
     if not np.isfinite(numbers(table, required, place=str(path), error=EpisodeError)).all():
         raise EpisodeError(f"{path}: a cell of {', '.join(required)} is empty or infinite.")
-    return pd.DataFrame(numbers(table, list(table), place=str(path), error=EpisodeError), columns=table.columns)
+    names = [str(name) for name in table]
+    return pd.DataFrame(numbers(table, names, place=str(path), error=EpisodeError), columns=names)
