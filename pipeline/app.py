@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shlex
 import sys
@@ -13,6 +14,7 @@ import typer
 
 from diffcloud import __version__
 from diffcloud.errors import DiffCloudError
+from diffcloud.io.files import refuse_undecoded
 from pipeline import ctrl_c
 from pipeline.console import errors, say
 from pipeline.fork_server import begin_importing
@@ -77,7 +79,11 @@ def main() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     keep_freed_memory()
     ctrl_c.listen()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal or a log may know fewer letters than messages have
+            stream.reconfigure(errors="backslashreplace")
     try:
+        refuse_undecoded(sys.argv[1:])
         if sys.argv[1:2] and sys.argv[1] in _PARALLEL:
             begin_importing(COMMANDS[sys.argv[1]].partition(":")[0], sys.argv[1:])
         with ctrl_c.none_lost():
@@ -111,7 +117,9 @@ def _unforeseen(error: Exception) -> str:
         told = f"Unexpected error ({told})"
     head = f"diffcloud {__version__}, Python {sys.version.split()[0]}"
     try:
-        with tempfile.NamedTemporaryFile("w", prefix="diffcloud-", suffix=".log", delete=False, encoding="utf-8") as log:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="diffcloud-", suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as log:
             log.write("\n".join([head, shlex.join(sys.argv), *traceback.format_exception(error)]))
         kept = f"The traceback is in {log.name}; please attach that file to a report"
     except OSError:

@@ -42,7 +42,7 @@ CONTACT_HEAD = ("nodes", "contacts", "free ms per step", "on a sphere ms per ste
 
 def bench(
     scene: SceneFile = None,
-    repeats: Annotated[int, typer.Option(min=1, help="Runs of each; the fastest one counts.")] = 3,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="Runs of each; the fastest one counts.")] = 3,
     contact: Annotated[bool, typer.Option(help="What contacts cost instead: finer and finer cloths on a sphere.")] = False,
     identify: Annotated[
         bool, typer.Option("--identify", help="Instead, how long `diffcloud identify` takes for the tutorial's towel.")
@@ -53,10 +53,10 @@ def bench(
             help="Instead, race the solvers of `diffcloud fit` on drawn cloths; this folder keeps what is finished."
         ),
     ] = None,
-    targets: Annotated[int, typer.Option(min=1, help="With --fits: drawn cloths of each scenario.")] = 3,
+    targets: Annotated[int, typer.Option(min=1, max=1000, help="With --fits: drawn cloths of each scenario.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="With --fits: random seed of the cloths.")] = 0,
     workers: Annotated[
-        int, typer.Option(min=1, help="With --fits: how many targets to run at once, each on one thread.")
+        int, typer.Option(min=1, max=1024, help="With --fits: how many targets to run at once, each on one thread.")
     ] = 1,
     markdown: Annotated[Path | None, typer.Option(help="With --fits: write the table to this Markdown file too.")] = None,
     threads: Threads = None,

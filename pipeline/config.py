@@ -8,7 +8,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
@@ -21,7 +21,7 @@ from diffcloud.fit.solvers import SOLVERS, Settings
 from diffcloud.fit.solvers.gauss_newton import ROUGH_SCREEN, ROUGH_STARTS
 from diffcloud.io.files import read_yaml
 from diffcloud.io.raw_episodes import ScenePlacement
-from diffcloud.io.schema import Component, NonNegative, Positive, Vector, explain
+from diffcloud.io.schema import Checked, Component, NonNegative, Positive, Vector, explain
 from diffcloud.regressors.settings import Loss, Profile, Target
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.depth_camera import DepthNoise
@@ -30,6 +30,8 @@ from diffcloud.sensing.fusion import FusionSettings
 from diffcloud.sensing.recorder import RecorderSettings
 
 _MOST, _FACTOR = 10_000_000, 1e6
+MOST_STARTS, MOST_CANDIDATES = 100, 10_000
+"""Of a fit. A start takes minutes, a candidate about a second."""
 Count = Annotated[int, Field(ge=1, le=_MOST)]
 CountOrNone = Annotated[int, Field(ge=0, le=_MOST)]
 """Zero: there is none, or it is left out."""
@@ -50,10 +52,8 @@ def _check_bounds(name: str, bounds: Bounds) -> None:
         raise ValueError(f"{name} must be in order (low < high), got {list(bounds)}")
 
 
-class Section(BaseModel):
+class Section(Checked, BaseModel):  # named again, for ruff to know that defaults are copied
     """One section of params.yaml."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class EpisodesConfig(Section):
@@ -192,11 +192,11 @@ class FitConfig(Section):
     """`adam` is the paper's; `cma_es` and `random_search` need no derivatives."""
     iterations: Count | None = None
     """Of gauss_newton and adam: steps at most; by default 20 and 50."""
-    starts: Count | None = None
+    starts: Annotated[int, Field(ge=1, le=MOST_STARTS)] | None = None
     """Of gauss_newton (at most) and adam: number of descents, from different places; by default 8 (2 with the linearised
     integrator) and 1. Only by default does gauss_newton also search. It lets the recording grow by default, and in joint
     fits."""
-    screen: CountOrNone | None = None
+    screen: Annotated[int, Field(ge=0, le=MOST_CANDIDATES)] | None = None
     """Of gauss_newton and adam: candidates simulated once to choose the starts from; by default 24 of gauss_newton (48 with
     the linearised integrator), none of adam, whose further starts are then spread over the box."""
     learning_rate: Positive | None = None

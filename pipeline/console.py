@@ -41,11 +41,13 @@ def _console(*, stderr: bool) -> Console:
 errors = _console(stderr=True)
 output = _console(stderr=False)
 
+Item = TypeVar("Item")
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 JsonFlag = Annotated[bool, typer.Option("--json", help="End standard output with one JSON object.")]
 Threads = Annotated[
-    int | None, typer.Option(min=1, help="Threads that simulate; results are the same for any number. Default: all cores.")
+    int | None,
+    typer.Option(min=1, max=1024, help="Threads that simulate; results are the same for any number. Default: all cores."),
 ]
 ParamsFile = Annotated[
     Path | None, typer.Option("--params", help="YAML with a section for this stage; options given here win.")
@@ -105,6 +107,23 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[float, str], None
                 errors.print(f"{label}: {done:.4g} of {total}{left}  {text}", soft_wrap=True)
 
         yield update
+
+
+def told_progress(label: str, items: Sequence[Item]) -> Iterator[Item]:
+    """The items, one by one, beside a bar that says how many are done."""
+    with progress_bar(label, len(items)) as update:
+        for done, item in enumerate(items):
+            update(done, "")
+            yield item
+
+
+def refuse_many(items: Sequence[object], most: int, what: str, advice: str) -> None:
+    """
+    Raises:
+        ConfigError: more episodes than a command takes at once.
+    """
+    if len(items) > most:
+        raise ConfigError(f"{len(items)} episodes are given. {what} {most} at most. {advice}.")
 
 
 def writes(suffix: str | None = None) -> Callable[[Command], Command]:

@@ -66,7 +66,7 @@ def coverage(
     ],
     scenario: Annotated[list[str] | None, typer.Option(help="Repeatable; by default those of the parameters file.")] = None,
     recordings: Annotated[
-        int, typer.Option(min=1, help="Cloths of each scenario, each recorded once (more often with --refits).")
+        int, typer.Option(min=1, max=10_000, help="Cloths of each scenario, each recorded once (more often with --refits).")
     ] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Of truths and noise.")] = 0,
     fix: Annotated[list[str] | None, typer.Option(help="Parameter whose true value fits are given, repeatable.")] = None,
@@ -89,7 +89,9 @@ def coverage(
         typer.Option(help="Written by `diffcloud train`, repeatable: what it predicts of the same recordings."),
     ] = None,
     markdown: Annotated[Path | None, typer.Option(help="Write all that the folder holds to this page.")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Recordings at once, each in a process with one thread.")] = 1,
+    workers: Annotated[
+        int, typer.Option(min=1, max=1024, help="Recordings at once, each in a process with one thread.")
+    ] = 1,
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:

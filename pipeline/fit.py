@@ -15,12 +15,27 @@ from diffcloud.io.episodes import read_episode
 from diffcloud.io.manifests import read_manifest, write_manifest
 from diffcloud.sim.threads import use_threads
 from pipeline.config import Config, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, episode_files, errors, finish, say, show, writes
+from pipeline.console import (
+    JsonFlag,
+    ParamsFile,
+    Threads,
+    assignments,
+    episode_files,
+    errors,
+    finish,
+    refuse_many,
+    say,
+    show,
+    told_progress,
+    writes,
+)
 from pipeline.ctrl_c import none_lost
 from pipeline.fit_jobs import JOINT, FitJob, Recording, first_start, read_recordings, remove_stale, stated_recordings
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
 from pipeline.workers import run_all
 
+_MOST_JOINT = 100
+"""Recordings of a joint fit, each of whose steps simulates all of them."""
 _INTERRUPTED = 130
 _SHOWN = {
     "loss",
@@ -186,6 +201,8 @@ def fit(
         workers=workers,
     )
     every, recordings = _recordings(episodes, scenario, scene, config)
+    if settings.joint:
+        refuse_many(recordings, _MOST_JOINT, "A joint fit takes", "Choose a part of them, or leave out --joint")
     groups: dict[tuple[Path, str], list[Recording]] = {}
     for folder, recording in recordings:
         key = (out, JOINT) if settings.joint else (out / folder, recording.name)
@@ -193,7 +210,7 @@ def fit(
     jobs = [FitJob(name, members, settings, folder) for (folder, name), members in groups.items()]
     jobs = [replace(job, init=first_start(init, job)) for job in jobs]
     # everything is read before anything is fitted: a damaged last file must not cost the first ones' time
-    for job in jobs:
+    for job in told_progress("checking", jobs):
         job.objective()
     space = jobs[0].space.asked
     table = Table("episode", "start", "final", "rms mm", *space.names, "iterations", "seconds", "stopped by")
@@ -276,7 +293,8 @@ def _recordings(
         found = read_recordings(tree)
         return True, [(name, one) for (name, _), one in zip(tree, found, strict=True)]
     chosen = choose_scenario(scenario, scene)
-    return False, [("", Recording(chosen, path.stem, read_episode(path))) for path in episode_files(arguments)]
+    files = told_progress("reading", episode_files(arguments))
+    return False, [("", Recording(chosen, path.stem, read_episode(path))) for path in files]
 
 
 def _row(record: FitRecord, space: FitSpace) -> list[str]:

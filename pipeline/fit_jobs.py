@@ -24,7 +24,7 @@ from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
 from diffcloud.scene.scenarios import Scenario
 from pipeline.config import FitConfig
-from pipeline.console import assignments, episode_files, errors
+from pipeline.console import assignments, episode_files, errors, told_progress
 from pipeline.scenario_options import choose_scenario
 from pipeline.workers import Tell, check_interrupt
 
@@ -108,7 +108,7 @@ def read_recordings(pairs: Sequence[tuple[str, Path]]) -> list[Recording]:
     files = [(name, file) for name, path in pairs for file in episode_files([path])]
     for name in scenarios:
         episode_files([file for one, file in files if one == name])
-    return [Recording(scenarios[name], file.stem, read_episode(file)) for name, file in files]
+    return [Recording(scenarios[name], file.stem, read_episode(file)) for name, file in told_progress("reading", files)]
 
 
 def compared(record: FitRecord, recordings: Sequence[Recording]) -> AnyObjective:

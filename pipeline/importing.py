@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -21,6 +22,7 @@ from diffcloud.io.episodes import write_episode
 from diffcloud.io.files import together
 from diffcloud.io.grippers import named_files
 from diffcloud.io.imports import RELEASE_FOLDERS, cloud_folder, release_episodes
+from diffcloud.io.inputs import open_input
 from diffcloud.io.published import RECORDED_START_M, read_trajectories, recorded_episode
 from diffcloud.io.recordings import Recording, read_joint_log, write_recording
 from diffcloud.io.ros.joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
@@ -224,7 +226,7 @@ def recording_kind(path: Path) -> str:
         raise ConfigError(f"{path}: unknown kind of recording; allowed are .bag, .db3, .mcap and folders.")
     # the SDK's files are bags too, and name their topics after the device
     marker = b"/device_0/sensor_"
-    with path.open("rb") as stream:
+    with open_input(path, kind="recording", error=ConfigError, most_bytes=sys.maxsize) as stream:
         tail = b""
         while block := stream.read(1 << 20):
             if marker in tail + block:

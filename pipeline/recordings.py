@@ -36,7 +36,9 @@ def recordings(
         list[str] | None,
         typer.Option(help="Instead, fit with this nuisance, and compare the pose found with the true one; repeatable."),
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, help="With --nuisance: recordings at once, each on one thread.")] = 1,
+    workers: Annotated[
+        int, typer.Option(min=1, max=1024, help="With --nuisance: recordings at once, each on one thread.")
+    ] = 1,
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:

@@ -78,12 +78,17 @@ def _own(name: str) -> Path:
 
 
 def limits(scenario: Scenario) -> list[str]:
-    """What the scene asks for and the contact model lacks."""
+    """What the scene asks for and the contact model lacks, and whether its cloth is drawn to another scale."""
+    from diffcloud.io.obj import STRETCHED, other_lengths
+
+    factor, told = other_lengths(scenario.scene.mesh)
+    doubts = [f"In the mesh of {scenario.name}, {told}"] if factor > STRETCHED else []
     surrounding = scenario.scene.surrounding
     meshes = [index for index, obstacle in enumerate(surrounding.obstacles) if obstacle.plane() is None]
     if not meshes or surrounding.reference_contact is not None or scenario.scene.integrator == "implicit":
-        return []
+        return doubts
     return [
+        *doubts,
         f"Obstacles {meshes} of {scenario.name} are not planar. Contact of this scene is simulated with planes only: the "
-        "cloth passes through these, and results are valid until the first such contact."
+        "cloth passes through these, and results are valid until the first such contact.",
     ]

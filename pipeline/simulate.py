@@ -35,7 +35,7 @@ def simulate(
     seed: Annotated[int | None, typer.Option(min=0, help="Of the draws and of exported clouds.")] = None,
     threads: Threads = None,
     workers: Annotated[
-        int, typer.Option(min=0, help="Local processes with one thread each, instead of the threads of this one.")
+        int, typer.Option(min=0, max=1024, help="Local processes with one thread each, instead of the threads of this one.")
     ] = 0,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, e.g. tcp://host:8786.")] = None,
     export_clouds: Annotated[

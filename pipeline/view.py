@@ -15,13 +15,25 @@ from diffcloud.fit.record import FitRecord, read_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import write_text
 from pipeline.config import load_config
-from pipeline.console import JsonFlag, ParamsFile, episode_files, errors, finish, progress_bar, writes
+from pipeline.console import (
+    JsonFlag,
+    ParamsFile,
+    episode_files,
+    errors,
+    finish,
+    progress_bar,
+    refuse_many,
+    told_progress,
+    writes,
+)
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario
 
 if TYPE_CHECKING:
     from diffcloud.report.overlay import Layer, Overlay
     from diffcloud.sensing.fusion import Seen
 
+_MOST_EPISODES = 50
+"""On a page, where each takes about a second and a megabyte."""
 _PHOTOGRAPH_PX = 900
 """Widest row of the cameras' images."""
 
@@ -50,7 +62,8 @@ def view(
     record = None if fit is None else read_fit(fit)
     overlays, facts = [], []
     paths = [path for given in episodes for path in ([given] if _is_raw(given) else episode_files([given]))]
-    for path in map(Path.absolute, paths):  # "." has no name
+    refuse_many(paths, _MOST_EPISODES, "A page shows", "Give fewer episodes, or make several pages")
+    for path in told_progress("drawing", [path.absolute() for path in paths]):  # "." has no name
         seen = _raw(path, params) if _is_raw(path) else _Shown(read_episode(path), {})
         chosen = _spread(seen.episode.frame_count, frames)
         layers, told = _layers(path, seen.episode, chosen, points, (scenario, scene), fit, record)

@@ -91,12 +91,28 @@ def simulate_set(
     """
     began = time.perf_counter()
     chunks = [chunk for split, count in plan.counts.items() for chunk in chunks_of(plan.draws, split, count)]
+    with ExitStack() as stack:
+        # before anything is written
+        client = None if scheduler is None else stack.enter_context(_scheduler_client(scheduler))
+        return _simulate_set(plan, out, chunks, workers, client, clouds, progress, began)
+
+
+def _simulate_set(
+    plan: SimulationPlan,
+    out: Path,
+    chunks: Sequence[Chunk],
+    workers: int,
+    client: Any,
+    clouds: int | None,
+    progress: Callable[[int], None] | None,
+    began: float,
+) -> SimulationOutcome:
     work = WorkFolder(out, [plan.scenario, plan.draws, dict(plan.counts)], chunks)
     missing = [chunk for chunk in chunks if work.read(chunk) is None]
     finished = resumed = sum(len(chunk.parameters) for chunk in chunks) - sum(len(c.parameters) for c in missing)
     if progress is not None:
         progress(finished)
-    for chunk, result in _simulated(plan, missing, workers, scheduler):
+    for chunk, result in _simulated(plan, missing, workers, client):
         work.write(chunk, result)
         finished += len(chunk.parameters)
         if progress is not None:
@@ -120,26 +136,19 @@ def simulate_set(
 
 
 def _simulated(
-    plan: SimulationPlan, chunks: Sequence[Chunk], workers: int, scheduler: str | None
+    plan: SimulationPlan, chunks: Sequence[Chunk], workers: int, client: Any
 ) -> Iterator[tuple[Chunk, SimulatedChunk]]:
     """Chunks as they are finished."""
     if not chunks:
         return
-    if scheduler is None and not workers:
+    if client is None and not workers:
         for chunk in chunks:
             yield chunk, simulate_chunk(plan.scenario, plan.draws, chunk)
         return
-    from distributed import Client, as_completed
+    from distributed import as_completed
 
     with ExitStack() as stack:
-        if scheduler is not None:
-            try:
-                client = stack.enter_context(Client(scheduler, timeout=_ANSWER_S))
-            except (OSError, ValueError) as error:
-                raise ConfigError(
-                    f"No Dask scheduler answers at {scheduler}: {error}. Start one with `dask scheduler`."
-                ) from error
-        else:
+        if client is None:
             client = stack.enter_context(_local_client(min(workers, len(chunks))))
         futures = {client.submit(simulate_chunk, plan.scenario, plan.draws, chunk, pure=False): chunk for chunk in chunks}
         done = as_completed(futures, with_results=True)
@@ -155,6 +164,23 @@ def _simulated(
                 raise _workers_lost(error) from error
             yield futures[future], result
             future.release()
+
+
+@contextmanager
+def _scheduler_client(address: str) -> Iterator[Any]:
+    """A Dask client of a scheduler.
+
+    Raises:
+        ConfigError: none answers.
+    """
+    from distributed import Client
+
+    try:
+        client = Client(address, timeout=_ANSWER_S)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"No Dask scheduler answers at {address}: {error}. Start one with `dask scheduler`.") from error
+    with client:
+        yield client
 
 
 @contextmanager

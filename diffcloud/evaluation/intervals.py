@@ -24,7 +24,7 @@ from typing import Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ConfigDict, ValidationError
 from scipy.optimize import brentq
 from scipy.special import stdtr, stdtrit
 
@@ -38,6 +38,7 @@ from diffcloud.fit.scan import Scan, scan
 from diffcloud.fit.solvers import GaussNewtonSettings, solve
 from diffcloud.fit.uncertainty import STEP_SIZE, Uncertainty, noise_mm, uncertainty
 from diffcloud.io.files import read_json
+from diffcloud.io.schema import Plain
 from diffcloud.scene.scenarios import Scenario
 
 Verdict = Literal[
@@ -69,8 +70,8 @@ _SHARE = 1 / 3
 """A parameter has its part in a combination from this component on."""
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class _Model(Plain):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=True)
 
 
 class Interval(_Model):

@@ -96,21 +96,27 @@ class EpisodeMeter:
         pose = own.pose(run)
         points = own.points(run, pose=pose)  # [B, L, N, 3]
         both = [chamfer(points[:, frame], [cloud] * len(sets)) for frame, cloud in enumerate(own.clouds)]
-        losses = []
+        losses, squares = [], []
         for seed in self._seeds:
             own.reseed(seed)
-            losses.append(own.frame_losses(run, pose=pose).mean(-1))
+            motion = own.match(run, pose=pose)
+            losses.append(own.losses(motion).mean(-1))
+            squares.append(own.squares(motion).mean(-1))
         every = torch.stack(losses)  # [draws, B]
         to_mm = 1e3 * self.scenario.length_unit_m
         columns = {
             "loss": every.mean(0),
             "loss_deviation": every.std(0, correction=1 if len(losses) > 1 else 0),
-            "rms_mm": to_mm * every.mean(0).sqrt(),
+            "rms_mm": to_mm * torch.stack(squares).mean(0).sqrt(),
             "two_sided": torch.stack(both).mean(0),
         }
         if others and self._others is not None:
-            elsewhere = self._others.frame_losses(run, pose=pose).mean(-1)
-            columns |= {"loss_other_frames": elsewhere, "rms_other_frames_mm": to_mm * elsewhere.sqrt()}
+            motion = self._others.match(run, pose=pose)
+            elsewhere = self._others.squares(motion).mean(-1)
+            columns |= {
+                "loss_other_frames": self._others.losses(motion).mean(-1),
+                "rms_other_frames_mm": to_mm * elsewhere.sqrt(),
+            }
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
         return [dict(zip(columns, row, strict=True)) for row in rows]
 

@@ -5,21 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation.intervals import Intervals
-from diffcloud.io.schema import Checked, NonNegative, explain
+from diffcloud.io.schema import Checked, NonNegative, Plain, explain
 
 Value = Annotated[float, Field(ge=-1e12, le=1e12)]
 Place = Annotated[float, Field(gt=0, le=1e12)]
 Text = Annotated[str, Field(max_length=10_000)]
 
 
-class _Metrics(BaseModel):
+class _Metrics(Plain):
     """Loss and errors, one for each parameter that has a known truth."""
 
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+    model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Value | None] = Field(init=False)
 
     loss: Value
@@ -112,16 +112,16 @@ class ComparisonFile(Checked):
     references: list[tuple[Text, Text, Value]]
 
 
-class TimingsFile(BaseModel):
+class TimingsFile(Plain):
     """timings.json."""
 
     methods: dict[Annotated[str, Field(pattern=r".+/.+")], dict[str, dict[str, Annotated[float, Field(ge=0, le=1e9)]]]]
 
 
-class FitRow(BaseModel):
+class FitRow(Plain):
     """A row of tables/fits.csv. Its other columns are losses, distances, parameters and their truth."""
 
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+    model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, NonNegative] = Field(init=False)
 
     scenario: Text
@@ -132,10 +132,10 @@ class FitRow(BaseModel):
     rms_mm: NonNegative
 
 
-class PredictionRow(BaseModel):
+class PredictionRow(Plain):
     """A row of tables/predictions.csv. Its other columns are parameters and their truth."""
 
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+    model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Value] = Field(init=False)
 
     scenario: Text

@@ -147,7 +147,14 @@ def time_contact(side: int, *, steps: int = 25, repeats: int = 3) -> ContactTimi
     sphere = sphere_surface((0.0, 0.0, -0.15), 0.15, subdivisions=3)
 
     def build(surrounding: Surrounding) -> System:
-        return build_system(mesh, preset("basis-knit"), time_step=0.01, handles=Handles(()), surrounding=surrounding)
+        return build_system(
+            mesh,
+            preset("basis-knit"),
+            time_step=0.01,
+            handles=Handles(()),
+            surrounding=surrounding,
+            integrator="linearised",
+        )
 
     contact = ContactSettings(1e5, 0.004, 0.0004)
     touching = build(Surrounding(obstacles=(sphere,), contact=contact, reference_contact=ReferenceContact()))

@@ -92,9 +92,11 @@ def leave_each_out(
         lies = _from(member, lying, of_recording(values, index), shown) if lying.variables else {}
         with torch.no_grad():
             run = member.simulate_to_loss(one_set({**lying.fixed, **lies}))
-            loss = float(member.frame_losses(run).mean())  # without the prior of the pose, as the joint fit's is told
+            motion = member.match(run)
+            loss = float(member.losses(motion).mean())  # without the prior of the pose, as the joint fit's is told
+            rms_mm = 1e3 * member.scenario.length_unit_m * float(member.squares(motion).mean()) ** 0.5
         parameters = {name: value for name, value in lying.fixed.items() if not is_laid(name)}
-        told.append(LeftOut(loss=loss, rms_mm=1e3 * member.scenario.length_unit_m * loss**0.5, parameters=parameters))
+        told.append(LeftOut(loss=loss, rms_mm=rms_mm, parameters=parameters))
         places.append(with_recording(found, lies, index))
     rows = torch.tensor([[place[name] for name in space.names] for place in places], dtype=torch.float64)
     losses = batch_losses(objective, space, rows)

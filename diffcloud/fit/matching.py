@@ -47,12 +47,20 @@ class Pairs:
     """Of all weights in a frame; where no place counts, they are missing."""
 
     def losses(self, moved: Tensor, cap: float) -> Tensor:
-        """[B, L] sums of the weighted squared distances, differentiable. A frame in which no place counts has the largest
-        loss: a motion that hides from the recording explains nothing.
+        """[B, L] what fits minimise of these pairs, differentiable; its slope and curvature are in `fit.curvature`.
 
         Args:
             moved: [B, L, N, 3] the places in the recording's frame.
             cap: largest distance that counts as itself.
+        """
+        return self.squares(moved, cap)
+
+    def squares(self, moved: Tensor, cap: float) -> Tensor:
+        """[B, L] sums of the weighted squared distances, each capped: what `rms_mm` is the root of, whatever the loss. A
+        frame in which no place counts has the largest sum: a motion that hides from the recording explains nothing.
+
+        Args:
+            moved, cap: as of `losses`.
         """
         found = (self.weights * (moved - self.partners).square().sum(-1).clamp(max=cap**2)).sum(-1)
         return torch.where(self.weights.sum(-1) > 0, found, self.share * cap**2)

@@ -254,9 +254,14 @@ class Objective:
         found = [pairs.losses(self._moved(motion, pairs), self.cap) for pairs in motion.pairs]
         return len(self.frames) * torch.stack(found).sum(0)
 
-    def way_losses(self, motion: Motion) -> list[float]:
-        """The loss of one matched motion forth, and in the default measure back."""
-        return [float(pairs.losses(self._moved(motion, pairs), self.cap).mean() / pairs.share) for pairs in motion.pairs]
+    def squares(self, motion: Motion) -> Tensor:
+        """[B, L] mean squared distances of a matched motion at each compared frame, in squared length units."""
+        found = [pairs.squares(self._moved(motion, pairs), self.cap) for pairs in motion.pairs]
+        return len(self.frames) * torch.stack(found).sum(0)
+
+    def way_squares(self, motion: Motion) -> list[float]:
+        """The same of one matched motion over all frames, forth, and in the default measure back."""
+        return [float(pairs.squares(self._moved(motion, pairs), self.cap).mean() / pairs.share) for pairs in motion.pairs]
 
     def points(self, run: Rollout, *, pose: Tensor | None = None) -> Tensor:
         """[B, L, N, 3] points sampled on a rollout's cloth at the compared frames, in the recording's frame."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.fit.names import SHARED, of_all
 from diffcloud.io.files import read_json
+from diffcloud.io.schema import Plain
 
 SCHEMA = 8
 """Of the file. Another one is refused, by name."""
@@ -27,8 +28,8 @@ Friction = Annotated[float, Field(ge=0, le=100)]
 Pose = Annotated[float, Field(ge=-1e3, le=1e3)]
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+class _Model(Plain):
+    model_config = ConfigDict(extra="forbid")
 
 
 class NuisanceValue(_Model):

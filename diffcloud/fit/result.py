@@ -162,7 +162,7 @@ def describe_fit(
         loss=loss,
         loss_start=outcome.loss_start,
         loss_resampled=float(np.mean(resampled)),
-        rms_mm=1e3 * unit * loss**0.5,
+        rms_mm=_rms_mm(recordings, paper=paper),
         length_unit_m=unit,
         iterations=outcome.iterations,
         simulations=outcome.simulations,
@@ -186,6 +186,14 @@ def describe_fit(
     return FitResult(record, motions)
 
 
+def _rms_mm(recordings: Sequence[RecordingFit], *, paper: bool) -> float:
+    """Of all recordings together, their mean squares averaged as their losses are."""
+    if len(recordings) == 1:
+        return recordings[0].rms_mm
+    squares = torch.tensor([[recording.rms_mm**2] for recording in recordings], dtype=torch.float64)
+    return float(mean_loss(squares, paper=paper)) ** 0.5
+
+
 def describe_recording(objective: Objective, run: Rollout, name: str) -> RecordingFit:
     """One recording beside the motion fitted to it.
 
@@ -194,18 +202,18 @@ def describe_recording(objective: Objective, run: Rollout, name: str) -> Recordi
     """
     unit, space = objective.scenario.length_unit_m, objective.pose_space
     motion = objective.match(run)
-    losses, ways = objective.losses(motion)[0], objective.way_losses(motion)
+    losses, squares, ways = objective.losses(motion)[0], objective.squares(motion)[0], objective.way_squares(motion)
     cut = objective.cut
     to_mm = 1e3 * unit
     return RecordingFit(
         name=name,
         scenario=objective.scenario.name,
         loss=float(losses.mean()),
-        rms_mm=to_mm * float(losses.mean()) ** 0.5,
+        rms_mm=to_mm * float(squares.mean()) ** 0.5,
         rms_to_recording_mm=to_mm * ways[0] ** 0.5,
         rms_to_cloth_mm=None if objective.paper else to_mm * ways[1] ** 0.5,
         frames=list(objective.frames),
-        frame_rms_mm=(to_mm * losses.sqrt()).tolist(),
+        frame_rms_mm=(to_mm * squares.sqrt()).tolist(),
         counted=(motion.pairs[0].weights[0] > 0).double().mean(-1).tolist(),
         cut_m=None if cut is None else cut * unit,
         nuisance=space.described(motion.pose[0], length_unit_m=unit),

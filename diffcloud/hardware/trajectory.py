@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError, HardwareError, LimitError
 from diffcloud.io.pickles import load_npy
-from diffcloud.io.tables import read_csv
+from diffcloud.io.tables import numbers, read_csv
 
 Floats = NDArray[np.float64]
 
@@ -215,13 +215,14 @@ def read_trajectory(path: Path, *, rate_hz: float = 10.0, stretch_time: float = 
         if path.suffix.lower() == ".npy":
             positions = np.asarray(load_npy(path), dtype=np.float64)
         else:
-            table = read_csv(path, kind="trajectory", error=EpisodeError).astype(float)
-            missing = [name for name in ("x", "y", "z") if name not in table.columns]
-            if missing:
-                raise HardwareError(f"{path}: columns {missing} are missing; it has {list(table.columns)}.")
-            positions = table[["x", "y", "z"]].to_numpy(np.float64)
-            times = table["t_s"].to_numpy(np.float64) if "t_s" in table.columns else None
-            gripper = table["gripper"].to_numpy(np.float64) if "gripper" in table.columns else None
+            table = read_csv(path, kind="trajectory", error=EpisodeError)
+
+            def columns(*names: str) -> Floats:
+                return numbers(table, names, place=str(path), error=EpisodeError)
+
+            positions = columns("x", "y", "z")
+            times = columns("t_s")[:, 0] if "t_s" in table.columns else None
+            gripper = columns("gripper")[:, 0] if "gripper" in table.columns else None
     except EpisodeError as error:
         raise HardwareError(str(error)) from error
     except (OSError, ValueError, TypeError) as error:

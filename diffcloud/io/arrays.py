@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -13,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import DiffCloudError
+from diffcloud.io.inputs import MOST_BYTES, check_size, open_input
 
-MOST_BYTES = 1 << 30
-"""Of one file's arrays, unpacked."""
 ELEMENTS = "biufSU"
 """Kinds of elements that are read: numbers and strings; an object would be a pointer."""
 MOST_DIMENSIONS = 8
@@ -38,18 +39,20 @@ def read_npz(
         names: of the arrays that are read; all of them where not given.
 
     Raises:
-        error: missing, damaged, encrypted, too large, without one of the names, or with elements that are no numbers or
-            strings.
+        error: missing, no regular file, damaged, encrypted, too large before or after it is unpacked, with two arrays of
+            one name, without one of the names, or with elements that are no numbers or strings.
     """
     path = Path(path)
-    if not path.is_file():
-        raise error(f"No such {kind}: {path}.")
     try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-            if size > most_bytes:
-                raise error(f"{path} unpacks to {size / 1e9:.1f} GB; a {kind} may have {most_bytes / 1e9:.1f} GB.")
-            held = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+        with open_input(path, kind=kind, error=error, most_bytes=most_bytes) as file, zipfile.ZipFile(file) as archive:
+            entries = archive.infolist()
+            # a file that unpacks to more than its directory states ends there: zipfile reads no further
+            size = sum(entry.file_size for entry in entries)
+            check_size(path, size, kind, error, most_bytes, says="unpacks to")
+            held = {entry.filename.removesuffix(".npy"): entry for entry in entries}
+            if len(held) < len(entries):
+                twice = Counter(entry.filename.removesuffix(".npy") for entry in entries).most_common(1)[0][0]
+                raise ValueError(f"it holds {twice!r} twice; an array may stand there once. Write the file again")
             missing = sorted(set(names or ()) - set(held))
             if missing:
                 raise ValueError(f"it lacks {', '.join(missing)}")
@@ -74,14 +77,9 @@ def read_npy(path: Path, *, kind: str, error: type[DiffCloudError], most_bytes: 
         error: missing, damaged, too large, or with elements that are no numbers or strings.
     """
     path = Path(path)
-    if not path.is_file():
-        raise error(f"No such {kind}: {path}.")
     try:
-        size = path.stat().st_size
-        if size > most_bytes:
-            raise error(f"{path} has {size / 1e9:.1f} GB; a {kind} may have {most_bytes / 1e9:.1f} GB.")
-        with path.open("rb") as stream:
-            return _array(stream, size, path.name)
+        with open_input(path, kind=kind, error=error, most_bytes=most_bytes) as stream:
+            return _array(stream, os.fstat(stream.fileno()).st_size, path.name)
     except (ValueError, OSError, EOFError) as damage:
         raise error(f"{path} is not a readable {kind}: {damage}.") from damage
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from diffcloud.errors import EmptyCloudError, EpisodeError
 from diffcloud.io.files import atomic
+from diffcloud.io.inputs import check_input
 from diffcloud.io.libusb import load_libusb
 from diffcloud.io.pickles import load_npy
 
@@ -30,8 +31,7 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
         EpisodeError: missing, damaged, empty (`EmptyCloudError`), of the wrong shape, or with NaN/Inf points.
     """
     path = Path(path)
-    if not path.is_file():
-        raise EpisodeError(f"No such cloud: {path}.")
+    check_input(path, kind="cloud", error=EpisodeError)
     readers = {".npy": load_npy, ".ply": _read_ply, ".xyz": _read_xyz, ".pcd": _read_pcd}
     if path.suffix.lower() not in readers:
         raise EpisodeError(f"{path}: unknown cloud format; allowed are {', '.join(FORMATS)}.")

@@ -28,8 +28,11 @@ ONLY_GRIPPER = ("gripper",)
 """The name of a single one."""
 _FARTHEST = 1e6
 """[m, s] Of a point, and of a time."""
-_LARGEST_BYTES = 4 * 2**30
 _MOST_PIXELS = 2**26
+_MOST_SIZES, _SMALLEST = 10.0, 0.5
+"""How far a gripper may be from the middle of the clouds, in their size, which counts as this much at least [m]."""
+_FASTEST = 100.0
+"""[m/s] Of a gripper; far more than an arm reaches, also where the scene's unit is a decimetre."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,7 @@ class Episode:
                     f"lost must be {list(shape)} bytes (frames, `pinholes` of the meta, bits of their pixels), got "
                     f"{list(self.lost.shape)}."
                 )
-        if max(float(np.abs(points).max()), float(times[-1])) > _FARTHEST:
+        if max(float(points.max()), -float(points.min()), float(times[-1])) > _FARTHEST:
             raise EpisodeError(f"Points or times lie beyond {_FARTHEST:g} m or s; they are in the wrong unit, or damaged.")
         if self.gripper is not None:
             names = self.grippers
@@ -141,6 +144,31 @@ class Episode:
                 raise EpisodeError(
                     f"gripper must be finite positions {[count, len(names), 3]} (frames, grippers, axes), got "
                     f"{list(self.gripper.shape)}."
+                )
+            self._refuse_implausible_track(self.gripper)
+
+    def _refuse_implausible_track(self, gripper: NDArray[np.float64]) -> None:
+        """
+        Raises:
+            EpisodeError: a gripper that holds no cloth of these clouds: a simulation would follow it for hours.
+        """
+        low, high = self.points.min(axis=0).astype(np.float64), self.points.max(axis=0).astype(np.float64)
+        size = max(float(np.linalg.norm(high - low)), _SMALLEST)
+        away = np.linalg.norm(gripper - (low + high) / 2, axis=-1)
+        frame, which = np.unravel_index(away.argmax(), away.shape)
+        if away.max() > _MOST_SIZES * size:
+            raise EpisodeError(
+                f"In frame {frame} the gripper {self.grippers[which]!r} is {away.max():.3g} m away from the middle of the "
+                f"clouds, which are {size:.2g} m large. It may be {_MOST_SIZES:g} times their size away. Give its "
+                "positions in metres, not millimetres, in the frame of the clouds."
+            )
+        if len(gripper) > 1:
+            speed = np.linalg.norm(np.diff(gripper, axis=0), axis=-1) / np.diff(self.times)[:, None]
+            frame, which = np.unravel_index(speed.argmax(), speed.shape)
+            if speed.max() > _FASTEST:
+                raise EpisodeError(
+                    f"After frame {frame} the gripper {self.grippers[which]!r} moves at {speed.max():.3g} m/s. It may move "
+                    f"at {_FASTEST:g} m/s. Give times in seconds and positions in metres, and look for rows in disorder."
                 )
 
     @property
@@ -273,7 +301,7 @@ def read_episode(path: Path) -> Episode:
         EpisodeError: missing, damaged, not an episode, or wrong inside; names the file and the field.
     """
     path = Path(path)
-    arrays = read_npz(path, kind="episode", error=EpisodeError, most_bytes=_LARGEST_BYTES)
+    arrays = read_npz(path, kind="episode", error=EpisodeError)
     names = set(arrays)
     if not names >= _REQUIRED or not names <= _REQUIRED | _OPTIONAL:
         raise EpisodeError(
@@ -286,7 +314,7 @@ def read_episode(path: Path) -> Episode:
     kinds = {"points": np.float32, "offsets": np.int64, "times": np.float64, "gripper": np.float64}
     kinds |= {"grippers": np.str_, "camera": np.uint8, "pixel": np.uint16, "sigma": np.float32, "lost": np.uint8}
     try:
-        converted = {name: array.astype(kinds[name], casting="same_kind") for name, array in arrays.items()}
+        converted = {name: array.astype(kinds[name], casting="same_kind", copy=False) for name, array in arrays.items()}
         if not isinstance(meta, dict):
             raise EpisodeError(f"meta must be a JSON object, got {type(meta).__name__}.")
         if converted.get("grippers", np.zeros(1)).ndim != 1:

@@ -21,18 +21,20 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 import yaml
 
 from diffcloud.errors import DiffCloudError, EpisodeError, OutputError
+from diffcloud.io.inputs import read_text
+from diffcloud.io.numbers import CORE, WHOLE, number, whole
 
 _MOST_VALUES = 100_000
 """Values that a YAML file may stand for."""
@@ -168,7 +170,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically (UTF-8)."""
-    write_bytes(path, text.encode("utf-8"))
+    write_bytes(path, text.encode("utf-8", errors="backslashreplace"))
 
 
 def write_shared(path: Path, text: str) -> None:
@@ -208,34 +210,33 @@ def read_json(path: Path, *, error: type[DiffCloudError] = DiffCloudError) -> An
     """Read a JSON file.
 
     Raises:
-        error: the file is missing or is not JSON, too large, or names a field twice; the message names the file and the
-            place.
+        error: the file is missing, no regular file or not JSON, too large, or names a field twice; the message names the
+            file and the place.
     """
     try:
         return json.loads(
-            _read_text(Path(path), _MOST_JSON, error),
+            read_text(path, error=error, most_bytes=_MOST_JSON),
             object_pairs_hook=partial(_object, Path(path), error),
             parse_constant=_refuse_constant,
             parse_float=_finite,
         )
-    except FileNotFoundError as missing:
-        raise error(f"No such file: {path}.") from missing
-    except (OSError, ValueError, RecursionError) as damage:  # of UTF-8, JSON and numbers
+    except (ValueError, RecursionError) as damage:  # of JSON and numbers
         raise error(f"{path} is not readable JSON: {damage}.") from damage
 
 
 def read_yaml(path: Path, *, error: type[DiffCloudError] = DiffCloudError, kind: str = "file") -> Any:
-    """Read a YAML file of plain values.
+    """Read a YAML file of plain values. Booleans and numbers are those of YAML 1.2; `yes`, `1:30`, `0x10`, `010` and
+    `1_000` are texts.
 
     Args:
         kind: what it is, for the message if it is missing.
 
     Raises:
-        error: the file is missing, is not YAML, too large, names a field twice, or its anchors stand for too much; the
-            message names file and place.
+        error: the file is missing, no regular file, is not YAML, too large, names a field twice, or its anchors stand for
+            too much; the message names file and place.
     """
     try:
-        loader = yaml.SafeLoader(_read_text(Path(path), _MOST_YAML, error))
+        loader = _PlainLoader(read_text(path, kind=kind, error=error, most_bytes=_MOST_YAML))
         try:
             node = loader.get_single_node()
             _refuse_twice(node, Path(path), error)
@@ -244,17 +245,42 @@ def read_yaml(path: Path, *, error: type[DiffCloudError] = DiffCloudError, kind:
             return None if node is None else loader.construct_document(node)
         finally:
             loader.dispose()
-    except FileNotFoundError as missing:
-        raise error(f"No such {kind}: {path}.") from missing
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as damage:
+    except (yaml.YAMLError, ValueError, RecursionError) as damage:  # ValueError: a number with too many digits
         raise error(f"{path} is not readable YAML: {damage}.") from damage
 
 
-def _read_text(path: Path, most: int, error: type[DiffCloudError]) -> str:
-    size = path.stat().st_size
-    if size > most:
-        raise error(f"{path} has {size / 1e6:.1f} MB; at most {most / 1e6:.0f} MB are read. Is it the right file?")
-    return path.read_text(encoding="utf-8")
+class _PlainLoader(yaml.SafeLoader):
+    """Plain values as in YAML 1.2. PyYAML's own are of YAML 1.1, where `1:30` is 90, `010` is 8 and `no` is false."""
+
+    yaml_implicit_resolvers: ClassVar[dict[str, list[tuple[str, re.Pattern[str]]]]] = {}
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        self.flatten_mapping(node)
+        for key, _ in node.value:  # names are texts, also of a recording that is called 1e5
+            if isinstance(key, yaml.ScalarNode):
+                key.tag = "tag:yaml.org,2002:str"
+        return super().construct_mapping(node, deep=deep)
+
+    def construct_plain_float(self, node: yaml.ScalarNode) -> float:
+        return number(re.sub(r"\.(?=inf|nan)", "", node.value.lower()))
+
+    def construct_plain_int(self, node: yaml.ScalarNode) -> int:
+        return whole(node.value)
+
+
+_PlainLoader.add_constructor("tag:yaml.org,2002:float", _PlainLoader.construct_plain_float)
+_PlainLoader.add_constructor("tag:yaml.org,2002:int", _PlainLoader.construct_plain_int)
+for _tag, _plain, _first in (
+    ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("null", r"~|null|Null|NULL|", "~nN"),
+    ("int", WHOLE.pattern, "-+0123456789"),
+    ("float", CORE.pattern, "-+.0123456789"),
+    ("float", r"[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)", "-+."),
+    ("merge", r"<<", "<"),
+):
+    _PlainLoader.add_implicit_resolver(
+        f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_plain})$"), [*_first, *([""] if _tag == "null" else [])]
+    )
 
 
 def _refuse_constant(text: str) -> float:
@@ -311,18 +337,37 @@ def _yaml_size(node: yaml.Node | None, known: dict[int, int]) -> int:
     return known.get(id(node), 1)
 
 
+def refuse_undecoded(names: Iterable[str | Path]) -> None:
+    """
+    Raises:
+        DiffCloudError: the name of a file is not in the system's encoding; records and reports could not hold it.
+    """
+    for name in map(str, names):
+        if any("\ud800" <= letter <= "\udfff" for letter in name):
+            raise DiffCloudError(
+                f"{name.encode('utf-8', 'backslashreplace').decode()} is a name that is not {sys.getfilesystemencoding()}. "
+                "Names of files and folders must be text in that encoding. Rename the file, or run in a UTF-8 locale "
+                "(LC_ALL=C.UTF-8)."
+            )
+
+
 def files_in(folder: Path, *suffixes: str) -> list[Path]:
     """Data files of a folder by name, with one of these suffixes (lower case; none given: any).
 
     Hidden files are never data: editors, operating systems and interrupted writes leave such behind (`._a.npz`).
+
+    Raises:
+        DiffCloudError: a name is not in the system's encoding.
     """
     if not Path(folder).is_dir():
         return []
-    return sorted(
+    found = sorted(
         path
         for path in Path(folder).iterdir()
         if not path.name.startswith(".") and (not suffixes or path.suffix.lower() in suffixes) and path.is_file()
     )
+    refuse_undecoded(found)
+    return found
 
 
 def numbered_files(folder: Path, formats: tuple[str, ...], *, kind: str, gaps: bool = False) -> dict[int, Path]:
@@ -371,7 +416,9 @@ def folders_in(folder: Path) -> list[Path]:
     """Folders of a folder by name, without hidden ones."""
     if not Path(folder).is_dir():
         return []
-    return sorted(path for path in Path(folder).iterdir() if not path.name.startswith(".") and path.is_dir())
+    found = sorted(path for path in Path(folder).iterdir() if not path.name.startswith(".") and path.is_dir())
+    refuse_undecoded(found)
+    return found
 
 
 @contextmanager

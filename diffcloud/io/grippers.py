@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.episodes import ONLY_GRIPPER
-from diffcloud.io.tables import read_csv
+from diffcloud.io.tables import numbers, read_csv
 
 _AXES = ["x", "y", "z"]
 _FARTHEST_M = 20.0
@@ -55,7 +54,7 @@ def read_tracks(files: Mapping[str, Path], frames: int) -> GripperTracks:
     positions, times = [], None
     for name, table in tables.items():
         place = str(files[name]) if len(tables) == 1 else f"{files[name]}, gripper {name!r}"
-        track = _numbers(table, _AXES, place)
+        track = numbers(table, _AXES, place=place, error=EpisodeError)
         if len(track) != frames:
             raise EpisodeError(f"{place} has {len(track)} rows for {frames} clouds; give one row a frame.")
         extent = float(np.ptp(track, axis=0).max())
@@ -63,7 +62,7 @@ def read_tracks(files: Mapping[str, Path], frames: int) -> GripperTracks:
             raise EpisodeError(f"{place}: the gripper moves by {extent:.0f}; positions are metres, not millimetres.")
         positions.append(track)
         if "t_s" in table.columns:
-            own = _numbers(table, ["t_s"], place)[:, 0]
+            own = numbers(table, ["t_s"], place=place, error=EpisodeError)[:, 0]
             if times is not None and np.abs(own - times).max() > _SAME_TIME_S:
                 raise EpisodeError(f"{place}: its times differ from those of the other grippers; give one row a frame.")
             times = own
@@ -83,13 +82,3 @@ def named_files(given: list[str]) -> dict[str, Path]:
     if not all(name and path for name, _, path in pairs) or len(set(names)) < len(names):
         raise EpisodeError(f"Give each gripper's file as NAME=PATH, each name once; got {', '.join(given)}.")
     return {name: Path(path) for name, _, path in pairs}
-
-
-def _numbers(table: pd.DataFrame, columns: list[str], place: str) -> NDArray[np.float64]:
-    missing = [name for name in columns if name not in table.columns]
-    if missing:
-        raise EpisodeError(f"{place}: columns {missing} are missing; it has {list(table.columns)}.")
-    try:
-        return table[columns].to_numpy(np.float64)
-    except ValueError as error:
-        raise EpisodeError(f"{place} is not a CSV of numbers: {error}.") from error

@@ -17,10 +17,13 @@ from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.files import atomic
+from diffcloud.io.inputs import open_input, read_input
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
 _LARGEST_PIXELS = 8192 * 8192
+_LARGEST_BYTES = 512 << 20
+"""Of a file: the largest colour image, without compression, has 200 MB, with 16 bits twice as many."""
 
 
 def write_depth(path: Path, depth: NDArray[np.uint16], *, durable: bool = False) -> None:
@@ -99,7 +102,7 @@ def decode_color(data: bytes, name: str) -> NDArray[np.uint8]:
 
 def png_size(path: Path) -> tuple[int, int]:
     """(width, height) from the header alone."""
-    with Path(path).open("rb") as stream:
+    with open_input(path, kind="image", error=EpisodeError) as stream:
         head = stream.read(24)
     if not head.startswith(_PNG) or len(head) < 24:
         raise EpisodeError(f"{path} is not a PNG file.")
@@ -173,12 +176,7 @@ def encode_jpeg(color: NDArray[np.uint8], *, width: int) -> bytes:
 
 
 def _bytes(path: Path) -> bytes:
-    try:
-        return Path(path).read_bytes()
-    except FileNotFoundError as error:
-        raise EpisodeError(f"No such image: {path}.") from error
-    except OSError as error:
-        raise EpisodeError(f"Cannot read {path}: {error.strerror}.") from error
+    return read_input(path, kind="image", error=EpisodeError, most_bytes=_LARGEST_BYTES)
 
 
 def _decode(data: bytes, name: str) -> NDArray[Any]:

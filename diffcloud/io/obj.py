@@ -9,10 +9,17 @@ import numpy as np
 
 from diffcloud.errors import MeshError
 from diffcloud.io.files import write_text
+from diffcloud.io.inputs import read_text
+from diffcloud.io.numbers import number, whole
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 
 _MOST_CORNERS = 100
 """Of a face: triangulating looks at each of its fans."""
+_MOST_BYTES = 100_000_000
+_MOST_STRETCH = 1.5
+"""The published jacket is worn 1.44 times as wide as its pattern, in the median face."""
+STRETCHED = 1.1
+"""Less than this a cloth that hangs may be; more is worth a warning."""
 _IGNORED = {"#", "mtllib", "usemtl", "o", "g", "s", "vn", "l"}
 
 
@@ -27,10 +34,12 @@ class _ObjFile:
 def read_cloth(path: Path) -> ClothMesh:
     """Read a cloth: nodes from `v`, rest shape from `vt`, seams kept (a node may own several verts).
 
-    A corner without `vt` takes the node's first vert, or a new one at (x, y) of the node.
+    `vt` is the flat rest shape in the unit of `v`, not the texture coordinates of a picture. A corner without `vt` takes
+    the node's first vert, or a new one at (x, y) of the node.
 
     Raises:
-        MeshError: an unreadable line, an index out of range, or a mesh that cannot be simulated.
+        MeshError: an unreadable line, an index out of range, a mesh that cannot be simulated, or edges whose lengths in
+            the rest shape and between the nodes differ by more than a factor of 1.5.
     """
     obj = _parse(path)
     verts = list(obj.verts)
@@ -59,14 +68,39 @@ def read_cloth(path: Path) -> ClothMesh:
     used = np.array(owners, dtype=np.int64) >= 0
     renumber = np.cumsum(used) - 1
     try:
-        return ClothMesh(
+        mesh = ClothMesh(
             nodes=np.array(obj.nodes, dtype=np.float64).reshape(-1, 3),
             verts=np.array(verts, dtype=np.float64).reshape(-1, 2)[used],
             vert_node=np.array(owners, dtype=np.int64)[used],
             face_verts=renumber[np.array(faces, dtype=np.int64).reshape(-1, 3)],
         )
+        factor, message = other_lengths(mesh)
+        if factor > _MOST_STRETCH:
+            raise MeshError(message)
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
+    return mesh
+
+
+def other_lengths(mesh: ClothMesh) -> tuple[float, str]:
+    """(factor, message): by how much edges between the nodes are longer or shorter than in the rest shape, and what to do.
+
+    The factor is that of the principal stretches in the median face, at least 1.
+    """
+    corner = mesh.nodes[mesh.faces]
+    edges = np.stack([corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]], axis=-1)  # [F, 3, 2]
+    gradient = edges @ np.linalg.inv(mesh.material_edges)
+    metric = np.swapaxes(gradient, 1, 2) @ gradient
+    stretch = np.median(np.sqrt(np.maximum(np.linalg.eigvalsh(metric), 0)), axis=0)
+    factor = float(np.maximum(stretch, 1 / np.maximum(stretch, 1e-9)).max())
+    along = np.median(np.sqrt(metric[:, [0, 1], [0, 1]]), axis=0)
+    area = 0.5 * np.linalg.norm(np.cross(edges[..., 0], edges[..., 1]), axis=-1).sum()
+    return factor, (
+        f"the material space (vt) has {mesh.face_area.sum():.3g} m², the faces between the nodes (v) have {area:.3g} m²; "
+        "vt looks like texture coordinates of a picture. It must be the flat rest shape in the unit of v, which a cloth "
+        f"that hangs stretches by some per cent. Scale u by {along[0]:.3g} and v by {along[1]:.3g} if the whole cloth is "
+        "drawn to one scale, or unfold it again in real size."
+    )
 
 
 def read_surface(path: Path) -> SurfaceMesh:
@@ -104,23 +138,18 @@ def write_surface(path: Path, mesh: SurfaceMesh) -> None:
 
 def _parse(path: Path) -> _ObjFile:
     obj = _ObjFile()
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise MeshError(f"No such mesh: {path}.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise MeshError(f"{path} is not a readable OBJ text file: {error}.") from error
-    for number, line in enumerate(text.splitlines(), start=1):
+    text = read_text(path, kind="mesh", error=MeshError, most_bytes=_MOST_BYTES)
+    for row, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words or words[0] in _IGNORED or words[0].startswith("#"):
             continue
         try:
             if words[0] == "v":
-                obj.nodes.append([float(word) for word in words[1:4]])
+                obj.nodes.append([number(word) for word in words[1:4]])
                 if len(obj.nodes[-1]) != 3:
                     raise ValueError("a node has three coordinates")
             elif words[0] == "vt":
-                obj.verts.append([float(word) for word in words[1:3]])
+                obj.verts.append([number(word) for word in words[1:3]])
                 if len(obj.verts[-1]) != 2:
                     raise ValueError("a material-space vert has two coordinates")
             elif words[0] == "f":
@@ -132,7 +161,7 @@ def _parse(path: Path) -> _ObjFile:
             else:
                 raise ValueError(f"unsupported keyword {words[0]!r}")
         except ValueError as error:
-            raise MeshError(f"{path}, line {number}: {error}.") from error
+            raise MeshError(f"{path}, line {row}: {error}.") from error
     for polygon in obj.polygons:
         for node, vert in polygon:
             if not 0 <= node < len(obj.nodes) or vert >= len(obj.verts):
@@ -145,8 +174,8 @@ def _parse(path: Path) -> _ObjFile:
 
 def _corner(word: str) -> tuple[int, int]:
     parts = word.split("/")
-    node = int(parts[0])
-    vert = int(parts[1]) if len(parts) > 1 and parts[1] else 0
+    node = whole(parts[0])
+    vert = whole(parts[1]) if len(parts) > 1 and parts[1] else 0
     if node < 1 or vert < 0:
         raise ValueError(f"index {word!r}: indices start at 1, relative ones are not supported")
     return node - 1, vert - 1

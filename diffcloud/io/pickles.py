@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.arrays import ELEMENTS, MOST_DIMENSIONS, npy_header, readable
+from diffcloud.io.inputs import read_input
 
 _LARGEST_BYTES = 256 * 2**20
 _LARGEST_PICKLE_BYTES = 4 * 2**20
@@ -34,15 +35,7 @@ def load_npy(path: Path) -> Any:
         EpisodeError: missing, too large, damaged, or a pickle that carries anything else.
     """
     path = Path(path)
-    try:
-        size = path.stat().st_size
-        if size > _LARGEST_BYTES:
-            raise EpisodeError(f"{path} has {size} bytes; at most {_LARGEST_BYTES} are read.")
-        data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise EpisodeError(f"No such file: {path}.") from error
-    except OSError as error:
-        raise EpisodeError(f"Cannot read {path}: {error.strerror}.") from error
+    data = read_input(path, error=EpisodeError, most_bytes=_LARGEST_BYTES)
     if not data:
         raise EpisodeError(f"{path} is empty.")
     stream = io.BytesIO(data)

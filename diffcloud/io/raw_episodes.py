@@ -27,14 +27,14 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError, field_validator
 
 from diffcloud.errors import DiffCloudError, EpisodeError, OutputError
 from diffcloud.io.camera_models import Intrinsics, IntrinsicsFile, RigidTransform
 from diffcloud.io.files import read_json, write_json
 from diffcloud.io.images import read_color, read_depth, write_color, write_depth
-from diffcloud.io.schema import Checked, FileName, Vector, explain
-from diffcloud.io.tables import read_csv
+from diffcloud.io.schema import Checked, FileName, Plain, Vector, explain
+from diffcloud.io.tables import numbers, read_csv
 
 SCHEMA_VERSION = 1
 UNITS = {"length": "m", "angle": "rad", "time": "s", "force": "N", "torque": "N·m"}
@@ -125,10 +125,10 @@ class PlacementFile(Checked):
     length_unit_m: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
 
 
-class EpisodeFile(BaseModel):
+class EpisodeFile(Plain):
     """episode.json. Labels of one's own may stand beside these fields."""
 
-    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="allow")
 
     schema_version: Literal[1]
     scenario: Annotated[Name, AfterValidator(_plain_word)] | None = None
@@ -310,7 +310,7 @@ def read_description(folder: Path) -> dict[str, Any]:
         told = EpisodeFile.model_validate(data)
     except ValidationError as error:
         raise explain(path, error, EpisodeError) from error
-    return told.model_dump(mode="json", exclude_unset=True)  # numbers even where the file has them as text
+    return told.model_dump(mode="json", exclude_unset=True)
 
 
 def read_camera_info(path: Path) -> CameraInfo:
@@ -630,13 +630,7 @@ def _refuse_backwards(times: NDArray[np.float64], path: Path) -> None:
 
 def _read_table(path: Path, required: Sequence[str], *, torn: bool) -> pd.DataFrame:
     table = read_csv(path, kind="table", error=EpisodeError, torn=torn)
-    try:
-        missing = [name for name in required if name not in table.columns]
-        if missing:
-            raise EpisodeError(f"{path}: columns {missing} are missing; it has {list(table.columns)}.")
-        numbers = table.astype(float)
-    except ValueError as error:
-        raise EpisodeError(f"{path} is not a CSV of numbers: {error}.") from error
-    if not np.isfinite(numbers[list(required)].to_numpy()).all():
+    if not np.isfinite(numbers(table, required, place=str(path), error=EpisodeError)).all():
         raise EpisodeError(f"{path}: a cell of {', '.join(required)} is empty or infinite.")
-    return numbers
+    names = [str(name) for name in table]
+    return pd.DataFrame(numbers(table, names, place=str(path), error=EpisodeError), columns=names)

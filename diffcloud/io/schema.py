@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any, cast
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
+from pydantic_core import CoreSchema, PydanticCustomError
+from pydantic_core.core_schema import no_info_before_validator_function
 
 from diffcloud.errors import DiffCloudError
+from diffcloud.io.numbers import CORE, PLAIN
 
 _MOST_FAULTS = 10
 """That a message lists."""
@@ -21,10 +24,47 @@ FileName = Annotated[str, Field(max_length=250)]
 """Longer ones no file system has."""
 
 
-class Checked(BaseModel):
+def _plain(schema: Any) -> Any:
+    """A schema of pydantic whose numbers and truth values are plain."""
+    if isinstance(schema, list | tuple):
+        return type(schema)(map(_plain, schema))
+    if not isinstance(schema, dict):
+        return schema
+    held = {name: _plain(part) if name != "metadata" else part for name, part in schema.items()}
+    match held.get("type"):
+        case "int" | "float":
+            return no_info_before_validator_function(_number, cast(CoreSchema, held))
+        case "bool":
+            return no_info_before_validator_function(_truth, cast(CoreSchema, held))
+    return held
+
+
+def _number(value: object) -> object:
+    if isinstance(value, bytes | bool) or (isinstance(value, str) and CORE.fullmatch(value) is None):
+        raise PydanticCustomError("plain_number", f"Input should be a number. Allowed are {PLAIN}")
+    return value
+
+
+def _truth(value: object) -> object:
+    if not isinstance(value, bool):
+        raise PydanticCustomError("plain_bool", "Input should be true or false, without quotes")
+    return value
+
+
+class Plain(BaseModel):
+    """A block of a file whose numbers are plain decimals, also in quotes; a truth value is no number, nor the reverse."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return _plain(handler(source))
+
+
+class Checked(Plain):
     """A block of a file: frozen, every field known."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 def explain(source: object, error: ValidationError, kind: type[DiffCloudError]) -> DiffCloudError:

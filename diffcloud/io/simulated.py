@@ -9,6 +9,7 @@ are sampled when they are needed (`clouds.augmentation`).
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,12 +19,13 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 from diffcloud.errors import DatasetError, unknown_name
 from diffcloud.io.arrays import read_npy, read_npz
 from diffcloud.io.files import atomic, read_json, write_json, write_npz, write_text
-from diffcloud.io.schema import Component, explain
+from diffcloud.io.inputs import read_text
+from diffcloud.io.schema import Component, Plain, explain
 from diffcloud.mesh.topology import SurfaceMesh
 
 Split = Literal["train", "test"]
@@ -39,7 +41,7 @@ Name = Annotated[str, Field(min_length=1, max_length=200)]
 Count = Annotated[int, Field(ge=0, le=10_000_000)]
 
 
-class SetParameter(BaseModel):
+class SetParameter(Plain):
     """A parameter of set.json."""
 
     name: Name
@@ -47,10 +49,10 @@ class SetParameter(BaseModel):
     high: Component
 
 
-class SetFile(BaseModel):
+class SetFile(Plain):
     """set.json, beside what says how the set was made."""
 
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+    model_config = ConfigDict(extra="allow")
 
     schema_version: Literal[1] = Field(alias="schema")
     scenario: Name
@@ -62,7 +64,7 @@ class SetFile(BaseModel):
     length_unit_m: Annotated[float, Field(gt=0, le=1e3)]
     draws: Name | None = None
     seed: Annotated[int, Field(ge=0)] | None = None
-    doubts: dict[Name, Component] = {}
+    doubts: dict[Name, Component] = Field(default_factory=dict)
     """Other material that differs from run to run -> factor of one deviation."""
     integrator: Name | None = None
     replaced: Count = 0
@@ -266,9 +268,9 @@ def _surface(path: Path) -> dict[str, Any]:
 
 def _table(path: Path, names: tuple[str, ...]) -> NDArray[np.float64]:
     try:
-        with path.open(encoding="utf-8") as file:
-            columns = file.readline().strip().split(",")
-            table = np.loadtxt(file, delimiter=",", ndmin=2)
+        file = io.StringIO(read_text(path, kind="table of parameters", error=DatasetError))
+        columns = file.readline().strip().split(",")
+        table = np.loadtxt(file, delimiter=",", ndmin=2)
         if columns != ["run", *names] or not np.array_equal(table[:, 0], np.arange(len(table))):
             raise ValueError(f"expected runs numbered from 0 with the columns {', '.join(names)}")
         return table[:, 1:]

@@ -9,11 +9,15 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from diffcloud.errors import DiffCloudError
+from diffcloud.io.inputs import read_text
+from diffcloud.io.numbers import PLAIN, disguised
 
-MOST_BYTES = 200_000_000
+_MOST_BYTES = 200_000_000
 """Of a file: a joint log of an hour at a kilohertz has as many."""
 _LONGEST_CELL = 10_000
 
@@ -21,7 +25,7 @@ _LONGEST_CELL = 10_000
 def read_csv(
     path: Path, *, kind: str, error: type[DiffCloudError], text: Sequence[str] = (), torn: bool = False
 ) -> pd.DataFrame:
-    """A table, as pandas reads it.
+    """A table, as pandas reads it; numbers are plain decimals.
 
     Args:
         kind: what it is, for messages: "gripper file".
@@ -29,18 +33,11 @@ def read_csv(
         torn: whether the last line may have been cut off by a power cut; it is left out.
 
     Raises:
-        error: missing, too large, no UTF-8, without a line of names, with a name twice, or with rows of different length.
+        error: missing, no regular file, too large, no UTF-8, without a line of names, with a name twice, with rows of
+            different length, or with what some would read as a number (`1_000`).
     """
     path = Path(path)
-    try:
-        size = path.stat().st_size
-        if size > MOST_BYTES:
-            raise error(f"{path} has {size / 1e6:.0f} MB; a {kind} may have {MOST_BYTES / 1e6:.0f} MB.")
-        content = path.read_text(encoding="utf-8")
-    except FileNotFoundError as missing:
-        raise error(f"No such {kind}: {path}.") from missing
-    except (OSError, UnicodeDecodeError) as damage:
-        raise error(f"{path} is not a readable {kind}: {damage}.") from damage
+    content = read_text(path, kind=kind, error=error, most_bytes=_MOST_BYTES)
     if torn:
         content = content[: content.rfind("\n") + 1]
     try:
@@ -56,6 +53,34 @@ def read_csv(
         longest = max((len(cell) for name in words for cell in words[name] if isinstance(cell, str)), default=0)
         if longest > _LONGEST_CELL:
             raise ValueError(f"a cell has {longest} letters")
+        for name in words:
+            if name not in text and (wrong := next((cell for cell in words[name] if _disguised(cell)), None)):
+                raise ValueError(f"column {name!r} has {wrong!r}, which is no number; allowed are {PLAIN}")
         return table
     except (ValueError, csv.Error, pd.errors.ParserWarning) as damage:  # pandas' own errors are values'
         raise error(f"{path} is not a readable {kind}: {damage}.") from damage
+
+
+def _disguised(cell: object) -> bool:
+    return isinstance(cell, str) and disguised(cell)
+
+
+def numbers(table: pd.DataFrame, columns: Sequence[str], *, place: str, error: type[DiffCloudError]) -> NDArray[np.float64]:
+    """[rows, columns] of a table; an empty cell is NaN.
+
+    Args:
+        place: of the table, for messages.
+
+    Raises:
+        error: a column is missing, or has cells that are no plain numbers, such as `1:30` or `True`.
+    """
+    missing = [name for name in columns if name not in table.columns]
+    if missing:
+        raise error(f"{place}: columns {missing} are missing; it has {list(table.columns)}.")
+    for name in columns:
+        if table[name].dtype.kind == "b":
+            raise error(f"{place} is not a CSV of numbers: column {name!r} has truth values. Allowed are {PLAIN}.")
+    try:
+        return table[list(columns)].to_numpy(np.float64)
+    except ValueError as damage:
+        raise error(f"{place} is not a CSV of numbers: {damage}. Allowed are {PLAIN}.") from damage

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import RobotError, unknown_name
+from diffcloud.io.inputs import read_input
 
 Floats = NDArray[np.float64]
 JointKind = Literal["fixed", "revolute", "continuous", "prismatic"]
@@ -117,24 +118,12 @@ def read_urdf(path: Path) -> RobotDescription:
 
 
 def _xml(path: Path) -> ElementTree.Element:
-    text = _read(path, _LARGEST_XML, "robot description")
+    text = read_input(path, kind="robot description", error=RobotError, most_bytes=_LARGEST_XML)
     _refuse_entities(text, path)
     try:
         return ElementTree.fromstring(text.decode("utf-8"))
     except (ElementTree.ParseError, UnicodeDecodeError, ValueError) as error:
         raise RobotError(f"{path} is not readable XML: {error}.") from error
-
-
-def _read(path: Path, largest: int, kind: str) -> bytes:
-    try:
-        size = path.stat().st_size
-        if size > largest:
-            raise RobotError(f"{path} has {size} bytes; a {kind} has at most {largest}.")
-        return path.read_bytes()
-    except FileNotFoundError as error:
-        raise RobotError(f"No such {kind}: {path}.") from error
-    except OSError as error:
-        raise RobotError(f"Cannot read {path}: {error.strerror}.") from error
 
 
 def _refuse_entities(text: bytes, path: Path) -> None:
@@ -259,7 +248,7 @@ def _read_mesh(path: Path) -> LinkMesh:
     suffix = path.suffix.lower()
     if suffix not in _MESH_FORMATS:
         raise RobotError(f"{path}: {unknown_name('mesh format', suffix, _MESH_FORMATS)}")
-    data = _read(path, _LARGEST_MESH, "mesh")
+    data = read_input(path, kind="mesh", error=RobotError, most_bytes=_LARGEST_MESH)
     try:
         mesh = _read_collada(data, path) if suffix == ".dae" else _read_triangles(data, suffix)
     except RobotError:

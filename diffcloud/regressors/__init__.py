@@ -6,7 +6,7 @@
 from diffcloud.regressors.checkpoints import Description, Prediction, Regressor
 from diffcloud.regressors.dataset import Augmentation, CloudDataset, SimulatedSet
 from diffcloud.regressors.networks import MODEL_NAMES, ModelName, build_network, frames_seen, layer_sizes
-from diffcloud.regressors.predict import episode_clouds, predict_episode
+from diffcloud.regressors.predict import predict_episode, recorded_frames
 from diffcloud.regressors.settings import PROFILE_NAMES, TrainingSettings, profile_settings
 
 __all__ = [
@@ -21,9 +21,9 @@ __all__ = [
     "SimulatedSet",
     "TrainingSettings",
     "build_network",
-    "episode_clouds",
     "frames_seen",
     "layer_sizes",
     "predict_episode",
     "profile_settings",
+    "recorded_frames",
 ]

@@ -7,6 +7,7 @@ clouds are centred and scaled, and what the outputs stand for.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,14 +15,16 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from diffcloud.clouds.background import Background
-from diffcloud.errors import CheckpointError, ConfigError
+from diffcloud.errors import CheckpointError, ConfigError, EpisodeError
 from diffcloud.io.files import write_bytes
+from diffcloud.io.inputs import check_input
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.regressors.grouping import Order
 from diffcloud.regressors.networks import ModelName, build_network
@@ -29,7 +32,6 @@ from diffcloud.regressors.posterior import Posterior
 from diffcloud.regressors.settings import Target
 
 _KEY = "diffcloud"
-_LARGEST_BYTES = 2**30
 _WIDEST = 5.0
 """Bound of the logarithm of a predicted width: what is beyond is an accident of the last layer."""
 SAMPLES = 1000
@@ -218,13 +220,58 @@ class Regressor:
     def scale(self) -> OutputScale:
         return OutputScale(torch.tensor(self.description.bounds), self.description.target)
 
-    @torch.no_grad()
-    def predict(self, clouds: Tensor) -> Prediction:
-        """Parameters of clouds.
+    def predict(self, clouds: Sequence[Sequence[ArrayLike]] | Tensor, *, seed: int = 0) -> Prediction:
+        """Predict the parameters of recorded clouds, which are prepared first (`prepared`).
 
         Args:
-            clouds: [B, T, P, 3] in the frame and length unit of the scenario's scene; T frames as the model sees them.
+            clouds: [B][T] clouds [N, 3] of any size, or a tensor [B, T, N, 3], in the frame and length unit of the
+                scenario's scene; T frames at `description.times`. `predict_episode` finds these frames in a recording.
+            seed: of the choice of points.
+
+        Raises:
+            EpisodeError: another number of frames, an empty cloud, or clouds that are not finite [N, 3].
         """
+        return self.predict_prepared(torch.stack([self.prepared(frames, seed=seed) for frames in clouds]))
+
+    def prepared(self, frames: Sequence[ArrayLike] | Tensor, *, seed: int = 0) -> Tensor:
+        """The clouds of one recording as the network was trained on them: without background, thinned to its points.
+
+        Points are drawn without repeats where there are enough. The order of a recording, by camera and by row, must not
+        decide which points a network groups.
+
+        Args:
+            frames: T clouds [N, 3].
+
+        Returns:
+            float32 [T, P, 3].
+
+        Raises:
+            EpisodeError: as of `predict`.
+        """
+        told = self.description
+        if len(frames) != len(told.times):
+            raise EpisodeError(
+                f"This {told.model} looks at {len(told.times)} frames, got {len(frames)}. Give those at "
+                f"{list(told.times)} s."
+            )
+        rng = np.random.default_rng(seed)
+        background = None if told.background is None else told.background.build()
+        clouds = []
+        for index, frame in enumerate(frames):  # they are ragged
+            cloud = np.asarray(frame, dtype=np.float32)
+            if cloud.ndim != 2 or cloud.shape[1] != 3 or not len(cloud) or not np.isfinite(cloud).all():
+                raise EpisodeError(
+                    f"Cloud {index} has shape {list(cloud.shape)}; a cloud is [points, 3], finite, not empty."
+                )
+            if background is not None:
+                free = cloud[~background.holds(torch.from_numpy(cloud)).numpy()]
+                cloud = free if len(free) else cloud
+            clouds.append(cloud[rng.choice(len(cloud), told.points, replace=len(cloud) < told.points)])
+        return torch.from_numpy(np.stack(clouds))
+
+    @torch.no_grad()
+    def predict_prepared(self, clouds: Tensor) -> Prediction:
+        """The same of clouds [B, T, P, 3] that are sampled as in training."""
         told = self.description
         self.network.eval()
         scaled, scale = self.scaled(clouds), self.scale
@@ -256,10 +303,9 @@ class Regressor:
             CheckpointError: missing, damaged, or not a regressor of this project; names the file and the field.
         """
         path = Path(path)
-        if not path.is_file():
+        if not path.exists():
             raise CheckpointError(f"No such checkpoint: {path}. Make one with `diffcloud train`.")
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise CheckpointError(f"{path} has {path.stat().st_size} bytes; at most {_LARGEST_BYTES} are read.")
+        check_input(path, kind="checkpoint", error=CheckpointError)
         try:
             with safe_open(path, framework="pt") as file:
                 text = (file.metadata() or {}).get(_KEY)

@@ -531,7 +531,7 @@ def _measured(regressor: Regressor, dataset: CloudDataset, indices: Sequence[int
     step, network = regressor.description.training["settings"]["batch_size"], regressor.network
     for begin in range(0, len(indices), step):
         clouds, parameters = dataset.batch(indices[begin : begin + step])
-        found, parameters = regressor.predict(clouds), parameters.cpu()
+        found, parameters = regressor.predict_prepared(clouds), parameters.cpu()
         fractions, (low, high) = found.scale.from_linear(parameters), found.scale.bounds.unbind(-1)
         true = low + (high - low) * parameters
         ends = [found.interval(level) for level in LEVELS]

@@ -31,8 +31,9 @@ class Scene:
     surrounding: Surrounding = field(default_factory=Surrounding)
     mass_material: Material | None = None
     """Gives the node masses where it differs from `material` (see `load.load_scene`)."""
-    integrator: Integrator = "linearised"
-    """"implicit": converged steps with smooth contact and rigid bodies; "linearised": ARCSim's steps."""
+    integrator: Integrator = "implicit"
+    """"implicit": converged steps with smooth contact and rigid bodies; "linearised": ARCSim's steps. The one
+    default; scene files of ARCSim and the `release_*` experiments name theirs."""
     order: Order = 2
     """Of the implicit integrator: 2, BDF2, or 1, backward Euler, which scenes with rigid bodies always have."""
     shaped: bool = False

@@ -24,7 +24,7 @@ def build_system(
     handles: Handles,
     surrounding: Surrounding | None = None,
     mass_material: Material | None = None,
-    integrator: Integrator = "linearised",
+    integrator: Integrator,
     order: Order = 2,
     shaped: bool = False,
 ) -> System:

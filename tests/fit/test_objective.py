@@ -14,7 +14,7 @@ from diffcloud.clouds.sampling import SurfacePoints
 from diffcloud.clouds.visibility import seen_places
 from diffcloud.errors import ConfigError, DivergedError, EpisodeError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton
-from diffcloud.fit.matching import pairs_forth
+from diffcloud.fit.matching import Pairs, pairs_forth
 from diffcloud.fit.pose import SET_UP
 from diffcloud.fit.residuals import Axis, linearise
 from diffcloud.fit.result import describe_recording
@@ -333,3 +333,17 @@ def test_a_basis_that_diverges_costs_no_parameter_set(scenario, episode, monkeyp
     monkeypatch.setattr(Objective, "simulate", fragile)
     with torch.no_grad():
         assert bool(torch.isfinite(objective(one_set(TRUTH))).all())
+
+
+def test_millimetres_are_those_of_distances_whatever_the_loss(scenario, episode, monkeypatch):
+    """A loss in metres, as CONTRIBUTING tells to write one, changes no `rms_mm`."""
+    values = {"stretch": torch.tensor([1.0]), "mass": torch.tensor([1.0])}
+    objective = Objective(scenario, episode, nuisance={})
+    expected = found_at(objective, {"stretch": 1.0, "mass": 1.0})
+    assert expected["rms_mm"] == pytest.approx(1e3 * expected["loss"] ** 0.5)
+    monkeypatch.setattr(Pairs, "losses", lambda self, moved, cap: self.squares(moved, cap).sqrt())
+    other = found_at(objective, {"stretch": 1.0, "mass": 1.0})
+    assert other["loss"] != pytest.approx(expected["loss"], rel=0.1)
+    for name in ("rms_mm", "frame_rms_mm", "rms_to_recording_mm", "rms_to_cloth_mm"):
+        assert other[name] == expected[name]
+    assert float(objective(values)) == pytest.approx(other["loss"])

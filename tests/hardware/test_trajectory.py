@@ -124,7 +124,7 @@ def test_trajectories_are_read_from_csv_and_npy(tmp_path):
         ("t_s,x,y,z\n0,0,0,0\n0,0,0,0\n", "must start at 0 and increase"),
         ("x,y,z\n0,0,0\nnan,0,0\n", "NaN"),
         ("x,y,z,gripper\n0,0,0,0\n0,0,0,85\n", "from 0 .open. to 1"),
-        ("x,y,z\na,b,c\n", "not a readable trajectory"),
+        ("x,y,z\na,b,c\n", "not a CSV of numbers"),
     ],
 )
 def test_bad_trajectories(tmp_path, text, message):

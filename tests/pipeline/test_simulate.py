@@ -126,6 +126,8 @@ def test_bad_input(work, monkeypatch, arguments, message):
     assert isinstance(done.exception, DiffCloudError)
     assert message in str(done.exception)
     assert not (work / "bad").exists()
+    assert not (work / "bad.partial").exists()
+    assert not (work / ".bad.diffcloud-lock").exists()
 
 
 @pytest.mark.slow

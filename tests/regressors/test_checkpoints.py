@@ -70,6 +70,21 @@ def test_frames_are_found_by_time(tmp_path):
         predict_episode(one, Episode.from_frames(frames[:4], whole.times[:4]))
 
 
+@pytest.mark.parametrize("points", [12, 30, 5000])
+def test_the_library_predicts_from_clouds_what_the_command_predicts_from_their_episode(points):
+    one, whole = regressor("pointnet2"), episode(points=points)
+    expected = predict_episode(one, whole).values
+    assert torch.equal(one.predict([[whole.frame(5)]]).values, expected)
+    assert torch.equal(one.predict(torch.from_numpy(whole.frame(5))[None, None]).values, expected)
+
+
+def test_clouds_that_are_none_are_refused():
+    cloud = np.zeros((50, 3))
+    for wrong in ([cloud, cloud], [], [np.zeros((0, 3))], [np.zeros((50, 2))], [cloud * np.nan]):
+        with pytest.raises(EpisodeError, match=r"looks at 1 frames|Cloud 0 has shape"):
+            regressor().predict([wrong])
+
+
 def test_clouds_of_any_size_are_taken():
     for points in (3, 5000):
         assert predict_episode(regressor(), episode(points=points)).values.shape == (1, 2)

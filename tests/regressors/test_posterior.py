@@ -80,7 +80,7 @@ class TestTraining:
         assert all(0 <= p <= 1 for p in told["uniform_ranks"].values())
 
     def test_intervals_are_quantiles_of_its_draws(self, trained):
-        found = Regressor.read(trained[1]).predict(torch.rand(2, 4, 24, 3))
+        found = Regressor.read(trained[1]).predict_prepared(torch.rand(2, 4, 24, 3))
         low, high = found.interval(0.8)
         inside = ((found.samples >= low[:, None]) & (found.samples <= high[:, None])).double().mean(1)
         torch.testing.assert_close(inside, torch.full_like(inside, 0.8), rtol=0, atol=0.003)

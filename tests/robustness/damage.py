@@ -7,6 +7,8 @@ import io
 import json
 import math
 import random
+import warnings
+import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -15,9 +17,11 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
-KINDS = ("missing", "wrong type", "NaN", "infinite", "negative", "zero", "huge", "duplicate", "too deep")
+KINDS = ("missing", "wrong type", "odd number", "NaN", "infinite", "negative", "zero", "huge", "duplicate", "too deep")
 _DEEP = "@@deep@@"
 _TWICE = "@@twice@@"
+_ODD = "1_000"
+"""A number to Python, and to YAML 1.1."""
 _LEVELS = 100_000
 _LONG = 1_000_000
 
@@ -67,6 +71,8 @@ def _changed(tree: Any, place: tuple[str | int, ...], damage: str, suffix: str) 
             del holder[key]
         case "wrong type":
             holder[key] = "text" if number or isinstance(value, list | dict | bool) or value is None else [1, 2]
+        case "odd number" if number:
+            holder[key] = _ODD
         case "NaN" | "infinite" if number:
             holder[key] = math.nan if damage == "NaN" else math.inf
         case "negative" if number:
@@ -93,6 +99,8 @@ def _written(tree: Any, suffix: str) -> bytes:
     deep = "[" * _LEVELS + "]" * _LEVELS
     for quoted in (f'"{_DEEP}"', f"'{_DEEP}'", _DEEP):
         text = text.replace(quoted, deep)
+    if suffix == ".yaml":
+        text = text.replace(f"'{_ODD}'", _ODD)
     return text.replace(f"'{_TWICE}", "'").replace(_TWICE, "").encode()
 
 
@@ -100,8 +108,8 @@ def table(data: bytes) -> Iterator[Damaged]:
     """Every column of a CSV file in turn, in its second row; and the whole."""
     lines = [line.split(",") for line in data.decode().splitlines()]
     cells = {
-        "wrong type": "text", "NaN": "nan", "infinite": "inf", "negative": "-1", "zero": "0", "huge": "1e300",
-        "missing": "", "too deep": "9" * _LONG,
+        "wrong type": "text", "odd number": _ODD, "NaN": "nan", "infinite": "inf", "negative": "-1", "zero": "0",
+        "huge": "1e300", "missing": "", "too deep": "9" * _LONG,
     }  # fmt: skip
     for column, name in enumerate(lines[0]):
         for damage, cell in cells.items():
@@ -153,6 +161,10 @@ def arrays(data: bytes) -> Iterator[Damaged]:
             stream = io.BytesIO()
             np.savez_compressed(stream, **{key: value for key, value in {**held, name: other}.items() if value is not None})
             yield Damaged(name, damage, stream.getvalue())
+        stream = io.BytesIO(data)
+        with zipfile.ZipFile(stream, "a") as archive, warnings.catch_warnings(action="ignore", category=UserWarning):
+            archive.writestr(f"{name}.npy", archive.read(f"{name}.npy"))
+        yield Damaged(name, "duplicate", stream.getvalue())
 
 
 def _filled(array: np.ndarray, value: float) -> np.ndarray:

@@ -15,6 +15,7 @@ from pydantic import BaseModel
 from diffcloud.errors import SceneError
 from diffcloud.io.schema import Checked
 from diffcloud.scene import Scene, load_scene
+from diffcloud.scene.scenarios import load_scenario
 from diffcloud.scene.schema import SceneFile
 from diffcloud.sim.moved import moved_surfaces
 from diffcloud.sim.simulate import rollout
@@ -242,3 +243,12 @@ def test_every_block_of_the_schema_is_reached():
     blocks = [block for block in Checked.__subclasses__() if block.__module__ == SceneFile.__module__]
     assert len(blocks) > 10
     assert all(block.model_fields.keys() <= words for block in blocks)
+
+
+def test_there_is_one_default_integrator(tmp_path):
+    """That of scenarios and of scenes in Python; ARCSim's files have ARCSim's steps."""
+    lift = load_scenario("lift").scene
+    made = Scene(lift.mesh, lift.material, lift.handles, frame_time=0.1)
+    assert made.integrator == lift.integrator == "implicit"
+    assert made.build()[0].setup.integrator == "implicit"
+    assert load_scene(write_file(write_files(tmp_path), sheet_over_box(movable=0))).integrator == "linearised"

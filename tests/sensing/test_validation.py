@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from diffcloud.io.calibrations import Calibration, CameraCalibration, write_calibration
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.images import write_depth
+from diffcloud.sensing.cameras import rays
 from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.pipeline.invoke import invoke
 from tests.sensing.table_scene import INTRINSICS, SERIALS, poses, write_table_episode
@@ -238,3 +240,65 @@ def test_the_command_explains_and_fails(episode, tmp_path):
     done = invoke("episode", "validate", episode, code=1)
     assert {finding["code"] for finding in done.result["findings"]} == {"image", "joint_count", "short_robot_log"}
     assert "No such folder" in invoke("episode", "validate", tmp_path / "none", code=1).errors
+
+
+def exchange(first, second):
+    spare = first.with_name("spare")
+    first.rename(spare)
+    second.rename(first)
+    spare.rename(second)
+
+
+def test_swapped_camera_folders(episode):
+    exchange(episode / "cameras" / "overhead", episode / "cameras" / "side")
+    assert "swapped_cameras" in codes(episode)
+    assert "Exchange their names" in message(episode, "swapped_cameras")
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_swapped_images(episode, flat):
+    """Also where there is a table alone, on which two views always have points that lie near each other."""
+    if flat:
+        for name, pose in poses().items():
+            for path in (episode / "cameras" / name / "depth").iterdir():
+                write_depth(path, plain_table(pose))
+    for kind in ("depth", "color"):
+        exchange(episode / "cameras" / "overhead" / kind, episode / "cameras" / "side" / kind)
+    assert codes(episode) == {"swapped_cameras"}
+    assert "level when each takes the other's pose" in message(episode, "swapped_cameras")
+
+
+def plain_table(pose):
+    column, row = np.meshgrid(np.arange(INTRINSICS.width), np.arange(INTRINSICS.height))
+    down = (rays(np.stack([column, row], axis=-1).astype(float), INTRINSICS) @ pose[:3, :3].T)[..., 2]
+    with np.errstate(divide="ignore"):
+        depth = np.where(down < 0, -pose[2, 3] / down, np.inf)
+    return np.where(depth < 4.0, np.rint(depth * 1000), 0).astype(np.uint16)
+
+
+def faults(folder):
+    return {one.code for one in validate_raw_episode(folder) if one.severity == "fault"}
+
+
+def test_a_camera_without_a_place_is_a_fault(episode):
+    edit_json(episode / "cameras" / "side" / "camera.json", T_world_camera=None)
+    assert faults(episode) == {"uncalibrated"}
+    assert "Run diffcloud calibrate" in message(episode, "uncalibrated")
+
+
+def test_a_gap_in_the_joint_log_is_a_fault(episode):
+    path = episode / "robot.csv"
+    head, *rows = path.read_text().splitlines()
+    later = [",".join([str(float(row.split(",")[0]) + 2), *row.split(",")[1:]]) for row in rows[6:]]
+    path.write_text("\n".join([head, *rows[:6], *later]) + "\n")
+    assert faults(episode) == {"clock_gap"}
+    assert "A gap of 2.05" in message(episode, "clock_gap")
+
+
+@pytest.mark.parametrize(("count", "severity"), [(3, "fault"), (5, "fault"), (6, "warning")])
+def test_joints_that_are_missing(episode, count, severity):
+    table = pd.read_csv(episode / "robot.csv")
+    table.drop(columns=[f"joint_{index}" for index in range(count + 1, 8)]).to_csv(episode / "robot.csv", index=False)
+    (found,) = [one for one in validate_raw_episode(episode) if one.code == "joint_count"]
+    assert found.severity == severity
+    assert f"It has {count} joints, the Gen3 7" in found.message

@@ -8,6 +8,7 @@ numbers them, as people number their takes: there the parts are those whose time
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from typing import Any
 import yaml
 
 from diffcloud.errors import DiffCloudError, EpisodeError
+from diffcloud.io.inputs import check_input
 from diffcloud.io.ros.topics import is_depth
 
 _METADATA = "metadata.yaml"
@@ -38,6 +40,9 @@ def opened(paths: Sequence[Path]) -> Iterator[Any]:
     from rosbags.typesys import Stores, get_typestore
 
     shown = ", ".join(map(str, paths))
+    for path in paths:
+        if Path(path).exists() and not Path(path).is_dir():
+            check_input(path, kind="recording", error=EpisodeError, most_bytes=sys.maxsize)
     # bags of rosbag2 before 2023 carry no message definitions; those of Humble serve
     try:
         reader = AnyReader([Path(path) for path in paths], default_typestore=get_typestore(Stores.ROS2_HUMBLE))

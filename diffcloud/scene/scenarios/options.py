@@ -53,10 +53,10 @@ class ScenarioOptions(Checked):
     frames: Annotated[int, Field(ge=1, le=100_000)] = 25
     rate_hz: Annotated[float, Field(gt=0, le=1e5)] = 10.0
     steps_per_frame: Annotated[int, Field(ge=1, le=10_000)] = 8
-    integrator: Integrator = "implicit"
+    integrator: Integrator = Scene.integrator
     """"implicit" has steps of second order and smooth contact; "linearised" are ARCSim's steps, a quarter to a tenth as
     long to compute and less exact (docs/results/discretisation.md)."""
-    shaped: bool = False
+    shaped: bool = Scene.shaped
     """Whether the cloth is at rest in bending as it starts, not flat."""
     soft_handles: bool = False
     loss_frames: tuple[int, ...] = (-1,)
@@ -68,16 +68,16 @@ class ScenarioOptions(Checked):
     threshold_m2: Annotated[float, Field(ge=0, le=1)] = 0.0
     """A fit stops when its loss is below; 0: never."""
     recorder: Recorder = "depth_cameras"
-    gravity: Vector = (0.0, 0.0, -9.81)
+    gravity: Vector = Surrounding.gravity
     air_density: NonNegative = 1.2
-    friction_obstacle: Friction = 0.3
-    friction_cloth: Friction = 0.6
+    friction_obstacle: Friction = Surrounding.friction_obstacle
+    friction_cloth: Friction = Surrounding.friction_cloth
     mesh_contact: bool = True
     """For the linearised integrator: whether contact is with all meshes and the cloth itself, or with planes only."""
-    self_contact: bool = True
+    self_contact: bool = Surrounding.self_contact
     """Whether the cloth meets itself; without, layers pass through each other, and steps are several times quicker."""
-    contact_stiffness: NonNegative = 1e4
-    contact_thickness_m: Annotated[float, Field(gt=0, le=1)] = 0.003
+    contact_stiffness: NonNegative = ContactSettings.stiffness
+    contact_thickness_m: Annotated[float, Field(gt=0, le=1)] = ContactSettings.repulsion_thickness
 
     @field_validator("doubts")
     @classmethod

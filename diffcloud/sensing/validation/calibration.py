@@ -17,6 +17,10 @@ from diffcloud.sensing.cameras import depth_points, transform
 from diffcloud.sensing.validation.findings import Finding, RecordedCamera
 
 _SWAP_POINTS = 3000
+_PLANES, _FLAT_M = 200, 0.01
+"""Planes that are tried, and how far off its points may be."""
+_TILTED_DEG, _LEVEL_DEG = 8.0, 4.0
+"""Of a table in both views: more with the stated poses, and less with the exchanged ones, is no accident."""
 _SWAP_M = 0.02
 """Views that disagree by more than this, and agree when exchanged, are exchanged."""
 
@@ -43,8 +47,11 @@ def calibration_findings(camera: RecordedCamera, folder: Path, calibration: Path
         held = _calibration_of(camera, folder, calibration)
         if held is None:
             if camera.info.T_world_camera is None:
-                message = "Not calibrated: neither T_world_camera nor a calibration file. Run diffcloud calibrate."
-                yield Finding("warning", "uncalibrated", place, message)
+                message = (
+                    "Not calibrated: neither T_world_camera nor a calibration file says where the camera stands, without "
+                    "which there are no clouds. Run diffcloud calibrate."
+                )
+                yield Finding("fault", "uncalibrated", place, message)
             return
         entry = held.camera(camera.info.serial, name=camera.name)
     except CalibrationError as error:
@@ -93,7 +100,18 @@ def _pose(camera: RecordedCamera, folder: Path, calibration: Path | None) -> NDA
 
 
 def exchanged_cameras(cameras: list[RecordedCamera], folder: Path, calibration: Path | None) -> Iterator[Finding]:
-    """Two views of one scene must agree; where they do so only with each other's pose, the poses are exchanged."""
+    """Two views of one scene must agree; where they do so only with each other's pose, the poses are exchanged. The same
+    where the table is level only with the other's pose, and where a folder holds the camera that another is named after."""
+    names = {camera.name for camera in cameras}
+    for camera in cameras:
+        if camera.info is not None and camera.info.name != camera.name and camera.info.name in names:
+            yield Finding(
+                "fault",
+                "swapped_cameras",
+                f"cameras/{camera.name}",
+                f"camera.json says that this is camera {camera.info.name!r}, which has a folder of its own: the folders "
+                "were swapped. Exchange their names.",
+            )
     for index, first in enumerate(cameras):
         for second in cameras[index + 1 :]:
             poses = [_pose(camera, folder, calibration) for camera in (first, second)]
@@ -102,7 +120,18 @@ def exchanged_cameras(cameras: list[RecordedCamera], folder: Path, calibration: 
                 continue
             stated = _disagreement(transform(poses[0], clouds[0]), transform(poses[1], clouds[1]))
             exchanged = _disagreement(transform(poses[1], clouds[0]), transform(poses[0], clouds[1]))
-            if stated > _SWAP_M and exchanged < 0.5 * stated:
+            normals = [_plane(cloud) for cloud in clouds]
+            tilts = [_tilt_deg(poses[view], normals[view]) for view in (0, 1)]
+            other = [_tilt_deg(poses[1 - view], normals[view]) for view in (0, 1)]
+            if min(tilts) > _TILTED_DEG and max(other) < _LEVEL_DEG:
+                yield Finding(
+                    "fault",
+                    "swapped_cameras",
+                    f"cameras/{first.name}, cameras/{second.name}",
+                    f"The table is tilted by {tilts[0]:.0f} and {tilts[1]:.0f} degrees in the two views, and level when "
+                    "each takes the other's pose: the cameras' images or calibrations are swapped. Exchange the folders.",
+                )
+            elif stated > _SWAP_M and exchanged < 0.5 * stated:
                 yield Finding(
                     "fault",
                     "swapped_cameras",
@@ -110,6 +139,29 @@ def exchanged_cameras(cameras: list[RecordedCamera], folder: Path, calibration: 
                     f"The two views disagree by {1000 * stated:.0f} mm, and by {1000 * exchanged:.0f} mm when each takes "
                     "the other's pose: the cameras or their calibrations are swapped.",
                 )
+
+
+def _plane(cloud: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """[3] unit normal of the plane that most points lie in, None if that is less than a third of them; seeded."""
+    rng = np.random.default_rng(0)
+    corners = cloud[rng.integers(len(cloud), size=(_PLANES, 3))]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1)
+    normal, origin = normal[length > 1e-6] / length[length > 1e-6, None], corners[length > 1e-6, 0]
+    if not len(normal):
+        return None
+    inside = np.abs(cloud @ normal.T - (normal * origin).sum(axis=1)) < _FLAT_M
+    best = int(inside.sum(axis=0).argmax())
+    if inside[:, best].mean() < 1 / 3:
+        return None
+    points = cloud[inside[:, best]]
+    found: NDArray[np.float64] = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2]
+    return found
+
+
+def _tilt_deg(pose: NDArray[np.float64], normal: NDArray[np.float64] | None) -> float:
+    """How far the plane is from level; NaN without one."""
+    return np.nan if normal is None else float(np.degrees(np.arccos(np.clip(abs((pose[:3, :3] @ normal)[2]), 0, 1))))
 
 
 def _first_points(camera: RecordedCamera) -> NDArray[np.float64] | None:

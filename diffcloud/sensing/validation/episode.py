@@ -33,6 +33,8 @@ _GAP = 2.5
 NEAREST_M, FARTHEST_M = 0.1, 8.0
 """Median depth of a table-top scene lies between."""
 _GEN3_JOINTS = 7
+_FEWEST_JOINTS = 6
+"""With fewer an arm cannot place its tool: columns are missing, unless a description says otherwise."""
 _FAR_RAD, _WINDOW_S = 2.5 * np.pi, 0.5
 """A joint angle beyond is in degrees, or of a joint that has gone on turning; how fast it is is told by windows so long."""
 _ALIKE = ("depth.emitter_enabled", "depth.laser_power", "depth.visual_preset")
@@ -304,8 +306,11 @@ def _robot(log: RobotLog) -> Iterator[Finding]:
         usual = float(np.median(intervals))
         if intervals.max() > max(_GAP * usual, 0.25):
             worst = int(intervals.argmax())
-            message = f"A gap of {intervals[worst]:.3f} s after {log.times[worst]:.3f} s, where {usual:.3f} s is usual."
-            yield Finding("warning", "clock_gap", place, message)
+            message = (
+                f"A gap of {intervals[worst]:.3f} s after {log.times[worst]:.3f} s, where {usual:.3f} s is usual: where "
+                "the arm was meanwhile is not known. Log at the arm's own rate, and record again or cut the episode there."
+            )
+            yield Finding("fault", "clock_gap", place, message)
 
 
 def _fastest(log: RobotLog) -> float:
@@ -321,7 +326,7 @@ def _joint_count(log: RobotLog, robot: Robot | None) -> Iterator[Finding]:
         return
     if robot is None:
         message = f"It has {logged} joints, the Gen3 {wanted}: give `preprocess` the description of this arm with --urdf."
-        yield Finding("warning", "joint_count", "robot.csv", message)
+        yield Finding("warning" if logged >= _FEWEST_JOINTS else "fault", "joint_count", "robot.csv", message)
     else:
         message = f"It has {logged} joints, the description {robot.description.name} has {wanted}."
         yield Finding("fault", "joint_count", "robot.csv", message)

@@ -36,7 +36,9 @@ class Forces:
         """Args: rng: draws parameters; without, they are one, compression is the material's, and air is still."""
         handles = Handles((Handle(0), Handle(1)))
         self.mesh = mesh
-        self.system = build_system(mesh, material, time_step=STEP, handles=handles, surrounding=surrounding, shaped=shaped)
+        self.system = build_system(
+            mesh, material, time_step=STEP, handles=handles, surrounding=surrounding, shaped=shaped, integrator="linearised"
+        )
         self.terms = self.system.scene.terms
         given = self.system.properties
 
