@@ -114,7 +114,7 @@ class TestPcd:
             ("binary", 10**9, b"abc", "states 1000000000 points"),
             ("binary_compressed", 10**9, b"abc" * 100, "states 1000000000 points"),
             ("binary", -1, b"abc", "states -1 points"),
-            ("zip", 1, b"0 0 0\n", "hold 0 at most"),
+            ("zip", 1, b"0 0 0\n", "DATA is zip; allowed are ascii, binary"),
         ],
     )
     def test_what_cannot_be_in_the_file_is_refused(self, tmp_path, kind, count, body, message):
