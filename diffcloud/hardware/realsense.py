@@ -71,8 +71,8 @@ def connected_cameras(context: Any | None = None) -> list[dict[str, str]]:
         devices = (rs.context() if context is None else context).query_devices()
     except RuntimeError as error:  # of the library: no home folder, or no access to USB
         raise HardwareError(
-            f"The RealSense library cannot look for cameras ({error}). Set HOME to a folder that exists, and check the udev "
-            "rules."
+            f"The RealSense library cannot look for cameras ({error}). Set HOME to a folder that exists, and check the "
+            "udev rules."
         ) from error
     found = [{key: device.get_info(info) for key, info in fields.items() if device.supports(info)} for device in devices]
     return sorted(found, key=lambda device: device.get("serial", ""))

@@ -116,8 +116,8 @@ def _times(folder: Path, named: NamedFrames, rate_hz: float | None) -> dict[int,
     if named.times is not None:
         if (folder / "timestamps.csv").is_file():
             raise EpisodeError(
-                f"{folder}: the names of the depth images are times ({named.paths[0].name}), and there is a timestamps.csv. "
-                "Remove timestamps.csv to use the names, or rename the images to its frame numbers."
+                f"{folder}: the names of the depth images are times ({named.paths[0].name}), and there is a timestamps.csv."
+                " Remove timestamps.csv to use the names, or rename the images to its frame numbers."
             )
         named.check_rate(rate_hz, folder / "depth")
         return dict(zip(numbers, named.times.tolist(), strict=True))

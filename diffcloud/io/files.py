@@ -31,7 +31,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import yaml
 
-from diffcloud.errors import DiffCloudError, EpisodeError, OutputError
+from diffcloud.errors import DiffCloudError, OutputError
 
 _MOST_VALUES = 100_000
 """Values that a YAML file may stand for."""

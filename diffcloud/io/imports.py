@@ -97,15 +97,15 @@ def cloud_folder(
     frames, empty = [], []
     named = named_frames(Path(folder), FORMATS, kind="clouds")
     named.check_rate(rate_hz, Path(folder))
-    for path in named.paths:
+    for number, path in zip(named.numbers, named.paths, strict=True):
         try:
             frames.append(read_cloud(path))
         except EmptyCloudError:
-            empty.append(path.name)
+            empty.append(number)
     if empty:
-        first = ", ".join(empty[:_MOST_NAMED]) + (" and more" if len(empty) > _MOST_NAMED else "")
+        first = ", ".join(map(str, empty[:_MOST_NAMED])) + (" and more" if len(empty) > _MOST_NAMED else "")
         raise EpisodeError(
-            f"{folder}: {len(empty)} of {len(empty) + len(frames)} clouds are empty ({first}). Every frame needs "
+            f"{folder}: {len(empty)} of {len(empty) + len(frames)} clouds are empty (frames {first}). Every frame needs "
             "points of the cloth: lower the height below which points were cut off, or leave these frames out and renumber "
             "the others."
         )
