@@ -53,7 +53,8 @@ class Intrinsics:
         allowed = LENS_COEFFICIENTS[self.distortion]
         if self.coefficients and allowed and len(self.coefficients) not in allowed:
             raise EpisodeError(
-                f"Distortion {self.distortion} has {', '.join(map(str, allowed))} coefficients, got {len(self.coefficients)}."
+                f"Distortion {self.distortion} has {', '.join(map(str, allowed))} coefficients, got "
+                f"{len(self.coefficients)}."
             )
         numbers = [self.fx, self.fy, self.cx, self.cy, *self.coefficients]
         if not np.isfinite(numbers).all() or self.width < 1 or self.height < 1:

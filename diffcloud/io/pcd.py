@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from diffcloud.errors import EpisodeError
+from diffcloud.errors import EmptyCloudError, EpisodeError
 
 _HEADER = 65_536
 """[B] Length that no header exceeds."""
@@ -36,7 +36,8 @@ def read_pcd(path: Path) -> NDArray[np.float64]:
     """[N, 3] points of a PCD file. Points with NaN are left out: PCL marks pixels without a measurement so.
 
     Raises:
-        EpisodeError: a damaged header, no fields x, y, z, a field type that PCD lacks, or data that end early.
+        EpisodeError: a damaged header, no fields x, y, z, a field type that PCD lacks, or data that end early;
+            nothing but NaN (`EmptyCloudError`).
     """
     with path.open("rb") as stream:
         header = _read_header(stream, path)
@@ -58,7 +59,7 @@ def read_pcd(path: Path) -> NDArray[np.float64]:
     points = np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
     kept = points[~np.isnan(points).any(axis=1)]
     if len(points) and not len(kept):
-        raise EpisodeError(f"{path} holds {len(points)} points, all of them NaN; leave this frame out.")
+        raise EmptyCloudError(f"{path} holds {len(points)} points, all of them NaN; leave this frame out.")
     return kept
 
 
