@@ -154,7 +154,7 @@ def _colors(folder: Path, camera: str, depth: NamedFrames) -> tuple[dict[int, Pa
         )
     if held.times is None or depth.times is None:
         return dict(zip(held.numbers, held.paths, strict=True)), ()
-    nearest = pair(camera, f"{folder / 'depth'}", depth.times.tolist(), held.times.tolist())
+    nearest = pair(camera, f"{folder / 'depth'}", depth.times, held.times)
     pairs = enumerate(nearest.colors.tolist())
     return {frame: held.paths[number] for frame, number in pairs if number >= 0}, nearest.warnings
 

@@ -110,7 +110,7 @@ def _text(stream: BinaryIO, header: _Header, path: Path) -> list[NDArray[Any]]:
         raise EpisodeError(f"{path} is not a readable PCD file (numbers, as many in each line): {error}.") from error
     if len(rows) != header.points:
         raise EpisodeError(f"{path} states {header.points} points and holds {len(rows)}.")
-    widths = [int(np.prod(header.layout[index].shape)) for index in range(len(header.layout))]
+    widths = [int(np.prod(header.layout[index].shape)) for index in range(len(header.layout.names or ()))]
     if not header.points:
         return [np.zeros(0)] * 3
     if rows.shape[1] != sum(widths):

@@ -104,7 +104,7 @@ def _polynomial(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
 def _invert(target: Floats, coefficients: tuple[float, ...]) -> Floats:
     if not any(coefficients):
         return target
-    target = _through(np.linalg.inv(_tilt(coefficients)), target)
+    target = _through(np.asarray(np.linalg.inv(_tilt(coefficients)), np.float64), target)
     xy = target
     for _ in range(_ITERATIONS):
         radial, tangential = _terms(xy, coefficients)

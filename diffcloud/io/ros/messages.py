@@ -152,8 +152,8 @@ def camera_intrinsics(message: Any, name: str, topic: str, *, rectified: bool = 
         distortion = _LENSES[model]
         lens = _whole(lens, LENS_COEFFICIENTS[distortion])
     try:
-        held = [float(matrix[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))]
-        return Intrinsics(message.width, message.height, *held, distortion, tuple(lens) if any(lens) else ())
+        fx, fy, cx, cy = (float(matrix[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return Intrinsics(message.width, message.height, fx, fy, cx, cy, distortion, tuple(lens) if any(lens) else ())
     except EpisodeError as error:
         raise EpisodeError(f"{where} does not describe a camera: {error}") from error
 

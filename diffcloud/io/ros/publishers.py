@@ -150,7 +150,7 @@ def _apart(difference: Floats) -> Floats:
 
 def _labels(publishers: Sequence[_Publisher], rivals: Sequence[int]) -> dict[int, str]:
     """What the user may name: the topic, with a number where several on it contradict each other."""
-    labels = {}
+    labels: dict[int, str] = {}
     for topic in {publishers[index].topic for index in rivals}:
         own = [index for index in rivals if publishers[index].topic == topic]
         labels |= dict.fromkeys(own, topic)
