@@ -5,9 +5,11 @@ from __future__ import annotations
 import io
 import os
 import shlex
+import stat
 import sys
 import tempfile
 import traceback
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -77,6 +79,7 @@ def main() -> None:
     # A step is a chain of small operations: a second thread gains nothing (measured), and beside another busy process its
     # spinning costs tenfold. Said to OpenMP, which reads it when torch is imported, by those commands that need torch.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    _have_a_home()
     keep_freed_memory()
     ctrl_c.listen()
     for stream in (sys.stdout, sys.stderr):
@@ -106,6 +109,22 @@ def main() -> None:
             raise
         say("Error:", _unforeseen(error), style="bold red")
         sys.exit(1)
+
+
+def _have_a_home() -> None:
+    """Name a folder of this user's alone as home where the system knows none, as for a container's user without an entry in
+    passwd: the cameras' library fails without a home, and caches would go to a folder ~ in the current one."""
+    if os.environ.get("HOME") or os.path.expanduser("~") not in ("~", ""):
+        return
+    folder = Path(tempfile.gettempdir()) / f"diffcloud-home-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+            folder = Path(tempfile.mkdtemp(prefix="diffcloud-home-"))  # somebody else made it
+    except OSError:
+        folder = Path(tempfile.gettempdir())
+    os.environ["HOME"] = str(folder)
 
 
 def _unforeseen(error: Exception) -> str:

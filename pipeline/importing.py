@@ -69,7 +69,9 @@ def release(
 @app.command()
 @writes(".npz")
 def clouds(
-    folder: Annotated[Path, typer.Argument(help="Numbered clouds (npy, ply, xyz, pcd), one a frame, in metres.")],
+    folder: Annotated[
+        Path, typer.Argument(help="Clouds (npy, ply, xyz, pcd) numbered or named by time, one a frame, in metres.")
+    ],
     out: Annotated[Path, typer.Option(help="Episode file (.npz).")],
     gripper: Annotated[
         list[str] | None,
@@ -78,7 +80,12 @@ def clouds(
             "gripper that names them, or NAME=PATH, repeated."
         ),
     ] = None,
-    rate_hz: Annotated[float | None, typer.Option(help="Frame rate, if the CSV has no t_s.")] = None,
+    rate_hz: Annotated[
+        float | None,
+        typer.Option(
+            help="Frame rate, if neither the CSV has t_s nor the file names are times. Names that are times must agree."
+        ),
+    ] = None,
     camera: Annotated[
         list[str] | None,
         typer.Option(
@@ -118,9 +125,19 @@ def recording(
     out: Annotated[Path, typer.Option(help="Folder of the raw episode; must not exist.")],
     joint_log: Annotated[Path | None, typer.Option(help="CSV with the columns of robot.csv.")] = None,
     log_offset: Annotated[float, typer.Option(help="Seconds to add to the joint log's times.")] = 0.0,
-    rate_hz: Annotated[float | None, typer.Option(help="Frame rate, where the source has no times.")] = None,
+    rate_hz: Annotated[
+        float | None,
+        typer.Option(help="Frame rate, where the source has no times. File names that are times must agree with it."),
+    ] = None,
     world_frame: Annotated[str, typer.Option(help="ROS: the robot's base in tf.")] = "base_link",
     tool_frame: Annotated[str, typer.Option(help="ROS: the tool in tf.")] = "tool_frame",
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="ROS: which topic to take where several could be: of depth, colour, camera_info, joint states or tf; "
+            "repeated. TOPIC#NUMBER takes one of several publishers of joint states on it."
+        ),
+    ] = None,
     joint: Annotated[
         list[str] | None, typer.Option(help="ROS: the arm's joints in order; joint_1, ... if not given.")
     ] = None,
@@ -157,6 +174,7 @@ def recording(
                 gripper_open=gripper_open,
                 gripper_closed=gripper_closed,
                 description=partial(robot_description, urdf),
+                topics=topic or (),
             )
         elif kinds == {"realsense"}:
             found = stack.enter_context(play_recordings(named))

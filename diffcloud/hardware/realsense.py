@@ -55,7 +55,11 @@ def import_realsense() -> Any:
 
 
 def connected_cameras(context: Any | None = None) -> list[dict[str, str]]:
-    """Name, serial, firmware and USB type of each camera that is plugged in."""
+    """Name, serial, firmware and USB type of each camera that is plugged in.
+
+    Raises:
+        HardwareError: the library cannot be imported, or cannot look for cameras.
+    """
     rs = import_realsense()
     fields = {
         "name": rs.camera_info.name,
@@ -63,7 +67,13 @@ def connected_cameras(context: Any | None = None) -> list[dict[str, str]]:
         "firmware": rs.camera_info.firmware_version,
         "usb": rs.camera_info.usb_type_descriptor,
     }
-    devices = (rs.context() if context is None else context).query_devices()
+    try:
+        devices = (rs.context() if context is None else context).query_devices()
+    except RuntimeError as error:  # of the library: no home folder, or no access to USB
+        raise HardwareError(
+            f"The RealSense library cannot look for cameras ({error}). Set HOME to a folder that exists, and check the "
+            "udev rules."
+        ) from error
     found = [{key: device.get_info(info) for key, info in fields.items() if device.supports(info)} for device in devices]
     return sorted(found, key=lambda device: device.get("serial", ""))
 

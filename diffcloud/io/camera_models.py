@@ -14,9 +14,16 @@ from diffcloud.io.schema import Checked, Component
 
 Pixels = Annotated[int, Field(ge=1, le=20_000)]
 
-Distortion = Literal["none", "brown_conrady", "inverse_brown_conrady"]
+Distortion = Literal["none", "brown_conrady", "inverse_brown_conrady", "equidistant"]
 """`brown_conrady`: OpenCV's, from rays to pixels. `inverse_brown_conrady`: the same polynomial from pixels to rays, which
-RealSense colour cameras state (mostly with zeros)."""
+RealSense colour cameras state (mostly with zeros). `equidistant`: OpenCV's fisheye, from rays to pixels."""
+LENS_COEFFICIENTS: dict[Distortion, tuple[int, ...]] = {
+    "none": (),
+    "brown_conrady": (5, 8, 12, 14),
+    "inverse_brown_conrady": (5,),
+    "equidistant": (4,),
+}
+"""How many coefficients a model may have."""
 
 
 @dataclass(frozen=True)
@@ -35,15 +42,20 @@ class Intrinsics:
     cy: float
     distortion: Distortion = "none"
     coefficients: tuple[float, ...] = ()
-    """(k1, k2, p1, p2, k3)."""
+    """In OpenCV's order: (k1, k2, p1, p2, k3), of brown_conrady also with k4..k6 (rational), s1..s4 (thin prism), and the
+    tilt of the sensor tau_x, tau_y [rad]; of equidistant (k1, k2, k3, k4)."""
 
     def __post_init__(self) -> None:
         if self.distortion not in get_args(Distortion):
             raise EpisodeError(unknown_name("distortion model", self.distortion, get_args(Distortion)))
         if self.distortion == "none" and any(self.coefficients):
             raise EpisodeError(f"Distortion 'none' takes no coefficients, got {list(self.coefficients)}.")
-        if len(self.coefficients) not in (0, 5):
-            raise EpisodeError(f"Distortion has 5 coefficients (k1, k2, p1, p2, k3), got {len(self.coefficients)}.")
+        allowed = LENS_COEFFICIENTS[self.distortion]
+        if self.coefficients and allowed and len(self.coefficients) not in allowed:
+            raise EpisodeError(
+                f"Distortion {self.distortion} has {', '.join(map(str, allowed))} coefficients, got "
+                f"{len(self.coefficients)}."
+            )
         numbers = [self.fx, self.fy, self.cx, self.cy, *self.coefficients]
         if not np.isfinite(numbers).all() or self.width < 1 or self.height < 1:
             raise EpisodeError(f"Intrinsics must be finite numbers and a size of at least 1 x 1, got {self}.")
@@ -86,7 +98,7 @@ class IntrinsicsFile(Checked):
     cx: Component
     cy: Component
     distortion: Distortion = "none"
-    coefficients: list[Component] = Field([], max_length=5)
+    coefficients: list[Component] = Field([], max_length=14)
 
     @model_validator(mode="after")
     def _is_a_camera(self) -> Self:

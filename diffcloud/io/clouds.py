@@ -1,11 +1,7 @@
-"""Cloud files of other tools: NPY, PLY, XYZ, PCD.
-
-PLY goes through trimesh and PCD through open3d, which is imported only when a PCD file is met.
-"""
+"""Cloud files of other tools: NPY, PLY, XYZ, PCD; and open3d, which is imported only where it is used."""
 
 from __future__ import annotations
 
-import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -17,11 +13,11 @@ from diffcloud.errors import EmptyCloudError, EpisodeError
 from diffcloud.io.files import atomic
 from diffcloud.io.inputs import check_input
 from diffcloud.io.libusb import load_libusb
+from diffcloud.io.pcd import read_pcd
 from diffcloud.io.pickles import load_npy
+from diffcloud.io.ply import read_ply
 
 FORMATS = (".npy", ".ply", ".xyz", ".pcd")
-_HEADER = 65_536
-"""[B] A longer one is none."""
 
 
 def read_cloud(path: Path) -> NDArray[np.float32]:
@@ -32,7 +28,7 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
     """
     path = Path(path)
     check_input(path, kind="cloud", error=EpisodeError)
-    readers = {".npy": load_npy, ".ply": _read_ply, ".xyz": _read_xyz, ".pcd": _read_pcd}
+    readers = {".npy": load_npy, ".ply": read_ply, ".xyz": _read_xyz, ".pcd": read_pcd}
     if path.suffix.lower() not in readers:
         raise EpisodeError(f"{path}: unknown cloud format; allowed are {', '.join(FORMATS)}.")
     points = np.asarray(readers[path.suffix.lower()](path))
@@ -57,21 +53,6 @@ def write_ply(path: Path, vertices: NDArray[Any], faces: NDArray[Any] | None = N
         shape.export(stream, file_type="ply")
 
 
-def _read_ply(path: Path) -> NDArray[Any]:
-    import trimesh
-
-    try:
-        loaded = trimesh.load(path, process=False)
-    except Exception as error:  # trimesh raises many kinds on damaged files
-        raise EpisodeError(f"{path} is not a readable PLY file: {error}.") from error
-    found = np.asarray(getattr(loaded, "vertices", np.zeros((0, 3))))
-    with path.open("rb") as stream:  # of text that was cut off at a line's end trimesh takes what is there
-        stated = re.search(rb"^element vertex (\d+)\s*$", stream.read(_HEADER), re.MULTILINE)
-    if stated is not None and len(found) < int(stated[1]):  # more where faces share places but not their texture
-        raise EpisodeError(f"{path} states {int(stated[1])} points and holds {len(found)}: it was cut off.")
-    return found
-
-
 def _read_xyz(path: Path) -> NDArray[Any]:
     try:
         with warnings.catch_warnings():
@@ -80,48 +61,6 @@ def _read_xyz(path: Path) -> NDArray[Any]:
     except (ValueError, UnicodeDecodeError) as error:
         raise EpisodeError(f"{path} is not a readable XYZ file (three or more numbers a line): {error}.") from error
     return table[:, :3] if table.size else np.zeros((0, 3))
-
-
-def _read_pcd(path: Path) -> NDArray[Any]:
-    _check_pcd(path)
-    open3d = import_open3d()
-    cloud = open3d.io.read_point_cloud(str(path), remove_nan_points=False, remove_infinite_points=False)
-    return np.asarray(cloud.points)
-
-
-def _check_pcd(path: Path) -> None:
-    """Refuse what open3d reads in silence: rows of text as points at zero, and points that the file cannot hold, for which
-    it takes memory.
-
-    Raises:
-        EpisodeError: these, or no header.
-    """
-    with path.open("rb") as stream:
-        head: dict[str, list[str]] = {}
-        while "DATA" not in head and stream.tell() < _HEADER and (line := stream.readline(_HEADER)):
-            name, *words = [*line.decode("ascii", errors="replace").split(), ""]
-            head[name.upper()] = words[:-1]
-        try:
-            points, kind, sizes = int(head["POINTS"][0]), head["DATA"][0].lower(), [int(size) for size in head["SIZE"]]
-            counts = [int(count) for count in head.get("COUNT", ["1"] * len(sizes))]
-            row = max(sum(size * count for size, count in zip(sizes, counts, strict=True)), 1)
-        except (KeyError, IndexError, ValueError) as error:
-            raise EpisodeError(
-                f"{path} is not a readable PCD file: its header lacks or garbles a field ({error})."
-            ) from error
-        left = path.stat().st_size - stream.tell()
-        # LZF, which compressed files have, gains at most a factor of 88
-        most = {"ascii": left // 2, "binary": left // row, "binary_compressed": 88 * left // row}.get(kind, 0)
-        if not 0 <= points <= most:
-            raise EpisodeError(f"{path} states {points} points, but what follows its header can hold {most} at most.")
-        if kind != "ascii":
-            return
-        try:
-            rows = np.loadtxt(stream, ndmin=2)
-        except (ValueError, UnicodeDecodeError) as error:
-            raise EpisodeError(f"{path} is not a readable PCD file (numbers, as many in each line): {error}.") from error
-    if len(rows) != points:
-        raise EpisodeError(f"{path} states {points} points and holds {len(rows)}.")
 
 
 def import_open3d() -> Any:
@@ -137,7 +76,6 @@ def import_open3d() -> Any:
         if isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):  # as libraries in C report a Ctrl-C
             raise KeyboardInterrupt from error
         raise EpisodeError(
-            f"open3d cannot be imported ({error}). On Debian: apt-get install libgl1 libegl1 libx11-6 libudev1 libgomp1. "
-            "Or convert PCD files to PLY."
+            f"open3d cannot be imported ({error}). On Debian: apt-get install libgl1 libegl1 libx11-6 libudev1 libgomp1."
         ) from error
     return open3d

@@ -1,8 +1,9 @@
 """Folders of PNG depth images and a JSON of the camera, as simple recorders and Open3D write them.
 
-<folder>/depth/*.png    16-bit, numbered          <folder>/color/*.png or *.jpg    optional, same numbers
+<folder>/depth/*.png    16-bit, numbered or named by time (`io.frame_names`)
+<folder>/color/*.png or *.jpg    optional, same numbers; of times, the nearest
 <folder>/camera.json    as in raw episodes, or Open3D's {width, height, intrinsic_matrix (column-major), depth_scale}
-<folder>/timestamps.csv frame, t_s                optional; else the rate is given
+<folder>/timestamps.csv frame, t_s                optional; else names are times, or the rate is given
 """
 
 from __future__ import annotations
@@ -17,10 +18,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.camera_models import Intrinsics, IntrinsicsFile, Pixels
-from diffcloud.io.files import files_in, numbered_files, read_json
+from diffcloud.io.files import files_in, read_json
+from diffcloud.io.frame_names import NamedFrames, named_frames
 from diffcloud.io.images import read_color, read_depth
 from diffcloud.io.raw_episodes import CameraFile, CameraInfo, Name, first_backwards, read_timestamps
 from diffcloud.io.recordings import RecordedFrame, Recording, check_frame_rate
+from diffcloud.io.ros.pairing import pair
 from diffcloud.io.schema import Component, explain
 
 _IMAGES = (".png", ".jpg", ".jpeg")
@@ -32,19 +35,23 @@ def depth_folders(folders: Mapping[str, Path], *, rate_hz: float | None = None) 
 
     Args:
         folders: by the camera's name.
-        rate_hz: of frames without timestamps.csv.
+        rate_hz: of frames without timestamps.csv whose names are no times.
 
     Raises:
-        EpisodeError: no images, no camera JSON, gaps in the numbers, JPEG depth, no times, times that run backwards, or a
-            rate that is none.
+        EpisodeError: no images, no camera JSON, gaps in the numbers, JPEG depth, no times, times in two places that
+            disagree, times that run backwards, or a rate that is none.
     """
     cameras = {name: _camera(Path(folder), name) for name, folder in folders.items()}
-    images = {name: numbered_files(Path(folder) / "depth", _IMAGES, kind="images") for name, folder in folders.items()}
-    times = {name: _times(Path(folder), sorted(images[name]), rate_hz) for name, folder in folders.items()}
+    named = {name: named_frames(Path(folder) / "depth", _IMAGES, kind="images") for name, folder in folders.items()}
+    images = {name: dict(zip(held.numbers, held.paths, strict=True)) for name, held in named.items()}
+    times = {name: _times(Path(folder), named[name], rate_hz) for name, folder in folders.items()}
     order = sorted((times[name][number], name, number) for name in folders for number in images[name])
 
-    colors, warnings = _aligned_colors(cameras, {name: _colors(Path(folder)) for name, folder in folders.items()})
-    warnings += _lost_colors(images, colors)
+    found = {name: _colors(Path(folder), name, named[name]) for name, folder in folders.items()}
+    colors, warnings = _aligned_colors(cameras, {name: held for name, (held, _) in found.items()})
+    for name, (_, why) in found.items():
+        warnings += why if colors[name] else ()
+    warnings += _lost_colors({name: images[name] for name in folders if named[name].times is None}, colors)
 
     def frames() -> Iterator[RecordedFrame]:
         for t, name, number in order:
@@ -104,7 +111,16 @@ class _Open3DCamera(BaseModel):
         return CameraInfo(name, self.serial_number or name, self.intrinsics(), 1 / self.depth_scale)
 
 
-def _times(folder: Path, numbers: list[int], rate_hz: float | None) -> dict[int, float]:
+def _times(folder: Path, named: NamedFrames, rate_hz: float | None) -> dict[int, float]:
+    numbers = list(named.numbers)
+    if named.times is not None:
+        if (folder / "timestamps.csv").is_file():
+            raise EpisodeError(
+                f"{folder}: the names of the depth images are times ({named.paths[0].name}), and there is a timestamps.csv."
+                " Remove timestamps.csv to use the names, or rename the images to its frame numbers."
+            )
+        named.check_rate(rate_hz, folder / "depth")
+        return dict(zip(numbers, named.times.tolist(), strict=True))
     if (folder / "timestamps.csv").is_file():
         frames, times = read_timestamps(folder / "timestamps.csv")
         known = dict(zip(frames.tolist(), times.tolist(), strict=True))
@@ -126,10 +142,21 @@ def _times(folder: Path, numbers: list[int], rate_hz: float | None) -> dict[int,
     return {number: (number - numbers[0]) / rate_hz for number in numbers}
 
 
-def _colors(folder: Path) -> dict[int, Path]:
-    """Number -> image; some, or all, may be missing."""
-    held = files_in(folder / "color", *_IMAGES) if (folder / "color").is_dir() else []
-    return numbered_files(folder / "color", _IMAGES, kind="images", gaps=True) if held else {}
+def _colors(folder: Path, camera: str, depth: NamedFrames) -> tuple[dict[int, Path], tuple[str, ...]]:
+    """(number of a depth image -> colour image, some or all may be missing; warnings)."""
+    if not files_in(folder / "color", *_IMAGES):
+        return {}, ()
+    held = named_frames(folder / "color", _IMAGES, kind="images", gaps=True)
+    if (held.times is None) != (depth.times is None):
+        raise EpisodeError(
+            f"{folder}: the images in depth ({depth.paths[0].name}) and color ({held.paths[0].name}) are not named alike: "
+            "one by times, the other by frame numbers. Name both in one way, or remove the folder color."
+        )
+    if held.times is None or depth.times is None:
+        return dict(zip(held.numbers, held.paths, strict=True)), ()
+    nearest = pair(camera, f"{folder / 'depth'}", depth.times, held.times)
+    pairs = enumerate(nearest.colors.tolist())
+    return {frame: held.paths[number] for frame, number in pairs if number >= 0}, nearest.warnings
 
 
 def _aligned_colors(

@@ -25,14 +25,13 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 import yaml
 
-from diffcloud.errors import DiffCloudError, EpisodeError, OutputError
+from diffcloud.errors import DiffCloudError, OutputError
 from diffcloud.io.inputs import read_text
 from diffcloud.io.numbers import CORE, WHOLE, number, whole
 
@@ -40,7 +39,8 @@ _MOST_VALUES = 100_000
 """Values that a YAML file may stand for."""
 _MOST_JSON, _MOST_YAML = 50_000_000, 1_000_000
 """Bytes of a file of text that is read as a whole: JSON; YAML, whose reader is slow."""
-_MOST_FRAMES = 100_000_000
+_COMMENT = re.compile(r'"(?:[^"\\]|\\.)*+"|//[^\n]*|#[^\n]*|/\*.*?\*/', re.DOTALL)
+"""A string of JSON, in which nothing is a comment, or a comment."""
 _SHARED_TIME = 1_600_000_000
 """Modification time given to files that several processes write with the same text [s]."""
 TEMPORARY, LOCK = ".diffcloud-tmp", ".diffcloud-lock"
@@ -206,16 +206,20 @@ def write_npz(path: Path, *, compressed: bool = True, **arrays: Any) -> None:
         save(stream, allow_pickle=False, **arrays)
 
 
-def read_json(path: Path, *, error: type[DiffCloudError] = DiffCloudError) -> Any:
+def read_json(path: Path, *, error: type[DiffCloudError] = DiffCloudError, comments: bool = False) -> Any:
     """Read a JSON file.
+
+    Args:
+        comments: accept comments (`//`, `/* */` and `#`), as the reader of ARCSim does.
 
     Raises:
         error: the file is missing, no regular file or not JSON, too large, or names a field twice; the message names the
             file and the place.
     """
     try:
+        text = read_text(path, error=error, most_bytes=_MOST_JSON)
         return json.loads(
-            read_text(path, error=error, most_bytes=_MOST_JSON),
+            _COMMENT.sub(_blank, text) if comments else text,
             object_pairs_hook=partial(_object, Path(path), error),
             parse_constant=_refuse_constant,
             parse_float=_finite,
@@ -281,6 +285,12 @@ for _tag, _plain, _first in (
     _PlainLoader.add_implicit_resolver(
         f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_plain})$"), [*_first, *([""] if _tag == "null" else [])]
     )
+
+
+def _blank(match: re.Match[str]) -> str:
+    """A comment as white space on as many lines, so that errors name the right place; a string as it is."""
+    held = match.group()
+    return held if held.startswith('"') else re.sub(r"[^\n]", " ", held)
 
 
 def _refuse_constant(text: str) -> float:
@@ -368,48 +378,6 @@ def files_in(folder: Path, *suffixes: str) -> list[Path]:
     )
     refuse_undecoded(found)
     return found
-
-
-def numbered_files(folder: Path, formats: tuple[str, ...], *, kind: str, gaps: bool = False) -> dict[int, Path]:
-    """Data files whose names end in numbers, by number.
-
-    Args:
-        kind: of file, for messages, such as "clouds".
-        gaps: whether numbers may be missing.
-
-    Raises:
-        EpisodeError: no such folder or file, two files of one number, numbers that are missing, or that are times.
-    """
-    if not Path(folder).is_dir():
-        raise EpisodeError(f"No such folder of {kind}: {folder}.")
-    found: dict[int, Path] = {}
-    for path in files_in(folder, *formats):
-        match = re.search(r"(\d+)$", path.stem)
-        if match is None:
-            continue
-        number = int(match.group(1))
-        if number in found:
-            raise EpisodeError(f"{folder}: {found[number].name} and {path.name} are both frame {number}.")
-        found[number] = path
-    if not found:
-        raise EpisodeError(f"{folder} holds no numbered {kind} ({', '.join(formats)}), such as 000{formats[0]}.")
-    numbers = sorted(found)
-    missing_between = [
-        (before, after) for before, after in pairwise(numbers) if after > before + 1
-    ]  # not each number in them
-    if numbers[-1] > _MOST_FRAMES:
-        raise EpisodeError(
-            f"{folder}: its files end in numbers such as {numbers[0]} and {numbers[-1]}, which are times and not frames. "
-            "Number them in order from 0, and give the times by --rate-hz or in a CSV with t_s."
-        )
-    if missing_between and not gaps:
-        missing = [
-            number for before, after in missing_between[:10] for number in range(before + 1, min(after, before + 11))
-        ][:10]
-        raise EpisodeError(
-            f"{folder}: frames {missing} are missing between {numbers[0]} and {numbers[-1]}; renumber or record again."
-        )
-    return {number: found[number] for number in numbers}
 
 
 def folders_in(folder: Path) -> list[Path]:

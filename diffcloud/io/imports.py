@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diffcloud.errors import EmptyCloudError, EpisodeError
 from diffcloud.io.clouds import FORMATS, read_cloud
 from diffcloud.io.episodes import Episode
-from diffcloud.io.files import folders_in, numbered_files
+from diffcloud.io.files import folders_in
+from diffcloud.io.frame_names import NamedFrames, named_frames
 from diffcloud.io.grippers import read_tracks
 from diffcloud.io.pickles import load_npy
 
@@ -38,6 +41,8 @@ ASSUMED_CATEGORIES = {
 _MODELS = ("mlp", "pointnet2", "meteornet")
 _MOST_NAMED = 5
 """Empty frames in a message."""
+_SAME_STEP = 0.5
+"""Part of a frame interval by which a CSV's times may differ from those in the names."""
 
 
 def release_episodes(folder: Path) -> Iterator[tuple[str, str, Episode]]:
@@ -65,7 +70,7 @@ def release_episodes(folder: Path) -> Iterator[tuple[str, str, Episode]]:
             }
             if episode.name in truth:
                 meta["truth"] = _pair(truth[episode.name])
-            frames = [read_cloud(path) for path in numbered_files(episode, (".npy",), kind="clouds").values()]
+            frames = [read_cloud(path) for path in named_frames(episode, (".npy",), kind="clouds").paths]
             times = RELEASE_FRAME_TIME * (np.arange(len(frames), dtype=np.float64) + RELEASE_FOLDERS[scenario][1])
             yield f"release_{scenario}", episode.name, Episode.from_frames(frames, times, meta=meta)
 
@@ -80,36 +85,57 @@ def cloud_folder(
     """An episode from a folder of numbered clouds, one file a frame.
 
     Args:
-        folder: files `<anything><number>.(npy|ply|xyz|pcd)`, numbers without gaps, in metres in the scene's frame.
+        folder: files `<anything><number>.(npy|ply|xyz|pcd)`, in metres in the scene's frame. The numbers are frames without
+            gaps, or times (`io.frame_names`).
         grippers: name -> CSV, as `io.grippers` reads them.
-        rate_hz: frame rate where the CSV has no t_s.
+        rate_hz: frame rate where neither the CSV has t_s nor the names are times.
 
     Raises:
-        EpisodeError: no clouds, a gap in the numbers, a bad or an empty cloud, or a CSV that does not match.
+        EpisodeError: no clouds, a gap in the numbers, a bad or an empty cloud, a CSV that does not match, or times in two
+            places that disagree.
     """
     frames, empty = [], []
-    for number, path in numbered_files(Path(folder), FORMATS, kind="clouds").items():
+    named = named_frames(Path(folder), FORMATS, kind="clouds")
+    named.check_rate(rate_hz, Path(folder))
+    for number, path in zip(named.numbers, named.paths, strict=True):
         try:
             frames.append(read_cloud(path))
         except EmptyCloudError:
             empty.append(number)
     if empty:
-        named = ", ".join(map(str, empty[:_MOST_NAMED])) + (" and more" if len(empty) > _MOST_NAMED else "")
+        first = ", ".join(map(str, empty[:_MOST_NAMED])) + (" and more" if len(empty) > _MOST_NAMED else "")
         raise EpisodeError(
-            f"{folder}: {len(empty)} of {len(empty) + len(frames)} clouds are empty (frames {named}). Every frame needs "
+            f"{folder}: {len(empty)} of {len(empty) + len(frames)} clouds are empty (frames {first}). Every frame needs "
             "points of the cloth: lower the height below which points were cut off, or leave these frames out and renumber "
             "the others."
         )
     tracks = read_tracks(grippers, len(frames)) if grippers else None
-    times = None if tracks is None else tracks.times
-    if times is None:
-        if rate_hz is None or rate_hz <= 0:
-            raise EpisodeError("Frame times are unknown: give --rate-hz, or a gripper CSV with a t_s column.")
-        times = np.arange(len(frames)) / rate_hz
+    times = _times(named, None if tracks is None else tracks.times, rate_hz, Path(folder))
     about = {"source": "clouds", **(meta or {})}
     if tracks is None:
         return Episode.from_frames(frames, times, meta=about)
     return Episode.from_frames(frames, times, gripper=tracks.positions, grippers=tracks.names, meta=about)
+
+
+def _times(
+    named: NamedFrames, stated: NDArray[np.float64] | None, rate_hz: float | None, folder: Path
+) -> NDArray[np.float64]:
+    """[T] times since the first frame [s]: those that a CSV states, or those in the names, or by the rate."""
+    if named.times is not None:
+        own = named.times - named.times[0]
+        if stated is not None and len(own) > 1 and np.abs(stated - own).max() > _SAME_STEP * np.median(np.diff(own)):
+            worst = int(np.abs(stated - own).argmax())
+            raise EpisodeError(
+                f"{folder}: the file names are times, and the gripper's t_s disagrees: {named.paths[worst].name} is "
+                f"{own[worst]:.4g} s after the first frame, and its row says {stated[worst]:.4g} s. Correct t_s, or rename "
+                "the files to frame numbers (000, 001, ...) to use t_s alone."
+            )
+        return own if stated is None else stated
+    if stated is not None:
+        return stated
+    if rate_hz is None or not 0 < rate_hz < math.inf:
+        raise EpisodeError("Frame times are unknown: give --rate-hz, or a gripper CSV with a t_s column.")
+    return np.asarray(np.arange(len(named.paths)) / rate_hz)
 
 
 def _table(path: Path) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from diffcloud.io.raw_episodes import (
     read_robot_log,
 )
 
-_EPOCH_S = 1e8
+EPOCH_S = 1e8
 """Times beyond three years are seconds since 1970."""
 
 
@@ -169,9 +169,9 @@ def read_joint_log(path: Path, *, offset_s: float = 0.0, recording_start_s: floa
             "the clock was set while recording, or rows were mixed up. Sort or cut the log."
         )
     times = log.times + offset_s
-    if times[0] < _EPOCH_S <= recording_start_s:  # a clock of its own
+    if times[0] < EPOCH_S <= recording_start_s:  # a clock of its own
         times = times + recording_start_s
-    if recording_start_s > times[-1] or (times[0] >= _EPOCH_S > recording_start_s):
+    if recording_start_s > times[-1] or (times[0] >= EPOCH_S > recording_start_s):
         raise EpisodeError(
             f"{path} covers {times[0]:.2f} to {times[-1]:.2f} s and the recording starts at "
             f"{recording_start_s:.2f} s: they are on different clocks. Give the difference with --log-offset."

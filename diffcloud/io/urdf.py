@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,10 +121,16 @@ def read_urdf(path: Path) -> RobotDescription:
 def _xml(path: Path) -> ElementTree.Element:
     text = read_input(path, kind="robot description", error=RobotError, most_bytes=_LARGEST_XML)
     _refuse_entities(text, path)
+    builder = ElementTree.TreeBuilder()
+    # not ElementTree's own parser: robots carry prefixes that nothing declares (drake:, gazebo:), and ROS reads them
+    parser = expat.ParserCreate("utf-8")
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    parser.CharacterDataHandler = builder.data
     try:
-        return ElementTree.fromstring(text.decode("utf-8"))
-    except (ElementTree.ParseError, UnicodeDecodeError, ValueError) as error:
+        parser.Parse(text.decode("utf-8"), True)
+    except (expat.ExpatError, UnicodeDecodeError, ValueError) as error:
         raise RobotError(f"{path} is not readable XML: {error}.") from error
+    return builder.close()
 
 
 def _refuse_entities(text: bytes, path: Path) -> None:

@@ -42,7 +42,7 @@ def load_scene(path: Path, *, reload_materials: bool = False) -> Scene:
         MeshError: a mesh that is missing or cannot be simulated.
     """
     path = Path(path)
-    data = read_json(path, error=SceneError)
+    data = read_json(path, error=SceneError, comments=True)
     try:
         scene = SceneFile.model_validate(data)
     except ValidationError as error:

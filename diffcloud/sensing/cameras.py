@@ -1,14 +1,16 @@
-"""Pixels, rays and points of a pinhole camera with Brown–Conrady distortion.
+"""Pixels, rays and points of a pinhole camera with Brown–Conrady distortion, or of a fisheye.
 
 The camera's frame is OpenCV's: x right, y down, z forward; pixel centres at whole numbers. Two conventions of the same
 polynomial are met: OpenCV's `brown_conrady` maps ideal to distorted coordinates, librealsense's `inverse_brown_conrady`
-distorted to ideal ones. Either way one direction is closed and the other is found by fixed-point iteration.
+distorted to ideal ones. Either way one direction is closed and the other is found by fixed-point iteration. OpenCV's
+`equidistant` bends the angle to the optical axis, by a polynomial from ideal to distorted angles.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from diffcloud.io.camera_models import Intrinsics
 
@@ -18,6 +20,10 @@ _ITERATIONS = 30
 """Of the fixed point; lenses of depth cameras converge to 1e-12 px in about ten."""
 
 
+_WIDEST_RAD, _LEAST_SLOPE = np.deg2rad(89.9), 1e-3
+"""Rays through a fisheye's pixels stay in front of the camera. Newton's steps stay finite where the polynomial is flat."""
+
+
 def project(points: Floats, intrinsics: Intrinsics) -> Floats:
     """Pixels [..., 2] (column, row) of camera points [..., 3] [m]."""
     ideal = points[..., :2] / points[..., 2:]
@@ -25,6 +31,8 @@ def project(points: Floats, intrinsics: Intrinsics) -> Floats:
         ideal = _polynomial(ideal, intrinsics.coefficients)
     elif intrinsics.distortion == "inverse_brown_conrady":
         ideal = _invert(ideal, intrinsics.coefficients)
+    elif intrinsics.distortion == "equidistant":
+        ideal = _fisheye(ideal, intrinsics.coefficients)
     return ideal * [intrinsics.fx, intrinsics.fy] + [intrinsics.cx, intrinsics.cy]
 
 
@@ -35,6 +43,8 @@ def rays(pixels: Floats, intrinsics: Intrinsics) -> Floats:
         plane = _invert(plane, intrinsics.coefficients)
     elif intrinsics.distortion == "inverse_brown_conrady":
         plane = _polynomial(plane, intrinsics.coefficients)
+    elif intrinsics.distortion == "equidistant":
+        plane = _unfisheye(plane, intrinsics.coefficients)
     return np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
 
 
@@ -88,12 +98,13 @@ def _polynomial(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
     if not any(coefficients):
         return xy
     radial, tangential = _terms(xy, coefficients)
-    return xy * radial + tangential
+    return _through(_tilt(coefficients), xy * radial + tangential)
 
 
 def _invert(target: Floats, coefficients: tuple[float, ...]) -> Floats:
     if not any(coefficients):
         return target
+    target = _through(np.asarray(np.linalg.inv(_tilt(coefficients)), np.float64), target)
     xy = target
     for _ in range(_ITERATIONS):
         radial, tangential = _terms(xy, coefficients)
@@ -102,9 +113,57 @@ def _invert(target: Floats, coefficients: tuple[float, ...]) -> Floats:
 
 
 def _terms(xy: Floats, coefficients: tuple[float, ...]) -> tuple[Floats, Floats]:
-    k1, k2, p1, p2, k3 = coefficients
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = (*coefficients, *[0.0] * 7)[:12]
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    tangential = np.stack([2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], axis=-1)
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    tangential = np.stack(
+        [
+            2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2),
+            p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4),
+        ],
+        axis=-1,
+    )
     return radial[..., None], tangential
+
+
+def _tilt(coefficients: tuple[float, ...]) -> Floats:
+    """[3, 3] from the plane of an upright sensor to that of one tilted about x, then y (OpenCV's tau_x, tau_y [rad])."""
+    x, y = coefficients[12:14] or (0.0, 0.0)
+    turn = Rotation.from_euler("xy", [-x, -y]).as_matrix()
+    onto = np.array([[turn[2, 2], 0, -turn[0, 2]], [0, turn[2, 2], -turn[1, 2]], [0, 0, 1]])
+    return np.asarray(onto @ turn)
+
+
+def _through(homography: Floats, xy: Floats) -> Floats:
+    if np.array_equal(homography, np.eye(3)):
+        return xy
+    moved = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1) @ homography.T
+    return np.asarray(moved[..., :2] / moved[..., 2:])
+
+
+def _fisheye(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
+    radius = np.linalg.norm(xy, axis=-1, keepdims=True)
+    angle = np.arctan(radius)
+    return np.asarray(xy * np.where(radius > 0, _bent(angle, coefficients) / np.where(radius > 0, radius, 1), 1))
+
+
+def _unfisheye(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
+    bent = np.linalg.norm(xy, axis=-1, keepdims=True)
+    angle = bent.clip(0, _WIDEST_RAD)
+    for _ in range(_ITERATIONS):  # Newton's
+        angle = (angle - (_bent(angle, coefficients) - bent) / _slope(angle, coefficients)).clip(0, _WIDEST_RAD)
+    return np.asarray(xy * np.where(bent > 0, np.tan(angle) / np.where(bent > 0, bent, 1), 1))
+
+
+def _bent(angle: Floats, coefficients: tuple[float, ...]) -> Floats:
+    k1, k2, k3, k4 = (*coefficients, *[0.0] * 4)[:4]
+    squared = angle * angle
+    return np.asarray(angle * (1 + squared * (k1 + squared * (k2 + squared * (k3 + squared * k4)))))
+
+
+def _slope(angle: Floats, coefficients: tuple[float, ...]) -> Floats:
+    k1, k2, k3, k4 = (*coefficients, *[0.0] * 4)[:4]
+    squared = angle * angle
+    slope = 1 + squared * (3 * k1 + squared * (5 * k2 + squared * (7 * k3 + squared * 9 * k4)))
+    return np.asarray(np.where(slope > _LEAST_SLOPE, slope, _LEAST_SLOPE))

@@ -286,7 +286,7 @@ def read_material(path: Path) -> Material:
     Raises:
         SceneError: the file is missing, lacks a field, has one too many, or a table of the wrong shape.
     """
-    data = read_json(path, error=SceneError)
+    data = read_json(path, error=SceneError, comments=True)
     expected = {"density", "stretching", "bending"}
     if not isinstance(data, dict) or set(data) != expected:
         got = sorted(data) if isinstance(data, dict) else type(data).__name__

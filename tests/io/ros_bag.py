@@ -44,6 +44,9 @@ class Habits:
     """Focal length in the colour's own camera_info [px]; None: there is none."""
     lens: tuple[float, ...] = (0.0,) * 5
     """D of every camera_info."""
+    lens_model: str = "plumb_bob"
+    calibrated: bool = True
+    """Whether K is not zero."""
     rectified_focal: float | None = None
     """Focal length in P [px]; None: P is zero."""
     color_late_s: Callable[[int], float] = lambda number: -0.002
@@ -122,6 +125,7 @@ class Bag:
     def _info(self, topic, t, arrival, frame, focal):
         matrix = INTRINSICS.matrix
         matrix[0, 0] = matrix[1, 1] = focal
+        matrix *= self._habits.calibrated
         rectified = np.zeros((3, 4))
         if self._habits.rectified_focal is not None:
             rectified[:, :3] = matrix
@@ -130,7 +134,7 @@ class Bag:
         lens = upper if self._ros1 else {key.lower(): value for key, value in upper.items()}
         region = self._type("sensor_msgs/msg/RegionOfInterest")(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
         size = {"height": INTRINSICS.height, "width": INTRINSICS.width}
-        rest = {**size, **lens, "distortion_model": "plumb_bob", "binning_x": 0, "binning_y": 0, "roi": region}
+        rest = {**size, **lens, "distortion_model": self._habits.lens_model, "binning_x": 0, "binning_y": 0, "roi": region}
         self._send(topic, t, "sensor_msgs/msg/CameraInfo", frame=frame, arrival=arrival, **rest)
 
     def _image(self, topic, t, arrival, frame, pixels, encoding):

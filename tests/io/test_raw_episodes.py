@@ -235,7 +235,7 @@ def test_a_write_the_kernel_refuses_keeps_what_is_there(tmp_path):
         ({"fx": 0.6}, "does not go with"),
         ({"cx": 700.0}, "principal point"),
         ({"distortion": "fisheye"}, "Input should be 'none', 'brown_conrady'"),
-        ({"coefficients": [0.1], "distortion": "brown_conrady"}, "5 coefficients"),
+        ({"coefficients": [0.1], "distortion": "brown_conrady"}, "5, 8, 12, 14 coefficients"),
         ({"f": 1}, "f\n  Extra inputs"),
     ],
 )

@@ -336,6 +336,42 @@ class TestLenses:
         held = self.intrinsics(tmp_path, depth=topic)
         assert (held.fx, held.distortion, held.coefficients) == (58.0, "none", ())
 
+    RATIONAL = (0.5, -2.6, 5e-4, -3e-4, 1.5, 0.38, -2.4, 1.4)
+
+    @pytest.mark.parametrize(
+        ("model", "lens", "distortion", "kept"),
+        [
+            ("plumb_bob", RATIONAL, "brown_conrady", RATIONAL),
+            ("rational_polynomial", RATIONAL, "brown_conrady", RATIONAL),
+            ("rational_polynomial", (*LENS, 0.0, 0.0, 0.0), "brown_conrady", LENS),
+            ("plumb_bob", LENS[:4], "brown_conrady", (*LENS[:4], 0.0)),
+            ("rational_polynomial", (*RATIONAL, 0.1, 0.0, 0.0, 0.0), "brown_conrady", (*RATIONAL, 0.1, 0.0, 0.0, 0.0)),
+            ("rational_polynomial", (*RATIONAL, *[0.0] * 5, 0.01), "brown_conrady", (*RATIONAL, *[0.0] * 5, 0.01)),
+            ("rational_polynomial", (0.0,) * 8, "none", ()),
+            ("equidistant", (0.1, 0.2, 0.0, 0.0), "equidistant", (0.1, 0.2, 0.0, 0.0)),
+            ("fisheye", (0.1,), "equidistant", (0.1, 0.0, 0.0, 0.0)),
+        ],
+    )
+    def test_no_coefficient_is_lost(self, tmp_path, model, lens, distortion, kept):
+        imported(tmp_path, bag(tmp_path, "rosbag2", lens=lens, lens_model=model, unaligned=False))
+        held = read_raw_episode(tmp_path / "e").cameras["side"].info.intrinsics
+        assert (held.distortion, held.coefficients) == (distortion, kept)
+
+    @pytest.mark.parametrize(
+        ("habits", "message"),
+        [
+            ({"lens": (0.1,) * 15}, "has 5, 8, 12, 14 coefficients, got 15"),
+            ({"lens": (0.1,) * 5, "lens_model": "equidistant"}, "has 4 coefficients, got 5"),
+            ({"lens": (0.1,) * 5, "lens_model": "kannala"}, "'kannala'; allowed are plumb_bob, rational_polynomial"),
+            ({"calibrated": False}, "has only zeros in K: this camera was never calibrated"),
+        ],
+    )
+    def test_what_is_no_lens_is_refused_with_its_topic(self, tmp_path, habits, message):
+        said = imported(tmp_path, bag(tmp_path, "rosbag2", unaligned=False, **habits), code=1).errors
+        assert message in said
+        assert "Camera overhead: its camera_info on /overhead/aligned_depth_to_color/camera_info" in said
+        assert not (tmp_path / "e").exists()
+
     def test_without_P_they_have_K(self, tmp_path):
         path = bag(tmp_path, "rosbag2", lens=self.LENS, depth="depth_registered/image_rect", unaligned=False)
         imported(tmp_path, path)

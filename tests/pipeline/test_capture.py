@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from importlib.resources import files
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from diffcloud.hardware import installed
 from diffcloud.io.calibrations import Calibration, CameraCalibration, write_calibration
 from diffcloud.io.raw_episodes import read_raw_episode
 from pipeline import capture
+from pipeline.app import _have_a_home
 from tests.hardware.kortex.opening import in_process
 from tests.hardware.kortex.server import HOME_M, FakeArm
 from tests.hardware.simulated import SMALL, TestCard
@@ -147,6 +149,33 @@ def test_trouble_names_what_is_kept(tmp_path, server, path):
     assert "went into fault: joint fault" in done.errors
     assert "What was recorded so far is in" in done.errors
     assert json.loads((tmp_path / "e" / "episode.json").read_text())["status"] == "stopped"
+
+
+def test_a_user_without_a_home_gets_a_folder_of_its_own(tmp_path, monkeypatch):
+    """As in a container whose user is not in passwd. Otherwise the cameras' library fails and caches go to a folder ~."""
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    _have_a_home()
+    home = Path(os.environ["HOME"])
+    assert (home.parent, home.stat().st_mode & 0o777) == (tmp_path, 0o700)
+    monkeypatch.delenv("HOME")
+    home.chmod(0o777)  # somebody else may have made it
+    _have_a_home()
+    assert Path(os.environ["HOME"]) != home
+    monkeypatch.setenv("HOME", "/here")
+    _have_a_home()
+    assert os.environ["HOME"] == "/here"
+
+
+def test_doctor_ends_well_where_the_cameras_library_fails(monkeypatch):
+    def fails():
+        raise RuntimeError("failed to get special folder 5")
+
+    monkeypatch.setattr("pyrealsense2.context", fails)
+    checks = {check["name"]: check for check in invoke("doctor").result["checks"]}
+    assert checks["pyrealsense2"]["state"] == "missing"
+    assert "failed to get special folder 5" in checks["pyrealsense2"]["detail"]
 
 
 def test_doctor_says_what_is_missing(server):

@@ -195,6 +195,25 @@ def test_paths_must_stay_inside(folder):
         load_scene(write(folder, data))
 
 
+def test_comments_are_read_over_and_text_with_slashes_is_kept(folder):
+    """As ARCSim's reader does, in scenes and in materials."""
+    plain, written = scene_data(), folder / "conf" / "commented.json"
+    plain["cloths"][0]["mesh"] = "meshes//cloth.obj"
+    plain["cloths"][0]["materials"][0]["data"] = "materials/#m/*.json"
+    (folder / "materials" / "#m").mkdir()
+    text = json.dumps(MATERIAL, indent=1).replace(",\n", ', // "stiff", {\n')
+    (folder / "materials" / "#m" / "*.json").write_text("/* by hand\n // twice */\n" + text + "# end")
+    written.write_text('// a "scene" */\n' + json.dumps(plain, indent=1).replace(",\n", ", /* , */ // }\n"))
+    (folder / "conf" / "plain.json").write_text(json.dumps(plain))
+    commented, expected = load_scene(written), load_scene(folder / "conf" / "plain.json")
+    for field in fields(expected.mesh):
+        np.testing.assert_array_equal(getattr(commented.mesh, field.name), getattr(expected.mesh, field.name))
+    assert commented.material.density == expected.material.density
+    written.write_text('{"a": 1 /* no end }')
+    with pytest.raises(SceneError, match=r"is not readable JSON: .*line 1 column 9"):
+        load_scene(written)
+
+
 def test_damaged_scene_files(folder):
     path = folder / "conf" / "scene.json"
     path.write_text("{]")

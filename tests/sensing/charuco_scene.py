@@ -58,12 +58,12 @@ def gripper_poses(count, rng, *, tilt_deg=20.0):
     return poses
 
 
-def render(T_camera_board, intrinsics, rng=None):
+def render(T_camera_board, intrinsics, rng=None, board=BOARD):
     """uint8 [H, W, 3]: the board over a grey ground, antialiased, optionally with pixel noise."""
-    width, height = BOARD.columns * _TEXTURE_PX, BOARD.rows * _TEXTURE_PX
-    texture = BOARD.opencv().generateImage((width, height), marginSize=0, borderBits=1)
+    width, height = board.columns * _TEXTURE_PX, board.rows * _TEXTURE_PX
+    texture = board.opencv().generateImage((width, height), marginSize=0, borderBits=1)
     # texture pixel -> metres on the board: pixel centres at whole numbers, the board starts at the first pixel's edge
-    metre = BOARD.square_m / _TEXTURE_PX
+    metre = board.square_m / _TEXTURE_PX
     to_board = np.array([[metre, 0, metre / 2], [0, metre, metre / 2], [0, 0, 1]])
     to_image = intrinsics.matrix @ T_camera_board[:3, [0, 1, 3]] @ to_board
     # finer image: pixel u becomes the block of _FINER pixels around _FINER * u + (_FINER - 1) / 2

@@ -12,8 +12,8 @@ from diffcloud.errors import CalibrationError
 from diffcloud.io.calibrations import read_calibration
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.images import read_color
-from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter, RobotLog, RobotSample
-from diffcloud.sensing.calibration.charuco import CameraViews, View
+from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter, RobotLog, RobotSample, read_raw_episode
+from diffcloud.sensing.calibration.charuco import CameraViews, CharucoBoard, View
 from diffcloud.sensing.calibration.checkerboard import onto_plane, register_checkerboard, rigid_motion
 from diffcloud.sensing.calibration.hand_eye import calibrate_hand_eye, find_views, still_pose
 from diffcloud.sensing.cameras import depth_points, inverse, project, rays, transform
@@ -27,6 +27,35 @@ def apart(found, true):
     """Millimetres and degrees between two poses."""
     turn = Rotation.from_matrix(found[:3, :3] @ true[:3, :3].T).magnitude()
     return 1000 * np.linalg.norm(found[:3, 3] - true[:3, 3]), np.rad2deg(turn)
+
+
+KINECT = (0.5, -2.6, 5e-4, -3e-4, 1.5, 0.38, -2.4, 1.4)
+"""Rational: the coefficients of an Azure Kinect's depth camera, in their size."""
+
+
+@pytest.mark.parametrize(
+    "lens", [KINECT, (*KINECT, 0.01, -0.002, 0.003, 0.001), (*KINECT, 0.01, -0.002, 0.003, 0.001, 0.02, -0.03)]
+)
+def test_opencv_agrees_about_all_coefficients(lens, rng):
+    import cv2
+
+    camera = Intrinsics(640, 576, 504.0, 504.0, 320.0, 290.0, "brown_conrady", lens)
+    points = rng.uniform([-0.5, -0.5, 0.8], [0.5, 0.5, 1.5], (50, 3))
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, np.array(lens))
+    np.testing.assert_allclose(project(points, camera), expected[:, 0], atol=1e-9)
+    np.testing.assert_allclose(rays(expected[:, 0], camera) * points[:, 2:], points, atol=1e-8)
+
+
+@pytest.mark.parametrize("lens", [(), (0.05, -0.02, 0.01, -0.003), (-0.03, 0.002, 0.0, 0.0)])
+def test_opencv_agrees_about_fisheyes(lens, rng):
+    import cv2
+
+    camera = Intrinsics(640, 576, 250.0, 251.0, 320.0, 290.0, "equidistant", lens)
+    points = np.concatenate([rng.uniform([-2, -2, 0.8], [2, 2, 1.5], (50, 3)), [[0, 0, 1]]])
+    held = np.array(lens or (0.0,) * 4)
+    expected, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), camera.matrix, held)
+    np.testing.assert_allclose(project(points, camera), expected[:, 0], atol=1e-9)
+    np.testing.assert_allclose(rays(project(points, camera), camera) * points[:, 2:], points, atol=1e-8)
 
 
 @pytest.mark.parametrize("model", ["none", "brown_conrady", "inverse_brown_conrady"])
@@ -294,6 +323,29 @@ def test_a_moving_gripper_gives_no_pose(tmp_path, rng):
     assert still_pose(log, 0.25) is not None
     assert still_pose(log, 0.75) is None
     assert still_pose(log, 9.0) is None
+
+
+@pytest.mark.parametrize("rows", [6, 8])
+@pytest.mark.parametrize("legacy", [False, True])
+def test_the_pattern_of_a_board_is_found_by_itself(tmp_path, rng, rows, legacy):
+    """With an even number of rows, OpenCV before 4.6 and calib.io print another pattern. Corners stay where they are."""
+    board = CharucoBoard(5, rows, 0.04, 0.03, legacy=legacy)
+    poses = gripper_poses(5, rng)
+    infos = {"side": CameraInfo("side", "1", INTRINSICS["side"], 0.001)}
+    with RawEpisodeWriter(tmp_path / "e", infos, rate_hz=1, source="test", robot={}, durable=False) as writer:
+        for index, pose in enumerate(poses):
+            turned = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+            for t in (index, index + 0.9):
+                writer.add_robot(RobotSample(t, np.zeros(7), 0.0, pose[:3, 3], turned))
+            seen = inverse(CAMERAS["side"]) @ pose @ GRIPPER_BOARD
+            picture = render(seen, INTRINSICS["side"], board=board)
+            writer.add_frame("side", index + 0.5, board_depth(seen, INTRINSICS["side"]), picture)
+    episode = read_raw_episode(tmp_path / "e")
+    views, held = find_views(episode.cameras, episode.robot, CharucoBoard(5, rows, 0.04, 0.03))
+    assert sum(len(view.numbers) for view in views["side"].views) > 10 * len(poses)
+    for view in views["side"].views:
+        points = transform(inverse(CAMERAS["side"]) @ held[view.pose] @ GRIPPER_BOARD, board.corners()[view.numbers])
+        assert np.abs(project(points, INTRINSICS["side"]) - view.pixels).max() < 1.0
 
 
 def test_a_board_that_is_not_there(tmp_path, rng):

@@ -121,6 +121,28 @@ def test_open_is_where_fingers_are_farther_apart(tmp_path, limits):
         assert poses[robot.links.index("r_link"), 1, 3] == pytest.approx(-expected)
 
 
+def test_prefixes_that_nothing_declares_are_read_over(tmp_path):
+    """Drake's and Gazebo's, as ROS reads them; a declared name space changes no name either."""
+    plain = planar_arm(tmp_path)
+    text = plain.read_text()
+    foreign = "<drake:proximity_properties><drake:rigid_hydroelastic/></drake:proximity_properties>"
+    text = text.replace('<limit lower="-3"', '<limit drake:acceleration="2.5" lower="-3"').replace(
+        "</robot>", f"{foreign}</robot>"
+    )
+    (tmp_path / "drake.urdf").write_text(text)
+    (tmp_path / "declared.urdf").write_text(text.replace("<robot ", '<robot xmlns="http://a.b" xmlns:drake="http://c.d" '))
+    expected = Robot.from_urdf(plain).tool_pose(np.array([0.3, -0.7]))
+    for name in ("drake.urdf", "declared.urdf"):
+        np.testing.assert_array_equal(Robot.from_urdf(tmp_path / name).tool_pose(np.array([0.3, -0.7])), expected)
+    (tmp_path / "grows.urdf").write_text('<!DOCTYPE a [<!ENTITY b "c">]>' + text)
+    with pytest.raises(RobotError, match="declares a document type or entities"):
+        read_urdf(tmp_path / "grows.urdf")
+    for damaged in (text[:-20], text + "<robot/>", text.replace("drake:acceleration=", "lower="), ""):
+        (tmp_path / "damaged.urdf").write_text(damaged)
+        with pytest.raises(RobotError, match="is not readable XML"):
+            read_urdf(tmp_path / "damaged.urdf")
+
+
 def test_bad_poses(tmp_path):
     robot = gen3()
     with pytest.raises(RobotError, match="does not reach"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.io.raw_episodes import RobotLog
+from diffcloud.io.ros.publishers import JointMessage, of_one_driver
 from diffcloud.io.ros.transforms import TransformTree
 from diffcloud.io.urdf import Joint, RobotDescription
 
@@ -72,26 +73,28 @@ class Grip:
 
 def joint_log(
     where: str,
-    messages: Sequence[tuple[float, Any]],
+    sent: Sequence[JointMessage],
     tree: TransformTree,
     *,
     world_frame: str,
     tool_frame: str,
     joint_names: Sequence[str] | None,
     grip: Grip,
+    named: Collection[str] = (),
 ) -> tuple[RobotLog, tuple[str, ...]]:
     """(rows in order of time, warnings about what stays unknown).
 
     Args:
         where: the recording, for messages.
-        messages: (time [s], sensor_msgs/JointState), one or more.
+        sent: one or more, in order of arrival.
         joint_names: of the arm, in order; None takes joint_1, joint_2, ...
+        named: topics that the user named, also as TOPIC#NUMBER (`publishers.of_one_driver`).
 
     Raises:
-        EpisodeError: a joint of the arm, or the gripper's, is not in joint_states (lists those that are), or the clock was
-            set back.
+        EpisodeError: a joint of the arm, or the gripper's, is not in joint_states (lists those that are), the clock was
+            set back, or several publishers send the same joints and none of them is named.
     """
-    seen = {name for _, message in messages for name in message.name}
+    seen = {name for held in sent for name in held.message.name}
     if joint_names is None:
         joint_names = sorted((name for name in seen if re.fullmatch(r"joint_\d+", name)), key=lambda name: int(name[6:]))
     missing = sorted(set(joint_names) - seen)
@@ -100,10 +103,12 @@ def joint_log(
             f"{where}: joint_states has {', '.join(sorted(seen))}; {missing or 'joint_1, ...'} not among them. Name the "
             "arm's joints in order with --joint."
         )
+    needed = {*joint_names, *([] if grip.joint is None else [grip.joint])}
+    kept, warnings = of_one_driver(where, sent, needed, named)
+    messages = [(held.time_s, held.message) for held in kept]
     rows, angles = _series(where, messages, joint_names)
     if not len(rows):
         raise EpisodeError(f"{where}: no message of joint_states has the angles of all of {', '.join(joint_names)}.")
-    warnings: list[str] = []
     gripper = np.full(len(rows), np.nan)
     others = sorted(seen - set(joint_names))
     gripper_joint = grip.joint

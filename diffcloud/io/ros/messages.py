@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
-from diffcloud.io.camera_models import Intrinsics
+from diffcloud.io.camera_models import LENS_COEFFICIENTS, Distortion, Intrinsics
 from diffcloud.io.images import decode_color, decode_depth
 from diffcloud.io.rvl import decode_rvl
 
@@ -23,14 +23,18 @@ DepthEncoding = Literal["16UC1", "32FC1"]
 DEPTH_UNITS_M: dict[DepthEncoding, float] = {"16UC1": 0.001, "32FC1": 0.00025}
 """Of the raw episode's 16-bit images. Floats are stored in quarters of a millimetre, up to 16 m."""
 _COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
+_LENSES: dict[str, Distortion] = {
+    **dict.fromkeys(("", "plumb_bob", "rational_polynomial"), "brown_conrady"),
+    **dict.fromkeys(("equidistant", "fisheye"), "equidistant"),
+}
+"""OpenCV tells its models apart by the number of coefficients, and drivers name them carelessly."""
 _COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
 
 
-def stamp_s(message: Any, arrival_ns: int) -> float:
-    """Time of a message: its own stamp, or its arrival where it has none [s]."""
+def stamp_s(message: Any) -> float:
+    """A message's own stamp [s]; 0 where nobody set it, and at the start of simulated time."""
     stamp = message.header.stamp
-    seconds = float(stamp.sec + 1e-9 * stamp.nanosec)
-    return seconds if seconds > 0 else 1e-9 * arrival_ns
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
 def depth_encoding(message: Any, topic: str) -> DepthEncoding:
@@ -113,34 +117,57 @@ def color_image(message: Any, topic: str) -> NDArray[np.uint8]:
     return np.ascontiguousarray(_pixels(message, np.dtype(np.uint8))[..., _COLOR_CHANNELS[message.encoding]])
 
 
-def camera_intrinsics(message: Any, name: str, *, rectified: bool = False) -> Intrinsics:
+def is_calibrated(message: Any) -> bool:
+    """Whether a CameraInfo has a camera matrix: drivers send zeros until somebody calibrates the camera."""
+    return bool(np.any(_field(message, "k")))
+
+
+def camera_intrinsics(message: Any, name: str, topic: str, *, rectified: bool = False) -> Intrinsics:
     """Of a CameraInfo message.
 
     Args:
+        name, topic: the camera and its camera_info, for messages.
         rectified: of images without distortion, whose camera is the left part of P; K and D are of those with it.
 
     Raises:
-        EpisodeError: a lens model that is not read, or numbers that no camera has.
+        EpisodeError: a camera that was never calibrated, a lens model that is not read, or numbers that no camera has.
     """
-    # ROS 1 writes D, K and P, ROS 2 d, k and p
-    matrix = np.asarray(message.k if hasattr(message, "k") else message.K, dtype=np.float64).reshape(3, 3)
-    lens = [float(value) for value in (message.d if hasattr(message, "d") else message.D)]
+    where = f"Camera {name}: its camera_info on {topic}"
+    if not is_calibrated(message):
+        raise EpisodeError(
+            f"{where} has only zeros in K: this camera was never calibrated. Calibrate it and record again, or write its "
+            "intrinsics into the recording."
+        )
+    matrix = _field(message, "k").reshape(3, 3)
+    model, lens = message.distortion_model, _field(message, "d").tolist()
     if rectified:
-        projection = np.asarray(message.p if hasattr(message, "p") else message.P, dtype=np.float64).reshape(3, 4)[:, :3]
+        projection = _field(message, "p").reshape(3, 4)[:, :3]
         matrix, lens = projection if projection.any() else matrix, []
-    distorted = any(lens)
-    if message.distortion_model not in ("", "plumb_bob") and distorted:
-        raise EpisodeError(f"Camera {name} has the distortion model {message.distortion_model!r}; plumb_bob is read.")
-    return Intrinsics(
-        message.width,
-        message.height,
-        float(matrix[0, 0]),
-        float(matrix[1, 1]),
-        float(matrix[0, 2]),
-        float(matrix[1, 2]),
-        "brown_conrady" if distorted else "none",
-        tuple((lens + [0.0] * 5)[:5]) if distorted else (),
-    )
+    distortion: Distortion = "none"
+    if any(lens):
+        if model not in _LENSES:
+            raise EpisodeError(
+                f"{where} has the distortion model {model!r}; allowed are {', '.join(filter(None, _LENSES))}."
+            )
+        distortion = _LENSES[model]
+        lens = _whole(lens, LENS_COEFFICIENTS[distortion])
+    try:
+        fx, fy, cx, cy = (float(matrix[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return Intrinsics(message.width, message.height, fx, fy, cx, cy, distortion, tuple(lens) if any(lens) else ())
+    except EpisodeError as error:
+        raise EpisodeError(f"{where} does not describe a camera: {error}") from error
+
+
+def _field(message: Any, name: str) -> NDArray[np.float64]:
+    """ROS 1 writes D, K and P, ROS 2 d, k and p."""
+    return np.asarray(getattr(message, name if hasattr(message, name) else name.upper()), dtype=np.float64)
+
+
+def _whole(lens: list[float], allowed: tuple[int, ...]) -> list[float]:
+    """Coefficients up to the least allowed count that holds all that are not zero."""
+    used = max(index for index, value in enumerate(lens, start=1) if value)
+    count = next((size for size in allowed if size >= used), None)
+    return lens if count is None else (lens + [0.0] * count)[:count]
 
 
 def _is_compressed_depth(message: Any) -> bool:

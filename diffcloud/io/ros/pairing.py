@@ -6,11 +6,10 @@ set back is refused, and each depth image gets the colour image nearest to it in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from diffcloud.errors import EpisodeError
 
@@ -36,7 +35,7 @@ class Pairing:
     warnings: tuple[str, ...]
 
 
-def pair(camera: str, depth_topic: str, depth_s: Sequence[float], color_s: Sequence[float] | None) -> Pairing:
+def pair(camera: str, depth_topic: str, depth_s: ArrayLike, color_s: ArrayLike | None) -> Pairing:
     """Sort depth images and give each its colour image.
 
     The tolerance is half a frame interval of the slower stream (no colour image can be asked to be nearer), within
@@ -61,12 +60,13 @@ def pair(camera: str, depth_topic: str, depth_s: Sequence[float], color_s: Seque
         )
     times = stamps[depths]
     colors = np.full(len(depths), -1)
-    if color_s is not None and not len(color_s):
+    sent = None if color_s is None else np.array(color_s, dtype=np.float64)
+    if sent is not None and not len(sent):
         warnings.append(f"Camera {camera}: its colour topic has no message, so no frame has colour.")
-    elif color_s is not None:
-        tolerance = _tolerance_s(times, np.sort(np.array(color_s)))
-        order = np.argsort(color_s, kind="stable")
-        clock = np.array(color_s)[order]
+    elif sent is not None:
+        tolerance = _tolerance_s(times, np.sort(sent))
+        order = np.argsort(sent, kind="stable")
+        clock = sent[order]
         after = np.searchsorted(clock, times).clip(0, len(clock) - 1)
         before = (after - 1).clip(0)
         nearest = np.where(np.abs(clock[before] - times) < np.abs(clock[after] - times), before, after)

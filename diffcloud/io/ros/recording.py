@@ -10,6 +10,7 @@ come: it is left out, with a warning.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,8 +21,9 @@ from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.camera_models import Intrinsics
-from diffcloud.io.raw_episodes import CameraInfo
-from diffcloud.io.recordings import RecordedFrame, Recording
+from diffcloud.io.raw_episodes import CameraInfo, RobotLog
+from diffcloud.io.recordings import EPOCH_S, RecordedFrame, Recording
+from diffcloud.io.ros.clocks import message_times
 from diffcloud.io.ros.files import opened, refuse_lone_parts
 from diffcloud.io.ros.joints import GRIPPER_JOINT, Grip, joint_log, log_from_links
 from diffcloud.io.ros.messages import (
@@ -31,9 +33,11 @@ from diffcloud.io.ros.messages import (
     color_image,
     depth_encoding,
     depth_image,
+    is_calibrated,
     stamp_s,
 )
 from diffcloud.io.ros.pairing import Pairing, pair
+from diffcloud.io.ros.publishers import JointMessage
 from diffcloud.io.ros.topics import (
     CAMERA_INFO,
     CameraTopics,
@@ -41,9 +45,11 @@ from diffcloud.io.ros.topics import (
     depth_cameras,
     info_topic,
     is_rectified,
+    only_named,
+    refuse_unknown,
     same_camera,
 )
-from diffcloud.io.ros.transforms import TransformTree
+from diffcloud.io.ros.transforms import TransformTree, refuse_rivals
 from diffcloud.io.urdf import RobotDescription
 
 _JOINTS = "sensor_msgs/msg/JointState"
@@ -59,6 +65,7 @@ def ros_recording(
     gripper_open: float = 0.0,
     gripper_closed: float | None = None,
     description: Callable[[], RobotDescription] | None = None,
+    topics: Sequence[str] = (),
 ) -> Recording:
     """A recording of ROS; images are read lazily.
 
@@ -70,30 +77,32 @@ def ros_recording(
         gripper_open, gripper_closed: that position [rad or m]; None takes that of a Robotiq 2F-85.
         description: returns the robot's description, for a recording without joint_states whose tf has the robot's
             links; None: such a recording gets no joint log.
+        topics: those to take where several could be. Of each kind (depth, colour, camera_info, joint states, transforms)
+            these alone are taken, if any of the kind is named. TOPIC#NUMBER is one of several publishers of joint states.
 
     Raises:
         ConfigError: a gripper whose positions, open and closed, are equal or no numbers.
         EpisodeError: unreadable, one part of a split recording, without depth and camera_info, stamps that run backwards,
-            or without the named joints; lists what there is.
+            without the named joints or topics, or with several candidates of which none is named; lists what there is.
     """
     grip = Grip.of(gripper_joint, gripper_open, gripper_closed)
     split = refuse_lone_parts(paths)
     shown = ", ".join(path.name for path in map(Path, paths))
-    scan = _scan(paths, shown)
+    scan = _scan(paths, shown, topics)
     tree = TransformTree(scan.transforms)
     cameras: dict[str, CameraInfo] = {}
     sources: dict[str, _Source] = {}
-    warnings = [*split, *tree.warnings]
-    for name, topics in scan.cameras.items():
-        info, depth = scan.infos.get(topics.info), scan.images.get(topics.depth)
+    warnings = [*split, *scan.warnings, *tree.warnings]
+    for name, own in scan.cameras.items():
+        info, depth = scan.infos.get(own.info), scan.images.get(own.depth)
         if info is None or depth is None:
-            raise EpisodeError(f"{shown}: camera {name} has no message on {topics.info} or {topics.depth}.")
-        color, why_not = _aligned_color(scan, topics)
+            raise EpisodeError(f"{shown}: camera {name} has no message on {own.info} or {own.depth}.")
+        color, why_not = _aligned_color(scan, own)
         warnings += why_not
-        pairing = pair(name, topics.depth, depth.stamps, None if color is None else scan.images[color].stamps)
+        pairing = pair(name, own.depth, depth.stamps, None if color is None else scan.images[color].stamps)
         warnings += pairing.warnings
         assert depth.encoding is not None  # of every depth topic
-        sources[name] = _Source(topics.depth, color, depth.encoding, pairing)
+        sources[name] = _Source(own.depth, color, depth.encoding, pairing)
         place = None
         try:
             place = tree.fixed(world_frame, info.header.frame_id or depth.frame)
@@ -101,8 +110,8 @@ def ros_recording(
             warnings.append(
                 f"Camera {name}: its place stays open, as {error}. Name the robot's base with --world-frame, or calibrate."
             )
-        intrinsics = camera_intrinsics(info, name, rectified=is_rectified(topics.depth))
-        cameras[name] = CameraInfo(name, f"ros{topics.depth}", intrinsics, DEPTH_UNITS_M[depth.encoding], place)
+        intrinsics = camera_intrinsics(info, name, own.info, rectified=is_rectified(own.depth))
+        cameras[name] = CameraInfo(name, f"ros{own.depth}", intrinsics, DEPTH_UNITS_M[depth.encoding], place)
     robot = None
     if scan.joints:
         robot, unknown = joint_log(
@@ -113,8 +122,10 @@ def ros_recording(
             tool_frame=tool_frame,
             joint_names=joint_names,
             grip=grip,
+            named=topics,
         )
         warnings += unknown
+        _refuse_other_clock(shown, robot, sources)
     elif description is not None and scan.transforms:
         try:
             robot, unknown = log_from_links(
@@ -140,7 +151,7 @@ class _Images:
     """(width, height) of the first colour image; of depth camera_info says it."""
     encoding: DepthEncoding | None
     """Of the first depth image; None for colour."""
-    stamps: list[float] = field(default_factory=list)
+    stamps: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     """In order of arrival [s]."""
 
 
@@ -152,8 +163,9 @@ class _Scan:
     cameras: Mapping[str, CameraTopics]
     infos: dict[str, Any] = field(default_factory=dict)
     images: dict[str, _Images] = field(default_factory=dict)
-    joints: list[tuple[float, Any]] = field(default_factory=list)
+    joints: list[JointMessage] = field(default_factory=list)
     transforms: list[tuple[float, Any]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -166,29 +178,81 @@ class _Source:
     pairing: Pairing
 
 
-def _scan(paths: Sequence[Path], shown: str) -> _Scan:
+def _scan(paths: Sequence[Path], shown: str, named: Sequence[str]) -> _Scan:
+    stamps: dict[str, list[tuple[float, float]]] = {}
+    joints: list[tuple[str, str, int, Any]] = []
+    transforms: list[tuple[str, int, Any]] = []
     with opened(paths) as reader:
         topics = {held.topic: held.msgtype for held in reader.connections}
-        scan = _Scan(topics, depth_cameras(topics, shown))
+        refuse_unknown(topics, named, shown)
+        scan = _Scan(topics, depth_cameras(topics, shown, named))
         depths = {camera.depth for camera in scan.cameras.values()}
         images = depths | {topic for camera in scan.cameras.values() for topic in camera.colors}
+        others = only_named(topics, named, (_JOINTS,)) | only_named(topics, named, _TF)
         wanted = [
-            held for held in reader.connections if held.topic in images or held.msgtype in (CAMERA_INFO, _JOINTS, *_TF)
+            held
+            for held in reader.connections
+            if held.topic in images or held.topic in others or held.msgtype == CAMERA_INFO
         ]
+        senders = _senders(wanted)
         for connection, arrival, raw in reader.messages(wanted):
             topic, kind = connection.topic, connection.msgtype
             message = reader.deserialize(raw, kind)
+            if kind == CAMERA_INFO:
+                if not is_calibrated(scan.infos.setdefault(topic, message)):
+                    scan.infos[topic] = message  # until one is
+                continue
+            own = stamps.setdefault(topic, [])
             if kind in _TF:
-                scan.transforms += [(stamp_s(item, arrival), item) for item in message.transforms]
-            elif kind == _JOINTS:
-                scan.joints.append((stamp_s(message, arrival), message))
-            elif kind == CAMERA_INFO:
-                scan.infos.setdefault(topic, message)
-            else:
-                if topic not in scan.images:
-                    scan.images[topic] = _first_image(message, topic, is_depth=topic in depths)
-                scan.images[topic].stamps.append(stamp_s(message, arrival))
+                for item in message.transforms:
+                    transforms.append((topic, len(own), item))
+                    own.append((stamp_s(item), 1e-9 * arrival))
+                continue
+            if kind == _JOINTS:
+                joints.append((topic, senders[connection.id, connection.topic, id(connection.owner)], len(own), message))
+            elif topic not in scan.images:
+                scan.images[topic] = _first_image(message, topic, is_depth=topic in depths)
+            elif message.header.frame_id != scan.images[topic].frame:
+                raise EpisodeError(
+                    f"{shown}: {topic} has images of two cameras, in the frames {scan.images[topic].frame!r} and "
+                    f"{message.header.frame_id!r}. Record each camera on a topic of its own."
+                )
+            own.append((stamp_s(message), 1e-9 * arrival))
+    refuse_rivals([(topic, item) for topic, _, item in transforms], shown)
+    static = {topic for topic in stamps if topic.endswith("tf_static")}
+    times, warnings = message_times({topic: held for topic, held in stamps.items() if topic not in static})
+    times |= {topic: np.array([stamp for stamp, _ in stamps[topic]]) for topic in static}  # holds for good
+    scan.warnings += warnings
+    for topic, held in scan.images.items():
+        held.stamps = times[topic]
+    scan.joints += [JointMessage(float(times[topic][row]), topic, sender, item) for topic, sender, row, item in joints]
+    scan.transforms += [(float(times[topic][row]), item) for topic, row, item in transforms]
     return scan
+
+
+def _senders(connections: Sequence[Any]) -> dict[tuple[int, str, int], str]:
+    """Who sends on a connection: the node's name in ROS 1; else which of the topic's connections in its file it is."""
+    senders: dict[tuple[int, str, int], str] = {}
+    counts = Counter[tuple[str, int]]()
+    for held in connections:
+        place = (held.topic, id(held.owner))
+        counts[place] += 1
+        senders[held.id, *place] = getattr(held.ext, "callerid", None) or str(counts[place])
+    return senders
+
+
+def _refuse_other_clock(shown: str, robot: RobotLog, sources: Mapping[str, _Source]) -> None:
+    """
+    Raises:
+        EpisodeError: joint states are stamped since 1970 and images in simulated time, or the other way round.
+    """
+    images = next(iter(sources.values())).pairing.times
+    if (robot.times[0] < EPOCH_S) != (images[0] < EPOCH_S):
+        raise EpisodeError(
+            f"{shown}: joint states are stamped {robot.times[0]:.2f} to {robot.times[-1]:.2f} s, depth images "
+            f"{images[0]:.2f} to {images[-1]:.2f} s: one is simulated time, the other time since 1970. Record with "
+            "use_sim_time set alike for all nodes."
+        )
 
 
 def _first_image(message: Any, topic: str, *, is_depth: bool) -> _Images:
@@ -230,12 +294,13 @@ def _unaligned(scan: _Scan, camera: CameraTopics, color: str) -> str | None:
     frames = [scan.images[topic].frame.strip("/") for topic in (color, camera.depth)]
     if frames[0] != frames[1]:
         return f"is seen from the tf frame {frames[0]!r}, depth from {frames[1]!r}"
-    held = scan.infos.get(info_topic(color, scan.topics) or "")
+    info = info_topic(color, scan.topics) or ""
+    held = scan.infos.get(info)
     if held is None:
         return "has no camera_info that would show that it shares depth's intrinsics"
-    depth = camera_intrinsics(depth_info, camera.name, rectified=is_rectified(camera.depth))
+    depth = camera_intrinsics(depth_info, camera.name, camera.info, rectified=is_rectified(camera.depth))
     try:
-        own = camera_intrinsics(held, color, rectified=is_rectified(color))
+        own = camera_intrinsics(held, color, info, rectified=is_rectified(color))
     except EpisodeError as error:
         return f"has intrinsics that cannot be compared ({error})"
     return None if _equal(own, depth) else f"has {_brief(own)}, depth {_brief(depth)}"
@@ -248,9 +313,11 @@ def _brief(held: Intrinsics) -> str:
 def _equal(first: Intrinsics, second: Intrinsics) -> bool:
     """Whether both say the same; the last digits may be rounded."""
     one, other = (
-        [held.width, held.height, held.fx, held.fy, held.cx, held.cy, *(held.coefficients or (0.0,) * 5)]
+        [held.width, held.height, held.fx, held.fy, held.cx, held.cy, *(*held.coefficients, *[0.0] * 14)[:14]]
         for held in (first, second)
     )
+    if "equidistant" in (first.distortion, second.distortion) and first.distortion != second.distortion:
+        return False
     return bool(np.allclose(one, other, rtol=1e-4, atol=1e-4))
 
 

@@ -7,7 +7,7 @@ Topics name camera and content by habit only: `/overhead/aligned_depth_to_color/
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from diffcloud.errors import EpisodeError
@@ -73,39 +73,81 @@ def info_topic(image_topic: str, topics: Mapping[str, str]) -> str | None:
     return None
 
 
-def depth_cameras(topics: Mapping[str, str], where: str) -> dict[str, CameraTopics]:
+def only_named(topics: Mapping[str, str], named: Collection[str], kinds: Collection[str]) -> set[str]:
+    """Topics of some message types; of these only the named ones, if any of them is named."""
+    found = {topic for topic, kind in topics.items() if kind in kinds}
+    return found & {name.partition("#")[0] for name in named} or found
+
+
+def refuse_unknown(topics: Mapping[str, str], named: Collection[str], where: str) -> None:
+    """
+    Raises:
+        EpisodeError: the user named a topic that the recording lacks; lists those that it has.
+    """
+    unknown = [name for name in named if name.partition("#")[0] not in topics]
+    if unknown:
+        raise EpisodeError(f"{where} has no topic {unknown[0]}, which --topic names; its topics are {_listed(topics)}.")
+
+
+def depth_cameras(topics: Mapping[str, str], where: str, named: Collection[str] = ()) -> dict[str, CameraTopics]:
     """All depth cameras of a recording, by name; of several depth topics of one camera, the one aligned to colour.
 
     Args:
         topics: message type by topic.
         where: the recording, for messages.
+        named: topics that the user named: of each kind of message these alone are taken, if there are any.
 
     Raises:
-        EpisodeError: no depth topic, no camera_info beside one, or one camera_info beside the depth of two cameras.
+        EpisodeError: no depth topic, several for one camera of which none is better, no camera_info beside one, or one
+            camera_info beside the depth of two cameras; lists the candidates.
     """
     depths: dict[Key, str] = {}
-    for _, topic in sorted((_preference(topic, kind), topic) for topic, kind in topics.items() if is_depth(topic, kind)):
-        depths.setdefault(_key(topic), topic)
+    held = {topic: topics[topic] for topic in topics if is_depth(topic, topics[topic])}
+    allowed = set(held) & set(named) or set(held)
+    for rank, topic in sorted((_preference(topic, held[topic]), topic) for topic in allowed):
+        other = depths.setdefault(_key(topic), topic)
+        if other != topic and _preference(other, held[other]) == rank:
+            raise EpisodeError(
+                f"{where} has several depth topics of one camera: {other} and {topic}. Name the one to take with --topic, "
+                f"as in `diffcloud import recording --topic {other}`."
+            )
     if not depths:
-        raise EpisodeError(f"{where} has no depth image topic; its topics are {', '.join(sorted(topics)) or 'none'}.")
+        raise EpisodeError(f"{where} has no depth image topic; its topics are {_listed(topics)}.")
     infos: dict[str, str] = {}
+    stated = only_named(topics, named, (CAMERA_INFO,))
     for topic in depths.values():
-        info = info_topic(topic, topics)
+        info = info_topic(topic, dict.fromkeys(stated, CAMERA_INFO))
+        if info is None and len(depths) == 1 and len(stated) == 1 and stated <= set(named):
+            (info,) = stated  # it may lie anywhere
         if info is None:
-            raise EpisodeError(f"{where} has no camera_info beside {topic}; record it, the intrinsics are in it.")
+            raise EpisodeError(
+                f"{where} has no camera_info beside {topic}; record it, the intrinsics are in it. "
+                + (
+                    f"If one of {_listed(stated)} belongs to it, name it with --topic."
+                    if stated
+                    else "There is none at all."
+                )
+            )
         if info in infos:
             raise EpisodeError(
                 f"{where} has one camera_info, {info}, for two cameras ({infos[info]} and {topic}): whose intrinsics it "
                 "states cannot be told. Record a camera_info beside the depth of each camera."
             )
         infos[info] = topic
-    colors = _colors(topics, list(depths))
+    shown = {
+        topic: kind for topic, kind in topics.items() if kind in (IMAGE, COMPRESSED_IMAGE) and _content(topic) == "color"
+    }
+    colors = _colors({topic: shown[topic] for topic in set(shown) & set(named) or shown}, list(depths))
     names = _names(list(depths))
     found = {
         name: CameraTopics(name, depths[key], info, colors[key])
         for key, name, info in zip(depths, names, infos, strict=True)
     }
     return dict(sorted(found.items()))
+
+
+def _listed(topics: Collection[str]) -> str:
+    return ", ".join(sorted(topics)) or "none"
 
 
 def _preference(topic: str, kind: str) -> tuple[bool, bool, bool]:
@@ -153,11 +195,9 @@ def _names(keys: list[Key]) -> list[str]:
 
 
 def _colors(topics: Mapping[str, str], cameras: list[Key]) -> dict[Key, tuple[str, ...]]:
-    """Colour topics of each camera: those whose topics share more with it than with any other camera."""
+    """Of colour topics those of each camera, whose names share more with it than with any other camera."""
     found: dict[Key, list[tuple[int, str]]] = {camera: [] for camera in cameras}
-    for topic, kind in topics.items():
-        if kind not in (IMAGE, COMPRESSED_IMAGE) or _content(topic) != "color":
-            continue
+    for topic in topics:
         shared = {camera: _shared(_key(topic), camera) for camera in cameras}
         nearest = [camera for camera, count in shared.items() if count == max(shared.values())]
         if len(nearest) == 1 and (shared[nearest[0]] > 0 or not _key(topic) or not nearest[0]):

@@ -6,6 +6,7 @@ frame such as `world`: the way from one to the other goes up to the nearest fram
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,6 +42,36 @@ class _Edge:
         before = (after - 1).clip(0)
         nearest = np.where(np.abs(self.stamps[before] - times) < np.abs(self.stamps[after] - times), before, after)
         return self.matrices[nearest]
+
+
+def refuse_rivals(transforms: Sequence[tuple[str, Any]], where: str) -> None:
+    """
+    Args:
+        transforms: (topic, geometry_msgs/TransformStamped).
+
+    Raises:
+        EpisodeError: two topics put one frame into different places; names both.
+    """
+    owners: dict[str, dict[str, list[Any]]] = {}
+    for topic, item in transforms:
+        owners.setdefault(_plain(item.child_frame_id), {}).setdefault(topic, []).append(item)
+    for child, by_topic in owners.items():
+        if len(by_topic) > 1 and not _agree([item for held in by_topic.values() for item in held]):
+            raise EpisodeError(
+                f"{where}: several topics of transforms place {child!r} differently: {', '.join(sorted(by_topic))}. Name "
+                f"those to take with --topic, as in `diffcloud import recording --topic {min(by_topic)}`. Name /tf_static "
+                "too, if it is needed."
+            )
+
+
+def _agree(items: Sequence[Any]) -> bool:
+    """Whether all transforms say the same."""
+    if len({_plain(item.header.frame_id) for item in items}) > 1:
+        return False
+    moves = np.array([[getattr(item.transform.translation, axis) for axis in "xyz"] for item in items])
+    turns = np.array([[getattr(item.transform.rotation, axis) for axis in "xyzw"] for item in items])
+    along = np.abs(turns @ turns[0])
+    return bool(np.abs(moves - moves[0]).max() <= _MOVED_M and (along >= np.cos(_MOVED_RAD / 2)).all())
 
 
 class TransformTree:

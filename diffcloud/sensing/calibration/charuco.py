@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -29,6 +29,9 @@ class CharucoBoard:
     square_m: float = 0.03
     marker_m: float = 0.022
     dictionary: str = "DICT_5X5_100"
+    legacy: bool = False
+    """Whether the board has the pattern of OpenCV before 4.6, which calib.io prints too. With an even number of rows, the
+    top left square then is white, with a marker. Corners have the same numbers and places."""
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or not 0 < self.marker_m < self.square_m < 1:
@@ -51,7 +54,14 @@ class CharucoBoard:
                 f"Unknown dictionary {self.dictionary!r}; such as DICT_4X4_50, DICT_5X5_100, DICT_6X6_250."
             )
         dictionary = cv2.aruco.getPredefinedDictionary(number)
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, dictionary)
+        board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, dictionary)
+        board.setLegacyPattern(self.legacy)
+        return board
+
+    @property
+    def patterns(self) -> tuple[CharucoBoard, ...]:
+        """The boards that may have been printed from these figures: with an even number of rows, also the legacy one."""
+        return (self,) if self.rows % 2 else (self, replace(self, legacy=not self.legacy))
 
     def corners(self) -> Floats:
         """[K, 3] inner corners in the board's frame: x right, y down, z into the board [m]."""

@@ -65,6 +65,9 @@ def find_views(
 ) -> tuple[dict[str, CameraViews], Floats]:
     """Detections in the still frames of a raw episode, one per gripper pose and camera.
 
+    Where the board may have been printed in two patterns, the one with more corners in all images together is taken: few
+    markers of one pattern can be mistaken for the other, many cannot.
+
     Returns:
         Views by camera, and the gripper poses [P, 4, 4] that they number.
 
@@ -80,6 +83,14 @@ def find_views(
     wrong = not_unit(robot.tool_quaternion)
     if wrong is not None:
         raise CalibrationError(wrong)
+    candidates = [_detected(cameras, robot, pattern) for pattern in board.patterns]
+    return max(candidates, key=lambda one: sum(len(view.numbers) for held in one[0].values() for view in held.views))
+
+
+def _detected(
+    cameras: Mapping[str, RawCamera], robot: RobotLog, board: CharucoBoard
+) -> tuple[dict[str, CameraViews], Floats]:
+    """`find_views` of a board in one pattern."""
     found: dict[str, CameraViews] = {}
     poses: list[Floats] = []
     for name, camera in cameras.items():
