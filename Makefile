@@ -140,9 +140,10 @@ coverage: venv
 robustness: venv
 	python -m tests.robustness --out docs/results/robustness.md
 
-# The pictures of docs/concepts.md, from what `make repro` leaves in data/.
+# The pictures of README and docs/concepts.md, from what `make repro` leaves in data/.
 pictures: venv
 	python docs/site/pictures.py
+	python docs/site/motion.py
 
 # The site of docs/, README and all commands, as files that open from disk: build/site/index.html.
 docs: venv

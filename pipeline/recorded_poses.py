@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.evaluation.summary import percent
 from diffcloud.fit.result import describe_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
@@ -158,7 +159,7 @@ def pose_rows(found: Sequence[Sequence[dict[str, Any]]]) -> list[list[str]]:
                 fits[0]["nuisance"],
                 str(len(fits)),
                 f"{100 * math.expm1(float(np.median(off))):.1f} %",
-                f"{100 * math.expm1(float(off.max())):.0f} %",
+                percent(math.expm1(float(off.max()))),
                 f"{np.median(shift):.1f}",
                 f"{np.median(turn):.2f}",
                 f"{right} of {len(fits)}",

@@ -32,6 +32,7 @@ from diffcloud.report import (
 from pipeline.config import load_config
 from pipeline.console import JsonFlag, ParamsFile, errors, finish, writes
 from pipeline.fit_jobs import fit_file
+from pipeline.scenario_options import choose_scenario, fitted_scenario
 
 
 @writes(".html")
@@ -51,13 +52,16 @@ def report(
     table = tables / "fits.csv"
     if not table.is_file():
         raise ConfigError(f"No such table: {table}; run `diffcloud evaluate` first.")
-    entries = []
+    entries: list[EpisodeEntry] = []
+    loss_frames: dict[str, tuple[int, ...]] = {}
     rows = table_rows(table)
     check_file(list[FitRow], table, rows)
     for known in rows:
         scenario, name = str(known["scenario"]), str(known["episode"])
         path = fit_file(fits, scenario, name)
         fit = read_fit(path)
+        if scenario not in loss_frames:
+            loss_frames[scenario] = choose_scenario(fitted_scenario(path, scenario)).loss_frames
         known = {"rms_start_mm": float("nan"), "rms_other_frames_mm": float("nan"), **known}
         index = next((i for i, one in enumerate(fit.episodes) if one.scenario == scenario), 0)
         source = fit.episodes[index].name
@@ -71,6 +75,7 @@ def report(
                 episode=read_episode(episodes / scenario / f"{source}.npz"),
                 motion=read_motion(path.with_suffix(".npz"), index),
                 pictures=_pictures(episodes / scenario, source),
+                loss_frames=loss_frames[scenario],
             )
         )
     trainings = [

@@ -102,8 +102,12 @@ def _layers(
     from diffcloud.scene.scenarios import SCENARIO_NAMES
 
     times = episode.times[frames]
-    layers = recorded_layers(episode, frames, points=points, rng=np.random.default_rng(0))
     name, scene = named
+    meant = episode.meta.get("scenario")
+    if fit is None and name is None and scene is None and meant in SCENARIO_NAMES:
+        name = str(meant)
+    alone = fit is None and name is None and scene is None
+    layers = recorded_layers(episode, frames, points=points, rng=np.random.default_rng(0), gripper=alone)
     if fit is not None and record is not None:
         from diffcloud.fit.result import read_motion
 
@@ -114,10 +118,7 @@ def _layers(
         layers += [unposed_layer(found, recording, motion, times), *table_layers(found, motion.nodes.reshape(-1, 3))]
         values = ", ".join(f"{key} {value:.3g}" for key, value in record.values.items())
         return layers, [f"fitted in {recording.scenario}: {values}; RMS {recording.rms_mm:.1f} mm"]
-    meant = episode.meta.get("scenario")
-    if name is None and scene is None and meant in SCENARIO_NAMES:
-        name = str(meant)
-    if name is None and scene is None:
+    if alone:
         return layers, ["no scenario: the recording alone"]
     chosen = choose_scenario(name, scene)
     return layers + scene_layers(chosen, episode, times), [f"scenario {chosen.name}, basis material"]

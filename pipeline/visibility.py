@@ -36,7 +36,9 @@ def visibility(
         show(table, json)
     fraction = found.visible_fraction(noise_mm)
     if not json:
-        output.print(f"{100 * fraction:.0f} % of neighbouring pairs differ by more than {noise_mm} mm.")
+        from diffcloud.evaluation.summary import percent
+
+        output.print(f"{percent(fraction)} of neighbouring pairs differ by more than {noise_mm} mm.")
     finish(
         {
             "visible_fraction": fraction,

@@ -178,6 +178,22 @@ def _posterior(record: Mapping[str, Any], name: str) -> tuple[float | None, floa
     return tuple(stated[0].get(name, (None, None))) if stated else (None, None)
 
 
+def percent(share: float) -> str:
+    """Return a share (1 is 100 %) as text: "42 %", "0.4 %", "less than 0.1 %". Only an exact zero reads "0 %", and no share
+    below 1 reads "100 %"."""
+    value = 100 * share
+    for digits in (0, 1):
+        rounded = round(value, digits)
+        if rounded == value or (rounded != 0 and not value < 100 <= rounded):
+            return f"{rounded:.{digits}f} %"
+    return "less than 0.1 %" if value < 1 else "more than 99.9 %"
+
+
+def against(below: float) -> str:
+    """Return a relative difference as text, "33 % below" or "2 % above"; `below` is positive for a smaller value."""
+    return f"{percent(abs(below))} {'below' if below >= 0 else 'above'}"
+
+
 def largest_sources(sources: Mapping[str, Mapping[str, float]], name: str, count: int = 3) -> str:
     """What to improve first: the largest sources of a parameter's variance, with their parts of it."""
     variances = {source: deviations[name] ** 2 for source, deviations in sources.items()}
@@ -329,10 +345,10 @@ def _winners(told: Tables) -> list[str]:
             text += f"; the middle of the range, {middle['rms_mm'].iloc[0]:.1f} mm"
         found.append(text + ".")
     for row in against_predictors(told["methods"]).to_dict("records"):
-        comparison = f"{100 * abs(row['below']):.0f} % {'below' if row['below'] >= 0 else 'above'}"
         found.append(
             f"{row['scenario']}: against predictors DiffCloud is lowest, within the sampling noise, in {row['lowest']} of "
-            f"{row['episodes']} episodes; its mean loss is {comparison} that of the best one, {label(row['predictor'])}."
+            f"{row['episodes']} episodes; its mean loss is {against(row['below'])} that of the best one, "
+            f"{label(row['predictor'])}."
         )
     reference = against_reference(told["methods"])
     if reference is not None:
@@ -348,7 +364,7 @@ def _success(told: Tables) -> list[str]:
         return []
     found = []
     for scenario, group in means[means["success_rate"].notna()].groupby("scenario", sort=False):
-        rates = ", ".join(f"{label(row['method'])} {100 * row['success_rate']:.0f} %" for row in group.to_dict("records"))
+        rates = ", ".join(f"{label(row['method'])} {percent(row['success_rate'])}" for row in group.to_dict("records"))
         found.append(f"{scenario}, simulated targets below the paper's threshold: {rates}.")
     return found
 

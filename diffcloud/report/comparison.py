@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 from markupsafe import Markup
 
-from diffcloud.evaluation.summary import Tables, label, overview, sentences
+from diffcloud.evaluation.summary import Tables, against, label, overview, percent, sentences
 from diffcloud.report.figures import INK, Figure
 from diffcloud.report.tables import UNKNOWN, Cell, Table, table
 
@@ -45,12 +45,9 @@ _INTERVALS = {
     "parameter": "parameter",
     "verdict": "verdict",
     "value": "fitted",
-    "low": "from",
-    "high": "to",
+    "interval": "interval",
     "factor": "within a factor of",
-    "physical_low": "SI from",
-    "physical_high": "to",
-    "physical_unit": "unit",
+    "physical_interval": "physical interval",
     "ratio_factor": "ratio within",
     "combination": "seen best",
     "sources": "improve first",
@@ -182,7 +179,7 @@ def comparison_sections(entry: ComparisonEntry) -> list[Section]:
             "1.5). “Improve first” names the largest sources and their parts of the variance: what is known better makes "
             "the interval shorter.",
             said["intervals"],
-            _table(told["intervals"], _INTERVALS),
+            _table(_with_intervals(told["intervals"]), _INTERVALS),
             "intervals",
         ),
         Section(
@@ -208,6 +205,22 @@ def comparison_sections(entry: ComparisonEntry) -> list[Section]:
         Section("episodes", "Every episode and method", "", [], _table(shown, _EPISODES), "methods"),
     ]
     return [section for section in sections if section.table.rows]
+
+
+def _with_intervals(found: pd.DataFrame) -> pd.DataFrame:
+    """The table of intervals with both ends of an interval in one column."""
+    if found.empty:
+        return found
+    ends = {"interval": ("low", "high"), "physical_interval": ("physical_low", "physical_high")}
+    units = {"interval": [""] * len(found), "physical_interval": found["physical_unit"]}
+    joined = {
+        name: [
+            None if pd.isna(low) or pd.isna(high) else f"{low:.4g} to {high:.4g} {unit}".rstrip()
+            for low, high, unit in zip(found[first], found[last], units[name], strict=True)
+        ]
+        for name, (first, last) in ends.items()
+    }
+    return found.assign(**joined)
 
 
 def comparison_failures(entry: ComparisonEntry) -> list[str]:
@@ -252,6 +265,6 @@ def _cell(name: str, value: Any) -> Cell:
     if isinstance(value, bool):
         return Cell("yes" if value else "no")
     if isinstance(value, int | float):
-        shares = {"success_rate": f"{100 * value:.0f} %", "below_predictor": f"{-100 * value:+.0f} %"}
-        return Cell(shares.get(name, f"{value:.4g}"), sort=value)
+        shown = {"success_rate": percent, "below_predictor": against}.get(name, "{:.4g}".format)
+        return Cell(shown(value), sort=value)
     return Cell(str(value))

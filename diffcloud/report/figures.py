@@ -16,8 +16,9 @@ import numpy as np
 import pandas as pd
 
 from diffcloud.evaluation.methods import PHASES
-from diffcloud.evaluation.summary import Tables, label
+from diffcloud.evaluation.summary import Tables, label, percent
 from diffcloud.fit.record import History
+from diffcloud.report.overlay import states_at
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -165,7 +166,7 @@ def _success(told: Tables) -> Figure | None:
             range(len(methods)), rates, color=[_COLOURS[0] if name == "diffcloud" else _COLOURS[5] for name in methods]
         )
         for place, (method, rate) in enumerate(zip(methods, rates, strict=True)):
-            text = "not measured" if np.isnan(rate) else f"{rate:.0f} % of {int(group['episodes'].get(method, 0))}"
+            text = "not measured" if np.isnan(rate) else f"{percent(rate / 100)} of {int(group['episodes'].get(method, 0))}"
             axis.text(0 if np.isnan(rate) else rate, place, f" {text}", va="center", fontsize=7, color=INK)
         axis.set_yticks(range(len(methods)), [label(name) for name in methods])
         axis.set_xlim(0, 125)
@@ -207,16 +208,16 @@ def _curves(histories: Mapping[tuple[str, str], History]) -> Figure | None:
 
 
 def overlay_figure(entries: Sequence[EpisodeEntry]) -> Figure | None:
-    """Recorded cloud with the cloth at the start of the fit and after it, at the loss frame of each scenario's first
-    episode, seen from the side: the horizontal axis along which the cloud is widest, and the vertical."""
+    """Draw the recorded cloud with the cloth at the start of the fit and after it, at the `shown_frame` of each scenario's
+    first episode, seen from the side: the horizontal axis along which the cloud is widest, and the vertical."""
     first = {entry.scenario: entry for entry in reversed(entries)}
     if not first:
         return None
     shown = [first[name] for name in dict.fromkeys(entry.scenario for entry in entries)]
     canvas, axes = new_canvas(2 * len(shown), height=2.9)
     for index, entry in enumerate(shown):
-        frame = entry.last_frame
-        state = int(np.abs(entry.motion.times - entry.episode.times[frame]).argmin())
+        frame = entry.shown_frame
+        (state,) = states_at(entry.motion.times, entry.episode.times[[frame]])
         cloud = entry.episode.frame(frame).astype(float)
         flat = cloud[:, :2] - cloud[:, :2].mean(axis=0)
         wide = np.linalg.svd(flat, full_matrices=False)[2][0]
@@ -236,7 +237,7 @@ def overlay_figure(entries: Sequence[EpisodeEntry]) -> Figure | None:
         "overlays",
         "Target, start and fitted cloth",
         "Recorded points (green) with the mesh at the start of the fit (left) and after it (right), from the side, at the "
-        "loss frame of the first episode of each scenario [length unit].",
+        "loss frame of the first episode of each scenario, or at the last frame that its fit compared [length unit].",
         "data/fits and data/episodes",
     )
 

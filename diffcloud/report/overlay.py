@@ -79,13 +79,18 @@ class Overlay:
         }
 
 
-def recorded_layers(episode: Episode, frames: Sequence[int], *, points: int, rng: np.random.Generator) -> list[Layer]:
-    """Clouds, one layer for each camera where points name theirs; the grippers, their paths, and the cameras' places.
+def recorded_layers(
+    episode: Episode, frames: Sequence[int], *, points: int, rng: np.random.Generator, gripper: bool = True
+) -> list[Layer]:
+    """Return the clouds (one layer per camera if the points name theirs), the recorded grippers with their paths, and the
+    positions of the cameras.
 
     Args:
         frames: that are drawn.
         points: of a cloud, at most.
         rng: of their choice.
+        gripper: whether the recorded grippers are visible at first. The recorded point may lie on the tool, centimetres
+            from the cloth, so pages with a simulated cloth show its `held_layers` instead.
     """
     kept = [_few(int(size), points, rng) for size in np.diff(episode.offsets)[list(frames)]]
     chosen = [index + episode.offsets[frame] for index, frame in zip(kept, frames, strict=True)]
@@ -106,8 +111,9 @@ def recorded_layers(episode: Episode, frames: Sequence[int], *, points: int, rng
     if episode.gripper is not None:
         alone = episode.grippers == ONLY_GRIPPER
         places = [episode.gripper[frame] for frame in frames]
-        layers.append(Layer("gripper", "marks", places, "held", labels=("",) if alone else episode.grippers))
-        layers += [Layer("gripper", "line", [track], "held") for track in np.moveaxis(episode.gripper, 1, 0)]
+        name, labels = "gripper, as recorded", ("",) if alone else episode.grippers
+        layers.append(Layer(name, "marks", places, "soft", labels=labels, shown=gripper))
+        layers += [Layer(name, "line", [track], "soft", shown=gripper) for track in np.moveaxis(episode.gripper, 1, 0)]
     if viewpoints := episode.viewpoints:
         standing = np.stack(list(viewpoints.values()))
         layers.append(Layer("cameras", "marks", [standing], "soft", labels=tuple(viewpoints), shown=False))
@@ -115,7 +121,7 @@ def recorded_layers(episode: Episode, frames: Sequence[int], *, points: int, rng
 
 
 def fitted_layers(motion: FittedMotion, times: NDArray[np.float64]) -> list[Layer]:
-    """The fitted cloth, the one that the fit started from, and the bodies around it.
+    """Return the fitted cloth with its held nodes, the cloth that the fit started from, and the bodies around it.
 
     Args:
         times: [T] of the frames that are drawn [s].
@@ -125,7 +131,21 @@ def fitted_layers(motion: FittedMotion, times: NDArray[np.float64]) -> list[Laye
         Layer("fitted", "mesh", motion.nodes[states], "fitted", motion.faces),
         Layer("start of the fit", "mesh", motion.start_nodes[states], "start", motion.faces, 0.45, shown=False),
     ]
-    return [*layers, *body_layers(motion.bodies)]
+    return [*layers, *held_layers(motion.nodes[states], motion.held), *body_layers(motion.bodies)]
+
+
+def held_layers(nodes: NDArray[np.float64], held: NDArray[np.int64]) -> list[Layer]:
+    """Return the held nodes of a cloth that is drawn, and their paths; nothing if no node is held.
+
+    Args:
+        nodes: [T, V, 3] of the cloth in each frame that is drawn.
+        held: [K] indices of nodes.
+    """
+    if not len(held):
+        return []
+    paths = nodes[:, held]
+    marks = Layer("held nodes", "marks", paths, "held", labels=("",) * len(held))
+    return [marks, *(Layer("held nodes", "line", [path], "held") for path in np.moveaxis(paths, 1, 0))]
 
 
 def body_layers(bodies: SurfaceMesh) -> list[Layer]:

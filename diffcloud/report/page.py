@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from diffcloud.evaluation.intervals import Intervals
+from diffcloud.evaluation.summary import percent
 from diffcloud.fit.record import FitRecord, FittedParameter, RecordingFit
 from diffcloud.fit.result import FittedMotion
 from diffcloud.io.episodes import Episode
@@ -47,11 +48,21 @@ class EpisodeEntry:
     motion: FittedMotion
     pictures: Mapping[str, bytes] = field(default_factory=dict)
     """Caption -> PNG, of episodes made from raw recordings."""
+    loss_frames: tuple[int, ...] = (-1,)
+    """Of the scenario; negative ones count from the end."""
 
     @property
-    def last_frame(self) -> int:
-        """The last of the recording that the fit compared."""
-        return self.recording.frames[-1]
+    def frames(self) -> list[int]:
+        """The frames of the recording that were simulated."""
+        end = self.motion.times[-1] + 1e-6
+        return [frame for frame, time in enumerate(self.episode.times) if time <= end]
+
+    @property
+    def shown_frame(self) -> int:
+        """The scenario's last loss frame that the fit compared, otherwise the last compared frame."""
+        count = self.episode.frame_count
+        named = {frame + count if frame < 0 else frame for frame in self.loss_frames}
+        return max(named.intersection(self.recording.frames), default=self.recording.frames[-1])
 
 
 def build_page(
@@ -115,17 +126,17 @@ class _Summary:
     final_mm: float
     known: int
     """Episodes whose hidden ratio of stretch to mass is known."""
-    ratio_error: float
-    """Median factor by which the fits miss it, less one."""
+    ratio_error: str
+    """Median factor by which the fits miss it, less one, as a percentage."""
 
 
 def _overlay(entry: EpisodeEntry, points: int, rng: np.random.Generator) -> Overlay:
     """The frames that were simulated."""
-    end = entry.motion.times[-1] + 1e-6
-    frames = [frame for frame, time in enumerate(entry.episode.times) if time <= end]
+    frames = entry.frames
     times = entry.episode.times[frames]
-    layers = recorded_layers(entry.episode, frames, points=points, rng=rng) + fitted_layers(entry.motion, times)
-    return Overlay(f"{entry.scenario} / {entry.name}", frames, times, layers, min(entry.last_frame, len(frames) - 1))
+    layers = recorded_layers(entry.episode, frames, points=points, rng=rng, gripper=False)
+    layers += fitted_layers(entry.motion, times)
+    return Overlay(f"{entry.scenario} / {entry.name}", frames, times, layers, min(entry.shown_frame, len(frames) - 1))
 
 
 def _losses(entry: EpisodeEntry) -> dict[str, Any]:
@@ -143,7 +154,7 @@ def _summary(entries: Sequence[EpisodeEntry]) -> _Summary:
         float(np.nanmean(starts)) if np.isfinite(starts).any() else None,
         float(np.mean([entry.row["rms_mm"] for entry in entries])),
         len(errors),
-        float(np.exp(np.median(errors)) - 1) if errors else 0.0,
+        percent(float(np.expm1(np.median(errors)))) if errors else "",
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from diffcloud.fit.laid import asked_as
 from diffcloud.fit.record import FitRecord, NuisanceValue, RecordingFit
-from diffcloud.report.tables import UNKNOWN, Cell, Table, number, table
+from diffcloud.report.tables import UNKNOWN, Cell, Table, number, part, table
 
 _SHOWN = {"m": (1e3, "mm", 1), "rad": (180 / math.pi, "°", 1), "s": (1e3, "ms", 1), "1": (1e2, "%", 1)}
 """Unit -> factor, unit shown, digits."""
@@ -52,7 +52,7 @@ def _row(name: str, recording: RecordingFit, variables: Sequence[str]) -> list[C
         number(recording.rms_to_recording_mm, 1),
         number(recording.rms_to_cloth_mm, 1),
         Cell(f"{len(frames)}", sort=len(frames), note=f"{frames[0]} to {frames[-1]}"),
-        number(float(np.mean(recording.counted)), 0, factor=100, unit=" %"),
+        part(float(np.mean(recording.counted))),
         number(recording.cut_m, 0, factor=1e3),
         *(_pose_cell([one for own, one in recording.nuisance.items() if asked_as(own) == key]) for key in variables),
     ]

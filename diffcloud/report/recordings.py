@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from diffcloud.evaluation.summary import percent
 from diffcloud.io.episodes import Episode
 from diffcloud.report.tables import UNKNOWN, Cell, Table, number, table
 
@@ -63,7 +64,7 @@ def _row(entry: RecordedEntry) -> list[Cell]:
     return [
         Cell(entry.name),
         Cell("; ".join(f"{name} {_range(values)}" for name, values in quality["points_per_view"].items())),
-        Cell("; ".join(f"{name} {100 * _mean(values):.0f} %" for name, values in quality["masked_fraction"].items())),
+        Cell("; ".join(f"{name} {percent(_mean(values))}" for name, values in quality["masked_fraction"].items())),
         number(_mean(overlap), 1, factor=1e3),
         Cell(moved) if moved else UNKNOWN,
         number(refined.get("skin_m"), 1, factor=1e3),

@@ -9,7 +9,7 @@ from typing import Any
 
 from diffcloud.errors import ConfigError
 from diffcloud.io.files import read_json
-from diffcloud.report.tables import Cell, Table, number, table
+from diffcloud.report.tables import Cell, Table, number, part, table
 
 
 @dataclass(frozen=True)
@@ -94,11 +94,10 @@ def _error_row(entry: TrainingEntry, name: str) -> list[Cell]:
     )
     ranks = held_out.get("calibration")
     note = "" if ranks is None else f"ranks uniform: p = {ranks['uniform_ranks'][name]:.2g}"
-    cells = [number(share, 0, factor=100, unit=" %") for share in shares[:2]]
     return [
         Cell(entry.scenario),
         Cell(entry.model),
         Cell(name),
-        *cells,
-        number(shares[2], 0, factor=100, unit=" %", note=note),
+        *map(part, shares[:2]),
+        part(shares[2], note=note),
     ]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from diffcloud.evaluation.summary import percent
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -36,8 +38,13 @@ def table(heads: Iterable[str], rows: Iterable[Iterable[Cell]]) -> Table:
     return Table(tuple(heads), tuple(tuple(row) for row in rows))
 
 
-def number(value: float | None, digits: int, *, factor: float = 1.0, unit: str = "", note: str = "") -> Cell:
-    """A number times `factor`, with a unit; a dash where there is none."""
+def number(value: float | None, digits: int, *, factor: float = 1.0, note: str = "") -> Cell:
+    """A number times `factor`, zero without a sign; a dash where there is none."""
     if value is None or value != value:
         return UNKNOWN
-    return Cell(f"{factor * value:.{digits}f}{unit}", sort=value, note=note)
+    return Cell(f"{factor * value:z.{digits}f}", sort=value, note=note)
+
+
+def part(share: float | None, *, note: str = "") -> Cell:
+    """Return a share as a percentage, or a dash if it is not known."""
+    return UNKNOWN if share is None or share != share else Cell(percent(share), sort=share, note=note)

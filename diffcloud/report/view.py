@@ -13,7 +13,7 @@ from diffcloud.fit.result import FittedMotion, recorded_pose
 from diffcloud.fit.targets import track_displacement
 from diffcloud.io.episodes import Episode
 from diffcloud.mesh.shapes import rectangle_surface
-from diffcloud.report.overlay import Layer, Overlay, body_layers, states_at
+from diffcloud.report.overlay import Layer, Overlay, body_layers, held_layers, states_at
 from diffcloud.report.rendering import render
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import rollout
@@ -33,7 +33,8 @@ def build_view(overlays: Sequence[Overlay], *, title: str, note: str, facts: Seq
 
 
 def scene_layers(scenario: Scenario, episode: Episode, times: NDArray[np.float64]) -> list[Layer]:
-    """The cloth of a scenario with its basis material, moved by the recording's gripper, and what stands around it.
+    """Return the cloth of a scenario with its nominal material, moved by the recorded gripper, its held nodes, and the
+    obstacles around it.
 
     Args:
         times: [T] of the frames that are drawn [s]; after the end of the scenario the cloth stays as it is then.
@@ -53,7 +54,8 @@ def scene_layers(scenario: Scenario, episode: Episode, times: NDArray[np.float64
     known = np.isfinite(nodes).all(axis=(1, 2))
     shown = [frame if fine else scenario.scene.mesh.nodes for frame, fine in zip(nodes, known, strict=True)]
     cloth = Layer("cloth, basis material", "mesh", shown, "fitted", system.mesh.faces)
-    return [cloth, *table_layers(scenario, np.concatenate(shown)), *body_layers(scenario.scene.bodies)]
+    held = held_layers(np.stack(shown), np.unique(scenario.scene.handles.nodes).astype(np.int64))
+    return [cloth, *held, *table_layers(scenario, np.concatenate(shown)), *body_layers(scenario.scene.bodies)]
 
 
 def unposed_layer(scenario: Scenario, recording: RecordingFit, motion: FittedMotion, times: NDArray[np.float64]) -> Layer:

@@ -6,6 +6,7 @@ They are made when the site is built and not kept, so they cannot be out of date
 from __future__ import annotations
 
 import ast
+import html
 import inspect
 import json
 import re
@@ -104,7 +105,7 @@ def title(text: str) -> str:
 
 
 def _summary(command: Any) -> str:
-    return _flat(command.help or "").split(". ")[0].rstrip(".")
+    return _cell(_escaped(_flat(command.help or "").split(". ")[0].rstrip(".")))
 
 
 def _command_page(path: tuple[str, ...], command: Any, guides: list[str]) -> str:
@@ -112,7 +113,7 @@ def _command_page(path: tuple[str, ...], command: Any, guides: list[str]) -> str
     context = command.make_context(name, [], resilient_parsing=True)
     described = inspect.cleandoc(command.callback.__doc__ if command.callback else command.help or "")
     usage = context.get_usage().removeprefix("Usage: ")
-    parts = [f"# {name}", described, f"```text\n{usage}\n```"]
+    parts = [f"# {name}", _escaped(described), f"```text\n{usage}\n```"]
     if guides:
         parts.append(f"Shown in: {', '.join(guides)}.")
     members = getattr(command, "commands", {})
@@ -159,9 +160,16 @@ def _cell(text: str) -> str:
 
 
 def _escaped(text: str) -> str:
-    """As it stands, but for what is between backquotes."""
+    """Return plain text as Markdown that shows every character; text between backquotes stays as it is.
+
+    Angle brackets become entities, because Markdown has no backslash escape for the opening one.
+    """
     parts = text.split("`")
-    return "`".join(part if index % 2 else re.sub(r"([<*_\[\]])", r"\\\1", part) for index, part in enumerate(parts))
+    return "`".join(part if index % 2 else _plain(part) for index, part in enumerate(parts))
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"([*_\[\]])", r"\\\1", html.escape(text, quote=False))
 
 
 def settings_page() -> str:
@@ -175,11 +183,11 @@ def settings_page() -> str:
     for name, field in settings.Config.model_fields.items():
         section = field.default
         if isinstance(section, settings.Section):
-            parts += [f"## {name}", _flat(type(section).__doc__ or ""), _settings_table(section)]
+            parts += [f"## {name}", _escaped(_flat(type(section).__doc__ or "")), _settings_table(section)]
             for key in type(section).model_fields:
                 inner = getattr(section, key)
                 if isinstance(inner, settings.Section):
-                    parts += [f"## {name}.{key}", _flat(type(inner).__doc__ or ""), _settings_table(inner)]
+                    parts += [f"## {name}.{key}", _escaped(_flat(type(inner).__doc__ or "")), _settings_table(inner)]
     return "\n\n".join(parts) + "\n"
 
 

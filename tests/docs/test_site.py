@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import markdown
 import pytest
 
 from tests.docs.examples import PAGES, ROOT, read
@@ -27,19 +29,31 @@ _FETCHED = {
 """Tag -> attribute whose address a browser fetches by itself; links to style sheets, icons and fonts come to it."""
 
 
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+_ELEMENTS = """
+a article aside blockquote body br button circle code details dialog div em figure footer form g
+h1 h2 h3 h4 h5 h6 head header hr html iframe img input label li link main meta nav noscript ol p path pre rect script small
+span strong style sub summary sup svg table tbody td th thead title tr ul
+"""
+"""Elements of HTML and SVG that pages of commands may have."""
+
+
 class Fetched(HTMLParser):
-    """Addresses that a page makes a browser fetch, those that a reader can follow, and how many equations it has."""
+    """Addresses that a page makes a browser fetch, those that a reader can follow, its elements, equations and text."""
 
     def __init__(self, page: Path) -> None:
         super().__init__()
         self.fetched: list[str] = []
         self.followed: list[str] = []
         self.equations = 0
+        self.elements: set[str] = set()
+        self.text = ""
         self.feed(page.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         given = {name: value or "" for name, value in attrs}
         self.equations += tag == "math"
+        self.elements.add(tag)
         if tag == "a":
             self.followed.append(given.get("href", ""))
         elif tag == "link":
@@ -47,6 +61,9 @@ class Fetched(HTMLParser):
                 self.fetched.append(given.get("href", ""))
         elif given.get(_FETCHED.get(tag, "")):
             self.fetched.append(given[_FETCHED[tag]])
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +111,55 @@ def test_pages_and_commands_link_both_ways(site):
     assert "../commands/" not in read("docs/regressors.md")  # GitHub has no such pages
     assert 'href="commands/train.html"' in (site / "regressors.html").read_text(encoding="utf-8")
     assert 'href="../regressors.html"' in (site / "commands" / "train.html").read_text(encoding="utf-8")
+
+
+def test_placeholders_of_help_texts_are_shown(site):
+    """<scenario> in a help text is text. A browser would take it for an element, and show nothing."""
+    told = {}
+    for path, command in reference.commands().items():
+        texts = [command.help or "", *(getattr(parameter, "help", None) or "" for parameter in command.params)]
+        told[path] = [placeholder for text in texts for placeholder in re.findall(r"<[\w|]+>[\w./]*", text)]
+    assert sum(map(bool, told.values())) >= 10
+    for path, placeholders in told.items():
+        shown = Fetched(site / reference.address(path).replace(".md", ".html")).text
+        for placeholder in placeholders:
+            assert placeholder in shown, f"{path} does not show {placeholder}"
+
+
+def test_pages_of_commands_have_no_elements_that_html_does_not_know(site):
+    known = set(_ELEMENTS.split())
+    for page in (site / "commands").glob("*.html"):
+        unknown = Fetched(page).elements - known
+        assert not unknown, f"{page.relative_to(site)}: {unknown}"
+
+
+def test_all_that_plain_text_holds_is_shown():
+    text = "a <b> & *c* _d_ [e](f) | `<g> & *h*`"
+    assert markdown.markdown(reference._escaped(text)) == (
+        "<p>a &lt;b&gt; &amp; *c* _d_ [e](f) | <code>&lt;g&gt; &amp; *h*</code></p>"
+    )
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on PATH: the site is not searched")
+@pytest.mark.parametrize("start", ["index.html", "results/coverage.html"])
+def test_a_search_on_a_page_from_disk_finds_another_page(site, start):
+    api = pytest.importorskip("playwright.sync_api")
+    with api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-background-networking"]
+        )
+        tab, wrong = browser.new_page(viewport={"width": 1280, "height": 800}), []
+        tab.on("pageerror", lambda error: wrong.append(str(error)))
+        tab.on("request", lambda asked: wrong.append(asked.url) if asked.url.startswith("http") else None)
+        tab.goto((site / start).as_uri())
+        tab.locator("input.md-search__input").click()
+        tab.keyboard.type("checkerboard")
+        found = tab.locator("a.md-search-result__link", has_text="Calibration").first
+        found.wait_for(timeout=15_000)
+        found.click()
+        tab.wait_for_url("**/calibration.html**")
+        browser.close()
+    assert wrong == []
 
 
 def test_equations_are_drawn(site):

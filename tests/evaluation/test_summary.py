@@ -15,6 +15,7 @@ from diffcloud.evaluation.summary import (
     fit_table,
     metrics,
     overview,
+    percent,
     sentences,
     tables,
 )
@@ -189,3 +190,22 @@ def test_fingerprints_tell_inputs_apart():
     assert one == fingerprint([{"a": np.arange(3)}, "x"], packages=["io"])
     assert one != fingerprint([{"a": np.arange(4)}, "x"], packages=["io"])
     assert one != fingerprint([{"a": np.arange(3)}, "x"], packages=["mesh"])
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [
+        (0.0, "0 %"),
+        (1.0, "100 %"),
+        (0.42, "42 %"),
+        (0.9949, "99 %"),
+        (0.0042, "0.4 %"),
+        (0.0004, "less than 0.1 %"),
+        (1e-12, "less than 0.1 %"),
+        (0.997, "99.7 %"),
+        (0.9999, "more than 99.9 %"),
+        (1.254, "125 %"),
+    ],
+)
+def test_no_share_is_rounded_to_nothing_or_to_all(share, text):
+    assert percent(share) == text

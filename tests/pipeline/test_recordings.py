@@ -95,7 +95,7 @@ def test_a_look_at_the_raw_recording_its_clouds_and_a_fit(work):
     invoke("fit", episode, "--scenario", "small", "--params", "params.yaml", "--out", "seen")
     invoke("view", episode, "--fit", "seen/small_hidden1.json", "--out", "fitted")
     page = (work / "fitted.html").read_text(encoding="utf-8")
-    for name in ("fitted", "start of the fit", "fitted, where the scene has it", "table", "cameras", "gripper"):
+    for name in ("fitted", "start of the fit", "fitted, where the scene has it", "table", "cameras", "held nodes"):
         assert f'"name":"{name}"' in page
     invoke("view", "episodes/small", "--frames", 2, "--points", 7, "--out", "few.html")
     assert '"numbers":[0,3]' in (work / "few.html").read_text(encoding="utf-8")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+
 import numpy as np
 
 from diffcloud.fit.result import FittedMotion
@@ -51,6 +54,11 @@ def page_of(*entries, comparison=None, title="Report"):
     return build_page(
         entries or [entry()], title=title, overlay_points=4, environment={"torch": "2"}, comparison=comparison
     )
+
+
+def overlays_of(page):
+    """What the page's script draws in three dimensions."""
+    return json.loads(re.search(r"const overlays = (.*);", page).group(1))
 
 
 def main_of(page):

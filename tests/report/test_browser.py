@@ -11,10 +11,13 @@ import sys
 import numpy as np
 import pytest
 
+from diffcloud.evaluation.summary import tables
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter
+from diffcloud.report import ComparisonEntry, comparison_figures
 from diffcloud.report.overlay import Overlay, recorded_layers
 from diffcloud.report.view import build_view
+from tests.evaluation.records import records
 from tests.report.pages import entry, page_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -41,6 +44,10 @@ _FAINT = """least => {
   }
   return found;
 }"""
+# tables wider than their section, and cells beyond its edge
+_CUT_OFF = """() => [...document.querySelectorAll(".scroll")].filter(box => box.scrollWidth > box.clientWidth
+  || [...box.querySelectorAll("td, th")].some(e => e.getBoundingClientRect().right > box.getBoundingClientRect().right + 1))
+  .map(box => box.textContent.trim().slice(0, 60))"""
 _NAMELESS = """() => [...document.querySelectorAll("input, select, button, a, img, [role=img]")]
   .filter(e => e.checkVisibility() && !e.closest(".js-plotly-plot .main-svg"))
   .filter(e => !(e.getAttribute("aria-label") || e.getAttribute("alt") || e.textContent.trim()
@@ -54,7 +61,10 @@ def pages():
     layers = recorded_layers(episode, frames, points=4, rng=np.random.default_rng(0))
     overlay = Overlay("tan1", frames, episode.times, layers)
     view = build_view([overlay], title="A recording", note="Two frames.", facts=[("tan1", "2 frames")])
-    return {"report": page_of(entry("tan1"), entry("tan2")), "view": view}
+    told = tables(records(), {})
+    failures = ["data/regressors/fold/" + 90 * "n" + ".safetensors: no such file"]
+    compared = ComparisonEntry(told, records(), failures, comparison_figures(told, records(), {}))
+    return {"report": page_of(entry("tan1"), entry("tan2"), comparison=compared), "view": view}
 
 
 @pytest.fixture(scope="module")
@@ -133,10 +143,25 @@ def test_text_stands_out(page, scheme):
     assert page.evaluate(_FAINT, CONTRAST) == []
 
 
-def test_a_narrow_window_scrolls_only_down(page):
-    page.set_viewport_size({"width": 420, "height": 800})
+@pytest.mark.parametrize("width", [1280, 390])
+def test_nothing_leaves_the_page_sideways(page, width):
+    page.set_viewport_size({"width": width, "height": 800})
     page.wait_for_timeout(300)
-    assert page.evaluate("document.documentElement.scrollWidth") <= 420
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert page.evaluate(_CUT_OFF) == []
+
+
+def test_a_narrow_table_names_each_cell(page):
+    """A table that does not fit has a line per cell, with its heading; a wide window makes it a table again."""
+    page.set_viewport_size({"width": 390, "height": 800})
+    cells = page.locator("table.sorts.cards tbody tr:first-child td")
+    heads = page.locator("table.sorts.cards thead th")
+    assert cells.count() == heads.count()
+    for index in range(cells.count()):
+        said = cells.nth(index).evaluate("e => getComputedStyle(e, '::before').content")
+        assert said == f'"{heads.nth(index).inner_text()}"'
+    page.set_viewport_size({"width": 1280, "height": 800})
+    assert page.locator("table.sorts.cards").count() == 0
 
 
 def test_a_recording_is_watched_while_it_grows(browser, tmp_path):

@@ -10,15 +10,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
 from diffcloud.fit.pose import PoseSpace
 from diffcloud.fit.result import recorded_pose
 from diffcloud.io.episodes import Episode
-from diffcloud.report.overlay import Layer, Overlay, recorded_layers, states_at
+from diffcloud.report import overlay_figure
+from diffcloud.report.overlay import Layer, Overlay, held_layers, recorded_layers, states_at
 from diffcloud.report.view import build_view, scene_layers, unposed_layer
 from diffcloud.scene.scenarios import load_scenario
 from tests.fit.records import recording_of
-from tests.report.pages import entry, page_of
+from tests.report.pages import entry, overlays_of, page_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 NASTY = "<!--<script>alert(1)</script>"
@@ -56,8 +58,8 @@ class TestRecorded:
 
     def test_gripper_path_and_cameras(self, two_cameras):
         found = drawn(two_cameras, frames=[1])
-        np.testing.assert_array_equal(found["gripper", "marks"].frames[0], two_cameras.gripper[1])
-        np.testing.assert_array_equal(found["gripper", "line"].frames[0], two_cameras.gripper[:, 0])
+        np.testing.assert_array_equal(found["gripper, as recorded", "marks"].frames[0], two_cameras.gripper[1])
+        np.testing.assert_array_equal(found["gripper, as recorded", "line"].frames[0], two_cameras.gripper[:, 0])
         assert found["cameras", "marks"].labels == ("overhead", "side")
 
     @pytest.mark.parametrize("names", [None, "overhead", ["overhead"], 3])
@@ -75,7 +77,53 @@ def test_the_cloth_follows_the_recorded_gripper():
     cloth = np.asarray(layers["cloth, basis material"].frames)
     held = scenario.scene.handles.nodes[0]
     np.testing.assert_allclose(cloth[:, held, 2] - cloth[0, held, 2], [0, 0.05, 0.1], atol=1e-3)
+    np.testing.assert_array_equal(np.asarray(layers["held nodes"].frames)[0], cloth[:, held])  # the last layer: its path
     assert np.ptp(layers["table"].frames[0][:, 2]) == 0
+
+
+def displaced_fold(loss_frames=(2,), compared=(1, 2, 3, 4)):
+    """A fit of four frames whose recorded gripper is a point 71 mm above the node that it holds."""
+    one = entry(scenario="fold")
+    frames = np.arange(5)
+    nodes = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]]) + 0.1 * frames[:, None, None]
+    times = 0.1 * frames
+    gripper = nodes[:, 1:2] + [0, 0, 0.071]
+    motion = replace(one.motion, nodes=nodes, start_nodes=nodes, times=times, held=np.array([1]))
+    episode = Episode.from_frames([np.zeros((4, 3))] * 5, times, gripper=gripper)
+    recording = one.recording.model_copy(update={"frames": list(compared)})
+    return replace(one, episode=episode, motion=motion, recording=recording, loss_frames=loss_frames)
+
+
+class TestShown:
+    """What the report shows of a fit first."""
+
+    def test_the_marker_lies_on_the_cloth_in_every_frame(self):
+        (told,) = overlays_of(page_of(displaced_fold()))
+        layers = {(layer["name"], layer["kind"]): layer for layer in told["layers"]}
+        cloth, marks = (np.array(layers[key]["frames"]) for key in (("fitted", "mesh"), ("held nodes", "marks")))
+        assert len(marks) == 5
+        np.testing.assert_array_equal(marks[:, :, 0], cloth[:, :, 1])
+        (path,) = layers["held nodes", "line"]["frames"]
+        np.testing.assert_array_equal(np.transpose(path), cloth[:, :, 1])
+        assert not layers["gripper, as recorded", "marks"]["shown"]
+
+    @pytest.mark.parametrize(
+        ("loss_frames", "compared", "shown"),
+        [((2,), (1, 2, 3, 4), 2), ((-1,), (1, 2, 3, 4), 4), ((1, 3), (1, 2, 3, 4), 3), ((4,), (1, 2, 3), 3)],
+    )
+    def test_the_loss_frame_is_shown_if_it_was_compared(self, loss_frames, compared, shown):
+        one = displaced_fold(loss_frames, compared)
+        assert overlays_of(page_of(one))[0]["opens"] == one.shown_frame == shown
+
+    def test_the_figure_has_the_same_frame(self, monkeypatch):
+        one, drawn = displaced_fold(), []
+        monkeypatch.setattr(Axes, "triplot", lambda _, x, z, *args, **options: drawn.append(z))
+        overlay_figure([one])
+        np.testing.assert_allclose(drawn, [one.motion.nodes[2, :, 2]] * 2)
+
+
+def test_a_cloth_that_nothing_holds_has_no_marker():
+    assert held_layers(np.zeros((2, 3, 3)), np.zeros(0, dtype=np.int64)) == []
 
 
 def test_without_its_pose_the_cloth_lies_where_the_scene_has_it():
@@ -147,4 +195,4 @@ class TestBrowser:
     def test_the_report_draws_its_cloth_and_its_curves(self, tmp_path):
         script = "return [byId('scene').data.map(one => one.type), byId('curves').data.length, pick.options.length]"
         found = self.seen(tmp_path, page_of(entry("one"), entry("two")), script)
-        assert found == [["scatter3d", "mesh3d", "mesh3d"], 2, 2]
+        assert found == [["scatter3d", "mesh3d", "mesh3d", "scatter3d", "scatter3d"], 2, 2]

@@ -66,3 +66,9 @@ def test_a_finer_mesh_than_the_scenarios_is_told():
     assert "as long" not in main_of(page_of(one))
     one.fit.halvings = 2
     assert "edges 1/4 as long" in main_of(page_of(one))
+
+
+def test_the_summary_says_how_close_a_fit_comes():
+    close = entry()
+    close.row["fitted_ratio"] = 2.2 * 1.003
+    assert "the fits miss it by <b>0.3 %</b> (median)" in main_of(page_of(close))
