@@ -65,7 +65,8 @@ def places(
 
     Returns:
         (kind and points [E, 5], of a plane its number in the place of the second point; area [m²], 1 if an obstacle
-        takes part and -1 if the pair is near at rest, and where along two edges, or of points the area before anything is taken off [E, 4]).
+        takes part and -1 if the pair is near at rest, and where along two edges, or of points the area before anything is
+        taken off [E, 4]).
         Places whose area vanishes are listed too, for the cautious matrix; they are no elements.
     """
     room = len(planes.points) * len(planes.offsets)

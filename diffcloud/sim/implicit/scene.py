@@ -78,7 +78,8 @@ class Work(Box):  # type: ignore[misc]
         target: [H, 3] where prescribed nodes go [m].
         wide, moved: the pattern that also couples what touches, and where the blocks of the scene's own lie in it, as
             `sparse.widened` says.
-        order, fill: [V + 2 B] the order of elimination of wide patterns, and how many blocks a factor had when it was found.
+        order: [V + 2 B] in which wide patterns are eliminated.
+        fill: blocks of a factor when that order was found.
         last: the factorised matrix with which the part before ended.
         left_path: how far from its straight path that part ended [m]; the next one will not differ by much.
         serves: the `time_step` of that part [s]; 0: its matrix is of no use for this one.

@@ -119,8 +119,8 @@ def test_a_flat_cloth_at_rest_has_no_contact_with_itself(side):
 @pytest.mark.slow
 @pytest.mark.parametrize("self_contact", [True, False])
 def test_a_fold_of_a_mesh_finer_than_the_thickness_keeps_its_layers_apart(self_contact):
-    """Half a diagonal is 2.8 mm, the thickness 3 mm: what is near at rest is let alone, what comes near is not. Away from the
-    crease layers rest on each other, a good part of the thickness apart; without contact they lie in each other."""
+    """Half a diagonal is 2.8 mm, the thickness 3 mm. Away from the crease layers rest on each other, a good part of the
+    thickness apart; without contact they lie in each other."""
     side, scale = 0.08, 0.08 / 0.2625
     supple = Sheet(density_kg_m2=0.3, stretching_n_m=60.0, bending_n_m=1e-6)
     options = {"size_m": (side, side), "nodes": (21, 21), "self_contact": self_contact, "material": supple}
@@ -137,8 +137,8 @@ def test_a_fold_of_a_mesh_finer_than_the_thickness_keeps_its_layers_apart(self_c
 
 @pytest.mark.parametrize("squeezed", [1.0, 0.6, 0.3])
 def test_what_is_near_at_rest_repels_only_when_it_is_squeezed(squeezed):
-    """A flat cloth whose half diagonals are below the thickness: no force at rest, nor at three fifths of its size; below half,
-    the thickness of near pairs, there is one."""
+    """A flat cloth whose half diagonals are below the thickness: no force at rest, nor at three fifths of its size. Below
+    half, the thickness of near pairs, there is one."""
     mesh = grid_cloth(6, 6, 0.02, 0.02)
     cloth = Forces(mesh, preset("basis-knit"), Surrounding(contact=ContactSettings(1e4, 0.003, 3e-4)))
     scene = build_scene(cloth.system.setup, 0.0125)
