@@ -26,7 +26,7 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, BinaryIO
 
 import numpy as np
 import yaml
@@ -256,8 +256,6 @@ def read_yaml(path: Path, *, error: type[DiffCloudError] = DiffCloudError, kind:
 class _PlainLoader(yaml.SafeLoader):
     """Plain values as in YAML 1.2. PyYAML's own are of YAML 1.1, where `1:30` is 90, `010` is 8 and `no` is false."""
 
-    yaml_implicit_resolvers: ClassVar[dict[str, list[tuple[str, re.Pattern[str]]]]] = {}
-
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         self.flatten_mapping(node)
         for key, _ in node.value:  # names are texts, also of a recording that is called 1e5
@@ -272,6 +270,7 @@ class _PlainLoader(yaml.SafeLoader):
         return whole(node.value)
 
 
+_PlainLoader.yaml_implicit_resolvers = {}  # its own, without those of YAML 1.1
 _PlainLoader.add_constructor("tag:yaml.org,2002:float", _PlainLoader.construct_plain_float)
 _PlainLoader.add_constructor("tag:yaml.org,2002:int", _PlainLoader.construct_plain_int)
 for _tag, _plain, _first in (

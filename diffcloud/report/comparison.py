@@ -211,16 +211,14 @@ def _with_intervals(found: pd.DataFrame) -> pd.DataFrame:
     """The table of intervals with both ends of an interval in one column."""
     if found.empty:
         return found
-    ends = {"interval": ("low", "high"), "physical_interval": ("physical_low", "physical_high")}
-    units = {"interval": [""] * len(found), "physical_interval": found["physical_unit"]}
-    joined = {
-        name: [
-            None if pd.isna(low) or pd.isna(high) else f"{low:.4g} to {high:.4g} {unit}".rstrip()
-            for low, high, unit in zip(found[first], found[last], units[name], strict=True)
+    columns = {"interval": ("low", "high"), "physical_interval": ("physical_low", "physical_high", "physical_unit")}
+    joined = found.copy()
+    for name, taken in columns.items():
+        joined[name] = [
+            None if pd.isna(low) or pd.isna(high) else " ".join([f"{low:.4g} to {high:.4g}", *unit])
+            for low, high, *unit in found[[*taken]].itertuples(index=False)
         ]
-        for name, (first, last) in ends.items()
-    }
-    return found.assign(**joined)
+    return joined
 
 
 def comparison_failures(entry: ComparisonEntry) -> list[str]:

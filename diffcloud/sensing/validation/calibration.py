@@ -114,9 +114,10 @@ def exchanged_cameras(cameras: list[RecordedCamera], folder: Path, calibration: 
             )
     for index, first in enumerate(cameras):
         for second in cameras[index + 1 :]:
-            poses = [_pose(camera, folder, calibration) for camera in (first, second)]
-            clouds = [_first_points(camera) for camera in (first, second)]
-            if poses[0] is None or poses[1] is None or clouds[0] is None or clouds[1] is None:
+            views = (first, second)
+            poses = [pose for camera in views if (pose := _pose(camera, folder, calibration)) is not None]
+            clouds = [points for camera in views if (points := _first_points(camera)) is not None]
+            if len(poses) < 2 or len(clouds) < 2:
                 continue
             stated = _disagreement(transform(poses[0], clouds[0]), transform(poses[1], clouds[1]))
             exchanged = _disagreement(transform(poses[1], clouds[0]), transform(poses[0], clouds[1]))

@@ -154,7 +154,8 @@ BARRIER_POINT_EDGE = _term("point_edge", 3, _point_edge)
 BARRIER_POINT_FACE = _term("point_face", 4, _point_face)
 BARRIER_EDGE_EDGE = _term("edge_edge", 4, _edge_edge, "s", "t")
 """Constants: area that counts [m²]; 1 where an obstacle takes part, -1 of a pair that is near at rest; of two edges the
-fractions along them at which they are closest, 0 or 1, or below zero where that is between their ends. Tables: [2, 3] of the law (`_law`)."""
+fractions along them at which they are closest, 0 or 1, or below zero where that is between their ends.
+Tables: [2, 3] of the law (`_law`)."""
 BARRIER_PLANE = Term(
     "barrier_plane",
     corners=1,
