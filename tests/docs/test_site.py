@@ -126,9 +126,9 @@ def test_placeholders_of_help_texts_are_shown(site):
             assert placeholder in shown, f"{path} does not show {placeholder}"
 
 
-def test_pages_of_commands_have_no_elements_that_html_does_not_know(site):
+def test_pages_have_no_elements_that_html_does_not_know(site):
     known = set(_ELEMENTS.split())
-    for page in (site / "commands").glob("*.html"):
+    for page in site.rglob("*.html"):
         unknown = Fetched(page).elements - known
         assert not unknown, f"{page.relative_to(site)}: {unknown}"
 
