@@ -103,7 +103,7 @@ class Comparison:
         return self.failures + gaps
 
 
-def compare(jobs: Sequence[Job], workers: int) -> Comparison:
+def compare(jobs: Sequence[Job], workers: int | None) -> Comparison:
     """All episodes.
 
     Raises:

@@ -33,7 +33,6 @@ _MOST, _FACTOR = 10_000_000, 1e6
 Count = Annotated[int, Field(ge=1, le=_MOST)]
 CountOrNone = Annotated[int, Field(ge=0, le=_MOST)]
 """Zero: there is none, or it is left out."""
-Workers = Annotated[int, Field(ge=1, le=1024)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Factor = Annotated[float, Field(gt=1, le=_FACTOR)]
 """Within which something is known."""
@@ -54,6 +53,14 @@ class Section(BaseModel):
     """One section of params.yaml."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _decides_results(cls, data: Any) -> Any:
+        for name in ("workers", "loaders"):
+            if isinstance(data, dict) and name in data:
+                raise ValueError(f"{name}: now only the option --{name}, since it does not change results; remove the key")
+        return data
 
 
 class EpisodesConfig(Section):
@@ -79,8 +86,6 @@ class EpisodesConfig(Section):
     """The same of all cameras together."""
     beside: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """(millimetres, degrees) by which cloth and gripper are not where the recording says."""
-    workers: Workers = 1
-    """Scenarios at once."""
 
     def recorder(self) -> RecorderSettings:
         return RecorderSettings(
@@ -152,8 +157,6 @@ class PreprocessConfig(Section):
     """Kept per frame at most."""
     thinning: Thinning = "random"
     seed: Seed = 0
-    workers: Workers = 1
-    """Processes, one episode each; they change nothing but the time."""
 
 
 class SimulateConfig(Section):
@@ -234,8 +237,6 @@ class FitConfig(Section):
     (`fit.finer`). Default: 1 of gauss_newton unless linearised, else 0."""
     joint: bool = False
     """One parameter set for all episodes, whatever their scenario: they must be of one cloth."""
-    workers: Workers = 1
-    """Processes, one fit each; they change nothing but the time."""
 
     @model_validator(mode="before")
     @classmethod
@@ -345,16 +346,10 @@ class TrainConfig(Section):
     patience: Count | None = None
     seed: Seed | None = None
     device: Literal["auto", "cpu", "gpu"] = "auto"
-    loaders: CountOrNone = 0
-    """Processes that sample clouds; they change nothing but the time."""
-    workers: Workers = 1
-    """Trainings at once, each in a process with one thread."""
 
     def changes(self) -> dict[str, object]:
         """What differs from the profile."""
-        return self.model_dump(
-            exclude={"scenarios", "models", "profile", "device", "loaders", "workers"}, exclude_none=True
-        )
+        return self.model_dump(exclude={"scenarios", "models", "profile", "device"}, exclude_none=True)
 
 
 class EvaluateConfig(Section):
@@ -373,8 +368,6 @@ class EvaluateConfig(Section):
     """Patterns of <scenario>/<episode> whose loss landscape is simulated."""
     landscape_size: Annotated[int, Field(ge=2, le=1000)] = 7
     """Places along each of its axes."""
-    workers: Workers = 1
-    """Processes, one episode each; they change nothing but the time."""
 
     @model_validator(mode="before")
     @classmethod

@@ -47,6 +47,14 @@ JsonFlag = Annotated[bool, typer.Option("--json", help="End standard output with
 Threads = Annotated[
     int | None, typer.Option(min=1, help="Threads that simulate; results are the same for any number. Default: all cores.")
 ]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=1024,
+        help="Processes, each with one thread; results are the same for any number. Default: one per core.",
+    ),
+]
 ParamsFile = Annotated[
     Path | None, typer.Option("--params", help="YAML with a section for this stage; options given here win.")
 ]

@@ -26,8 +26,8 @@ from diffcloud.sensing.whole_surface import sample_surface
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.system import System
-from pipeline.config import EpisodesConfig, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, errors, finish, writes
+from pipeline.config import EpisodesConfig, load_config
+from pipeline.console import JsonFlag, ParamsFile, Workers, errors, finish, writes
 from pipeline.scenario_options import choose_scenario
 from pipeline.workers import Tell, run_all
 
@@ -38,15 +38,15 @@ _HIDDEN = ("stretch", "mass")
 def episodes(
     out: Annotated[Path, typer.Option(help="Folder; episodes go to OUT/<scenario>/<episode>, raw or .npz.")],
     params: ParamsFile = None,
-    workers: Annotated[int | None, typer.Option(help="Scenarios at once, each in a process with one thread.")] = None,
+    workers: Workers = None,
     json: JsonFlag = False,
 ) -> None:
     """Make or collect the recorded episodes of every scenario."""
     config = load_config(params)
-    settings = updated(config.episodes, workers=workers)
+    settings = config.episodes
     jobs = [EpisodesJob(name, index, settings, out / name) for index, name in enumerate(config.scenarios)]
     written = {}
-    for job, names, error in run_all("episodes", jobs, settings.workers):
+    for job, names, error in run_all("episodes", jobs, workers):
         if error is not None:
             raise DiffCloudError(error)
         written[job.scenario] = names

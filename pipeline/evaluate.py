@@ -27,7 +27,19 @@ from diffcloud.sim.properties import check_values, one_set
 from diffcloud.sim.threads import use_threads
 from pipeline.comparison import Comparison, compare, comparison_jobs, write_tables
 from pipeline.config import Config, load_config
-from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, errors, finish, output, say, show, with_suffix
+from pipeline.console import (
+    JsonFlag,
+    ParamsFile,
+    Threads,
+    Workers,
+    assignments,
+    errors,
+    finish,
+    output,
+    say,
+    show,
+    with_suffix,
+)
 from pipeline.fit_jobs import Recording, compared, joint_fit
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario
 
@@ -166,6 +178,7 @@ def evaluate(
     markdown: MarkdownFile = None,
     allow_missing: AllowMissing = False,
     params: ParamsFile = None,
+    workers: Workers = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
@@ -191,7 +204,7 @@ def evaluate(
         )
     ]
     with claimed(out):
-        comparison = compare(jobs, config.evaluate.workers)
+        comparison = compare(jobs, workers)
         metrics = write_evaluation(config, comparison, fits=fits, out=out, markdown=markdown, as_json=json)
     finish({"metrics": metrics, "missing": comparison.missing}, json)
     stop_if_missing(comparison, allow_missing)

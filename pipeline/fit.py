@@ -15,7 +15,19 @@ from diffcloud.io.episodes import read_episode
 from diffcloud.io.manifests import read_manifest, write_manifest
 from diffcloud.sim.threads import use_threads
 from pipeline.config import Config, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, episode_files, errors, finish, say, show, writes
+from pipeline.console import (
+    JsonFlag,
+    ParamsFile,
+    Threads,
+    Workers,
+    assignments,
+    episode_files,
+    errors,
+    finish,
+    say,
+    show,
+    writes,
+)
 from pipeline.ctrl_c import none_lost
 from pipeline.fit_jobs import JOINT, FitJob, Recording, first_start, read_recordings, remove_stale, stated_recordings
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario
@@ -151,7 +163,7 @@ def fit(
     joint: Annotated[
         bool | None, typer.Option("--joint", help="One parameter set for all episodes, of any scenario: one cloth.")
     ] = None,
-    workers: Annotated[int | None, typer.Option(help="Fits at once, each in a process with one thread.")] = None,
+    workers: Workers = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
@@ -183,7 +195,6 @@ def fit(
         doubts=doubts,
         halvings=halvings,
         joint=joint,
-        workers=workers,
     )
     every, recordings = _recordings(episodes, scenario, scene, config)
     groups: dict[tuple[Path, str], list[Recording]] = {}
@@ -218,7 +229,7 @@ def fit(
         write_manifest(out, read_manifest(out) | {path.relative_to(out).as_posix() for job in jobs for path in job.files})
     try:
         with none_lost():
-            for job, record, error in run_all("fit", jobs, settings.workers, patient=True):
+            for job, record, error in run_all("fit", jobs, workers, patient=True):
                 if error is None:
                     mesh = f" ({record.finer_by})" if record.finer_by else ""
                     errors.print(f"{job.label}: loss {record.loss_start:.3e} -> {record.loss:.3e}{mesh}")

@@ -278,7 +278,7 @@ class FitJob:
 
     @cached_property
     def _fingerprint(self) -> str:
-        settings = self.settings.model_dump(exclude={"workers", "joint"})  # which the name and the recordings tell
+        settings = self.settings.model_dump(exclude={"joint"})  # which the name and the recordings tell
         more = self.settings.halved_at_most([one.scenario for one in self.recordings])
         resolved = [self.space, self.solver_settings, more]  # what is not given is decided here, outside of these packages
         return fingerprint([self.name, self.recordings, settings, resolved, self.halvings], packages=_CODE)

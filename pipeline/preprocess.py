@@ -23,7 +23,7 @@ from diffcloud.sensing.masking import RobotMask
 from diffcloud.sensing.pictures import cloud_picture, mask_picture
 from diffcloud.sensing.robot import Robot, gen3
 from pipeline.config import PreprocessConfig, RawConfig, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, episode_files, errors, finish, warn, writes
+from pipeline.console import JsonFlag, ParamsFile, Workers, episode_files, errors, finish, warn, writes
 from pipeline.workers import Tell, run_all
 
 
@@ -37,14 +37,14 @@ def preprocess(
     urdf: Annotated[Path | None, typer.Option(help="The robot of raw episodes; without it, as params say.")] = None,
     mask: Annotated[bool, typer.Option(help="Take the robot out of raw episodes.")] = True,
     calibration: Annotated[Path | None, typer.Option(help="Calibration file for the cameras of raw episodes.")] = None,
-    workers: Annotated[int | None, typer.Option(help="Episodes at once, each in a process with one thread.")] = None,
+    workers: Workers = None,
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
     """Raw episodes: depth to points, robot and table out, views merged. All episodes: crop, remove outliers, thin."""
     config = load_config(params)
     raw = updated(config.preprocess.raw, robot=None if urdf is None else str(urdf))
-    settings = updated(config.preprocess, raw=raw, workers=workers)
+    settings = updated(config.preprocess, raw=raw)
     if not mask:
         settings = settings.model_copy(update={"raw": settings.raw.model_copy(update={"robot": None})})
     sources = _sources(recorded.absolute(), config.scenarios)  # "." has no name
@@ -54,7 +54,7 @@ def preprocess(
     jobs = [PreprocessJob(scenario, path, out, settings, calibrated) for scenario, path in sources]
     kept: dict[str, Any] = {}
     failures, warnings = list[str](), list[str]()
-    for job, done, error in run_all("preprocess", jobs, settings.workers):
+    for job, done, error in run_all("preprocess", jobs, workers):
         if error is None:
             kept[f"{job.scenario}/{job.name}"] = done.points
             warnings += [f"{job.label}: {message}" for message in done.warnings]

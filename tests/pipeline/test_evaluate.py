@@ -151,8 +151,7 @@ def test_finished_episodes_are_kept_until_their_inputs_change(work, monkeypatch)
 def test_two_processes_give_what_one_gives(work):
     one = results(work)
     shutil.rmtree(work / "reports")
-    (work / "params.yaml").write_text(yaml.safe_dump(PARAMS | {"evaluate": {**PARAMS["evaluate"], "workers": 2}}))
-    invoke("evaluate", "--params", "params.yaml")
+    invoke("evaluate", "--params", "params.yaml", "--workers", 2)
     assert results(work)["reports/metrics.json"] == one["reports/metrics.json"]
 
 
