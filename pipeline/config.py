@@ -64,12 +64,10 @@ class Section(BaseModel):
 
 
 class EpisodesConfig(Section):
-    """Where episodes come from."""
+    """Synthetic recordings. A person's own lie in raw/, where `diffcloud preprocess` finds them."""
 
-    source: Name = "synthetic"
-    """`synthetic`, or a folder with <scenario>/<episode>.npz or raw <scenario>/<episode>/ (see `diffcloud import`)."""
-    per_scenario: Count = 2
-    """Synthetic episodes of each scenario."""
+    per_scenario: CountOrNone = 2
+    """Of each scenario; 0: none, only a person's own are used."""
     seed: Seed = 0
     hidden_range: Bounds = (0.3, 3.0)
     """Hidden multipliers of camera recordings are drawn log-uniformly from it; fully observed scenarios (`recorder:
@@ -94,6 +92,15 @@ class EpisodesConfig(Section):
             cameras_moved=self.cameras_moved,
             beside=self.beside,
         )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_of_now(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "source" in data:
+            raise ValueError(
+                "source: recordings in raw/ are always used; remove the key, and set per_scenario: 0 for no others"
+            )
+        return data
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

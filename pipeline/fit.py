@@ -12,6 +12,7 @@ from rich.table import Table
 from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.fit import FitRecord, FitSpace
 from diffcloud.io.episodes import read_episode
+from diffcloud.io.files import files_in, folders_in
 from diffcloud.io.manifests import read_manifest, write_manifest
 from diffcloud.sim.threads import use_threads
 from pipeline.config import Config, load_config, updated
@@ -26,6 +27,7 @@ from pipeline.console import (
     finish,
     say,
     show,
+    warn,
     writes,
 )
 from pipeline.ctrl_c import none_lost
@@ -251,22 +253,17 @@ def fit(
         remove_stale(out, jobs)
 
 
-def _by_scenario(episodes: list[Path], scenarios: list[str]) -> bool:
-    """Whether there is one folder, and in it one for each scenario.
-
-    Raises:
-        ConfigError: for some of them only.
-    """
+def _by_scenario(episodes: list[Path], scenarios: list[str]) -> list[str]:
+    """Those scenarios that have episodes in the only folder that is given; none if there is another argument."""
     if len(episodes) != 1:
-        return False
-    there = [name for name in scenarios if (episodes[0] / name).is_dir()]
-    missing = [name for name in scenarios if name not in there]
-    if there and missing:
-        raise ConfigError(
-            f"{episodes[0]} has a folder for {', '.join(there)}, but none for {', '.join(missing)}. Give --scenario "
-            f"{there[0]} {episodes[0] / there[0]}, or a parameters file (--params) whose `scenarios` all have one."
-        )
-    return not missing
+        return []
+    there = [name for name in scenarios if files_in(episodes[0] / name, ".npz")]
+    if there and (missing := [name for name in scenarios if name not in there]):
+        errors.print(f"{episodes[0]} has no episodes of {', '.join(missing)}.", soft_wrap=True)
+    more = [folder.name for folder in folders_in(episodes[0]) if folder.name not in scenarios and files_in(folder, ".npz")]
+    if there and more:
+        warn(f"{episodes[0]} also has episodes of {', '.join(more)}. They are not fitted: list them under `scenarios`.")
+    return there
 
 
 def _recordings(
@@ -282,8 +279,8 @@ def _recordings(
         if scenario is not None or scene is not None:
             raise ConfigError("Each episode names its scenario; leave out --scenario and --scene.")
         return False, [(one.scenario.name, one) for one in read_recordings(stated)]
-    if scenario is None and scene is None and _by_scenario(arguments, config.scenarios):
-        tree = [(name, path) for name in config.scenarios for path in episode_files([arguments[0] / name])]
+    if scenario is None and scene is None and (there := _by_scenario(arguments, config.scenarios)):
+        tree = [(name, path) for name in there for path in episode_files([arguments[0] / name])]
         found = read_recordings(tree)
         return True, [(name, one) for (name, _), one in zip(tree, found, strict=True)]
     chosen = choose_scenario(scenario, scene)

@@ -207,10 +207,12 @@ def test_without_a_scenario_those_of_the_parameters_are_fitted(work):
     params = yaml.safe_load((work / "params.yaml").read_text()) | {"scenarios": ["small", "other"]}
     (work / "params.yaml").write_text(yaml.safe_dump(params))
     fit = ("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
-    message = str(run(*fit, code=1).exception)
-    assert "a folder for small, but none for other" in message
-    assert "Give --scenario small data/episodes/small" in message
-    assert not (work / "data/fits").exists()
+    done = run(*fit, "--json")
+    assert "data/episodes has no episodes of other." in done.stderr
+    assert list(result(done)["fits"]) == ["small/e1", "small/e2"]
+    shutil.copytree(work / "data/episodes/small", work / "data/episodes/unlisted")
+    assert "also has episodes of unlisted. They are not fitted" in " ".join(run(*fit, "--json").stderr.split())
+    shutil.rmtree(work / "data/episodes/unlisted")
     shutil.copytree(work / "data/episodes/small", work / "data/episodes/other")
     first = result(run(*fit, "--json"))["fits"]
     assert list(first) == ["small/e1", "small/e2", "other/e1", "other/e2"]
