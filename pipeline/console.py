@@ -67,6 +67,11 @@ def finish(result: dict[str, Any], as_json: bool) -> None:
         sys.stdout.flush()
 
 
+def known(number: float | None, form: str) -> str:
+    """A table's cell of a number that may be missing."""
+    return "–" if number is None else format(number, form)
+
+
 def show(table: Table, as_json: bool) -> None:
     """Print a table; with --json to standard error, so that standard output stays clean."""
     (errors if as_json else output).print(table)

@@ -25,6 +25,7 @@ from pipeline.console import (
     episode_files,
     errors,
     finish,
+    known,
     say,
     show,
     warn,
@@ -218,7 +219,8 @@ def fit(
 
     def add(job: FitJob, record: FitRecord) -> None:
         name = told_as(job)
-        results[name] = {key: value for key, value in record.plain().items() if key in _SHOWN}
+        plain = record.plain() | {"seconds": record.seconds}
+        results[name] = {key: value for key, value in plain.items() if key in _SHOWN}
         table.add_row(name, *_row(record, space))
         for recording in record.episodes if job.name == JOINT else ():
             left = recording.left_out
@@ -294,7 +296,7 @@ def _row(record: FitRecord, space: FitSpace) -> list[str]:
         f"{record.rms_mm:.1f}",
         *(f"{record.parameters[name].value:.3f}" for name in space.names),
         str(record.iterations),
-        f"{record.seconds:.1f}",
+        known(record.seconds, ".1f"),
         record.stop_reason,
     ]
 

@@ -16,6 +16,7 @@ from diffcloud.errors import CheckpointError, ConfigError, DatasetError, DiffClo
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import read_json
 from diffcloud.io.fingerprints import fingerprint
+from diffcloud.io.timings import read_timings
 from diffcloud.regressors import (
     ModelName,
     Regressor,
@@ -23,9 +24,8 @@ from diffcloud.regressors import (
     TrainingSettings,
     profile_settings,
 )
-from diffcloud.regressors.checkpoints import timings_path
 from pipeline.config import TrainConfig, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, Workers, errors, finish, show, writes
+from pipeline.console import JsonFlag, ParamsFile, Workers, errors, finish, known, show, writes
 from pipeline.ctrl_c import none_lost
 from pipeline.workers import Tell, run_all
 
@@ -217,11 +217,11 @@ class TrainJob:
     def _known(self) -> dict[str, Any] | None:
         """What an earlier run of the same settings, data and code has left."""
         try:
-            told = read_json(timings_path(self._checkpoint), error=DatasetError)
+            told = read_json(self._checkpoint.with_suffix("") / "training.json", error=DatasetError)
             if not isinstance(told, dict) or told.get("fingerprint") != self._fingerprint:
                 return None
             Regressor.read(self._checkpoint)
-            return self._told(read_json(self._checkpoint.with_suffix("") / "training.json", error=DatasetError), told)
+            return self._told(told, read_timings(self._checkpoint))
         except (DatasetError, CheckpointError):  # none, or a damaged one: trained again
             return None
 
@@ -231,8 +231,8 @@ class TrainJob:
             "best_epoch": summary["best_epoch"],
             "history": summary["history"],
             "held_out": summary["held_out"],
-            "resumed_from": timings["resumed"],
-            "seconds": timings["seconds"],
+            "resumed_from": timings.get("resumed", 0),
+            "seconds": timings.get("seconds"),
         }
 
     @property
@@ -259,5 +259,5 @@ def _add_rows(table: Table, network: str, told: Mapping[str, Any]) -> None:
         )
         cells = (f"{100 * row[key]:.1f} %" for key in keys)
         table.add_row(
-            network, name, str(told["held_out"]["draws"]), *cells, str(told["best_epoch"]), f"{told['seconds']:.0f}"
+            network, name, str(told["held_out"]["draws"]), *cells, str(told["best_epoch"]), known(told["seconds"], ".0f")
         )

@@ -180,7 +180,7 @@ def test_several_networks_at_once_are_those_of_one_after_another(work):
     alone = result(run(*both))
     written = {file.name: file.read_bytes() for file in (work / NETWORKS).glob("*.safetensors")}
     assert set(written) == {"mlp.safetensors", "pointnet2.safetensors"}
-    for file in (work / NETWORKS).glob("*.timings.json"):
+    for file in (work / NETWORKS).glob("*/training.json"):
         file.unlink()
     together = result(run(*both, "--workers", 2))
     assert {file.name: file.read_bytes() for file in (work / NETWORKS).glob("*.safetensors")} == written
@@ -221,7 +221,12 @@ def test_without_a_scenario_those_of_the_parameters_are_fitted(work):
     (work / "data/episodes/other/e1.npz").unlink()
     again = result(run(*fit, "--json"))["fits"]
     assert again == {name: told for name, told in first.items() if name != "other/e1"}  # kept, with their seconds
-    assert sorted(path.name for path in (work / "data/fits/other").iterdir()) == ["e2.json", "e2.npz", "notes.json"]
+    assert sorted(path.name for path in (work / "data/fits/other").iterdir()) == [
+        ".e2.timings.json",
+        "e2.json",
+        "e2.npz",
+        "notes.json",
+    ]
 
 
 def test_a_finished_network_is_kept_until_something_changes(work):
