@@ -109,14 +109,14 @@ moved: venv
 	    diffcloud episodes --params $$params --out $(MOVED)/$$kind/raw; \
 	    diffcloud preprocess --params $$params --out $(MOVED)/$$kind/clouds $(MOVED)/$$kind/raw; \
 	    diffcloud recordings --params $$params --recorded $(MOVED)/$$kind/raw --episodes $(MOVED)/$$kind/clouds \
-	        --out docs/results/moved-$$kind.md --workers 2 $(NUISANCE); \
+	        --out docs/results/moved-$$kind.md $(NUISANCE); \
 	done
 
 # How often intervals hold the truth: drawn cloths, recorded, fitted, and held against what was drawn; truths that fits do not
 # expect; and fresh recordings of the same cloths. Then, in a folder of its own, the same for a posterior trained on simulated
 # lifts of uncertain material, as those cameras see them, beside fits. Five hours on two cores; what is finished is kept.
 POSTERIOR := build/coverage-posterior
-COUNTED := diffcloud coverage --params docs/results/coverage.yaml --workers 2
+COUNTED := diffcloud coverage --params docs/results/coverage.yaml
 COVERAGE := $(COUNTED) --out build/coverage
 BESIDE := $(COUNTED) --out $(POSTERIOR)/coverage --seed 6985324 --recordings 24 --scenario lift
 DRAWN := --seed 82037895

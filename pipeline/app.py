@@ -76,9 +76,6 @@ def diffcloud(
 
 def main() -> None:
     """Run, and turn the project's own errors into a message and exit status 1; any other, into where its traceback is."""
-    # A step is a chain of small operations: a second thread gains nothing (measured), and beside another busy process its
-    # spinning costs tenfold. Said to OpenMP, which reads it when torch is imported, by those commands that need torch.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     _have_a_home()
     keep_freed_memory()
     ctrl_c.listen()

@@ -10,15 +10,16 @@ from typing import Any
 
 import pandas as pd
 
-from diffcloud.errors import CheckpointError, ConfigError, DiffCloudError, EpisodeError
+from diffcloud.errors import CheckpointError, DiffCloudError, EpisodeError
 from diffcloud.evaluation import ComparisonSettings, EpisodeRecord, Estimate, Gap, compare_episode
 from diffcloud.evaluation.methods import predicted
 from diffcloud.evaluation.repeats import other_repeats
 from diffcloud.evaluation.summary import PREDICTORS
 from diffcloud.fit import FitRecord, read_fit
 from diffcloud.io.episodes import Episode, read_episode
-from diffcloud.io.files import files_in, read_json, write_json, write_text
+from diffcloud.io.files import files_in, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint, kept_record
+from diffcloud.io.timings import read_seconds, read_timings
 from diffcloud.regressors import Regressor, predict_episode
 from diffcloud.scene.scenarios import Scenario
 from pipeline.config import Config
@@ -103,7 +104,7 @@ class Comparison:
         return self.failures + gaps
 
 
-def compare(jobs: Sequence[Job], workers: int) -> Comparison:
+def compare(jobs: Sequence[Job], workers: int | None) -> Comparison:
     """All episodes.
 
     Raises:
@@ -215,11 +216,11 @@ def _networks(config: Config, scenario: str, regressors: Path, simulated: Path) 
         path = folder / f"{model}.safetensors"
         seconds = {
             phase: value
-            for phase, file in (
-                ("dataset", simulated / f"{scenario}.timings.json"),
-                ("training", folder / f"{model}.timings.json"),
+            for phase, result in (
+                ("dataset", simulated / scenario),
+                ("training", path),
             )
-            if (value := _seconds(file)) is not None
+            if not read_timings(result).get("resumed") and (value := read_seconds(result)) is not None
         }
         if path.is_file():
             try:
@@ -232,14 +233,6 @@ def _networks(config: Config, scenario: str, regressors: Path, simulated: Path) 
             reason = "not trained for this scenario (train.scenarios, train.models)"
             found.append(_Network(model, None, reason, False, {}, level))
     return found
-
-
-def _seconds(path: Path) -> float | None:
-    """Wall time of a whole run; of an interrupted one it is not known."""
-    if not path.is_file():
-        return None
-    told = read_json(path, error=ConfigError)
-    return None if told.get("resumed") else float(told["seconds"])
 
 
 def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame]) -> None:

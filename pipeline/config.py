@@ -35,7 +35,6 @@ MOST_STARTS, MOST_CANDIDATES = 100, 10_000
 Count = Annotated[int, Field(ge=1, le=_MOST)]
 CountOrNone = Annotated[int, Field(ge=0, le=_MOST)]
 """Zero: there is none, or it is left out."""
-Workers = Annotated[int, Field(ge=1, le=1024)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Factor = Annotated[float, Field(gt=1, le=_FACTOR)]
 """Within which something is known."""
@@ -55,14 +54,20 @@ def _check_bounds(name: str, bounds: Bounds) -> None:
 class Section(Checked, BaseModel):  # named again, for ruff to know that defaults are copied
     """One section of params.yaml."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _decides_results(cls, data: Any) -> Any:
+        for name in ("workers", "loaders"):
+            if isinstance(data, dict) and name in data:
+                raise ValueError(f"{name}: now only the option --{name}, since it does not change results; remove the key")
+        return data
+
 
 class EpisodesConfig(Section):
-    """Where episodes come from."""
+    """Synthetic recordings. A person's own lie in raw/, where `diffcloud preprocess` finds them."""
 
-    source: Name = "synthetic"
-    """`synthetic`, or a folder with <scenario>/<episode>.npz or raw <scenario>/<episode>/ (see `diffcloud import`)."""
-    per_scenario: Count = 2
-    """Synthetic episodes of each scenario."""
+    per_scenario: CountOrNone = 2
+    """Of each scenario; 0: none, only a person's own are used."""
     seed: Seed = 0
     hidden_range: Bounds = (0.3, 3.0)
     """Hidden multipliers of camera recordings are drawn log-uniformly from it; fully observed scenarios (`recorder:
@@ -79,8 +84,6 @@ class EpisodesConfig(Section):
     """The same of all cameras together."""
     beside: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """(millimetres, degrees) by which cloth and gripper are not where the recording says."""
-    workers: Workers = 1
-    """Scenarios at once."""
 
     def recorder(self) -> RecorderSettings:
         return RecorderSettings(
@@ -89,6 +92,15 @@ class EpisodesConfig(Section):
             cameras_moved=self.cameras_moved,
             beside=self.beside,
         )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_of_now(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "source" in data:
+            raise ValueError(
+                "source: recordings in raw/ are always used; remove the key, and set per_scenario: 0 for no others"
+            )
+        return data
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -152,8 +164,6 @@ class PreprocessConfig(Section):
     """Kept per frame at most."""
     thinning: Thinning = "random"
     seed: Seed = 0
-    workers: Workers = 1
-    """Processes, one episode each; they change nothing but the time."""
 
 
 class SimulateConfig(Section):
@@ -234,8 +244,6 @@ class FitConfig(Section):
     (`fit.finer`). Default: 1 of gauss_newton unless linearised, else 0."""
     joint: bool = False
     """One parameter set for all episodes, whatever their scenario: they must be of one cloth."""
-    workers: Workers = 1
-    """Processes, one fit each; they change nothing but the time."""
 
     @model_validator(mode="before")
     @classmethod
@@ -345,16 +353,10 @@ class TrainConfig(Section):
     patience: Count | None = None
     seed: Seed | None = None
     device: Literal["auto", "cpu", "gpu"] = "auto"
-    loaders: CountOrNone = 0
-    """Processes that sample clouds; they change nothing but the time."""
-    workers: Workers = 1
-    """Trainings at once, each in a process with one thread."""
 
     def changes(self) -> dict[str, object]:
         """What differs from the profile."""
-        return self.model_dump(
-            exclude={"scenarios", "models", "profile", "device", "loaders", "workers"}, exclude_none=True
-        )
+        return self.model_dump(exclude={"scenarios", "models", "profile", "device"}, exclude_none=True)
 
 
 class EvaluateConfig(Section):
@@ -373,8 +375,6 @@ class EvaluateConfig(Section):
     """Patterns of <scenario>/<episode> whose loss landscape is simulated."""
     landscape_size: Annotated[int, Field(ge=2, le=1000)] = 7
     """Places along each of its axes."""
-    workers: Workers = 1
-    """Processes, one episode each; they change nothing but the time."""
 
     @model_validator(mode="before")
     @classmethod

@@ -49,6 +49,14 @@ Threads = Annotated[
     int | None,
     typer.Option(min=1, max=1024, help="Threads that simulate; results are the same for any number. Default: all cores."),
 ]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=1024,
+        help="Processes, each with one thread; results are the same for any number. Default: one per core.",
+    ),
+]
 ParamsFile = Annotated[
     Path | None, typer.Option("--params", help="YAML with a section for this stage; options given here win.")
 ]
@@ -59,6 +67,11 @@ def finish(result: dict[str, Any], as_json: bool) -> None:
     if as_json:
         sys.stdout.write(json.dumps(result, allow_nan=False) + "\n")
         sys.stdout.flush()
+
+
+def known(number: float | None, form: str) -> str:
+    """A table's cell of a number that may be missing."""
+    return "–" if number is None else format(number, form)
 
 
 def show(table: Table, as_json: bool) -> None:

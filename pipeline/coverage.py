@@ -25,7 +25,7 @@ from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.depth_camera import DepthNoise
 from diffcloud.sim.properties import PARAMETERS
 from pipeline.config import Config, EpisodesConfig, load_config
-from pipeline.console import JsonFlag, ParamsFile, errors, finish, show, warn, writes
+from pipeline.console import JsonFlag, ParamsFile, Workers, errors, finish, show, warn, writes
 from pipeline.coverage_page import (
     HEAD,
     REFIT_HEAD,
@@ -89,9 +89,7 @@ def coverage(
         typer.Option(help="Written by `diffcloud train`, repeatable: what it predicts of the same recordings."),
     ] = None,
     markdown: Annotated[Path | None, typer.Option(help="Write all that the folder holds to this page.")] = None,
-    workers: Annotated[
-        int, typer.Option(min=1, max=1024, help="Recordings at once, each in a process with one thread.")
-    ] = 1,
+    workers: Workers = None,
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:

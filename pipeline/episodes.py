@@ -1,8 +1,7 @@
-"""`diffcloud episodes`: the first stage. Makes synthetic recordings, or checks and copies a person's own."""
+"""`diffcloud episodes`: the first stage. Makes synthetic recordings; a person's own lie in raw/."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,10 +14,10 @@ import typer
 from numpy.typing import NDArray
 
 from diffcloud.errors import ConfigError, DiffCloudError
-from diffcloud.io.episodes import read_episode, write_episode
-from diffcloud.io.files import files_in, folders_in, staged
-from diffcloud.io.manifests import remove_files
-from diffcloud.io.raw_episodes import raw_episode_files, read_description, read_raw_episode
+from diffcloud.io.episodes import write_episode
+from diffcloud.io.files import staged
+from diffcloud.io.manifests import remove_files, write_manifest
+from diffcloud.io.raw_episodes import raw_episode_files, read_description
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.depth_camera import DepthNoise, published_cameras
 from diffcloud.sensing.recorder import ClothMotion, record
@@ -26,8 +25,8 @@ from diffcloud.sensing.whole_surface import sample_surface
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.system import System
-from pipeline.config import EpisodesConfig, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, errors, finish, writes
+from pipeline.config import EpisodesConfig, load_config
+from pipeline.console import JsonFlag, ParamsFile, Workers, errors, finish, writes
 from pipeline.scenario_options import choose_scenario
 from pipeline.workers import Tell, run_all
 
@@ -38,15 +37,18 @@ _HIDDEN = ("stretch", "mass")
 def episodes(
     out: Annotated[Path, typer.Option(help="Folder; episodes go to OUT/<scenario>/<episode>, raw or .npz.")],
     params: ParamsFile = None,
-    workers: Annotated[int | None, typer.Option(help="Scenarios at once, each in a process with one thread.")] = None,
+    workers: Workers = None,
     json: JsonFlag = False,
 ) -> None:
-    """Make or collect the recorded episodes of every scenario."""
+    """Make synthetic recordings of every scenario."""
     config = load_config(params)
-    settings = updated(config.episodes, workers=workers)
+    settings = config.episodes
     jobs = [EpisodesJob(name, index, settings, out / name) for index, name in enumerate(config.scenarios)]
+    if not settings.per_scenario:
+        jobs = []
+        write_manifest(out, [])
     written = {}
-    for job, names, error in run_all("episodes", jobs, settings.workers):
+    for job, names, error in run_all("episodes", jobs, workers):
         if error is not None:
             raise DiffCloudError(error)
         written[job.scenario] = names
@@ -69,10 +71,8 @@ class EpisodesJob:
         return self.scenario
 
     def run(self, tell: Tell) -> list[str]:
-        """Make or copy them; their names."""
+        """Make them; their names."""
         scenario = choose_scenario(self.scenario)
-        if self.settings.source != "synthetic":
-            return _own(Path(self.settings.source) / self.scenario, self.out)
         return _synthetic(scenario, self.settings, self.index, self.out, lambda _, text: tell(0.0, text))
 
 
@@ -193,23 +193,3 @@ def hidden_parameters(
         return dict(zip(_HIDDEN, drawn.T, strict=True))
     low, high = np.log(config.hidden_range)
     return {name: np.exp(rng.uniform(low, high, config.per_scenario)) for name in _HIDDEN}
-
-
-def _own(folder: Path, out: Path) -> list[str]:
-    """Check a person's episodes, raw or not, and copy them."""
-    files, raw = files_in(folder, ".npz"), [path for path in folders_in(folder) if (path / "episode.json").is_file()]
-    if not files and not raw:
-        raise ConfigError(
-            f"{folder} holds no episodes (*.npz, or raw episodes). Make them with `diffcloud import` or `diffcloud "
-            "capture`, or set episodes.source: synthetic."
-        )
-    for path in files:
-        write_episode(out / path.name, read_episode(path))
-    for path in raw:
-        read_raw_episode(path)
-        with staged(out / path.name) as copy:
-            for name in raw_episode_files(path)[0]:
-                (copy / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(path / name, copy / name)
-            _clear(out / path.name, str(read_description(path).get("source")))
-    return [path.stem for path in files] + [path.name for path in raw]

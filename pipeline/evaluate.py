@@ -16,7 +16,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, Intervals, significant, state_intervals
 from diffcloud.evaluation.markdown import comparison_page
 from diffcloud.evaluation.methods import scan_of, space_of
-from diffcloud.evaluation.summary import PREDICTORS, label, largest_sources, sentences, tables
+from diffcloud.evaluation.summary import PREDICTORS, headline, label, largest_sources, sentences, tables
 from diffcloud.evaluation.summary import metrics as summary_metrics
 from diffcloud.fit import Objective, read_fit
 from diffcloud.fit.pose import parse_priors
@@ -27,7 +27,19 @@ from diffcloud.sim.properties import check_values, one_set
 from diffcloud.sim.threads import use_threads
 from pipeline.comparison import Comparison, compare, comparison_jobs, write_tables
 from pipeline.config import Config, load_config
-from pipeline.console import JsonFlag, ParamsFile, Threads, assignments, errors, finish, output, say, show, with_suffix
+from pipeline.console import (
+    JsonFlag,
+    ParamsFile,
+    Threads,
+    Workers,
+    assignments,
+    errors,
+    finish,
+    output,
+    say,
+    show,
+    with_suffix,
+)
 from pipeline.fit_jobs import Recording, compared, joint_fit
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario
 
@@ -159,17 +171,18 @@ def evaluate(
     regressors: Annotated[Path, typer.Option(help="Folder with <scenario>/<model>.safetensors; may lack any.")] = Path(
         "data/regressors"
     ),
-    simulated: Annotated[Path, typer.Option(help="Folder with <scenario>.timings.json of the data sets.")] = Path(
+    simulated: Annotated[Path, typer.Option(help="Folder with <scenario>/ of the data sets, for wall times.")] = Path(
         "data/simulated"
     ),
-    out: Annotated[Path, typer.Option(help="Folder for metrics.json, timings.json and tables/.")] = Path("reports"),
+    out: Annotated[Path, typer.Option(help="Folder for metrics.json, seconds.csv and tables/.")] = Path("reports"),
     markdown: MarkdownFile = None,
     allow_missing: AllowMissing = False,
     params: ParamsFile = None,
+    workers: Workers = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
-    """Compare all methods on all episodes: metrics.json, timings.json, and tables. Ctrl-C keeps finished episodes."""
+    """Compare all methods on all episodes: metrics.json, tables, and wall times. Ctrl-C keeps finished episodes."""
     use_threads(threads)
     if context.invoked_subcommand is not None:
         return
@@ -191,7 +204,7 @@ def evaluate(
         )
     ]
     with claimed(out):
-        comparison = compare(jobs, config.evaluate.workers)
+        comparison = compare(jobs, workers)
         metrics = write_evaluation(config, comparison, fits=fits, out=out, markdown=markdown, as_json=json)
     finish({"metrics": metrics, "missing": comparison.missing}, json)
     stop_if_missing(comparison, allow_missing)
@@ -207,14 +220,14 @@ def write_evaluation(
     as_json: bool,
     references: Mapping[tuple[str, str], float] | None = None,
 ) -> dict[str, Any]:
-    """Write metrics, timings and tables, print the main ones, and return the metrics.
+    """Write metrics, wall times and tables, print the main ones, and return all metrics; metrics.json has the main ones.
 
     Args:
         fits: folder with <scenario>/<episode>.json.
         markdown: a page of the tables, if wanted.
         references: see `summary.method_table`.
     """
-    curves, residuals, seconds = _curves(config, fits)
+    curves, residuals = _curves(config, fits)
     predictions = _predictions(comparison.records)
     told = tables(comparison.records, comparison.seconds, references)
     metrics = _metrics(told["fits"], predictions) | {"comparison": summary_metrics(told)}
@@ -222,18 +235,17 @@ def write_evaluation(
         "losses": pd.DataFrame(curves),
         "residuals": pd.DataFrame(residuals),
         "predictions": pd.DataFrame(predictions, columns=_columns(predictions)),
-        **told,
+        **{name: table for name, table in told.items() if name != "seconds"},
     }
     known = [[*key, loss] for key, loss in (references or {}).items()]
     whole = {"records": comparison.records, "failures": comparison.failures, "references": known}
-    by_episode = {"/".join(key): value for key, value in comparison.seconds.items()}
     with together():
         write_tables(out / "tables", frames)
         write_json(out / "tables" / "comparison.json", whole)
-        write_json(out / "timings.json", {"fit_seconds": seconds, "methods": by_episode})
+        write_tables(out, {"seconds": told["seconds"]})  # not among the tables: it differs from run to run
         if markdown is not None:
             write_text(markdown, comparison_page(told, comparison.missing, config.report.title))
-        write_json(out / "metrics.json", metrics)
+        write_json(out / "metrics.json", headline(told))
     for table in printed(told):
         show(table, as_json)
     for sentence in (line for lines in sentences(told).values() for line in lines):
@@ -268,13 +280,12 @@ def printed(told: Mapping[str, pd.DataFrame]) -> list[Table]:
     return [losses, means]
 
 
-def _curves(config: Config, fits: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, float]]:
-    """Of all fits: losses of each iteration, RMS of each frame, wall times."""
+def _curves(config: Config, fits: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Of all fits: losses of each iteration, RMS of each frame."""
     curves: list[dict[str, Any]] = []
     residuals: list[dict[str, Any]] = []
-    seconds: dict[str, float] = {}
-    named = [(f"{name}/", path) for name in config.scenarios for path in files_in(fits / name, ".json")]
-    for folder, path in [*named, *(("", path) for path in joint_fit(fits))]:
+    named = [path for name in config.scenarios for path in files_in(fits / name, ".json")]
+    for path in [*named, *joint_fit(fits)]:
         fit = read_fit(path)
         curves += [
             {"scenario": fit.scenario, "episode": path.stem, "iteration": i, "loss": min(filter(None, row))}
@@ -286,8 +297,7 @@ def _curves(config: Config, fits: Path) -> tuple[list[dict[str, Any]], list[dict
             for one in fit.episodes
             for frame, rms in zip(one.frames, one.frame_rms_mm, strict=True)
         ]
-        seconds[f"{folder}{path.stem}"] = fit.seconds
-    return curves, residuals, seconds
+    return curves, residuals
 
 
 def _predictions(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -16,8 +16,8 @@ from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.threads import use_threads
 from pipeline.acceptance import SCENES
 from pipeline.comparison import compare, comparison_jobs
-from pipeline.config import Config, load_config, updated
-from pipeline.console import JsonFlag, Threads, errors, finish, writes
+from pipeline.config import Config, load_config
+from pipeline.console import JsonFlag, Threads, Workers, errors, finish, writes
 from pipeline.evaluate import AllowMissing, MarkdownFile, app, stop_if_missing, write_evaluation
 from pipeline.fit_jobs import FitJob, Recording
 from pipeline.report import report
@@ -39,7 +39,7 @@ def release(
         Path | None, typer.Option(help="JSON with the reference simulator's own fits, scenario -> episode -> loss.")
     ] = None,
     only: Annotated[str, typer.Option(help="Pattern of <scenario>/<episode>, such as 'release_lift/*'.")] = "*",
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; the profile says how many if not given.")] = None,
+    workers: Workers = None,
     allow_missing: AllowMissing = False,
     threads: Threads = None,
     json: JsonFlag = False,
@@ -49,7 +49,6 @@ def release(
     if not (folder / "conf").is_dir():
         raise ConfigError(f"{folder} has no conf/; give the folder with lift_real_pcls/ and conf/.")
     config = load_config(params)
-    config = config.model_copy(update={"evaluate": updated(config.evaluate, workers=workers)})
     chosen = [item for item in release_episodes(folder) if fnmatch.fnmatch(f"{item[0]}/{item[1]}", only)]
     config = config.model_copy(update={"scenarios": [name for name in SCENES if any(item[0] == name for item in chosen)]})
     if not chosen:
@@ -57,7 +56,7 @@ def release(
     scenes = {name: folder / "conf" / "rigidcloth" / SCENES[name] for name in config.scenarios}
     scenarios = {name: choose_scenario(name, scene) for name, scene in scenes.items()}
     _import(chosen, data / "episodes")
-    fitted, failures = _fit(config, chosen, scenarios, data / "fits")
+    fitted, failures = _fit(config, chosen, scenarios, data / "fits", workers)
     jobs = [
         job
         for name, scenario in scenarios.items()
@@ -73,7 +72,7 @@ def release(
         )
         if f"{name}/{job.name}" in fitted  # not what is left of an earlier profile
     ]
-    comparison = compare(jobs, config.evaluate.workers)
+    comparison = compare(jobs, workers)
     comparison.failures[:0] = failures
     references = {} if reference is None else _references(reference)
     metrics = write_evaluation(
@@ -104,7 +103,11 @@ def _import(chosen: list[tuple[str, str, Episode]], folder: Path) -> None:
 
 
 def _fit(
-    config: Config, chosen: list[tuple[str, str, Episode]], scenarios: dict[str, Scenario], folder: Path
+    config: Config,
+    chosen: list[tuple[str, str, Episode]],
+    scenarios: dict[str, Scenario],
+    folder: Path,
+    workers: int | None,
 ) -> tuple[set[str], list[str]]:
     """Fit what is not fitted yet: <scenario>/<episode> of the fits, and messages of those that failed."""
     jobs = [
@@ -112,7 +115,7 @@ def _fit(
         for name, label, episode in chosen
     ]
     fitted, failures = set[str](), list[str]()
-    for job, _, error in run_all("fit", jobs, config.evaluate.workers, patient=True):
+    for job, _, error in run_all("fit", jobs, workers, patient=True):
         errors.print(f"fitted {job.label}" if error is None else f"{job.label}: {error}")
         if error is None:
             fitted.add(job.label)

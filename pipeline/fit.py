@@ -12,6 +12,7 @@ from rich.table import Table
 from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.fit import FitRecord, FitSpace
 from diffcloud.io.episodes import read_episode
+from diffcloud.io.files import files_in, folders_in
 from diffcloud.io.manifests import read_manifest, write_manifest
 from diffcloud.sim.threads import use_threads
 from pipeline.config import Config, load_config, updated
@@ -19,14 +20,17 @@ from pipeline.console import (
     JsonFlag,
     ParamsFile,
     Threads,
+    Workers,
     assignments,
     episode_files,
     errors,
     finish,
+    known,
     refuse_many,
     say,
     show,
     told_progress,
+    warn,
     writes,
 )
 from pipeline.ctrl_c import none_lost
@@ -166,7 +170,7 @@ def fit(
     joint: Annotated[
         bool | None, typer.Option("--joint", help="One parameter set for all episodes, of any scenario: one cloth.")
     ] = None,
-    workers: Annotated[int | None, typer.Option(help="Fits at once, each in a process with one thread.")] = None,
+    workers: Workers = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
@@ -198,7 +202,6 @@ def fit(
         doubts=doubts,
         halvings=halvings,
         joint=joint,
-        workers=workers,
     )
     every, recordings = _recordings(episodes, scenario, scene, config)
     if settings.joint:
@@ -222,7 +225,8 @@ def fit(
 
     def add(job: FitJob, record: FitRecord) -> None:
         name = told_as(job)
-        results[name] = {key: value for key, value in record.plain().items() if key in _SHOWN}
+        plain = record.plain() | {"seconds": record.seconds}
+        results[name] = {key: value for key, value in plain.items() if key in _SHOWN}
         table.add_row(name, *_row(record, space))
         for recording in record.episodes if job.name == JOINT else ():
             left = recording.left_out
@@ -235,7 +239,7 @@ def fit(
         write_manifest(out, read_manifest(out) | {path.relative_to(out).as_posix() for job in jobs for path in job.files})
     try:
         with none_lost():
-            for job, record, error in run_all("fit", jobs, settings.workers, patient=True):
+            for job, record, error in run_all("fit", jobs, workers, patient=True):
                 if error is None:
                     mesh = f" ({record.finer_by})" if record.finer_by else ""
                     errors.print(f"{job.label}: loss {record.loss_start:.3e} -> {record.loss:.3e}{mesh}")
@@ -257,22 +261,17 @@ def fit(
         remove_stale(out, jobs)
 
 
-def _by_scenario(episodes: list[Path], scenarios: list[str]) -> bool:
-    """Whether there is one folder, and in it one for each scenario.
-
-    Raises:
-        ConfigError: for some of them only.
-    """
+def _by_scenario(episodes: list[Path], scenarios: list[str]) -> list[str]:
+    """Those scenarios that have episodes in the only folder that is given; none if there is another argument."""
     if len(episodes) != 1:
-        return False
-    there = [name for name in scenarios if (episodes[0] / name).is_dir()]
-    missing = [name for name in scenarios if name not in there]
-    if there and missing:
-        raise ConfigError(
-            f"{episodes[0]} has a folder for {', '.join(there)}, but none for {', '.join(missing)}. Give --scenario "
-            f"{there[0]} {episodes[0] / there[0]}, or a parameters file (--params) whose `scenarios` all have one."
-        )
-    return not missing
+        return []
+    there = [name for name in scenarios if files_in(episodes[0] / name, ".npz")]
+    if there and (missing := [name for name in scenarios if name not in there]):
+        errors.print(f"{episodes[0]} has no episodes of {', '.join(missing)}.", soft_wrap=True)
+    more = [folder.name for folder in folders_in(episodes[0]) if folder.name not in scenarios and files_in(folder, ".npz")]
+    if there and more:
+        warn(f"{episodes[0]} also has episodes of {', '.join(more)}. They are not fitted: list them under `scenarios`.")
+    return there
 
 
 def _recordings(
@@ -288,8 +287,8 @@ def _recordings(
         if scenario is not None or scene is not None:
             raise ConfigError("Each episode names its scenario; leave out --scenario and --scene.")
         return False, [(one.scenario.name, one) for one in read_recordings(stated)]
-    if scenario is None and scene is None and _by_scenario(arguments, config.scenarios):
-        tree = [(name, path) for name in config.scenarios for path in episode_files([arguments[0] / name])]
+    if scenario is None and scene is None and (there := _by_scenario(arguments, config.scenarios)):
+        tree = [(name, path) for name in there for path in episode_files([arguments[0] / name])]
         found = read_recordings(tree)
         return True, [(name, one) for (name, _), one in zip(tree, found, strict=True)]
     chosen = choose_scenario(scenario, scene)
@@ -304,7 +303,7 @@ def _row(record: FitRecord, space: FitSpace) -> list[str]:
         f"{record.rms_mm:.1f}",
         *(f"{record.parameters[name].value:.3f}" for name in space.names),
         str(record.iterations),
-        f"{record.seconds:.1f}",
+        known(record.seconds, ".1f"),
         record.stop_reason,
     ]
 

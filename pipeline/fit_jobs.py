@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit import FitSpace, JointObjective, Objective, Progress, read_fit, write_fit
@@ -22,6 +22,7 @@ from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import read_yaml
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
+from diffcloud.io.timings import timings_path
 from diffcloud.scene.scenarios import Scenario
 from pipeline.config import FitConfig
 from pipeline.console import assignments, episode_files, errors, told_progress
@@ -278,7 +279,7 @@ class FitJob:
 
     @cached_property
     def _fingerprint(self) -> str:
-        settings = self.settings.model_dump(exclude={"workers", "joint"})  # which the name and the recordings tell
+        settings = self.settings.model_dump(exclude={"joint"})  # which the name and the recordings tell
         more = self.settings.halved_at_most([one.scenario for one in self.recordings])
         resolved = [self.space, self.solver_settings, more]  # what is not given is decided here, outside of these packages
         return fingerprint([self.name, self.recordings, settings, resolved, self.halvings], packages=_CODE)
@@ -318,8 +319,10 @@ def remove_stale(out: Path, jobs: Sequence[FitJob]) -> None:
     kept = {path for job in jobs for path in job.files}
     kept |= {path for job in others if job.known() is not None for path in job.files}
     inside = {path.relative_to(out).as_posix() for path in kept}
-    removed = remove_files(out, sorted(read_manifest(out) - inside))
+    stale = sorted(read_manifest(out) - inside)
+    timings = {timings_path(PurePosixPath(name)).as_posix() for name in stale}
+    removed = remove_files(out, [*timings, *stale])
     write_manifest(out, inside)
-    if removed:
-        told = "Removed fits whose episode is gone or whose settings have changed"
-        errors.print(f"{told}: {', '.join(removed)}.", soft_wrap=True)
+    if told := [name for name in removed if name not in timings]:
+        text = "Removed fits whose episode is gone or whose settings have changed"
+        errors.print(f"{text}: {', '.join(told)}.", soft_wrap=True)

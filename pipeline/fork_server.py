@@ -11,13 +11,10 @@ import multiprocessing
 import signal
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from multiprocessing import resource_tracker
 from multiprocessing.context import BaseContext
-from pathlib import Path
 
-from diffcloud.errors import DiffCloudError
-from diffcloud.io.files import read_yaml
+from diffcloud.sim.threads import cores
 
 _KIND = "forkserver" if sys.platform == "linux" else "spawn"
 """On macOS, libraries that torch loads may not survive a fork."""
@@ -50,18 +47,13 @@ def begin_importing(module: str, arguments: Sequence[str]) -> None:
 
 
 def asked_workers(arguments: Sequence[str]) -> int:
-    """The value of --workers, else `workers` of the command's section in the file of --params, else 1. Invalid values are
-    left for the command to report."""
-    told: object = _after("--workers", arguments)
-    file = _after("--params", arguments)
-    if told is None and file is not None:
-        with suppress(DiffCloudError):
-            section = read_yaml(Path(file))
-            for name in (arguments[0], "workers"):
-                section = section.get(name) if isinstance(section, dict) else None
-            told = section
+    """The value of --workers. Without it, the default (one per core) for a stage, which has --params, and 1 for other
+    commands, which mostly have one job. Invalid values are left for the command to report."""
+    told = _after("--workers", arguments)
+    if told is None:
+        return 1 if _after("--params", arguments) is None else cores()
     try:
-        return int(str(told))
+        return int(told)
     except ValueError:
         return 1
 

@@ -13,6 +13,7 @@ import torch
 import typer
 import yaml
 
+import diffcloud
 from diffcloud.errors import ConfigError, DiffCloudError, DivergedError, EpisodeError
 from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, Intervals, significant, state_intervals
 from diffcloud.evaluation.methods import scan_of, space_of
@@ -576,7 +577,7 @@ def _page(
         entries,
         title="A cloth from its recordings",
         overlay_points=1200,
-        environment={"command": "diffcloud identify", **record.versions},
+        environment={"command": "diffcloud identify", "diffcloud": diffcloud.__version__},
         findings=findings,
         intervals=found,
     )

@@ -15,6 +15,7 @@ from diffcloud.evaluation.intervals import LEVEL, WITHIN, read_intervals
 from diffcloud.evaluation.methods import space_of
 from diffcloud.fit import FitRecord, read_fit
 from diffcloud.io.files import files_in, read_yaml, together, write_text
+from diffcloud.io.timings import NAME
 from pipeline.console import JsonFlag, errors, finish
 
 _PARAMS = """\
@@ -68,6 +69,10 @@ def init(
             )
     if _above(folder, ".dvc") is None:
         _start_dvc(folder)
+    ignored = folder / ".dvcignore"
+    before = ignored.read_text(encoding="utf-8") if ignored.is_file() else ""
+    pattern = NAME.format("*")
+    pages |= {} if pattern in before else {".dvcignore": f"{before}{pattern}\n"}
     with together():
         for name, text in pages.items():
             write_text(folder / name, text)

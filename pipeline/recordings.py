@@ -20,7 +20,7 @@ from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.evaluation import CloudFigures, evaluate_clouds, visible_clouds
 from diffcloud.sensing.recorder import Truth, read_truth
 from pipeline.config import EpisodesConfig, FitConfig, load_config
-from pipeline.console import JsonFlag, ParamsFile, finish, output, progress_bar, writes
+from pipeline.console import JsonFlag, ParamsFile, Workers, finish, output, progress_bar, writes
 from pipeline.recorded_poses import PoseJob, pose_page, pose_rows
 from pipeline.scenario_options import choose_scenario
 from pipeline.workers import run_all
@@ -36,9 +36,7 @@ def recordings(
         list[str] | None,
         typer.Option(help="Instead, fit with this nuisance, and compare the pose found with the true one; repeatable."),
     ] = None,
-    workers: Annotated[
-        int, typer.Option(min=1, max=1024, help="With --nuisance: recordings at once, each on one thread.")
-    ] = 1,
+    workers: Workers = None,
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
@@ -79,7 +77,7 @@ def recordings(
     finish({"out": str(out), "episodes": len(measured), **_summary(measured, fitted)}, json)
 
 
-def _poses(jobs: list[PoseJob], workers: int, out: Path, recorded: EpisodesConfig, json: bool) -> None:
+def _poses(jobs: list[PoseJob], workers: int | None, out: Path, recorded: EpisodesConfig, json: bool) -> None:
     done, failures = [], []
     for job, told, error in run_all("recordings", jobs, workers):
         if error is None:

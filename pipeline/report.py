@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import platform
-import subprocess
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import torch
 import typer
 
 import diffcloud
 from diffcloud.errors import ConfigError
-from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, TimingsFile, check_file
+from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, check_file
 from diffcloud.evaluation.summary import tables as comparison_tables
 from diffcloud.fit import read_fit
 from diffcloud.fit.result import read_motion
@@ -88,12 +84,7 @@ def report(
         "parameters": "params.yaml" if params is None else str(params),
         "seed of the fits": str(config.fit.seed),
         "seed of the comparison": str(config.evaluate.seed),
-        "git revision": _revision(),
-        "diffcloud": diffcloud.__version__,
-        "torch": torch.__version__,
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} processors",
+        "diffcloud": diffcloud.__version__,  # what differs by run or machine lies beside each fit (`io.timings`)
     }
     comparison = _comparison(tables, entries)
     predictions = table_rows(tables / "predictions.csv")
@@ -124,25 +115,13 @@ def _comparison(folder: Path, entries: list[EpisodeEntry]) -> ComparisonEntry:
     """
     whole = read_json(folder / "comparison.json", error=ConfigError)
     check_file(ComparisonFile, folder / "comparison.json", whole)
-    timings = read_json(folder.parent / "timings.json", error=ConfigError)
-    check_file(TimingsFile, folder.parent / "timings.json", timings)
     records, failures = whole["records"], whole["failures"]
     references = {(scenario, name): float(loss) for scenario, name, loss in whole["references"]}
-    seconds = {(key.split("/")[0], key.split("/", 1)[1]): told for key, told in timings["methods"].items()}
-    told = comparison_tables(records, seconds, references)
+    told = comparison_tables(records, {}, references)
     histories = {(entry.scenario, entry.name): entry.fit.history for entry in entries}
     figures = comparison_figures(told, records, histories)
     overlays = overlay_figure(entries)
     return ComparisonEntry(told, records, failures, [*figures, *([overlays] if overlays else [])])
-
-
-def _revision() -> str:
-    """Of the source tree, where there is one."""
-    command = ["git", "-C", str(Path(diffcloud.__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
 
 
 def _pictures(folder: Path, name: str) -> dict[str, bytes]:

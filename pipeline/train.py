@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, cast
 
+import torch
 import typer
 from rich.table import Table
 
@@ -15,6 +16,7 @@ from diffcloud.errors import CheckpointError, ConfigError, DatasetError, DiffClo
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import read_json
 from diffcloud.io.fingerprints import fingerprint
+from diffcloud.io.timings import read_timings
 from diffcloud.regressors import (
     ModelName,
     Regressor,
@@ -22,9 +24,8 @@ from diffcloud.regressors import (
     TrainingSettings,
     profile_settings,
 )
-from diffcloud.regressors.checkpoints import timings_path
 from pipeline.config import TrainConfig, load_config, updated
-from pipeline.console import JsonFlag, ParamsFile, errors, finish, show, writes
+from pipeline.console import JsonFlag, ParamsFile, Workers, errors, finish, known, show, writes
 from pipeline.ctrl_c import none_lost
 from pipeline.workers import Tell, run_all
 
@@ -71,12 +72,13 @@ def train(
     seed: Annotated[int | None, typer.Option(min=0, help="Of all random numbers.")] = None,
     device: Annotated[str | None, typer.Option(help="auto, cpu or gpu (mixed precision).")] = None,
     loaders: Annotated[
-        int | None,
+        int,
         typer.Option(
-            help="Processes that sample clouds, on the CPU. 0: the training process does, on the GPU if it trains there."
+            min=0,
+            help="Processes that sample clouds, on the CPU. 0: the training process does, on the GPU if it trains there.",
         ),
-    ] = None,
-    workers: Annotated[int | None, typer.Option(help="Trainings at once, each in a process with one thread.")] = None,
+    ] = 0,
+    workers: Workers = None,
     json: JsonFlag = False,
 ) -> None:
     """Train networks. After Ctrl-C or a kill the same command keeps finished ones and goes on from the last saved epoch."""
@@ -100,8 +102,6 @@ def train(
         patience=patience,
         seed=seed,
         device=device,
-        loaders=loaders,
-        workers=workers,
     )
     settings = {name: profile_settings(config.profile, name, **config.changes()) for name in config.models}
     every = scenario is None
@@ -111,7 +111,7 @@ def train(
         train_set, test_set = SimulatedSet.read(source, "train"), SimulatedSet.read(source, "test")
         if train_set.scenario != name:
             raise ConfigError(f"{source} holds draws of {train_set.scenario}, not of {name}.")
-        jobs += [TrainJob(kind, train_set, test_set, settings[kind], config, folder) for kind in config.models]
+        jobs += [TrainJob(kind, train_set, test_set, settings[kind], config, folder, loaders) for kind in config.models]
     for job in jobs:
         errors.print(f"Training {job.label}: {_described(job.settings, job.train)} ...")
     table = Table(
@@ -127,9 +127,11 @@ def train(
     )
     results: dict[str, Any] = {}
     failures: list[str] = []
+    if workers is None and config.device != "cpu" and torch.cuda.is_available():
+        workers = 1  # trainings at once would share the GPU
     try:
         with none_lost():
-            for job, told, error in run_all("train", jobs, config.workers):
+            for job, told, error in run_all("train", jobs, workers):
                 if error is None:
                     name = job.label if every else job.model
                     results[name] = told
@@ -175,6 +177,8 @@ class TrainJob:
     settings: TrainingSettings
     config: TrainConfig
     folder: Path
+    loaders: int
+    """Processes that sample clouds."""
 
     @property
     def label(self) -> str:
@@ -204,7 +208,7 @@ class TrainJob:
             self.settings,
             self._checkpoint,
             device=self.config.device,
-            workers=self.config.loaders,
+            workers=self.loaders,
             mark=self._fingerprint,
             progress=show_progress,
         )
@@ -213,11 +217,11 @@ class TrainJob:
     def _known(self) -> dict[str, Any] | None:
         """What an earlier run of the same settings, data and code has left."""
         try:
-            told = read_json(timings_path(self._checkpoint), error=DatasetError)
+            told = read_json(self._checkpoint.with_suffix("") / "training.json", error=DatasetError)
             if not isinstance(told, dict) or told.get("fingerprint") != self._fingerprint:
                 return None
             Regressor.read(self._checkpoint)
-            return self._told(read_json(self._checkpoint.with_suffix("") / "training.json", error=DatasetError), told)
+            return self._told(told, read_timings(self._checkpoint))
         except (DatasetError, CheckpointError):  # none, or a damaged one: trained again
             return None
 
@@ -227,8 +231,8 @@ class TrainJob:
             "best_epoch": summary["best_epoch"],
             "history": summary["history"],
             "held_out": summary["held_out"],
-            "resumed_from": timings["resumed"],
-            "seconds": timings["seconds"],
+            "resumed_from": timings.get("resumed", 0),
+            "seconds": timings.get("seconds"),
         }
 
     @property
@@ -255,5 +259,5 @@ def _add_rows(table: Table, network: str, told: Mapping[str, Any]) -> None:
         )
         cells = (f"{100 * row[key]:.1f} %" for key in keys)
         table.add_row(
-            network, name, str(told["held_out"]["draws"]), *cells, str(told["best_epoch"]), f"{told['seconds']:.0f}"
+            network, name, str(told["held_out"]["draws"]), *cells, str(told["best_epoch"]), known(told["seconds"], ".0f")
         )

@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Protocol, TypeVar
 
 from diffcloud.errors import DiffCloudError
-from diffcloud.sim.threads import use_threads
+from diffcloud.sim.threads import cores, use_threads
 from pipeline.console import progress_bar
 from pipeline.fork_server import worker_context
 from pipeline.lazy import imports
@@ -48,20 +48,22 @@ AnyJob = TypeVar("AnyJob", bound=Job)
 
 
 def run_all(
-    title: str, jobs: Sequence[AnyJob], workers: int, *, patient: bool = False
+    title: str, jobs: Sequence[AnyJob], workers: int | None, *, patient: bool = False
 ) -> Iterator[tuple[AnyJob, Any, str | None]]:
     """(job, what it gave, message of its error) in the order of the jobs.
 
     Args:
-        workers: processes, each with one thread; 1: this one.
+        workers: processes, each with one thread; 1: this one; None: one per core.
         patient: after Ctrl-C, wait for running jobs, which look at `check_interrupt`; else their processes end at once.
 
     Raises:
         DiffCloudError: a process died.
         KeyboardInterrupt: Ctrl-C.
     """
+    workers = cores() if workers is None else workers
     with progress_bar(title, len(jobs)) as update:
         if workers == 1 or len(jobs) < 2:
+            _one_thread()
             for index, job in enumerate(jobs):
                 update(index, job.label)
                 yield (job, *_attempt(job, partial(_tell, update, index, job.label)))
@@ -125,14 +127,19 @@ def _tell(update: Callable[[float, str], None], index: int, label: str, done: fl
     update(index + done, f"{label}  {text}")
 
 
+def _one_thread() -> None:
+    """Of torch, also where the environment allows it more: sums in several threads may end in other last bits."""
+    with imports():
+        import torch  # here, not as this module is imported: by now the collector waits
+    torch.set_num_threads(1)
+
+
 def _begin(stop: Event, patient: bool) -> None:
     """Of a worker: Ctrl-C is the parent's, and one thread is its share of the cores."""
     global _stop
     _stop = stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with imports():
-        import torch  # here, not as this module is imported: by now the collector waits
-    torch.set_num_threads(1)
+    _one_thread()
     use_threads(1)
     keep_freed_memory()
     threading.Thread(target=_end_with_parent, daemon=True).start()

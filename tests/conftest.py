@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -34,6 +34,14 @@ for number in (signal.SIGHUP, signal.SIGQUIT):
 def pytest_xdist_auto_num_workers() -> int:
     """Of `-n auto`: one more than there are cores, since many tests of cameras, arm and processes wait."""
     return cores() + 1
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _one_worker() -> Iterator[None]:
+    """Commands that a test runs in its own process run their jobs there too, unless it gives --workers."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.workers.cores", lambda: 1)
+        yield
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from pydantic import BaseModel
 
 ROOT = Path(__file__).parents[1]
 ALLOWED = {
@@ -109,14 +110,26 @@ def test_stage_parameters_are_sections_of_the_configuration():
     from pipeline.config import Config
 
     written = yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8"))
-    assert set(written) == set(Config.model_fields)
-    used = {name for stage in stages().values() for name in stage.get("params", [])}
-    assert used | {"scenarios"} == set(Config.model_fields)
+    used = {name.partition(".")[0] for stage in stages().values() for name in stage.get("params", [])}
+    assert used == set(Config.model_fields)
     Config.model_validate(written)
+
+    def compare(section: type[BaseModel], values: dict, name: str) -> None:
+        """Every key is stated, so that `dvc exp run -S` finds it."""
+        assert list(values) == list(section.model_fields), name
+        for key, field in section.model_fields.items():
+            if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+                compare(field.annotation, values[key], f"{name}{key}.")
+
+    compare(Config, written, "")
 
 
 def test_every_stage_command_exists():
     check_commands(stages())
+
+
+def test_stages_run_the_code_of_the_checkout():
+    assert all(stage["cmd"].startswith("python -m pipeline.app ") for stage in stages().values())
 
 
 def check_commands(stages: dict) -> None:
@@ -127,10 +140,9 @@ def check_commands(stages: dict) -> None:
 
     commands = get_command(app).commands
     for stage in stages.values():
-        words = stage["cmd"].split()
-        assert words[0] == "diffcloud"
-        assert words[1] in commands
-        options = {option for parameter in commands[words[1]].params for option in parameter.opts}
+        words = stage["cmd"].removeprefix("python -m pipeline.app ").removeprefix("diffcloud ").split()
+        assert words[0] in commands
+        options = {option for parameter in commands[words[0]].params for option in parameter.opts}
         assert {word for word in words if word.startswith("--")} <= options
 
 

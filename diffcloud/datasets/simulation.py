@@ -20,8 +20,9 @@ from diffcloud.datasets.chunks import Chunk, Replaced, SimulatedChunk, chunks_of
 from diffcloud.datasets.draws import ParameterDraws
 from diffcloud.datasets.work import WorkFolder
 from diffcloud.errors import ConfigError, DatasetError, DiffCloudError
-from diffcloud.io.files import atomic, write_json
+from diffcloud.io.files import atomic
 from diffcloud.io.simulated import SPLITS, SimulatedSet, Split, write_simulated
+from diffcloud.io.timings import write_timings
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.threads import use_threads
 
@@ -74,7 +75,7 @@ def simulate_set(
     clouds: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> SimulationOutcome:
-    """Simulate a set into a folder, where it appears when it is whole, and its wall time into `<out>.timings.json`.
+    """Simulate a set into a folder, where it appears when it is whole, with its wall time beside it (`io.timings`).
 
     Finished chunks are kept in `<out>.partial` and used by the next call with the same plan.
 
@@ -128,7 +129,7 @@ def _simulate_set(
 
     def write(folder: Path) -> list[str]:
         # beside the set, not in it: the same draws have the same bytes, whatever they took
-        write_json(folder.with_name(f"{folder.name}.timings.json"), {"seconds": outcome.seconds, "resumed": resumed})
+        write_timings(folder, outcome.seconds, resumed=resumed)
         return _write(folder, plan, results, clouds)
 
     work.publish(write)

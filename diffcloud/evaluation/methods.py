@@ -76,7 +76,7 @@ def fitted(fit: FitRecord, recording: int) -> Estimate:
         of_recording(fit.simulated, recording),
         simulations=simulations_each(fit),
         gradients=not issubclass(SOLVERS[fit.solver], SearchSettings),
-        seconds={"optimisation": fit.seconds / len(fit.episodes)},
+        seconds={} if fit.seconds is None else {"optimisation": fit.seconds / len(fit.episodes)},
     )
 
 

@@ -112,12 +112,6 @@ class ComparisonFile(Checked):
     references: list[tuple[Text, Text, Value]]
 
 
-class TimingsFile(Plain):
-    """timings.json."""
-
-    methods: dict[Annotated[str, Field(pattern=r".+/.+")], dict[str, dict[str, Annotated[float, Field(ge=0, le=1e9)]]]]
-
-
 class FitRow(Plain):
     """A row of tables/fits.csv. Its other columns are losses, distances, parameters and their truth."""
 

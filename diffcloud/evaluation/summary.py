@@ -277,7 +277,7 @@ def against_reference(table: pd.DataFrame, *, within: float = 0.05) -> tuple[int
 
 
 def metrics(told: Tables) -> dict[str, Any]:
-    """Numbers for `metrics.json`: scenario -> method -> means; who wins; what is identified. No wall times."""
+    """All numbers of the comparison: scenario -> method -> means; who wins; what is identified. No wall times."""
     by_scenario: dict[str, Any] = {}
     for row in told["means"].to_dict("records"):
         entry = {str(key): value for key, value in row.items() if key not in ("scenario", "method") and not _unknown(value)}
@@ -297,6 +297,34 @@ def metrics(told: Tables) -> dict[str, Any]:
             verdicts.setdefault(str(scenario), {})[str(parameter)] = {str(key): int(n) for key, n in counts.items()}
         found["verdicts"] = verdicts
     return found
+
+
+def headline(told: Tables) -> dict[str, Any]:
+    """The few numbers of `metrics.json`, to compare revisions by; 4 significant digits, no wall times.
+
+    Returns:
+        scenario -> `rms_mm` (method -> mean RMS distance at the compared frames [mm]) and, of the fits where known,
+        `rms_other_frames_mm` (mean) and `ratio_factor` (median factor, at least 1, between fitted and true stretch / mass).
+    """
+    found: dict[str, Any] = {}
+    for row in told["means"].to_dict("records"):
+        entry = found.setdefault(str(row["scenario"]), {"rms_mm": {}})
+        entry["rms_mm"][str(row["method"])] = row["rms_mm"]
+        if row["method"] == "diffcloud" and not _unknown(row["rms_other_frames_mm"]):
+            entry["rms_other_frames_mm"] = row["rms_other_frames_mm"]
+    fits = told["fits"]
+    if {"fitted_ratio", "true_ratio"} <= set(fits.columns):
+        factors = np.exp(np.abs(np.log(fits["fitted_ratio"] / fits["true_ratio"])))
+        for scenario, group in factors.groupby(fits["scenario"], sort=False):
+            if group.notna().any():
+                found[str(scenario)]["ratio_factor"] = group.median()
+    return _rounded(found)
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _rounded(entry) for key, entry in value.items()}
+    return float(f"{value:.4g}")
 
 
 def sentences(told: Tables) -> dict[str, list[str]]:

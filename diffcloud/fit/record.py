@@ -11,8 +11,9 @@ from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.fit.names import SHARED, of_all
 from diffcloud.io.files import read_json
 from diffcloud.io.schema import Plain
+from diffcloud.io.timings import read_seconds
 
-SCHEMA = 8
+SCHEMA = 9
 """Of the file. Another one is refused, by name."""
 MOST_HALVINGS = 3
 """Each multiplies the nodes by about four."""
@@ -219,7 +220,8 @@ class FitRecord(_Model):
     iterations: Count
     simulations: Annotated[int, Field(ge=1, le=1_000_000_000)]
     """Runs of the simulator; one with derivatives counts once. Those of fits that leave a recording out do not."""
-    seconds: NonNegative
+    seconds: NonNegative | None = Field(default=None, exclude=True)
+    """Wall time, which lies beside the file (`io.timings`); None where it is not known."""
     stop_reason: Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
     start: dict[str, Value]
     """Parameters of the first start, the given ones too, and how the cloth lies, named as in `free`."""
@@ -239,7 +241,6 @@ class FitRecord(_Model):
     """Of the place where it ended; None if the solver has not looked around there."""
     failures: list[str]
     """Of starts that diverged."""
-    versions: dict[str, str]
     fingerprint: Text = ""
     """Of inputs and code, by which a later call knows a finished fit."""
 
@@ -346,7 +347,7 @@ def read_fit(path: Path) -> FitRecord:
             f"{path} was written by another version (schema {told.get('schema')}, read here: {SCHEMA}); fit again."
         )
     try:
-        return FitRecord.model_validate(told)
+        return FitRecord.model_validate({**told, "seconds": read_seconds(path)})
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-import diffcloud
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.joint import AnyObjective, mean_loss
 from diffcloud.fit.laid import described_laid, is_laid
@@ -26,6 +24,7 @@ from diffcloud.fit.record import LARGEST, FitRecord, FittedParameter, History, M
 from diffcloud.fit.solvers import SOLVER_NAMES, FitOutcome, Settings
 from diffcloud.io.arrays import read_npz
 from diffcloud.io.files import together, write_json, write_npz
+from diffcloud.io.timings import write_timings
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS, one_set
@@ -181,7 +180,6 @@ def describe_fit(
         history=_history(outcome),
         scan=None if outcome.scan is None else outcome.scan.record(),
         failures=[*outcome.failures, *_cut_short(members, runs, episodes)],
-        versions={"diffcloud": diffcloud.__version__, "torch": torch.__version__, "python": platform.python_version()},
     )
     return FitResult(record, motions)
 
@@ -248,6 +246,8 @@ def write_fit(folder: Path, name: str, result: FitResult) -> Path:
         }
         arrays |= {_key(key, index): array for key, array in told.items()}
     with together():
+        if result.record.seconds is not None:
+            write_timings(path, result.record.seconds)
         write_npz(path.with_suffix(".npz"), **arrays)
         write_json(path, result.record.plain())
     return path

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from diffcloud.errors import DiffCloudError
 from diffcloud.io.files import read_json, write_json
@@ -19,19 +20,38 @@ def read_manifest(folder: Path) -> set[str]:
     Raises:
         DiffCloudError: damaged.
     """
-    path = Path(folder) / NAME
-    if not path.is_file():
-        return set()
-    told = read_json(path)
-    files = told.get("files") if isinstance(told, dict) else None
+    files = _read(folder).get("files", [])
     if not isinstance(files, list) or not all(isinstance(name, str) and len(name) <= _LONGEST for name in files):
-        raise DiffCloudError(f"{path} must list `files`; remove it, and the command will remove no older results.")
+        raise DiffCloudError(
+            f"{Path(folder) / NAME} must list `files`; remove it, and the command will remove no older results."
+        )
     return set(files)
 
 
-def write_manifest(folder: Path, names: Iterable[str]) -> None:
-    """State what a command has written, or is going to write."""
-    write_json(Path(folder) / NAME, {"files": sorted(names)})
+def read_marks(folder: Path) -> dict[str, str]:
+    """Result -> fingerprint of what it was made from, of the finished results; empty where nothing is known.
+
+    Raises:
+        DiffCloudError: damaged.
+    """
+    marks = _read(folder).get("fingerprints", {})
+    return {str(name): str(mark) for name, mark in marks.items()} if isinstance(marks, dict) else {}
+
+
+def write_manifest(folder: Path, names: Iterable[str], marks: Mapping[str, str] | None = None) -> None:
+    """State what a command has written, or is going to write.
+
+    Args:
+        marks: see `read_marks`.
+    """
+    told = {} if marks is None else {"fingerprints": dict(sorted(marks.items()))}
+    write_json(Path(folder) / NAME, {"files": sorted(names), **told})
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    path = Path(folder) / NAME
+    told = read_json(path) if path.is_file() else {}
+    return told if isinstance(told, dict) else {"files": None}
 
 
 def remove_files(folder: Path, names: Iterable[str]) -> list[str]:

@@ -99,7 +99,7 @@ class Description(BaseModel):
     """Laplace width of each parameter's error, as a fraction on the target's scale; with a heteroscedastic head, the
     factor on the width that it predicts. From the validation draws."""
     training: dict[str, Any] = {}
-    """Settings of the training, and versions."""
+    """Settings of the training."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -329,11 +329,6 @@ class Regressor:
         # copies, since kernels take other paths, with other last bits, where memory is not aligned as torch aligns it
         network.load_state_dict({name: tensor.clone() for name, tensor in tensors.items()}, assign=True)
         return Regressor(described, network.eval())
-
-
-def timings_path(checkpoint: Path) -> Path:
-    """The file beside a checkpoint that tells the seconds of its training."""
-    return checkpoint.with_suffix(".timings.json")
 
 
 def _check_tensors(path: Path, network: nn.Module, tensors: dict[str, Tensor]) -> None:

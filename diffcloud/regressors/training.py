@@ -11,7 +11,6 @@ import hashlib
 import logging
 import math
 import pickle
-import platform
 import signal
 import time
 import warnings
@@ -31,16 +30,15 @@ from scipy.stats import kstest
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-import diffcloud
 from diffcloud.errors import ConfigError, TrainingError
 from diffcloud.io.files import together, write_bytes, write_json
+from diffcloud.io.timings import write_timings
 from diffcloud.regressors.checkpoints import (
     BackgroundBody,
     Description,
     OutputScale,
     Regressor,
     split_outputs,
-    timings_path,
 )
 from diffcloud.regressors.dataset import Augmentation, CloudDataset, SimulatedSet
 from diffcloud.regressors.networks import ModelName, frames_seen
@@ -95,13 +93,12 @@ def train_regressor(
     """Train, keep the best weights, measure them on held-out draws, and write all that.
 
     Writes together: `out` (the checkpoint), a folder of the same name without suffix (`training.json`, beside DVCLive's
-    metrics, which come epoch by epoch), and `<name>.timings.json`, apart since the other files have the same bytes for the
-    same seed. The state after the last saved epoch lies in a hidden file beside `out` until the end; the same call takes
-    it up.
+    metrics, which come epoch by epoch), and the wall time beside them (`io.timings`). The state after the last saved epoch
+    lies in a hidden file beside `out` until the end; the same call takes it up.
 
     Args:
         workers: processes that sample clouds, on the CPU; 0 for none: then CUDA does, if the network is trained there.
-        mark: fingerprint of what is trained, code included; kept with the timings, and no state of another one is taken up.
+        mark: fingerprint of what is trained, code included; kept with the result, and no state of another one is taken up.
 
     Raises:
         ConfigError: sets that do not belong together or are too small.
@@ -142,7 +139,7 @@ def train_regressor(
         order=settings.order,
         density=settings.density,
         spread=(1.0,) * len(train.names),
-        training={"settings": asdict(settings), "draws": clouds.draws, "versions": _versions()},
+        training={"settings": asdict(settings), "draws": clouds.draws},
     )
     torch.manual_seed(settings.seed)
     module = _Training(told, settings, told.build(dropout=settings.dropout))
@@ -168,13 +165,14 @@ def train_regressor(
         "best_epoch": recorder.best_epoch,
         "history": recorder.history,
         "held_out": _held_out(regressor, clouds),
+        "fingerprint": mark,
     }
     network.cpu()
     seconds = time.perf_counter() - began
     with together():
         write_json(live / "training.json", summary)
         regressor.write(out)
-        write_json(timings_path(out), {"seconds": seconds, "resumed": resumed_from, "fingerprint": mark})
+        write_timings(out, seconds, resumed=resumed_from)
     for left in out.parent.glob(f".{out.stem}.*.resume"):
         left.unlink(missing_ok=True)
     return TrainingResult(regressor, summary, seconds, resumed_from)
@@ -584,7 +582,3 @@ def _held_out(regressor: Regressor, clouds: _Clouds) -> dict[str, Any]:
             "uniform_ranks": {name: float(kstest(ranks[:, index], "uniform").pvalue) for index, name in enumerate(names)},
         }
     return told
-
-
-def _versions() -> dict[str, str]:
-    return {"diffcloud": diffcloud.__version__, "torch": torch.__version__, "python": platform.python_version()}

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from diffcloud.evaluation.methods import PHASES
 from diffcloud.evaluation.summary import Tables, label, percent
 from diffcloud.fit.record import History
 from diffcloud.report.overlay import states_at
@@ -57,7 +56,7 @@ def comparison_figures(
         records: of `evaluation.compare_episode`.
         histories: (scenario, episode) -> history of the fit.
     """
-    makers = [_losses(told), _seconds(told), _parameters(told), _success(told), _curves(histories)]
+    makers = [_losses(told), _parameters(told), _success(told), _curves(histories)]
     makers += [_landscape(record) for record in records]
     return [figure for figure in makers if figure is not None]
 
@@ -92,36 +91,6 @@ def _losses(told: Tables) -> Figure | None:
         "One dot per episode, a bar at the mean. The loss by the fit's measure at its frames, as a root mean square, fresh "
         "points, the same simulator for all.",
         "tables/methods.csv",
-    )
-
-
-def _seconds(told: Tables) -> Figure | None:
-    table = told["seconds"]
-    if table.empty:
-        return None
-    means = table.groupby("method", sort=False)[[*PHASES, "total"]].mean()
-    canvas, (axis,) = new_canvas(1, height=0.9 + 0.32 * len(means))
-    methods = list(means.index)
-    axis.barh(range(len(methods)), means["total"].clip(lower=1e-3), color=_COLOURS[5], alpha=0.35, label="all")
-    for phase, marker, colour in zip(PHASES, "sDo^", _COLOURS, strict=False):
-        known = means[phase].notna()
-        places = np.flatnonzero(known)
-        axis.scatter(means.loc[known, phase].clip(lower=1e-3), places, marker=marker, color=colour, s=28, label=phase)
-    axis.set_yticks(range(len(methods)), [label(name) for name in methods])
-    axis.invert_yaxis()
-    axis.set_xscale("log")
-    # whole decades: a range within one has labels at minor ticks, which run into each other
-    low, high = means["total"].clip(lower=1e-3).min(), means["total"].max()
-    axis.set_xlim(10 ** np.floor(np.log10(low) - 1e-9), 10 ** np.ceil(np.log10(max(high, 1e-3)) + 1e-9))
-    axis.set_xlabel("seconds")
-    axis.legend(fontsize=7, frameon=False, labelcolor=INK)
-    return _finished(
-        canvas,
-        "seconds",
-        "Compute time per method",
-        "Wall time in each phase, mean over episodes. Data set and training are paid once for a scenario, inference and "
-        "optimisation for each episode. Measured where the run was made, possibly beside other work.",
-        "tables/seconds.csv",
     )
 
 

@@ -163,7 +163,7 @@ def _fits_table(entries: Sequence[EpisodeEntry]) -> Table:
     for entry in entries:
         names |= dict.fromkeys(name for name, one in entry.fit.parameters.items() if not one.doubtful)
     heads = ("episode", "scenario", "fabric", "start mm", "fitted mm", "other frames mm", *names)
-    heads = (*heads, "stretch / mass", "also fitted", "iterations", "seconds")
+    heads = (*heads, "stretch / mass", "also fitted", "iterations", "simulations")
     return table(heads, (_fit_row(index, entry, list(names)) for index, entry in enumerate(entries)))
 
 
@@ -181,7 +181,7 @@ def _fit_row(index: int, entry: EpisodeEntry, names: Sequence[str]) -> list[Cell
         number(row.get("fitted_ratio"), 2, note="" if true_ratio is None else f"true {true_ratio:.2f}"),
         _along_cell(fit),
         number(fit.iterations, 0),
-        number(fit.seconds, 1),
+        number(fit.simulations, 0),
     ]
 
 

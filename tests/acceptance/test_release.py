@@ -161,7 +161,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
         (Path(__file__).parents[2] / "pipeline" / "profiles" / "release.yaml").read_text(encoding="utf-8")
     )
     profile["fit"] |= {"iterations": 2, "starts": 2, "smoothing": 0.0}
-    profile["evaluate"] |= {"draws": 2, "landscapes": [], "workers": 1}
+    profile["evaluate"] |= {"draws": 2, "landscapes": []}
     Path("quick.yaml").write_text(yaml.safe_dump(profile))
     command = ("evaluate", "release", release, "--params", "quick.yaml", "--only", "*/fold_tan*", "--markdown", "c.md")
     found = invoke(*command).result["metrics"]["comparison"]

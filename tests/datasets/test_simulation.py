@@ -141,7 +141,7 @@ def test_an_interrupted_set_ends_with_the_same_bytes_and_redoes_nothing(whole, t
     assert outcome.resumed == CHUNK
     assert sorted(simulated) == [3, 4]
     assert contents(out) == contents(whole)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["set", "set.timings.json"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".set.timings.json", "set"]
 
 
 def test_a_kill_while_joining_loses_nothing(whole, tmp_path, monkeypatch):

@@ -30,7 +30,7 @@ PARAMS = {
     "preprocess": {"raw": {"refine": False, "flying_m": 0.1}, "points": 300},
     "fit": {"iterations": 1, "screen": 3, "points": 200},
     "train": {"scenarios": ["fold"]},
-    "evaluate": {"draws": 1, "rivals": ["middle"], "level": None, "workers": 1},
+    "evaluate": {"draws": 1, "rivals": ["middle"], "level": None},
 }
 """In place of params.yaml and the profiles."""
 QUICK = {"base": "lift", "nodes": [5, 5], "frames": 5, "steps_per_frame": 1, "recorder": "whole_surface", "points": 200}

@@ -57,6 +57,5 @@ def record_of(*recordings: RecordingFit, **changes: Any) -> FitRecord:
         "history": History(names=["stretch"], loss=[[0.2], [0.1]], values=[[[1.0]], [[1.5]]], gradient_norm=[]),
         "scan": None,
         "failures": [],
-        "versions": {},
     }  # fmt: skip
     return FitRecord.model_validate(told | changes)

@@ -9,8 +9,9 @@ import pandas as pd
 import pytest
 import yaml
 
-from diffcloud.io.episodes import read_episode
+from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.sensing.validation.episode import validate_raw_episode
+from pipeline.preprocess import PreprocessJob
 from tests.pipeline.invoke import invoke
 from tests.sensing.cloth_scene import SETTINGS, write_cloth_episode
 from tests.sensing.test_validation import edit_json
@@ -93,3 +94,85 @@ def test_bad_robots_and_places(tmp_path, params):
     description.write_text(description.read_text().replace('"lift"', '"../lift"'), encoding="utf-8")
     assert "must be a plain folder name" in invoke("preprocess", *common, code=1).errors
     assert not (tmp_path / "episodes").exists()
+
+
+@pytest.fixture
+def several(tmp_path) -> Path:
+    """params.yaml of both scenarios that have depth cameras."""
+    path = tmp_path / "several.yaml"
+    path.write_text(yaml.safe_dump({"scenarios": ["lift", "fold"], "preprocess": {"points": 100}}), encoding="utf-8")
+    return path
+
+
+def clouds(path: Path, seed: int = 0) -> Path:
+    """An episode of clouds."""
+    frames = list(np.random.default_rng(seed).uniform(0, 0.3, (2, 200, 3)))
+    write_episode(path, Episode.from_frames(frames, np.array([0.0, 0.1])))
+    return path
+
+
+def test_scenarios_without_recordings_are_passed_over(tmp_path, params, several):
+    """A folder of lifts alone; of nothing at all, an error that says where recordings lie."""
+    clouds(tmp_path / "raw/lift/blue.npz")
+    done = invoke("preprocess", tmp_path / "raw", "--out", tmp_path / "out", "--params", several)
+    assert list(done.result["points"]) == ["lift/blue"]
+    (tmp_path / "empty").mkdir()
+    errors = invoke("preprocess", tmp_path / "empty", "--out", tmp_path / "out2", "--params", several, code=1).errors
+    assert "no recordings of lift, fold" in errors
+    errors = invoke("preprocess", tmp_path / "gone", "--out", tmp_path / "out2", "--params", several, code=1).errors
+    assert "No such folder" in errors
+    assert not (tmp_path / "out2").exists()
+
+
+def test_recordings_are_found_where_raw_says(tmp_path, several, params):
+    """raw/<name>/ by the scenario in its episode.json, raw/<scenario>/ and raw/episodes/<scenario>/; beside others'."""
+    raw = tmp_path / "raw"
+    edit_json(write_cloth_episode(raw / "tan1", frames=1).folder / "episode.json", scenario="lift")
+    clouds(raw / "lift/tan2.npz")
+    clouds(raw / "episodes/fold/tan3.npz")
+    clouds(raw / "drape/tan4.npz")
+    clouds(raw / "scenes/tan5.npz")
+    clouds(tmp_path / "recorded/lift/hidden1.npz")
+    board = write_cloth_episode(raw / "episodes/board", frames=1).folder
+    edit_json(board / "episode.json", scenario=None)
+    settings = {**yaml.safe_load(params.read_text()), "scenarios": ["lift", "fold"]}
+    params.write_text(yaml.safe_dump(settings))
+    done = invoke("preprocess", tmp_path / "recorded", raw, "--out", tmp_path / "out", "--params", params)
+    assert set(done.result["points"]) == {"lift/hidden1", "lift/tan1", "lift/tan2", "fold/tan3"}
+    assert "Left out: " in done.errors
+    assert "raw/drape. Its name is none of the scenarios lift, fold" in done.errors
+    assert "board/episode.json names no scenario" in done.errors
+    clouds(tmp_path / "recorded/fold/tan3.npz")
+    again = invoke("preprocess", tmp_path / "recorded", raw, "--out", tmp_path / "out", "--params", params, code=1)
+    assert "Two recordings are called fold/tan3" in again.errors
+
+
+def test_only_what_has_changed_is_done_again(tmp_path, several, monkeypatch):
+    """A new recording, another setting, a recording that is gone: what is there is what a first run would leave."""
+    for name in ("a", "b"):
+        clouds(tmp_path / f"raw/lift/{name}.npz", seed=ord(name))
+    command = ("preprocess", tmp_path / "raw", "--params", several, "--out")
+    first = invoke(*command, tmp_path / "out")
+    done = list[str]()
+    run = PreprocessJob.run
+    monkeypatch.setattr(PreprocessJob, "run", lambda job, tell: done.append(job.name) or run(job, tell))
+    assert invoke(*command, tmp_path / "out").result == first.result
+    assert done == []
+    clouds(tmp_path / "raw/lift/c.npz", seed=3)
+    clouds(tmp_path / "raw/lift/b.npz", seed=4)
+    assert list(invoke(*command, tmp_path / "out").result["points"]) == ["lift/a", "lift/b", "lift/c"]
+    assert done == ["b", "c"]
+    several.write_text(several.read_text().replace("points: 100", "points: 90"))
+    (tmp_path / "raw/lift/a.npz").unlink()
+    (tmp_path / "out/lift/mine.txt").write_text("mine")
+    said = invoke(*command, tmp_path / "out").errors
+    assert done == ["b", "c", "b", "c"]
+    assert "Removed clouds whose recording is gone: lift/a.npz." in said
+    invoke(*command, tmp_path / "anew")
+    (tmp_path / "out/lift/mine.txt").unlink()
+    outs = tmp_path / "out", tmp_path / "anew"
+    kept, fresh = ({path.relative_to(out): path.read_bytes() for path in out.rglob("*") if path.is_file()} for out in outs)
+    assert kept == fresh
+    (tmp_path / "out/lift/b.npz").write_bytes(b"damaged")
+    invoke(*command, tmp_path / "out")
+    assert (tmp_path / "out/lift/b.npz").read_bytes() == fresh[Path("lift/b.npz")]

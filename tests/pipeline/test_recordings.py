@@ -144,18 +144,17 @@ def test_again_replaces_only_what_is_synthetic(work):
     assert (own / "notes.txt").is_file()
 
 
-def test_own_raw_episodes_are_copied(work):
-    settings = {**PARAMS, "episodes": {"source": "recorded"}}
-    (work / "own.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
-    done = invoke("episodes", "--params", "own.yaml", "--out", "copied")
-    assert done.result["episodes"] == {"small": ["small_hidden1"]}
-    assert (work / "copied" / "small" / "small_hidden1" / "episode.json").is_file()
+def test_none_are_made_where_only_own_ones_are_wanted(work):
+    (work / "own.yaml").write_text(yaml.safe_dump({**PARAMS, "episodes": {"per_scenario": 0}}), encoding="utf-8")
+    assert invoke("episodes", "--params", "own.yaml", "--out", "no_others").result["episodes"] == {}
+    assert [path.name for path in (work / "no_others").iterdir()] == ["manifest.json"]
+    (work / "own.yaml").write_text(yaml.safe_dump({**PARAMS, "episodes": {"source": "raw/episodes"}}), encoding="utf-8")
+    assert "recordings in raw/ are always used" in invoke("episodes", "--params", "own.yaml", "--out", "o", code=1).errors
 
 
 def test_a_truncated_image_and_one_without_depth_are_named(work):
     raw = work / "copied_for_damage" / "small" / "small_hidden1"
-    (work / "own.yaml").write_text(yaml.safe_dump({**PARAMS, "episodes": {"source": "recorded"}}), encoding="utf-8")
-    invoke("episodes", "--params", "own.yaml", "--out", "copied_for_damage")
+    shutil.copytree(work / "recorded" / "small" / "small_hidden1", raw)
     common = ("preprocess", raw, "--params", "params.yaml", "--out", "damaged")
     image = raw / "cameras" / "side" / "depth" / "000002.png"
     whole = image.read_bytes()

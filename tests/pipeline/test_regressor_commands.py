@@ -180,7 +180,7 @@ def test_several_networks_at_once_are_those_of_one_after_another(work):
     alone = result(run(*both))
     written = {file.name: file.read_bytes() for file in (work / NETWORKS).glob("*.safetensors")}
     assert set(written) == {"mlp.safetensors", "pointnet2.safetensors"}
-    for file in (work / NETWORKS).glob("*.timings.json"):
+    for file in (work / NETWORKS).glob("*/training.json"):
         file.unlink()
     together = result(run(*both, "--workers", 2))
     assert {file.name: file.read_bytes() for file in (work / NETWORKS).glob("*.safetensors")} == written
@@ -207,10 +207,12 @@ def test_without_a_scenario_those_of_the_parameters_are_fitted(work):
     params = yaml.safe_load((work / "params.yaml").read_text()) | {"scenarios": ["small", "other"]}
     (work / "params.yaml").write_text(yaml.safe_dump(params))
     fit = ("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
-    message = str(run(*fit, code=1).exception)
-    assert "a folder for small, but none for other" in message
-    assert "Give --scenario small data/episodes/small" in message
-    assert not (work / "data/fits").exists()
+    done = run(*fit, "--json")
+    assert "data/episodes has no episodes of other." in done.stderr
+    assert list(result(done)["fits"]) == ["small/e1", "small/e2"]
+    shutil.copytree(work / "data/episodes/small", work / "data/episodes/unlisted")
+    assert "also has episodes of unlisted. They are not fitted" in " ".join(run(*fit, "--json").stderr.split())
+    shutil.rmtree(work / "data/episodes/unlisted")
     shutil.copytree(work / "data/episodes/small", work / "data/episodes/other")
     first = result(run(*fit, "--json"))["fits"]
     assert list(first) == ["small/e1", "small/e2", "other/e1", "other/e2"]
@@ -219,7 +221,12 @@ def test_without_a_scenario_those_of_the_parameters_are_fitted(work):
     (work / "data/episodes/other/e1.npz").unlink()
     again = result(run(*fit, "--json"))["fits"]
     assert again == {name: told for name, told in first.items() if name != "other/e1"}  # kept, with their seconds
-    assert sorted(path.name for path in (work / "data/fits/other").iterdir()) == ["e2.json", "e2.npz", "notes.json"]
+    assert sorted(path.name for path in (work / "data/fits/other").iterdir()) == [
+        ".e2.timings.json",
+        "e2.json",
+        "e2.npz",
+        "notes.json",
+    ]
 
 
 def test_a_finished_network_is_kept_until_something_changes(work):

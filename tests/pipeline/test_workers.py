@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 
 import psutil
 import pytest
 
+import pipeline.fork_server
+import pipeline.workers
 from diffcloud.errors import ConfigError, DiffCloudError
+from pipeline.config import load_config
 from pipeline.fork_server import asked_workers
 from pipeline.workers import Tell, run_all
 
@@ -84,16 +88,15 @@ def test_workers_end_with_a_process_that_is_killed(tmp_path):
         (["fit", "e.npz", "--workers", "2"], 2),
         (["fit", "--workers=3", "e.npz"], 3),
         (["fit", "--params", "params.yaml"], 4),
-        (["train", "--params=params.yaml"], 1),
+        (["fit", "e.npz"], 1),
+        (["train", "--params=params.yaml"], 4),
         (["fit", "--params", "params.yaml", "--workers", "1"], 1),
-        (["fit", "--params", "none.yaml"], 1),
         (["fit", "--workers"], 1),
         (["fit", "--workers", "many"], 1),
     ],
 )
-def test_the_server_of_workers_begins_where_the_command_line_asks_for_several(tmp_path, monkeypatch, arguments, count):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "params.yaml").write_text("fit: {workers: 4}\ntrain: {epochs: 1}\n")
+def test_the_server_of_workers_begins_where_the_command_line_asks_for_several(monkeypatch, arguments, count):
+    monkeypatch.setattr(pipeline.fork_server, "cores", lambda: 4)
     assert asked_workers(arguments) == count
 
 
@@ -114,3 +117,36 @@ def test_workers_have_imported_what_their_command_needs_and_no_interrupt_reaches
     )
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.split() == ["True", "True", "False"]
+
+
+def test_by_default_there_is_a_worker_for_each_core(monkeypatch):
+    """A process of its own each, as the machine has cores; with one core, this process."""
+    for count in (1, 3):
+        monkeypatch.setattr(pipeline.workers, "cores", lambda count=count: count)
+        found = {pid for _, pid, _ in run_all("processes", [Process(seconds=0.3) for _ in range(6)], None)}
+        assert (found == {os.getpid()}) == (count == 1)
+        assert len(found) <= count
+
+
+@dataclass(frozen=True)
+class Process:
+    """Tells its process."""
+
+    seconds: float
+    label: str = "process"
+
+    def run(self, tell: Tell) -> int:
+        time.sleep(self.seconds)
+        return os.getpid()
+
+
+@pytest.mark.parametrize(
+    ("section", "name"),
+    [*((one, "workers") for one in ("episodes", "preprocess", "fit", "train", "evaluate")), ("train", "loaders")],
+)
+def test_a_number_of_workers_is_no_parameter(tmp_path, section, name):
+    """It would make a stage stale, and change nothing but the time."""
+    path = tmp_path / "params.yaml"
+    path.write_text(f"{section}: {{{name}: 2}}\n")
+    with pytest.raises(ConfigError, match=f"{section}: .*now only the option --{name}"):
+        load_config(path)

@@ -44,7 +44,7 @@ def page(told, figures):
 
 def test_every_figure_is_there_with_caption_and_source(figures):
     names = [figure.name for figure in figures]
-    assert names == ["losses", "seconds", "parameters", "success", "curves", "landscape_lift_tan1"]
+    assert names == ["losses", "parameters", "success", "curves", "landscape_lift_tan1"]
     for figure in figures:
         assert figure.caption
         assert figure.source

@@ -73,8 +73,8 @@ COMMANDS = {
 DISTURBANCES = get_args(Disturbance)
 _TIMES = ("seconds", "date", "created", "fingerprint")
 """Fields of outputs that tell when, or how long, or are made of such."""
-_TELL_TIMES = ("timings.json", "seconds.csv", "seconds.svg", "seconds.png", "index.html", "report.html")
-"""Outputs that hold them in places of their own."""
+_TELL_TIMES = "seconds.csv"
+"""A table that has nothing else."""
 _PATIENCE = 300.0
 _DAC_OVERRIDE, _DROP_BOUNDING = 1, 24
 
