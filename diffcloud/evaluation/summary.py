@@ -314,10 +314,10 @@ def headline(told: Tables) -> dict[str, Any]:
             entry["rms_other_frames_mm"] = row["rms_other_frames_mm"]
     fits = told["fits"]
     if {"fitted_ratio", "true_ratio"} <= set(fits.columns):
-        factors = np.exp(np.abs(np.log(fits["fitted_ratio"] / fits["true_ratio"])))
-        for scenario, group in factors.groupby(fits["scenario"], sort=False):
-            if group.notna().any():
-                found[str(scenario)]["ratio_factor"] = group.median()
+        for scenario, group in fits.groupby("scenario", sort=False):
+            factors = np.exp(np.abs(np.log(group["fitted_ratio"] / group["true_ratio"])))
+            if np.isfinite(factors).any():
+                found[str(scenario)]["ratio_factor"] = float(np.nanmedian(factors))
     return _rounded(found)
 
 
