@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from diffcloud.errors import DiffCloudError
@@ -41,12 +41,47 @@ def none_lost() -> Iterator[None]:
     """
     try:
         yield
+    except KeyboardInterrupt:
+        _was_pressed()  # who catches it has answered this one
+        raise
     except DiffCloudError:
         raise
     except Exception as error:
         if _was_pressed():
             raise KeyboardInterrupt from error
         raise
+
+
+@contextmanager
+def pressed_after(seconds: float | None) -> Iterator[Callable[[], bool]]:
+    """Press Ctrl-C, as a person would, if this block still runs after so many seconds; only the main thread may call this.
+
+    Args:
+        seconds: None: never.
+
+    Yields:
+        Whether it was this that pressed.
+
+    Raises:
+        KeyboardInterrupt: the time is over.
+    """
+    over = threading.Event()
+    main = threading.get_ident()
+
+    def press() -> None:
+        over.set()
+        signal.pthread_kill(main, signal.SIGINT)
+
+    timer = None if seconds is None else threading.Timer(seconds, press)
+    if timer is not None:
+        timer.daemon = True
+        timer.start()
+    try:
+        yield over.is_set
+    finally:
+        if timer is not None:
+            timer.cancel()
+            timer.join()  # what it has pressed comes before the end of this block
 
 
 def _was_pressed() -> bool:
