@@ -29,7 +29,7 @@ def listen() -> None:
         signal.set_wakeup_fd(write, warn_on_full_buffer=False)
         _heard.append(read)
         sys.unraisablehook = _press_again
-    _was_pressed()  # one before this does not count
+    was_pressed()  # one before this does not count
 
 
 @contextmanager
@@ -42,12 +42,12 @@ def none_lost() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        _was_pressed()  # who catches it has answered this one
+        was_pressed()  # who catches it has answered this one
         raise
     except DiffCloudError:
         raise
     except Exception as error:
-        if _was_pressed():
+        if was_pressed():
             raise KeyboardInterrupt from error
         raise
 
@@ -84,7 +84,7 @@ def pressed_after(seconds: float | None) -> Iterator[Callable[[], bool]]:
             timer.join()  # what it has pressed comes before the end of this block
 
 
-def _was_pressed() -> bool:
+def was_pressed() -> bool:
     """Whether Ctrl-C was pressed since this was last asked."""
     try:
         return bool(_heard) and signal.SIGINT in os.read(_heard[0], 1 << 16)

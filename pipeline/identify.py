@@ -32,6 +32,7 @@ from diffcloud.report import EpisodeEntry, build_page
 from diffcloud.scene.scenarios import Scenario, load_scenario
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
 from diffcloud.scene.scenarios.layout import FIELDS, Found, find_layout, found_size, node_counts
+from diffcloud.sim import warm
 from diffcloud.sim.properties import one_set
 from diffcloud.sim.threads import use_threads
 from pipeline import ctrl_c
@@ -39,6 +40,7 @@ from pipeline.config import Config, FitConfig
 from pipeline.console import JsonFlag, Threads, duration_s, errors, finish, progress_bar, warn
 from pipeline.fit_jobs import FitJob, Recording, compared
 from pipeline.preprocess import PreprocessJob
+from pipeline.workers import check_interrupt
 
 _DENSITY = 0.16
 _MATERIAL = {"stretching_n_m": 60.0, "bending_n_m": 1e-5, "poisson": 0.3}
@@ -126,6 +128,8 @@ def identify(
         so_far = _SoFar()
         fit = partial(_fitted, so_far, out, episodes, cloth, layouts)
         steps = int(cloth.get("steps_per_frame", _STEPS))
+        if seconds is not None:
+            warm.implicit()  # a compilation, which is done once, is none of the time and cannot be interrupted
         status: Status = "finished"
         try:
             with ctrl_c.none_lost(), ctrl_c.pressed_after(seconds) as is_over:
@@ -419,6 +423,7 @@ def _stated(
     halvings = 0
     for left in range(RESTARTS, -1, -1):
         record, objective, _, steps = fit(f"fit{RESTARTS - left}", settings, steps, halvings, init)
+        check_interrupt()
         space, seen = space_of(record), scan_of(record)
         with progress_bar("identify", None) as update:
             update(0.0, f"intervals of {record.rms_mm:.2f} mm")
@@ -469,6 +474,7 @@ def _fitted(
             if ended is not None:
                 so_far.take((ended, compared(ended, members), job, steps))
             raise
+        check_interrupt()
         objective = compared(record, members)
         so_far.take((record, objective, job, steps))
         apart, noise = distance_to_finer_mm(objective, record.simulated, finer_steps)
