@@ -54,7 +54,9 @@ def none_lost() -> Iterator[None]:
 
 @contextmanager
 def pressed_after(seconds: float | None) -> Iterator[Callable[[], bool]]:
-    """Press Ctrl-C, as a person would, if this block still runs after so many seconds; only the main thread may call this.
+    """As if Ctrl-C were pressed, if this block still runs after so many seconds; only the main thread may call this.
+
+    It is a signal of its own: a command that a script starts in the background ignores that of Ctrl-C.
 
     Args:
         seconds: None: never.
@@ -66,28 +68,27 @@ def pressed_after(seconds: float | None) -> Iterator[Callable[[], bool]]:
         KeyboardInterrupt: the time is over.
     """
     over = threading.Event()
-    main = threading.get_ident()
 
-    def press() -> None:
+    def press(number: int, frame: object) -> None:
         over.set()
-        signal.pthread_kill(main, signal.SIGINT)
+        raise KeyboardInterrupt
 
-    timer = None if seconds is None else threading.Timer(seconds, press)
-    if timer is not None:
-        timer.daemon = True
-        timer.start()
+    if seconds is None:
+        yield over.is_set
+        return
+    before = signal.signal(signal.SIGALRM, press)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield over.is_set
     finally:
-        if timer is not None:
-            timer.cancel()
-            timer.join()  # what it has pressed comes before the end of this block
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def was_pressed() -> bool:
     """Whether Ctrl-C was pressed since this was last asked."""
     try:
-        return bool(_heard) and signal.SIGINT in os.read(_heard[0], 1 << 16)
+        return bool(_heard) and not {signal.SIGINT, signal.SIGALRM}.isdisjoint(os.read(_heard[0], 1 << 16))
     except BlockingIOError:  # nothing was written
         return False
 

@@ -279,7 +279,7 @@ class FitJob:
             DivergedError: the motion diverges there.
         """
         objective, space, settings, began = self.objective(), self.space, self.solver_settings, time.perf_counter()
-        values = space.starts(1, first=self.init)[0].double()
+        values = space.starts(1, seed=settings.seed, first=self.init)[0].double()
         losses = batch_losses(objective, space, values)
         history = FitHistory(space.names, [losses], [values])
         outcome = FitOutcome(
