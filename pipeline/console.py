@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -14,7 +15,15 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 from rich.text import Text
 
@@ -26,6 +35,7 @@ if TYPE_CHECKING:
 
 _QUIET_S = 10.0
 """Between lines of progress where standard error is no terminal."""
+_LONGEST_S = 3.6e6
 _PLAIN_WIDTH = 140
 """Columns where the output is a file or a log: tables keep their headings."""
 
@@ -97,13 +107,17 @@ def say(head: str, message: str, *, style: str, console: Console | None = None) 
 
 
 @contextmanager
-def progress_bar(label: str, total: int) -> Iterator[Callable[[float, str], None]]:
-    """A bar on standard error; call with (done, text). Where that is no terminal, a line every ten seconds."""
-    columns = (
+def progress_bar(label: str, total: int | None) -> Iterator[Callable[[float, str], None]]:
+    """A bar on standard error; call with (done, text). Where that is no terminal, a line every ten seconds.
+
+    Args:
+        total: work that is planned; None: it is not known how much there will be, and no remaining time is shown.
+    """
+    columns: tuple[ProgressColumn, ...] = (
         TextColumn("{task.description}", style="bold", markup=False),
         BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
+        *((MofNCompleteColumn(), TimeRemainingColumn()) if total is not None else ()),
+        TimeElapsedColumn(),
         TextColumn("{task.fields[text]}", markup=False),
     )
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
@@ -116,8 +130,11 @@ def progress_bar(label: str, total: int) -> Iterator[Callable[[float, str], None
             now = time.monotonic()
             if progress.disable and now - told >= _QUIET_S:
                 told = now
-                left = f", about {(now - began) * (total - done) / done:.0f} s left" if done > 0 else ""
-                errors.print(f"{label}: {done:.4g} of {total}{left}  {text}", soft_wrap=True)
+                so_far = f"{now - began:.0f} s"
+                if total is not None:
+                    left = f", about {(now - began) * (total - done) / done:.0f} s left" if 0 < done < total else ""
+                    so_far = f"{done:.4g} of {total}, {so_far}{left}"
+                errors.print(f"{label}: {so_far}  {text}", soft_wrap=True)
 
         yield update
 
@@ -192,6 +209,22 @@ def assignments(items: list[str] | None, option: str) -> dict[str, float]:
         except ValueError as error:
             raise ConfigError(f"{option} takes NAME=NUMBER, got {item!r}.") from error
     return values
+
+
+def duration_s(text: str, option: str) -> float:
+    """ "90", "60s", "3min" or "1h" -> seconds.
+
+    Raises:
+        ConfigError: anything else, or no time at all.
+    """
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*(s|min|h|)\s*", text)
+    seconds = float(match[1]) * {"": 1, "s": 1, "min": 60, "h": 3600}[match[2]] if match else 0.0
+    if not 0 < seconds <= _LONGEST_S:
+        raise ConfigError(
+            f"{option} takes a time above 0 and up to 1000 h, in seconds or with a unit (90, 60s, 3min, 1h), got {text!r}. "
+            f"Try {option} 10min."
+        )
+    return seconds
 
 
 def named_serials(items: list[str], option: str) -> dict[str, str]:

@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from diffcloud.errors import DiffCloudError
@@ -29,7 +29,7 @@ def listen() -> None:
         signal.set_wakeup_fd(write, warn_on_full_buffer=False)
         _heard.append(read)
         sys.unraisablehook = _press_again
-    _was_pressed()  # one before this does not count
+    was_pressed()  # one before this does not count
 
 
 @contextmanager
@@ -41,18 +41,54 @@ def none_lost() -> Iterator[None]:
     """
     try:
         yield
+    except KeyboardInterrupt:
+        was_pressed()  # who catches it has answered this one
+        raise
     except DiffCloudError:
         raise
     except Exception as error:
-        if _was_pressed():
+        if was_pressed():
             raise KeyboardInterrupt from error
         raise
 
 
-def _was_pressed() -> bool:
+@contextmanager
+def pressed_after(seconds: float | None) -> Iterator[Callable[[], bool]]:
+    """As if Ctrl-C were pressed, if this block still runs after so many seconds; only the main thread may call this.
+
+    It is a signal of its own: a command that a script starts in the background ignores that of Ctrl-C.
+
+    Args:
+        seconds: None: never.
+
+    Yields:
+        Whether it was this that pressed.
+
+    Raises:
+        KeyboardInterrupt: the time is over.
+    """
+    over = threading.Event()
+
+    def press(number: int, frame: object) -> None:
+        over.set()
+        raise KeyboardInterrupt
+
+    if seconds is None:
+        yield over.is_set
+        return
+    before = signal.signal(signal.SIGALRM, press)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield over.is_set
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def was_pressed() -> bool:
     """Whether Ctrl-C was pressed since this was last asked."""
     try:
-        return bool(_heard) and signal.SIGINT in os.read(_heard[0], 1 << 16)
+        return bool(_heard) and not {signal.SIGINT, signal.SIGALRM}.isdisjoint(os.read(_heard[0], 1 << 16))
     except BlockingIOError:  # nothing was written
         return False
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -9,6 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit import FitSpace, JointObjective, Objective, Progress, read_fit, write_fit
+from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.doubts import with_doubts
 from diffcloud.fit.finer import FinerFit, solve_and_refine
 from diffcloud.fit.joint import AnyObjective
@@ -17,7 +19,8 @@ from diffcloud.fit.left_out import leave_out_and_go_on
 from diffcloud.fit.priors import parameter_priors
 from diffcloud.fit.record import FitRecord, LeftOut
 from diffcloud.fit.result import describe_fit
-from diffcloud.fit.solvers import SearchSettings, Settings
+from diffcloud.fit.solvers import FitOutcome, Settings
+from diffcloud.fit.solvers.outcome import FitHistory
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import read_yaml
 from diffcloud.io.fingerprints import fingerprint
@@ -34,8 +37,6 @@ JOINT = "joint"
 _CODE = ("mesh", "io", "sim", "scene", "clouds", "fit")
 """Packages whose source decides the numbers of a fit."""
 _MOST_RECORDINGS = 1000
-_JOINT_PART = 0.4
-"""Of the time of a joint fit, until recordings are left out; about."""
 
 
 @dataclass(frozen=True)
@@ -226,26 +227,20 @@ class FitJob:
         known = self.known()
         if known is not None and known.stop_reason != "interrupted":
             return known
-        reached = 0.0
+        unit_mm = 1e3 * self.scenario.length_unit_m
+
+        def show(doing: str, progress: Progress) -> None:
+            """No part that is done: how many starts, meshes and joint fits there will be is not known."""
+            check_interrupt()
+            values = "  ".join(f"{key} {progress.values[key]:.3g}" for key in space.asked.names if key in progress.values)
+            step = progress.iteration if progress.simulations is None else progress.simulations
+            tell(0.0, f"{doing}step {step}  best {unit_mm * progress.best**0.5:.2f} mm  {values}")
 
         def show_progress(halvings: int, progress: Progress) -> None:
-            nonlocal reached
-            check_interrupt()
-            values = "  ".join(f"{key} {progress.values[key]:.3g}" for key in space.asked.names)
-            if isinstance(settings, SearchSettings):
-                done, most = progress.simulations or 0, settings.simulations
-            else:  # of Gauss–Newton for each start, of which it is not known how many are followed
-                done, most = progress.iteration, settings.iterations
-            part = _JOINT_PART if len(self.recordings) > 1 else 1.0
-            reached = max(reached, part * min(done / max(most, 1), 1.0))  # on a finer mesh, steps count anew
-            mesh = "finer mesh  " if halvings else ""
-            tell(reached, f"{mesh}step {done}  best {progress.best:.3e}  {values}")
+            show("finer mesh  " if halvings else "", progress)
 
         def show_left_out(done: float, doing: str, progress: Progress) -> None:
-            nonlocal reached
-            check_interrupt()
-            reached = max(reached, _JOINT_PART + (1 - _JOINT_PART) * done)  # what goes on begins anew
-            tell(reached, f"{doing}  step {progress.iteration}  best {progress.best:.3e}")
+            show(f"{doing}  ", progress)
 
         space, settings = self.space, self.solver_settings
         fitted = self.solved(show_progress)
@@ -276,6 +271,32 @@ class FitJob:
         if interrupted or pressed:
             raise KeyboardInterrupt
         return record
+
+    def begun(self) -> FitRecord:
+        """The place where the fit begins, written and returned as a fit that was interrupted there: for who has been
+        interrupted before the first loss, and must tell something.
+
+        Raises:
+            DivergedError: the motion diverges there.
+        """
+        objective, space, settings, began = self.objective(), self.space, self.solver_settings, time.perf_counter()
+        values = space.starts(1, seed=settings.seed, first=self.init)[0].double()
+        losses = batch_losses(objective, space, values)
+        history = FitHistory(space.names, [losses], [values])
+        outcome = FitOutcome(
+            values=dict(zip(space.names, values[0].tolist(), strict=True)),
+            loss=float(losses[0]),
+            best_start=0,
+            simulations=len(objective.members),
+            stop_reason="interrupted",
+            seconds=time.perf_counter() - began,
+            history=history,
+        )
+        names = [one.name for one in self.recordings]
+        result = describe_fit(objective, space, settings, outcome, episodes=names)
+        result.record.halvings, result.record.fingerprint = self.halvings, self._fingerprint
+        write_fit(self.folder, self.name, result)
+        return result.record
 
     @cached_property
     def _fingerprint(self) -> str:

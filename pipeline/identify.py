@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from diffcloud.evaluation.methods import scan_of, space_of
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitRecord, JointObjective, Objective
 from diffcloud.fit.joint import AnyObjective
-from diffcloud.fit.result import read_motion
+from diffcloud.fit.result import physical_values, read_motion
 from diffcloud.fit.uncertainty import distance_to_finer_mm, finer_steps
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import claimed, read_json, read_yaml, together, write_bytes, write_json, write_text
@@ -32,12 +33,15 @@ from diffcloud.report import EpisodeEntry, build_page
 from diffcloud.scene.scenarios import Scenario, load_scenario
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
 from diffcloud.scene.scenarios.layout import FIELDS, Found, find_layout, found_size, node_counts
+from diffcloud.sim import warm
 from diffcloud.sim.properties import one_set
 from diffcloud.sim.threads import use_threads
+from pipeline import ctrl_c
 from pipeline.config import Config, FitConfig
-from pipeline.console import JsonFlag, Threads, errors, finish, progress_bar, warn
+from pipeline.console import JsonFlag, Threads, duration_s, errors, finish, progress_bar, warn
 from pipeline.fit_jobs import FitJob, Recording, compared
 from pipeline.preprocess import PreprocessJob
+from pipeline.workers import check_interrupt
 
 _DENSITY = 0.16
 _MATERIAL = {"stretching_n_m": 60.0, "bending_n_m": 1e-5, "poisson": 0.3}
@@ -52,7 +56,32 @@ noise accounts for."""
 _TRANSFERS, _GAIN = 1.25, 0.5
 _Fitted = tuple[FitRecord, AnyObjective, FitJob, int]
 """A fit, what it minimised, the job, and the steps a frame that it ended with."""
+Status = Literal["finished", "interrupted", "budget reached"]
+_NO_TIME = "there was no time for it"
 _HEAD = "# Found by diffcloud identify, with the reason beside each value. Edit and run the command again to overrule."
+
+
+@dataclass
+class _SoFar:
+    """What is known, also when the time is over or Ctrl-C was pressed."""
+
+    fitted: _Fitted | None = None
+    """The last fit: each begins where the one before ended."""
+    intervals: Intervals | None = None
+    """Of this fit; None: not yet."""
+    mesh: tuple[float, float] | Literal["no time"] | None = "no time"
+    """As `distance_to_finer_mm` gives it; None: the finer cloth diverges."""
+
+    def take(self, fitted: _Fitted) -> None:
+        self.fitted, self.intervals = fitted, None
+
+    def look_at_finer_mesh(self) -> None:
+        assert self.fitted is not None
+        record, objective, *_ = self.fitted
+        try:
+            self.mesh = distance_to_finer_mm(objective, record.simulated, Scenario.finer)
+        except DivergedError:
+            self.mesh = None
 
 
 def identify(
@@ -76,6 +105,10 @@ def identify(
     within: Annotated[
         float | None, typer.Option(help="Factor within which a parameter counts as identified. Default: 1.5.")
     ] = None,
+    budget: Annotated[
+        str | None,
+        typer.Option(help="Time for the fits and what follows (90, 60s, 3min, 1h); then it reports the best so far."),
+    ] = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
@@ -87,27 +120,45 @@ def identify(
     if mass is not None and not (0 < mass < math.inf):
         raise ConfigError(f"--mass is in kg per square metre, above 0, got {mass:g}.")
     stated = None if size is None else _sides(size)
+    seconds = None if budget is None else duration_s(budget, "--budget")
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out takes a folder, and {out} is a file.")
     with claimed(out):
         episodes, cloth, layouts = find_scene(recordings, out, stated, mass)
         chosen = _chosen(parameters, cloth, mass)
-        fit = partial(_fitted, out, episodes, cloth, layouts)
+        so_far = _SoFar()
+        fit = partial(_fitted, so_far, out, episodes, cloth, layouts)
         steps = int(cloth.get("steps_per_frame", _STEPS))
-        record, objective, job, ended, found = _stated(fit, chosen, steps, level=level, within=within)
-        mesh = _finer_mesh(objective, record)
-        findings = _findings(record, objective, found, mesh)
+        if seconds is not None:
+            warm.implicit()  # a compilation, which is done once, is none of the time and cannot be interrupted
+        status: Status = "finished"
+        try:
+            with ctrl_c.none_lost(), ctrl_c.pressed_after(seconds) as is_over:
+                _stated(so_far, fit, chosen, steps, level=level, within=within)
+                so_far.look_at_finer_mesh()
+        except KeyboardInterrupt:
+            status = "budget reached" if is_over() else "interrupted"
+            if so_far.fitted is None:  # Ctrl-C once more
+                raise
+        assert so_far.fitted is not None
+        record, _, job, ended = so_far.fitted
+        findings = _findings(so_far, status)
         with together():
             for path in job.files:
                 _copy(path, out / f"fit{path.suffix}")
             for name in episodes:
                 _copy(_stage(out, ended) / f"{name}.yaml", out / "scenarios" / f"{name}.yaml")
-            write_text(out / "report.html", _page(record, found, findings, episodes, job))
-            write_json(out / "intervals.json", found.model_dump(mode="json"))
+            write_text(out / "report.html", _page(record, so_far.intervals, findings, episodes, job))
+            if so_far.intervals is not None:
+                write_json(out / "intervals.json", so_far.intervals.model_dump(mode="json"))
+        if so_far.intervals is None:  # those of an earlier run are of another fit
+            (out / "intervals.json").unlink(missing_ok=True)
     for line in findings:
         errors.print(line, soft_wrap=True)
     errors.print(f"Wrote {out / 'report.html'}, {out / 'fit.json'}.")
-    finish(_result(record, found, findings, None if mesh is None else mesh[0]), json)
+    finish(_result(so_far, findings, status), json)
+    if status == "interrupted":
+        raise KeyboardInterrupt
 
 
 def _copy(source: Path, target: Path) -> None:
@@ -131,11 +182,12 @@ def find_scene(
     """
     names = _names(recordings)
     episodes = {name: _read(path, name, out) for name, path in names.items()}
-    cloth = _cloth(out, episodes, size, mass)
     path = out / "recordings.yaml"
-    stated = _fields(path).keys() if path.is_file() else set[str]()
-    layouts = _layouts(out, episodes, names, cloth)
-    _warn_of_changes(out, episodes, stated)
+    with together():  # nothing of a scene that was not found would count in the next run
+        cloth = _cloth(out, episodes, size, mass)
+        stated = _fields(path).keys() if path.is_file() else set[str]()
+        layouts = _layouts(out, episodes, names, cloth)
+        _warn_of_changes(out, episodes, stated)
     return episodes, cloth, layouts
 
 
@@ -351,33 +403,38 @@ def _scenarios(
 
 
 def _stated(
+    so_far: _SoFar,
     fit: Callable[[str, FitConfig, int, int, Mapping[str, float]], _Fitted],
     settings: FitConfig,
     steps: int,
     *,
     level: float,
     within: float,
-) -> tuple[FitRecord, AnyObjective, FitJob, int, Intervals]:
-    """Fit and state intervals; where these meet a lower loss, fit again from there. Also the scenario's steps a frame.
+) -> None:
+    """Fit and state intervals; where these meet a lower loss, fit again from there.
 
     Not `state_intervals`' own restarts: here the record belongs to the intervals, and finer steps may be asked for anew.
 
     Args:
+        so_far: takes them.
         fit: `_fitted` of the recordings.
         steps: a frame, to begin with.
     """
     init: Mapping[str, float] = {}
     halvings = 0
     for left in range(RESTARTS, -1, -1):
-        record, objective, job, steps = fit(f"fit{RESTARTS - left}", settings, steps, halvings, init)
+        record, objective, _, steps = fit(f"fit{RESTARTS - left}", settings, steps, halvings, init)
+        check_interrupt()
         space, seen = space_of(record), scan_of(record)
-        found = state_intervals(objective, space, record.free, level=level, within=within, seen=seen)
+        with progress_bar("identify", None) as update:
+            update(0.0, f"intervals of {record.rms_mm:.2f} mm")
+            found = state_intervals(objective, space, record.free, level=level, within=within, seen=seen)
+        so_far.intervals = found
         if found.lower is None or not left:
-            break
+            return
         near = ", ".join(f"{name} {found.lower[name]:.3g}" for name in space.asked.names)
         errors.print(f"The loss is lower at {near}; fitting again from there.")
         init, settings, halvings = found.lower, _single_start(settings), record.halvings
-    return record, objective, job, steps, found
 
 
 def _single_start(settings: FitConfig) -> FitConfig:
@@ -386,6 +443,7 @@ def _single_start(settings: FitConfig) -> FitConfig:
 
 
 def _fitted(
+    so_far: _SoFar,
     out: Path,
     episodes: Mapping[str, Episode],
     cloth: Mapping[str, Any],
@@ -399,6 +457,7 @@ def _fitted(
     """Fit, with finer and finer steps from the place found, until they no longer matter; and the scenario's steps a frame.
 
     Args:
+        so_far: takes each fit, also one that Ctrl-C has ended.
         name: of the fit; one for each number of steps is kept in OUT/stages/, so that the same command goes on after it.
         halvings: of edges and steps, to begin with.
     """
@@ -406,9 +465,19 @@ def _fitted(
         scenarios = _scenarios(out, cloth, layouts, steps)
         members = [Recording(scenarios[name], name, episode) for name, episode in episodes.items()]
         job = FitJob(f"{name}_steps{steps}", members, settings, out / "stages", init, halvings)
-        with progress_bar("identify", 1) as update:
-            record = job.run(partial(_tell, update, steps))
+        try:
+            with progress_bar("identify", None) as update:
+                record = job.run(partial(_tell, update, steps))
+        except KeyboardInterrupt:
+            ended = job.known()
+            if ended is None and so_far.fitted is None:
+                ended = job.begun()
+            if ended is not None:
+                so_far.take((ended, compared(ended, members), job, steps))
+            raise
+        check_interrupt()
         objective = compared(record, members)
+        so_far.take((record, objective, job, steps))
         apart, noise = distance_to_finer_mm(objective, record.simulated, finer_steps)
         errors.print(
             f"{steps * 2**record.halvings} steps a frame: {record.rms_mm:.1f} mm RMS; four times the steps move the cloth "
@@ -432,6 +501,8 @@ def _validation(record: FitRecord, objective: AnyObjective) -> str:
     held, gains = [], []
     weighed = space_of(record).fixed
     for member, episode in zip(objective.members, record.episodes, strict=True):
+        if episode.left_out is None and record.stop_reason == "interrupted":
+            return f"Whether parameters carry over from one recording to another is not known: {_NO_TIME}."
         if episode.left_out is None:
             return "Leaving one recording out failed: whether parameters carry over is not known."
         with torch.no_grad():
@@ -455,16 +526,10 @@ def _motion_of(objective: Objective) -> str:
     return str(np.round(end / max(float(np.abs(end).max()), 1e-9), 0).tolist())
 
 
-def _finer_mesh(objective: AnyObjective, record: FitRecord) -> tuple[float, float] | None:
-    """See `distance_to_finer_mm`; None where the finer cloth diverges."""
-    try:
-        return distance_to_finer_mm(objective, record.simulated, Scenario.finer)
-    except DivergedError:
-        return None
-
-
-def mesh_sentence(mesh: tuple[float, float] | None) -> str:
-    """Whether the parameters depend on the mesh, by what `_finer_mesh` has found."""
+def mesh_sentence(mesh: tuple[float, float] | Literal["no time"] | None) -> str:
+    """Whether the parameters depend on the mesh, by what `_SoFar.mesh` says."""
+    if mesh == "no time":
+        return f"Whether the parameters depend on the mesh is not known: {_NO_TIME}."
     if mesh is None:
         return (
             "With a mesh of half the edge length, the simulation diverges: whether the parameters depend on the mesh "
@@ -480,33 +545,44 @@ def mesh_sentence(mesh: tuple[float, float] | None) -> str:
     return f"{told}: the parameters hold for this mesh only, and no interval accounts for that."
 
 
-def _findings(record: FitRecord, objective: AnyObjective, found: Intervals, mesh: tuple[float, float] | None) -> list[str]:
+def _findings(so_far: _SoFar, status: Status) -> list[str]:
     """The report's first lines: does the model explain the recordings, do parameters carry over, what are they."""
-    if found.explains:
+    assert so_far.fitted is not None
+    record, objective, *_ = so_far.fitted
+    found, lines = so_far.intervals, list[str]()
+    if status != "finished":
+        why = "Ctrl-C was pressed" if status == "interrupted" else "the time of --budget was over"
+        lines.append(f"Unfinished: {why}. These are the best parameters so far; the same command without it finishes them.")
+    if found is None:
+        lines.append(
+            f"The misfit is {record.rms_mm:.1f} mm RMS. It is not known whether the model explains the recordings, and "
+            f"there are no intervals: {_NO_TIME}."
+        )
+    elif found.explains:
         verdict = "It is doubtful whether the model explains" if found.remark else "The model explains"
-        lines = [f"{verdict} the recordings: misfit {record.rms_mm:.1f} mm RMS."]
+        lines.append(f"{verdict} the recordings: misfit {record.rms_mm:.1f} mm RMS.")
     else:
         worst = max(record.episodes, key=lambda one: one.rms_mm)
         frame = int(np.argmax(worst.frame_rms_mm))
-        lines = [
+        lines.append(
             f"The model does not explain the recordings: {found.reason}. The misfit is largest in {worst.name}, frame "
             f"{worst.frames[frame]}, with {worst.frame_rms_mm[frame]:.1f} mm."
-        ]
-    lines.append(_validation(record, objective))
-    if found.explains:
-        lines += found.sentences
-    lines += finer_mesh_sentences(record, explains=found.explains)
-    lines.append(mesh_sentence(mesh))
-    for name, entry in found.parameters.items():
-        digits = significant(entry.low, entry.high)
-        ends = (
-            ""
-            if entry.low is None
-            else f", {found.level:.0%} interval {digits(entry.physical_low)} to {digits(entry.physical_high)}"
         )
-        first = largest_sources(found.sources, name, 2)
-        improve = f" (improve first: {first})" if first and entry.low is not None else ""
-        lines.append(f"{name}: {digits(entry.physical)} {entry.physical_unit}{ends}: {entry.verdict}{improve}.")
+    lines.append(_validation(record, objective))
+    if found is not None and found.explains:
+        lines += found.sentences
+    lines += finer_mesh_sentences(record, explains=found is None or found.explains)
+    lines.append(mesh_sentence(so_far.mesh))
+    for name, told in _parameters(so_far).items():
+        digits = significant(told["low"], told["high"])
+        ends, verdict, improve = "", "unfinished", ""
+        if found is not None:
+            entry, verdict = found.parameters[name], told["verdict"]
+            first = largest_sources(found.sources, name, 2)
+            if entry.low is not None:
+                ends = f", {found.level:.0%} interval {digits(entry.physical_low)} to {digits(entry.physical_high)}"
+                improve = f" (improve first: {first})" if first else ""
+        lines.append(f"{name}: {digits(told['physical'])} {told['physical_unit']}{ends}: {verdict}{improve}.")
     return lines
 
 
@@ -527,33 +603,54 @@ def finer_mesh_sentences(record: FitRecord, *, explains: bool) -> list[str]:
     return lines
 
 
-def _result(record: FitRecord, found: Intervals, findings: Sequence[str], mesh_mm: float | None) -> dict[str, Any]:
-    parameters = {
-        name: {
-            "value": entry.value,
-            "physical": entry.physical,
-            "physical_unit": entry.physical_unit,
-            "low": entry.physical_low,
-            "high": entry.physical_high,
-            "verdict": entry.verdict,
+def _parameters(so_far: _SoFar) -> dict[str, dict[str, Any]]:
+    """Of each parameter its value and, if there are intervals, these."""
+    assert so_far.fitted is not None
+    record, objective, *_ = so_far.fitted
+    if so_far.intervals is not None:
+        return {
+            name: {
+                "value": entry.value,
+                "physical": entry.physical,
+                "physical_unit": entry.physical_unit,
+                "low": entry.physical_low,
+                "high": entry.physical_high,
+                "verdict": entry.verdict,
+            }
+            for name, entry in so_far.intervals.parameters.items()
         }
-        for name, entry in found.parameters.items()
-    }
+    values = {name: record.free[name] for name in space_of(record).asked.names}
+    nothing = {"low": None, "high": None, "verdict": None}
     return {
-        "parameters": parameters,
+        name: {
+            "value": one.value,
+            "physical": one.physical,
+            "physical_unit": one.physical_unit,
+            **nothing,
+        }
+        for name, one in physical_values(objective.members[0].scenario, values).items()
+    }
+
+
+def _result(so_far: _SoFar, findings: Sequence[str], status: Status) -> dict[str, Any]:
+    assert so_far.fitted is not None
+    record, found = so_far.fitted[0], so_far.intervals
+    return {
+        "status": status,
+        "parameters": _parameters(so_far),
         "rms_mm": record.rms_mm,
-        "explains": found.explains and found.arrived,
-        "reason": found.reason,
-        "remark": found.remark,
+        "explains": None if found is None else found.explains and found.arrived,
+        "reason": "" if found is None else found.reason,
+        "remark": "" if found is None else found.remark,
         "halvings": record.halvings,
-        "finer_mesh_mm": mesh_mm,
+        "finer_mesh_mm": so_far.mesh[0] if isinstance(so_far.mesh, tuple) else None,
         "findings": list(findings),
         "episodes": {one.name: one.rms_mm for one in record.episodes},
     }
 
 
 def _page(
-    record: FitRecord, found: Intervals, findings: Sequence[str], episodes: Mapping[str, Episode], job: FitJob
+    record: FitRecord, found: Intervals | None, findings: Sequence[str], episodes: Mapping[str, Episode], job: FitJob
 ) -> str:
     entries = []
     for index, recording in enumerate(record.episodes):

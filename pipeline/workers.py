@@ -18,6 +18,7 @@ from typing import Any, Protocol, TypeVar
 
 from diffcloud.errors import DiffCloudError
 from diffcloud.sim.threads import cores, use_threads
+from pipeline import ctrl_c
 from pipeline.console import progress_bar
 from pipeline.fork_server import worker_context
 from pipeline.lazy import imports
@@ -95,12 +96,12 @@ def run_all(
 
 
 def check_interrupt() -> None:
-    """For a job in a worker, now and then.
+    """For a job, now and then.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed.
+        KeyboardInterrupt: Ctrl-C was pressed; of a worker, in its parent; here, and a library has dropped the exception.
     """
-    if _stop is not None and _stop.is_set():
+    if (_stop is not None and _stop.is_set()) or ctrl_c.was_pressed():
         raise KeyboardInterrupt
 
 

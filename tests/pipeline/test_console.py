@@ -24,7 +24,27 @@ def test_where_there_is_no_terminal_a_line_comes_every_ten_seconds(monkeypatch, 
         for call in range(1, 7):
             update(call / 3, f"loss {1 / call:.2f}")
     lines = capsys.readouterr().err.splitlines()
-    assert lines == ["fit: 1 of 10, about 108 s left  loss 0.33", "fit: 2 of 10, about 96 s left  loss 0.17"]
+    assert lines == ["fit: 1 of 10, 12 s, about 108 s left  loss 0.33", "fit: 2 of 10, 24 s, about 96 s left  loss 0.17"]
+
+
+def test_of_work_whose_amount_is_not_known_no_remaining_time_is_told(monkeypatch, capsys):
+    clock = itertools.count(step=12.0)
+    monkeypatch.setattr(console.time, "monotonic", lambda: next(clock))
+    with console.progress_bar("identify", None) as update:
+        update(0.0, "best 2.10 mm")
+        update(0.99, "best 2.05 mm")
+    assert capsys.readouterr().err.splitlines() == ["identify: 12 s  best 2.10 mm", "identify: 24 s  best 2.05 mm"]
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("90", 90), ("60s", 60), ("3min", 180), ("1h", 3600), ("0.5 h", 1800)])
+def test_a_time_has_its_unit(text, seconds):
+    assert console.duration_s(text, "--budget") == seconds
+
+
+@pytest.mark.parametrize("text", ["", "0", "0min", "-1", "soon", "3 days", "1e9h", "nan", "inf", "1001h", "5m3"])
+def test_what_is_no_time_is_refused(text):
+    with pytest.raises(ConfigError, match=r"--budget takes a time above 0 .*Try --budget 10min"):
+        console.duration_s(text, "--budget")
 
 
 @pytest.mark.parametrize(

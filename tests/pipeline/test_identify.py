@@ -6,8 +6,10 @@ import contextlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,21 +20,22 @@ import torch
 import yaml
 
 from diffcloud.clouds import SurfaceSampler
+from diffcloud.errors import EpisodeError
 from diffcloud.fit import read_fit
 from diffcloud.fit.result import read_motion
-from diffcloud.io.clouds import write_ply
+from diffcloud.io.clouds import read_cloud, write_ply
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.raw_episodes import read_raw_episode
 from diffcloud.scene.scenarios import built_in, make_scenario
 from diffcloud.sim.simulate import rollout
-from pipeline import identify
+from pipeline import fit_jobs, identify
 from pipeline.config import FitConfig
 from pipeline.fit_jobs import FitJob
 from pipeline.identify import finer_mesh_sentences, mesh_sentence
 from pipeline.preprocess import Cleaned, PreprocessJob
 from tests.fit.records import record_of, recording_of
 from tests.io.ros_bag import bag
-from tests.pipeline.invoke import invoke
+from tests.pipeline.invoke import DIFFCLOUD, environment, invoke
 from tests.sensing.table_scene import write_table_episode
 from tests.test_architecture import check_commands
 
@@ -268,6 +271,104 @@ class TestRefusals:
         assert "Two recordings are named first" in twice.errors
 
 
+UNFINISHED = ("report.html", "fit.json", "fit.npz", "cloth.yaml", "recordings.yaml")
+
+
+def check_unfinished(out, told, status, why):
+    """The report of a run that was stopped; the same command without the stop finishes it."""
+    assert told["status"] == status
+    assert told["findings"][0].startswith(f"Unfinished: {why}")
+    assert all((out / name).is_file() for name in UNFINISHED)
+    page = (out / "report.html").read_text()
+    assert page.index('class="findings"') < page.index(f"Unfinished: {why}")
+    assert 0.03 <= read_fit(out / "fit.json").free["stretch"] <= 30
+    assert told["rms_mm"] > 0
+
+
+class TestStopped:
+    """By Ctrl-C or by the end of --budget, which are one."""
+
+    @pytest.mark.parametrize("stage", ["first", "intervals", "finer mesh"])
+    def test_what_is_known_is_reported_and_the_next_run_finishes_it(self, work, monkeypatch, stage):
+        def stop(*given, **options):
+            raise KeyboardInterrupt
+
+        name = {"first": "solve_and_refine", "intervals": "state_intervals", "finer mesh": "distance_to_finer_mm"}[stage]
+        words = [*COMMAND, "--parameters", "stretch"]
+        with monkeypatch.context() as patch:
+            patch.setattr(fit_jobs if stage == "first" else identify, name, stop)
+            told = invoke(*words, code=130).result
+        check_unfinished(Path("found"), told, "interrupted", "Ctrl-C was pressed")
+        assert told["explains"] is None
+        assert told["parameters"]["stretch"]["low"] is None
+        assert any("no intervals: there was no time for it" in line for line in told["findings"])
+        assert not Path("found/intervals.json").exists()
+        if stage != "first":
+            return
+        done = invoke(*words).result
+        assert done["status"] == "finished"
+        assert not any("Unfinished" in line for line in done["findings"])
+        assert done["parameters"]["stretch"]["physical"] == pytest.approx(30.0, rel=0.3)
+        assert Path("found/intervals.json").is_file()
+        assert "Unfinished" not in Path("found/report.html").read_text()
+
+    def test_a_budget_is_kept(self, work):
+        began = time.monotonic()
+        told = invoke(*COMMAND, "--parameters", "stretch", "--budget", "0.3s").result
+        assert time.monotonic() - began < 60
+        check_unfinished(Path("found"), told, "budget reached", "the time of --budget was over")
+
+    def test_nonsense_is_refused_before_anything_is_written(self, work):
+        refused = invoke(*COMMAND, "--budget", "soon", code=1)
+        assert "--budget takes a time above 0" in refused.errors
+        assert not Path("found").exists()
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("by", ["budget", "ctrl-c"])
+    def test_a_towel_of_another_simulator_after_a_minute(self, tmp_path, by):
+        """Within 15 seconds of the minute's end."""
+        lifted_by_mujoco(tmp_path, "one", stretching=40.0)
+        lifted_by_mujoco(tmp_path, "two", stretching=40.0, **OTHER)
+        words = ["identify", "one", "two", "--size", "0.40x0.30", "--mass", "0.25", "--out", "found", "--json"]
+        words += ["--budget", "60s"] if by == "budget" else []
+        began = time.monotonic()
+        deaf = ["env", "--ignore-signal=INT"] if by == "budget" else []  # as a script starts it in the background
+        command = [*deaf, *DIFFCLOUD, *words]
+        with subprocess.Popen(command, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE) as process:
+            if by == "ctrl-c":
+                time.sleep(60)
+                process.send_signal(signal.SIGINT)
+            out, _ = process.communicate(timeout=120)
+        assert time.monotonic() - began < 75
+        assert process.returncode == (0 if by == "budget" else 130)
+        told = json.loads(out.decode().strip().splitlines()[-1])
+        status = ("budget reached", "the time of --budget") if by == "budget" else ("interrupted", "Ctrl-C was pressed")
+        check_unfinished(tmp_path / "found", told, *status)
+
+
+class TestScene:
+    def test_a_rejected_size_changes_nothing_in_the_next_run(self, work):
+        wrong = [*map(str, COMMAND)]
+        wrong[wrong.index("0.16x0.12")] = "0.40x0.30"
+        assert "0.400 x 0.300 m was stated" in invoke(*wrong, code=1).errors
+        assert not Path("found/cloth.yaml").exists()
+        assert not Path("found/recordings.yaml").exists()
+        _, cloth, _ = identify.find_scene([Path("recorded/first")], Path("found"), None, None)
+        assert cloth["size_m"] == pytest.approx(SIZE, abs=0.005)
+
+    @pytest.mark.parametrize("sides", [(1.0, 1.0), (0.22, 0.18)])
+    @pytest.mark.parametrize("stated", [None, "as the table"])
+    def test_clouds_with_the_table_are_refused(self, work, sides, stated):
+        rng, folder = np.random.default_rng(3), Path("recorded/first")
+        count = round(1e5 * sides[0] * sides[1])
+        for path in folder.glob("*.ply"):
+            table = np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)) * sides + (0.5, 0.0), np.full(count, 0.02)])
+            write_ply(path, np.concatenate([read_cloud(path), table + 0.002 * rng.standard_normal(table.shape)]))
+        with pytest.raises(EpisodeError, match=r"seem to hold the table.*Only points of the cloth.*Remove the table"):
+            identify.find_scene([folder], Path("found"), None if stated is None else sides, None)
+        assert not Path("found/cloth.yaml").exists()
+
+
 def lifted_by_mujoco(folder, name, *, stretching, yaw=0.0, centre=(0.55, 0.0), cut_m=-np.inf):
     """Clouds with two millimetres of noise of a towel of 13 x 10 nodes, those above the table by more than `cut_m`."""
     pytest.importorskip("mujoco")
@@ -490,5 +591,5 @@ def test_fits_go_on_with_the_mesh_that_the_last_one_ended_with(monkeypatch):
     monkeypatch.setattr(identify, "space_of", lambda record: SimpleNamespace(asked=SimpleNamespace(names=("stretch",))))
     found = [SimpleNamespace(lower=lower), SimpleNamespace(lower=None)]
     monkeypatch.setattr(identify, "state_intervals", lambda *given, **options: found.pop(0))
-    identify._stated(fit, FitConfig(starts=2), 8, level=0.9, within=1.5)
+    identify._stated(identify._SoFar(), fit, FitConfig(starts=2), 8, level=0.9, within=1.5)
     assert asked == [("fit0", 2, 8, 0, {}), ("fit1", 1, 16, 1, lower)]

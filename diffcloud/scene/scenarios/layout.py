@@ -29,6 +29,16 @@ _RIM = 0.005
 """Part of the points beyond each side: noise, and scraps."""
 _SIZE_OFF = 0.2
 """Part by which the found size may differ from the stated one: beyond, it is another cloth, or a part of one."""
+_LEVEL_M = 0.015
+"""Of points above or below the first frame, that may be on the table still."""
+_STRETCHED = 1.2
+"""Times its length, as far as a lifted cloth may reach."""
+_A_CELL = 8
+"""Points of the first frame in a cell, in which later frames have one if something lies there."""
+_FEW_CELLS = 20
+"""That must have left the table, for what stays there to tell a cloth from a table: some come and go by chance."""
+_STAYS = 0.5
+"""Part of the area that must have left the table, of which at least so much has really left, if it is a cloth."""
 _AT_CORNER_M = 0.03
 _TRAVEL_M = 0.03
 _CELL_M = 0.034
@@ -73,8 +83,8 @@ def find_layout(episode: Episode, size: tuple[float, float]) -> Layout:
         size: of the cloth [m].
 
     Raises:
-        EpisodeError: no gripper, another unit, a cloud that is not flat and level, a size that is not that of the cloud,
-            or a gripper that is not at the cloth; says what to try.
+        EpisodeError: no gripper, another unit, a cloud that is not flat and level or that holds the table, a size that is
+            not that of the cloud, or a gripper that is not at the cloth; says what to try.
     """
     if episode.gripper is None:
         raise EpisodeError("The recording has no track of its gripper: put a gripper.csv (t_s, x, y, z) beside the clouds.")
@@ -86,6 +96,7 @@ def find_layout(episode: Episode, size: tuple[float, float]) -> Layout:
     warnings = _few_points(episode)
     cloud = _flat_cloud(episode)
     yaw, sides, centre = _rectangle(cloud)
+    _refuse_table(episode, cloud, sides)
     if (sides[0] < sides[1]) != (size[0] < size[1]):  # the longer side is the longer one's
         yaw, sides = yaw + math.pi / 2, (sides[1], sides[0])
     off = max(abs(side / stated - 1) for side, stated in zip(sides, size, strict=True))
@@ -93,7 +104,7 @@ def find_layout(episode: Episode, size: tuple[float, float]) -> Layout:
         raise EpisodeError(
             f"The first frame shows a cloth of {sides[0]:.3f} x {sides[1]:.3f} m, and {size[0]:.3f} x {size[1]:.3f} m was "
             "stated. Check --size and the unit of the clouds (metres), and that the first frame shows the whole cloth, "
-            "flat on the table; it does not if all points near the table were cut off."
+            "flat on the table, and nothing of the table; it does not if all points near the table were cut off."
         )
     if off > _SIZE_OFF / 2:
         warnings.append(f"the first frame shows {sides[0]:.3f} x {sides[1]:.3f} m, {off:.0%} off the stated size")
@@ -148,6 +159,33 @@ def find_layout(episode: Episode, size: tuple[float, float]) -> Layout:
         ),
     }
     return Layout(found, tuple(warnings))
+
+
+def _refuse_table(episode: Episode, cloud: NDArray[np.float64], sides: tuple[float, float]) -> None:
+    """By what still lies on the table where the gripper is highest. A cloth is lifted around the grasped point about as far
+    as the gripper has risen, or it would be stretched; a table stays.
+
+    Raises:
+        EpisodeError: more stays than could of a cloth.
+    """
+    assert episode.gripper is not None
+    rise = episode.gripper[:, 0, 2] - episode.gripper[0, 0, 2]
+    top = int(rise.argmax())
+    area = sides[0] * sides[1]
+    cell = math.sqrt(area * _A_CELL / len(cloud))
+    frame = episode.frame(top)
+    lying = frame[np.abs(frame[:, 2] - np.median(cloud[:, 2])) < _LEVEL_M]
+    first, stays = (len(np.unique(np.floor(points[:, :2] / cell), axis=0)) for points in (cloud, lying))
+    # a quarter of a disc, as around a corner: from elsewhere, more is lifted
+    reach = min(max(float(rise[top]) - _LEVEL_M, 0.0) / _STRETCHED, *sides)
+    lifted = math.pi / 4 * reach**2 / area * first
+    if lifted >= _FEW_CELLS and first - stays < _STAYS * lifted:
+        raise EpisodeError(
+            f"The clouds seem to hold the table: the first frame covers {sides[0]:.2f} x {sides[1]:.2f} m, and with the "
+            f"gripper {rise[top]:.2f} m higher, points still lie on {stays / first:.0%} of that; of a cloth, at most "
+            f"{1 - lifted / first:.0%} could. Only points of the cloth are allowed. Remove the table: crop the clouds to "
+            "the cloth, or record the empty table too and leave out what both show."
+        )
 
 
 def _few_points(episode: Episode) -> list[str]:
