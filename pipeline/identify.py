@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -57,6 +58,8 @@ _TRANSFERS, _GAIN = 1.25, 0.5
 _Fitted = tuple[FitRecord, AnyObjective, FitJob, int]
 """A fit, what it minimised, the job, and the steps a frame that it ended with."""
 Status = Literal["finished", "interrupted", "budget reached"]
+_FITTING = 0.9
+"""Part of the time of --budget after which fits end: the report needs some, too."""
 _NO_TIME = "there was no time for it"
 _HEAD = "# Found by diffcloud identify, with the reason beside each value. Edit and run the command again to overrule."
 
@@ -107,12 +110,13 @@ def identify(
     ] = None,
     budget: Annotated[
         str | None,
-        typer.Option(help="Time for the fits and what follows (90, 60s, 3min, 1h); then it reports the best so far."),
+        typer.Option(help="Time for reading, fits and report (90, 60s, 3min, 1h). Then the best so far is reported."),
     ] = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
     """Find the parameters of a cloth from recordings of it: layout, joint fit, intervals, and a report."""
+    began = time.monotonic()
     use_threads(threads)
     level, within = level or LEVEL, WITHIN if within is None else within
     if within <= 1:
@@ -130,6 +134,7 @@ def identify(
         fit = partial(_fitted, so_far, out, episodes, cloth, layouts)
         steps = int(cloth.get("steps_per_frame", _STEPS))
         if seconds is not None:
+            seconds = max(_FITTING * seconds - (time.monotonic() - began), 1.0)
             warm.implicit()  # a compilation, which is done once, is none of the time and cannot be interrupted
         status: Status = "finished"
         try:
@@ -551,8 +556,10 @@ def _findings(so_far: _SoFar, status: Status) -> list[str]:
     record, objective, *_ = so_far.fitted
     found, lines = so_far.intervals, list[str]()
     if status != "finished":
-        why = "Ctrl-C was pressed" if status == "interrupted" else "the time of --budget was over"
-        lines.append(f"Unfinished: {why}. These are the best parameters so far; the same command without it finishes them.")
+        why, again = (
+            ("Ctrl-C was pressed", "") if status == "interrupted" else ("the time of --budget was over", " without it")
+        )
+        lines.append(f"Unfinished: {why}. These are the best parameters so far. Run the same command{again} to finish.")
     if found is None:
         lines.append(
             f"The misfit is {record.rms_mm:.1f} mm RMS. It is not known whether the model explains the recordings, and "

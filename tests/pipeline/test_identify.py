@@ -323,7 +323,7 @@ class TestStopped:
         assert "--budget takes a time above 0" in refused.errors
         assert not Path("found").exists()
 
-    @pytest.mark.slow
+    @pytest.mark.longest  # with nothing beside it: it asks how soon the command ends
     @pytest.mark.parametrize("by", ["budget", "ctrl-c"])
     def test_a_towel_of_another_simulator_after_a_minute(self, tmp_path, by):
         """Within 15 seconds of the minute's end."""
