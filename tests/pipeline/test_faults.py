@@ -22,9 +22,10 @@ from tests.pipeline.invoke import DIFFCLOUD, environment, invoke, run_process
 from tests.pipeline.test_commands import SMALL
 from tests.regressors.simulated import sagging_sheet
 
-FIT = ("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
+ALONE = ("--params", "params.yaml", "--workers", 1)
+FIT = ("fit", *ALONE, "--out", "data/fits", "data/episodes")
 SET = ("simulate", "--scenario", "small", "--train", 40, "--test", 34)
-TRAIN = ("train", "--params", "params.yaml", "--scenario", "small", "--model", "mlp", "--data", "sim", "--out", "networks")
+TRAIN = ("train", *ALONE, "--scenario", "small", "--model", "mlp", "--data", "sim", "--out", "networks")
 
 DIES = (
     "import contextlib, os, sys\n"
@@ -101,9 +102,9 @@ class TestKilledWhileWriting:
     """By SIGKILL, in the middle of a file."""
 
     COMMANDS = (
-        ("e2.npz", ("preprocess", "--params", "params.yaml", "--out", "out", "data/episodes")),
-        ("e2.npz", ("fit", "--params", "params.yaml", "--out", "out", "data/episodes")),
-        ("e2.json", ("fit", "--params", "params.yaml", "--out", "out", "data/episodes")),
+        ("e2.npz", ("preprocess", *ALONE, "--out", "out", "data/episodes")),
+        ("e2.npz", ("fit", *ALONE, "--out", "out", "data/episodes")),
+        ("e2.json", ("fit", *ALONE, "--out", "out", "data/episodes")),
         ("train-000000.npz", (*SET, "--workers", 0, "--out", "out")),
         ("test_nodes.npy", (*SET, "--workers", 0, "--out", "out")),
         ("set.json", (*SET, "--workers", 0, "--out", "out")),
@@ -130,7 +131,7 @@ class TestKilledWhileWriting:
 
     def test_what_is_left_is_not_taken_for_an_episode(self, work):
         """A killed `preprocess` leaves half a file, and macOS files of its own, beside the episodes."""
-        run_code(DIES, "e2.npz", "preprocess", "--params", "params.yaml", "--out", "clean", "data/episodes", cwd=work)
+        run_code(DIES, "e2.npz", "preprocess", *ALONE, "--out", "clean", "data/episodes", cwd=work)
         (work / "clean" / "small" / "._e1.npz").write_bytes(b"macOS")
         assert len(hidden(work / "clean")) == 2
         done = invoke("fit", "--scenario", "small", "--iterations", 1, "--out", "fits", "clean/small")
@@ -170,7 +171,7 @@ class TestFullDisk:
 class TestTwoAtOnce:
     @pytest.mark.parametrize(
         "command",
-        [(*SET, "--workers", 0, "--out", "out"), ("fit", "--params", "params.yaml", "--out", "out", "data/episodes")],
+        [(*SET, "--workers", 0, "--out", "out"), ("fit", *ALONE, "--out", "out", "data/episodes")],
     )
     def test_the_second_is_told_of_the_first_which_ends_as_if_alone(self, work, command):
         invoke(*command)
@@ -250,7 +251,8 @@ class TestOnlyOwnFilesAreRemoved:
         done = invoke(*FIT)
         told = "Removed fits whose episode is gone or whose settings have changed: joint.json, joint.npz, small/e2.json"
         assert told in done.errors
-        assert sorted(path.name for path in folder.iterdir()) == ["e1.json", "e1.npz", "mine.json", "notes.txt"]
+        names = [".e1.timings.json", "e1.json", "e1.npz", "mine.json", "notes.txt"]
+        assert sorted(path.name for path in folder.iterdir()) == names
 
     def test_a_foreign_folder_in_the_place_of_a_sets_work_is_kept(self, work):
         (work / "out.partial").mkdir()
