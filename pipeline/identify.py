@@ -143,7 +143,11 @@ def identify(
                 so_far.look_at_finer_mesh()
         except KeyboardInterrupt:
             status = "budget reached" if is_over() else "interrupted"
-            if so_far.fitted is None:  # Ctrl-C once more
+            if so_far.fitted is None and status == "budget reached":
+                raise DiffCloudError(
+                    f"--budget {budget} was over before a first loss was known. The fit of an earlier run stays. Give more time."
+                ) from None
+            if so_far.fitted is None:  # Ctrl-C once more, or before a first loss beside an earlier fit
                 raise
         assert so_far.fitted is not None
         record, _, job, ended = so_far.fitted
@@ -475,8 +479,8 @@ def _fitted(
                 record = job.run(partial(_tell, update, steps))
         except KeyboardInterrupt:
             ended = job.known()
-            if ended is None and so_far.fitted is None:
-                ended = job.begun()
+            if ended is None and so_far.fitted is None and not (out / "fit.json").exists():
+                ended = job.begun()  # an earlier run's fit is worth more than the place where this one begins
             if ended is not None:
                 so_far.take((ended, compared(ended, members), job, steps))
             raise

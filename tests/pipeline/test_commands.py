@@ -166,7 +166,7 @@ def test_joint_fit_gives_one_result(work):
     write_episode(work / "e2.npz", clouds_of(small_lift(), stretch=1.4, mass=1.0))
     run("fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 1, "--joint", "e1.npz", "e2.npz", cwd=work)
     assert json.loads((work / "fits" / "joint.json").read_text())["episodes"][1]["name"] == "e2"
-    assert sorted(path.name for path in (work / "fits").iterdir()) == ["joint.json", "joint.npz"]
+    assert sorted(path.name for path in (work / "fits").glob("[!.]*")) == ["joint.json", "joint.npz"]
 
 
 class TestJointFitOverMotions:
@@ -280,7 +280,8 @@ def test_interrupted_fit_leaves_the_best_so_far_and_goes_on(work, monkeypatch):
     assert (first["stop_reason"], second["stop_reason"]) == ("iterations", "interrupted")
     assert second["loss"] <= second["loss_start"]
     calls[:] = [0] * 20  # no more interrupts
-    assert run(*command, cwd=work).result["fits"]["e1"]["seconds"] == first["seconds"]  # kept
+    seconds = read_seconds(work / "fits" / "e1.json")
+    assert run(*command, cwd=work).result["fits"]["e1"]["seconds"] == seconds > 0  # kept
     assert json.loads((work / "fits" / "e2.json").read_text())["iterations"] == 10
     begun = len(calls)
     run(*command, "--seed", 1, cwd=work)  # another fit
@@ -301,7 +302,8 @@ def test_a_ctrl_c_after_the_last_step_does_not_cost_the_fit(work, monkeypatch):
     run(*command, cwd=work, code=130)
     first = json.loads((work / "fits" / "e1.json").read_text())
     assert first["stop_reason"] == "iterations"
-    assert run(*command, cwd=work).result["fits"]["e1"]["seconds"] == first["seconds"]  # kept
+    seconds = read_seconds(work / "fits" / "e1.json")
+    assert run(*command, cwd=work).result["fits"]["e1"]["seconds"] == seconds > 0  # kept
 
 
 @pytest.mark.slow
