@@ -145,7 +145,8 @@ def identify(
             status = "budget reached" if is_over() else "interrupted"
             if so_far.fitted is None and status == "budget reached":
                 raise DiffCloudError(
-                    f"--budget {budget} was over before a first loss was known. The fit of an earlier run stays. Give more time."
+                    f"--budget {budget} was over before a first loss was known. The fit of an earlier run stays. Give more "
+                    "time."
                 ) from None
             if so_far.fitted is None:  # Ctrl-C once more, or before a first loss beside an earlier fit
                 raise
