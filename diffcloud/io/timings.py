@@ -45,4 +45,6 @@ def read_timings(result: Path) -> dict[str, Any]:
 def read_seconds(result: Path) -> float | None:
     """Wall time of a result [s]; None where it is not known."""
     seconds = read_timings(result).get("seconds")
-    return float(seconds) if type(seconds) in (int, float) and seconds >= 0 else None
+    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or seconds < 0:
+        return None
+    return float(seconds)
