@@ -8,7 +8,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
@@ -253,6 +253,12 @@ class FitConfig(Section):
         if isinstance(data, dict) and "offset" in data:
             raise ValueError("offset: now `nuisance`, such as x=0.1m,y=0.1m,yaw=30deg, or none")
         return data
+
+    @field_validator("bounds", "fixed", mode="before")
+    @classmethod
+    def _given(cls, values: Any) -> Any:
+        """null stands for a parameter that has none of its own."""
+        return {name: value for name, value in values.items() if value is not None} if isinstance(values, dict) else values
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -107,6 +109,7 @@ def test_stage_dependencies_are_the_imports(stage):
 
 
 def test_stage_parameters_are_sections_of_the_configuration():
+    from diffcloud.sim.properties import PARAMETERS
     from pipeline.config import Config
 
     written = yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8"))
@@ -122,6 +125,34 @@ def test_stage_parameters_are_sections_of_the_configuration():
                 compare(field.annotation, values[key], f"{name}{key}.")
 
     compare(Config, written, "")
+    for mapping in ("bounds", "fixed"):
+        assert list(written["fit"][mapping]) == list(PARAMETERS)
+
+
+def leaves(values: dict, above: str = "") -> Iterator[str]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{above}{name}.")
+        else:
+            yield f"{above}{name}"
+
+
+def test_every_setting_can_be_set_in_an_experiment(tmp_path):
+    """By `dvc exp run -S`, which takes keys that the file states; and what is set is what a stage reads."""
+    from dvc.utils.hydra import apply_overrides
+
+    from pipeline.config import load_config
+
+    path = tmp_path / "params.yaml"
+    for name in leaves(yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8"))):
+        shutil.copy(ROOT / "params.yaml", path)
+        apply_overrides(path, [f"{name}=null"])
+    changes = ["fit.seed=3", "fit.fixed.mass=1.2", "fit.bounds.stretch=[0.5,2]", "fit.solver=cma_es", "fit.screen=null"]
+    shutil.copy(ROOT / "params.yaml", path)
+    apply_overrides(path, [*changes, "fit.simulations=50", "preprocess.raw.origin_m=[1,2,3]"])
+    config = load_config(path)
+    assert (config.fit.seed, config.fit.fixed, config.fit.bounds) == (3, {"mass": 1.2}, {"stretch": (0.5, 2.0)})
+    assert (config.fit.solver, config.fit.simulations, config.preprocess.raw.origin_m) == ("cma_es", 50, (1.0, 2.0, 3.0))
 
 
 def test_every_stage_command_exists():

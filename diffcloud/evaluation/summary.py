@@ -314,10 +314,9 @@ def headline(told: Tables) -> dict[str, Any]:
             entry["rms_other_frames_mm"] = row["rms_other_frames_mm"]
     fits = told["fits"]
     if {"fitted_ratio", "true_ratio"} <= set(fits.columns):
-        for scenario, group in fits.groupby("scenario", sort=False):
-            factors = np.exp(np.abs(np.log(group["fitted_ratio"] / group["true_ratio"])))
-            if np.isfinite(factors).any():
-                found[str(scenario)]["ratio_factor"] = float(np.nanmedian(factors))
+        for scenario, group in fits.dropna(subset=["fitted_ratio", "true_ratio"]).groupby("scenario", sort=False):
+            off = np.abs(np.log(group["fitted_ratio"] / group["true_ratio"]))
+            found[str(scenario)]["ratio_factor"] = np.exp(np.median(off))
     return _rounded(found)
 
 
