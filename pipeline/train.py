@@ -16,7 +16,8 @@ from diffcloud.errors import CheckpointError, ConfigError, DatasetError, DiffClo
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import read_json
 from diffcloud.io.fingerprints import fingerprint
-from diffcloud.io.timings import read_timings
+from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
+from diffcloud.io.timings import read_timings, timings_path
 from diffcloud.regressors import (
     ModelName,
     Regressor,
@@ -149,6 +150,11 @@ def train(
     finish({"out": str(out), "models": results}, json)
     if failures:
         raise DiffCloudError("\n".join(failures))
+    if every:
+        inside = {path.relative_to(out).as_posix() for job in jobs for path in job.files}
+        if removed := remove_files(out, sorted(read_manifest(out) - inside)):
+            errors.print(f"Removed networks that are not asked for any more: {', '.join(removed)}.", soft_wrap=True)
+        write_manifest(out, inside)
 
 
 def _viewpoints(path: Path, scenarios: Sequence[str]) -> list[list[float]]:
@@ -183,6 +189,12 @@ class TrainJob:
     @property
     def label(self) -> str:
         return f"{self.train.scenario}/{self.model}"
+
+    @property
+    def files(self) -> list[Path]:
+        """What `run` has left."""
+        live = self._checkpoint.with_suffix("")
+        return [self._checkpoint, timings_path(self._checkpoint), *(path for path in live.rglob("*") if path.is_file())]
 
     def run(self, tell: Tell) -> dict[str, Any]:
         """Train, write, and return what there is to tell.

@@ -160,7 +160,7 @@ def test_every_stage_command_exists():
 
 
 def test_stages_run_the_code_of_the_checkout():
-    assert all(stage["cmd"].startswith("python -m pipeline.app ") for stage in stages().values())
+    assert all(stage["cmd"].startswith("python -m pipeline ") for stage in stages().values())
 
 
 def check_commands(stages: dict) -> None:
@@ -171,7 +171,7 @@ def check_commands(stages: dict) -> None:
 
     commands = get_command(app).commands
     for stage in stages.values():
-        words = stage["cmd"].removeprefix("python -m pipeline.app ").removeprefix("diffcloud ").split()
+        words = stage["cmd"].removeprefix("python -m pipeline ").removeprefix("diffcloud ").split()
         assert words[0] in commands
         options = {option for parameter in commands[words[0]].params for option in parameter.opts}
         assert {word for word in words if word.startswith("--")} <= options

@@ -76,7 +76,7 @@ def test_the_headline_is_small_rounded_and_knows_no_time():
     """RMS in millimetres of losses 0.001 and 0.003 in m²; ratios of 1 and 2 where the truth is 0.5: factors 2 and 4."""
     truth = {"stretch": 0.5, "mass": 1.0}
     known = [
-        record("lift", "a", methods={"diffcloud": 0.001, "middle": 0.01}, truth=truth),
+        record("lift", "a", methods={"diffcloud": 0.001, "middle": 0.01, "mlp": 0.02}, truth=truth),
         record("lift", "b", methods={"diffcloud": 0.003, "middle": 0.01}, truth=truth, stretch=2.0),
         record("fold", "c", methods={"diffcloud": 0.004}),
     ]
@@ -84,6 +84,7 @@ def test_the_headline_is_small_rounded_and_knows_no_time():
     rms_mm = {name: 1e3 * math.sqrt(loss) for name, loss in (("first", 0.001), ("second", 0.003), ("middle", 0.01))}
     assert found["lift"]["rms_mm"]["diffcloud"] == pytest.approx((rms_mm["first"] + rms_mm["second"]) / 2, abs=0.005)
     assert found["lift"]["rms_mm"]["middle"] == 100.0
+    assert set(found["lift"]["rms_mm"]) == {"diffcloud", "middle"}  # trained weights depend on the processor
     assert found["lift"]["ratio_factor"] == pytest.approx(math.sqrt(8), abs=5e-4)  # the median of factors is geometric
     assert "ratio_factor" not in found["fold"]
     assert all(float(f"{value:.4g}") == value for value in found["lift"]["rms_mm"].values())

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from diffcloud.errors import DiffCloudError
 from pipeline.app import app
 
-DIFFCLOUD = [sys.executable, "-m", "pipeline.app"]
+DIFFCLOUD = [sys.executable, "-m", "pipeline"]
 ROOT = Path(__file__).parents[2]
 
 

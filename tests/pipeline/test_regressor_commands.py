@@ -199,6 +199,12 @@ def test_without_a_scenario_those_of_the_parameters_are_trained(work):
     train = ("train", "--params", "params.yaml", "--data", "sims", "--out", "data/regressors", "--json")
     assert list(result(run(*train))["models"]) == ["small/mlp", "other/mlp"]
     assert Regressor.read(work / "data/regressors/other/mlp.safetensors").description.scenario == "other"
+    (work / "data/regressors/other/notes.txt").write_text("mine")
+    params["train"]["scenarios"] = ["small"]
+    (work / "params.yaml").write_text(yaml.safe_dump(params))
+    run(*train)  # leaves what training these alone would leave, and what it did not write
+    assert [path.name for path in (work / "data/regressors/other").rglob("*")] == ["notes.txt"]
+    assert (work / "data/regressors/small/mlp.safetensors").is_file()
 
 
 def test_without_a_scenario_those_of_the_parameters_are_fitted(work):
