@@ -325,21 +325,21 @@ class TestStopped:
 
     @pytest.mark.longest  # with nothing beside it: it asks how soon the command ends
     @pytest.mark.parametrize("by", ["budget", "ctrl-c"])
-    def test_a_towel_of_another_simulator_after_a_minute(self, tmp_path, by):
-        """Within 15 seconds of the minute's end."""
+    def test_a_towel_of_another_simulator_ends_soon_after_its_time(self, tmp_path, by):
+        """Within 15 seconds. Without a budget, this takes about a minute with nothing beside it."""
         lifted_by_mujoco(tmp_path, "one", stretching=40.0)
         lifted_by_mujoco(tmp_path, "two", stretching=40.0, **OTHER)
         words = ["identify", "one", "two", "--size", "0.40x0.30", "--mass", "0.25", "--out", "found", "--json"]
-        words += ["--budget", "60s"] if by == "budget" else []
+        words += ["--budget", "25s"] if by == "budget" else []
         began = time.monotonic()
         deaf = ["env", "--ignore-signal=INT"] if by == "budget" else []  # as a script starts it in the background
         command = [*deaf, *DIFFCLOUD, *words]
         with subprocess.Popen(command, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE) as process:
             if by == "ctrl-c":
-                time.sleep(60)
+                time.sleep(25)
                 process.send_signal(signal.SIGINT)
             out, _ = process.communicate(timeout=120)
-        assert time.monotonic() - began < 75
+        assert time.monotonic() - began < 40
         assert process.returncode == (0 if by == "budget" else 130)
         told = json.loads(out.decode().strip().splitlines()[-1])
         status = ("budget reached", "the time of --budget") if by == "budget" else ("interrupted", "Ctrl-C was pressed")
