@@ -25,6 +25,7 @@ from diffcloud.report import (
     comparison_figures,
     overlay_figure,
 )
+from diffcloud.scene.scenarios.release import RELEASE
 from pipeline.config import load_config
 from pipeline.console import JsonFlag, ParamsFile, errors, finish, writes
 from pipeline.fit_jobs import fit_file
@@ -57,7 +58,7 @@ def report(
         path = fit_file(fits, scenario, name)
         fit = read_fit(path)
         if scenario not in loss_frames:
-            loss_frames[scenario] = choose_scenario(fitted_scenario(path, scenario)).loss_frames
+            loss_frames[scenario] = _loss_frames(path, scenario)
         known = {"rms_start_mm": float("nan"), "rms_other_frames_mm": float("nan"), **known}
         index = next((i for i, one in enumerate(fit.episodes) if one.scenario == scenario), 0)
         source = fit.episodes[index].name
@@ -105,6 +106,13 @@ def report(
         write_text(out, page)
     errors.print(f"Wrote {out} ({len(page) / 1e6:.1f} MB).")
     finish({"out": str(out), "episodes": len(entries), "bytes": len(page.encode())}, json)
+
+
+def _loss_frames(fit: Path, scenario: str) -> tuple[int, ...]:
+    """Of the scenario of a fit. Those of a published one are known without its scene file, which is not asked for here."""
+    if scenario in RELEASE:
+        return (RELEASE[scenario].loss_frame,)
+    return choose_scenario(fitted_scenario(fit, scenario)).loss_frames
 
 
 def _comparison(folder: Path, entries: list[EpisodeEntry]) -> ComparisonEntry:
