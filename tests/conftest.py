@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # as the commands do, before numpy and torch are imported
+
 import signal
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -18,9 +21,6 @@ from diffcloud.mesh import grid_cloth
 from diffcloud.scene.scenarios import Scenario, built_in, grid_scenario
 from diffcloud.scene.scenarios.grid import Gripper
 from diffcloud.sim.threads import cores
-
-if "OMP_NUM_THREADS" not in os.environ:
-    torch.set_num_threads(1)  # as the commands do: beside another busy process spinning threads cost tenfold
 
 # a shell without job control starts background jobs deaf to Ctrl-C, and nohup deafens them to a closed terminal; processes
 # inherit that, and tests send all three
