@@ -17,17 +17,18 @@ SIZE = (0.40, 0.30)
 def recorded(
     *, size=SIZE, yaw=0.0, centre=(0.5, 0.1), height=0.03, corner=(1, 1), noise=0.002, points=3000, travel=0.3, turn=None
 ) -> Episode:
-    """Two frames of a flat cloth, with a gripper at one of its corners (signs of its own x and y)."""
+    """Two frames of a flat cloth that rises with the gripper at one of its corners (signs of its own x and y)."""
     rng = np.random.default_rng(0)
     flat = (rng.random((points, 2)) - 0.5) * size
     c, s = math.cos(yaw), math.sin(yaw)
     rotation = np.array([[c, s], [-s, c]])  # for rows
     cloud = np.column_stack([flat @ rotation + centre, np.full(points, height)]) + noise * rng.standard_normal((points, 3))
+    raised = cloud + np.array([0.0, 0.0, travel])
     place = np.array(corner) * np.array(size) / 2 @ rotation + centre
     track = np.array([[[*place, height]], [[*place, height + travel]]])
     if turn is not None:
-        cloud, track = cloud @ turn.T, track @ turn.T
-    return Episode.from_frames([cloud, cloud + np.array([0.0, 0.0, 0.01])], np.array([0.0, 0.1]), gripper=track)
+        cloud, raised, track = cloud @ turn.T, raised @ turn.T, track @ turn.T
+    return Episode.from_frames([cloud, raised], np.array([0.0, 0.1]), gripper=track)
 
 
 def values(layout):
