@@ -11,8 +11,8 @@ from diffcloud.sim.compiled.data import Floats, Ints
 
 
 class Surfaces(NamedTuple):
-    """B motions of V nodes, V / C for each of C clocks, at L frames. Axis B of velocities or rates has length one where all motions share them; so has
-    axis L of velocities where all frames do."""
+    """B motions of V nodes at L frames, V / C nodes for each of C clocks. Axis B of velocities or rates has length one
+    where all motions share them; so has axis L of velocities where all frames do."""
 
     nodes: Floats
     """[B, L, V, 3]"""

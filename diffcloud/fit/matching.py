@@ -12,10 +12,10 @@ either is a sample of a surface, along which it may slide: with the surface's no
 where s is the distance between recorded points. So w is small inside of the surface and near one where r leads beyond its
 rim. (Chen and Medioni 1992 minimise the first part alone.)
 
-Cameras may have clocks of their own. Then a motion has its V nodes once for each of the C clocks, at the times at which that
-clock looks, one set after the other: which nodes a place lies on says whose clock it goes by. A recorded point goes by
-its camera's clock. A sampled point looks for the recorded points of each clock from where it is at that clock's time, and
-its partner is the nearest of all.
+Each camera may have a clock of its own. A motion holds its V nodes once for each of the C clocks, at the times of that
+clock, one set after the other. The nodes on which a place lies therefore name its clock. A recorded point belongs to its
+camera's clock. A sampled point is compared with the points of each clock, from its place at the time of that clock. Its
+partner is the nearest of all.
 """
 
 from __future__ import annotations

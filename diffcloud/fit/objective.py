@@ -473,10 +473,8 @@ class Objective:
                 cloud = target.views[clock][frame] if every[clock, frame] else whole  # whose points do not count here
                 index = torch.randint(len(cloud.points), (int(count),), generator=generator)
                 points.append(cloud.points[index])
-                weights = target.sure[clock][frame]
-                sure.append(
-                    shares[clock, frame] * (weights[index] if every[clock, frame] else torch.zeros(int(count)).double())
-                )
+                weights = target.sure[clock][frame] if every[clock, frame] else torch.zeros(len(whole.points)).double()
+                sure.append(shares[clock, frame] * weights[index])
         frames = len(target.clouds)
         return Recorded(
             torch.cat(points).unflatten(0, (frames, -1)), torch.cat(sure).unflatten(0, (frames, -1)), tuple(counts.tolist())

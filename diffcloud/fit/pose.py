@@ -128,7 +128,8 @@ class PoseSpace:
     names: tuple[str, ...]
     """d of them."""
     deviations: Tensor
-    """[d] of their priors, in the scene's length unit, rad, s and 1. Values are off the centres of these: `clocks`, or zero."""
+    """[d] of their priors, in the scene's length unit, rad, s and 1. Values [..., d] are differences from the centre of the
+    prior, which is the offset of a clock, and zero for all others."""
     resolved: Tensor
     """[d] a step no larger than this ends the search for a pose."""
     prior_weights: Tensor

@@ -68,7 +68,7 @@ class Target:
     clouds: tuple[NeighbourIndex, ...]
     """[L] of all cameras."""
     views: tuple[tuple[NeighbourIndex, ...], ...]
-    """[C][L] what was recorded by each clock of `space`; a frame in which it recorded nothing holds a point out of reach."""
+    """[C][L] what was recorded by each clock of `space`; where that is nothing, a point out of reach."""
     sure: tuple[tuple[Tensor, ...], ...]
     """[C][L] how much each of its points counts; nothing where it recorded nothing."""
     cut: float | None
@@ -88,8 +88,14 @@ class Target:
         """What noise and spacing of the points leave of the default loss [squared length unit]."""
         if len(self.views) == 1:
             return float(np.mean([cloud.from_surface for cloud in self.clouds]))
-        every = [(cloud.from_surface, len(cloud.points)) for view in self.views for cloud in view]
-        return float(np.average([np.mean(left) for left, _ in every], weights=[points for _, points in every]))
+        left, points = [], []
+        for view in self.views:
+            for cloud, whole in zip(view, self.clouds, strict=True):
+                to_point, to_surface = cloud.from_surface
+                denser = (whole.spacing / cloud.spacing) ** 2 if cloud.spacing > 0 else 1.0  # another camera's points
+                left.append((to_point * min(denser, 1.0) + to_surface) / 2)
+                points.append(len(cloud.points))
+        return float(np.average(left, weights=points))
 
     def at(self, chosen: Sequence[int]) -> Target:
         """The same with some of its frames, by their places among these."""
@@ -141,11 +147,8 @@ def read_target(
         else list(dict.fromkeys(_checked(scenario, episode, frame) for frame in named))
     )
     clouds = tuple(NeighbourIndex(torch.as_tensor(episode.frame(frame), dtype=torch.float64)) for frame in frames)
-    views, sure, watching = (
-        [clouds],
-        [tuple(_sure(episode, frame) for frame in frames)],
-        [list(range(len(episode.viewpoints)))],
-    )
+    views, sure = [clouds], [tuple(_sure(episode, frame) for frame in frames)]
+    watching = [[] if whole else list(range(len(episode.viewpoints)))]
     if clocks is not ONE_CLOCK:
         views, sure = map(list, zip(*(_of_camera(episode, frames, camera) for camera in range(len(clocks))), strict=True))
         watching = _watching(episode)
@@ -249,7 +252,7 @@ def _usable(
     """Frames after the start, within the simulation, with enough of the cloth of the basis above the cut.
 
     Args:
-        late: after its time stamp, a frame shows the motion [s].
+        late: largest offset of a clock [s].
     """
     end = _end(scenario) - max(late, 0.0)
     frames = [index for index, time in enumerate(episode.times) if 0 < time <= end]

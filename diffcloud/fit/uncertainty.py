@@ -314,15 +314,16 @@ def _between(measured: NDArray[np.float64], normal: NDArray[np.float64]) -> NDAr
 
 
 def _refined(objective: Objective, parameters: Mapping[str, Tensor], run: Rollout) -> Tensor:
-    """[1, L, C · V, 3] from the motion to that with finer steps, at the compared frames; zero for the paper's measure, which
-    takes the published step as it is."""
+    """[1, L, C · V, 3] from the motion to that with finer steps, at the compared frames; zero for the paper's measure,
+    which takes the published step as it is."""
     if objective.paper:
         return torch.zeros_like(objective.looked_at(run))
     return _way_to(finer_steps(objective.scenario), objective, parameters, run)
 
 
 def _way_to(finer: Scenario, objective: Objective, parameters: Mapping[str, Tensor], run: Rollout) -> Tensor:
-    """[1, L, C · V, 3] from a motion to that of a finer variant of its scenario, at its own nodes and the compared frames."""
+    """[1, L, C · V, 3] from a motion to that of a finer variant of its scenario, at its own nodes in the compared
+    frames."""
     system, _ = finer.scene.build()
     steps = objective.loss_steps * finer.scene.frame_steps // objective.scenario.scene.frame_steps
     track = None

@@ -230,16 +230,19 @@ class Episode:
             return {}
         cameras = self.meta.get("cameras")
         if not (isinstance(cameras, list) and cameras and all(isinstance(name, str) for name in cameras)):
-            raise EpisodeError(f"clocks in an episode's meta need its list of cameras, got cameras {cameras!r}.")
+            raise EpisodeError(
+                f"The episode's meta has clocks, and its cameras are {cameras!r}. Clocks need the list of the cameras' "
+                "names, in the order in which points number them. Add `cameras`, or remove `clocks`."
+            )
         if not (isinstance(told, Mapping) and set(told) <= set(cameras) and all(map(_is_clock, told.values()))):
             raise EpisodeError(
-                'clocks in an episode\'s meta are camera -> {"offset_s": seconds, "sigma_s": seconds, not negative}, of the '
-                f"cameras {', '.join(cameras)}; got {told!r}."
+                f"clocks in an episode's meta are {told!r}. They may hold, for each of the cameras {', '.join(cameras)}, "
+                "offset_s and sigma_s in seconds, sigma_s not negative. Correct them, or remove `clocks`."
             )
         if self.camera is None or int(self.camera.max()) >= len(cameras):
             raise EpisodeError(
-                "The episode's meta has the clocks of its cameras, but not each point names one of them. Give every point its "
-                "`camera`, or remove `clocks`."
+                "The episode's meta has the clocks of its cameras, but some points name none of them. With `clocks`, every "
+                "point names one of the cameras. Give each point its `camera`, or remove `clocks`."
             )
         nothing = {"offset_s": 0.0, "sigma_s": 0.0}
         return {name: Clock(*(float(told.get(name, nothing)[key]) for key in Clock._fields)) for name in cameras}
