@@ -31,7 +31,7 @@ _ROUGH = 1e-4
 _REUSE = 5e-1
 """Below this relative change a matrix serves once more, be it that of the part before, and then as long as changes shrink:
 a new one costs as much as five to ten steps with an old one, which Broyden's updates correct."""
-_SHRINKING = 0.3
+_SHRINKING = 0.6
 _WHOLE = 1 - 1e-9
 """A way that is free so far is free: where it has been shortened before, only rounding keeps it from being whole."""
 _ALMOST_WHOLE = 0.999
