@@ -58,7 +58,8 @@ class Scene:
 
     def basis(self, name: Basis) -> float:
         """What multipliers act on, in the scene's units: stiffness at rest in stretching [N/m], in shear divided by
-        that, or in bending [N·m]; density of the cloth or of the air that moves with it [kg/m²], of the air [kg/m³], its linear drag [kg/(m²·s)], mass of all rigid bodies [kg]."""
+        that, or in bending [N·m]; density of the cloth or of the air that moves with it [kg/m²], of the air [kg/m³], its
+        linear drag [kg/(m²·s)], mass of all rigid bodies [kg]."""
         match name:
             case "stretching":
                 return self.material.resting_stretching_stiffness

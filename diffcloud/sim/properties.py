@@ -126,9 +126,7 @@ PARAMETERS: dict[str, Parameter] = {
         Parameter("bending", "multiplier on the bending table", "N·m", _MULTIPLIED, "bending"),
         Parameter("drag", "multiplier on the air density and the tangential drag", "kg/m³", _MULTIPLIED, "air_density"),
         Parameter("added_mass", "multiplier on the air that moves with the cloth", "kg/m²", _MULTIPLIED, "added_mass"),
-        Parameter(
-            "linear_drag", "multiplier on the drag that grows with velocity", "kg/(m²·s)", _MULTIPLIED, "linear_drag"
-        ),
+        Parameter("linear_drag", "multiplier on drag in proportion to velocity", "kg/(m²·s)", _MULTIPLIED, "linear_drag"),
         Parameter("damping", "stiffness-proportional damping", "s", (0.0, 0.1)),
         Parameter("friction_obstacle", "Coulomb coefficient between cloth and obstacles", "–", (0.0, 1.5)),
         Parameter("friction_cloth", "Coulomb coefficient of the cloth with itself", "–", (0.0, 1.5)),

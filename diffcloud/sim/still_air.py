@@ -5,9 +5,9 @@ the sides a <= b that moves along its normal it is
 
     m = π / 4 C_A(b / a) ρ a
 
-with C_A from DNV-RP-C205 (2010), table D-2: 0.579 of a square, 1 of a long strip. Along the plate only a thin layer moves; its
-friction on both sides is ρ sqrt(2 ν ω) of the velocity (Stokes' second problem; Landau & Lifshitz, Fluid Mechanics, §24),
-here at the frequency ω² = 3 g / (2 b) of a plate that hangs from one side.
+with C_A from DNV-RP-C205 (2010), table D-2: 0.579 of a square, 1 of a long strip. Along the plate only a thin layer moves;
+its friction on both sides is ρ sqrt(2 ν ω) of the velocity (Stokes' second problem; Landau & Lifshitz, Fluid Mechanics,
+§24), here at the frequency ω² = 3 g / (2 b) of a plate that hangs from one side.
 
 The added mass acts in all directions alike here, as a mass matrix with one number a node: along the cloth that is too much.
 """

@@ -71,7 +71,7 @@ class Episode:
             "damping": 0.004 * one,
             "drag": 0.9 * one,
             "friction_obstacle": 0.4 * one,
-            **{name: 1.4 * one for name in STILL_AIR},
+            **{name: 1.4 * one for name in STILL_AIR if name in self.scalars},
             "positions": nodes[None].clone(),
             "velocities": torch.zeros_like(nodes)[None],
             "track": self.track.clone(),
