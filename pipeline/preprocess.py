@@ -18,7 +18,7 @@ from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import files_in, folders_in, together
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.images import write_color
-from diffcloud.io.manifests import read_manifest, read_marks, remove_files, write_manifest
+from diffcloud.io.manifests import read_manifest, read_marks, remove_files, remove_manifest, write_manifest
 from diffcloud.io.raw_episodes import RawEpisode, raw_episode_files, read_description, read_raw_episode
 from diffcloud.sensing.filters import clean_frame
 from diffcloud.sensing.fusion import Seen, fuse
@@ -83,6 +83,8 @@ def preprocess(
             write_manifest(out, read_manifest(out), marks)
         else:
             failures.append(error)
+    if failures and not (cleaned or written):
+        remove_manifest(out)
     if whole and not failures:
         inside = {name for job in jobs for name in job.files}
         if removed := remove_files(out, sorted(read_manifest(out) - inside)):

@@ -196,7 +196,8 @@ def against(below: float) -> str:
 
 def largest_sources(sources: Mapping[str, Mapping[str, float]], name: str, count: int = 3) -> str:
     """What to improve first: the largest sources of a parameter's variance, with their parts of it."""
-    variances = {source: deviations[name] ** 2 for source, deviations in sources.items()}
+    largest = max((abs(deviations[name]) for deviations in sources.values()), default=0.0) or 1.0
+    variances = {source: (deviations[name] / largest) ** 2 for source, deviations in sources.items()}  # none overflows
     total = sum(variances.values()) or 1.0
     ranked = sorted(variances.items(), key=lambda item: -item[1])[:count]
     return ", ".join(

@@ -21,6 +21,8 @@ MATERIAL_DOUBTS = {
     "compression": 3.0,
     "bending": 1.5,
     "drag": 1.3,
+    "added_mass": 2.0,
+    "linear_drag": 3.0,
     "damping": 1.5,
     "friction_obstacle": 1.3,
     "friction_cloth": 1.3,

@@ -2,11 +2,12 @@
 
 A cloth s times as large as the scene's, x = c + s (ξ - c), moves as the scene's own cloth ξ does where
 
-    stretching is k / s²,  bending B / s⁴,  gravity g / s,  air density ρ s,  and the gripper's displacement u / s.
+    stretching is k / s²,  bending B / s⁴,  gravity g / s,  air density ρ s,  added mass m s,
+    and the gripper's displacement u / s.
 
 Written in ξ, inertia gains a factor s⁴, weight s³, the energy of stretching s², that of bending none, and the work of
-quadratic drag s⁵; all is divided by s⁴. Linear drag gains what inertia does; shear, compression and friction are ratios,
-and damping is a time. So the mesh and all that is computed from it stay.
+quadratic drag and the inertia of the air s⁵; all is divided by s⁴. Linear drag gains what inertia does; shear, compression
+and friction are ratios, and damping is a time. So the mesh and all that is computed from it stay.
 
 c is below the cloth's middle, on the table, so the table does not move. The grasped nodes do, and the pose takes that up.
 Contact and the gap below the cloth are s times as thick, soft handles s² times as stiff, and a bending table is read at a
@@ -67,7 +68,8 @@ class Inputs:
                 properties,
                 stretching=properties.stretching / size[:, None] ** 2,
                 bending=properties.bending / size[:, None] ** 4,
-                gravity=properties.gravity / size,
+                node_mass=properties.weight + (properties.node_mass - properties.weight) * size[:, None],
+                weight=properties.weight / size[:, None],
                 air_density=properties.air_density * size,
             )
         if reach is not None and system.handles.grippers:

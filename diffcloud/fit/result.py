@@ -91,7 +91,7 @@ def whole_material(scenario: Scenario, values: Mapping[str, float]) -> WholeMate
     changed = scenario.properties(system, one_set(values))
     stretching, bending = float(changed.stretching.mean()), float(changed.bending.mean())
     return WholeMaterial(
-        density=float(changed.node_mass.sum()) / float(scenario.scene.mesh.face_area.sum()),
+        density=float(changed.weight.sum()) / float(scenario.scene.mesh.face_area.sum()),
         stretching=stretching * material.resting_stretching_stiffness,
         poisson=material.resting_poisson_ratio,
         shear=stretching * float(changed.shear) * material.resting_shear_stiffness,

@@ -48,6 +48,13 @@ def write_manifest(folder: Path, names: Iterable[str], marks: Mapping[str, str] 
     write_json(Path(folder) / NAME, {"files": sorted(names), **told})
 
 
+def remove_manifest(folder: Path) -> None:
+    """Of a folder in which nothing was made; the folder too, where it was all that it held."""
+    remove_files(folder, [NAME])
+    with suppress(OSError):  # it has something else in it
+        Path(folder).rmdir()
+
+
 def _read(folder: Path) -> dict[str, Any]:
     path = Path(folder) / NAME
     told = read_json(path) if path.is_file() else {}

@@ -58,7 +58,8 @@ class Scene:
 
     def basis(self, name: Basis) -> float:
         """What multipliers act on, in the scene's units: stiffness at rest in stretching [N/m], in shear divided by
-        that, or in bending [N·m]; density of the cloth [kg/m²] or of the air [kg/m³], mass of all rigid bodies [kg]."""
+        that, or in bending [N·m]; density of the cloth or of the air that moves with it [kg/m²], of the air [kg/m³], its
+        linear drag [kg/(m²·s)], mass of all rigid bodies [kg]."""
         match name:
             case "stretching":
                 return self.material.resting_stretching_stiffness
@@ -70,6 +71,10 @@ class Scene:
                 return (self.mass_material or self.material).density
             case "air_density":
                 return self.surrounding.air_density
+            case "added_mass":
+                return self.surrounding.added_mass
+            case "linear_drag":
+                return self.surrounding.linear_drag
             case "body_mass":
                 return float(self.build()[0].properties.body_mass.sum()) if self.surrounding.bodies else 0.0
 

@@ -122,6 +122,10 @@ class ExtensionBlock(Checked):
     damping: NonNegative | None = None
     compression: Annotated[float, Field(ge=0, le=1)] = 1.0
     """The part of its stretching stiffness with which the cloth resists compression in its plane."""
+    added_mass: NonNegative = 0.0
+    """Of air that moves with the cloth, per area of it [kg/m²]."""
+    linear_drag: NonNegative = 0.0
+    """Beside `wind.drag`, in all directions [kg/(m²·s)]."""
 
 
 class SceneFile(Checked):

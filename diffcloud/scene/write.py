@@ -91,6 +91,8 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
             "shaped": scene.shaped,
             "contact": _contact_name(scene.surrounding.reference_contact),
             "compression": scene.material.compression,
+            "added_mass": around.added_mass,
+            "linear_drag": around.linear_drag,
         },
     }
     if math.isfinite(scene.end_time):

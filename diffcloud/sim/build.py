@@ -54,7 +54,8 @@ def build_system(
     bodies = Bodies.build(surrounding.bodies)
     density = (mass_material or material).density
     properties = Properties(
-        node_mass=torch.as_tensor(density * mesh.node_area, dtype=torch.float64)[None],
+        node_mass=torch.as_tensor((density + surrounding.added_mass) * mesh.node_area, dtype=torch.float64)[None],
+        weight=torch.as_tensor(density * mesh.node_area, dtype=torch.float64)[None],
         stretching=torch.ones(1, len(mesh.faces), dtype=torch.float64),
         bending=torch.ones(1, len(mesh.hinges.length), dtype=torch.float64),
         body_mass=torch.as_tensor(np.asarray(bodies.mass, dtype=np.float64))[None],
@@ -63,9 +64,9 @@ def build_system(
                 "shear": 1.0,
                 "compression": material.compression,
                 "damping": material.damping,
-                "gravity": 1.0,
                 "air_density": surrounding.air_density,
                 "air_drag": surrounding.air_drag,
+                "linear_drag": surrounding.linear_drag,
                 "friction_obstacle": surrounding.friction_obstacle,
                 "friction_cloth": surrounding.friction_cloth,
             }

@@ -261,7 +261,7 @@ class Batch:
             size=system.mesh.size,
             places=np.concatenate([self.positions[entry, :1][:, self.held.node], targets]),
             held=schedule.active[:last],
-            gravity=self._parameters[entry].gravity[0] * np.array(system.setup.surrounding.gravity, dtype=np.float64),
+            gravity=np.array(system.setup.surrounding.gravity, dtype=np.float64),
             wind=float(np.linalg.norm(system.setup.surrounding.wind)),
             velocities=self.velocities[entry, 0],
             others=np.concatenate([moving, bodies], axis=1),

@@ -22,7 +22,9 @@ class Properties:
     """Physical quantities with a leading batch axis [B, ...]; every one is differentiable."""
 
     node_mass: Tensor
-    """[B, V] [kg]"""
+    """[B, V] of the cloth and of the air that moves with it: what a force has to accelerate [kg]."""
+    weight: Tensor
+    """[B, V] of the cloth alone: what gravity pulls at [kg]."""
     stretching: Tensor
     """[B, F] multiplier on the stretching table of each face [-]."""
     shear: Tensor
@@ -34,12 +36,12 @@ class Properties:
     """[B, H] multiplier on the bending table of each hinge [-]."""
     damping: Tensor
     """[B] stiffness-proportional damping [s]."""
-    gravity: Tensor
-    """[B] multiplier on gravity [-]."""
     air_density: Tensor
     """[B] of the quadratic normal drag [kg/m³]."""
     air_drag: Tensor
     """[B] of the linear tangential drag [kg/(m²·s)]."""
+    linear_drag: Tensor
+    """[B] of the linear drag in all directions [kg/(m²·s)]."""
     friction_obstacle: Tensor
     """[B] Coulomb coefficient between cloth and obstacles [-]."""
     friction_cloth: Tensor
@@ -60,7 +62,7 @@ class Properties:
         return Properties(*(tensor.repeat(count, *[1] * (tensor.dim() - 1)) for tensor in self.tensors()))
 
 
-Basis = Literal["stretching", "shear", "bending", "density", "air_density", "body_mass"]
+Basis = Literal["stretching", "shear", "bending", "density", "air_density", "added_mass", "linear_drag", "body_mass"]
 """What of the basis material, the air and the bodies a multiplier acts on."""
 
 
@@ -123,6 +125,8 @@ PARAMETERS: dict[str, Parameter] = {
         Parameter("compression", "part of the stretching stiffness that resists compression", "–", (0.001, 1.0), most=1.0),
         Parameter("bending", "multiplier on the bending table", "N·m", _MULTIPLIED, "bending"),
         Parameter("drag", "multiplier on the air density and the tangential drag", "kg/m³", _MULTIPLIED, "air_density"),
+        Parameter("added_mass", "multiplier on the air that moves with the cloth", "kg/m²", _MULTIPLIED, "added_mass"),
+        Parameter("linear_drag", "multiplier on drag in proportion to velocity", "kg/(m²·s)", _MULTIPLIED, "linear_drag"),
         Parameter("damping", "stiffness-proportional damping", "s", (0.0, 0.1)),
         Parameter("friction_obstacle", "Coulomb coefficient between cloth and obstacles", "–", (0.0, 1.5)),
         Parameter("friction_cloth", "Coulomb coefficient of the cloth with itself", "–", (0.0, 1.5)),
@@ -195,9 +199,11 @@ def scaled_properties(
     stretch = over_nodes("stretch")
     if stretch.shape[1] > 1:
         stretch = stretch[:, faces].mean(-1)
+    weight = base.weight * over_nodes("mass") * get("density")[:, None]
     return replace(
         base,
-        node_mass=base.node_mass * over_nodes("mass") * get("density")[:, None],
+        node_mass=weight + (base.node_mass - base.weight) * get("added_mass")[:, None],
+        weight=weight,
         stretching=base.stretching * stretch,
         shear=base.shear * get("shear"),
         compression=values.get("compression", base.compression),
@@ -205,6 +211,7 @@ def scaled_properties(
         damping=values.get("damping", base.damping),
         air_density=base.air_density * get("drag"),
         air_drag=base.air_drag * get("drag"),
+        linear_drag=base.linear_drag * get("linear_drag"),
         body_mass=base.body_mass * get("body_mass")[:, None],
         friction_obstacle=values.get("friction_obstacle", base.friction_obstacle),
         friction_cloth=values.get("friction_cloth", base.friction_cloth),

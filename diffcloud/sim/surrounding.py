@@ -62,6 +62,10 @@ class Surrounding:
     """[kg/m³]; ARCSim's default, real air has 1.2."""
     air_drag: float = 0.0
     """Tangential drag [kg/(m²·s)]."""
+    added_mass: float = 0.0
+    """Of air that moves with the cloth, in all directions alike [kg/m²]: it has inertia, and no weight."""
+    linear_drag: float = 0.0
+    """In all directions [kg/(m²·s)]."""
     lagged_air: bool = False
     """Whether drag is that before the linearised step, as in ARCSim, where light cloth in dense air explodes."""
     friction_cloth: float = 0.6

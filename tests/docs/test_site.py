@@ -34,8 +34,10 @@ _ELEMENTS = """
 a article aside blockquote body br button circle code details dialog div em figure footer form g
 h1 h2 h3 h4 h5 h6 head header hr html iframe img input label li link main meta nav noscript ol p path pre rect script small
 span strong style sub summary sup svg table tbody td th thead title tr ul
+annotation math merror mfrac mi mn mo mover mpadded mphantom mroot mrow mspace msqrt mstyle msub msubsup msup mtable mtd
+mtext mtr munder munderover semantics
 """
-"""Elements of HTML and SVG that pages of commands may have."""
+"""Elements of HTML, SVG and MathML that pages may have."""
 
 
 class Fetched(HTMLParser):

@@ -125,9 +125,13 @@ def survive(fault: Fault, project: Path, reference: dict[str, Any], usual_s: flo
                 wrong = f"cannot be run again: {again.stderr[-300:]}"
             elif differs := _differs(contents(work, command), reference):
                 wrong = f"another result: {differs}"
-            elif left := [name for name in _hidden(work, command) if not name.endswith((".diffcloud-lock", ".gitignore"))]:
+            elif left := [name for name in _hidden(work, command) if not name.endswith(_MEANT)]:
                 wrong = f"left over: {left}"
         return wrong, told[-400:]
+
+
+_MEANT = (".diffcloud-lock", ".gitignore", ".timings.json")
+"""Endings of hidden files that belong there."""
 
 
 def _hidden(work: Path, command: Command) -> list[str]:

@@ -142,6 +142,8 @@ def _messages(results: list[dict[str, Any]]) -> list[str]:
 
 
 def _plain(text: str) -> str:
-    """Without what differs from one computer to the next, and what would end a cell."""
-    text = re.sub(r"(/\S*)?/(project|tmp)/", "", text).replace("|", "\\|")
+    """Without what differs from one computer to the next, and what would end a cell or be an element of HTML."""
+    text = re.sub(r"(/\S*)?/(project|tmp)/", "", text)
+    for plain, escaped in (("&", "&amp;"), ("<", "&lt;"), ("|", "\\|")):
+        text = text.replace(plain, escaped)
     return text if len(text) <= _LONGEST else text[:_LONGEST] + " …"

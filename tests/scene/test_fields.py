@@ -154,6 +154,8 @@ EFFECTS = [
     Effect("diffcloud.contact", "planes", around("reference_contact"), None),
     Effect("diffcloud.contact", "published", around("reference_contact"), ReferenceContact.as_published()),
     Effect("diffcloud.compression", 0.1, lambda scene: scene.material.compression, 0.1),
+    Effect("diffcloud.added_mass", 0.1, around("added_mass"), 0.1),
+    Effect("diffcloud.linear_drag", 0.5, around("linear_drag"), 0.5),
     Effect("diffcloud.damping", 0.01, lambda scene: scene.material.damping, 0.01),
 ]
 REFUSED = [

@@ -15,6 +15,7 @@ from diffcloud.sim import Properties, State, init, rollout, rollout_tangents
 from diffcloud.sim.system import System
 
 SCALARS = ("stretch", "shear", "mass", "density", "bending", "damping", "drag", "friction_obstacle")
+STILL_AIR = ("added_mass", "linear_drag")
 STEPS = tuple(10.0**-k for k in range(2, 9))
 
 
@@ -44,6 +45,11 @@ class Episode:
         weights[steps // 2] = torch.randn(nodes, 3, dtype=torch.float64, generator=generator)
         return Episode(scenario, system, steps, track, weights)
 
+    @property
+    def scalars(self) -> tuple[str, ...]:
+        """The parameters that the scene has."""
+        return SCALARS + (STILL_AIR if self.scenario.scene.surrounding.added_mass else ())
+
     def base(self) -> dict[str, Tensor]:
         """Inputs of batch 1, away from special values.
 
@@ -65,6 +71,7 @@ class Episode:
             "damping": 0.004 * one,
             "drag": 0.9 * one,
             "friction_obstacle": 0.4 * one,
+            **{name: 1.4 * one for name in STILL_AIR if name in self.scalars},
             "positions": nodes[None].clone(),
             "velocities": torch.zeros_like(nodes)[None],
             "track": self.track.clone(),
@@ -78,7 +85,7 @@ class Episode:
         return (result.positions * self.weights).sum((1, 2, 3))
 
     def properties(self, inputs: Mapping[str, Tensor]) -> Properties:
-        return self.scenario.properties(self.system, {name: inputs[name] for name in SCALARS})
+        return self.scenario.properties(self.system, {name: inputs[name] for name in self.scalars})
 
     def reverse(self, directions: Sequence[Mapping[str, Tensor]]) -> list[float]:
         """One backward pass, dotted with every direction."""
@@ -131,7 +138,7 @@ def directions(episode: Episode, *, seed: int = 1, per_field: int = 3) -> dict[s
     """A direction for each scalar, and a few random ones for each field, scaled to sensible perturbations."""
     generator = torch.Generator().manual_seed(seed)
     base = episode.base()
-    found = {name: {name: base[name].clone()} for name in SCALARS}
+    found = {name: {name: base[name].clone()} for name in episode.scalars}
     for name, scale in (("positions", 1e-3), ("velocities", 1e-2), ("track", 1e-3)):
         for index in range(per_field):
             random = torch.randn(base[name].shape, dtype=torch.float64, generator=generator)

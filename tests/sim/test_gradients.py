@@ -12,7 +12,7 @@ import torch
 
 from diffcloud.scene.scenarios import built_in, grid_scenario
 from tests.conftest import shaken, small_lift
-from tests.sim.directional import SCALARS, STEPS, Episode, directions
+from tests.sim.directional import SCALARS, STEPS, STILL_AIR, Episode, directions
 
 FREE_FALL_GAP = 5.0
 """Over a table that is out of reach."""
@@ -62,10 +62,11 @@ def test_with_table_contact():
 @pytest.mark.parametrize("gap", [FREE_FALL_GAP, 0.002])
 def test_short_episodes(gap, compression):
     """The same on a small cloth over a few steps, for every run of the tests."""
-    episode = Episode.build(small_lift(gap_m=gap, compression=compression), 10)
+    air = "still" if gap == FREE_FALL_GAP else "drag"
+    episode = Episode.build(small_lift(gap_m=gap, compression=compression, air=air), 10)
     found = compare(episode, directions(episode, per_field=1))
     if compression < 1:
-        plate = Episode.build(small_lift(gap_m=gap), 10)
+        plate = Episode.build(small_lift(gap_m=gap, air=air), 10)
         assert not torch.equal(plate.run(plate.base()), episode.run(episode.base()))
     # nothing slides yet: free fall has no friction, and a sticking node's does not depend on the coefficient
     assert abs(found.pop("friction_obstacle")[0]) < 1e-10
@@ -101,7 +102,7 @@ def test_one_step():
 
 def test_converged_newton_steps():
     """The exact Jacobian has no symmetry, and the step is solved by Newton's method."""
-    episode = Episode.build(small_lift(gap_m=FREE_FALL_GAP, nodes=(4, 4), integrator="implicit"), 3)
+    episode = Episode.build(small_lift(gap_m=FREE_FALL_GAP, nodes=(4, 4), integrator="implicit", air="still"), 3)
     found = compare(episode, directions(episode, per_field=1), steps=STEPS[2:])
     del found["friction_obstacle"]
     for name, (value, forward, central) in found.items():
@@ -160,4 +161,4 @@ def test_scalars_cover_every_parameter():
 
     # these act only in scenes with contact of the cloth with itself, with bodies (test_contact_gradients), and with cloth
     # that gives way to compression (test_implicit)
-    assert set(SCALARS) | {"friction_cloth", "body_mass", "compression"} == set(PARAMETERS)
+    assert set(SCALARS) | set(STILL_AIR) | {"friction_cloth", "body_mass", "compression"} == set(PARAMETERS)

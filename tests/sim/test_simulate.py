@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -92,8 +92,11 @@ def test_the_step_solves_its_equation(rng):
     forces = Forces(system.mesh, MATERIAL)
     forces.terms, forces.timing = system.scene.terms, Timing(dt, dt)
     forces.parameters = Parameters(
-        *(value[0].numpy() for value in (system.properties.node_mass, 1 / system.properties.node_mass)),
-        *(np.atleast_1d(value[0].numpy()) for value in system.properties.tensors()[1:]),
+        **{
+            field.name: np.atleast_1d(getattr(system.properties, field.name)[0].numpy())
+            for field in fields(system.properties)
+        },
+        inverse_mass=1 / system.properties.node_mass[0].numpy(),
         hold=np.array([system.handles.stiffness]),
         target=positions[0, :1].numpy(),
     )

@@ -452,11 +452,11 @@ def test_bent_cylinder_has_the_energy_of_a_plate():
 @pytest.mark.parametrize("lagged", [False, True])
 def test_air_pushes_against_the_motion_and_as_formulas_say(lagged, mesh):
     forces = Forces(mesh, CONSTANT, Surrounding(wind=(0.0, 0.0, 0.5), lagged_air=lagged))
-    forces.parameters = forces.parameters._replace(air_drag=np.array([0.3]))
+    forces.parameters = forces.parameters._replace(air_drag=np.array([0.3]), linear_drag=np.array([0.1]))
     velocities = np.tile([2.0, 0.0, -1.0], (len(mesh.nodes), 1))
     total = forces.force("air", forces.motion(mesh.nodes, velocities, velocities)).sum(0)
     area = 0.3 * 0.4
-    assert total.tolist() == pytest.approx([-0.3 * area * 2.0, 0.0, 1.0 * area * 1.5 * 1.5])
+    assert total.tolist() == pytest.approx([-(0.3 + 0.1) * area * 2.0, 0.0, (1.5 + 0.1) * area * 1.5])
 
 
 class TestShaped:

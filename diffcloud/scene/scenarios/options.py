@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import Material, preset, read_material
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.properties import PARAMETERS
+from diffcloud.sim.still_air import AIR_DENSITY, StillAir, still_air
 from diffcloud.sim.surrounding import ContactSettings, Integrator, ReferenceContact, Surrounding
 
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
@@ -69,7 +70,11 @@ class ScenarioOptions(Checked):
     """A fit stops when its loss is below; 0: never."""
     recorder: Recorder = "depth_cameras"
     gravity: Vector = Surrounding.gravity
-    air_density: NonNegative = 1.2
+    air: Literal["none", "drag", "still"] = "drag"
+    """"none": a vacuum, as in most simulators; "drag": the pressure on faces that move through the air; "still": also the
+    air that moves along with the cloth, which makes it swing slower, and linear drag (`sim.still_air`)."""
+    air_density: NonNegative = AIR_DENSITY
+    """Of air that is there [kg/m³]."""
     friction_obstacle: Friction = Surrounding.friction_obstacle
     friction_cloth: Friction = Surrounding.friction_cloth
     mesh_contact: bool = True
@@ -141,6 +146,7 @@ def assemble(
         handles += [Handle(node, motion, gripper=name) for node in grasped]
     handles += [Handle(node) for node in held]
     thickness = options.contact_thickness_m
+    moving = still_air(mesh, options.air_density) if options.air == "still" else StillAir(0.0, 0.0)
     scene = Scene(
         mesh=mesh,
         material=replace(_material(options), compression=options.compression),
@@ -149,7 +155,9 @@ def assemble(
         frame_steps=options.steps_per_frame,
         surrounding=Surrounding(
             gravity=options.gravity,
-            air_density=options.air_density,
+            air_density=0.0 if options.air == "none" else options.air_density,
+            added_mass=moving.added_mass,
+            linear_drag=moving.linear_drag,
             friction_obstacle=options.friction_obstacle,
             friction_cloth=options.friction_cloth,
             self_contact=options.self_contact,

@@ -134,6 +134,8 @@ class Scenario:
             around,
             air_density=around.air_density * air,
             air_drag=around.air_drag * air,
+            added_mass=around.added_mass * values.get("added_mass", 1.0),
+            linear_drag=around.linear_drag * values.get("linear_drag", 1.0),
             friction_obstacle=values.get("friction_obstacle", around.friction_obstacle),
             friction_cloth=values.get("friction_cloth", around.friction_cloth),
             bodies=bodies,

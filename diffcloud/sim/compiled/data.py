@@ -16,7 +16,9 @@ class Parameters(NamedTuple):
     """What a motion can be differentiated by, of one cloth; gradients and rates have the same fields."""
 
     node_mass: Floats
-    """[V] [kg]"""
+    """[V] of the cloth and of the air that moves with it: what a force has to accelerate [kg]."""
+    weight: Floats
+    """[V] of the cloth alone: what gravity pulls at [kg]."""
     inverse_mass: Floats
     """[N] of all points, zero for those of obstacles and bodies; follows from the node masses [1/kg]."""
     stretching: Floats
@@ -29,12 +31,12 @@ class Parameters(NamedTuple):
     """[H] multiplier on the bending table of each hinge [-]."""
     damping: Floats
     """[1] stiffness-proportional damping [s]."""
-    gravity: Floats
-    """[1] multiplier on gravity [-]."""
     air_density: Floats
     """[1] of the quadratic normal drag [kg/m³]."""
     air_drag: Floats
     """[1] of the linear tangential drag [kg/(m²·s)]."""
+    linear_drag: Floats
+    """[1] of the linear drag in all directions [kg/(m²·s)]."""
     friction_obstacle: Floats
     """[1] Coulomb coefficient between cloth and obstacles [-]."""
     friction_cloth: Floats

@@ -213,8 +213,7 @@ def _bodies(work: Work, solved: Solved, slopes: Motion, y: Floats, own: Floats, 
         for k in range(9):
             turned[b, k] += own[b, 3 + k]
         for axis in range(3):
-            change = w[row, axis] - start_bodies[b, 12 + axis] - dt * parameters.gravity[0] * gravity[axis]
-            gradients.gravity[0] += dt * mass * gravity[axis] * y[row, axis]
+            change = w[row, axis] - start_bodies[b, 12 + axis] - dt * gravity[axis]
             gradients.body_mass[b] -= change * y[row, axis] + ended[b, 9 + axis] * y[row + 1, axis]
             turned[b, 9 + axis] = -mass * y[row + 1, axis]
         spin_inputs(work, b, w[row + 1], inputs, constants)

@@ -128,7 +128,7 @@ def residual(
     for b in range(len(start_bodies)):
         mass, row = parameters.body_mass[b], nodes + 2 * b
         for axis in range(3):
-            change = velocity[row, axis] - start_bodies[b, 12 + axis] - dt * parameters.gravity[0] * gravity[axis]
+            change = velocity[row, axis] - start_bodies[b, 12 + axis] - dt * gravity[axis]
             found[row, axis] = mass * change
             found[row + 1, axis] = mass * turned[b, 9 + axis]
     first = first_body_point

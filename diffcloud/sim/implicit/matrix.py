@@ -110,15 +110,16 @@ def _cautious(p: Parameters) -> Parameters:
     none, whole = np.zeros(1), np.ones(1)
     return Parameters(
         node_mass=p.node_mass,
+        weight=p.weight,
         inverse_mass=p.inverse_mass,
         stretching=p.stretching,
         shear=p.shear,
         compression=whole,
         bending=p.bending,
         damping=p.damping,
-        gravity=p.gravity,
         air_density=none,
         air_drag=none,
+        linear_drag=none,
         friction_obstacle=p.friction_obstacle,
         friction_cloth=p.friction_cloth,
         body_mass=p.body_mass,

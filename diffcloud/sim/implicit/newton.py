@@ -15,9 +15,8 @@ from diffcloud.sim.implicit.room import Room, away, cover, distances_at, free_wa
 from diffcloud.sim.implicit.scene import Work
 
 _TOLERANCE = 1e-11
-"""Expected next change of velocity, relative to the largest, at which Newton's method has converged.
-
-It is overestimated: convergence is faster than linear, so what is left is far smaller."""
+"""All changes of velocity still expected, relative to the largest, at which Newton's method has converged: as much as a
+geometric series with the ratio of the last two has left."""
 _ROUNDING = 1e-7
 """Below this relative change a step that no longer shrinks has reached the arithmetic's precision."""
 _ITERATIONS = 30
@@ -31,7 +30,9 @@ _ROUGH = 1e-4
 _REUSE = 5e-1
 """Below this relative change a matrix serves once more, be it that of the part before, and then as long as changes shrink:
 a new one costs as much as five to ten steps with an old one, which Broyden's updates correct."""
-_SHRINKING = 0.3
+_SHRINKING = 0.45
+_SLOWEST_RATIO = 0.9
+"""Of one change to that before it, as far as what is left after a step is told from it: changes may grow at first."""
 _WHOLE = 1 - 1e-9
 """A way that is free so far is free: where it has been shortened before, only rounding keeps it from being whole."""
 _ALMOST_WHOLE = 0.999
@@ -111,7 +112,8 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
             here, short, part = _search(work, here, direction, downhill, room, rough, trial_left)
             left_over, trial_left = trial_left, left_over
             before, change = change, size
-            expected = change * min(change / before, 1.0) if np.isfinite(before) else change
+            ratio = min(change / before, _SLOWEST_RATIO)
+            expected = change * ratio / (1 - ratio) if np.isfinite(before) else change
             settled = expected < _TOLERANCE or (fresh and change < _ROUNDING and change > 0.3 * before)
             if settled and _arrived(here.scenery, work.final_scenery):
                 work.last, work.left_path = matrix, away(room, here.points)

@@ -229,9 +229,8 @@ def _body_rows(
     for b in range(own.shape[1]):
         row, mass, rate = nodes + 2 * b, parameters.body_mass[b], parameter_rates.body_mass[d, b]
         for axis in range(3):
-            gone = w[row, axis] - start_bodies[b, 12 + axis] - dt * parameters.gravity[0] * gravity[axis]
-            pulled = dt * parameter_rates.gravity[d, 0] * gravity[axis]
-            right[row, axis] = mass * (own[d, b, 12 + axis] + pulled) - rate * gone
+            gone = w[row, axis] - start_bodies[b, 12 + axis] - dt * gravity[axis]
+            right[row, axis] = mass * own[d, b, 12 + axis] - rate * gone
             right[row + 1, axis] = -rate * ended[b, 9 + axis] - mass * turned[b, d, 9 + axis]
     along = turned[:, d].copy()
     for p in range(len(rigid.body)):

@@ -1,6 +1,6 @@
 """Air drag and wind on each face.
 
-    f = ρ_air a |u_n| v_n N + drag a v_t,   v = v_wind - mean corner velocity
+    f = ρ_air a |u_n| v_n N + drag a v_t + linear a v,   v = v_wind - mean corner velocity
 
 with a the material-space area; a third of f acts on each corner. The speed u_n of the pressure is that before the step, the
 velocities it multiplies are those after it: drag then damps however light the cloth and however long the step. ARCSim takes
@@ -27,10 +27,10 @@ def force(face: Element) -> Sequence[Vector]:
     lagged = face.constant("lagged") > 0.0
     relative = Vector(*(where(lagged, before[axis], after[axis]) for axis in range(3)))
     speed = dot(relative, unit)
-    drag = face.parameter("air_drag")
+    drag, linear = face.parameter("air_drag"), face.parameter("linear_drag")
     pressure = (face.parameter("air_density") * absolute(dot(before, unit)) - drag) * speed
     third = face.constant("area") / 3.0
-    pushed = third * (pressure * unit + drag * relative)
+    pushed = third * (pressure * unit + (drag + linear) * relative)
     return [pushed] * 3
 
 
@@ -54,6 +54,6 @@ TERM = Term(
     force=force,
     build=build,
     constants={"area": (), "wind": (3,), "lagged": ()},
-    parameters={"air_density": "episode", "air_drag": "episode"},
+    parameters={"air_density": "episode", "air_drag": "episode", "linear_drag": "episode"},
 )
 """Constants: area in material space [m²]; velocity of the air [m/s]; 1 where velocities before the step count."""

@@ -1,4 +1,4 @@
-"""Weight: f = m γ g on each node, with a multiplier γ on gravity."""
+"""Weight: f = m g on each node. The air that moves with a cloth adds to its inertia, and not to m."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from diffcloud.sim.terms.term import Element, Elements, Setup, Term
 
 
 def force(node: Element) -> Sequence[Vector]:
-    """m γ g."""
-    return [(node.parameter("node_mass") * node.parameter("gravity")) * node.vector("acceleration")]
+    """m g."""
+    return [node.parameter("weight") * node.vector("acceleration")]
 
 
 def build(setup: Setup) -> Elements:
@@ -29,6 +29,6 @@ TERM = Term(
     force=force,
     build=build,
     constants={"acceleration": (3,)},
-    parameters={"node_mass": "corner", "gravity": "episode"},
+    parameters={"weight": "corner"},
 )
 """Constants: g [m/s²]."""

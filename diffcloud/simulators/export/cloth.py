@@ -139,8 +139,9 @@ def _simplified(scene: Scene) -> list[str]:
     around, said = scene.surrounding, []
     if any(around.gravity[:2]):
         said.append(f"Gravity is vertical; in the fit it is {list(around.gravity)} m/s².")
-    if around.air_density or around.air_drag:
-        said.append(f"There is no air; the fit has air of {around.air_density:.3g} kg/m³.")
+    if around.air_density or around.air_drag or around.linear_drag or around.added_mass:
+        moving = f", of which {around.added_mass:.3g} kg/m² move with the cloth" if around.added_mass else ""
+        said.append(f"There is no air; the fit has air of {around.air_density:.3g} kg/m³{moving}.")
     if not scene.handles.hard:
         said.append(f"Held nodes follow exactly; in the fit, springs of {scene.handles.stiffness:g} N/m hold them.")
     return said

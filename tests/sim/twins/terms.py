@@ -28,7 +28,7 @@ def norm(vector: Tensor) -> Tensor:
 
 
 def gravity(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
-    return parameters["node_mass"][:, None] * parameters["gravity"] * constants["acceleration"]
+    return parameters["weight"][:, None] * constants["acceleration"]
 
 
 def coefficients(samples: Tensor, e00: Tensor, e11: Tensor, e01: Tensor) -> Tensor:
@@ -161,7 +161,8 @@ def air(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Ten
     relative = before if constants["lagged"] > 0 else after
     across = relative @ normal
     pressure = parameters["air_density"] * (before @ normal).abs() * across * normal
-    return (constants["area"] * (pressure + parameters["air_drag"] * (relative - across * normal)) / 3).expand(3, 3)
+    drag = parameters["air_drag"] * (relative - across * normal) + parameters["linear_drag"] * relative
+    return (constants["area"] * (pressure + drag) / 3).expand(3, 3)
 
 
 def handles(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> Tensor:
