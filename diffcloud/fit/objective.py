@@ -330,8 +330,12 @@ class Objective:
         if self._first is None:
             self._first = torch.zeros(1, len(self.pose_space.names), dtype=torch.float64)
             with suppress(DivergedError):  # then steps begin at zero, whatever the parameters
-                nodes = self.with_bodies(self.looked_at(self.simulate_to_loss({})))
+                run = self.simulate_to_loss({})
+                nodes = self.with_bodies(self.looked_at(run))
                 self._first, _ = self._follow(nodes, torch.zeros_like(nodes), self._first, _FIRST_CAPS)
+                if len(self.pose_space.clocks) > 1 and self.pose_space.moves_clocks:  # may be far off their offsets
+                    velocities = self.still_bodies(self._velocities(run))
+                    self._first, _ = self._follow(nodes, velocities, self._first, _CAPS)
         return self._first
 
     def _follow(
