@@ -11,15 +11,15 @@ from diffcloud.sim.compiled.data import Floats, Ints
 
 
 class Surfaces(NamedTuple):
-    """B motions of V nodes at L frames. Axis B of velocities or rates has length one where all motions share them; so has
-    axis L of velocities where all frames do."""
+    """B motions of V nodes at L frames, V / C nodes for each of C clocks. Axis B of velocities or rates has length one
+    where all motions share them; so has axis L of velocities where all frames do."""
 
     nodes: Floats
     """[B, L, V, 3]"""
     velocities: Floats
     """Likewise; empty: none."""
     rates: Floats
-    """[k, B, L, V', 3] of the first V' nodes by k variables; the others stand still."""
+    """[k, B, L, V', 3] by k variables of the first V' / C nodes of each clock; the others stand still."""
 
 
 class Placements(NamedTuple):
@@ -33,20 +33,20 @@ class Placements(NamedTuple):
     shift: Floats
     """[B, 3]"""
     lag: Floats
-    """[B]"""
+    """[B, C]"""
     matrix_rates: Floats
     """[d, B, 3, 3]"""
     shift_rates: Floats
     """[d, 3]"""
     lag_rates: Floats
-    """[d]"""
+    """[d, C]"""
 
 
 class Partners(NamedTuple):
     """N pairs in each frame. Where all motions, or all frames, share them, axis B or L has length one."""
 
     corners: Ints
-    """[B, L, N, 3] nodes of the face on which a place lies."""
+    """[B, L, N, 3] nodes of the face on which a place lies, all of one clock."""
     barycentric: Floats
     """[B, L, N, 3] where on it."""
     points: Floats
@@ -77,13 +77,14 @@ def sum_terms(
         cap: largest distance that counts as itself.
         hidden: loss of a frame in which no place counts.
     """
-    own, cloth = surfaces.rates.shape[0], surfaces.rates.shape[3]
+    own, clocks = surfaces.rates.shape[0], placements.lag.shape[1]
+    each, cloth = surfaces.nodes.shape[2] // clocks, surfaces.rates.shape[3] // clocks
     count = own + len(placements.shift_rates)
     moves, own_normals = surfaces.velocities.size > 0, pairs.normals.size == 0
     c0, c1, c2 = placements.centre[0], placements.centre[1], placements.centre[2]
     along, beside = np.empty(count), np.empty(count)
     for b in range(surfaces.nodes.shape[0]):
-        matrix, matrix_rates, lag = placements.matrix[b], placements.matrix_rates[:, b], placements.lag[b]
+        matrix, matrix_rates = placements.matrix[b], placements.matrix_rates[:, b]
         m00, m01, m02 = matrix[0, 0], matrix[0, 1], matrix[0, 2]
         m10, m11, m12 = matrix[1, 0], matrix[1, 1], matrix[1, 2]
         m20, m21, m22 = matrix[2, 0], matrix[2, 1], matrix[2, 2]
@@ -100,6 +101,8 @@ def sum_terms(
                     continue
                 total += weight
                 i, j, k = corners[pair, 0], corners[pair, 1], corners[pair, 2]
+                clock = i // each
+                lag, bodies = placements.lag[b, clock], clock * (each - cloth)  # nodes before these that have no rates
                 u, v, w = barycentric[pair, 0], barycentric[pair, 1], barycentric[pair, 2]
                 p0, p1, p2 = _inside(nodes, i, j, k, u, v, w)
                 v0 = v1 = v2 = 0.0
@@ -132,14 +135,14 @@ def sum_terms(
                 for row in range(count):
                     if row < own:
                         s0 = s1 = s2 = 0.0
-                        if i < cloth:
-                            s0, s1, s2 = _inside(rates[row], i, j, k, u, v, w)
+                        if i - clock * each < cloth:
+                            s0, s1, s2 = _inside(rates[row], i - bodies, j - bodies, k - bodies, u, v, w)
                         r0 = m00 * s0 + m01 * s1 + m02 * s2
                         r1 = m10 * s0 + m11 * s1 + m12 * s2
                         r2 = m20 * s0 + m21 * s1 + m22 * s2
                     else:
                         turn, shift = matrix_rates[row - own], placements.shift_rates[row - own]
-                        late = placements.lag_rates[row - own]
+                        late = placements.lag_rates[row - own, clock]
                         r0 = turn[0, 0] * p0 + turn[0, 1] * p1 + turn[0, 2] * p2 + shift[0]
                         r1 = turn[1, 0] * p0 + turn[1, 1] * p1 + turn[1, 2] * p2 + shift[1]
                         r2 = turn[2, 0] * p0 + turn[2, 1] * p1 + turn[2, 2] * p2 + shift[2]
@@ -189,7 +192,7 @@ def compile_terms() -> None:
     points = np.zeros((1, 1, 3, 3))
     surfaces = Surfaces(points, points, points[None])
     placements = Placements(
-        np.zeros(3), np.eye(3)[None], np.zeros((1, 3)), np.zeros(1), np.eye(3)[None, None], np.eye(3)[:1], np.zeros(1)
+        np.zeros(3), np.eye(3)[None], np.zeros((1, 3)), np.zeros((1, 1)), np.eye(3)[None, None], np.eye(3)[:1], np.eye(1)
     )
     pairs = Partners(np.zeros((1, 1, 3, 3), np.int64), points, points, points, np.ones((1, 1, 3)), np.ones(1))
     sum_terms(surfaces, placements, pairs, 1.0, 1.0, np.zeros(1), np.zeros((1, 2)), np.zeros((1, 2, 2)))

@@ -11,13 +11,18 @@ either is a sample of a surface, along which it may slide: with the surface's no
 
 where s is the distance between recorded points. So w is small inside of the surface and near one where r leads beyond its
 rim. (Chen and Medioni 1992 minimise the first part alone.)
+
+Each camera may have a clock of its own. A motion holds its V nodes once for each of the C clocks, at the times of that
+clock, one set after the other. The nodes on which a place lies therefore name its clock. A recorded point belongs to its
+camera's clock. A sampled point is compared with the points of each clock, from its place at the time of that clock. Its
+partner is the nearest of all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -81,23 +86,23 @@ class Motion:
     """B simulated motions at L frames, and how they lie in the recording."""
 
     nodes: Tensor
-    """[B, L, V, 3] of the cloth and of the bodies beside it, in the scene."""
+    """[B, L, C · V, 3] of the cloth and of the bodies beside it, for each clock, in the scene."""
     velocities: Tensor | None
-    """[B, L, V, 3], where the lag is free."""
+    """[B, L, C · V, 3], where a lag is free."""
     pose: Tensor
     """[B, d]"""
     pairs: tuple[Pairs, ...]
     """Forth; in the default measure, back too."""
 
     def shown(self, space: PoseSpace) -> Tensor:
-        """[B, L, V, 3] where the nodes are when the recording looks at them."""
+        """[B, L, C · V, 3] where the nodes are when the recording looks at them."""
         return _shown(self.nodes, self.velocities, self.pose, space)
 
     def terms(self, space: PoseSpace, rates: Tensor | None, cap: float) -> tuple[Tensor, Tensor, Tensor]:
         """Loss [B], half of its slope [B, k + d] and of its curvature [B, k + d, k + d], by k variables and the pose.
 
         Args:
-            rates: [k, B, L, V', 3] of the first V' nodes, the cloth's; None: k is 0.
+            rates: [k, B, L, C · V', 3] of the first V' nodes of each clock, the cloth's; None: k is 0.
             cap: largest distance that counts as itself.
         """
         from diffcloud.fit.curvature import Partners, Placements, Surfaces, sum_terms  # numba takes a moment to import
@@ -123,7 +128,8 @@ class Motion:
         """Assert the shapes on which the kernel, which checks no bounds, relies."""
         batch, frames = self.nodes.shape[:2]
         assert self.pose.shape == (batch, len(space.names))
-        assert "lag" not in space.names or self.velocities is not None
+        assert not space.moves_clocks or self.velocities is not None
+        assert self.nodes.shape[2] % len(space.clocks) == 0
         assert self.velocities is None or self.velocities.shape == self.nodes.shape
         assert rates is None or rates.shape[1:3] == (batch, frames)
         for one in self.pairs:
@@ -143,6 +149,17 @@ def _array(tensor: Tensor, *axes: int) -> Any:
     return tensor.detach().contiguous().numpy()
 
 
+class Recorded(NamedTuple):
+    """Q recorded points of each of L frames that look for the cloth, those of one clock after those of another."""
+
+    points: Tensor
+    """[L, Q, 3]"""
+    sure: Tensor
+    """[L, Q] how much each counts."""
+    counts: tuple[int, ...]
+    """[C] how many of them are of each clock."""
+
+
 class Matcher:
     """Finds the pairs of B motions at one pose after the other: what was found last helps to find what is next."""
 
@@ -153,17 +170,17 @@ class Matcher:
         velocities: Tensor | None,
         places: SurfacePoints,
         faces: Tensor,
-        recorded: tuple[Tensor, Tensor] | None,
+        recorded: Recorded | None,
         *,
         near: float,
     ) -> None:
         """
         Args:
             target: of L frames.
-            nodes: [B, L, V, 3]; velocities likewise, where the lag is free.
+            nodes: [B, L, C · V, 3]; velocities likewise, where a lag is free.
             places: [B, L, N] sampled on the cloth.
             faces: [F, 3] of the cloth, and of bodies beside it.
-            recorded: [L, Q, 3] points that look for the cloth, and [L, Q] how much each counts; None where none do.
+            recorded: points that look for the cloth; None where none do.
             near: what is nearer to a point hides nothing.
         """
         self._target, self._faces, self._near = target, faces, near
@@ -184,23 +201,23 @@ class Matcher:
             nodes = nodes[entries]
             places = SurfacePoints(places.nodes[entries], places.barycentric[entries])
         velocities = self._of(self._velocities, entries)
-        shown = _shown(nodes, velocities, pose, target.space)
-        points = places.of(shown)
-        moved = target.space.moved(points, pose)
+        views = _by_clock(_shown(nodes, velocities, pose, target.space), target.space)
+        points = [places.of(view) for view in views]
+        moved = [target.space.moved(one, pose) for one in points]
         if self._seen is None and target.viewpoints is not None:
-            eyes = target.space.back(target.viewpoints, pose)
-            blind = torch.stack([one.blind(moved) for one in target.lost], dim=-1) if target.lost else None
-            self._seen = seen_places(shown, self._faces, points, eyes, near=self._near, blind=blind)
+            self._seen = self._look(views, points, moved, pose)
         share, seen = 1.0 if self._recorded is None else 0.5, self._of(self._seen, entries)
         last = [self._of(found, entries) for found in self._found]
-        forth, found = pairs_forth(places, moved, target.clouds, cut=target.cut, share=share, seen=seen, guesses=last[0])
+        forth, found = pairs_forth(
+            places, moved, target.views, nodes=views[0].shape[-2], cut=target.cut, share=share, seen=seen, guesses=last[0]
+        )
         self._keep(0, found, entries)
         pairs = [forth]
         if self._recorded is not None:
             back, found = pairs_back(
-                shown,
+                views,
                 self._faces,
-                *self._recorded,
+                self._recorded,
                 forth.spacing,
                 space=target.space,
                 pose=pose,
@@ -210,6 +227,18 @@ class Matcher:
             self._keep(1, found, entries)
             pairs.append(back)
         return Motion(nodes, velocities, pose, tuple(pairs))
+
+    def _look(self, views: Sequence[Tensor], points: Sequence[Tensor], moved: Sequence[Tensor], pose: Tensor) -> Tensor:
+        """bool [B, L, N] which points [B, L, N, 3] any camera sees, each when its clock looks."""
+        target = self._target
+        assert target.viewpoints is not None
+        eyes, seen = target.space.back(target.viewpoints, pose), torch.zeros_like(points[0][..., 0], dtype=torch.bool)
+        for view, at, there, cameras in zip(views, points, moved, target.watching, strict=True):
+            if cameras:
+                lost = [target.lost[one] for one in cameras if target.lost]
+                blind = torch.stack([one.blind(there) for one in lost], dim=-1) if lost else None
+                seen |= seen_places(view, self._faces, at, eyes[:, cameras], near=self._near, blind=blind)
+        return seen
 
     def look_anew(self) -> None:
         """Forget what the cameras saw at the first pose: so far away that the steps of a search change nothing of it, but a
@@ -229,50 +258,74 @@ class Matcher:
 
 
 def _shown(nodes: Tensor, velocities: Tensor | None, pose: Tensor, space: PoseSpace) -> Tensor:
-    lag = space.lag(pose)
-    if lag is None or velocities is None:
+    if velocities is None:
         return nodes
-    return nodes + lag[:, None, None, None] * velocities
+    lags = space.lags(pose)
+    return nodes + lags.repeat_interleave(nodes.shape[2] // lags.shape[1], dim=1)[:, None, :, None] * velocities
+
+
+def _by_clock(nodes: Tensor, space: PoseSpace) -> tuple[Tensor, ...]:
+    """[C] the nodes [B, L, V, 3] of each clock, of [B, L, C · V, 3]."""
+    return nodes.chunk(len(space.clocks), dim=2)
 
 
 @torch.no_grad()
 def pairs_forth(
     places: SurfacePoints,
-    moved: Tensor,
-    clouds: Sequence[NeighbourIndex],
+    moved: Sequence[Tensor],
+    clouds: Sequence[Sequence[NeighbourIndex]],
     *,
+    nodes: int = 0,
     cut: float | None,
     share: float,
     seen: Tensor | None = None,
     guesses: Tensor | None = None,
 ) -> tuple[Pairs, Tensor]:
-    """Each place with the nearest recorded point of its frame, and the numbers of these points [B, L, N].
+    """Each place with the nearest recorded point of its frame, and the numbers of the nearest ones of each clock
+    [B, L, N, C].
 
     Args:
-        moved: [B, L, N, 3] the places in the recording's frame.
+        moved: [C] where the places are in the recording's frame when each clock looks [B, L, N, 3].
+        clouds: [C][L] what was recorded by each clock.
+        nodes: of one clock; numbers of a later one's begin after those.
         cut: places below this height do not count: the recording ends there.
         share: of all weights.
         seen: bool [B, L, N] which places a camera could see; None for all.
-        guesses: [B, L, N] points that may be near; they save time.
+        guesses: [B, L, N, C] points that may be near; they save time.
     """
-    near = [None] * len(clouds) if guesses is None else guesses.unbind(1)
-    found = [cloud.nearest_index(moved[:, frame], near[frame]) for frame, cloud in enumerate(clouds)]
-    partners = torch.stack([cloud.points[index] for cloud, index in zip(clouds, found, strict=True)], dim=1)
-    normals = torch.stack([cloud.normals[index] for cloud, index in zip(clouds, found, strict=True)], dim=1)
-    counted = torch.ones_like(moved[..., 0]) if cut is None else (moved[..., 2] >= cut).to(moved)
+    every, frames = [], len(clouds[0])
+    here, nearest = moved[0], None
+    for clock, (own, at) in enumerate(zip(clouds, moved, strict=True)):
+        near = [None] * frames if guesses is None else guesses[..., clock].unbind(1)
+        found = [cloud.nearest_index(at[:, frame], near[frame]) for frame, cloud in enumerate(own)]
+        points = torch.stack([cloud.points[index] for cloud, index in zip(own, found, strict=True)], dim=1)
+        across = torch.stack([cloud.normals[index] for cloud, index in zip(own, found, strict=True)], dim=1)
+        every.append(torch.stack(found, dim=1))
+        if clock == 0:
+            partners, normals = points, across
+            continue
+        nearest = (here - partners).square().sum(-1) if nearest is None else nearest
+        away = (at - points).square().sum(-1)
+        nearer = away < nearest
+        nearest, which = torch.where(nearer, away, nearest), nearer[..., None]
+        partners, normals, here = (
+            torch.where(which, *pair) for pair in ((points, partners), (across, normals), (at, here))
+        )
+        own_nodes = places.nodes % nodes + clock * nodes
+        places = SurfacePoints(torch.where(which, own_nodes, places.nodes), places.barycentric)
+    counted = torch.ones_like(here[..., 0]) if cut is None else (here[..., 2] >= cut).to(here)
     if seen is not None:
         counted = counted * seen
-    weights = share / len(clouds) * counted / counted.sum(-1, keepdim=True).clamp(min=1.0)
-    spacing = moved.new_tensor([cloud.spacing for cloud in clouds])
-    return Pairs(places, partners, normals, spacing, weights, share / len(clouds)), torch.stack(found, dim=1)
+    weights = share / frames * counted / counted.sum(-1, keepdim=True).clamp(min=1.0)
+    spacing = here.new_tensor([max(cloud.spacing for cloud in of_frame) for of_frame in zip(*clouds, strict=True)])
+    return Pairs(places, partners, normals, spacing, weights, share / frames), torch.stack(every, dim=-1)
 
 
 @torch.no_grad()
 def pairs_back(
-    positions: Tensor,
+    views: Sequence[Tensor],
     faces: Tensor,
-    recorded: Tensor,
-    sure: Tensor,
+    recorded: Recorded,
     spacing: Tensor,
     *,
     space: PoseSpace,
@@ -283,18 +336,23 @@ def pairs_back(
     """Each recorded point with the nearest place on the surface, and the numbers of the faces there [B, L, Q].
 
     Args:
-        positions: [B, L, V, 3] nodes of the surface.
+        views: [C] nodes of the surface when each clock looks [B, L, V, 3].
         faces: [F, 3] of the cloth, and of bodies beside it.
-        recorded: [L, Q, 3].
-        sure: [L, Q] how much each counts.
         pose: [B, d]
         guesses: [B, L, Q] faces that may be near; they save time.
     """
-    places, found = nearest_places(positions, faces, space.back(recorded, pose), guesses)
-    weights = share * sure / sure.sum(-1, keepdim=True) / len(recorded)
-    batch = len(positions)
-    shares = weights.expand(batch, -1, -1)
-    return Pairs(places, recorded.expand(batch, -1, -1, -1), None, spacing, shares, share / len(recorded)), found
+    points, sure, counts = recorded
+    queries = space.back(points, pose).split(counts, dim=2)
+    near = [None] * len(counts) if guesses is None else guesses.split(counts, dim=2)
+    every = [nearest_places(view, faces, query, guess) for view, query, guess in zip(views, queries, near, strict=True)]
+    nodes = [places.nodes + clock * views[0].shape[2] for clock, (places, _) in enumerate(every)]
+    places = SurfacePoints(torch.cat(nodes, dim=2), torch.cat([places.barycentric for places, _ in every], dim=2))
+    weights = share * sure / sure.sum(-1, keepdim=True) / len(points)
+    batch = len(views[0])
+    pairs = Pairs(
+        places, points.expand(batch, -1, -1, -1), None, spacing, weights.expand(batch, -1, -1), share / len(points)
+    )
+    return pairs, torch.cat([found for _, found in every], dim=2)
 
 
 def nearest_places(

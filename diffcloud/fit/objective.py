@@ -24,8 +24,8 @@ from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.alignment import aligned
 from diffcloud.fit.inputs import Inputs
-from diffcloud.fit.matching import Matcher, Motion, Pairs
-from diffcloud.fit.pose import PoseSpace, default_priors
+from diffcloud.fit.matching import Matcher, Motion, Pairs, Recorded
+from diffcloud.fit.pose import PoseSpace, clocks_of, default_priors, priors_by_clock
 from diffcloud.fit.targets import read_target
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
@@ -73,7 +73,7 @@ class Objective:
         Args:
             paper: the published measure.
             nuisance: free variables of the pose, with the standard deviations of their priors [m, rad, s]; by default
-                the episode's `default_priors`, in the paper's measure none.
+                the episode's `default_priors`, in the paper's measure none. `lag` is that of every camera's clock.
             frames: to compare; negative ones count from the end. By default every usable one, unless the scenario names
                 some.
             points: sampled per frame; by default the scenario's, which all frames share in the default measure.
@@ -88,7 +88,7 @@ class Objective:
         self.system, _ = scenario.scene.build()
         if nuisance is None:
             nuisance = {} if paper else default_priors(episode)
-        self.nuisance = dict(nuisance)
+        self.nuisance = dict(nuisance) if paper else priors_by_clock(nuisance, clocks_of(episode))
         if paper and self.nuisance:
             raise ConfigError(f"The paper's measure knows no pose; leave out the nuisance {', '.join(self.nuisance)}.")
         self._unit = scenario.length_unit_m
@@ -284,17 +284,24 @@ class Objective:
 
     def match(self, run: Rollout, *, pose: Tensor | None = None) -> Motion:
         """A rollout beside an episode, at its pose or at poses [B, d]."""
-        times = self.times
-        nodes = self.with_bodies(run.at(times))
-        velocities = None
-        if "lag" in self.pose_space.names:
-            before, after = ((times + way * float(run.times[1])).clamp(0.0, float(run.times[-1])) for way in (-1, 1))
-            moved = self.with_bodies(run.at(after)) - self.with_bodies(run.at(before))
-            velocities = moved / (after - before)[:, None, None]
-        return self.matched(nodes, velocities, pose)
+        velocities = self.still_bodies(self._velocities(run)) if self.pose_space.moves_clocks else None
+        return self.matched(self.with_bodies(self.looked_at(run)), velocities, pose)
+
+    def looked_at(self, run: Rollout) -> Tensor:
+        """[B, L, C · V', 3] a rollout's nodes at the compared frames, at the offset of each of the C clocks: those of one
+        clock after those of another."""
+        return torch.cat([run.at(self.times + offset) for offset in self.pose_space.clocks.values()], dim=-2)
+
+    def _velocities(self, run: Rollout) -> Tensor:
+        """[B, L, C · V', 3] of the same nodes: differences over a step to both sides, zero before the start."""
+        step, last, found = float(run.times[1]), float(run.times[-1]), []
+        for offset in self.pose_space.clocks.values():
+            before, after = ((self.times + offset + way * step).clamp(0.0, last) for way in (-1, 1))
+            found.append((run.at(after) - run.at(before)) / (after - before).clamp(min=1e-9)[:, None, None])
+        return torch.cat(found, dim=-2)
 
     def matched(self, nodes: Tensor, velocities: Tensor | None, pose: Tensor | None) -> Motion:
-        """The same of nodes and velocities [B, L, V, 3] at the compared frames, those of bodies among them."""
+        """The same of nodes and velocities [B, L, C · V, 3] at the compared frames, those of bodies among them."""
         with torch.no_grad():
             still = nodes.detach(), None if velocities is None else velocities.detach()
             if pose is None and self.pose_space.names:
@@ -323,14 +330,18 @@ class Objective:
         if self._first is None:
             self._first = torch.zeros(1, len(self.pose_space.names), dtype=torch.float64)
             with suppress(DivergedError):  # then steps begin at zero, whatever the parameters
-                nodes = self.with_bodies(self.simulate_to_loss({}).at(self.times))
+                run = self.simulate_to_loss({})
+                nodes = self.with_bodies(self.looked_at(run))
                 self._first, _ = self._follow(nodes, torch.zeros_like(nodes), self._first, _FIRST_CAPS)
+                if len(self.pose_space.clocks) > 1 and self.pose_space.moves_clocks:  # may be far off their offsets
+                    velocities = self.still_bodies(self._velocities(run))
+                    self._first, _ = self._follow(nodes, velocities, self._first, _CAPS)
         return self._first
 
     def _follow(
         self, nodes: Tensor, velocities: Tensor | None, start: Tensor, caps: Sequence[float]
     ) -> tuple[Tensor, Matcher]:
-        """[B, d] poses of lowest loss of nodes [B, L, V, 3], from a start on, on a few frames and then on all; and what
+        """[B, d] poses of lowest loss of nodes [B, L, C · V, 3], from a start on, on a few frames and then on all; and what
         matches all of them there."""
         space, every = self.pose_space, range(nodes.shape[1])
         few = np.unique(np.linspace(0, len(every) - 1, _FEW).round().astype(int)).tolist()
@@ -348,16 +359,16 @@ class Objective:
         return pose, matcher
 
     def _matcher(self, nodes: Tensor, velocities: Tensor | None, frames: Sequence[int]) -> Matcher:
-        """Of motions [B, L, V, 3] at some of the compared frames."""
-        chosen = list(frames)
+        """Of motions [B, L, C · V, 3] at some of the compared frames."""
+        chosen, clocks = list(frames), len(self.pose_space.clocks)
         still, moving = nodes[:, chosen], None if velocities is None else velocities[:, chosen]
         return Matcher(
             self._target.at(chosen),
             still,
             moving,
-            self.sampler.draw(still),
+            self.sampler.draw(still[:, :, : still.shape[2] // clocks]),
             self._faces,
-            None if self.paper else (self._recorded[0][chosen], self._recorded[1][chosen]),
+            None if self.paper else self._recorded_in(chosen),
             near=_NEAR_M / self._unit,
         )
 
@@ -365,7 +376,7 @@ class Objective:
         """Loss [B], half of its slope [B, k + d] and curvature [B, k + d, k + d], without the prior of the pose.
 
         Args:
-            rates: [k, B, L, V, 3] of the cloth's nodes by k variables; None for none.
+            rates: [k, B, L, C · V', 3] of the cloth's nodes by k variables; None for none.
             factor: of the cap.
         """
         return motion.terms(self.pose_space, rates, self.cap * factor)
@@ -378,14 +389,15 @@ class Objective:
         """
         space = self._target.space
         here = motion.shown(space)
-        rates = torch.nn.functional.pad(rates, (0, 0, 0, here.shape[-2] - rates.shape[-2]))  # bodies stand still
-        moved, every = [], []
+        rates, moved, every = self.still_bodies(rates), [], []
+        nodes = here.shape[-2] // len(space.clocks)
         for pairs in motion.pairs:
+            clock = pairs.places.nodes[..., 0] // nodes
             points = pairs.places.of(here)
             velocities = None if motion.velocities is None else pairs.places.of(motion.velocities)
             own = [space.carried(pairs.places.of(rate), motion.pose) for rate in rates]
             moved.append(space.moved(points, motion.pose))
-            every.append(torch.cat([torch.stack(own), space.rates(points, motion.pose, velocities)]))
+            every.append(torch.cat([torch.stack(own), space.rates(points, motion.pose, velocities, clock)]))
         return moved, every
 
     def freed(self, nuisance: Mapping[str, float]) -> Objective:
@@ -396,7 +408,8 @@ class Objective:
         """
         other = copy(self)
         target = self._target
-        space = PoseSpace.build(nuisance, target.space.centre, length_unit_m=self.length_unit_m)
+        centre, clocks = target.space.centre, target.space.clocks
+        space = PoseSpace.build(nuisance, centre, length_unit_m=self.length_unit_m, clocks=clocks)
         other.nuisance, other._target, other._first = dict(nuisance), replace(target, space=space), None
         other.loss_steps = other._steps_to_loss()
         return other
@@ -408,8 +421,7 @@ class Objective:
         chosen = sorted(self.times.argsort(stable=True)[:kept].tolist())
         other._target = self._target.at(chosen)
         if not self.paper:
-            points, sure = self._recorded
-            other._recorded = points[chosen], sure[chosen]
+            other._recorded = self._recorded_in(chosen)
         other.loss_steps = other._steps_to_loss()
         return other
 
@@ -424,25 +436,50 @@ class Objective:
         return other
 
     def with_bodies(self, positions: Tensor) -> Tensor:
-        """[..., V, 3] nodes of the cloth -> with those of the bodies beside it, in the default measure."""
-        if self.paper or not len(self._bodies):
-            return positions
-        return torch.cat([positions, self._bodies.expand(*positions.shape[:-2], -1, -1)], dim=-2)
+        """[..., C · V', 3] nodes of the cloth -> with those of the bodies beside it, in the default measure."""
+        return self._beside(positions, self._bodies)
+
+    def still_bodies(self, rates: Tensor) -> Tensor:
+        """[..., C · V', 3] derivatives of the cloth's nodes -> with those of the bodies, which stand still."""
+        return self._beside(rates, torch.zeros_like(self._bodies))
+
+    def _beside(self, cloth: Tensor, bodies: Tensor) -> Tensor:
+        if self.paper or not len(bodies):
+            return cloth
+        views = cloth.unflatten(-2, (len(self.pose_space.clocks), -1))
+        return torch.cat([views, bodies.expand(*views.shape[:-2], -1, -1)], dim=-2).flatten(-3, -2)
+
+    def _recorded_in(self, chosen: list[int]) -> Recorded:
+        points, sure, counts = self._recorded
+        return Recorded(points[chosen], sure[chosen], counts)
 
     def _steps_to_loss(self) -> int:
-        last = float(self._target.times.max())
-        steps = int(np.ceil(last / self.system.time_step - 1e-6)) + ("lag" in self.nuisance)  # a velocity has two sides
-        return min(steps, self.scenario.steps)
+        space = self._target.space
+        last = float(self._target.times.max()) + max(space.clocks.values())
+        steps = int(np.ceil(last / self.system.time_step - 1e-6)) + space.moves_clocks  # a velocity has two sides
+        return min(max(steps, 1), self.scenario.steps)
 
     def _moved(self, motion: Motion, pairs: Pairs) -> Tensor:
         space = self._target.space
         return space.moved(pairs.places.of(motion.shown(space)), motion.pose)
 
-    def _drawn(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """[L, Q, 3] recorded points that look for the cloth, as many as there are sampled ones, and [L, Q] how sure."""
+    def _drawn(self, generator: torch.Generator) -> Recorded:
+        """Recorded points that look for the cloth, as many as there are sampled ones, at least one of each clock: in every
+        frame the same number of a clock, which count as much as their share of the frame's points."""
+        target = self._target
+        every = np.array([[len(of) if of.any() else 0 for of in sure] for sure in target.sure])  # [C, L]
+        counts = np.maximum(np.floor(self.point_count * every.sum(1) / every.sum()).astype(int), 1)
+        counts[0] = max(self.point_count - counts[1:].sum(), 1)
+        shares = every / every.sum(0) / (counts / counts.sum())[:, None]
         points, sure = [], []
-        for cloud, weight in zip(self._target.clouds, self._target.sure, strict=True):
-            index = torch.randint(len(cloud.points), (self.point_count,), generator=generator)
-            points.append(cloud.points[index])
-            sure.append(weight[index])
-        return torch.stack(points), torch.stack(sure)
+        for frame, whole in enumerate(target.clouds):
+            for clock, count in enumerate(counts):
+                cloud = target.views[clock][frame] if every[clock, frame] else whole  # whose points do not count here
+                index = torch.randint(len(cloud.points), (int(count),), generator=generator)
+                points.append(cloud.points[index])
+                weights = target.sure[clock][frame] if every[clock, frame] else torch.zeros(len(whole.points)).double()
+                sure.append(shares[clock, frame] * weights[index])
+        frames = len(target.clouds)
+        return Recorded(
+            torch.cat(points).unflatten(0, (frames, -1)), torch.cat(sure).unflatten(0, (frames, -1)), tuple(counts.tolist())
+        )

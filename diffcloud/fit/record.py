@@ -38,7 +38,7 @@ class NuisanceValue(_Model):
 
     value: Pose
     prior: Annotated[float, Field(gt=0, le=1e3)]
-    """Standard deviation of its prior about zero."""
+    """Standard deviation of its prior, about the offset of a clock (`RecordingFit.clocks`), or about zero."""
     unit: Literal["m", "rad", "s", "1"]
     """Of both."""
     of: Literal["pose", "cloth"] = "pose"
@@ -77,6 +77,8 @@ class RecordingFit(_Model):
     """How the recording lies."""
     centre: tuple[Pose, Pose, Pose]
     """[3] of the recording, about which the scene is turned [length unit]."""
+    clocks: dict[str, Pose] = Field(default_factory=lambda: {"lag": 0.0}, min_length=1)
+    """Variable of the lag of each clock, in `nuisance` where it is free -> offset [s] that the recording states."""
     left_out: LeftOut | None = None
     """In a joint fit of several recordings."""
 

@@ -164,7 +164,7 @@ class Moved:
 
     run: Rollout
     rates: Tensor
-    """[k, B, L, V, 3] of their nodes at the compared frames."""
+    """[k, B, L, C · V, 3] of their nodes at the compared frames, as `Objective.looked_at` has them."""
     beside: Rollout | None
     """The [2 · k · B] motions that these are differences of."""
 
@@ -185,8 +185,7 @@ def _by_tangents(objective: Objective, space: FitSpace, places: Tensor) -> Moved
 
     rates = [torch.cat(parts) for parts in zip(*_along(inputs, places, _ways(places)), strict=True)]
     run, moves = given(places).rollout_tangents(rates)
-    times = objective.times
-    return Moved(run, torch.stack([replace(run, positions=move).at(times) for move in moves]), None)
+    return Moved(run, torch.stack([objective.looked_at(replace(run, positions=move)) for move in moves]), None)
 
 
 def _by_differences(objective: Objective, space: FitSpace, places: Tensor) -> Moved:
@@ -206,7 +205,7 @@ def _by_differences(objective: Objective, space: FitSpace, places: Tensor) -> Mo
         replace(run, positions=run.positions[part], velocities=run.velocities[part])
         for part in (slice(count), slice(count, None))
     )
-    there = beside.at(objective.times).unflatten(0, (2, -1, count))
+    there = objective.looked_at(beside).unflatten(0, (2, -1, count))
     width = (above - below).sum(-1)  # halved at a bound
     return Moved(here, (there[0] - there[1]) / width[..., None, None, None], beside)
 

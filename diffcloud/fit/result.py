@@ -216,6 +216,7 @@ def describe_recording(objective: Objective, run: Rollout, name: str) -> Recordi
         cut_m=None if cut is None else cut * unit,
         nuisance=space.described(motion.pose[0], length_unit_m=unit),
         centre=cast(tuple[float, float, float], tuple(space.centre.tolist())),
+        clocks=dict(space.clocks),
     )
 
 
@@ -223,7 +224,7 @@ def recorded_pose(recording: RecordingFit, *, length_unit_m: float) -> tuple[Pos
     """The pose that a fit found for a recording, and its values [1, d]."""
     priors = {name: entry.prior for name, entry in recording.nuisance.items() if entry.of == "pose"}
     centre = torch.tensor(recording.centre, dtype=torch.float64)
-    space = PoseSpace.build(priors, centre, length_unit_m=length_unit_m)
+    space = PoseSpace.build(priors, centre, length_unit_m=length_unit_m, clocks=recording.clocks)
     return space, space.of(recording.nuisance, length_unit_m=length_unit_m)[None]
 
 

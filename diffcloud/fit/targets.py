@@ -12,7 +12,7 @@ from torch import Tensor
 
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.errors import EpisodeError
-from diffcloud.fit.pose import PoseSpace
+from diffcloud.fit.pose import ONE_CLOCK, PoseSpace, clocks_of
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import rollout
@@ -27,6 +27,7 @@ _USABLE, _NEARLY, _TOO_LITTLE = 0.5, 0.8, 0.05
 what is too little in any case."""
 _MOST = 30
 """Usable frames that are compared where none are named: neighbours in a quick recording say nearly the same."""
+_OUT_OF_REACH = 1e9
 _UNSURE_M = 0.005
 """A recorded point whose depth is so uncertain counts half."""
 
@@ -65,14 +66,19 @@ class Target:
     times: Tensor
     """[L] [s]"""
     clouds: tuple[NeighbourIndex, ...]
-    sure: tuple[Tensor, ...]
-    """How much each recorded point counts."""
+    """[L] of all cameras."""
+    views: tuple[tuple[NeighbourIndex, ...], ...]
+    """[C][L] what was recorded by each clock of `space`; where that is nothing, a point out of reach."""
+    sure: tuple[tuple[Tensor, ...], ...]
+    """[C][L] how much each of its points counts; nothing where it recorded nothing."""
     cut: float | None
     """Height below which nothing was recorded."""
     viewpoints: Tensor | None
-    """[C, 3] of the cameras, in the recording's frame; None where they are not known."""
+    """[cameras, 3], in the recording's frame; None where they are not known."""
     lost: tuple[LostPixels, ...]
-    """[C] what these cameras lost; empty where that is not known."""
+    """What each of these cameras lost; empty where that is not known."""
+    watching: tuple[list[int], ...]
+    """[C] which of these cameras go by each clock."""
     space: PoseSpace
     track: Tensor | None
     """[1, S, G, 3] displacement of the grippers."""
@@ -80,7 +86,16 @@ class Target:
     @cached_property
     def noise_loss(self) -> float:
         """What noise and spacing of the points leave of the default loss [squared length unit]."""
-        return float(np.mean([cloud.from_surface for cloud in self.clouds]))
+        if len(self.views) == 1:
+            return float(np.mean([cloud.from_surface for cloud in self.clouds]))
+        left, points = [], []
+        for view in self.views:
+            for cloud, whole in zip(view, self.clouds, strict=True):
+                to_point, to_surface = cloud.from_surface
+                denser = (whole.spacing / cloud.spacing) ** 2 if cloud.spacing > 0 else 1.0  # another camera's points
+                left.append((to_point * min(denser, 1.0) + to_surface) / 2)
+                points.append(len(cloud.points))
+        return float(np.average(left, weights=points))
 
     def at(self, chosen: Sequence[int]) -> Target:
         """The same with some of its frames, by their places among these."""
@@ -92,7 +107,8 @@ class Target:
             frames=tuple(self.frames[one] for one in chosen),
             times=self.times[index],
             clouds=tuple(self.clouds[one] for one in chosen),
-            sure=tuple(self.sure[one] for one in chosen),
+            views=tuple(tuple(view[one] for one in chosen) for view in self.views),
+            sure=tuple(tuple(sure[one] for one in chosen) for sure in self.sure),
             lost=tuple(replace(one, pixels=one.pixels[index]) for one in self.lost),
         )
 
@@ -110,38 +126,74 @@ def read_target(
     Args:
         named: frames to compare, negative ones counted from the end; None for every usable one.
         whole: whether all of a recording counts; else it is looked for a height below which nothing was recorded, and for
-            where the cameras stood.
+            where the cameras stood and when they looked.
         nuisance: variables of the pose with the deviations of their priors [m, rad, s].
 
     Raises:
         EpisodeError: a frame that the episode lacks, one after the end of the simulation, none that is usable, other
-            grippers than the scene's, or viewpoints that are no positions.
+            grippers than the scene's, viewpoints that are no positions, or clocks of other cameras.
         ConfigError: an unknown variable of the pose.
     """
     unit = scenario.length_unit_m
+    clocks = ONE_CLOCK if whole else clocks_of(episode)
     track = None
     if episode.gripper is not None:
         moved = track_displacement(episode, system.handles.grippers, scenario.steps, system.time_step)
         track = torch.as_tensor(moved, dtype=torch.float64)[None]
     height = None if whole else _found_cut(system, episode, unit)
     frames = (
-        _spread(_usable(scenario, system, episode, track, height))
+        _spread(_usable(scenario, system, episode, track, height, max(clocks.values())))
         if named is None
         else list(dict.fromkeys(_checked(scenario, episode, frame) for frame in named))
     )
     clouds = tuple(NeighbourIndex(torch.as_tensor(episode.frame(frame), dtype=torch.float64)) for frame in frames)
+    views, sure = [clouds], [tuple(_sure(episode, frame) for frame in frames)]
+    watching = [[] if whole else list(range(len(episode.viewpoints)))]
+    if clocks is not ONE_CLOCK:
+        views, sure = map(list, zip(*(_of_camera(episode, frames, camera) for camera in range(len(clocks))), strict=True))
+        watching = _watching(episode)
     centre = torch.as_tensor(episode.points.mean(0, dtype=np.float64))  # of all frames, so that a pose holds for others too
     return Target(
         tuple(frames),
         torch.as_tensor(episode.times[frames], dtype=torch.float64),
         clouds,
-        tuple(_sure(episode, frame) for frame in frames),
+        tuple(views),
+        tuple(sure),
         height,
         None if whole or not episode.viewpoints else torch.from_numpy(np.stack(list(episode.viewpoints.values()))),
         () if whole else _lost(episode, frames),
-        PoseSpace.build(nuisance, centre, length_unit_m=unit),
+        tuple(watching),
+        PoseSpace.build(nuisance, centre, length_unit_m=unit, clocks=clocks),
         track,
     )
+
+
+def _of_camera(
+    episode: Episode, frames: Sequence[int], camera: int
+) -> tuple[tuple[NeighbourIndex, ...], tuple[Tensor, ...]]:
+    """What one camera recorded in each frame, and how much each of its points counts."""
+    assert episode.camera is not None
+    views, sure = [], []
+    for frame in frames:
+        own = episode.camera[episode.offsets[frame] : episode.offsets[frame + 1]] == camera
+        points = torch.as_tensor(episode.frame(frame)[own], dtype=torch.float64)
+        views.append(NeighbourIndex(points if len(points) else torch.full((1, 3), _OUT_OF_REACH, dtype=torch.float64)))
+        sure.append(_sure(episode, frame)[own] if len(points) else torch.zeros(1, dtype=torch.float64))
+    return tuple(views), tuple(sure)
+
+
+def _watching(episode: Episode) -> list[list[int]]:
+    """
+    Raises:
+        EpisodeError: a camera whose place is known, but whose clock is not, or the reverse.
+    """
+    standing = list(episode.viewpoints)
+    if standing and set(standing) != set(episode.clocks):
+        raise EpisodeError(
+            f"The episode's meta has viewpoints of {', '.join(standing)} and, with `clocks`, the cameras "
+            f"{', '.join(episode.clocks)}; both must name the same cameras."
+        )
+    return [[standing.index(camera)] if standing else [] for camera in episode.clocks]
 
 
 def _lost(episode: Episode, frames: Sequence[int]) -> tuple[LostPixels, ...]:
@@ -194,9 +246,15 @@ def _checked(scenario: Scenario, episode: Episode, frame: int) -> int:
     return frame % episode.frame_count
 
 
-def _usable(scenario: Scenario, system: System, episode: Episode, track: Tensor | None, cut: float | None) -> list[int]:
-    """Frames after the start, within the simulation, with enough of the cloth of the basis above the cut."""
-    end = _end(scenario)
+def _usable(
+    scenario: Scenario, system: System, episode: Episode, track: Tensor | None, cut: float | None, late: float
+) -> list[int]:
+    """Frames after the start, within the simulation, with enough of the cloth of the basis above the cut.
+
+    Args:
+        late: largest offset of a clock [s].
+    """
+    end = _end(scenario) - max(late, 0.0)
     frames = [index for index, time in enumerate(episode.times) if 0 < time <= end]
     if cut is not None and frames:
         with torch.no_grad():

@@ -43,7 +43,7 @@ from diffcloud.fit.matching import Motion
 from diffcloud.fit.names import of_recording
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
-from diffcloud.fit.pose import NUISANCE, TRIED, set_up_of, unit_of
+from diffcloud.fit.pose import NUISANCE, TRIED, kind_of, priors_by_clock, set_up_of, unit_of
 from diffcloud.fit.residuals import Axis, moved_by
 from diffcloud.fit.targets import track_displacement
 from diffcloud.scene.scenarios import Scenario
@@ -229,15 +229,15 @@ class _Part:
         run, rates = moved.run, moved.rates
         refined = _refined(objective, space.parameters(Axis.of(space).values(places)), run)
         fitted_pose = objective.match(run).pose[0]
-        set_up = set_up_of(objective.episode)
+        set_up = priors_by_clock(set_up_of(objective.episode), objective.pose_space.clocks)
         free = objective.freed({**set_up, **objective.nuisance})
         pose_names = free.pose_space.names
         values = free.pose_space.of(objective.pose_space.described(fitted_pose, length_unit_m=1.0), length_unit_m=1.0)
         motion = free.match(run, pose=values[None])
         # what is tried, to both sides: variables move nodes, pose variables the pose
         ways = torch.cat([rates * _STEP, refined[None]])[:, 0]
-        ways = torch.nn.functional.pad(ways, (0, 0, 0, motion.nodes.shape[-2] - ways.shape[-2]))
-        small = torch.tensor([TRIED[name] / unit_of(name, objective.length_unit_m) for name in pose_names])
+        ways = free.still_bodies(ways)
+        small = torch.tensor([TRIED[kind_of(name)] / unit_of(name, objective.length_unit_m) for name in pose_names])
         still = torch.zeros(len(pose_names), *ways.shape[1:], dtype=torch.float64)
         ways, turns = torch.cat([ways, still]), torch.cat([torch.zeros(k + 1, len(pose_names)), small.diag()]).double()
         both = torch.cat([torch.zeros_like(ways[:1]), ways, -ways])
@@ -256,9 +256,9 @@ class _Part:
         if len(felt) > k:
             onto[:, k:] = -np.linalg.solve(curved[k:, k:], curved[k:, :k]).T
         found = {
-            name: onto @ change[index, felt] * (set_up[name] / TRIED[name] if name in set_up else 1.0)
+            name: onto @ change[index, felt] * (set_up[name] / TRIED[kind_of(name)] if name in set_up else 1.0)
             for index, name in enumerate(names)
-            if index not in own and not (name in NUISANCE and objective.paper)
+            if index not in own and not (kind_of(name) in NUISANCE and objective.paper)
         }
         for index, name in enumerate(objective.pose_space.names, k):  # what a prior about another centre would add
             found[name] = onto[:, index] * prior[index] * float(objective.pose_space.deviations[index - k])
@@ -288,7 +288,7 @@ def _slopes(
     curvature [k + d, k + d] at the first.
 
     Args:
-        rates: [k, 1, L, V, 3] of the nodes, the same for all motions.
+        rates: [k, 1, L, C · V, 3] of the nodes, the same for all motions.
     """
     slopes, first = [], None
     for begin in range(0, len(nodes), _CHUNK):
@@ -314,15 +314,16 @@ def _between(measured: NDArray[np.float64], normal: NDArray[np.float64]) -> NDAr
 
 
 def _refined(objective: Objective, parameters: Mapping[str, Tensor], run: Rollout) -> Tensor:
-    """[1, L, V, 3] from the motion to that with finer steps, at the compared frames; zero for the paper's measure, which
-    takes the published step as it is."""
+    """[1, L, C · V, 3] from the motion to that with finer steps, at the compared frames; zero for the paper's measure,
+    which takes the published step as it is."""
     if objective.paper:
-        return torch.zeros_like(run.at(objective.times))
+        return torch.zeros_like(objective.looked_at(run))
     return _way_to(finer_steps(objective.scenario), objective, parameters, run)
 
 
 def _way_to(finer: Scenario, objective: Objective, parameters: Mapping[str, Tensor], run: Rollout) -> Tensor:
-    """[1, L, V, 3] from a motion to that of a finer variant of its scenario, at its own nodes and the compared frames."""
+    """[1, L, C · V, 3] from a motion to that of a finer variant of its scenario, at its own nodes in the compared
+    frames."""
     system, _ = finer.scene.build()
     steps = objective.loss_steps * finer.scene.frame_steps // objective.scenario.scene.frame_steps
     track = None
@@ -330,8 +331,9 @@ def _way_to(finer: Scenario, objective: Objective, parameters: Mapping[str, Tens
         moved = track_displacement(objective.episode, system.handles.grippers, steps, system.time_step)
         track = torch.as_tensor(moved)[None]
     fine = Inputs.of(finer, system, steps, parameters, track).rollout()
-    own = run.at(objective.times)
-    return fine.at(objective.times)[..., : own.shape[-2], :] - own
+    own, views = objective.looked_at(run), (len(objective.pose_space.clocks), -1)
+    found = objective.looked_at(fine).unflatten(-2, views)[..., : run.positions.shape[-2], :]
+    return found.flatten(-3, -2) - own
 
 
 def _times(objective: Objective, loss: float, scores: NDArray[np.float64]) -> float:
@@ -346,8 +348,9 @@ def _times(objective: Objective, loss: float, scores: NDArray[np.float64]) -> fl
 def _clustered(objective: Objective, motion: Motion, rates: Tensor) -> NDArray[np.float64]:
     """[C, n] sums of what pairs add to the slope over each cluster."""
     patch = torch.from_numpy(patches(objective.system.mesh.nodes, _PATCHES))
-    bodies = motion.nodes.shape[-2] - len(patch)
-    patch = torch.cat([patch, torch.full((bodies,), _PATCHES)])
+    clocks = len(objective.pose_space.clocks)
+    bodies = motion.nodes.shape[-2] // clocks - len(patch)
+    patch = torch.cat([patch, torch.full((bodies,), _PATCHES)]).repeat(clocks)
     sums = None
     for pairs, moved, columns in zip(motion.pairs, *objective.columns(motion, rates), strict=True):
         scores = pairs.scores(moved, columns, objective.cap)[:, 0]  # [n, L, N]

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,8 @@ _FARTHEST = 1e6
 _MOST_PIXELS = 2**26
 _MOST_SIZES, _SMALLEST = 10.0, 0.5
 """How far a gripper may be from the middle of the clouds, in their size, which counts as this much at least [m]."""
+_LATEST = 1e3
+"""[s] Of the offset of a clock, and of its deviation."""
 _FASTEST = 100.0
 """[m/s] Of a gripper; far more than an arm reaches, also where the scene's unit is a decimetre."""
 
@@ -67,6 +69,14 @@ class Pinhole:
         """As an episode's meta has it."""
         pose = self.T_camera_scene.tolist()
         return {"size": [self.width, self.height], "focal": self.focal, "centre": self.centre, "T_camera_scene": pose}
+
+
+class Clock(NamedTuple):
+    """How late a camera stamps what it sees: a point stamped t shows the motion at t + offset."""
+
+    offset_s: float
+    sigma_s: float
+    """Standard deviation of it; zero of the camera to whose clock the offsets of the others refer."""
 
 
 @dataclass(frozen=True)
@@ -208,6 +218,36 @@ class Episode:
         return float(told)
 
     @property
+    def clocks(self) -> dict[str, Clock]:
+        """Camera -> its clock, in the order in which `camera` numbers them; empty where the meta states none. Cameras that
+        its `clocks` leave out have no offset.
+
+        Raises:
+            EpisodeError: the meta's `clocks` are no offsets of its `cameras`, or points do not name their camera.
+        """
+        told = self.meta.get("clocks")
+        if not told:
+            return {}
+        cameras = self.meta.get("cameras")
+        if not (isinstance(cameras, list) and cameras and all(isinstance(name, str) for name in cameras)):
+            raise EpisodeError(
+                f"The episode's meta has clocks, and its cameras are {cameras!r}. Clocks need the list of the cameras' "
+                "names, in the order in which points number them. Add `cameras`, or remove `clocks`."
+            )
+        if not (isinstance(told, Mapping) and set(told) <= set(cameras) and all(map(_is_clock, told.values()))):
+            raise EpisodeError(
+                f"clocks in an episode's meta are {told!r}. They may hold, for each of the cameras {', '.join(cameras)}, "
+                "offset_s and sigma_s in seconds, sigma_s not negative. Correct them, or remove `clocks`."
+            )
+        if self.camera is None or int(self.camera.max()) >= len(cameras):
+            raise EpisodeError(
+                "The episode's meta has the clocks of its cameras, but some points name none of them. With `clocks`, every "
+                "point names one of the cameras. Give each point its `camera`, or remove `clocks`."
+            )
+        nothing = {"offset_s": 0.0, "sigma_s": 0.0}
+        return {name: Clock(*(float(told.get(name, nothing)[key]) for key in Clock._fields)) for name in cameras}
+
+    @property
     def scale_sigma(self) -> float | None:
         """By what fraction distances in the clouds may be off, one standard deviation; None where the meta does not say.
 
@@ -281,6 +321,14 @@ class Episode:
             grippers=grippers,
             meta=dict(meta or {}),
         )
+
+
+def _is_clock(told: object) -> bool:
+    if not (isinstance(told, Mapping) and set(told) == set(Clock._fields)):
+        return False
+    if any(isinstance(one, bool) or not isinstance(one, int | float) for one in told.values()):
+        return False
+    return abs(told["offset_s"]) < _LATEST and 0 <= told["sigma_s"] < _LATEST
 
 
 def write_episode(path: Path, episode: Episode) -> None:

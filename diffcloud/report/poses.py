@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from diffcloud.fit.laid import asked_as
-from diffcloud.fit.record import FitRecord, NuisanceValue, RecordingFit
+from diffcloud.fit.record import FitRecord, RecordingFit
 from diffcloud.report.tables import UNKNOWN, Cell, Table, number, part, table
 
 _SHOWN = {"m": (1e3, "mm", 1), "rad": (180 / math.pi, "°", 1), "s": (1e3, "ms", 1), "1": (1e2, "%", 1)}
 """Unit -> factor, unit shown, digits."""
 _WIDE = 2.0
-"""A value so many of its prior's deviations off zero is pointed out."""
+"""A value so many of its prior's deviations off the centre of that is pointed out."""
 
 
 def poses_table(fits: Sequence[tuple[str, FitRecord]]) -> Table:
@@ -54,7 +54,7 @@ def _row(name: str, recording: RecordingFit, variables: Sequence[str]) -> list[C
         Cell(f"{len(frames)}", sort=len(frames), note=f"{frames[0]} to {frames[-1]}"),
         part(float(np.mean(recording.counted))),
         number(recording.cut_m, 0, factor=1e3),
-        *(_pose_cell([one for own, one in recording.nuisance.items() if asked_as(own) == key]) for key in variables),
+        *(_pose_cell(recording, [own for own in recording.nuisance if asked_as(own) == key]) for key in variables),
     ]
 
 
@@ -63,11 +63,13 @@ def _left_out_cell(recording: RecordingFit) -> Cell:
     return UNKNOWN if recording.left_out is None else number(recording.left_out.rms_mm, 1)
 
 
-def _pose_cell(entries: Sequence[NuisanceValue]) -> Cell:
+def _pose_cell(recording: RecordingFit, names: Sequence[str]) -> Cell:
     """Of one variable, or the RMS of several that were asked for as one."""
+    entries = [recording.nuisance[name] for name in names]
     if not entries:
         return UNKNOWN
     factor, _, digits = _SHOWN[entries[0].unit]
-    far = any(abs(entry.value) > _WIDE * entry.prior for entry in entries)
+    off = [entry.value - recording.clocks.get(name, 0.0) for name, entry in zip(names, entries, strict=True)]
+    far = any(abs(one) > _WIDE * entry.prior for one, entry in zip(off, entries, strict=True))
     value = entries[0].value if len(entries) == 1 else math.hypot(*(entry.value for entry in entries)) / len(entries) ** 0.5
     return number(value, digits, factor=factor, note="beyond its prior" if far else "")

@@ -85,14 +85,14 @@ class TestForth:
     def test_below_the_cut_nothing_counts(self, generator):
         moved = torch.rand(2, 1, 40, 3, generator=generator, dtype=torch.float64)
         clouds = [NeighbourIndex(torch.rand(30, 3, generator=generator, dtype=torch.float64))]
-        pairs, _ = pairs_forth(at_points(moved), moved, clouds, cut=0.4, share=1.0)
+        pairs, _ = pairs_forth(at_points(moved), [moved], [clouds], cut=0.4, share=1.0)
         assert torch.equal(pairs.weights > 0, moved[..., 2] >= 0.4)
         torch.testing.assert_close(pairs.weights.sum((1, 2)), torch.ones(2, dtype=torch.float64))
 
     def test_the_partner_is_the_nearest(self, generator):
         moved = torch.rand(2, 2, 40, 3, generator=generator, dtype=torch.float64)
         clouds = [NeighbourIndex(torch.rand(30, 3, generator=generator, dtype=torch.float64)) for _ in range(2)]
-        pairs, _ = pairs_forth(at_points(moved), moved, clouds, cut=None, share=0.5)
+        pairs, _ = pairs_forth(at_points(moved), [moved], [clouds], cut=None, share=0.5)
         for frame, cloud in enumerate(clouds):
             expected = torch.cdist(moved[:, frame], cloud.points.expand(2, -1, -1)).amin(-1)
             torch.testing.assert_close((moved[:, frame] - pairs.partners[:, frame]).norm(dim=-1), expected)

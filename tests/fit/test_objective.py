@@ -305,7 +305,7 @@ class TestWhatCounts:
         clouds = [NeighbourIndex(torch.rand(30, 3, generator=generator, dtype=torch.float64))] * 2
         nodes = torch.arange(5).reshape(1, 1, 5, 1).expand(1, 2, 5, 3)
         places = SurfacePoints(nodes, torch.full_like(moved, 1 / 3))
-        pairs, _ = pairs_forth(places, moved, clouds, cut=0.0, share=0.5)
+        pairs, _ = pairs_forth(places, [moved], [clouds], cut=0.0, share=0.5)
         losses = pairs.losses(moved, 0.05)[0]
         assert float(losses[1]) == pytest.approx(0.25 * 0.05**2)
         assert float(losses[0]) <= float(losses[1])

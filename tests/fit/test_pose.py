@@ -69,11 +69,10 @@ class TestTransform:
         whole, step = space(), 1e-6
 
         def at(values):
-            lag = whole.lag(values)
-            return whole.moved(points + lag[:, None, None, None] * velocities, values)
+            return whole.moved(points + whole.lags(values)[..., None, None] * velocities, values)
 
-        lag = whole.lag(poses)
-        found = whole.rates(points + lag[:, None, None, None] * velocities, poses, velocities)
+        clock = torch.zeros(points.shape[:-1], dtype=torch.long)
+        found = whole.rates(points + whole.lags(poses)[..., None, None] * velocities, poses, velocities, clock)
         for index in range(len(NUISANCE)):
             way = torch.zeros_like(poses)
             way[:, index] = step
