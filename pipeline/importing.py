@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from diffcloud.errors import ConfigError
 from diffcloud.hardware.realsense import play_recordings
 from diffcloud.io.depth_folders import depth_folders
-from diffcloud.io.episodes import write_episode
+from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.files import together
 from diffcloud.io.grippers import named_files
 from diffcloud.io.imports import RELEASE_FOLDERS, cloud_folder, release_episodes
@@ -28,6 +28,9 @@ from diffcloud.io.recordings import Recording, read_joint_log, write_recording
 from diffcloud.io.ros.joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
 from diffcloud.io.ros.recording import ros_recording
 from diffcloud.io.urdf import RobotDescription, read_urdf
+from diffcloud.sensing.filters import without_strays
+from diffcloud.sensing.fusion import FusionSettings
+from diffcloud.sensing.visible_region import with_cut_planes
 from pipeline.console import JsonFlag, errors, finish, warn, writes
 
 _FARTHEST_M = 50.0
@@ -57,7 +60,7 @@ def release(
             kind = scenario.removeprefix("release_")
             made = {scenario: episode}
             if kind in tracks:
-                made[f"recorded_{kind}"] = recorded_episode(kind, name, episode, tracks[kind])
+                made[f"recorded_{kind}"] = _recorded(kind, name, episode, tracks[kind])
             for folder_name, one in made.items():
                 write_episode(out / folder_name / f"{name}.npz", one)
                 written.setdefault(folder_name, []).append(name)
@@ -205,6 +208,18 @@ def _tracks(folder: Path, trajectories: Path) -> dict[str, NDArray[np.float64]]:
             "that does, or leave --trajectories out."
         )
     return read_trajectories(trajectories, kinds)
+
+
+def _recorded(kind: str, name: str, published: Episode, track: NDArray[np.float64]) -> Episode:
+    """The recording without strays; of known cameras with the heights at which their points were cut off."""
+    episode = without_strays(recorded_episode(kind, name, published, track), FusionSettings.cluster_gap_m)
+    if episode.camera is not None:
+        return with_cut_planes(episode)
+    warn(
+        f"{name}: no known camera set-up gives its points whole pixels and millimetres, so its points name no camera. Fits "
+        "treat it as one anonymous cloud per frame."
+    )
+    return episode
 
 
 def _named(sources: list[Path]) -> dict[str, Path]:

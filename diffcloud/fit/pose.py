@@ -57,14 +57,14 @@ def unit_of(name: str, length_unit_m: float) -> float:
 
 
 def set_up_of(episode: Episode) -> dict[str, float]:
-    """`SET_UP` with the clock of an episode, as far as preprocessing has measured it, and its scale, where it says how far
-    that may be off.
+    """`SET_UP` with the clock of an episode, as far as preprocessing has measured it, its scale, where it says how far
+    that may be off, and the `pose_sigmas` of its meta.
 
     Raises:
         EpisodeError: the episode's meta is damaged.
     """
     measured = {"lag": episode.lag_sigma_s, "scale": episode.scale_sigma}
-    return SET_UP | {name: sigma for name, sigma in measured.items() if sigma is not None}
+    return SET_UP | {name: sigma for name, sigma in measured.items() if sigma is not None} | episode.pose_sigmas
 
 
 def default_priors(episode: Episode) -> dict[str, float]:
@@ -73,7 +73,7 @@ def default_priors(episode: Episode) -> dict[str, float]:
     Raises:
         EpisodeError: the episode's meta is damaged.
     """
-    return {**set_up_of(episode), **LAID}
+    return {**set_up_of(episode), **LAID, **episode.pose_sigmas}
 
 
 def parse_priors(text: str) -> dict[str, float]:
