@@ -15,7 +15,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from diffcloud.errors import ConfigError
+from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.hardware.realsense import play_recordings
 from diffcloud.io.depth_folders import depth_folders
 from diffcloud.io.episodes import Episode, write_episode
@@ -28,6 +28,7 @@ from diffcloud.io.recordings import Recording, read_joint_log, write_recording
 from diffcloud.io.ros.joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
 from diffcloud.io.ros.recording import ros_recording
 from diffcloud.io.urdf import RobotDescription, read_urdf
+from diffcloud.sensing.agreement import agreement, corrected
 from diffcloud.sensing.filters import without_strays
 from diffcloud.sensing.fusion import FusionSettings
 from diffcloud.sensing.visible_region import with_cut_planes
@@ -55,15 +56,17 @@ def release(
     """Import the data published with the paper."""
     tracks = {} if trajectories is None else _tracks(folder, trajectories)
     written: dict[str, list[str]] = {}
+    recorded: dict[Path, Episode] = {}
     with together():
         for scenario, name, episode in release_episodes(folder):
             kind = scenario.removeprefix("release_")
-            made = {scenario: episode}
+            write_episode(out / scenario / f"{name}.npz", episode)
+            written.setdefault(scenario, []).append(name)
             if kind in tracks:
-                made[f"recorded_{kind}"] = _recorded(kind, name, episode, tracks[kind])
-            for folder_name, one in made.items():
-                write_episode(out / folder_name / f"{name}.npz", one)
-                written.setdefault(folder_name, []).append(name)
+                recorded[out / f"recorded_{kind}" / f"{name}.npz"] = _recorded(kind, name, episode, tracks[kind])
+                written.setdefault(f"recorded_{kind}", []).append(name)
+        for path, episode in _corrected(recorded).items():
+            write_episode(path, episode)
     for scenario, names in written.items():
         errors.print(f"{scenario}: {len(names)} episodes in {out / scenario}")
     finish({"out": str(out), "episodes": written}, json)
@@ -220,6 +223,25 @@ def _recorded(kind: str, name: str, published: Episode, track: NDArray[np.float6
         "treat it as one anonymous cloud per frame."
     )
     return episode
+
+
+def _corrected(recorded: dict[Path, Episode]) -> dict[Path, Episode]:
+    """The recordings with the second camera corrected against the first, by one correction for each set-up."""
+    result = dict(recorded)
+    groups: dict[tuple[Path, str], dict[Path, Episode]] = {}
+    for path, episode in recorded.items():
+        if "set_up" in episode.meta:
+            groups.setdefault((path.parent, episode.meta["set_up"]), {})[path] = episode
+    for (_, name), mine in groups.items():
+        first, second = next(iter(mine.values())).meta["cameras"]
+        try:
+            found = agreement(list(mine.values()), (first, second))
+        except EpisodeError as error:
+            warn(f"Set-up {name}: the camera {second} was not corrected. {error}")
+            continue
+        about = {"from": [path.stem for path in mine]}
+        result |= {path: corrected(episode, found, second, about) for path, episode in mine.items()}
+    return result
 
 
 def _named(sources: list[Path]) -> dict[str, Path]:

@@ -283,12 +283,13 @@ class Episode:
             EpisodeError: a frame of which nothing is kept.
         """
         chosen = np.flatnonzero(kept) if kept.dtype == bool else kept
-        fields = {name: getattr(self, name) for name in ("camera", "pixel", "sigma")}
         return replace(
             self,
             points=self.points[chosen],
             offsets=np.searchsorted(chosen, self.offsets),
-            **{name: None if value is None else value[chosen] for name, value in fields.items()},
+            camera=None if self.camera is None else self.camera[chosen],
+            pixel=None if self.pixel is None else self.pixel[chosen],
+            sigma=None if self.sigma is None else self.sigma[chosen],
         )
 
     @staticmethod

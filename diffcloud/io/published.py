@@ -30,8 +30,7 @@ RECORDED_START_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(
     {"lift": (0.0, 0.105, 0.0), "fold": (0.0, -0.286, -0.033)}
 )
 """Kind of motion -> x and y of the gripper at the start of its scenario, about a centimetre from the held corner at most,
-and what to add to the robot's z where the
-clouds' place in the robot's frame is unknown [m]."""
+and what to add to the robot's z where the clouds' place in the robot's frame is unknown [m]."""
 _POSE_SIGMAS: Mapping[bool, Mapping[str, float]] = MappingProxyType(
     {
         True: {"x": 0.01, "y": 0.01, "yaw": math.radians(1)},

@@ -1,8 +1,8 @@
 """Which camera saw each point of the published real recordings.
 
 A published cloud joins the depth images of two cameras. Depths are whole millimetres and image coordinates are whole
-pixels, so with the right camera pose, each point has whole coordinates in its image. The recordings have several camera set-ups,
-listed in `published_cameras.json`. A recording has the set-up that gives all its points whole coordinates.
+pixels, so with the right camera pose, each point has whole coordinates in its image. The recordings have several
+camera set-ups, listed in `published_cameras.json`. A recording has the set-up that gives all its points whole coordinates.
 """
 
 from __future__ import annotations
@@ -59,11 +59,12 @@ def published_set_ups() -> tuple[SetUp, ...]:
     """All known set-ups."""
     with as_file(files("diffcloud.io") / "published_cameras.json") as path:
         told = read_json(path)
+    width, height = told["size"]
     return tuple(
         SetUp(
             name,
             {
-                camera: Pinhole(*told["size"], (fx, fy), (cx, cy), np.array(entry["T_camera_clouds"][camera]))
+                camera: Pinhole(width, height, (fx, fy), (cx, cy), np.array(entry["T_camera_clouds"][camera]))
                 for camera, (fx, fy, cx, cy) in told["intrinsics"].items()
             },
             None if entry["robot_to_clouds_m"] is None else np.array(entry["robot_to_clouds_m"]),
@@ -73,7 +74,7 @@ def published_set_ups() -> tuple[SetUp, ...]:
 
 
 def recognised(points: NDArray[np.float64], set_ups: Iterable[SetUp]) -> SetUp | None:
-    """The set-up whose cameras saw points [N, 3] in the clouds' frame [m]; None if they are whole in no set-up."""
+    """The set-up whose cameras saw points [N, 3] in the clouds' frame [m], or None."""
     for set_up in set_ups:
         if (set_up.seen(points)[0] >= 0).mean() >= _RECOGNISED:
             return set_up
