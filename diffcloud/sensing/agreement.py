@@ -13,6 +13,9 @@ interpolated quadratically between three frames. Weights are Tukey's.
 Which numbers a recording shows depends on the motion. A flat cloth that moves in its own plane shows neither a shift in
 this plane nor the lag. Errors of a surface are shared by all points of a frame, so standard deviations come from sums over
 whole frames (sandwich estimator). Directions that remain as uncertain as their priors are left uncorrected.
+
+Limit: noise of the normals looks like information. A flat cloth gets a shift in its plane and a turn about its normal, with
+standard deviations that are far too small. Use recordings in which the cloth bends. The lag of a cloth at rest is refused.
 """
 
 from __future__ import annotations
