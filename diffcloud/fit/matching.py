@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -149,7 +149,8 @@ def _array(tensor: Tensor, *axes: int) -> Any:
     return tensor.detach().contiguous().numpy()
 
 
-class Recorded(NamedTuple):
+@dataclass(frozen=True)
+class Recorded:
     """Q recorded points of each of L frames that look for the cloth, those of one clock after those of another."""
 
     points: Tensor
@@ -341,7 +342,7 @@ def pairs_back(
         pose: [B, d]
         guesses: [B, L, Q] faces that may be near; they save time.
     """
-    points, sure, counts = recorded
+    points, sure, counts = recorded.points, recorded.sure, recorded.counts
     queries = space.back(points, pose).split(counts, dim=2)
     near = [None] * len(counts) if guesses is None else guesses.split(counts, dim=2)
     every = [nearest_places(view, faces, query, guess) for view, query, guess in zip(views, queries, near, strict=True)]

@@ -450,8 +450,8 @@ class Objective:
         return torch.cat([views, bodies.expand(*views.shape[:-2], -1, -1)], dim=-2).flatten(-3, -2)
 
     def _recorded_in(self, chosen: list[int]) -> Recorded:
-        points, sure, counts = self._recorded
-        return Recorded(points[chosen], sure[chosen], counts)
+        whole = self._recorded
+        return Recorded(whole.points[chosen], whole.sure[chosen], whole.counts)
 
     def _steps_to_loss(self) -> int:
         space = self._target.space

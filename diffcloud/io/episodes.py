@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +76,8 @@ class Pinhole:
         return {"size": [self.width, self.height], "focal": self.focal, "centre": self.centre, "T_camera_scene": pose}
 
 
-class Clock(NamedTuple):
+@dataclass(frozen=True)
+class Clock:
     """How late a camera stamps what it sees: a point stamped t shows the motion at t + offset."""
 
     offset_s: float
@@ -250,7 +251,7 @@ class Episode:
                 "point names one of the cameras. Give each point its `camera`, or remove `clocks`."
             )
         nothing = {"offset_s": 0.0, "sigma_s": 0.0}
-        return {name: Clock(*(float(told.get(name, nothing)[key]) for key in Clock._fields)) for name in cameras}
+        return {name: Clock(*(float(told.get(name, nothing)[key]) for key in ("offset_s", "sigma_s"))) for name in cameras}
 
     @property
     def scale_sigma(self) -> float | None:
@@ -358,7 +359,7 @@ class Episode:
 
 
 def _is_clock(told: object) -> bool:
-    if not (isinstance(told, Mapping) and set(told) == set(Clock._fields)):
+    if not (isinstance(told, Mapping) and set(told) == {"offset_s", "sigma_s"}):
         return False
     if any(isinstance(one, bool) or not isinstance(one, int | float) for one in told.values()):
         return False

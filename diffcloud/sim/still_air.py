@@ -15,7 +15,7 @@ The added mass acts in all directions alike here, as a mass matrix with one numb
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,7 +32,8 @@ _ADDED = (0.579, 0.642, 0.690, 0.757, 0.801, 0.830, 0.872, 0.897, 0.917, 0.934, 
 """C_A at those ratios of a rectangle's sides."""
 
 
-class StillAir(NamedTuple):
+@dataclass(frozen=True)
+class StillAir:
     """What still air does to a cloth."""
 
     added_mass: float
