@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -16,6 +16,7 @@ from diffcloud.io.schema import explain
 from diffcloud.mesh.topology import ClothMesh, FloatArray, SurfaceMesh
 from diffcloud.scene.description import Scene
 from diffcloud.scene.schema import KeyframeBlock, ObstacleBlock, SceneFile, TransformBlock
+from diffcloud.sim.grasp import GRIP_M, Grasp, nodes_under_pad
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import read_material
 from diffcloud.sim.motion import Keyframe, Motion, axis_angle_quaternion
@@ -72,7 +73,9 @@ def load_scene(path: Path, *, reload_materials: bool = False) -> Scene:
         mesh=mesh,
         material=raw if reload_materials else scaled,
         mass_material=scaled if reload_materials else None,
-        handles=Handles(_handles(path, scene, mesh, motions), magic.handle_stiffness, scene.diffcloud.hard_handles),
+        handles=Handles(
+            _handles(path, scene, mesh, motions), magic.handle_stiffness, scene.diffcloud.hard_handles, _grasp(scene)
+        ),
         frame_time=scene.frame_time,
         frame_steps=scene.frame_steps,
         end_time=min(scene.end_time, (scene.end_frame or np.inf) * scene.frame_time),
@@ -174,10 +177,35 @@ def _contact(scene: SceneFile) -> ReferenceContact | None:
     return ReferenceContact.as_published() if scene.diffcloud.contact == "published" else ReferenceContact()
 
 
+def _grasp(scene: SceneFile) -> Grasp | None:
+    own = scene.diffcloud
+    return None if own.grip is None else Grasp(own.grip, GRIP_M if own.grip_m is None else own.grip_m)
+
+
+def _under_pad(place: str, mesh: ClothMesh, nodes: Sequence[int], size: float) -> list[int]:
+    """The nodes that a pad in the place of each of the nodes holds."""
+    extent = np.ptp(mesh.verts, axis=0)
+    if size >= extent.min():
+        raise SceneError(
+            f"{place}: a pad of {size:g} does not fit on a cloth of {extent[0]:.4g} x {extent[1]:.4g}. It must be smaller "
+            "than both sides; give a smaller `diffcloud.grip_m`."
+        )
+    found: set[int] = set()
+    for node in nodes:
+        under = nodes_under_pad(mesh, node, size)
+        if len(under) == 1:
+            raise SceneError(
+                f"{place}: a pad of {size:g} at node {node} holds no other node of this mesh, so it would be a point. A "
+                'pad holds two nodes at least; give a larger `diffcloud.grip_m`, a finer mesh, or `diffcloud.grip` "pivot".'
+            )
+        found.update(under)
+    return sorted(found)
+
+
 def _handles(path: Path, scene: SceneFile, mesh: ClothMesh, motions: list[Motion]) -> tuple[Handle, ...]:
     several = len({block.motion for block in scene.handles} - {None}) > 1
     step = scene.frame_time / scene.frame_steps
-    handles = []
+    handles, grasp = [], _grasp(scene)
     for index, block in enumerate(scene.handles):
         taken = step * max(1.0, np.ceil(block.start_time / step))
         # later the published scenes have it
@@ -192,9 +220,13 @@ def _handles(path: Path, scene: SceneFile, mesh: ClothMesh, motions: list[Motion
                     f"{path}: handles.{index}.nodes: node {node} does not exist, the cloth has nodes "
                     f"0..{len(mesh.nodes) - 1}."
                 )
-            motion = None if block.motion is None else motions[block.motion]
-            gripper = f"motion_{block.motion}" if several else "gripper"  # each motion is a gripper's
-            handles.append(Handle(node, motion, block.start_time, block.end_time, block.fade_time, gripper))
+        nodes, pad = block.nodes, 0
+        if grasp is not None and grasp.kind == "pad":
+            nodes, pad = _under_pad(f"{path}: handles.{index}", mesh, block.nodes, grasp.size), index + 1
+        motion = None if block.motion is None else motions[block.motion]
+        gripper = f"motion_{block.motion}" if several else "gripper"  # each motion is a gripper's
+        one = Handle(0, motion, block.start_time, block.end_time, block.fade_time, gripper, pad)
+        handles += [replace(one, node=node) for node in nodes]
     return tuple(handles)
 
 

@@ -6,9 +6,9 @@ Defaults are ARCSim's. The blocks `diffcloud` are this project's own additions, 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from diffcloud.io.schema import Checked, Component, FileName, NonNegative, Positive, Vector
 from diffcloud.sim.surrounding import Integrator
@@ -122,6 +122,16 @@ class ExtensionBlock(Checked):
     damping: NonNegative | None = None
     compression: Annotated[float, Field(ge=0, le=1)] = 1.0
     """The part of its stretching stiffness with which the cloth resists compression in its plane."""
+    grip: Literal["pad", "pivot"] | None = None
+    """What the nodes of a handle stand for: a pad, which holds all nodes under it, or a pivot. Default: nodes."""
+    grip_m: Positive | None = None
+    """Side of the pad, or of the square that a pivot stands for. Default: 0.02."""
+
+    @model_validator(mode="after")
+    def _has_a_grip_of_that_size(self) -> Self:
+        if self.grip is None and self.grip_m is not None:
+            raise ValueError("`grip_m` is the size of a `grip`, and there is none: add `grip`, or leave `grip_m` out")
+        return self
 
 
 class SceneFile(Checked):

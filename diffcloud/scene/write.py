@@ -44,6 +44,7 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
         "lagged_air": scene.integrator == "linearised"
         and around.lagged_air != (around.reference_contact == ReferenceContact.as_published()),
         "a gripper with several motions": _shared_grippers(scene),
+        "an upright pad": any(any(handle.turned) for handle in scene.handles.handles),
     }
     if any(unsaid.values()):
         named = ", ".join(name for name, lost in unsaid.items() if lost)
@@ -93,6 +94,9 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
             "compression": scene.material.compression,
         },
     }
+    grasp = scene.handles.grasp
+    if grasp is not None and grasp.kind == "pivot":  # a pad is the nodes that it holds
+        data["diffcloud"] |= {"grip": "pivot", "grip_m": grasp.size}
     if math.isfinite(scene.end_time):
         data["end_time"] = scene.end_time
     path = folder / "conf" / f"{name}.json"

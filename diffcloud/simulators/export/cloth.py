@@ -132,7 +132,13 @@ def _whole(scene: Scene, problem: Problem) -> Scene:
     """The scene in the problem's frame, with the motion that was recorded."""
     alike = ours.scene(problem)
     around = replace(scene.surrounding, obstacles=alike.surrounding.obstacles, moving=(), bodies=())
-    return replace(scene, mesh=problem.mesh, handles=alike.handles, surrounding=around, end_time=problem.seconds)
+    return replace(
+        scene,
+        mesh=problem.mesh,
+        handles=replace(alike.handles, grasp=scene.handles.grasp),
+        surrounding=around,
+        end_time=problem.seconds,
+    )
 
 
 def _simplified(scene: Scene) -> list[str]:
@@ -143,6 +149,9 @@ def _simplified(scene: Scene) -> list[str]:
         said.append(f"There is no air; the fit has air of {around.air_density:.3g} kg/m³.")
     if not scene.handles.hard:
         said.append(f"Held nodes follow exactly; in the fit, springs of {scene.handles.stiffness:g} N/m hold them.")
+    grasp = scene.handles.grasp
+    if grasp is not None and grasp.kind == "pivot":
+        said.append(f"Held nodes are points of the mesh; in the fit, each yields as a {grasp.described(1)} does.")
     return said
 
 
