@@ -123,7 +123,7 @@ class ExtensionBlock(Checked):
     compression: Annotated[float, Field(ge=0, le=1)] = 1.0
     """The part of its stretching stiffness with which the cloth resists compression in its plane."""
     grip: Literal["pad", "pivot"] | None = None
-    """What the nodes of a handle stand for: a pad, which holds all nodes under it, or a pivot. Default: nodes."""
+    """What a handle holds: a pad around a node, or of the nodes where it names several; or a pivot. Default: nodes."""
     grip_m: Positive | None = None
     """Side of the pad, or of the square that a pivot stands for. Default: 0.02."""
 

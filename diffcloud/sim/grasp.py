@@ -82,11 +82,27 @@ def inside(places: FloatArray, lower: FloatArray, upper: FloatArray) -> IntArray
 
 def nodes_under_pad(mesh: ClothMesh, node: int, size: float) -> list[int]:
     """Nodes of any mesh that a pad at a node holds, the node among them; on a seam, those of all its patches."""
-    low, high = mesh.verts.min(axis=0), mesh.verts.max(axis=0)
     found = {node}
-    for vert in np.flatnonzero(mesh.vert_node == node):
-        found.update(mesh.vert_node[inside(mesh.verts, *window(mesh.verts[vert], low, high, size))].tolist())
+    for square in _squares(mesh, node, size):
+        found.update(mesh.vert_node[inside(mesh.verts, *square)].tolist())
     return sorted(found)
+
+
+def _squares(mesh: ClothMesh, node: int, size: float) -> list[tuple[FloatArray, FloatArray]]:
+    """`window` around each of a node's verts, in the patch of material space where it lies."""
+    from scipy.sparse import coo_array  # slow to import
+    from scipy.sparse.csgraph import connected_components
+
+    corners = mesh.face_verts
+    joined = coo_array(
+        (np.ones(2 * len(corners)), (corners[:, :2].ravel(), corners[:, 1:].ravel())), (len(mesh.verts),) * 2
+    )
+    patch = connected_components(joined, directed=False)[1]
+    found = []
+    for vert in np.flatnonzero(mesh.vert_node == node):
+        own = mesh.verts[patch == patch[vert]]
+        found.append(window(mesh.verts[vert], own.min(axis=0), own.max(axis=0), size))
+    return found
 
 
 def turned_up(places: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
@@ -119,7 +135,6 @@ def stretching_factors(mesh: ClothMesh, nodes: Sequence[int], grasp: Grasp | Non
     factors = np.ones(len(mesh.faces))
     if grasp is None or grasp.kind != "pivot":
         return factors
-    low, high = mesh.verts.min(axis=0), mesh.verts.max(axis=0)
     middle = mesh.verts[mesh.face_verts].mean(axis=1)
     held = set(nodes)
     for node in held:
@@ -139,6 +154,6 @@ def stretching_factors(mesh: ClothMesh, nodes: Sequence[int], grasp: Grasp | Non
             factors[at] = 1 / inverse
         else:
             factors[at] = _RIGID
-            for vert in np.flatnonzero(mesh.vert_node == node):
-                factors[inside(middle, *window(mesh.verts[vert], low, high, grasp.size))] = _RIGID
+            for square in _squares(mesh, node, grasp.size):
+                factors[inside(middle, *square)] = _RIGID
     return factors

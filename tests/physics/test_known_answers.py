@@ -135,7 +135,7 @@ ELASTICA = {
 def heavy_strip(gamma, cells, length=0.1, bending=1e-4):
     # the clamp ends in the middle of a cell: the hinge at the clamp bends over half a cell on either side
     side = length / (cells + 0.5)
-    mesh = grid_cloth(3, cells + 2, 2 * side, side * (cells + 1), alternate_diagonals=True)
+    mesh = grid_cloth(3, cells + 2, 2 * side, side * (cells + 1), through=1)
     clamped = [row * (cells + 2) + column for row in range(3) for column in (0, 1)]
     gravity = gamma * bending / (DENSITY * length**3)
     system = build_system(

@@ -25,6 +25,7 @@ from diffcloud.simulators.problem import Problem, Sheet, Track, distances
 
 WORTH_SAYING = 0.01
 """Relative difference of a stiffness, or strain of the start, above which it is said."""
+_DIGITS = 12
 _LEVEL = np.deg2rad(0.1)
 _STRAINED = (0.0, 0.25, 0.5, 1.0)
 """Where between rest and their reference strain the tables are looked up for a material that stiffens."""
@@ -253,7 +254,7 @@ def _held(scene: Scene, motion: FittedMotion, paths: NDArray[np.float64]) -> tup
         if np.ptp(path, axis=0).max() < 1e-9:
             held.setdefault(handle.node, None)
         else:
-            path = path - path[0]
+            path = np.round(path - path[0], _DIGITS)  # nodes of one pad move alike, but for rounding
             keys = tuple(Keyframe(float(time), (x, y, z)) for time, (x, y, z) in zip(times, path.tolist(), strict=True))
             held[handle.node] = Motion(keys)
     loose -= held.keys()
