@@ -101,8 +101,9 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
             "compression": scene.material.compression,
         },
     }
-    if scene.handles.grasp is not None:
-        data["diffcloud"] |= {"grip": scene.handles.grasp.kind, "grip_m": scene.handles.grasp.size}
+    grasp = scene.handles.grasp
+    if grasp is not None and grasp.kind != "upright_pad":  # the motions of its nodes are all of that one
+        data["diffcloud"] |= {"grip": grasp.kind, "grip_m": grasp.size}
     if math.isfinite(scene.end_time):
         data["end_time"] = scene.end_time
     path = folder / "conf" / f"{name}.json"

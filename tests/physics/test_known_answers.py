@@ -172,7 +172,7 @@ def test_scale_degeneracy(factor):
 
     With hard handles and no air. So clouds identify ratios only. Mass alone does move the cloth.
     """
-    options = built_in("lift").model_copy(update={"nodes": (5, 5), "frames": 10, "air_density": 0.0})
+    options = built_in("lift").model_copy(update={"nodes": (5, 5), "frames": 10, "air_density": 0.0, "gap_m": 0.003})
 
     def run(parameters, contact):
         scenario = grid_scenario(options.model_copy(update={"contact_stiffness": 1e5 * contact}))

@@ -26,6 +26,7 @@ from diffcloud.simulators.problem import Problem, Sheet, Track, distances
 WORTH_SAYING = 0.01
 """Relative difference of a stiffness, or strain of the start, above which it is said."""
 _DIGITS = 12
+"""Of paths in metres."""
 _LEVEL = np.deg2rad(0.1)
 _STRAINED = (0.0, 0.25, 0.5, 1.0)
 """Where between rest and their reference strain the tables are looked up for a material that stiffens."""
@@ -133,13 +134,10 @@ def _whole(scene: Scene, problem: Problem) -> Scene:
     """The scene in the problem's frame, with the motion that was recorded."""
     alike = ours.scene(problem)
     around = replace(scene.surrounding, obstacles=alike.surrounding.obstacles, moving=(), bodies=())
-    return replace(
-        scene,
-        mesh=problem.mesh,
-        handles=replace(alike.handles, grasp=scene.handles.grasp),
-        surrounding=around,
-        end_time=problem.seconds,
-    )
+    own = {handle.node: handle for handle in scene.handles.handles}
+    held = tuple(replace(one, pad=own[one.node].pad, gripper=own[one.node].gripper) for one in alike.handles.handles)
+    handles = replace(alike.handles, handles=held, grasp=scene.handles.grasp)
+    return replace(scene, mesh=problem.mesh, handles=handles, surrounding=around, end_time=problem.seconds)
 
 
 def _simplified(scene: Scene) -> list[str]:
