@@ -182,23 +182,6 @@ def _grasp(scene: SceneFile) -> Grasp | None:
     return None if own.grip is None else Grasp(own.grip, GRIP_M if own.grip_m is None else own.grip_m)
 
 
-def _under_pad(place: str, mesh: ClothMesh, node: int, size: float) -> list[int]:
-    """The nodes that a pad at a node holds."""
-    extent = np.ptp(mesh.verts, axis=0)
-    if size >= extent.min():
-        raise SceneError(
-            f"{place}: a pad of {size:g} does not fit on a cloth of {extent[0]:.4g} x {extent[1]:.4g}. It must be smaller "
-            "than both sides; give a smaller `diffcloud.grip_m`."
-        )
-    found = nodes_under_pad(mesh, node, size)
-    if len(found) == 1:
-        raise SceneError(
-            f"{place}: a pad of {size:g} at node {node} holds no other node of this mesh, so it would be a point. A pad "
-            'holds two nodes at least; give a larger `diffcloud.grip_m`, a finer mesh, or `diffcloud.grip` "pivot".'
-        )
-    return found
-
-
 def _handles(path: Path, scene: SceneFile, mesh: ClothMesh, motions: list[Motion]) -> tuple[Handle, ...]:
     several = len({block.motion for block in scene.handles} - {None}) > 1
     step = scene.frame_time / scene.frame_steps
@@ -221,7 +204,10 @@ def _handles(path: Path, scene: SceneFile, mesh: ClothMesh, motions: list[Motion
         if grasp is not None and grasp.kind == "pad":
             pad = index + 1
             if len(block.nodes) == 1:
-                nodes = _under_pad(f"{path}: handles.{index}", mesh, block.nodes[0], grasp.size)
+                try:
+                    nodes = nodes_under_pad(mesh, block.nodes[0], grasp.size)
+                except SceneError as error:
+                    raise SceneError(f"{path}: handles.{index}: {error}") from error
         motion = None if block.motion is None else motions[block.motion]
         gripper = f"motion_{block.motion}" if several else "gripper"  # each motion is a gripper's
         one = Handle(0, motion, block.start_time, block.end_time, block.fade_time, gripper, pad)

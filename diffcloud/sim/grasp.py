@@ -22,6 +22,7 @@ from typing import Literal
 
 import numpy as np
 
+from diffcloud.errors import SceneError
 from diffcloud.mesh.topology import ClothMesh, FloatArray, IntArray
 
 Grip = Literal["pad", "upright_pad", "pivot"]
@@ -31,7 +32,7 @@ GRIP_M = 0.02
 """Size of a grasp where none is stated: about that of the pads of a Robotiq 2F-85 [m]."""
 _RIGID = 30.0
 """The compliance of a pivot is then within a tenth of a rigid square's, in most meshes within a twentieth."""
-_LEAST = 0.1
+_LEAST = 0.09
 """Of 1/s, where the formula holds: beyond, edges are shorter than the square."""
 _TOLERANCE = 1e-9
 _POINTS: tuple[tuple[float, float, tuple[tuple[int, float, float], ...]], ...] = (
@@ -81,15 +82,30 @@ def inside(places: FloatArray, lower: FloatArray, upper: FloatArray) -> IntArray
 
 
 def nodes_under_pad(mesh: ClothMesh, node: int, size: float) -> list[int]:
-    """Nodes of any mesh that a pad at a node holds, the node among them; on a seam, those of all its patches."""
+    """Nodes of any mesh that a pad at a node holds, the node among them; on a seam, those of all its patches.
+
+    Raises:
+        SceneError: a pad that is as large as the cloth, or that holds the node alone.
+    """
     found = {node}
-    for square in _squares(mesh, node, size):
-        found.update(mesh.vert_node[inside(mesh.verts, *square)].tolist())
+    for patch, lower, upper in _squares(mesh, node, size):
+        extent = np.ptp(patch, axis=0)
+        if size >= extent.min():
+            raise SceneError(
+                f"A pad of {size:g} does not fit on a cloth of {extent[0]:.4g} x {extent[1]:.4g}. It must be smaller than "
+                "both sides; give a smaller grip_m."
+            )
+        found.update(mesh.vert_node[inside(mesh.verts, lower, upper)].tolist())
+    if len(found) == 1:
+        raise SceneError(
+            f"A pad of {size:g} at node {node} holds no other node of this mesh, so it would be a point. A pad holds two "
+            'nodes at least; give a larger grip_m, a finer mesh, or the grip "pivot".'
+        )
     return sorted(found)
 
 
-def _squares(mesh: ClothMesh, node: int, size: float) -> list[tuple[FloatArray, FloatArray]]:
-    """`window` around each of a node's verts, in the patch of material space where it lies."""
+def _squares(mesh: ClothMesh, node: int, size: float) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """For each of a node's verts: the verts of its patch of material space [N, 2], and `window` around it there."""
     from scipy.sparse import coo_array  # slow to import
     from scipy.sparse.csgraph import connected_components
 
@@ -101,7 +117,7 @@ def _squares(mesh: ClothMesh, node: int, size: float) -> list[tuple[FloatArray, 
     found = []
     for vert in np.flatnonzero(mesh.vert_node == node):
         own = mesh.verts[patch == patch[vert]]
-        found.append(window(mesh.verts[vert], own.min(axis=0), own.max(axis=0), size))
+        found.append((own, *window(mesh.verts[vert], own.min(axis=0), own.max(axis=0), size)))
     return found
 
 
@@ -113,12 +129,14 @@ def turned_up(places: FloatArray, low: FloatArray, high: FloatArray) -> FloatArr
         low, high: [2] corners of the rectangle around the cloth.
 
     Raises:
-        ValueError: the pad is not at the rim.
+        SceneError: the pad is not at the rim.
     """
     at_low, at_high = (np.isclose(end, bound) for end, bound in ((places.min(0), low), (places.max(0), high)))
     outward = at_high.astype(float) - at_low.astype(float)
     if not outward.any():
-        raise ValueError("an upright pad turns up the rim of the cloth, and this one is inside")
+        raise SceneError(
+            'An upright pad inside the cloth. It turns up a rim: hold an edge or a corner, or use the grip "pad".'
+        )
     outward /= np.linalg.norm(outward)
     reach = places @ outward
     reach = reach - reach.min()
@@ -154,6 +172,6 @@ def stretching_factors(mesh: ClothMesh, nodes: Sequence[int], grasp: Grasp | Non
             factors[at] = 1 / inverse
         else:
             factors[at] = _RIGID
-            for square in _squares(mesh, node, grasp.size):
-                factors[inside(middle, *square)] = _RIGID
+            for _, lower, upper in _squares(mesh, node, grasp.size):
+                factors[inside(middle, lower, upper)] = _RIGID
     return factors

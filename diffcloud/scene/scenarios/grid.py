@@ -147,8 +147,8 @@ def grid_scenario(options: GridScenario) -> Scenario:
         for each in chain.from_iterable(held):
             try:
                 way = turned_up(verts[each], verts[0], verts[-1]) @ turn
-            except ValueError as error:
-                raise SceneError(f"Scenario {options.name}: {error}; hold an edge or a corner, or use a pad.") from error
+            except SceneError as error:
+                raise SceneError(f"Scenario {options.name}: {error}") from error
             turned |= {node: (x, y, z) for node, (x, y, z) in zip(each, way.tolist(), strict=True)}
     grasped = [*chain.from_iterable(nodes[:-1])]
     extent = 2.0 * max(options.size_m) + options.reach

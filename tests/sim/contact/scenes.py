@@ -39,7 +39,7 @@ def over_box(contact: ReferenceContact, *, proximity: bool = True, height: float
         contact_thickness_m=0.005,
         gravity=(0.0, 0.0, -30.0),
         gap_m=height,
-        **{"grip_m": 0.01, **changes},
+        **{"grip": "pad", "grip_m": 0.01, **changes},
     )
     obstacle = box((-0.047, -0.061, -0.2), (0.053, 0.043, 0.0))
     surrounding = replace(scenario.scene.surrounding, obstacles=(obstacle,), reference_contact=contact, proximity=proximity)
