@@ -84,7 +84,7 @@ class Scene:
         two nodes that are held alike is held like them: a pad keeps its size, and a pivot, which `build` scales, too."""
         mesh, edges = refined(self.mesh)
         turned = {replace(handle, turned=Handle.turned): handle.turned for handle in self.handles.handles}
-        more = []
+        more: list[Handle] = []
         for place, (a, b) in enumerate(edges.tolist(), len(self.mesh.nodes)):
             for handle in self.handles.handles:
                 other = turned.get(replace(handle, node=b, turned=Handle.turned)) if handle.node == a else None

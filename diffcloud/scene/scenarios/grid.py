@@ -136,13 +136,10 @@ def grid_scenario(options: GridScenario) -> Scenario:
     turn = np.array([[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])  # for row vectors
     start = np.array([*options.center_m, options.table_height_m + options.gap_m])
     mesh = replace(flat, nodes=flat.nodes @ turn + start)
-    if pads is None:
-        nodes, numbers = places, {}
-    else:
-        held = [[inside(verts, *pad).tolist() for pad in each] for each in pads]
-        nodes = [[*chain.from_iterable(each)] for each in held]
-        numbers = {node: number for number, each in enumerate(chain.from_iterable(held), 1) for node in each}
-    turned = {}
+    held: list[list[list[int]]] = [[inside(verts, *pad).tolist() for pad in each] for each in pads or []]
+    nodes = places if pads is None else [[*chain.from_iterable(each)] for each in held]
+    numbers = {node: number for number, each in enumerate(chain.from_iterable(held), 1) for node in each}
+    turned: dict[int, tuple[float, float, float]] = {}
     if options.grip == "upright_pad":
         for each in chain.from_iterable(held):
             try:
