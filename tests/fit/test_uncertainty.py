@@ -75,7 +75,7 @@ class TestDoubts:
 
     def test_clouds_that_are_too_large_move_the_fit_as_far_as_it_says(self, scenario):
         """Where the episode says how far their scale may be off, but the fit takes it as exact."""
-        episode = replace(recorded(scenario), meta={"scale_sigma": 0.03})
+        episode = replace(recorded(scenario, seed=3), meta={"scale_sigma": 0.03})
         one = Objective(scenario, episode, nuisance={})
         centre = one.pose_space.centre.numpy()
         sizes = [(centre + np.exp(part) * (episode.points - centre)).astype(np.float32) for part in (0.03, -0.03)]
@@ -120,7 +120,7 @@ class TestDoubts:
 
     def test_the_prior_of_a_pose_moves_the_fit_as_far_as_it_says(self, scenario):
         """Cameras that are ten deviations of the prior too low: it holds the pose back, and the fit makes up for it."""
-        episode, near = recorded(scenario), 0.0002
+        episode, near = recorded(scenario, seed=1, points=12_000), 0.0002
         lifted = replace(episode, points=episode.points + np.array([0, 0, 10 * near], dtype=np.float32))
         one, other = (Objective(scenario, each, nuisance={"z": near}) for each in (episode, lifted))
         moved = logarithm(other) - logarithm(one)
@@ -170,7 +170,7 @@ class TestNoise:
     def test_two_recordings_say_more_than_one(self, scenario):
         members = [Objective(scenario, recorded(scenario, seed=seed), nuisance={}) for seed in (1, 2)]
         one, other, both = (
-            uncertainty(each, beside("bending", 1.0, 1.1), {**TRUTH, "bending": 1.0})
+            uncertainty(each, beside("bending", 1.0, 1.03), {**TRUTH, "bending": 1.0})  # known better than clouds show it
             for each in (*members, JointObjective(members))
         )
         assert both.clusters == one.clusters + other.clusters

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.episodes import Episode
+from diffcloud.scene.scenarios.grid import GridScenario
 
-_GAP_M = 0.002
-"""Of the cloth over the table at the start, as scenarios have it."""
 _LARGEST_M = 5.0
 """Of a cloth: a larger cloud is in another unit."""
 _SMALLEST_M = 0.02
@@ -43,6 +42,8 @@ _AT_CORNER_M = 0.03
 _TRAVEL_M = 0.03
 _CELL_M = 0.034
 _NODES = (5, 13)
+_GAP_M: float = GridScenario.model_fields["gap_m"].default
+"""Of the cloth over the table at the start."""
 _FEW_POINTS = 100
 FIELDS = ("center_m", "yaw_deg", "laid_turn_deg", "table_height_m", "grasped", "rate_hz", "frames", "path")
 """Of a scenario, those that `find_layout` finds."""
@@ -144,7 +145,7 @@ def find_layout(episode: Episode, size: tuple[float, float]) -> Layout:
         "center_m": Found([round(float(part), 4) for part in centre], "middle of the rectangle around the first frame"),
         "yaw_deg": Found(round(math.degrees(yaw) % 360, 2), "turn at which that rectangle is smallest"),
         "laid_turn_deg": Found(0.0, "the first frame shows the turn; above 0, a fit finds how far it is off"),
-        "table_height_m": Found(round(table, 4), f"{1e3 * _GAP_M:.0f} mm below the middle height of the first frame"),
+        "table_height_m": Found(round(table, 5), f"{1e3 * _GAP_M:.1g} mm below the middle height of the first frame"),
         "grasped": Found(
             [corners.get(node, node)], f"node nearest the gripper's first position, {1e3 * distances[node]:.0f} mm away"
         ),
