@@ -15,10 +15,10 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from diffcloud.errors import ConfigError
+from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.hardware.realsense import play_recordings
 from diffcloud.io.depth_folders import depth_folders
-from diffcloud.io.episodes import write_episode
+from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.files import together
 from diffcloud.io.grippers import named_files
 from diffcloud.io.imports import RELEASE_FOLDERS, cloud_folder, release_episodes
@@ -28,6 +28,10 @@ from diffcloud.io.recordings import Recording, read_joint_log, write_recording
 from diffcloud.io.ros.joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
 from diffcloud.io.ros.recording import ros_recording
 from diffcloud.io.urdf import RobotDescription, read_urdf
+from diffcloud.sensing.agreement import agreement, corrected
+from diffcloud.sensing.filters import without_strays
+from diffcloud.sensing.fusion import FusionSettings
+from diffcloud.sensing.visible_region import with_cut_planes
 from pipeline.console import JsonFlag, errors, finish, warn, writes
 
 _FARTHEST_M = 50.0
@@ -52,15 +56,17 @@ def release(
     """Import the data published with the paper."""
     tracks = {} if trajectories is None else _tracks(folder, trajectories)
     written: dict[str, list[str]] = {}
+    recorded: dict[Path, Episode] = {}
     with together():
         for scenario, name, episode in release_episodes(folder):
             kind = scenario.removeprefix("release_")
-            made = {scenario: episode}
+            write_episode(out / scenario / f"{name}.npz", episode)
+            written.setdefault(scenario, []).append(name)
             if kind in tracks:
-                made[f"recorded_{kind}"] = recorded_episode(kind, name, episode, tracks[kind])
-            for folder_name, one in made.items():
-                write_episode(out / folder_name / f"{name}.npz", one)
-                written.setdefault(folder_name, []).append(name)
+                recorded[out / f"recorded_{kind}" / f"{name}.npz"] = _recorded(kind, name, episode, tracks[kind])
+                written.setdefault(f"recorded_{kind}", []).append(name)
+        for path, episode in _corrected(recorded).items():
+            write_episode(path, episode)
     for scenario, names in written.items():
         errors.print(f"{scenario}: {len(names)} episodes in {out / scenario}")
     finish({"out": str(out), "episodes": written}, json)
@@ -205,6 +211,37 @@ def _tracks(folder: Path, trajectories: Path) -> dict[str, NDArray[np.float64]]:
             "that does, or leave --trajectories out."
         )
     return read_trajectories(trajectories, kinds)
+
+
+def _recorded(kind: str, name: str, published: Episode, track: NDArray[np.float64]) -> Episode:
+    """The recording without strays; of known cameras with the heights at which their points were cut off."""
+    episode = without_strays(recorded_episode(kind, name, published, track), FusionSettings.cluster_gap_m)
+    if episode.camera is not None:
+        return with_cut_planes(episode)
+    warn(
+        f"{name}: no known camera set-up gives its points whole pixels and millimetres, so its points name no camera. Fits "
+        "treat it as one anonymous cloud per frame."
+    )
+    return episode
+
+
+def _corrected(recorded: dict[Path, Episode]) -> dict[Path, Episode]:
+    """The recordings with the second camera corrected against the first, by one correction for each set-up."""
+    result = dict(recorded)
+    groups: dict[tuple[Path, str], dict[Path, Episode]] = {}
+    for path, episode in recorded.items():
+        if "set_up" in episode.meta:
+            groups.setdefault((path.parent, episode.meta["set_up"]), {})[path] = episode
+    for (_, name), mine in groups.items():
+        first, second = next(iter(mine.values())).meta["cameras"]
+        try:
+            found = agreement(list(mine.values()), (first, second))
+        except EpisodeError as error:
+            warn(f"Set-up {name}: the camera {second} was not corrected. {error}")
+            continue
+        about = {"from": [path.stem for path in mine]}
+        result |= {path: corrected(episode, found, second, about) for path, episode in mine.items()}
+    return result
 
 
 def _named(sources: list[Path]) -> dict[str, Path]:

@@ -307,11 +307,6 @@ def _clean(episode: Episode, config: PreprocessConfig) -> Episode:
     joined = np.concatenate(indices)
     quality = {key: [report[key] for report in reports] for key in reports[0]}
     return replace(
-        episode,
-        points=episode.points[joined],
-        offsets=np.cumsum([0, *(len(index) for index in indices)], dtype=np.int64),
-        camera=None if episode.camera is None else episode.camera[joined],
-        pixel=None if episode.pixel is None else episode.pixel[joined],
-        sigma=None if episode.sigma is None else episode.sigma[joined],
+        episode.select(joined),
         meta={**episode.meta, "quality": {**episode.meta.get("quality", {}), **quality}},
     )

@@ -89,15 +89,15 @@ def priors_by_clock(priors: Mapping[str, float], clocks: Collection[str]) -> dic
 
 
 def set_up_of(episode: Episode) -> dict[str, float]:
-    """`SET_UP` with the clock of an episode, as far as preprocessing has measured it, and its scale, where it says how far
-    that may be off. Where the episode knows the clock of each camera, the deviation of its offset is added to that of the
-    episode's own, as independent.
+    """`SET_UP` with the clock of an episode, as far as preprocessing has measured it, its scale, where it says how far
+    that may be off, and the `pose_sigmas` of its meta. Where the episode knows the clock of each camera, the deviation of
+    its offset is added to that of the episode's own, as independent.
 
     Raises:
         EpisodeError: the episode's meta is damaged.
     """
     measured = {"lag": episode.lag_sigma_s, "scale": episode.scale_sigma}
-    found = SET_UP | {name: sigma for name, sigma in measured.items() if sigma is not None}
+    found = SET_UP | {name: sigma for name, sigma in measured.items() if sigma is not None} | episode.pose_sigmas
     own = found.pop("lag")
     sigmas = {f"{_OF_CAMERA}{camera}": math.hypot(own, clock.sigma_s) for camera, clock in episode.clocks.items()}
     return found | (sigmas or {"lag": own})
@@ -109,7 +109,7 @@ def default_priors(episode: Episode) -> dict[str, float]:
     Raises:
         EpisodeError: the episode's meta is damaged.
     """
-    return {**set_up_of(episode), **LAID}
+    return set_up_of(episode) | {name: episode.pose_sigmas.get(name, sigma) for name, sigma in LAID.items()}
 
 
 def parse_priors(text: str) -> dict[str, float]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -64,6 +64,11 @@ class Pinhole:
         if not sound or min(width, height) < 1 or width * height > _MOST_PIXELS:
             raise ValueError("not a camera")
         return Pinhole(width, height, (fx, fy), (cx, cy), pose)
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """[3] where the camera stands in the scene."""
+        return np.asarray(-self.T_camera_scene[:, :3].T @ self.T_camera_scene[:, 3])
 
     def described(self) -> dict[str, Any]:
         """As an episode's meta has it."""
@@ -261,6 +266,19 @@ class Episode:
             raise EpisodeError(f"scale_sigma in an episode's meta must be a fraction between 0 and 1, got {told!r}.")
         return float(told)
 
+    @property
+    def pose_sigmas(self) -> dict[str, float]:
+        """Standard deviations of variables of the pose that the recording knows better or worse than usual [m, rad, s].
+
+        Raises:
+            EpisodeError: the meta's `pose_sigmas` are no positive numbers.
+        """
+        told = self.meta.get("pose_sigmas") or {}
+        values = list(told.values()) if isinstance(told, Mapping) else [None]
+        if not all(isinstance(one, int | float) and not isinstance(one, bool) and 0 < one < _FARTHEST for one in values):
+            raise EpisodeError(f"pose_sigmas of an episode's meta are variable -> positive number, got {told!r}.")
+        return {str(name): float(one) for name, one in told.items()}
+
     @cached_property
     def pinholes(self) -> tuple[Pinhole, ...]:
         """[C] the cameras whose lost pixels are known; empty where none is.
@@ -297,6 +315,22 @@ class Episode:
                 "another loss frame."
             )
         return self.points[self.offsets[position] : self.offsets[position + 1]]
+
+    def select(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> Episode:
+        """The points to keep: a mask [P], or indices that go up.
+
+        Raises:
+            EpisodeError: a frame of which nothing is kept.
+        """
+        chosen = np.flatnonzero(kept) if kept.dtype == bool else kept
+        return replace(
+            self,
+            points=self.points[chosen],
+            offsets=np.searchsorted(chosen, self.offsets),
+            camera=None if self.camera is None else self.camera[chosen],
+            pixel=None if self.pixel is None else self.pixel[chosen],
+            sigma=None if self.sigma is None else self.sigma[chosen],
+        )
 
     @staticmethod
     def from_frames(

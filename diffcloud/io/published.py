@@ -1,13 +1,14 @@
-"""The gripper's tracks published with the paper, and its real recordings as recordings: metres, seconds, and that track.
+"""The gripper's tracks published with the paper, and its real recordings in metres and seconds, with cameras and track.
 
 The published scenes look at one frame and move their handle along a path of their own. Here a lift or fold is what was
 recorded: clouds in metres, of a 10 Hz motion whose gripper was where the published track says. The track is in the robot's
-frame. The clouds' frame is turned against it by 90° about the vertical; where it lies was found from the clouds' highest
-points, which go along with the track.
+frame. The clouds' frame is turned against it by 90° about the vertical. The camera set-up says where its origin lies, if
+that is known. Otherwise it was found from the clouds' highest points, which go along with the track.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,17 +18,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
-from diffcloud.io.episodes import Episode
+from diffcloud.io.episodes import Episode, Pinhole
 from diffcloud.io.pickles import load_npy
+from diffcloud.io.published_cameras import SetUp, published_set_ups, recognised
 
 RELEASE_UNIT_M = 0.35
 """One length unit of the published recordings [m]."""
 RECORDED_RATE_HZ = 10.0
 """Of the robot's commands and of the clouds (paper, section IV-D): row j of a track is where the gripper was in cloud j."""
 RECORDED_START_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(
-    {"lift": (0.0, 0.105, 0.0), "fold": (0.0, -0.30, -0.033)}
+    {"lift": (0.0, 0.105, 0.0), "fold": (0.0, -0.286, -0.033)}
 )
-"""Kind of motion -> x and y in the clouds' frame where its gripper starts, and what to add to the robot's z [m]."""
+"""Kind of motion -> x and y of the gripper at the start of its scenario, about a centimetre from the held corner at most,
+and what to add to the robot's z where the clouds' place in the robot's frame is unknown [m]."""
+_POSE_SIGMAS: Mapping[bool, Mapping[str, float]] = MappingProxyType(
+    {
+        True: {"x": 0.01, "y": 0.01, "yaw": math.radians(1)},
+        False: {"x": 0.03, "y": 0.03, "yaw": math.radians(20)},
+    }
+)
+"""Whether the clouds' place in the robot's frame is known -> standard deviations of where the cloth's held corner and the
+gripper's track are [m, rad]. Known: the fingers hold the cloth up to a centimetre from its corner."""
 _SCALE_SIGMA = 0.02
 """By what fraction distances in the clouds may be off: what the cameras' data sheet allows. In the published calibration
 images, the board is 3 to 6 % too large; but what the clouds themselves were made with was not published, so the prior is
@@ -50,7 +61,7 @@ def read_trajectories(folder: Path, kinds: tuple[str, ...]) -> dict[str, NDArray
 
 
 def recorded_episode(kind: str, name: str, published: Episode, track: NDArray[np.float64]) -> Episode:
-    """A published recording in metres and seconds, with its gripper.
+    """A published recording in metres and seconds, with its gripper, and with its cameras if their set-up is known.
 
     Args:
         kind: key of `RECORDED_START_M`.
@@ -59,8 +70,11 @@ def recorded_episode(kind: str, name: str, published: Episode, track: NDArray[np
         track: [T, 3] in the robot's frame [m].
 
     Returns:
-        Points [m] and the gripper's positions [T, 1, 3] [m] in the clouds' frame, times from 0 [s]. The published
-        predictions are left out: they are multipliers of another scene. The meta says how far the clouds' scale may be off.
+        Points [m] and the gripper's positions [T, 1, 3] [m] in the scenario's frame, times from 0 [s], and if the set-up is
+        known, camera and pixel of each point. The published predictions are left out: they are multipliers of another
+        scene. The meta says how far scale and pose may be off (`scale_sigma`, `pose_sigmas`). Of a known set-up, it has
+        `set_up`, `cameras`, `viewpoints`, `pinholes`, and `clouds_shift_m`, which was added to the clouds. With this shift,
+        the gripper starts where the scenario's does.
 
     Raises:
         EpisodeError: the track has another number of rows than the recording has frames.
@@ -71,17 +85,56 @@ def recorded_episode(kind: str, name: str, published: Episode, track: NDArray[np
             "cloud."
         )
     meta = {name: value for name, value in published.meta.items() if name != "predictions"}
-    return replace(
+    points = RELEASE_UNIT_M * published.points.astype(np.float64)
+    set_up = recognised(points, published_set_ups())
+    known = set_up is not None and set_up.robot_to_clouds_m is not None
+    meta |= {"scenario": f"recorded_{kind}", "scale_sigma": _SCALE_SIGMA, "pose_sigmas": dict(_POSE_SIGMAS[known])}
+    gripper, shift = in_clouds_frame(kind, track), np.zeros(3)
+    if set_up is not None and set_up.robot_to_clouds_m is not None:
+        x, y, z = set_up.robot_to_clouds_m
+        shift[:2] = gripper[0, :2] - [track[0, 1] + x, y - track[0, 0]]
+        gripper[:, 2] = track[:, 2] + z
+    episode = replace(
         published,
-        points=(RELEASE_UNIT_M * published.points.astype(np.float64)).astype(np.float32),
+        points=(points + shift).astype(np.float32),
         times=np.arange(published.frame_count) / RECORDED_RATE_HZ,
-        gripper=in_clouds_frame(kind, track)[:, None],
-        meta={**meta, "scenario": f"recorded_{kind}", "scale_sigma": _SCALE_SIGMA},
+        gripper=gripper[:, None],
+        meta=meta,
     )
+    return episode if set_up is None else _with_cameras(episode, points, set_up, shift)
+
+
+def _with_cameras(episode: Episode, points: NDArray[np.float64], set_up: SetUp, shift: NDArray[np.float64]) -> Episode:
+    """
+    Args:
+        points: [P, 3] of the episode in the clouds' frame [m].
+        shift: [3] added to them [m].
+    """
+    camera, pixel = set_up.seen(points)
+    pinholes = {name: _shifted(pinhole, shift) for name, pinhole in set_up.pinholes.items()}
+    return replace(
+        episode,
+        camera=camera.astype(np.uint8),
+        pixel=pixel.astype(np.uint16),
+        meta={
+            **episode.meta,
+            "set_up": set_up.name,
+            "clouds_shift_m": shift.tolist(),
+            "cameras": list(pinholes),
+            "viewpoints": {name: pinhole.position.tolist() for name, pinhole in pinholes.items()},
+            "pinholes": {name: pinhole.described() for name, pinhole in pinholes.items()},
+        },
+    ).select(camera >= 0)
+
+
+def _shifted(pinhole: Pinhole, shift: NDArray[np.float64]) -> Pinhole:
+    pose = pinhole.T_camera_scene.copy()
+    pose[:, 3] -= pose[:, :3] @ shift
+    return replace(pinhole, T_camera_scene=pose)
 
 
 def in_clouds_frame(kind: str, track: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A track [T, 3] in the robot's frame [m] as one [T, 3] in the clouds' frame [m], by a rotation and a shift."""
+    """A track [T, 3] in the robot's frame [m] as one [T, 3] in the scenario's frame [m], by a rotation and a shift."""
     way = track - track[0]
     x, y, lift = RECORDED_START_M[kind]
     return np.stack([x + way[:, 1], y - way[:, 0], track[:, 2] + lift], axis=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.clouds import import_open3d
+from diffcloud.io.episodes import Episode
 
 Thinning = Literal["random", "voxel", "farthest"]
 """At `random`, the point nearest the middle of each occupied `voxel`, or each time the one `farthest` from those kept."""
@@ -107,6 +108,7 @@ def in_large_clusters(points: NDArray[np.floating[Any]], gap: float, least_part:
     """[N] whether a point belongs to a cluster that holds at least `least_part` of the largest one's points.
 
     Points of voxels of side `gap` that touch, also at corners, are of one cluster: clusters are at least `gap` apart.
+    Points have three coordinates, or time as a fourth one.
     """
     if not len(points):
         return np.zeros(0, dtype=bool)
@@ -119,6 +121,28 @@ def in_large_clusters(points: NDArray[np.floating[Any]], gap: float, least_part:
     size = np.bincount(cluster)
     kept: NDArray[np.bool_] = size[cluster] >= least_part * size.max()
     return kept
+
+
+def without_strays(episode: Episode, gap: float) -> Episode:
+    """The episode without clusters that are never connected with the cloth, such as pieces of robot and background.
+
+    Clusters are those of `in_large_clusters`, in space and time: points of neighbouring frames are connected like points of
+    one frame. The largest cluster is the cloth. So a corner of the cloth that is connected with the rest in a later frame
+    only is kept, however few its points. A frame without any point of the largest cluster keeps all its points.
+
+    Args:
+        gap: least distance between clusters, in the episode's length unit.
+
+    Returns:
+        Its meta's `quality` has `strays`: the number of removed points in each frame.
+    """
+    frame = np.repeat(np.arange(episode.frame_count), np.diff(episode.offsets))
+    kept = in_large_clusters(np.column_stack([episode.points, gap * (frame + 0.5)]), gap, 1.0)
+    seen = np.bincount(frame, weights=kept) > 0
+    kept |= ~seen[frame]
+    strays = np.bincount(frame[~kept], minlength=episode.frame_count).tolist()
+    quality = {**episode.meta.get("quality", {}), "strays": strays}
+    return replace(episode.select(kept), meta={**episode.meta, "quality": quality})
 
 
 def _one_per_voxel(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:

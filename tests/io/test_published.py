@@ -10,9 +10,10 @@ import torch
 
 from diffcloud.fit import Objective
 from diffcloud.fit.pose import default_priors
-from diffcloud.io.episodes import read_episode
+from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.imports import release_episodes
 from diffcloud.io.published import RECORDED_START_M, RELEASE_UNIT_M, in_clouds_frame, read_trajectories, recorded_episode
+from diffcloud.io.published_cameras import published_set_ups
 from diffcloud.scene.scenarios import load_scenario
 from tests.io.test_imports import make_clouds
 from tests.pipeline.invoke import invoke
@@ -94,6 +95,79 @@ class TestImport:
         (published / "trajs" / "fold_traj.npy").unlink()
         (published / "pysim" / "fold_real_pcls").rename(published / "elsewhere")
         assert set(import_release(published).result["episodes"]) == {"release_lift", "recorded_lift", "release_band"}
+
+
+def grid_clouds(set_up, rng, count):
+    """Clouds in the release's unit: whole pixels and millimetres of both cameras, and the camera of each point."""
+    clouds, cameras = [], []
+    for _ in range(count):
+        parts = []
+        for pinhole in set_up.pinholes.values():
+            pixel = np.stack([rng.integers(290, 330, 60), rng.integers(220, 260, 60)], axis=1)
+            z = 1e-3 * rng.integers(700, 720, 60)
+            ray = np.column_stack([(pixel - pinhole.centre) / pinhole.focal, np.ones(60)]) * z[:, None]
+            T = pinhole.T_camera_scene
+            parts.append((ray - T[:, 3]) @ T[:, :3])
+        clouds.append(np.concatenate(parts) / RELEASE_UNIT_M)
+        cameras.append(np.repeat([0, 1], 60))
+    return clouds, np.concatenate(cameras)
+
+
+class TestCameras:
+    """Points name the camera in whose image they have whole pixels and whole millimetres."""
+
+    @pytest.mark.parametrize("set_up", published_set_ups(), ids=lambda one: one.name)
+    @pytest.mark.parametrize("kind", NAMES)
+    def test_the_set_up_is_found_from_the_points_alone(self, set_up, kind):
+        clouds, cameras = grid_clouds(set_up, np.random.default_rng(0), 25)
+        published = Episode.from_frames(clouds, 0.04 * np.arange(25))
+        episode = recorded_episode(kind, "any_name", published, track_of(kind))
+        assert episode.meta["set_up"] == set_up.name
+        np.testing.assert_array_equal(episode.camera, cameras)
+        assert episode.meta["cameras"] == list(episode.viewpoints) == ["overhead", "side"]
+        # each point lies on its pixel's ray in the episode's frame
+        for number, pinhole in enumerate(episode.pinholes):
+            mine = episode.camera == number
+            x = episode.points[mine] @ pinhole.T_camera_scene[:, :3].T + pinhole.T_camera_scene[:, 3]
+            seen = np.array(pinhole.focal) * x[:, :2] / x[:, 2:] + pinhole.centre
+            assert np.abs(seen - episode.pixel[mine]).max() < 0.01
+            assert np.abs(1e3 * x[:, 2] - np.rint(1e3 * x[:, 2])).max() < 0.01
+
+    def test_points_off_the_grid_name_no_camera(self):
+        clouds, _ = grid_clouds(published_set_ups()[0], np.random.default_rng(0), 25)
+        published = Episode.from_frames([cloud + 0.001 for cloud in clouds], 0.04 * np.arange(25))
+        episode = recorded_episode("lift", "any_name", published, track_of("lift"))
+        assert episode.camera is None
+        assert "set_up" not in episode.meta
+
+    def test_where_the_robots_frame_is_known_the_pose_is_tight(self):
+        for set_up in published_set_ups():
+            clouds, _ = grid_clouds(set_up, np.random.default_rng(0), 25)
+            episode = recorded_episode("lift", "one", Episode.from_frames(clouds, 0.04 * np.arange(25)), track_of("lift"))
+            known, priors = set_up.robot_to_clouds_m is not None, default_priors(episode)
+            assert (priors["x"], priors["yaw"]) == (
+                pytest.approx(0.01 if known else 0.03),
+                pytest.approx(np.radians(1 if known else 20)),
+            )
+            if known:  # the gripper and the clouds keep their places against each other
+                x, y, z = set_up.robot_to_clouds_m
+                r = track_of("lift")
+                place = np.stack([r[:, 1] + x, y - r[:, 0], r[:, 2] + z], axis=1)
+                np.testing.assert_allclose(episode.gripper[:, 0] - episode.meta["clouds_shift_m"], place, atol=1e-12)
+
+
+def test_every_point_of_the_published_recordings_names_its_camera(release):
+    tracks = read_trajectories(release.parent / "trajs", ("lift", "fold"))
+    found = [(scenario.removeprefix("release_"), name, episode) for scenario, name, episode in release_episodes(release)]
+    names = {}
+    for kind, name, published in found:
+        if kind in tracks:
+            episode = recorded_episode(kind, name, published, tracks[kind])
+            assert len(episode.points) == len(published.points), name
+            assert set(np.unique(episode.camera)) == {0, 1}
+            names.setdefault(episode.meta["set_up"], set()).add(name)
+    assert {key: len(value) for key, value in names.items()} == {"folds": 10, "lifts_a": 3, "lifts_b": 7}
+    assert names["lifts_a"] == {"lift_redblack", "lift_redblack2", "lift_tan2"}
 
 
 class TestFrame:

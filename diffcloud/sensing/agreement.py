@@ -1,0 +1,366 @@
+"""How two cameras that see one moving cloth disagree: pose, depth scale and clock of the second against the first.
+
+Where both cameras see the same place, a point of one lies on the surface that the other sees. A point q of the second
+camera belongs at
+
+    q' = m + R(w) (e + exp(s) (q - e) - m) + t
+
+with a rotation vector w and a shift t about the middle m of the clouds, and a scale s about the second camera e. A frame of
+the second camera with time stamp T shows the motion at T + lag on the first camera's clock. Gauss-Newton minimises
+distances along normals, in both directions: from points of one camera to the other's surface at that time. This surface is
+interpolated quadratically between three frames. Weights are Tukey's.
+
+Which numbers a recording shows depends on the motion. A flat cloth that moves in its own plane shows neither a shift in
+this plane nor the lag. Errors of a surface are shared by all points of a frame, so standard deviations come from sums over
+whole frames (sandwich estimator). Directions that remain as uncertain as their priors are left uncorrected.
+
+Limit: noise of the normals looks like information. A flat cloth gets a shift in its plane and a turn about its normal, with
+standard deviations that are far too small. Use recordings in which the cloth bends. The lag of a cloth at rest is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from diffcloud.errors import EpisodeError
+from diffcloud.io.episodes import Episode, Pinhole
+
+Floats = NDArray[np.float64]
+
+_PRIORS = np.array([np.radians(5.0)] * 3 + [0.05] * 3 + [0.03, 0.1])
+"""Standard deviations of w [rad], t [m], s [1] and lag [s] before the recording was seen."""
+_KNOWN = 0.3
+"""A direction is corrected if the recording leaves less than this part of its prior's standard deviation."""
+_NEIGHBOURS = 40
+_SPREAD_M = 0.025
+"""The neighbours that define a normal lie within this radius; sparser places belong to no surface."""
+_EDGE_M = 0.006
+"""Beside the nearest point of a surface by more than this, a point is beyond its edge."""
+_ALIKE = 0.85
+"""Cosine between the normals of surfaces that may be the same one."""
+_GATE_M = 0.02
+"""Points farther from the surface show something else."""
+_FIRST_GATES_M = (0.06, 0.06, 0.05, 0.04, 0.03, 0.03)
+"""Of the first iterations, in place of that."""
+_ITERATIONS = 30
+_CONVERGED = 0.002
+"""A step this small, in standard deviations of the priors, is the last one."""
+_TUKEY = 4.685
+_TO_DEVIATION = 1.4826
+_MOVES = 1.5
+"""The lag is free if the surfaces' speed along their normals exceeds this many times what noise alone would make of it."""
+_CLOCK_BIAS_S = 0.02
+"""Added to the standard deviation of a clock. Noise of the normals takes up to a third off the offset in simulations."""
+_UNKNOWN_CLOCK_S = 0.1
+_SOURCES = 200
+"""Points of each camera and frame that are compared."""
+_LEAST_ROWS, _LEAST_FRAMES = 300, 5
+"""Fewer compared points or frames show no agreement."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Correction of the second camera, to be applied to its points."""
+
+    middle: Floats
+    """[3] about which it is turned [m]."""
+    eye: Floats
+    """[3] about which it is scaled [m]: the second camera."""
+    values: Floats
+    """[8] w [rad], t [m], s, lag [s]; zero in directions that the recordings do not show."""
+    covariance: Floats
+    """[8, 8] of the values. Directions that the recordings do not show keep the prior's."""
+    before_m: float
+    after_m: float
+    """Root mean square distances of points to the other camera's surface, without and with the correction [m]."""
+
+    @property
+    def sigmas(self) -> Floats:
+        """[8] standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def moved(self, points: Floats) -> Floats:
+        """[N, 3] points of the second camera -> where they belong [m]."""
+        return self._matrix(points - self.eye) + self._shift()
+
+    def pinhole(self, seen: Pinhole) -> Pinhole:
+        """The second camera with its corrected pose. A scale of depths moves no pixel, so it is left out."""
+        T = seen.T_camera_scene
+        R = T[:, :3] @ self._rotation().T
+        return replace(seen, T_camera_scene=np.column_stack([R, -R @ self.moved(seen.position[None])[0]]))
+
+    def plane(self, plane: Sequence[float]) -> list[float]:
+        """[a, b, c, d]: half space a x + b y + c z >= d of the second camera's points, after the correction."""
+        normal, offset = np.array(plane[:3]), plane[3]
+        on = self.moved((offset * normal / (normal @ normal))[None])[0]
+        turned = self._rotation() @ normal
+        return [*turned.tolist(), float(turned @ on)]
+
+    def described(self) -> dict[str, Any]:
+        """For metadata, in SI."""
+        names = ("rotation_rad", "translation_m", "log_scale", "lag_s")
+        parts: tuple[slice | int, ...] = (slice(0, 3), slice(3, 6), 6, 7)
+        return {
+            "method": "point to surface between two cameras, Gauss-Newton with Tukey weights",
+            "about_m": self.middle.tolist(),
+            "scale_about_m": self.eye.tolist(),
+            **{name: self.values[part].tolist() for name, part in zip(names, parts, strict=True)},
+            "sigmas": {name: self.sigmas[part].tolist() for name, part in zip(names, parts, strict=True)},
+            "rms_before_m": self.before_m,
+            "rms_after_m": self.after_m,
+        }
+
+    def _rotation(self) -> Floats:
+        return np.asarray(Rotation.from_rotvec(self.values[:3]).as_matrix())
+
+    def _matrix(self, vectors: Floats) -> Floats:
+        return np.asarray(np.exp(self.values[6]) * vectors @ self._rotation().T)
+
+    def _shift(self) -> Floats:
+        """[3] where the second camera itself belongs."""
+        return np.asarray(self.middle + self._rotation() @ (self.eye - self.middle) + self.values[3:6])
+
+    def back(self, points: Floats) -> Floats:
+        """The inverse of `moved`."""
+        return np.asarray(self.eye + np.exp(-self.values[6]) * (points - self._shift()) @ self._rotation())
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """What one camera saw in one frame."""
+
+    points: Floats
+    """[N, 3] moved onto the planes through their neighbours."""
+    normals: Floats
+    tree: cKDTree | None
+
+    @staticmethod
+    def of(points: Floats, eye: Floats) -> _Surface:
+        """Of points [N, 3] seen from a place [3]; normals point towards it."""
+        points = np.unique(points, axis=0)  # clouds may have been sampled with repetition
+        if len(points) < 2 * _NEIGHBOURS:
+            return _Surface(np.empty((0, 3)), np.empty((0, 3)), None)
+        distance, index = cKDTree(points).query(points, _NEIGHBOURS)
+        dense = distance[:, -1] < _SPREAD_M
+        around = points[index[dense]]
+        centre = around.mean(axis=1)
+        away = around - centre[:, None]
+        normal = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away))[1][..., 0]
+        own = points[dense]
+        own = own - ((own - centre) * normal).sum(-1, keepdims=True) * normal
+        normal *= np.sign(((eye - own) * normal).sum(-1, keepdims=True))
+        return _Surface(own, normal, cKDTree(own) if len(own) else None)
+
+    def height(self, points: Floats, facing: Floats, gate: float) -> tuple[Floats, Floats]:
+        """Height [N] of points above the surface along its normals [N, 3]; NaN where no surface faces the same
+        way as the points' own surface does [N, 3]: cloth has two sides, and folds have layers."""
+        height, normal = np.full(len(points), np.nan), np.zeros((len(points), 3))
+        if self.tree is None or not len(points):
+            return height, normal
+        distance, index = self.tree.query(points, distance_upper_bound=gate)
+        near = np.flatnonzero(np.isfinite(distance))
+        away, n = points[near] - self.points[index[near]], self.normals[index[near]]
+        above = (away * n).sum(-1)
+        beside = np.sqrt(np.maximum((away**2).sum(-1) - above**2, 0.0)) < _EDGE_M
+        beside &= (facing[near] * n).sum(-1) > _ALIKE
+        height[near[beside]], normal[near[beside]] = above[beside], n[beside]
+        return height, normal
+
+
+@dataclass(frozen=True)
+class _Rows:
+    J: Floats
+    """[N, 8]"""
+    r: Floats
+    """[N] [m]"""
+    frame: NDArray[np.int64]
+    """[N] numbers of the frames."""
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """One recording of two cameras."""
+
+    times: Floats
+    surfaces: tuple[list[_Surface], list[_Surface]]
+    sources: tuple[list[NDArray[np.int64]], list[NDArray[np.int64]]]
+    """Points of these surfaces that are compared with the other camera's."""
+
+    @staticmethod
+    def of(episode: Episode, numbers: tuple[int, int], rng: np.random.Generator) -> _Pair:
+        assert episode.camera is not None
+        clouds: tuple[list[Floats], list[Floats]] = ([], [])
+        for frame in range(episode.frame_count):
+            begin, end = episode.offsets[frame], episode.offsets[frame + 1]
+            for number, into in zip(numbers, clouds, strict=True):
+                into.append(episode.points[begin:end][episode.camera[begin:end] == number].astype(np.float64))
+        eyes = [episode.viewpoints[episode.meta["cameras"][number]] for number in numbers]
+        surfaces = tuple([_Surface.of(c, eye) for c in side] for side, eye in zip(clouds, eyes, strict=True))
+        sources = tuple([rng.permutation(len(s.points))[:_SOURCES] for s in side] for side in surfaces)
+        return _Pair(episode.times, (surfaces[0], surfaces[1]), (sources[0], sources[1]))
+
+    def rows(self, now: Agreement, gate: float, first: int) -> list[_Rows]:
+        """Of every frame in both directions; frames are numbered from `first`."""
+        found, lag = list[_Rows](), float(now.values[7])
+        for frame, time in enumerate(self.times):
+            for to in (0, 1):  # from the second camera's points to the first one's surface, and the other way
+                sign = 1.0 if to == 0 else -1.0
+                own, chosen = self.surfaces[1 - to][frame], self.sources[1 - to][frame]
+                between = _between(self.times, time + sign * lag)
+                if between is None or not len(chosen):
+                    continue
+                world, facing = own.points[chosen], own.normals[chosen]
+                if to == 0:
+                    world, facing = now.moved(world), facing @ now._rotation().T
+                local, facing = (world, facing) if to == 0 else (now.back(world), facing @ now._rotation())
+                height, rate, normal = np.zeros(len(world)), np.zeros(len(world)), np.zeros((len(world), 3))
+                for k, weight, slope in between:
+                    h, n = self.surfaces[to][k].height(local, facing, gate)
+                    height += weight * h
+                    rate += slope * h
+                    normal += weight * n
+                if to == 1:
+                    normal = normal @ now._rotation().T
+                good = np.isfinite(height)
+                height, rate, normal, world = height[good], rate[good], normal[good], world[good]
+                # the second camera's surface goes along with its correction, its point's height goes the other way
+                turned, scaled = np.cross(world - now.middle - now.values[3:6], normal), world - now._shift()
+                columns = [turned, normal, (scaled * normal).sum(-1)[:, None]]
+                J = np.column_stack([sign * np.concatenate(columns, axis=1), sign * rate])
+                found.append(_Rows(J, height, np.full(len(height), first + frame)))
+        return found
+
+
+def _between(times: Floats, time: float) -> list[tuple[int, float, float]] | None:
+    """Three frames with the weights that interpolate at a time, and their slopes [1/s]; None outside of the recording."""
+    middle = int(np.abs(times - time).argmin())
+    if not 0 < middle < len(times) - 1:
+        return None
+    chosen, result = (middle, middle - 1, middle + 1), []
+    for k in chosen:
+        a, b = (other for other in chosen if other != k)
+        scale = (times[k] - times[a]) * (times[k] - times[b])
+        result.append((k, (time - times[a]) * (time - times[b]) / scale, (2 * time - times[a] - times[b]) / scale))
+    return result
+
+
+def _rows(pairs: Sequence[_Pair], now: Agreement, gate: float) -> _Rows:
+    parts, first = list[_Rows](), 0
+    for pair in pairs:
+        parts += pair.rows(now, gate, first)
+        first += len(pair.times)
+    if not parts:
+        return _Rows(np.empty((0, 8)), np.empty(0), np.empty(0, dtype=np.int64))
+    return _Rows(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("J", "r", "frame")))
+
+
+def agreement(episodes: Sequence[Episode], cameras: tuple[str, str], *, scale: bool = True, seed: int = 0) -> Agreement:
+    """Estimate the second camera's correction from all recordings of one set-up.
+
+    Args:
+        episodes: in metres, each with `camera` of its points, and `cameras` and `viewpoints` in its meta.
+        cameras: names of the first, which stays, and of the second.
+        scale: whether the second camera's depths may have a wrong scale.
+        seed: of the points that are compared.
+
+    Raises:
+        EpisodeError: points that name no camera, an unknown camera, or surfaces that do not overlap enough to be compared.
+    """
+    rng, pairs = np.random.default_rng(seed), list[_Pair]()
+    for episode in episodes:
+        known = episode.meta.get("cameras") or []
+        if episode.camera is None or not set(cameras) <= set(known) or cameras[1] not in episode.viewpoints:
+            raise EpisodeError(
+                f"The cameras {' and '.join(cameras)} cannot be compared: the recording's points name the cameras "
+                f"{', '.join(map(str, known)) or 'none'}. Points must name their camera, and `viewpoints` its place. Give "
+                "a recording that `diffcloud preprocess` made of raw depth images of two cameras."
+            )
+        pairs.append(_Pair.of(episode, (known.index(cameras[0]), known.index(cameras[1])), rng))
+    clouds = [s.points for pair in pairs for side in pair.surfaces for s in side]
+    middle = np.concatenate(clouds).mean(axis=0) if sum(map(len, clouds)) else np.zeros(3)
+    now = Agreement(middle, episodes[0].viewpoints[cameras[1]], np.zeros(8), np.diag(_PRIORS**2), 0.0, 0.0)
+    free = np.array([True] * 6 + [scale, True])
+    before_m = _rms(_rows(pairs, now, _GATE_M))
+    interval = float(np.median(np.concatenate([np.diff(pair.times) for pair in pairs])))
+    for iteration in range(_ITERATIONS):
+        gate = _FIRST_GATES_M[iteration] if iteration < len(_FIRST_GATES_M) else _GATE_M
+        rows = _rows(pairs, now, gate)
+        frames = len(np.unique(rows.frame))
+        if len(rows.r) < _LEAST_ROWS or frames < _LEAST_FRAMES:
+            raise EpisodeError(
+                f"The cameras {' and '.join(cameras)} cannot be compared: {len(rows.r)} points in {frames} frames lie "
+                f"within {100 * gate:g} cm of the other camera's surface. It takes {_LEAST_ROWS} points in {_LEAST_FRAMES} "
+                "frames. Check the cameras' poses, or leave the correction off."
+            )
+        free[7] = np.sqrt(np.mean(rows.J[:, 7] ** 2)) > _MOVES * _sigma(rows) / (np.sqrt(2) * interval)
+        previous, now = now, _stepped(now, rows, free)
+        if gate == _GATE_M and np.abs((now.values - previous.values) / _PRIORS).max() < _CONVERGED:
+            break
+    return replace(now, before_m=before_m, after_m=_rms(_rows(pairs, now, _GATE_M)))
+
+
+def _stepped(now: Agreement, rows: _Rows, free: NDArray[np.bool_]) -> Agreement:
+    """After one Gauss-Newton step in the directions that the rows show."""
+    inside = np.maximum(1 - (rows.r / (_TUKEY * _sigma(rows))) ** 2, 0.0)
+    weight = inside**2
+    J = rows.J[:, free] * _PRIORS[free]  # in deviations of the priors
+    H, g = J.T @ (weight[:, None] * J), J.T @ (weight * rows.r)
+    H += 1e-9 * np.trace(H) * np.eye(len(H))
+    scores = np.zeros((int(rows.frame.max()) + 1, len(H)))
+    np.add.at(scores, rows.frame, J * (weight * rows.r)[:, None])
+    inverse = np.linalg.inv(H)
+    variance, ways = np.linalg.eigh(inverse @ (scores.T @ scores) @ inverse)
+    shown = variance < _KNOWN**2
+    chosen, hidden = ways[:, shown], ways[:, ~shown]
+    step, covariance = np.zeros(8), np.eye(8)
+    step[free] = -chosen @ np.linalg.solve(chosen.T @ H @ chosen, chosen.T @ g)
+    covariance[np.ix_(free, free)] = chosen @ np.diag(np.maximum(variance[shown], 0.0)) @ chosen.T + hidden @ hidden.T
+    # about the middle, small steps add to the rotation vector
+    return replace(now, values=now.values + _PRIORS * step, covariance=_PRIORS[:, None] * covariance * _PRIORS)
+
+
+def _sigma(rows: _Rows) -> float:
+    """Standard deviation of the distances [m], from their median."""
+    return max(_TO_DEVIATION * float(np.median(np.abs(rows.r))), 1e-5)
+
+
+def _rms(rows: _Rows) -> float:
+    return float(np.sqrt(np.mean(rows.r**2))) if len(rows.r) else float("nan")
+
+
+def corrected(episode: Episode, found: Agreement, camera: str, about: Mapping[str, Any]) -> Episode:
+    """The episode with the second camera's points, pose and cut plane corrected.
+
+    Args:
+        camera: the second camera.
+        about: added to the metadata of the correction, such as from which recordings it was estimated.
+
+    Returns:
+        Its meta has `agreement`, the correction, and `clocks`: camera -> `offset_s` and `sigma_s` [s]. A point of the
+        second camera with time stamp T shows the motion at T + offset_s on the first camera's clock. The first camera's
+        own offset is against the gripper's track. The cameras do not show it, so its standard deviation is wide. Times
+        remain as they were.
+    """
+    assert episode.camera is not None
+    meta = dict(episode.meta)
+    points = episode.points.copy()
+    mine = episode.camera == list(meta["cameras"]).index(camera)
+    points[mine] = found.moved(points[mine].astype(np.float64))
+    meta["viewpoints"] = {**meta["viewpoints"], camera: found.moved(episode.viewpoints[camera][None])[0].tolist()}
+    if camera in meta.get("pinholes", {}):
+        moved = found.pinhole(Pinhole.of(meta["pinholes"][camera]))
+        meta["pinholes"] = {**meta["pinholes"], camera: moved.described()}
+    if camera in meta.get("cut_planes", {}):
+        meta["cut_planes"] = {**meta["cut_planes"], camera: found.plane(meta["cut_planes"][camera])}
+    meta["agreement"] = {camera: {**found.described(), **about}}
+    first = next(name for name in meta["cameras"] if name != camera)
+    clock = {"offset_s": float(found.values[7]), "sigma_s": float(np.hypot(found.sigmas[7], _CLOCK_BIAS_S))}
+    meta["clocks"] = {first: {"offset_s": 0.0, "sigma_s": _UNKNOWN_CLOCK_S}, camera: clock}
+    return replace(episode, points=points, meta=meta)
