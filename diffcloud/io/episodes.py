@@ -250,8 +250,8 @@ class Episode:
                 "The episode's meta has the clocks of its cameras, but some points name none of them. With `clocks`, every "
                 "point names one of the cameras. Give each point its `camera`, or remove `clocks`."
             )
-        nothing = {"offset_s": 0.0, "sigma_s": 0.0}
-        return {name: Clock(*(float(told.get(name, nothing)[key]) for key in ("offset_s", "sigma_s"))) for name in cameras}
+        stated = {name: Clock(float(one["offset_s"]), float(one["sigma_s"])) for name, one in told.items()}
+        return {name: stated.get(name, Clock(0.0, 0.0)) for name in cameras}
 
     @property
     def scale_sigma(self) -> float | None:

@@ -87,11 +87,12 @@ def recorded_episode(kind: str, name: str, published: Episode, track: NDArray[np
     meta = {name: value for name, value in published.meta.items() if name != "predictions"}
     points = RELEASE_UNIT_M * published.points.astype(np.float64)
     set_up = recognised(points, published_set_ups())
-    known = set_up is not None and set_up.robot_to_clouds_m is not None
-    meta |= {"scenario": f"recorded_{kind}", "scale_sigma": _SCALE_SIGMA, "pose_sigmas": dict(_POSE_SIGMAS[known])}
+    robot = None if set_up is None else set_up.robot_to_clouds_m
+    sigmas = dict(_POSE_SIGMAS[robot is not None])
+    meta |= {"scenario": f"recorded_{kind}", "scale_sigma": _SCALE_SIGMA, "pose_sigmas": sigmas}
     gripper, shift = in_clouds_frame(kind, track), np.zeros(3)
-    if set_up is not None and set_up.robot_to_clouds_m is not None:
-        x, y, z = set_up.robot_to_clouds_m
+    if robot is not None:
+        x, y, z = robot
         shift[:2] = gripper[0, :2] - [track[0, 1] + x, y - track[0, 0]]
         gripper[:, 2] = track[:, 2] + z
     episode = replace(

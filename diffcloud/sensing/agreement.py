@@ -31,6 +31,7 @@ from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.episodes import Episode, Pinhole
+from diffcloud.sensing.robust import deviation, tukey
 
 Floats = NDArray[np.float64]
 
@@ -52,8 +53,6 @@ _FIRST_GATES_M = (0.06, 0.06, 0.05, 0.04, 0.03, 0.03)
 _ITERATIONS = 30
 _CONVERGED = 0.002
 """A step this small, in standard deviations of the priors, is the last one."""
-_TUKEY = 4.685
-_TO_DEVIATION = 1.4826
 _MOVES = 1.5
 """The lag is free if the surfaces' speed along their normals exceeds this many times what noise alone would make of it."""
 _CLOCK_BIAS_S = 0.02
@@ -308,8 +307,7 @@ def agreement(episodes: Sequence[Episode], cameras: tuple[str, str], *, scale: b
 
 def _stepped(now: Agreement, rows: _Rows, free: NDArray[np.bool_]) -> Agreement:
     """After one Gauss-Newton step in the directions that the rows show."""
-    inside = np.maximum(1 - (rows.r / (_TUKEY * _sigma(rows))) ** 2, 0.0)
-    weight = inside**2
+    weight = tukey(rows.r, _sigma(rows))
     J = rows.J[:, free] * _PRIORS[free]  # in deviations of the priors
     H, g = J.T @ (weight[:, None] * J), J.T @ (weight * rows.r)
     H += 1e-9 * np.trace(H) * np.eye(len(H))
@@ -328,7 +326,7 @@ def _stepped(now: Agreement, rows: _Rows, free: NDArray[np.bool_]) -> Agreement:
 
 def _sigma(rows: _Rows) -> float:
     """Standard deviation of the distances [m], from their median."""
-    return max(_TO_DEVIATION * float(np.median(np.abs(rows.r))), 1e-5)
+    return max(deviation(rows.r), 1e-5)
 
 
 def _rms(rows: _Rows) -> float:

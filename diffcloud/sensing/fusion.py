@@ -27,6 +27,7 @@ from diffcloud.sensing.cameras import inverse, project, rays, transform
 from diffcloud.sensing.filters import in_large_clusters
 from diffcloud.sensing.masking import RobotMask, Spoilt, View, joints_at, spoilt_pixels
 from diffcloud.sensing.refinement import Sight, refine_extrinsics
+from diffcloud.sensing.robust import deviation
 from diffcloud.sensing.smoothing import smooth_depth
 from diffcloud.sensing.tool_poses import turning
 
@@ -45,8 +46,6 @@ _REFINED_FRAMES = 10
 _REFINED_POINTS = 1000
 _DEEPEST_M = 0.03
 """Points farther below the table are not of it."""
-_TO_DEVIATION = 1.4826
-"""From the median of absolute errors to the standard deviation of normal ones."""
 _CLEAR_DEVIATIONS = 4.0
 """In deviations of the table's heights: 3 in 100,000 of its points lie higher."""
 _MOST_CLEARANCE_M = 0.02
@@ -322,10 +321,10 @@ def fit_table(samples: list[tuple[Floats, NDArray[np.uint8] | None]]) -> Table |
     up, offset = (up, offset) if up[2] > 0 else (-up, -offset)
     heights = points @ up - offset
     under = heights[(heights < 0) & (heights > -_DEEPEST_M)]  # where no cloth is
-    deviation = _TO_DEVIATION * float(np.median(-under)) if len(under) else 0.0
+    spread = deviation(under) if len(under) else 0.0
     colors = [color[np.abs(sample @ up - offset) < _ON_TABLE_M] for sample, color in samples if color is not None]
     color = np.median(np.concatenate(colors), axis=0) if colors and sum(map(len, colors)) else None
-    return Table(up, offset, color, deviation)
+    return Table(up, offset, color, spread)
 
 
 def _cloud(

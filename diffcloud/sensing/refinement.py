@@ -40,6 +40,7 @@ from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import RawEpisode, RobotLog
 from diffcloud.sensing.cameras import inverse, rotate, transform
 from diffcloud.sensing.masking import RobotMask, View, joints_at
+from diffcloud.sensing.robust import deviation, tukey
 
 Floats = NDArray[np.float64]
 
@@ -54,8 +55,6 @@ _COLUMNS = 212
 _GATE_M = 0.03
 """Farther from the described surface a measurement is of something else: three times what a usable calibration is off."""
 _CLOTH_GATE_M = 0.02
-_TUKEY = 4.685
-"""Of the residuals' standard deviation: 95 % efficient on normal noise."""
 _SHAPE_M = 0.002
 """By which surfaces differ from their descriptions beyond a common skin, and depth is off beyond its noise."""
 _SHARED = 36
@@ -367,9 +366,7 @@ def _tukey(u: Floats) -> Floats:
     """[N] weights 0..1 of residuals over their deviations."""
     if not len(u):
         return np.zeros(0)
-    scale = 1.4826 * float(np.median(np.abs(u))) + 1e-9
-    weight: Floats = np.square(1 - np.minimum(np.abs(u) / (_TUKEY * scale), 1.0) ** 2)
-    return weight
+    return tukey(u, deviation(u) + 1e-9)
 
 
 def _image_normals(points: Floats, solid: NDArray[np.bool_], directions: Floats) -> tuple[Floats, Floats]:

@@ -23,28 +23,18 @@ G = 9.81
 MATERIAL = preset("basis-knit")
 
 
-def hanging(nodes=5, handles=(), **air):
-    mesh = grid_cloth(nodes, nodes, 0.3, 0.3)
+def cloth(mesh=None, handles=(), integrator="implicit", **air):
+    mesh = grid_cloth(5, 5, 0.3, 0.3) if mesh is None else mesh
     surrounding = Surrounding(air_density=0.0, self_contact=False, **air)
     return build_system(
-        mesh, MATERIAL, time_step=0.01, handles=Handles(handles), surrounding=surrounding, integrator="implicit"
+        mesh, MATERIAL, time_step=0.01, handles=Handles(handles), surrounding=surrounding, integrator=integrator
     )
 
 
 @pytest.mark.parametrize("integrator", ["implicit", "linearised"])
 def test_a_falling_cloth_accelerates_by_the_share_of_its_weight(integrator):
     """(ρ + m) z'' = -ρ g: nothing else acts."""
-    added = 0.4 * MATERIAL.density
-    mesh = grid_cloth(4, 4, 0.3, 0.3)
-    system = build_system(
-        mesh,
-        MATERIAL,
-        time_step=0.01,
-        handles=Handles(()),
-        surrounding=Surrounding(air_density=0.0, added_mass=added, self_contact=False),
-        integrator=integrator,
-    )
-    run = rollout(system, 20)
+    run = rollout(cloth(grid_cloth(4, 4, 0.3, 0.3), integrator=integrator, added_mass=0.4 * MATERIAL.density), 20)
     np.testing.assert_allclose(run.velocities[0, -1, :, 2], -G / 1.4 * 0.2, rtol=1e-9)
     np.testing.assert_allclose(run.velocities[0, -1, :, :2], 0.0, atol=1e-9)
 
@@ -52,7 +42,7 @@ def test_a_falling_cloth_accelerates_by_the_share_of_its_weight(integrator):
 def test_linear_drag_ends_at_the_velocity_at_which_it_bears_the_weight():
     """c v = ρ g, and the way there is exponential with the rate c / ρ."""
     drag = 2.0 * MATERIAL.density  # [1/s] times the density: the time constant is 0.5 s
-    run = rollout(hanging(linear_drag=drag), 500)
+    run = rollout(cloth(linear_drag=drag), 500)
     velocity = run.velocities[0, :, :, 2].mean(-1).numpy()
     assert velocity[-1] == pytest.approx(-G / 2.0, rel=1e-3)
     assert velocity[50] == pytest.approx(-G / 2.0 * (1 - math.exp(-1.0)), rel=5e-3)
@@ -61,7 +51,7 @@ def test_linear_drag_ends_at_the_velocity_at_which_it_bears_the_weight():
 def test_a_cloth_that_hangs_still_is_as_without_air():
     """At rest only the weight counts."""
     held = tuple(Handle(node) for node in range(5))
-    runs = [rollout(hanging(handles=held, linear_drag=1.2, added_mass=added), 1200) for added in (0.0, 0.15)]
+    runs = [rollout(cloth(handles=held, linear_drag=1.2, added_mass=added), 1200) for added in (0.0, 0.15)]
     first, second = (run.positions[0, -1].numpy() for run in runs)
     assert np.abs(runs[0].velocities[0, -1].numpy()).max() < 1e-3
     np.testing.assert_allclose(first, second, atol=1e-4)
@@ -73,16 +63,9 @@ def test_a_cloth_swings_slower_with_air_that_moves_along():
     def period(added):
         shaken = Motion((Keyframe(0.0, (0, 0, 0)), Keyframe(0.1, (0, 0.01, 0))))
         held = tuple(Handle(node, shaken, gripper="bar") for node in range(5))
-        mesh_up = grid_cloth(5, 5, 0.3, 0.3)
-        nodes = mesh_up.nodes[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])  # hangs down from its first row
-        system = build_system(
-            replace(mesh_up, nodes=np.ascontiguousarray(nodes)),
-            MATERIAL,
-            time_step=0.01,
-            handles=Handles(held),
-            surrounding=Surrounding(air_density=0.0, added_mass=added, self_contact=False),
-            integrator="implicit",
-        )
+        flat = grid_cloth(5, 5, 0.3, 0.3)
+        nodes = flat.nodes[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])  # hangs down from its first row
+        system = cloth(replace(flat, nodes=np.ascontiguousarray(nodes)), held, added_mass=added)
         edge = rollout(system, 400).positions[0, 30:, -5:, 1].mean(-1).numpy()
         centred = edge - edge.mean()
         crossings = np.flatnonzero((centred[:-1] < 0) & (centred[1:] >= 0))
