@@ -198,8 +198,9 @@ class FitConfig(Section):
     parameters: Names = ["stretch", "mass"]
     bounds: dict[str, Bounds] = {}
     fixed: dict[str, Component] = {}
-    solver: Literal["gauss_newton", "adam", "cma_es", "random_search"] = "gauss_newton"
-    """`adam` is the paper's; `cma_es` and `random_search` need no derivatives."""
+    solver: Literal["likelihood", "gauss_newton", "adam", "cma_es", "random_search"] = "gauss_newton"
+    """`likelihood` gives each frame a variance, and knows what the model cannot predict; `adam` is the paper's; `cma_es`
+    and `random_search` need no derivatives."""
     iterations: Count | None = None
     """Of gauss_newton and adam: steps at most; by default 20 and 50."""
     starts: Annotated[int, Field(ge=1, le=MOST_STARTS)] | None = None
@@ -269,6 +270,8 @@ class FitConfig(Section):
             raise ValueError("laid: the published measure takes the cloth to lie as the scene has it; leave it out")
         if self.paper and parse_doubts(self.doubts or "none"):
             raise ValueError("doubts: the published measure takes the rest of the material for known; leave them out")
+        if self.paper and self.solver == "likelihood":
+            raise ValueError("paper: the published measure has no likelihood; choose another solver, or leave it out")
         if self.halvings and (self.paper or self.solver != "gauss_newton"):
             raise ValueError("halvings: of solver gauss_newton, and not of the published measure; leave it out")
         if self.solver == "adam" and self.screen and not 2 <= (self.starts or 1) <= self.screen:
@@ -310,12 +313,13 @@ class FitConfig(Section):
 
     def halved_at_most(self, scenarios: Sequence[Scenario]) -> int:
         """How often edges and step may be halved in a fit of recordings in these scenarios."""
-        return int(self._fits_more(scenarios)) if self.halvings is None else self.halvings
+        default = self.solver == "gauss_newton" and self._fits_more(scenarios)
+        return int(default) if self.halvings is None else self.halvings
 
     def _fits_more(self, scenarios: Sequence[Scenario]) -> bool:
         """Whether more than what is asked for is fitted by default: where derivatives make that cheap."""
         implicit = all(one.scene.integrator == "implicit" for one in scenarios)
-        return not self.paper and self.solver == "gauss_newton" and implicit
+        return not self.paper and self.solver in ("gauss_newton", "likelihood") and implicit
 
     def solver_settings(self, scenario: Scenario) -> Settings:
         """Of the solver, with what the scenario says where nothing is given."""
@@ -325,7 +329,9 @@ class FitConfig(Section):
         elif self.solver == "gauss_newton" and scenario.scene.integrator == "linearised":
             given |= {"screen": ROUGH_SCREEN, "starts": ROUGH_STARTS}
         own = scenario.threshold if self.paper else 0.0
-        given |= {"seed": self.seed, "threshold": own if self.threshold is None else self.threshold}
+        given["seed"] = self.seed
+        if self.solver != "likelihood":
+            given["threshold"] = own if self.threshold is None else self.threshold
         return SOLVERS[self.solver](**given | self._solver_options())
 
     def _solver_options(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import typer
 from rich.table import Table
 
 from diffcloud.errors import ConfigError
-from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, Intervals, significant, state_intervals
+from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, Intervals, intervals_of, significant
 from diffcloud.evaluation.markdown import comparison_page
 from diffcloud.evaluation.methods import scan_of, space_of
 from diffcloud.evaluation.summary import PREDICTORS, headline, label, largest_sources, sentences, tables
@@ -133,10 +133,9 @@ def intervals(
         chosen = choose_scenario(stated or fitted_scenario(fit, one.scenario), scene)
         recordings.append(Recording(chosen, one.name, read_episode(path)))
     objective = compared(record, recordings)
-    found = state_intervals(
-        objective, space_of(record), record.free,
-        level=level, within=within, restarts=RESTARTS, seen=scan_of(record),
-    )  # fmt: skip
+    found = intervals_of(
+        record, objective, space_of(record), level=level, within=within, restarts=RESTARTS, seen=scan_of(record)
+    )
     if out is not None:
         write_json(with_suffix(out, ".json"), found.model_dump(mode="json"))
     if not json:

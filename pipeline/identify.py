@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,14 +16,13 @@ import typer
 import yaml
 
 import diffcloud
-from diffcloud.errors import ConfigError, DiffCloudError, DivergedError, EpisodeError
-from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, Intervals, significant, state_intervals
-from diffcloud.evaluation.methods import scan_of, space_of
+from diffcloud.errors import ConfigError, DiffCloudError, EpisodeError
+from diffcloud.evaluation.intervals import FOLLOWS, LEVEL, WITHIN, Intervals, intervals_of, significant
+from diffcloud.evaluation.methods import space_of
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitRecord, JointObjective, Objective
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.result import physical_values, read_motion
-from diffcloud.fit.uncertainty import distance_to_finer_mm, finer_steps
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import claimed, read_json, read_yaml, together, write_bytes, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint
@@ -46,18 +45,16 @@ from pipeline.preprocess import PreprocessJob
 from pipeline.workers import check_interrupt
 
 _DENSITY = 0.16
-_MATERIAL = {"stretching_n_m": 60.0, "bending_n_m": 1e-5, "poisson": 0.3}
+_MATERIAL = {"stretching_n_m": 60.0, "bending_n_m": 5e-6, "poisson": 0.2, "damping_s": 0.002}
+_AROUND = {"friction_obstacle": 0.4, "compression": 0.5}
+_DOUBTS = {"friction_obstacle": 2.0, "compression": 3.0, "shear": 1.2, "damping": 2.5}
 _BOUNDS = {"stretch": (0.03, 30.0), "bending": (0.03, 30.0), "mass": (0.2, 5.0)}
 _BAGS = (".bag", ".mcap", ".db3")
 _CLOTH_FIELDS = ("base", "size_m", "nodes", "material", "grip", "grip_m", "steps_per_frame")
-_STEPS = 8
-_MOST_STEPS = 64
-_NOISE_PART = 0.5
-"""Largest distance to the motion with finer steps or a finer mesh that does not matter, as a part of the misfit that
-noise accounts for."""
+_STEPS = 16
 _TRANSFERS, _GAIN = 1.25, 0.5
-_Fitted = tuple[FitRecord, AnyObjective, FitJob, int]
-"""A fit, what it minimised, the job, and the steps a frame that it ended with."""
+_Fitted = tuple[FitRecord, AnyObjective, FitJob]
+"""A fit, what it minimised, and the job."""
 Status = Literal["finished", "interrupted", "budget reached"]
 _FITTING = 0.9
 """Part of the time of --budget after which fits end: the report needs some, too."""
@@ -70,22 +67,8 @@ class _SoFar:
     """What is known, also when the time is over or Ctrl-C was pressed."""
 
     fitted: _Fitted | None = None
-    """The last fit: each begins where the one before ended."""
     intervals: Intervals | None = None
     """Of this fit; None: not yet."""
-    mesh: tuple[float, float] | Literal["no time"] | None = "no time"
-    """As `distance_to_finer_mm` gives it; None: the finer cloth diverges."""
-
-    def take(self, fitted: _Fitted) -> None:
-        self.fitted, self.intervals = fitted, None
-
-    def look_at_finer_mesh(self) -> None:
-        assert self.fitted is not None
-        record, objective, *_ = self.fitted
-        try:
-            self.mesh = distance_to_finer_mm(objective, record.simulated, Scenario.finer)
-        except DivergedError:
-            self.mesh = None
 
 
 def identify(
@@ -132,16 +115,14 @@ def identify(
         episodes, cloth, layouts = find_scene(recordings, out, stated, mass)
         chosen = _chosen(parameters, cloth, mass)
         so_far = _SoFar()
-        fit = partial(_fitted, so_far, out, episodes, cloth, layouts)
-        steps = int(cloth.get("steps_per_frame", _STEPS))
         if seconds is not None:
             seconds = max(_FITTING * seconds - (time.monotonic() - began), 1.0)
             warm.implicit()  # a compilation, which is done once, is none of the time and cannot be interrupted
         status: Status = "finished"
         try:
             with ctrl_c.none_lost(), ctrl_c.pressed_after(seconds) as is_over:
-                _stated(so_far, fit, chosen, steps, level=level, within=within)
-                so_far.look_at_finer_mesh()
+                _fit(so_far, out, episodes, cloth, layouts, chosen)
+                so_far.intervals = _intervals(so_far, level=level, within=within)
         except KeyboardInterrupt:
             status = "budget reached" if is_over() else "interrupted"
             if so_far.fitted is None and status == "budget reached":
@@ -152,13 +133,15 @@ def identify(
             if so_far.fitted is None:  # Ctrl-C once more, or before a first loss beside an earlier fit
                 raise
         assert so_far.fitted is not None
-        record, _, job, ended = so_far.fitted
+        record, _, job = so_far.fitted
+        if so_far.intervals is None and record.estimate is not None:  # what was reached has some, too
+            so_far.intervals = _intervals(so_far, level=level, within=within)
         findings = _findings(so_far, status)
         with together():
             for path in job.files:
                 _copy(path, out / f"fit{path.suffix}")
             for name in episodes:
-                _copy(_stage(out, ended) / f"{name}.yaml", out / "scenarios" / f"{name}.yaml")
+                _copy(_stage(out) / f"{name}.yaml", out / "scenarios" / f"{name}.yaml")
             write_text(out / "report.html", _page(record, so_far.intervals, findings, episodes, job))
             if so_far.intervals is not None:
                 write_json(out / "intervals.json", so_far.intervals.model_dump(mode="json"))
@@ -301,7 +284,9 @@ def _cloth(
         ),
         "grip_m": Found(GRIP_M, "side of the pad, or of the square that a pivot stands for; measure your gripper's [m]"),
         "material": Found(material, f"what multipliers act on; density {told}"),
-        "steps_per_frame": Found(_STEPS, "doubled while finer steps move the cloth by more than half of the noise"),
+        **{name: Found(value, "usual; fitted too, within `doubts`") for name, value in _AROUND.items()},
+        "doubts": Found(_DOUBTS, "factors within which what nobody asks for is known"),
+        "steps_per_frame": Found(_STEPS, "finer steps move a lifted cloth by less than the noise"),
     }
     write_text(path, _yaml(found))
     return {name: entry.value for name, entry in found.items()}
@@ -397,116 +382,57 @@ def _chosen(parameters: str | None, cloth: Mapping[str, Any], mass: float | None
             raise ConfigError("--mass goes with a material of stated density_kg_m2 in cloth.yaml.")
         fixed = {"mass": mass / float(density)}
     bounds = {name: list(pair) for name, pair in _BOUNDS.items() if name in names}
-    return FitConfig.model_validate({"parameters": names, "fixed": fixed, "bounds": bounds, "starts": 2, "screen": 14})
+    return FitConfig.model_validate({"parameters": names, "fixed": fixed, "bounds": bounds, "solver": "likelihood"})
 
 
-def _stage(out: Path, steps: int) -> Path:
-    """The folder of the scenarios with so many steps a frame."""
-    return out / "stages" / f"steps{steps}"
+def _stage(out: Path) -> Path:
+    """The folder of the scenarios of an unfinished fit."""
+    return out / "stages" / "scenarios"
 
 
-def _scenarios(
-    out: Path, cloth: Mapping[str, Any], layouts: Mapping[str, Mapping[str, Any]], steps: int
-) -> dict[str, Scenario]:
+def _scenarios(out: Path, cloth: Mapping[str, Any], layouts: Mapping[str, Mapping[str, Any]]) -> dict[str, Scenario]:
     """One per recording, each written to the folder of its stage: other commands read those of the finished fit."""
     found = {}
     for name, fields in layouts.items():
-        path = _stage(out, steps) / f"{name}.yaml"
-        write_text(path, yaml.safe_dump({**cloth, **fields, "steps_per_frame": steps}, sort_keys=False))
+        path = _stage(out) / f"{name}.yaml"
+        write_text(path, yaml.safe_dump({**cloth, **fields}, sort_keys=False))
         found[name] = load_scenario(path)
     return found
 
 
-def _stated(
-    so_far: _SoFar,
-    fit: Callable[[str, FitConfig, int, int, Mapping[str, float]], _Fitted],
-    settings: FitConfig,
-    steps: int,
-    *,
-    level: float,
-    within: float,
-) -> None:
-    """Fit and state intervals; where these meet a lower loss, fit again from there.
-
-    Not `state_intervals`' own restarts: here the record belongs to the intervals, and finer steps may be asked for anew.
-
-    Args:
-        so_far: takes them.
-        fit: `_fitted` of the recordings.
-        steps: a frame, to begin with.
-    """
-    init: Mapping[str, float] = {}
-    halvings = 0
-    for left in range(RESTARTS, -1, -1):
-        record, objective, _, steps = fit(f"fit{RESTARTS - left}", settings, steps, halvings, init)
-        check_interrupt()
-        space, seen = space_of(record), scan_of(record)
-        with progress_bar("identify", None) as update:
-            update(0.0, f"intervals of {record.rms_mm:.2f} mm")
-            found = state_intervals(objective, space, record.free, level=level, within=within, seen=seen)
-        so_far.intervals = found
-        if found.lower is None or not left:
-            return
-        near = ", ".join(f"{name} {found.lower[name]:.3g}" for name in space.asked.names)
-        errors.print(f"The loss is lower at {near}; fitting again from there.")
-        init, settings, halvings = found.lower, _single_start(settings), record.halvings
-
-
-def _single_start(settings: FitConfig) -> FitConfig:
-    """From a place that is known."""
-    return settings.model_copy(update={"starts": 1, "screen": 0})
-
-
-def _fitted(
+def _fit(
     so_far: _SoFar,
     out: Path,
     episodes: Mapping[str, Episode],
     cloth: Mapping[str, Any],
     layouts: Mapping[str, Mapping[str, Any]],
-    name: str,
     settings: FitConfig,
-    steps: int,
-    halvings: int,
-    init: Mapping[str, float],
-) -> _Fitted:
-    """Fit, with finer and finer steps from the place found, until they no longer matter; and the scenario's steps a frame.
-
-    Args:
-        so_far: takes each fit, also one that Ctrl-C has ended.
-        name: of the fit; one for each number of steps is kept in OUT/stages/, so that the same command goes on after it.
-        halvings: of edges and steps, to begin with.
+) -> None:
     """
-    while True:
-        scenarios = _scenarios(out, cloth, layouts, steps)
-        members = [Recording(scenarios[name], name, episode) for name, episode in episodes.items()]
-        job = FitJob(f"{name}_steps{steps}", members, settings, out / "stages", init, halvings)
-        try:
-            with progress_bar("identify", None) as update:
-                record = job.run(partial(_tell, update, steps))
-        except KeyboardInterrupt:
-            ended = job.known()
-            if ended is None and so_far.fitted is None and not (out / "fit.json").exists():
-                ended = job.begun()  # an earlier run's fit is worth more than the place where this one begins
-            if ended is not None:
-                so_far.take((ended, compared(ended, members), job, steps))
-            raise
-        check_interrupt()
-        objective = compared(record, members)
-        so_far.take((record, objective, job, steps))
-        apart, noise = distance_to_finer_mm(objective, record.simulated, finer_steps)
-        errors.print(
-            f"{steps * 2**record.halvings} steps a frame: {record.rms_mm:.1f} mm RMS; four times the steps move the cloth "
-            f"by {apart:.1f} mm, the points' noise is {noise:.1f} mm.",
-        )
-        if apart <= _NOISE_PART * noise or 2 * steps > _MOST_STEPS:
-            if apart > _NOISE_PART * noise:
-                warn(f"finer steps still move the cloth by {apart:.1f} mm: what is found includes an error of that size.")
-            return record, objective, job, steps
-        steps, init, settings, halvings = 2 * steps, record.free, _single_start(settings), record.halvings
+    Args:
+        so_far: takes the fit, also one that Ctrl-C has ended.
+    """
+    scenarios = _scenarios(out, cloth, layouts)
+    members = [Recording(scenarios[name], name, episode) for name, episode in episodes.items()]
+    job = FitJob("fit", members, settings, out / "stages")
+    try:
+        with progress_bar("identify", None) as update:
+            record = job.run(update)
+    except KeyboardInterrupt:
+        ended = job.known()
+        if ended is None and not (out / "fit.json").exists():
+            ended = job.begun()  # an earlier run's fit is worth more than the place where this one begins
+        if ended is not None:
+            so_far.fitted = ended, compared(ended, members), job
+        raise
+    check_interrupt()
+    so_far.fitted = record, compared(record, members), job
 
 
-def _tell(update: Callable[[float, str], None], steps: int, done: float, text: str) -> None:
-    update(done, f"{steps} steps a frame  {text}")
+def _intervals(so_far: _SoFar, *, level: float, within: float) -> Intervals:
+    assert so_far.fitted is not None
+    record, objective, _ = so_far.fitted
+    return intervals_of(record, objective, space_of(record), level=level, within=within)
 
 
 def _validation(record: FitRecord, objective: AnyObjective) -> str:
@@ -541,29 +467,26 @@ def _motion_of(objective: Objective) -> str:
     return str(np.round(end / max(float(np.abs(end).max()), 1e-9), 0).tolist())
 
 
-def mesh_sentence(mesh: tuple[float, float] | Literal["no time"] | None) -> str:
-    """Whether the parameters depend on the mesh, by what `_SoFar.mesh` says."""
-    if mesh == "no time":
-        return f"Whether the parameters depend on the mesh is not known: {_NO_TIME}."
-    if mesh is None:
-        return (
-            "With a mesh of half the edge length, the simulation diverges: whether the parameters depend on the mesh "
-            "is not known."
-        )
-    apart, noise = mesh
-    told = (
-        "With a mesh of half the edge length and the same parameters, the simulated cloth would lie "
-        f"{apart:.1f} mm (RMS) away from the fitted one"
-    )
-    if apart <= _NOISE_PART * noise:
-        return f"{told}: this mesh is fine enough."
-    return f"{told}: the parameters hold for this mesh only, and no interval accounts for that."
+def follows(record: FitRecord) -> list[str]:
+    """Of each recording, until when the model follows it, for people."""
+    lines = []
+    for one, told in zip(record.episodes, record.estimate.recordings if record.estimate else (), strict=False):
+        gone = np.flatnonzero(np.array(told.misfits) > FOLLOWS)
+        rate = told.horizon_s / max(one.frames[-1], 1)
+        if len(gone) == 0:
+            told_so = f"follows {one.name} to within noise and mesh up to {told.horizon_s:.1f} s, where frames end to count"
+        elif gone[0] == 0:
+            told_so = f"does not follow {one.name} from the first frame on"
+        else:
+            told_so = f"follows {one.name} to within noise and mesh until {rate * one.frames[gone[0]]:.1f} s, then departs"
+        lines.append(f"The model {told_so}.")
+    return lines
 
 
 def _findings(so_far: _SoFar, status: Status) -> list[str]:
     """The report's first lines: does the model explain the recordings, do parameters carry over, what are they."""
     assert so_far.fitted is not None
-    record, objective, *_ = so_far.fitted
+    record, objective, _ = so_far.fitted
     found, lines = so_far.intervals, list[str]()
     if status != "finished":
         why, again = (
@@ -575,21 +498,12 @@ def _findings(so_far: _SoFar, status: Status) -> list[str]:
             f"The misfit is {record.rms_mm:.1f} mm RMS. It is not known whether the model explains the recordings, and "
             f"there are no intervals: {_NO_TIME}."
         )
-    elif found.explains:
-        verdict = "It is doubtful whether the model explains" if found.remark else "The model explains"
-        lines.append(f"{verdict} the recordings: misfit {record.rms_mm:.1f} mm RMS.")
-    else:
-        worst = max(record.episodes, key=lambda one: one.rms_mm)
-        frame = int(np.argmax(worst.frame_rms_mm))
-        lines.append(
-            f"The model does not explain the recordings: {found.reason}. The misfit is largest in {worst.name}, frame "
-            f"{worst.frames[frame]}, with {worst.frame_rms_mm[frame]:.1f} mm."
-        )
+    elif not found.explains:
+        lines.append(f"The model does not explain the recordings: {found.reason}.")
+    lines += follows(record)
     lines.append(_validation(record, objective))
     if found is not None and found.explains:
         lines += found.sentences
-    lines += finer_mesh_sentences(record, explains=found is None or found.explains)
-    lines.append(mesh_sentence(so_far.mesh))
     for name, told in _parameters(so_far).items():
         digits = significant(told["low"], told["high"])
         ends, verdict, improve = "", "unfinished", ""
@@ -603,27 +517,10 @@ def _findings(so_far: _SoFar, status: Status) -> list[str]:
     return lines
 
 
-def finer_mesh_sentences(record: FitRecord, *, explains: bool) -> list[str]:
-    """What finer meshes brought where the scenario's does not explain the recordings."""
-    lines = []
-    if record.halvings:
-        lines.append(
-            f"The recordings are explained better with {record.finer_by} as the scenario's, and steps too: the parameters "
-            "are of that mesh."
-        )
-    if record.finer_loss is not None and not explains:
-        rms_mm = 1e3 * record.length_unit_m * record.finer_loss**0.5
-        lines.append(
-            f"With half the edge length and half the step, the fit ended at a misfit of {rms_mm:.1f} mm RMS, or was given "
-            "up there: the mesh is probably not what the model lacks."
-        )
-    return lines
-
-
 def _parameters(so_far: _SoFar) -> dict[str, dict[str, Any]]:
     """Of each parameter its value and, if there are intervals, these."""
     assert so_far.fitted is not None
-    record, objective, *_ = so_far.fitted
+    record, objective, _ = so_far.fitted
     if so_far.intervals is not None:
         return {
             name: {
@@ -659,8 +556,10 @@ def _result(so_far: _SoFar, findings: Sequence[str], status: Status) -> dict[str
         "explains": None if found is None else found.explains and found.arrived,
         "reason": "" if found is None else found.reason,
         "remark": "" if found is None else found.remark,
-        "halvings": record.halvings,
-        "finer_mesh_mm": so_far.mesh[0] if isinstance(so_far.mesh, tuple) else None,
+        "horizons_s": {
+            one.name: told.horizon_s
+            for one, told in zip(record.episodes, record.estimate.recordings if record.estimate else (), strict=False)
+        },
         "findings": list(findings),
         "episodes": {one.name: one.rms_mm for one in record.episodes},
     }

@@ -8,7 +8,7 @@ from typing import Any
 
 from diffcloud.errors import DiffCloudError, DivergedError
 from diffcloud.evaluation import methods
-from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, state_intervals
+from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, intervals_of
 from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
@@ -136,8 +136,8 @@ def compare_episode(
     objective.reseed(fit.measure.seed)
     if settings.level is not None and len(fit.episodes) == 1:  # those of a joint fit are of all its recordings together
         try:
-            told_intervals = state_intervals(
-                objective, space, best,
+            told_intervals = intervals_of(
+                fit, objective, space,
                 level=settings.level, within=settings.within, restarts=RESTARTS, seen=methods.scan_of(fit),
             )  # fmt: skip
             record["intervals"] = told_intervals.model_dump(mode="json")

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -32,6 +32,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
+from diffcloud.fit.record import FitRecord
 from diffcloud.fit.residuals import Axis
 from diffcloud.fit.result import physical_values
 from diffcloud.fit.scan import Scan, scan
@@ -62,6 +63,10 @@ _DOUBTED = 1.3
 on a fit gets a remark (see `Objective.unexplained`)."""
 _UNEXPLAINED_RMS = 2.0
 """RMS over a coarse allowance for noise and spacing, from which the model does not explain another recording."""
+FOLLOWS = 4.0
+"""Mean squared distance over what is accounted for, up to which the model follows a recording."""
+_MANY = 1_000_000
+"""Clusters of a variance that is not estimated from any."""
 _STEP = 2.0
 """The largest next step of a fit that has arrived, in standard deviations."""
 _PRIOR = 0.5
@@ -179,7 +184,6 @@ def state_intervals(
     deviations = np.sqrt(np.maximum(found.covariance.diagonal(), 1e-300))
     arrived = lower is None and bool((np.abs(found.step) <= _STEP * deviations).all())
     found = replace(found, sources={**found.sources, "next step": np.outer(found.step, found.step)})
-    total = found.covariance
     misfit = [_misfit(member, loss) for member, loss in zip(objective.members, found.losses.tolist(), strict=True)]
     rms, accounted, excess = max(misfit, key=lambda each: each[2])
     explains = objective.paper or excess <= 1
@@ -196,7 +200,37 @@ def state_intervals(
         )
         if not all(member.episode.viewpoints for member in objective.members):
             reason += "; if cameras saw only a part of it, import the clouds with `--camera NAME=x,y,z`"
-    remark = "" if reason else _remark(objective, found)
+    told = _Told(arrived, explains, reason, "" if reason else _remark(objective, found), lower)
+    return _intervals(found, space, values, objective.members[0].scenario, told, level=level, within=within)
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What is known of a fit beside its covariance, as `Intervals` has it."""
+
+    arrived: bool
+    explains: bool
+    reason: str = ""
+    remark: str = ""
+    lower: dict[str, float] | None = None
+
+
+def _intervals(
+    found: Uncertainty,
+    space: FitSpace,
+    values: Mapping[str, float],
+    scenario: Scenario,
+    fit: _Told,
+    *,
+    level: float,
+    within: float,
+) -> Intervals:
+    """
+    Args:
+        space: of what was asked for.
+        values: about which the intervals are.
+    """
+    total = found.covariance
     reaches = {name: _reach(found, row, level) for name, row in zip(space.names, np.eye(len(space.names)), strict=True)}
     ratio_row = _ratio_row(space)
     ratio_reach = None if ratio_row is None else _reach(found, ratio_row, level)
@@ -208,9 +242,9 @@ def state_intervals(
         factor = _factor(values[name], low, high)
         prior = found.sources.get("prior")
         told: Verdict
-        if not explains:
+        if not fit.explains:
             told = "the model does not explain the recording"
-        elif not arrived:
+        elif not fit.arrived:
             told = "the fit has not arrived"
         elif prior is not None and prior[index, index] > _PRIOR * total[index, index]:
             told = "the prior speaks"
@@ -222,8 +256,8 @@ def state_intervals(
             told = "only a combination"
         else:
             told = "not identified"
-        stated = arrived
-        one = physical_values(objective.members[0].scenario, {name: 1.0})[name]
+        stated = fit.arrived
+        one = physical_values(scenario, {name: 1.0})[name]
         parameters[name] = Interval(
             value=values[name],
             low=low if stated else None,
@@ -242,9 +276,9 @@ def state_intervals(
         below, above = (math.exp(min(reach, 700.0)) for reach in ratio_reach)
         ratio = RatioInterval(
             value=value,
-            low=value / below if arrived else None,
-            high=value * above if arrived else None,
-            factor=max(below, above) if arrived else None,
+            low=value / below if fit.arrived else None,
+            high=value * above if fit.arrived else None,
+            factor=max(below, above) if fit.arrived else None,
         )
     several = len(space.names) > 1
     return Intervals(
@@ -257,13 +291,70 @@ def state_intervals(
         sources=_sources(found, space, ratio_row),
         clusters=found.clusters,
         covariance=total.tolist(),
-        arrived=arrived,
-        explains=explains,
-        reason=reason,
-        remark=remark,
-        note="" if ratio is None else _node_set_note(objective.members[0].scenario),
-        lower=lower,
+        arrived=fit.arrived,
+        explains=fit.explains,
+        reason=fit.reason,
+        remark=fit.remark,
+        note="" if ratio is None else _node_set_note(scenario),
+        lower=fit.lower,
     )
+
+
+def intervals_of(
+    record: FitRecord,
+    objective: AnyObjective,
+    space: FitSpace,
+    *,
+    level: float = LEVEL,
+    within: float = WITHIN,
+    restarts: int = 0,
+    seen: Scan | None = None,
+) -> Intervals:
+    """Of a fit, as its solver knows them: `likelihood` has found them itself, for others see `state_intervals`.
+
+    Args:
+        objective: what the fit has minimised.
+        level, within, restarts, seen: as of `state_intervals`; the last two only of other solvers.
+
+    Raises:
+        DivergedError: the fitted motion diverges.
+    """
+    told = record.estimate
+    if told is None:
+        return state_intervals(objective, space, record.free, level=level, within=within, restarts=restarts, seen=seen)
+    count = len(told.mean)
+    sources = {name: np.array(rows) for name, rows in told.sources.items()}
+    sources["noise"] = sources.pop("recording")
+    nothing, flat = np.zeros(count), np.zeros((count, count))
+    found = Uncertainty(
+        names=tuple(told.mean),
+        places=nothing,
+        losses=np.zeros(len(record.episodes)),
+        loss=0.0,
+        sources={**sources, STEP_SIZE: flat},
+        refined=nothing,
+        clusters=_MANY,
+        step=nothing,
+        curvature=flat,
+    )
+    explains, reason = _followed(record)
+    fit = _Told(arrived=True, explains=explains, reason=reason)
+    asked = space.asked
+    return _intervals(found, asked, told.mean, objective.members[0].scenario, fit, level=level, within=within)
+
+
+def _followed(record: FitRecord) -> tuple[bool, str]:
+    """Whether the model follows every recording for most of what counts, and else why not."""
+    assert record.estimate is not None
+    for one, told in zip(record.episodes, record.estimate.recordings, strict=True):
+        misfits = np.array(told.misfits)
+        if np.median(misfits) > FOLLOWS:
+            times = math.sqrt(float(np.median(misfits)))
+            return False, (
+                f"in {one.name} the cloth is {times:.1f} times as far from the recording as noise, spacing and mesh "
+                "account for: check the size, the grasp, the gripper's track, and whether clouds hold more than the cloth"
+            )
+    return True, ""
 
 
 def _remark(objective: AnyObjective, found: Uncertainty) -> str:

@@ -23,7 +23,15 @@ from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis
-from diffcloud.fit.solvers import FitOutcome, GaussNewtonSettings, Progress, Settings, fit_gauss_newton, solve
+from diffcloud.fit.solvers import (
+    FitOutcome,
+    GaussNewtonSettings,
+    LikelihoodSettings,
+    Progress,
+    Settings,
+    fit_gauss_newton,
+    solve,
+)
 from diffcloud.fit.solvers.gauss_newton import EQUALLY
 
 _CLEARLY = 0.9
@@ -70,6 +78,10 @@ def solve_and_refine(
     Raises:
         DivergedError, KeyboardInterrupt: as of `solve`.
     """
+    if isinstance(settings, LikelihoodSettings):  # which looks at the finer mesh itself
+        outcome = solve(objective, space, settings, progress=None if progress is None else partial(progress, 0))
+        assert outcome.estimate is not None
+        return FinerFit(objective.earliest(outcome.estimate.horizons), outcome, 0)
     told = [None if progress is None else partial(progress, done) for done in range(halvings + 1)]
     found = FinerFit(objective, solve(objective, space, settings, progress=told[0]), 0)
     while found.halvings < halvings and isinstance(settings, GaussNewtonSettings) and _asks_for_more(found):

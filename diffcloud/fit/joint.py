@@ -75,6 +75,10 @@ class JointObjective:
         """As of `Objective`, of every one."""
         return JointObjective([one.until(part) for one in self.members])
 
+    def earliest(self, counts: Sequence[int]) -> JointObjective:
+        """As of `Objective`, with a count for each."""
+        return JointObjective([one.earliest([count]) for one, count in zip(self.members, counts, strict=True)])
+
     def thinned(self, most: int) -> JointObjective:
         """As of `Objective`, of every one."""
         return JointObjective([one.thinned(most) for one in self.members])

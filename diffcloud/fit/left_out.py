@@ -20,7 +20,15 @@ from diffcloud.fit.names import of_recording, plain_name, with_recording, withou
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.record import LeftOut
 from diffcloud.fit.scan import LOWER
-from diffcloud.fit.solvers import FitOutcome, GaussNewtonSettings, Progress, Settings, fit_gauss_newton
+from diffcloud.fit.solvers import (
+    FitOutcome,
+    GaussNewtonSettings,
+    LikelihoodSettings,
+    Progress,
+    Settings,
+    fit_gauss_newton,
+    solve,
+)
 from diffcloud.sim.properties import one_set
 
 _STEPS = 10
@@ -54,7 +62,7 @@ def leave_out_and_go_on(
     objective.reseed(settings.seed)
     left = _TIMES
     while True:
-        told, lower = leave_each_out(objective, space, outcome.values, progress=progress)
+        told, lower = leave_each_out(objective, space, outcome.values, settings, progress=progress)
         if lower is None or not left or not isinstance(settings, GaussNewtonSettings):
             return told
         left -= 1
@@ -66,13 +74,19 @@ def leave_out_and_go_on(
 
 
 def leave_each_out(
-    objective: JointObjective, space: FitSpace, values: Mapping[str, float], *, progress: Tell | None = None
+    objective: JointObjective,
+    space: FitSpace,
+    values: Mapping[str, float],
+    settings: Settings = GaussNewtonSettings(),
+    *,
+    progress: Tell | None = None,
 ) -> tuple[list[LeftOut], dict[str, float] | None]:
     """For each recording: a fit to all others, from the joint optimum on, measured on it with its own pose, and with how
     the cloth lay in it, which is fitted to it alone.
 
     Args:
         values: fitted to all, named as `fit.names` says.
+        settings: of the joint fit; a descent by Gauss–Newton, but where it was by `likelihood`.
 
     Returns:
         What came of each; and, if the values of one of these fits give a clearly lower joint loss, these values.
@@ -85,11 +99,11 @@ def leave_each_out(
     for index, member in enumerate(objective.members):
         shown = None if progress is None else partial(progress, index / count, f"leaving out {index + 1} of {count}")
         others = JointObjective([*objective.members[:index], *objective.members[index + 1 :]])
-        found = _from(others, space.without_recording(index), without_recording(values, index), shown)
+        found = _from(others, space.without_recording(index), without_recording(values, index), settings, shown)
         alike = {name: value for name, value in found.items() if name == plain_name(name)}
         here, _ = space.of_recording(index)
         lying = FitSpace(tuple(one for one in here.variables if one.name not in alike), {**here.fixed, **alike})
-        lies = _from(member, lying, of_recording(values, index), shown) if lying.variables else {}
+        lies = _from(member, lying, of_recording(values, index), settings, shown) if lying.variables else {}
         with torch.no_grad():
             run = member.simulate_to_loss(one_set({**lying.fixed, **lies}))
             motion = member.match(run)
@@ -104,8 +118,14 @@ def leave_each_out(
 
 
 def _from(
-    objective: AnyObjective, space: FitSpace, values: Mapping[str, float], progress: Callable[[Progress], None] | None
+    objective: AnyObjective,
+    space: FitSpace,
+    values: Mapping[str, float],
+    settings: Settings,
+    progress: Callable[[Progress], None] | None,
 ) -> dict[str, float]:
     """The fitted values at the end of a descent from these."""
-    settings = GaussNewtonSettings(iterations=_STEPS, starts=1, screen=0, scans=0, init=values)
-    return fit_gauss_newton(objective, space, settings, progress=progress).uninterrupted().values
+    further: Settings = GaussNewtonSettings(iterations=_STEPS, starts=1, screen=0, scans=0, init=values)
+    if isinstance(settings, LikelihoodSettings):
+        further = replace(settings, starts=1, init=values)
+    return solve(objective, space, further, progress=progress).uninterrupted().values

@@ -284,7 +284,7 @@ class Objective:
 
     def match(self, run: Rollout, *, pose: Tensor | None = None) -> Motion:
         """A rollout beside an episode, at its pose or at poses [B, d]."""
-        velocities = self.still_bodies(self._velocities(run)) if self.pose_space.moves_clocks else None
+        velocities = self.still_bodies(self.velocities(run)) if self.pose_space.moves_clocks else None
         return self.matched(self.with_bodies(self.looked_at(run)), velocities, pose)
 
     def looked_at(self, run: Rollout) -> Tensor:
@@ -292,7 +292,7 @@ class Objective:
         clock after those of another."""
         return torch.cat([run.at(self.times + offset) for offset in self.pose_space.clocks.values()], dim=-2)
 
-    def _velocities(self, run: Rollout) -> Tensor:
+    def velocities(self, run: Rollout) -> Tensor:
         """[B, L, C · V', 3] of the same nodes: differences over a step to both sides, zero before the start."""
         step, last, found = float(run.times[1]), float(run.times[-1]), []
         for offset in self.pose_space.clocks.values():
@@ -334,7 +334,7 @@ class Objective:
                 nodes = self.with_bodies(self.looked_at(run))
                 self._first, _ = self._follow(nodes, torch.zeros_like(nodes), self._first, _FIRST_CAPS)
                 if len(self.pose_space.clocks) > 1 and self.pose_space.moves_clocks:  # may be far off their offsets
-                    velocities = self.still_bodies(self._velocities(run))
+                    velocities = self.still_bodies(self.velocities(run))
                     self._first, _ = self._follow(nodes, velocities, self._first, _CAPS)
         return self._first
 
@@ -424,6 +424,24 @@ class Objective:
             other._recorded = self._recorded_in(chosen)
         other.loss_steps = other._steps_to_loss()
         return other
+
+    def earliest(self, counts: Sequence[int]) -> Objective:
+        """The same on its earliest compared frames.
+
+        Args:
+            counts: one number, of these; a `JointObjective` takes one for each recording.
+        """
+        (count,) = counts
+        chosen = sorted(self.times.argsort(stable=True)[:count].tolist())
+        return Objective(
+            self.scenario,
+            self.episode,
+            paper=self.paper,
+            nuisance=self.nuisance,
+            frames=[self.frames[each] for each in chosen],
+            points=self.asked_points,
+            seed=self._seed,
+        )
 
     def thinned(self, most: int) -> Objective:
         """The same with at most so many points sampled per frame. Where no pose is solved for, points cost little beside

@@ -199,6 +199,40 @@ class ScanRecord(_Model):
         return self
 
 
+class Followed(_Model):
+    """How far the model follows one recording."""
+
+    horizon_s: float
+    """Frames after it did not count [s]."""
+    misfits: list[NonNegative]
+    """Of each frame that counted, its mean squared distance over what noise, spacing and mesh account for."""
+    finer_mm: list[NonNegative]
+    """By how much a mesh of half the edge length moves the cloth in each, RMS over the nodes."""
+
+
+class EstimateRecord(_Model):
+    """What the solver `likelihood` says of the parameters that were asked for, on the axis of the fit; k of them."""
+
+    mean: dict[str, Value]
+    """Of all answers, by their likelihoods."""
+    sources: dict[str, list[list[Annotated[float, Field(ge=-1e9, le=1e9)]]]]
+    """Source -> its part of the covariance [k][k]."""
+    starts: list[dict[str, Value]]
+    """Where each start ended, the likeliest first."""
+    weights: list[Annotated[float, Field(ge=0, le=1)]]
+    """Of these."""
+    recordings: list[Followed] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _has_one_shape(self) -> Self:
+        count = len(self.mean)
+        if any(len(rows) != count or any(len(row) != count for row in rows) for rows in self.sources.values()):
+            raise ValueError("sources must hold [k][k] numbers for the k parameters of mean")
+        if len(self.starts) != len(self.weights):
+            raise ValueError("starts and weights must be as long as each other")
+        return self
+
+
 class FitRecord(_Model):
     """One fit."""
 
@@ -243,6 +277,8 @@ class FitRecord(_Model):
     """On the scenario's own mesh at first, and on finer ones as far as starts went on there."""
     scan: ScanRecord | None
     """Of the place where it ended; None if the solver has not looked around there."""
+    estimate: EstimateRecord | None = None
+    """Of the solver `likelihood`."""
     failures: list[str]
     """Of starts that diverged."""
     fingerprint: Text = ""

@@ -20,8 +20,20 @@ from diffcloud.fit.names import of_recording
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.pose import PoseSpace
-from diffcloud.fit.record import LARGEST, FitRecord, FittedParameter, History, Measure, RecordingFit, WholeMaterial
+from diffcloud.fit.record import (
+    LARGEST,
+    EstimateRecord,
+    FitRecord,
+    FittedParameter,
+    Followed,
+    History,
+    Measure,
+    RecordingFit,
+    WholeMaterial,
+)
+from diffcloud.fit.residuals import Axis
 from diffcloud.fit.solvers import SOLVER_NAMES, FitOutcome, Settings
+from diffcloud.fit.solvers.likelihood import Estimate
 from diffcloud.io.arrays import read_npz
 from diffcloud.io.files import together, write_json, write_npz
 from diffcloud.io.timings import write_timings
@@ -180,6 +192,7 @@ def describe_fit(
         settings={name: value for name, value in asdict(settings).items() if name != "init"},
         history=_history(outcome),
         scan=None if outcome.scan is None else outcome.scan.record(),
+        estimate=None if outcome.estimate is None else _estimate(outcome.estimate, members),
         failures=[*outcome.failures, *_cut_short(members, runs, episodes)],
     )
     return FitResult(record, motions)
@@ -387,6 +400,25 @@ def _parameters(scenario: Scenario, space: FitSpace, values: Mapping[str, float]
         low, high, here = (math.log(one) if variable.low > 0 else one for one in (*bounds, entry.value))
         entry.at_bound = min(here - low, high - here) < _AT_BOUND * (high - low)
     return found
+
+
+def _estimate(found: Estimate, members: Sequence[Objective]) -> EstimateRecord:
+    asked = [index for index, one in enumerate(found.space.variables) if not one.doubtful]
+    axis, names = Axis.of(found.space), [found.space.names[index] for index in asked]
+
+    def told(place: Tensor) -> dict[str, float]:
+        return dict(zip(names, axis.bounded(place[: len(found.space.names)])[asked].tolist(), strict=True))
+
+    return EstimateRecord(
+        mean=told(found.mean),
+        sources={name: part[asked][:, asked].tolist() for name, part in found.sources.items()},
+        starts=[told(one.place) for one in found.answers],
+        weights=found.weights.tolist(),
+        recordings=[
+            Followed(horizon_s=float(member.times.max()), misfits=misfits, finer_mm=[1e3 * apart for apart in apart_m])
+            for member, misfits, apart_m in zip(members, found.best.misfits, found.best.apart_m, strict=True)
+        ],
+    )
 
 
 def _history(outcome: FitOutcome) -> History:

@@ -14,6 +14,7 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.errors import DivergedError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton, residuals
 from diffcloud.fit.batches import batch_losses
+from diffcloud.fit.bounded import lowest_within
 from diffcloud.fit.doubts import MATERIAL_DOUBTS, with_doubts
 from diffcloud.fit.laid import with_laid
 from diffcloud.fit.priors import INDEPENDENT
@@ -420,7 +421,7 @@ class TestFits:
             root = torch.from_numpy(rng.normal(size=(6, 6)))
             matrix, slope = root @ root.T + 1e-3 * torch.eye(6).double(), torch.from_numpy(rng.normal(size=6))
             least, most = torch.from_numpy(-rng.uniform(0, 1, 6)), torch.from_numpy(rng.uniform(0, 1, 6))
-            step = gauss_newton._lowest(matrix, slope, least, most)
+            step = lowest_within(matrix, slope, least, most)
             uphill = slope + matrix @ step
             below, above = step <= least + 1e-12, step >= most - 1e-12
             assert bool(((step >= least - 1e-12) & (step <= most + 1e-12)).all())

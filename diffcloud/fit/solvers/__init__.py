@@ -1,6 +1,7 @@
 """Solvers: from an objective and a space of bounded variables to the best place found. One file each.
 
-`gauss_newton` and `adam` descend along derivatives; `cma_es` and `random_search` are searches, which ask for losses alone.
+`likelihood` finds the likeliest parameters and their uncertainty. `gauss_newton` and `adam` descend along derivatives of
+the loss; `cma_es` and `random_search` are searches, which ask for losses alone.
 """
 
 from __future__ import annotations
@@ -12,13 +13,15 @@ from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.solvers.adam import AdamSettings, fit_adam
 from diffcloud.fit.solvers.cma_es import CmaEsSettings, fit_cma_es
 from diffcloud.fit.solvers.gauss_newton import GaussNewtonSettings, fit_gauss_newton
+from diffcloud.fit.solvers.likelihood import LikelihoodSettings, fit_likelihood
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
 from diffcloud.fit.solvers.random_search import RandomSearchSettings, fit_random_search
 from diffcloud.fit.solvers.search import SearchSettings
 
-Settings = GaussNewtonSettings | AdamSettings | CmaEsSettings | RandomSearchSettings
+Settings = LikelihoodSettings | GaussNewtonSettings | AdamSettings | CmaEsSettings | RandomSearchSettings
 
 SOLVERS: Mapping[str, type[Settings]] = {
+    "likelihood": LikelihoodSettings,
     "gauss_newton": GaussNewtonSettings,
     "adam": AdamSettings,
     "cma_es": CmaEsSettings,
@@ -36,6 +39,7 @@ __all__ = [
     "FitHistory",
     "FitOutcome",
     "GaussNewtonSettings",
+    "LikelihoodSettings",
     "Progress",
     "RandomSearchSettings",
     "SearchSettings",
@@ -44,6 +48,7 @@ __all__ = [
     "fit_adam",
     "fit_cma_es",
     "fit_gauss_newton",
+    "fit_likelihood",
     "fit_random_search",
     "solve",
 ]
@@ -63,6 +68,8 @@ def solve(
         KeyboardInterrupt: interrupted before the first loss.
     """
     match settings:
+        case LikelihoodSettings():
+            return fit_likelihood(objective, space, settings, progress=progress)
         case GaussNewtonSettings():
             return fit_gauss_newton(objective, space, settings, progress=progress)
         case AdamSettings():

@@ -45,6 +45,7 @@ from torch import Tensor
 
 from diffcloud.errors import DivergedError
 from diffcloud.fit.batches import batch_losses
+from diffcloud.fit.bounded import lowest_within
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.names import plain_name
 from diffcloud.fit.parameters import FitSpace
@@ -65,8 +66,6 @@ _GOOD, _POOR = 0.5, 0.25
 """Parts of the predicted decrease that a good step brings, and that a poor one does not."""
 _GROWS, _HALVES, _SHRINKS = 3.0, 0.5, 0.2
 """Times a step: the next radius after a good one, unless it is larger already, after a poor one, and after one in vain."""
-_LEAST_SPREAD = 1e-12
-"""Of the matrix of a step, in its largest eigenvalue: below is rounding."""
 _SMALLEST_STEP = 1e-3
 """A step below 0.1 % of a value, or a predicted decrease below the first part of the loss, means that a start has arrived;
 below the second one, if the step was in vain: over that length, the loss is rougher than its slope. By the second part a
@@ -350,7 +349,7 @@ class _Way:
         if bool(free.any()):
             inner = normal[free][:, free]
             least, most = ((end - place)[free].clamp(-self._radius, self._radius) for end in (low, high))
-            step[free] = _lowest(inner + _DAMPING * inner.diagonal().diag(), slope[free], least, most)
+            step[free] = lowest_within(inner + _DAMPING * inner.diagonal().diag(), slope[free], least, most)
         self._predicted = float(-2 * slope @ step - step @ normal @ step)
         return place + step
 
@@ -377,18 +376,6 @@ class _Way:
         if self._held is not None and self.end is not None and math.isfinite(self.loss):
             self._held = None
             self._begin()
-
-
-def _lowest(matrix: Tensor, slope: Tensor, least: Tensor, most: Tensor) -> Tensor:
-    """[k] where slope · s + s · matrix s / 2 is lowest between `least` and `most` [k], of a positive matrix [k, k]."""
-    from scipy.optimize import lsq_linear  # slow to import
-
-    spread, axes = torch.linalg.eigh(matrix)
-    root = spread.clamp(min=_LEAST_SPREAD * float(spread[-1])).sqrt()
-    found = lsq_linear(
-        (root * axes).T.numpy(), (-(axes.T @ slope) / root).numpy(), (least.numpy(), most.numpy()), method="bvls"
-    )
-    return torch.from_numpy(found.x)
 
 
 @dataclass(frozen=True)

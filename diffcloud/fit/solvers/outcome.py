@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
 
 from diffcloud.fit.scan import Scan
+
+if TYPE_CHECKING:
+    from diffcloud.fit.solvers.likelihood import Estimate
 
 StopReason = Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
 """`converged`: the best start cannot get lower by more than a ten-thousandth, or a thousandth where the loss is rough; or
@@ -59,6 +62,8 @@ class FitOutcome:
     """Messages of starts that diverged."""
     scan: Scan | None = None
     """Of the place where it ended, which then has no lower minimum beside it."""
+    estimate: Estimate | None = None
+    """Of the solver `likelihood`, which knows its uncertainty."""
 
     def gone_on(self, further: FitOutcome) -> FitOutcome:
         """This fit, whose best start went on by itself, with what came of that."""

@@ -1,0 +1,586 @@
+"""The parameters of a cloth and how well its recordings show them, for a model that cannot predict all of a motion.
+
+A frame t has a mean squared distance m from simulated to recorded points and another from recorded to simulated ones. Each
+has a variance v that is known: noise and spacing of the points, one squared millimetre, and the squared half of what a mesh
+of half the edge length changes there. What the model lacks beside that is not known, so each frame has a factor s >= 1 on
+its variances, which the likelihood chooses. With c the mean of m / v over both ways, s = max(1, c), and
+
+    Φ = Σ_t n (log v_t + ρ(c_t)) + prior,      ρ(c) = c up to 1, 1 + log c above,
+
+is twice the negative logarithm of the likelihood of n independent residuals a frame, and of the priors. Errors of a model
+are correlated over a cloth, so n is far below the number of points.
+
+After some time nobody can predict which fold forms: there, derivatives explode. Frames count up to a horizon, where the
+finer mesh and the given one part. The finer mesh also corrects the positions: its difference to the given mesh is added to
+the simulated nodes. What half of that difference would change is a part of the uncertainty.
+
+The variables are those of the space and the pose of each recording. Gauss and Newton's steps, bounded in each variable, go
+from three starts; the answers are weighed by their likelihoods.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloud.errors import DivergedError
+from diffcloud.fit.bounded import lowest_within
+from diffcloud.fit.joint import AnyObjective
+from diffcloud.fit.matching import Pairs
+from diffcloud.fit.objective import Objective
+from diffcloud.fit.parameters import FitSpace
+from diffcloud.fit.residuals import Axis, moved_by
+from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.threads import map_threads
+
+INDEPENDENT = 10.0
+"""Residuals of a frame that count as independent, of frames a tenth of a second apart."""
+_FRAME_S = 0.1
+"""Frames that are closer share these."""
+_MODEL_M = 0.001
+"""What no simulator of cloth predicts better."""
+_PART_M = 0.004
+"""Difference to the finer mesh, RMS over the nodes, at which the horizon is."""
+_LEAST_S = 1.0
+"""Before the horizon, whatever the meshes say: at a first guess of the material they may part too early."""
+_START = math.log(4.5)
+"""Between starts, in the logarithm of the stretching."""
+_RADIUS = 1.0
+"""Of a step, in each variable."""
+_SMALL = 0.25
+"""A step this small ends a descent, in standard deviations."""
+_FEWEST_STEPS = 3
+"""Of a descent."""
+_RISE = 0.02
+"""By which Φ may rise, for each independent residual."""
+_HALVINGS = 3
+_REFRESH = 1.0
+"""Standard deviations after which the finer mesh is simulated anew."""
+_NARROW = 0.05
+"""Least bound on a step, where a start diverges or rises."""
+_GAINS, _BEHIND = 3.0, 20.0
+"""A start ends where so many times what its next step promises would leave its Φ so far above the best."""
+_TINY = 1e-12
+_EDGE = 1e-6
+"""Distance from a bound, where nothing would pull back."""
+_FAR = 100.0
+"""Bound on a pose, in deviations."""
+
+
+@dataclass(frozen=True)
+class LikelihoodSettings:
+    """Of one fit."""
+
+    iterations: int = 12
+    """Steps of each start at most."""
+    starts: int = 3
+    """Descents: from the centres of the priors, then with the first variable, the stretching, above and below."""
+    seed: int = 0
+    """Of the points that are drawn."""
+    init: Mapping[str, float] = field(default_factory=dict)
+    """Values of the first start."""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """What one recording says at one place: L frames, forth and back, k variables of the motion and d of the pose."""
+
+    squares: Tensor
+    """[2, L] mean squared distances."""
+    slopes: Tensor
+    """[2, L, k + d] half of their slopes."""
+    curvatures: Tensor
+    """[2, L, k + d, k + d] half of their Gauss–Newton matrices."""
+    shifted: Tensor
+    """[2, L, k + d] by which half of the slopes change if the nodes move by what was asked for."""
+    variances: Tensor
+    """[2, L] that are known."""
+
+    @property
+    def misfits(self) -> Tensor:
+        """[L] mean squares over known variances, c."""
+        return (self.squares / self.variances).mean(0)
+
+    @property
+    def weights(self) -> Tensor:
+        """[2, L] slope of Φ by the mean squares, for one independent residual."""
+        return 0.5 / (self.variances * self.misfits.clamp(min=1.0))
+
+    def energy(self) -> float:
+        """Φ for one independent residual a frame, but for a constant."""
+        c = self.misfits
+        return float((self.variances.log().mean(0) + torch.where(c < 1, c, 1 + c.clamp(min=1e-9).log())).sum())
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Where one start ended."""
+
+    place: Tensor
+    """[K] variables of the space on their axis, and then the pose of each recording in deviations of its prior."""
+    covariance: Tensor
+    """[K, K]"""
+    sources: Mapping[str, Tensor]
+    """Source -> its part of the covariance [K, K]."""
+    energy: float
+    """Φ"""
+    converged: bool
+    misfits: tuple[list[float], ...]
+    """Of each recording, c of its frames."""
+    apart_m: tuple[list[float], ...]
+    """Of each recording, how far the finer mesh is in its frames, RMS over the nodes."""
+    trace: tuple[tuple[float, Tensor], ...]
+    """Mean squared distance and place at each step."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A fit of one or several recordings."""
+
+    space: FitSpace
+    answers: tuple[Answer, ...]
+    """Of all starts that were followed to their end, the likeliest first."""
+    horizons: tuple[int, ...]
+    """Of each recording, how many of its compared frames count."""
+    simulations: int
+    interrupted: bool = False
+
+    @property
+    def best(self) -> Answer:
+        return self.answers[0]
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """[A] of the answers, by their likelihoods."""
+        energies = np.array([one.energy for one in self.answers])
+        found = np.exp(-0.5 * (energies - energies.min()))
+        return np.asarray(found / found.sum())
+
+    @property
+    def mean(self) -> Tensor:
+        """[K] of the mixture of all answers."""
+        return torch.from_numpy(self.weights) @ torch.stack([one.place for one in self.answers])
+
+    @property
+    def sources(self) -> dict[str, Tensor]:
+        """Source -> its part of the mixture's covariance [K, K]; `starts` is what the answers differ by."""
+        apart, mean = torch.zeros_like(self.best.covariance), self.mean
+        found = {name: torch.zeros_like(apart) for name in self.best.sources}
+        for weight, one in zip(self.weights.tolist(), self.answers, strict=True):
+            apart += weight * torch.outer(one.place - mean, one.place - mean)
+            for name, part in one.sources.items():
+                found[name] += weight * part
+        return {**found, "starts": apart}
+
+    @property
+    def covariance(self) -> Tensor:
+        """[K, K] of the mixture."""
+        return torch.stack([*self.sources.values()]).sum(0)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Of the likeliest answer."""
+        axis = Axis.of(self.space)
+        return dict(zip(self.space.names, axis.bounded(self.best.place[: len(self.space.names)]).tolist(), strict=True))
+
+
+class _Recording:
+    """One recording up to its horizon, on the given mesh and the finer one."""
+
+    def __init__(self, objective: Objective, space: FitSpace, columns: Tensor, first_pose: int) -> None:
+        """
+        Args:
+            space: of this recording, and the places of its variables among all.
+            first_pose: place of the first variable of its pose.
+        """
+        self.objective, self.space, self.axis = objective, space, Axis.of(space)
+        poses = len(objective.pose_space.names)
+        self.columns = torch.cat([columns, first_pose + torch.arange(poses)])
+        self.motion = columns
+        self.poses = slice(first_pose, first_pose + poses)
+        unit = objective.length_unit_m
+        self.known = torch.tensor([cloud.from_surface for cloud in objective.clouds], dtype=torch.float64).T
+        self.known = self.known + (_MODEL_M / unit) ** 2
+        self.finer = self.simulated_by(objective.scenario.finer())
+        times = objective.times.sort().values
+        gap = float(times.diff().median()) if len(times) > 1 else _FRAME_S
+        self.independent = INDEPENDENT * min(1.0, gap / _FRAME_S)
+
+    def simulated_by(self, scenario: Scenario) -> Objective:
+        """The same recording with another simulation, of which only the nodes are wanted."""
+        one = self.objective
+        return Objective(scenario, one.episode, nuisance=one.nuisance, frames=one.frames, points=1)
+
+    def parameters(self, place: Tensor) -> dict[str, Tensor]:
+        return self.space.parameters(self.axis.bounded(place[None, self.motion]))
+
+    def nodes(self, place: Tensor) -> Tensor:
+        """[1, L, C · V, 3] of the cloth in the scene."""
+        return self.objective.looked_at(self.objective.simulate_to_loss(self.parameters(place)))
+
+    def change(self, place: Tensor, nodes: Tensor, other: Objective) -> Tensor:
+        """[1, L, C · V, 3] by which another simulation, whose first nodes are those of the mesh, moves the nodes."""
+        clocks = len(self.objective.pose_space.clocks)
+        there = other.looked_at(other.simulate_to_loss(self.parameters(place))).unflatten(-2, (clocks, -1))
+        return there[..., : nodes.shape[-2] // clocks, :].flatten(-3, -2) - nodes
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """The motion of one recording at a place, and how it changes."""
+
+    recording: _Recording
+    nodes: Tensor
+    rates: Tensor
+    velocities: Tensor | None
+
+    @staticmethod
+    def at(recording: _Recording, place: Tensor) -> _Linear:
+        objective = recording.objective
+        moved = moved_by(objective, recording.space, place[None, recording.motion])
+        velocities = objective.velocities(moved.run) if objective.pose_space.moves_clocks else None
+        return _Linear(recording, objective.looked_at(moved.run), moved.rates, velocities)
+
+    def frames(self, place: Tensor, shift: Tensor | None, asked: Tensor | None = None) -> Frames:
+        """
+        Args:
+            shift: [1, L, C · V, 3] added to the nodes.
+            asked: likewise, whose effect on the slopes is wanted.
+        """
+        one = self.recording
+        objective, space = one.objective, one.objective.pose_space
+        pose = (place[one.poses] * space.deviations)[None]
+        nodes = self.nodes if shift is None else self.nodes + shift
+        motion = objective.matched(objective.with_bodies(nodes), self.velocities, pose)
+        points, columns = objective.columns(motion, self.rates)
+        views, ways = motion.shown(space), list[tuple[Tensor, Tensor, Tensor, Tensor]]()
+        units = torch.cat([torch.ones(len(self.rates)).double(), space.deviations])[:, None, None, None, None]
+        for pairs, at, moves in zip(motion.pairs, points, columns, strict=True):
+            normals = pairs.normals
+            if normals is None:
+                first, second, third = pairs.places.corners(views).unbind(-2)
+                normals = torch.linalg.cross(second - first, third - first)
+                normals = space.carried(normals / normals.norm(dim=-1, keepdim=True).clamp(min=_TINY), pose)
+            moved = None if asked is None else space.carried(pairs.places.of(objective.still_bodies(asked)), pose)
+            ways.append(_way(pairs, at - pairs.partners, normals, units * moves, moved, objective.cap))
+        squares, slopes, curvatures, shifted = (torch.stack(part) for part in zip(*ways, strict=True))
+        variances = one.known if shift is None else one.known + _squared(shift / 2)
+        return Frames(squares, slopes, curvatures, shifted, variances)
+
+
+def _way(
+    pairs: Pairs, away: Tensor, normals: Tensor, moves: Tensor, moved: Tensor | None, cap: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """One way's parts of `Frames`, the curvature as `fit.matching` has it.
+
+    Args:
+        away: [1, L, N, 3] from the recorded points to the simulated ones; likewise the surfaces' normals.
+        moves: [K, 1, L, N, 3] of the simulated points by the variables.
+        moved: [1, L, N, 3] of them, whose effect on the slopes is wanted.
+    """
+    across = (away * normals).sum(-1, keepdim=True) * normals
+    along = away - across
+    along = along / (along.square().sum(-1, keepdim=True) + pairs.spacing[:, None, None].square()).sqrt().clamp(min=_TINY)
+    counts = (pairs.weights / pairs.weights.sum(-1, keepdim=True).clamp(min=_TINY))[0]
+    squares = away.square().sum(-1)[0]
+    near = torch.where(squares < cap**2, counts, 0.0)
+    mean = torch.where(counts.sum(-1) > 0, (counts * squares.clamp(max=cap**2)).sum(-1), cap**2)
+    slope = torch.einsum("kln,ln->lk", (moves * away).sum(-1)[:, 0], near)
+    matrix, shifted = torch.zeros_like(slope)[..., None] * slope[:, None], torch.zeros_like(slope)
+    for direction in (normals, along):
+        part = (moves * direction).sum(-1)[:, 0]
+        matrix = matrix + torch.einsum("aln,bln,ln->lab", part, part, near)
+        if moved is not None:
+            shifted = shifted + torch.einsum("kln,ln,ln->lk", part, (moved * direction).sum(-1)[0], near)
+    return mean, slope, matrix, shifted
+
+
+def _squared(shift: Tensor) -> Tensor:
+    """[L] mean over nodes of a displacement [1, L, N, 3]."""
+    return shift[0].square().sum(-1).mean(-1)
+
+
+class _Likelihood:
+    """Φ of all recordings."""
+
+    def __init__(self, objectives: Sequence[Objective], space: FitSpace, iterations: int) -> None:
+        self.space, self.axis, self.iterations = space, Axis.of(space), iterations
+        self.recordings, self.simulations = list[_Recording](), 0
+        variables = count = len(space.names)
+        for index, objective in enumerate(objectives):
+            own, columns = space.of_recording(index)
+            self.recordings.append(_Recording(objective, own, columns, count))
+            count += len(objective.pose_space.names)
+        steps, poses = space.prior_steps(), torch.ones(count - variables, dtype=torch.float64)
+        self.precision = torch.cat([torch.where(steps > 0, 1 / steps.square(), 0.0), poses])
+        low, high = self.axis.ends
+        self.low, self.high = torch.cat([low + _EDGE, -_FAR * poses]), torch.cat([high - _EDGE, _FAR * poses])
+        centres = [0.0 if one.deviation is not None else one.centre for one in space.variables]
+        self.centre = torch.cat([self.axis.places(torch.tensor(centres, dtype=torch.float64)), 0 * poses])
+
+    def inside(self, place: Tensor) -> Tensor:
+        return torch.minimum(torch.maximum(place, self.low), self.high)
+
+    def off_centre(self, place: Tensor) -> Tensor:
+        return torch.where(self.precision > 0, place - self.centre, 0.0)
+
+    def horizons(self, place: Tensor) -> tuple[int, ...]:
+        """Of each recording, how many of its frames come before the finer mesh parts from the given one."""
+
+        def one(recording: _Recording) -> int:
+            change = recording.change(place, recording.nodes(place), recording.finer)
+            apart = _squared(change).sqrt() * recording.objective.length_unit_m
+            times, order = recording.objective.times.sort(stable=True)
+            gone = torch.nonzero((apart[order] > _PART_M) & (times > _LEAST_S))
+            return int(gone[0]) if len(gone) else len(apart)
+
+        self.simulations += 2 * len(self.recordings)
+        return tuple(map_threads(one, self.recordings))
+
+    def start(self, init: Mapping[str, float], offset: float) -> Tensor:
+        """[K] these values, else the centres of the priors, and with the first variable so far off on its axis."""
+        place = self.centre.clone()
+        for index, name in enumerate(self.space.names):
+            if name in init:
+                place[index] = self.axis.places(torch.full((len(self.space.names),), init[name]).double())[index]
+        place[0] += offset
+        return self.inside(place)
+
+
+@dataclass(frozen=True)
+class _Reached:
+    """The last place of a descent that counts."""
+
+    energy: float
+    place: Tensor
+    linear: list[_Linear]
+    matrix: Tensor
+    covariance: Tensor
+
+
+class _Descent:
+    """From one start."""
+
+    def __init__(self, likelihood: _Likelihood, place: Tensor, tell: Callable[[int, float, Tensor], None]) -> None:
+        """
+        Args:
+            tell: takes step, mean squared distance, and place.
+        """
+        self.of, self.place, self._tell = likelihood, place, tell
+        self.reached: _Reached | None = None
+        self._shifts: list[Tensor | None] = [None] * len(likelihood.recordings)
+        self._looked: Tensor | None = None
+        self._trace: list[tuple[float, Tensor]] = []
+
+    def run(self, to_beat: float) -> Answer | None:
+        """Where it ends; None where it falls behind.
+
+        Args:
+            to_beat: Φ of a better answer.
+        """
+        of, place, radius, tried = self.of, self.place, _RADIUS, 0
+        allowed = _RISE * sum(one.independent * len(one.objective.frames) for one in of.recordings)
+        for _ in range(of.iterations):
+            best = self.reached
+            try:
+                linear = self._linear(place)
+            except DivergedError:
+                if best is None:
+                    raise
+                place, radius = 0.5 * (place + best.place), max(0.5 * radius, _NARROW)
+                continue
+            energy, slope, matrix, square = self._terms(linear, place)
+            if best is not None and energy > best.energy + allowed:
+                tried += 1
+                if tried > _HALVINGS:
+                    break
+                place, radius = 0.5 * (place + best.place), max(0.5 * radius, _NARROW)
+                continue
+            tried = 0
+            if self._stale(place):
+                self._look(linear, place)
+                energy, slope, matrix, square = self._terms(linear, place)
+            self.reached = _Reached(energy, place, linear, matrix, torch.linalg.inv(matrix))
+            self._trace.append((square, place))
+            self._tell(len(self._trace), square, place)
+            box = torch.full_like(place, radius)
+            step = lowest_within(matrix, slope, torch.maximum(-box, of.low - place), torch.minimum(box, of.high - place))
+            if len(self._trace) >= _FEWEST_STEPS:
+                if bool((step.abs() < _SMALL * self.reached.covariance.diagonal().sqrt()).all()):
+                    return self.answer(converged=True)
+                gain = -float(2 * slope @ step + step @ matrix @ step)
+                if energy - _GAINS * gain > to_beat + _BEHIND:
+                    return None
+            place, radius = of.inside(place + step), min(1.5 * radius, _RADIUS)
+        return self.answer(converged=False)
+
+    def _linear(self, place: Tensor) -> list[_Linear]:
+        self.of.simulations += len(self.of.recordings)
+        return map_threads(lambda one: _Linear.at(one, place), self.of.recordings)
+
+    def _stale(self, place: Tensor) -> bool:
+        """Whether the finer mesh was last simulated too far away."""
+        if self._looked is None or self.reached is None:
+            return True
+        asked = [index for index, one in enumerate(self.of.space.variables) if not one.doubtful]
+        moved = (place - self._looked).abs() / self.reached.covariance.diagonal().sqrt()
+        return bool(moved[asked].max() > _REFRESH)
+
+    def _look(self, linear: Sequence[_Linear], place: Tensor) -> None:
+        """Simulate the finer mesh here."""
+        self._looked = place
+        found = map_threads(lambda one: self._changed(one, place, one.recording.finer), linear)
+        self._shifts = [old if new is None else new for old, new in zip(self._shifts, found, strict=True)]
+
+    def _changed(self, one: _Linear, place: Tensor, other: Objective) -> Tensor | None:
+        """By how much another simulation moves the nodes; None where it diverges."""
+        self.of.simulations += 1
+        try:
+            return one.recording.change(place, one.nodes, other)
+        except DivergedError:
+            return None
+
+    def _terms(self, linear: Sequence[_Linear], place: Tensor) -> tuple[float, Tensor, Tensor, float]:
+        """Φ, half of its slope and Gauss–Newton matrix, and the mean squared distance."""
+        of, squares = self.of, list[float]()
+        off = torch.where(of.precision > 0, place - of.centre, 0.0)
+        energy, slope, matrix = float((of.precision * off.square()).sum()), of.precision * off, torch.diag(of.precision)
+        for one, shift in zip(linear, self._shifts, strict=True):
+            frames, n, columns = one.frames(place, shift), one.recording.independent, one.recording.columns
+            energy += n * frames.energy()
+            weights = n * frames.weights
+            slope[columns] += torch.einsum("wl,wlk->k", weights, frames.slopes)
+            matrix[columns[:, None], columns] += torch.einsum("wl,wlab->ab", weights, frames.curvatures)
+            squares.append(float(frames.squares.mean()))
+        return energy, slope, matrix, float(np.mean(squares))
+
+    def answer(self, *, converged: bool) -> Answer:
+        """Of the place that was reached."""
+        assert self.reached is not None
+        place, covariance, of = self.reached.place, self.reached.covariance, self.of
+        precision = torch.diag(of.precision)
+        sources = {"recording": covariance @ (self.reached.matrix - precision) @ covariance}
+        for index, one in enumerate(of.space.variables):
+            name = one.name if one.doubtful else "prior"
+            part = of.precision[index] * torch.outer(covariance[index], covariance[index])
+            sources[name] = sources.get(name, 0.0) + part
+        poses = covariance[len(of.space.names) :]
+        sources["pose"] = poses.T @ poses
+        sources |= {name: torch.zeros_like(covariance) for name in ("mesh", "time step")}
+        misfits, apart = [], []
+        for one, shift in zip(self.reached.linear, self._shifts, strict=True):
+            recording = one.recording
+            stepped = recording.simulated_by(recording.objective.scenario.with_steps(2))
+            changes = {"mesh": None if shift is None else shift / 2, "time step": self._changed(one, place, stepped)}
+            frames = one.frames(place, shift)
+            weights = recording.independent * frames.weights
+            for name, change in changes.items():
+                if change is not None:
+                    pulled = torch.einsum("wl,wlk->k", weights, one.frames(place, shift, change).shifted)
+                    moved = covariance[:, recording.columns] @ pulled
+                    sources[name] = sources[name] + torch.outer(moved, moved)
+            misfits.append(frames.misfits.tolist())
+            away = torch.zeros(len(frames.misfits)).double() if shift is None else _squared(shift).sqrt()
+            apart.append((away * recording.objective.length_unit_m).tolist())
+        total = torch.stack([*sources.values()]).sum(0)
+        return Answer(
+            place, total, sources, self.reached.energy, converged, tuple(misfits), tuple(apart), tuple(self._trace)
+        )
+
+
+@torch.no_grad()
+def estimate(
+    objective: AnyObjective,
+    space: FitSpace,
+    settings: LikelihoodSettings,
+    *,
+    progress: Callable[[int, int, float, dict[str, float]], None] | None = None,
+) -> Estimate:
+    """The parameters that recordings show, by the rules at the head of this module. Ctrl-C ends the fit and keeps the best
+    so far.
+
+    Args:
+        objective: of the recordings, with the frames that may count.
+        space: variables and their priors.
+        progress: takes the number of the start, the step, the mean squared distance and the values.
+
+    Raises:
+        DivergedError: the motion diverges from every start.
+        KeyboardInterrupt: before the first place was compared.
+    """
+    whole = _Likelihood(objective.members, space, settings.iterations)
+    first = whole.start(settings.init, 0.0)
+    horizons = whole.horizons(first)
+    likelihood = _Likelihood(objective.earliest(horizons).members, space, settings.iterations)
+    answers, failures, interrupted = list[Answer](), list[DivergedError](), False
+    for number in range(settings.starts):
+
+        def tell(step: int, square: float, place: Tensor, number: int = number) -> None:
+            if progress is not None:
+                values = likelihood.axis.values(place[: len(space.names)]).tolist()
+                progress(number, step, square, dict(zip(space.names, values, strict=True)))
+
+        away = _START * ((number + 1) // 2) * (1 if number % 2 else -1)
+        descent = _Descent(likelihood, likelihood.start(settings.init, away), tell)
+        try:
+            found = descent.run(min((one.energy for one in answers), default=math.inf))
+        except DivergedError as error:
+            failures.append(error)
+            continue
+        except KeyboardInterrupt:
+            interrupted = True
+            if not answers and descent.reached is None:
+                raise
+            if not answers:
+                answers.append(descent.answer(converged=False))
+            break
+        if found is not None:
+            answers.append(found)
+    if not answers:
+        raise failures[0]
+    answers.sort(key=lambda one: one.energy)
+    simulations = whole.simulations + likelihood.simulations
+    return Estimate(space, tuple(answers), horizons, simulations, interrupted)
+
+
+def fit_likelihood(
+    objective: AnyObjective,
+    space: FitSpace,
+    settings: LikelihoodSettings,
+    *,
+    progress: Callable[[Progress], None] | None = None,
+) -> FitOutcome:
+    """`estimate` as a solver: the likeliest answer, whose losses are mean squared distances.
+
+    Raises:
+        DivergedError, KeyboardInterrupt: as of `estimate`.
+    """
+    began, best = time.perf_counter(), math.inf
+
+    def tell(start: int, step: int, square: float, values: dict[str, float]) -> None:
+        nonlocal best
+        best = min(best, square)
+        if progress is not None:
+            progress(Progress(step, square, best, values))
+
+    found = estimate(objective, space, settings, progress=tell)
+    squares, places = zip(*found.best.trace, strict=True)
+    values = [Axis.of(space).bounded(place[: len(space.names)])[None] for place in places]
+    return FitOutcome(
+        values=found.values,
+        loss=squares[-1],
+        best_start=0,
+        simulations=found.simulations,
+        stop_reason="interrupted" if found.interrupted else "converged" if found.best.converged else "iterations",
+        seconds=time.perf_counter() - began,
+        history=FitHistory(space.names, [torch.tensor([square]).double() for square in squares], values),
+        estimate=found,
+    )

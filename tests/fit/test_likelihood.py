@@ -1,0 +1,180 @@
+"""The likelihood with a variance for each frame, and the fit that it leads to."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from diffcloud.errors import DivergedError
+from diffcloud.fit import FitSpace, JointObjective, Objective
+from diffcloud.fit.parameters import Variable
+from diffcloud.fit.solvers import LikelihoodSettings, fit_likelihood, likelihood
+from diffcloud.fit.solvers.likelihood import Answer, Estimate, Frames
+from tests.conftest import small_lift
+from tests.fit.test_fit import GENTLE, clouds_of
+
+TRUTH = {"stretch": 0.6, "mass": 1.7}
+SCENARIO = small_lift(**{**GENTLE, "integrator": "implicit", "points": 2000})
+POSE = {"x": 0.01, "yaw": 0.05}
+SPACE = FitSpace(
+    (Variable("stretch", 0.03, 30.0, 10.0), Variable("bending", 0.1, 10.0, 1.5, doubtful=True)), {"mass": TRUTH["mass"]}
+)
+
+
+def objective(**changes):
+    """Of a cloth on the finer mesh, by which the fit corrects its own."""
+    return Objective(SCENARIO, clouds_of(SCENARIO.finer(), **{"points": 2000, **TRUTH, **changes}), nuisance=POSE)
+
+
+@pytest.fixture(scope="module")
+def member():
+    return likelihood._Likelihood([objective()], SPACE, 12)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return fit_likelihood(objective(), SPACE, LikelihoodSettings())
+
+
+def frames(squares, variances, variables=1):
+    squares, variances = (torch.tensor(part, dtype=torch.float64) for part in (squares, variances))
+    shape = (*squares.shape, variables)
+    return Frames(squares, torch.zeros(shape), torch.zeros(*shape, variables), torch.zeros(shape), variances)
+
+
+class TestFrames:
+    def test_a_frame_within_its_variance_counts_by_its_squares(self):
+        one = frames([[0.2], [0.4]], [[1.0], [1.0]])
+        assert one.misfits.tolist() == pytest.approx([0.3])
+        assert one.energy() == pytest.approx(0.3)
+
+    def test_a_frame_beyond_it_has_a_variance_of_its_own(self):
+        """Whatever is known of it: what it says is the logarithm of its squares alone."""
+        squares = [[9.0], [9.0]]
+        one, other = (frames(squares, [[known], [known]]).energy() for known in (1.0, 3.0))
+        assert one == pytest.approx(other) == pytest.approx(1 + math.log(9.0))
+
+    @pytest.mark.parametrize("times", [0.1, 10.0])
+    def test_the_weights_are_its_slope(self, times, rng):
+        variances, squares = rng.uniform(0.5, 2.0, (2, 3)), times * rng.uniform(0.5, 2.0, (2, 3))
+        told = frames(squares.tolist(), variances.tolist()).weights
+        for way, frame in np.ndindex(2, 3):
+            step = np.zeros((2, 3))
+            step[way, frame] = 1e-6 * times
+            above, below = (frames((squares + sign * step).tolist(), variances.tolist()).energy() for sign in (1, -1))
+            assert (above - below) / (2e-6 * times) == pytest.approx(float(told[way, frame]), rel=1e-6)
+
+
+class TestRecording:
+    def at(self, member, place, shift=None, asked=None):
+        (recording,) = member.recordings
+        with torch.no_grad():
+            return likelihood._Linear.at(recording, place).frames(place, shift, asked)
+
+    def test_slopes_are_those_of_the_squares(self, member):
+        """By material and pose, forth and back, in all frames but those in which points begin to count."""
+        place = member.start({"stretch": 0.8}, 0.0)
+        place[2:] = torch.tensor([0.3, -0.2], dtype=torch.float64)
+        here, step = self.at(member, place), 2e-3
+        for variable in range(len(place)):
+            away = torch.zeros_like(place)
+            away[variable] = step
+            above, below = (self.at(member, place + sign * away).squares for sign in (1, -1))
+            central, told = (above - below) / (4 * step), here.slopes[..., variable]
+            assert int(((central - told).abs() > 0.02 * told.abs().max()).sum()) <= 2
+
+    def test_what_a_shift_of_the_nodes_does_to_the_slopes(self):
+        """Where the cloth lies as it was recorded, from recorded points to the surface."""
+        episode = clouds_of(SCENARIO, points=2000, **TRUTH)
+        member = likelihood._Likelihood([Objective(SCENARIO, episode, nuisance=POSE)], SPACE, 12)
+        place = member.start({"stretch": TRUTH["stretch"]}, 0.0)
+        lying = self.at(member, place)
+        up = torch.zeros(1, lying.squares.shape[1], len(SCENARIO.scene.mesh.nodes), 3).double()
+        up[..., 2] = 0.0002
+        asked, moved = self.at(member, place, None, up), self.at(member, place, up)
+        change = (moved.slopes - lying.slopes)[1]
+        assert float((asked.shifted[1] - change).abs().max()) < 0.1 * float(change.abs().max())
+        assert float(moved.variances[0, 0] - lying.variances[0, 0]) == pytest.approx(1e-8, rel=1e-6)
+
+    def test_frames_count_up_to_where_the_meshes_part(self, member, monkeypatch):
+        for apart, count in ((1.0, 12), (1e-9, 10)):  # all frames, and the least, at ten a second
+            monkeypatch.setattr(likelihood, "_PART_M", apart)
+            assert member.horizons(member.start({}, 0.0)) == (count,)
+
+
+class TestMixture:
+    def answers(self, *energies):
+        return tuple(
+            Answer(
+                torch.tensor([float(index)]).double(), torch.tensor([[0.5]]).double(),
+                {"recording": torch.tensor([[0.5]]).double()}, energy, True, ([1.0],), ([0.0],), (),
+            )
+            for index, energy in enumerate(energies)
+        )  # fmt: skip
+
+    def test_equally_likely_answers(self):
+        found = Estimate(FitSpace((SPACE.variables[0],), {}), self.answers(3.0, 3.0), (5,), 2)
+        assert found.weights.tolist() == [0.5, 0.5]
+        assert float(found.mean) == 0.5
+        assert float(found.covariance) == pytest.approx(0.5 + 0.25)
+        assert float(found.sources["starts"]) == pytest.approx(0.25)
+
+    def test_an_unlikely_one_hardly_counts(self):
+        found = Estimate(FitSpace((SPACE.variables[0],), {}), self.answers(0.0, 40.0), (5,), 2)
+        assert float(found.mean) < 1e-8
+        assert float(found.covariance) == pytest.approx(0.5, abs=1e-7)
+
+
+class TestFits:
+    def test_the_truth_is_in_the_interval(self, found):
+        told = found.estimate
+        deviation = float(told.covariance[0, 0].sqrt())
+        assert found.stop_reason == "converged"
+        assert abs(float(told.mean[0]) - math.log(TRUTH["stretch"])) < 1.645 * deviation
+        assert 0.005 < deviation < 0.5
+        assert np.median(told.best.misfits[0]) < 1.5
+        assert told.simulations == found.simulations < 60
+
+    def test_the_sources_add_up_to_the_covariance(self, found):
+        best = found.estimate.best
+        torch.testing.assert_close(torch.stack([*best.sources.values()]).sum(0), best.covariance)
+        assert {"recording", "prior", "bending", "pose", "mesh", "time step"} == set(best.sources)
+        assert all(float(torch.linalg.eigvalsh(part)[0]) > -1e-9 for part in best.sources.values())
+
+    def test_two_recordings_say_more_than_one(self, found):
+        both = JointObjective([objective(), objective(seed=6)])
+        joint = fit_likelihood(both, SPACE, LikelihoodSettings(starts=1)).estimate
+        alone = found.estimate.best.sources["recording"]
+        assert float(joint.best.sources["recording"][0, 0]) < 0.8 * float(alone[0, 0])
+
+    def test_ctrl_c_keeps_what_was_reached(self):
+        seen = []
+
+        def press(progress):
+            seen.append(progress)
+            if len(seen) == 2:
+                raise KeyboardInterrupt
+
+        told = fit_likelihood(objective(), SPACE, LikelihoodSettings(), progress=press)
+        assert told.stop_reason == "interrupted"
+        assert told.values == pytest.approx({name: seen[-1].values[name] for name in told.values})
+        assert float(told.estimate.covariance[0, 0]) > 0
+
+    def test_before_the_first_place_nothing_is_known(self, monkeypatch):
+        def press(*given):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(likelihood._Linear, "at", press)
+        with pytest.raises(KeyboardInterrupt):
+            fit_likelihood(objective(), SPACE, LikelihoodSettings())
+
+    def test_a_motion_that_diverges_from_every_start_is_told(self, monkeypatch):
+        def diverge(*given):
+            raise DivergedError(3, [0], "no number", {})
+
+        monkeypatch.setattr(likelihood._Linear, "at", diverge)
+        with pytest.raises(DivergedError):
+            fit_likelihood(objective(), SPACE, LikelihoodSettings())
