@@ -278,7 +278,7 @@ def _cloth(
     found = {
         "base": Found("lift", "a rectangular cloth on a table"),
         "size_m": Found(list(size), reason),
-        "nodes": Found(list(node_counts(size)), "about 3.4 cm apart, but 5 to 13 along each side"),
+        "nodes": Found(list(node_counts(size)), "13 along the longer side, and at least 5 along the other"),
         "grip": Found(
             "pad", "fingers level; or upright_pad (pinched from above), or pivot (a point that lets the cloth turn)"
         ),

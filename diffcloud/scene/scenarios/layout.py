@@ -41,7 +41,6 @@ _STAYS = 0.5
 """Part of the area that must have left the table, of which at least so much has really left, if it is a cloth."""
 _AT_CORNER_M = 0.03
 _TRAVEL_M = 0.03
-_CELL_M = 0.034
 _NODES = (5, 13)
 _GAP_M: float = GridScenario.model_fields["gap_m"].default
 """Of the cloth over the table at the start."""
@@ -73,8 +72,8 @@ def found_size(episode: Episode) -> tuple[float, float]:
 
 
 def node_counts(size: tuple[float, float]) -> tuple[int, int]:
-    """Nodes along both sides, some 3.4 cm apart: the fewest that buckle and fold about as finer ones do."""
-    columns, rows = (min(max(round(side / _CELL_M) + 1, _NODES[0]), _NODES[1]) for side in size)
+    """Nodes along both sides, 13 along the longer one: the fewest that buckle and fold about as finer ones do."""
+    columns, rows = (max(round((_NODES[1] - 1) * side / max(size)) + 1, _NODES[0]) for side in size)
     return columns, rows
 
 
@@ -130,7 +129,7 @@ def find_layout(episode: Episode, size: tuple[float, float], pad: float = GRIP_M
     inner = np.maximum(half - pad / 2, 0.0)  # a pad at a rim lies inside the cloth
     distances = np.linalg.norm(np.clip(nodes, -inner, inner) - local, axis=1)
     node = int(distances.argmin())
-    if distances[node] > 0.5 * _CELL_M + _AT_CORNER_M:
+    if distances[node] > 0.5 * max(size) / (_NODES[1] - 1) + _AT_CORNER_M:
         warnings.append(f"the gripper begins {1e3 * distances[node]:.0f} mm beside the nearest place of a grasp")
     corners = {
         0: "left_bottom",
