@@ -101,7 +101,7 @@ class TestRecording:
 
     def test_frames_count_up_to_where_the_meshes_part(self, member, monkeypatch):
         for apart, count in ((1.0, 12), (1e-9, 1)):
-            monkeypatch.setattr(likelihood, "_PART_M", apart)
+            monkeypatch.setattr(likelihood, "_GONE_M", apart)
             assert member.horizons(member.start({}, 0.0)) == (count,)
 
 

@@ -47,8 +47,10 @@ _FRAME_S = 0.1
 """Frames that are closer share these."""
 _MODEL_M = 0.001
 """What no simulator of cloth predicts better."""
-_PART_M = 0.008
-"""Difference to the finer mesh, RMS over the nodes, at which the horizon is."""
+_PART_M, _GONE_M = 0.004, 0.010
+"""Difference to the finer mesh, RMS over the nodes, at which the horizon is: after `_LEAST_S`, and before it."""
+_LEAST_S = 1.2
+"""A first guess of the material may part too early."""
 _START = math.log(4.5)
 """Between starts, in the logarithm of the stretching."""
 _RADIUS = 1.0
@@ -336,7 +338,8 @@ class _Likelihood:
         def one(recording: _Recording) -> int:
             change = recording.change(place, recording.nodes(place), recording.finer)
             apart = _squared(change).sqrt() * recording.objective.length_unit_m
-            gone = torch.nonzero(apart[recording.objective.times.argsort(stable=True)] > _PART_M)
+            times, order = recording.objective.times.sort(stable=True)
+            gone = torch.nonzero(apart[order] > torch.where(times > _LEAST_S, _PART_M, _GONE_M))
             return max(int(gone[0]), 1) if len(gone) else len(apart)
 
         self.simulations += 2 * len(self.recordings)
