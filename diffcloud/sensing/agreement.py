@@ -24,7 +24,7 @@ does not show the lag.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import EpisodeError
-from diffcloud.io.episodes import Episode, Pinhole
+from diffcloud.io.episodes import Clock, Episode, Pinhole
 from diffcloud.sensing.robust import deviation, tukey
 
 Floats = NDArray[np.float64]
@@ -79,6 +79,8 @@ _LEAST_ROWS, _LEAST_FRAMES = 300, 5
 class Agreement:
     """Correction of the second camera, to be applied to its points."""
 
+    cameras: tuple[str, str]
+    """Names of the first camera, which stays, and of the second."""
     middle: Floats
     """[3] about which it is turned [m]."""
     eye: Floats
@@ -89,7 +91,8 @@ class Agreement:
     """[8, 8] of the values. Directions that the recordings do not show keep the prior's. The prior's mean is zero."""
     before_m: float
     after_m: float
-    """Root mean square distances of points to the other camera's surface, without and with the correction [m]."""
+    """Root mean square distances of points to the other camera's surface, without and with the correction [m]; NaN if no
+    point is near it."""
 
     @property
     def sigmas(self) -> Floats:
@@ -123,8 +126,8 @@ class Agreement:
             "scale_about_m": self.eye.tolist(),
             **{name: self.values[part].tolist() for name, part in zip(names, parts, strict=True)},
             "sigmas": {name: self.sigmas[part].tolist() for name, part in zip(names, parts, strict=True)},
-            "rms_before_m": self.before_m,
-            "rms_after_m": self.after_m,
+            "rms_before_m": self.before_m if np.isfinite(self.before_m) else None,
+            "rms_after_m": self.after_m if np.isfinite(self.after_m) else None,
         }
 
     def _rotation(self) -> Floats:
@@ -312,21 +315,29 @@ def agreement(episodes: Sequence[Episode], cameras: tuple[str, str], *, scale: b
         seed: of the points that are compared.
 
     Raises:
-        EpisodeError: points that name no camera, an unknown camera, or surfaces that do not overlap enough to be compared.
+        EpisodeError: points that name no camera, an unknown camera, one that was corrected before, or surfaces that do not
+            overlap enough to be compared.
     """
     rng, pairs = np.random.default_rng(seed), list[_Pair]()
     for episode in episodes:
-        known = episode.meta.get("cameras") or []
-        if episode.camera is None or not set(cameras) <= set(known) or cameras[1] not in episode.viewpoints:
+        told = episode.meta.get("cameras")
+        known = list(map(str, told)) if isinstance(told, list) else []
+        if episode.camera is None or not set(cameras) <= set(known) & set(episode.viewpoints):
             raise EpisodeError(
                 f"The cameras {' and '.join(cameras)} cannot be compared: the recording's points name the cameras "
-                f"{', '.join(map(str, known)) or 'none'}. Points must name their camera, and `viewpoints` its place. Give "
+                f"{', '.join(known) or 'none'}. Points must name their camera, and `viewpoints` its place. Give "
                 "a recording that `diffcloud preprocess` made of raw depth images of two cameras."
+            )
+        done = episode.meta.get("agreement")
+        if isinstance(done, Mapping) and cameras[1] in done:
+            raise EpisodeError(
+                f"The camera {cameras[1]} of this recording has been corrected already: its meta has `agreement`. Points "
+                "are corrected once. Leave the correction off, or give the recording as it was before."
             )
         pairs.append(_Pair.of(episode, (known.index(cameras[0]), known.index(cameras[1])), rng))
     clouds = [s.points for pair in pairs for side in pair.surfaces for s in side]
     middle = np.concatenate(clouds).mean(axis=0) if sum(map(len, clouds)) else np.zeros(3)
-    now = Agreement(middle, episodes[0].viewpoints[cameras[1]], np.zeros(8), np.diag(_PRIORS**2), 0.0, 0.0)
+    now = Agreement(cameras, middle, episodes[0].viewpoints[cameras[1]], np.zeros(8), np.diag(_PRIORS**2), 0.0, 0.0)
     free = np.array([0, 1, 2, 3, 4, 5, *([6] if scale else []), 7])
     before_m = _rms(_rows(pairs, now, _GATE_M))
     for iteration in range(_ITERATIONS):
@@ -392,32 +403,33 @@ def _rms(rows: _Rows) -> float:
     return float(np.sqrt(np.mean(rows.r**2))) if len(rows.r) else float("nan")
 
 
-def corrected(episode: Episode, found: Agreement, camera: str, about: Mapping[str, Any]) -> Episode:
+def corrected(episode: Episode, found: Agreement, recordings: Sequence[str]) -> Episode:
     """The episode with the second camera's points, pose and cut plane corrected.
 
     Args:
-        camera: the second camera.
-        about: added to the metadata of the correction, such as from which recordings it was estimated.
+        recordings: names of those that the correction was estimated from, for its metadata.
 
     Returns:
         Its meta has `agreement`, the correction, and `clocks`: camera -> `offset_s` and `sigma_s` [s]. A point of the
-        second camera with time stamp T shows the motion at T + offset_s on the first camera's clock. The first camera's
-        own offset is against the gripper's track. The cameras do not show it, so its standard deviation is wide. Times
-        remain as they were.
+        second camera with time stamp T shows the motion at T + offset_s on the first camera's clock. The offset of this
+        clock against the gripper's track stays as the recording states it. If the recording states nothing, it is zero,
+        with a wide standard deviation. Times remain as they were.
     """
     assert episode.camera is not None
-    meta = dict(episode.meta)
+    meta, (first, camera) = dict(episode.meta), found.cameras
     points = episode.points.copy()
     mine = episode.camera == list(meta["cameras"]).index(camera)
     points[mine] = found.moved(points[mine].astype(np.float64))
     meta["viewpoints"] = {**meta["viewpoints"], camera: found.moved(episode.viewpoints[camera][None])[0].tolist()}
-    if camera in meta.get("pinholes", {}):
-        moved = found.pinhole(Pinhole.of(meta["pinholes"][camera]))
-        meta["pinholes"] = {**meta["pinholes"], camera: moved.described()}
-    if camera in meta.get("cut_planes", {}):
+    for name, pinhole in zip(meta.get("pinholes") or {}, episode.pinholes, strict=True):
+        if name == camera:
+            meta["pinholes"] = {**meta["pinholes"], camera: found.pinhole(pinhole).described()}
+    if camera in episode.cut_planes:
         meta["cut_planes"] = {**meta["cut_planes"], camera: found.plane(meta["cut_planes"][camera])}
-    meta["agreement"] = {camera: {**found.described(), **about}}
-    first = next(name for name in meta["cameras"] if name != camera)
-    clock = {"offset_s": float(found.values[7]), "sigma_s": float(np.hypot(found.sigmas[7], _CLOCK_BIAS_S))}
-    meta["clocks"] = {first: {"offset_s": 0.0, "sigma_s": _UNKNOWN_CLOCK_S}, camera: clock}
+    meta["agreement"] = {**(meta.get("agreement") or {}), camera: {**found.described(), "from": list(recordings)}}
+    stated = Clock(0.0, _UNKNOWN_CLOCK_S if episode.lag_sigma_s is None else 0.0)
+    clocks = dict.fromkeys(meta["cameras"], stated) | episode.clocks
+    late = float(found.values[7]) + clocks[first].offset_s
+    clocks[camera] = Clock(late, float(np.hypot(found.sigmas[7], _CLOCK_BIAS_S)))
+    meta["clocks"] = {name: asdict(clock) for name, clock in clocks.items()}
     return replace(episode, points=points, meta=meta)

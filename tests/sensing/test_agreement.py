@@ -140,7 +140,7 @@ def test_displacement_turn_and_clock_are_recovered_from_depth_images():
 def test_points_pose_and_cut_plane_move_together():
     episode = recording()
     found = agreement([episode], CAMERAS, scale=False)
-    after = corrected(episode, found, "side", {"from": ["a"]})
+    after = corrected(episode, found, ["a"])
     side = episode.camera == 1
     np.testing.assert_array_equal(after.points[~side], episode.points[~side])
     before_pinhole, after_pinhole = episode.pinholes[1], after.pinholes[1]
