@@ -301,7 +301,10 @@ class Episode:
         told = self.meta.get("pose_sigmas") or {}
         values = list(told.values()) if isinstance(told, Mapping) else [None]
         if not all(isinstance(one, int | float) and not isinstance(one, bool) and 0 < one < _FARTHEST for one in values):
-            raise EpisodeError(f"pose_sigmas of an episode's meta are variable -> positive number, got {told!r}.")
+            raise EpisodeError(
+                f"pose_sigmas of an episode's meta are {told!r}. They may be variable -> positive number [m, rad, s]. "
+                "Correct them, or remove `pose_sigmas`."
+            )
         return {str(name): float(one) for name, one in told.items()}
 
     @cached_property

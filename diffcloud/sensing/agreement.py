@@ -348,7 +348,8 @@ def agreement(episodes: Sequence[Episode], cameras: tuple[str, str], *, scale: b
             raise EpisodeError(
                 f"The cameras {' and '.join(cameras)} cannot be compared: {len(rows.r)} points in {frames} frames lie "
                 f"within {100 * gate:g} cm of the other camera's surface. It takes {_LEAST_ROWS} points in {_LEAST_FRAMES} "
-                "frames. Check the cameras' poses, or leave the correction off."
+                f"frames, and a surface has {_NEIGHBOURS} points within {100 * _SPREAD_M:g} cm. Check the cameras' poses, "
+                "give denser clouds, or leave the correction off."
             )
         previous, now = now, _stepped(now, rows, free)
         if gate == _GATE_M and np.abs((now.values - previous.values) / _PRIORS).max() < _CONVERGED:
