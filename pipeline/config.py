@@ -152,6 +152,10 @@ class PreprocessConfig(Section):
     """Cleaning of clouds."""
 
     raw: RawConfig = RawConfig()
+    align_cameras: tuple[Name, Name] | None = None
+    """Names of two cameras: the second one's pose, depth scale and clock are corrected against the first, as far as the
+    recording shows them (`diffcloud.sensing.agreement`). The clouds must be in metres. Off by default, since `raw.refine`
+    finds the cameras' places, and a single recording of a stiff or slow cloth shows little more."""
     crop_m: tuple[Point, Point] | None = None
     """Lowest and highest corner of a box in the scene's frame."""
     outlier_neighbours: CountOrNone = 20
@@ -164,6 +168,12 @@ class PreprocessConfig(Section):
     """Kept per frame at most."""
     thinning: Thinning = "random"
     seed: Seed = 0
+
+    @model_validator(mode="after")
+    def _two_cameras(self) -> Self:
+        if self.align_cameras is not None and len(set(self.align_cameras)) < 2:
+            raise ValueError(f"align_cameras takes two different cameras, got {list(self.align_cameras)}")
+        return self
 
 
 class SimulateConfig(Section):

@@ -239,8 +239,8 @@ def _corrected(recorded: dict[Path, Episode]) -> dict[Path, Episode]:
         except EpisodeError as error:
             warn(f"Set-up {name}: the camera {second} was not corrected. {error}")
             continue
-        about = {"from": [path.stem for path in mine]}
-        result |= {path: corrected(episode, found, second, about) for path, episode in mine.items()}
+        names = [path.stem for path in mine]
+        result |= {path: corrected(episode, found, names) for path, episode in mine.items()}
     return result
 
 

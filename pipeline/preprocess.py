@@ -20,6 +20,7 @@ from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.images import write_color
 from diffcloud.io.manifests import read_manifest, read_marks, remove_files, remove_manifest, write_manifest
 from diffcloud.io.raw_episodes import RawEpisode, raw_episode_files, read_description, read_raw_episode
+from diffcloud.sensing.agreement import agreement, corrected
 from diffcloud.sensing.filters import clean_frame
 from diffcloud.sensing.fusion import Seen, fuse
 from diffcloud.sensing.masking import RobotMask
@@ -52,7 +53,8 @@ def preprocess(
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
-    """Raw episodes: depth to points, robot and table out, views merged. All episodes: crop, remove outliers, thin.
+    """Raw episodes: depth to points, robot and table out, views merged. All episodes: align two cameras if the parameters
+    file names them (`align_cameras`), crop, remove outliers, thin.
 
     Finished episodes are kept until the recording, a setting or the code changes. Of a folder, clouds whose recording is
     gone are removed.
@@ -154,12 +156,13 @@ class PreprocessJob:
         Raises:
             EpisodeError: a damaged episode, or one of which nothing is left.
         """
-        pictures = None
+        pictures = raw = None
         try:
             if self.path.is_dir():
-                pictures = _Pictures(read_raw_episode(self.path))
+                raw = read_raw_episode(self.path)
+                pictures = _Pictures(raw)
                 episode = fuse(
-                    pictures.raw,
+                    raw,
                     robot_mask(self.settings.raw),
                     self.settings.raw.fusion(),
                     calibration=self.calibration,
@@ -168,7 +171,7 @@ class PreprocessJob:
                 )
             else:
                 episode = read_episode(self.path)
-            episode = _clean(episode, self.settings)
+            episode = _clean(aligned(episode, self.settings, self.name, raw), self.settings)
         except EpisodeError as error:
             raise EpisodeError(f"{self.path}: {error}") from error
         with together():
@@ -264,6 +267,27 @@ def _robot(raw: RawConfig) -> Robot | None:
     if raw.robot is None:
         return None
     return gen3() if raw.robot == "gen3" else Robot.from_urdf(Path(raw.robot))
+
+
+def aligned(episode: Episode, config: PreprocessConfig, name: str, raw: RawEpisode | None) -> Episode:
+    """The recording of this name with one camera corrected against another, if the settings name both.
+
+    Args:
+        raw: what the clouds were made of; None if they come from a file.
+
+    Raises:
+        EpisodeError: other cameras, views that cannot be compared, or clouds that are not in metres.
+    """
+    if config.align_cameras is None:
+        return episode
+    if raw is not None:
+        unit = (config.raw.fusion().placement or raw.placement).length_unit_m
+        if unit != 1.0:
+            raise EpisodeError(
+                f"The scene's length unit is {unit:g} m. align_cameras takes clouds in metres. Set length_unit_m to 1, or "
+                "leave align_cameras out."
+            )
+    return corrected(episode, agreement([episode], config.align_cameras), [name])
 
 
 class _Pictures:

@@ -151,9 +151,10 @@ def _raw(path: Path, params: Path | None) -> _Shown:
     from diffcloud.io.raw_episodes import read_raw_episode
     from diffcloud.sensing.fusion import fuse
     from diffcloud.sensing.pictures import mask_picture
-    from pipeline.preprocess import robot_mask
+    from pipeline.preprocess import aligned, robot_mask
 
-    settings = load_config(params).preprocess.raw
+    config = load_config(params).preprocess
+    settings = config.raw
     raw = read_raw_episode(path)
     photographs: dict[int, bytes] = {}
 
@@ -162,7 +163,7 @@ def _raw(path: Path, params: Path | None) -> _Shown:
 
     with progress_bar(f"fusing {path.name}", len(next(iter(raw.cameras.values())).frames)) as update:
         episode = fuse(raw, robot_mask(settings), settings.fusion(), tell=update, watch=watch)
-    return _Shown(episode, photographs)
+    return _Shown(aligned(episode, config, path.name, raw), photographs)
 
 
 def _spread(count: int, most: int) -> list[int]:

@@ -236,8 +236,7 @@ class Matcher:
         eyes, seen = target.space.back(target.viewpoints, pose), torch.zeros_like(points[0][..., 0], dtype=torch.bool)
         for view, at, there, cameras in zip(views, points, moved, target.watching, strict=True):
             if cameras:
-                lost = [target.lost[one] for one in cameras if target.lost]
-                blind = torch.stack([one.blind(there) for one in lost], dim=-1) if lost else None
+                blind = target.blind(cameras, there)
                 seen |= seen_places(view, self._faces, at, eyes[:, cameras], near=self._near, blind=blind)
         return seen
 

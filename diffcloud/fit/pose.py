@@ -27,7 +27,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from diffcloud.errors import ConfigError, unknown_name
+from diffcloud.errors import ConfigError, EpisodeError, unknown_name
 from diffcloud.fit.priors import INDEPENDENT, parse_deviations
 from diffcloud.fit.record import NuisanceValue
 from diffcloud.io.episodes import Episode
@@ -97,10 +97,20 @@ def set_up_of(episode: Episode) -> dict[str, float]:
         EpisodeError: the episode's meta is damaged.
     """
     measured = {"lag": episode.lag_sigma_s, "scale": episode.scale_sigma}
-    found = SET_UP | {name: sigma for name, sigma in measured.items() if sigma is not None} | episode.pose_sigmas
+    found = SET_UP | {name: sigma for name, sigma in measured.items() if sigma is not None} | _pose_sigmas(episode)
     own = found.pop("lag")
     sigmas = {f"{_OF_CAMERA}{camera}": math.hypot(own, clock.sigma_s) for camera, clock in episode.clocks.items()}
     return found | (sigmas or {"lag": own})
+
+
+def _pose_sigmas(episode: Episode) -> dict[str, float]:
+    told = episode.pose_sigmas
+    if unknown := set(told) - set(NUISANCE):
+        raise EpisodeError(
+            f"pose_sigmas of an episode's meta name {', '.join(sorted(unknown))}. They may name {', '.join(NUISANCE)}. "
+            "Correct them, or remove `pose_sigmas`."
+        )
+    return told
 
 
 def default_priors(episode: Episode) -> dict[str, float]:

@@ -77,11 +77,27 @@ class Target:
     """[cameras, 3], in the recording's frame; None where they are not known."""
     lost: tuple[LostPixels, ...]
     """What each of these cameras lost; empty where that is not known."""
+    planes: Tensor | None
+    """[cameras, 4] (a, b, c, d) in the recording's frame: each camera's points with a x + b y + c z < d were removed; None
+    where nothing was."""
     watching: tuple[list[int], ...]
     """[C] which of these cameras go by each clock."""
     space: PoseSpace
     track: Tensor | None
     """[1, S, G, 3] displacement of the grippers."""
+
+    def blind(self, cameras: Sequence[int], points: Tensor) -> Tensor | None:
+        """bool [B, L, N, C] which of these cameras could not have recorded points [B, L, N, 3] in the recording's frame,
+        whatever stands before them; None if that is not known."""
+        if not self.lost and self.planes is None:
+            return None
+        found = torch.zeros(*points.shape[:-1], len(cameras), dtype=torch.bool)
+        if self.lost:
+            found |= torch.stack([self.lost[camera].blind(points) for camera in cameras], dim=-1)
+        if self.planes is not None:
+            planes = self.planes[list(cameras)]
+            found |= points @ planes[:, :3].T < planes[:, 3]
+        return found
 
     @cached_property
     def noise_loss(self) -> float:
@@ -131,7 +147,8 @@ def read_target(
 
     Raises:
         EpisodeError: a frame that the episode lacks, one after the end of the simulation, none that is usable, other
-            grippers than the scene's, viewpoints that are no positions, or clocks of other cameras.
+            grippers than the scene's, viewpoints that are no positions, cut planes that are no planes, or clocks of other
+            cameras.
         ConfigError: an unknown variable of the pose.
     """
     unit = scenario.length_unit_m
@@ -162,6 +179,7 @@ def read_target(
         height,
         None if whole or not episode.viewpoints else torch.from_numpy(np.stack(list(episode.viewpoints.values()))),
         () if whole else _lost(episode, frames),
+        None if whole else _planes(episode),
         tuple(watching),
         PoseSpace.build(nuisance, centre, length_unit_m=unit, clocks=clocks),
         track,
@@ -217,6 +235,13 @@ def _lost(episode: Episode, frames: Sequence[int]) -> tuple[LostPixels, ...]:
         )
         for camera, pinhole in found
     )
+
+
+def _planes(episode: Episode) -> Tensor | None:
+    """Of the cameras whose places are known; of one whose points were not cut, zeros, which cut nothing."""
+    planes = episode.cut_planes
+    found = [planes.get(name, np.zeros(4)) for name in episode.viewpoints]
+    return torch.from_numpy(np.stack(found)) if planes and found else None
 
 
 def _widened(pixels: Tensor) -> Tensor:

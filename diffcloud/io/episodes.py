@@ -208,6 +208,30 @@ class Episode:
         return found
 
     @property
+    def cut_planes(self) -> dict[str, NDArray[np.float64]]:
+        """Camera -> [4] (a, b, c, d): the camera shows only points of the scene with a x + b y + c z >= d. Cameras whose
+        points were not cut have none.
+
+        Raises:
+            EpisodeError: `cut_planes` of the meta are no planes of its `cameras`.
+        """
+        told, cameras = self.meta.get("cut_planes"), self.meta.get("cameras")
+        if not told:
+            return {}
+        try:
+            found = {str(name): np.array(plane, dtype=np.float64) for name, plane in told.items()}
+        except (AttributeError, TypeError, ValueError):
+            found = {"": np.empty(0)}
+        if not (isinstance(cameras, list) and set(found) <= set(map(str, cameras))) or not all(
+            plane.shape == (4,) and np.isfinite(plane).all() and plane[:3].any() for plane in found.values()
+        ):
+            raise EpisodeError(
+                f"cut_planes of the episode's meta are {told!r}, with the cameras {cameras!r}. They are camera -> "
+                "[a, b, c, d], finite, with a, b, c not all zero. Correct them, or remove `cut_planes`."
+            )
+        return found
+
+    @property
     def lag_sigma_s(self) -> float | None:
         """Standard deviation with which preprocessing has measured how late the joint log is; None where it has not.
 
@@ -277,7 +301,10 @@ class Episode:
         told = self.meta.get("pose_sigmas") or {}
         values = list(told.values()) if isinstance(told, Mapping) else [None]
         if not all(isinstance(one, int | float) and not isinstance(one, bool) and 0 < one < _FARTHEST for one in values):
-            raise EpisodeError(f"pose_sigmas of an episode's meta are variable -> positive number, got {told!r}.")
+            raise EpisodeError(
+                f"pose_sigmas of an episode's meta are {told!r}. They may be variable -> positive number [m, rad, s]. "
+                "Correct them, or remove `pose_sigmas`."
+            )
         return {str(name): float(one) for name, one in told.items()}
 
     @cached_property

@@ -10,18 +10,21 @@ the second camera with time stamp T shows the motion at T + lag on the first cam
 distances along normals, in both directions: from points of one camera to the other's surface at that time. This surface is
 interpolated quadratically between three frames. Weights are Tukey's.
 
-Which numbers a recording shows depends on the motion. A flat cloth that moves in its own plane shows neither a shift in
-this plane nor the lag. Errors of a surface are shared by all points of a frame, so standard deviations come from sums over
-whole frames (sandwich estimator). Directions that remain as uncertain as their priors are left uncorrected.
+Noise of the normals and speeds would look like information: a flat cloth would show a shift in its own plane. So they are
+measured twice, on the surface that a point is compared with (J) and on the point's own surface (Z). Both have the same mean
+and independent noise. Z'J then estimates the information without bias, and Z'r = 0 is solved for the correction
+(instrumental variables, Wooldridge 2010, chapter 5). Directions in which Z'J is as small as noise makes it are not shown.
 
-Limit: noise of the normals looks like information. A flat cloth gets a shift in its plane and a turn about its normal, with
-standard deviations that are far too small. Use recordings in which the cloth bends. The lag of a cloth at rest is refused.
+Errors of a surface are shared by neighbouring points and frames. Sums over neighbouring frames say how many comparisons
+count as one. The result is the posterior mean with the priors below: what the recording hardly shows stays near zero, and
+keeps the prior's standard deviation. A flat cloth shows neither a shift in its plane nor a turn in it, and a cloth at rest
+does not show the lag.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,22 +33,30 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from diffcloud.errors import EpisodeError
-from diffcloud.io.episodes import Episode, Pinhole
+from diffcloud.io.episodes import Clock, Episode, Pinhole
 from diffcloud.sensing.robust import deviation, tukey
 
 Floats = NDArray[np.float64]
 
 _PRIORS = np.array([np.radians(5.0)] * 3 + [0.05] * 3 + [0.03, 0.1])
 """Standard deviations of w [rad], t [m], s [1] and lag [s] before the recording was seen."""
-_KNOWN = 0.3
-"""A direction is corrected if the recording leaves less than this part of its prior's standard deviation."""
+_SHOWN = 0.5
+"""A direction is shown if its information exceeds this part of what noise of the normals would leave of it if all points
+of a frame shared their noise. Noise alone reaches 0.2."""
+_VOXEL_M = 0.006
+"""Points are averaged in voxels of this side, so that both cameras' surfaces are equally smooth."""
 _NEIGHBOURS = 40
 _SPREAD_M = 0.025
 """The neighbours that define a normal lie within this radius; sparser places belong to no surface."""
+_BORDER = 0.25
+"""A place farther from the mean of its neighbours than this part of their radius is at a border. Its height and normal have
+common noise."""
 _EDGE_M = 0.006
 """Beside the nearest point of a surface by more than this, a point is beyond its edge."""
 _ALIKE = 0.85
 """Cosine between the normals of surfaces that may be the same one."""
+_REACH_M = 0.06
+"""In the frames before and after, a surface may be so far away."""
 _GATE_M = 0.02
 """Points farther from the surface show something else."""
 _FIRST_GATES_M = (0.06, 0.06, 0.05, 0.04, 0.03, 0.03)
@@ -53,12 +64,13 @@ _FIRST_GATES_M = (0.06, 0.06, 0.05, 0.04, 0.03, 0.03)
 _ITERATIONS = 30
 _CONVERGED = 0.002
 """A step this small, in standard deviations of the priors, is the last one."""
-_MOVES = 1.5
-"""The lag is free if the surfaces' speed along their normals exceeds this many times what noise alone would make of it."""
+_SHARED_FRAMES = 3
+"""Frames next to one another that are compared with the same surfaces."""
 _CLOCK_BIAS_S = 0.02
-"""Added to the standard deviation of a clock. Noise of the normals takes up to a third off the offset in simulations."""
+"""Added to the standard deviation of a clock. Depth errors that this model lacks act on the offset too: on the published
+recordings, estimates with other weights and surfaces differ by about as much."""
 _UNKNOWN_CLOCK_S = 0.1
-_SOURCES = 200
+_SOURCES = 300
 """Points of each camera and frame that are compared."""
 _LEAST_ROWS, _LEAST_FRAMES = 300, 5
 """Fewer compared points or frames show no agreement."""
@@ -68,6 +80,8 @@ _LEAST_ROWS, _LEAST_FRAMES = 300, 5
 class Agreement:
     """Correction of the second camera, to be applied to its points."""
 
+    cameras: tuple[str, str]
+    """Names of the first camera, which stays, and of the second."""
     middle: Floats
     """[3] about which it is turned [m]."""
     eye: Floats
@@ -75,10 +89,11 @@ class Agreement:
     values: Floats
     """[8] w [rad], t [m], s, lag [s]; zero in directions that the recordings do not show."""
     covariance: Floats
-    """[8, 8] of the values. Directions that the recordings do not show keep the prior's."""
+    """[8, 8] of the values. Directions that the recordings do not show keep the prior's. The prior's mean is zero."""
     before_m: float
     after_m: float
-    """Root mean square distances of points to the other camera's surface, without and with the correction [m]."""
+    """Root mean square distances of points to the other camera's surface, without and with the correction [m]; NaN if no
+    point is near it."""
 
     @property
     def sigmas(self) -> Floats:
@@ -107,13 +122,13 @@ class Agreement:
         names = ("rotation_rad", "translation_m", "log_scale", "lag_s")
         parts: tuple[slice | int, ...] = (slice(0, 3), slice(3, 6), 6, 7)
         return {
-            "method": "point to surface between two cameras, Gauss-Newton with Tukey weights",
+            "method": "point to surface between two cameras, instrumental variables with Tukey weights",
             "about_m": self.middle.tolist(),
             "scale_about_m": self.eye.tolist(),
             **{name: self.values[part].tolist() for name, part in zip(names, parts, strict=True)},
             "sigmas": {name: self.sigmas[part].tolist() for name, part in zip(names, parts, strict=True)},
-            "rms_before_m": self.before_m,
-            "rms_after_m": self.after_m,
+            "rms_before_m": self.before_m if np.isfinite(self.before_m) else None,
+            "rms_after_m": self.after_m if np.isfinite(self.after_m) else None,
         }
 
     def _rotation(self) -> Floats:
@@ -143,27 +158,27 @@ class _Surface:
     @staticmethod
     def of(points: Floats, eye: Floats) -> _Surface:
         """Of points [N, 3] seen from a place [3]; normals point towards it."""
-        points = np.unique(points, axis=0)  # clouds may have been sampled with repetition
+        points = _thinned(points)
         if len(points) < 2 * _NEIGHBOURS:
             return _Surface(np.empty((0, 3)), np.empty((0, 3)), None)
         distance, index = cKDTree(points).query(points, _NEIGHBOURS)
-        dense = distance[:, -1] < _SPREAD_M
-        around = points[index[dense]]
-        centre = around.mean(axis=1)
-        away = around - centre[:, None]
+        centre = points[index].mean(axis=1)
+        inner = np.linalg.norm(points - centre, axis=1) < _BORDER * distance[:, -1]
+        kept = inner & (distance[:, -1] < _SPREAD_M)
+        own, centre = points[kept], centre[kept]
+        away = points[index[kept]] - centre[:, None]
         normal = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away))[1][..., 0]
-        own = points[dense]
         own = own - ((own - centre) * normal).sum(-1, keepdims=True) * normal
         normal *= np.sign(((eye - own) * normal).sum(-1, keepdims=True))
         return _Surface(own, normal, cKDTree(own) if len(own) else None)
 
-    def height(self, points: Floats, facing: Floats, gate: float) -> tuple[Floats, Floats]:
+    def height(self, points: Floats, facing: Floats) -> tuple[Floats, Floats]:
         """Height [N] of points above the surface along its normals [N, 3]; NaN where no surface faces the same
         way as the points' own surface does [N, 3]: cloth has two sides, and folds have layers."""
         height, normal = np.full(len(points), np.nan), np.zeros((len(points), 3))
         if self.tree is None or not len(points):
             return height, normal
-        distance, index = self.tree.query(points, distance_upper_bound=gate)
+        distance, index = self.tree.query(points, distance_upper_bound=_REACH_M)
         near = np.flatnonzero(np.isfinite(distance))
         away, n = points[near] - self.points[index[near]], self.normals[index[near]]
         above = (away * n).sum(-1)
@@ -173,12 +188,23 @@ class _Surface:
         return height, normal
 
 
+def _thinned(points: Floats) -> Floats:
+    """The mean of the points [N, 3] in each voxel, [V, 3]."""
+    cell = np.floor(points / _VOXEL_M).astype(np.int64)
+    _, voxel, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    total = np.zeros((len(count), 3))
+    np.add.at(total, voxel.reshape(-1), points)
+    return np.asarray(total / count[:, None])
+
+
 @dataclass(frozen=True)
 class _Rows:
     J: Floats
-    """[N, 8]"""
+    """[N, 8] by the normals and speeds of the surface that a point is compared with."""
+    Z: Floats
+    """[N, 8] by those of the point's own surface."""
     r: Floats
-    """[N] [m]"""
+    """[N] [m]."""
     frame: NDArray[np.int64]
     """[N] numbers of the frames."""
 
@@ -191,6 +217,8 @@ class _Pair:
     surfaces: tuple[list[_Surface], list[_Surface]]
     sources: tuple[list[NDArray[np.int64]], list[NDArray[np.int64]]]
     """Points of these surfaces that are compared with the other camera's."""
+    rates: tuple[list[Floats], list[Floats]]
+    """[N] of each source, how fast its own surface moves against its normal [m/s]; NaN where that is not seen."""
 
     @staticmethod
     def of(episode: Episode, numbers: tuple[int, int], rng: np.random.Generator) -> _Pair:
@@ -203,38 +231,56 @@ class _Pair:
         eyes = [episode.viewpoints[episode.meta["cameras"][number]] for number in numbers]
         surfaces = tuple([_Surface.of(c, eye) for c in side] for side, eye in zip(clouds, eyes, strict=True))
         sources = tuple([rng.permutation(len(s.points))[:_SOURCES] for s in side] for side in surfaces)
-        return _Pair(episode.times, (surfaces[0], surfaces[1]), (sources[0], sources[1]))
+        rates = tuple(
+            [
+                _against(side, episode.times, time, seen.points[own], seen.normals[own])[1]
+                for time, seen, own in zip(episode.times, side, chosen, strict=True)
+            ]
+            for side, chosen in zip(surfaces, sources, strict=True)
+        )
+        return _Pair(episode.times, (surfaces[0], surfaces[1]), (sources[0], sources[1]), (rates[0], rates[1]))
 
     def rows(self, now: Agreement, gate: float, first: int) -> list[_Rows]:
         """Of every frame in both directions; frames are numbered from `first`."""
-        found, lag = list[_Rows](), float(now.values[7])
+        found, lag, back = list[_Rows](), float(now.values[7]), now._rotation()
         for frame, time in enumerate(self.times):
             for to in (0, 1):  # from the second camera's points to the first one's surface, and the other way
                 sign = 1.0 if to == 0 else -1.0
                 own, chosen = self.surfaces[1 - to][frame], self.sources[1 - to][frame]
-                between = _between(self.times, time + sign * lag)
-                if between is None or not len(chosen):
-                    continue
-                world, facing = own.points[chosen], own.normals[chosen]
+                world, facing, own_rate = own.points[chosen], own.normals[chosen], self.rates[1 - to][frame]
                 if to == 0:
-                    world, facing = now.moved(world), facing @ now._rotation().T
-                local, facing = (world, facing) if to == 0 else (now.back(world), facing @ now._rotation())
-                height, rate, normal = np.zeros(len(world)), np.zeros(len(world)), np.zeros((len(world), 3))
-                for k, weight, slope in between:
-                    h, n = self.surfaces[to][k].height(local, facing, gate)
-                    height += weight * h
-                    rate += slope * h
-                    normal += weight * n
+                    world, facing = now.moved(world), facing @ back.T
+                local, local_facing = (world, facing) if to == 0 else (now.back(world), facing @ back)
+                at = time + sign * lag
+                height, rate, normal = _against(self.surfaces[to], self.times, at, local, local_facing)
                 if to == 1:
-                    normal = normal @ now._rotation().T
-                good = np.isfinite(height)
-                height, rate, normal, world = height[good], rate[good], normal[good], world[good]
-                # the second camera's surface goes along with its correction, its point's height goes the other way
-                turned, scaled = np.cross(world - now.middle - now.values[3:6], normal), world - now._shift()
-                columns = [turned, normal, (scaled * normal).sum(-1)[:, None]]
-                J = np.column_stack([sign * np.concatenate(columns, axis=1), sign * rate])
-                found.append(_Rows(J, height, np.full(len(height), first + frame)))
+                    normal = normal @ back.T
+                good = (np.abs(height) < gate) & np.isfinite(rate) & np.isfinite(own_rate)
+                world, r = world[good], height[good]
+                columns = []
+                for n, speed in ((normal[good], rate[good]), (facing[good], own_rate[good])):
+                    # the second camera's surface goes along with its correction, its point's height goes the other way
+                    turned, scaled = np.cross(world - now.middle - now.values[3:6], n), world - now._shift()
+                    columns.append(sign * np.column_stack([turned, n, (scaled * n).sum(-1), speed]))
+                found.append(_Rows(columns[0], columns[1], r, np.full(len(r), first + frame)))
         return found
+
+
+def _against(
+    surfaces: Sequence[_Surface], times: Floats, time: float, points: Floats, facing: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Heights [N] of points [N, 3] above a moving surface at a time [m], how fast they grow [m/s], and its normals [N, 3].
+    Heights are NaN outside of the recording, and where `_Surface.height` is."""
+    between = _between(times, time)
+    height, rate, normal = np.zeros(len(points)), np.zeros(len(points)), np.zeros((len(points), 3))
+    if between is None or not len(points):
+        return height * np.nan, rate * np.nan, normal
+    for k, weight, slope in between:
+        h, n = surfaces[k].height(points, facing)
+        height += weight * h
+        rate += slope * h
+        normal += weight * n
+    return height, rate, normal
 
 
 def _between(times: Floats, time: float) -> list[tuple[int, float, float]] | None:
@@ -256,8 +302,8 @@ def _rows(pairs: Sequence[_Pair], now: Agreement, gate: float) -> _Rows:
         parts += pair.rows(now, gate, first)
         first += len(pair.times)
     if not parts:
-        return _Rows(np.empty((0, 8)), np.empty(0), np.empty(0, dtype=np.int64))
-    return _Rows(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("J", "r", "frame")))
+        return _Rows(np.empty((0, 8)), np.empty((0, 8)), np.empty(0), np.empty(0, dtype=np.int64))
+    return _Rows(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("J", "Z", "r", "frame")))
 
 
 def agreement(episodes: Sequence[Episode], cameras: tuple[str, str], *, scale: bool = True, seed: int = 0) -> Agreement:
@@ -270,24 +316,31 @@ def agreement(episodes: Sequence[Episode], cameras: tuple[str, str], *, scale: b
         seed: of the points that are compared.
 
     Raises:
-        EpisodeError: points that name no camera, an unknown camera, or surfaces that do not overlap enough to be compared.
+        EpisodeError: points that name no camera, an unknown camera, one that was corrected before, or surfaces that do not
+            overlap enough to be compared.
     """
     rng, pairs = np.random.default_rng(seed), list[_Pair]()
     for episode in episodes:
-        known = episode.meta.get("cameras") or []
-        if episode.camera is None or not set(cameras) <= set(known) or cameras[1] not in episode.viewpoints:
+        told = episode.meta.get("cameras")
+        known = list(map(str, told)) if isinstance(told, list) else []
+        if episode.camera is None or not set(cameras) <= set(known) & set(episode.viewpoints):
             raise EpisodeError(
                 f"The cameras {' and '.join(cameras)} cannot be compared: the recording's points name the cameras "
-                f"{', '.join(map(str, known)) or 'none'}. Points must name their camera, and `viewpoints` its place. Give "
+                f"{', '.join(known) or 'none'}. Points must name their camera, and `viewpoints` its place. Give "
                 "a recording that `diffcloud preprocess` made of raw depth images of two cameras."
+            )
+        done = episode.meta.get("agreement")
+        if isinstance(done, Mapping) and cameras[1] in done:
+            raise EpisodeError(
+                f"The camera {cameras[1]} of this recording has been corrected already: its meta has `agreement`. Points "
+                "are corrected once. Leave the correction off, or give the recording as it was before."
             )
         pairs.append(_Pair.of(episode, (known.index(cameras[0]), known.index(cameras[1])), rng))
     clouds = [s.points for pair in pairs for side in pair.surfaces for s in side]
     middle = np.concatenate(clouds).mean(axis=0) if sum(map(len, clouds)) else np.zeros(3)
-    now = Agreement(middle, episodes[0].viewpoints[cameras[1]], np.zeros(8), np.diag(_PRIORS**2), 0.0, 0.0)
-    free = np.array([True] * 6 + [scale, True])
+    now = Agreement(cameras, middle, episodes[0].viewpoints[cameras[1]], np.zeros(8), np.diag(_PRIORS**2), 0.0, 0.0)
+    free = np.array([0, 1, 2, 3, 4, 5, *([6] if scale else []), 7])
     before_m = _rms(_rows(pairs, now, _GATE_M))
-    interval = float(np.median(np.concatenate([np.diff(pair.times) for pair in pairs])))
     for iteration in range(_ITERATIONS):
         gate = _FIRST_GATES_M[iteration] if iteration < len(_FIRST_GATES_M) else _GATE_M
         rows = _rows(pairs, now, gate)
@@ -296,32 +349,51 @@ def agreement(episodes: Sequence[Episode], cameras: tuple[str, str], *, scale: b
             raise EpisodeError(
                 f"The cameras {' and '.join(cameras)} cannot be compared: {len(rows.r)} points in {frames} frames lie "
                 f"within {100 * gate:g} cm of the other camera's surface. It takes {_LEAST_ROWS} points in {_LEAST_FRAMES} "
-                "frames. Check the cameras' poses, or leave the correction off."
+                f"frames, and a surface has {_NEIGHBOURS} points within {100 * _SPREAD_M:g} cm. Check the cameras' poses, "
+                "give denser clouds, or leave the correction off."
             )
-        free[7] = np.sqrt(np.mean(rows.J[:, 7] ** 2)) > _MOVES * _sigma(rows) / (np.sqrt(2) * interval)
         previous, now = now, _stepped(now, rows, free)
         if gate == _GATE_M and np.abs((now.values - previous.values) / _PRIORS).max() < _CONVERGED:
             break
     return replace(now, before_m=before_m, after_m=_rms(_rows(pairs, now, _GATE_M)))
 
 
-def _stepped(now: Agreement, rows: _Rows, free: NDArray[np.bool_]) -> Agreement:
-    """After one Gauss-Newton step in the directions that the rows show."""
+def _stepped(now: Agreement, rows: _Rows, free: NDArray[np.int64]) -> Agreement:
+    """After one Gauss-Newton step towards the posterior mean."""
     weight = tukey(rows.r, _sigma(rows))
-    J = rows.J[:, free] * _PRIORS[free]  # in deviations of the priors
-    H, g = J.T @ (weight[:, None] * J), J.T @ (weight * rows.r)
-    H += 1e-9 * np.trace(H) * np.eye(len(H))
-    scores = np.zeros((int(rows.frame.max()) + 1, len(H)))
-    np.add.at(scores, rows.frame, J * (weight * rows.r)[:, None])
-    inverse = np.linalg.inv(H)
-    variance, ways = np.linalg.eigh(inverse @ (scores.T @ scores) @ inverse)
-    shown = variance < _KNOWN**2
-    chosen, hidden = ways[:, shown], ways[:, ~shown]
+    J, Z = rows.J[:, free] * _PRIORS[free], rows.Z[:, free] * _PRIORS[free]  # in deviations of the priors
+    shown = _shown(J, Z, weight, len(np.unique(rows.frame)))
+    hidden = np.eye(len(free)) - shown @ shown.T
+    J, Z = J @ shown, weight[:, None] * (Z @ shown)
+    A, scores = Z.T @ J, Z * rows.r[:, None]
+    noise = scores.T @ scores * _counted_as_one(scores, rows.frame // _SHARED_FRAMES)
+    gain = np.linalg.solve(noise, A).T
+    posterior = np.linalg.inv(np.eye(len(A)) + gain @ A)
+    values = now.values[free] / _PRIORS[free]
     step, covariance = np.zeros(8), np.eye(8)
-    step[free] = -chosen @ np.linalg.solve(chosen.T @ H @ chosen, chosen.T @ g)
-    covariance[np.ix_(free, free)] = chosen @ np.diag(np.maximum(variance[shown], 0.0)) @ chosen.T + hidden @ hidden.T
+    step[free] = -shown @ posterior @ (gain @ scores.sum(axis=0) + shown.T @ values) - hidden @ values
+    covariance[np.ix_(free, free)] = shown @ posterior @ shown.T + hidden
     # about the middle, small steps add to the rotation vector
     return replace(now, values=now.values + _PRIORS * step, covariance=_PRIORS[:, None] * covariance * _PRIORS)
+
+
+def _shown(J: Floats, Z: Floats, weight: Floats, frames: int) -> Floats:
+    """[D, d] orthonormal directions in which J [N, D] and Z [N, D] have more in common than noise."""
+    information = Z.T @ (weight[:, None] * J)
+    ways = np.linalg.eigh(information + information.T)[1]
+    common, of_J, of_Z = (weight @ (a @ ways * (b @ ways)) for a, b in ((J, Z), (J, J), (Z, Z)))
+    noise = np.sqrt(np.maximum(of_J - common, 0.0) * np.maximum(of_Z - common, 0.0) / frames)
+    return np.asarray(ways[:, common > np.maximum(_SHOWN * noise, 1e-9 * common.max())])
+
+
+def _counted_as_one(scores: Floats, group: NDArray[np.int64]) -> float:
+    """How many rows of scores [N, d] count as one, because rows of one group [N] share their errors."""
+    sums = np.zeros((int(group.max()) + 1, scores.shape[1]))
+    np.add.at(sums, group, scores)
+    sums = sums[np.unique(group)]
+    sums = sums - sums.mean(axis=0)
+    ratio = np.linalg.solve(scores.T @ scores, sums.T @ sums)
+    return max(float(np.trace(ratio)) / max(len(ratio), 1), 1.0)
 
 
 def _sigma(rows: _Rows) -> float:
@@ -333,32 +405,33 @@ def _rms(rows: _Rows) -> float:
     return float(np.sqrt(np.mean(rows.r**2))) if len(rows.r) else float("nan")
 
 
-def corrected(episode: Episode, found: Agreement, camera: str, about: Mapping[str, Any]) -> Episode:
+def corrected(episode: Episode, found: Agreement, recordings: Sequence[str]) -> Episode:
     """The episode with the second camera's points, pose and cut plane corrected.
 
     Args:
-        camera: the second camera.
-        about: added to the metadata of the correction, such as from which recordings it was estimated.
+        recordings: names of those that the correction was estimated from, for its metadata.
 
     Returns:
         Its meta has `agreement`, the correction, and `clocks`: camera -> `offset_s` and `sigma_s` [s]. A point of the
-        second camera with time stamp T shows the motion at T + offset_s on the first camera's clock. The first camera's
-        own offset is against the gripper's track. The cameras do not show it, so its standard deviation is wide. Times
-        remain as they were.
+        second camera with time stamp T shows the motion at T + offset_s on the first camera's clock. The offset of this
+        clock against the gripper's track stays as the recording states it. If the recording states nothing, it is zero,
+        with a wide standard deviation. Times remain as they were.
     """
     assert episode.camera is not None
-    meta = dict(episode.meta)
+    meta, (first, camera) = dict(episode.meta), found.cameras
     points = episode.points.copy()
     mine = episode.camera == list(meta["cameras"]).index(camera)
     points[mine] = found.moved(points[mine].astype(np.float64))
     meta["viewpoints"] = {**meta["viewpoints"], camera: found.moved(episode.viewpoints[camera][None])[0].tolist()}
-    if camera in meta.get("pinholes", {}):
-        moved = found.pinhole(Pinhole.of(meta["pinholes"][camera]))
-        meta["pinholes"] = {**meta["pinholes"], camera: moved.described()}
-    if camera in meta.get("cut_planes", {}):
+    for name, pinhole in zip(meta.get("pinholes") or {}, episode.pinholes, strict=True):
+        if name == camera:
+            meta["pinholes"] = {**meta["pinholes"], camera: found.pinhole(pinhole).described()}
+    if camera in episode.cut_planes:
         meta["cut_planes"] = {**meta["cut_planes"], camera: found.plane(meta["cut_planes"][camera])}
-    meta["agreement"] = {camera: {**found.described(), **about}}
-    first = next(name for name in meta["cameras"] if name != camera)
-    clock = {"offset_s": float(found.values[7]), "sigma_s": float(np.hypot(found.sigmas[7], _CLOCK_BIAS_S))}
-    meta["clocks"] = {first: {"offset_s": 0.0, "sigma_s": _UNKNOWN_CLOCK_S}, camera: clock}
+    meta["agreement"] = {**(meta.get("agreement") or {}), camera: {**found.described(), "from": list(recordings)}}
+    stated = Clock(0.0, _UNKNOWN_CLOCK_S if episode.lag_sigma_s is None else 0.0)
+    clocks = dict.fromkeys(meta["cameras"], stated) | episode.clocks
+    late = float(found.values[7]) + clocks[first].offset_s
+    clocks[camera] = Clock(late, float(np.hypot(found.sigmas[7], _CLOCK_BIAS_S)))
+    meta["clocks"] = {name: asdict(clock) for name, clock in clocks.items()}
     return replace(episode, points=points, meta=meta)

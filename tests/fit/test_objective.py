@@ -222,6 +222,39 @@ class TestWhatCounts:
         assert min(with_["counted"]) < 0.9
         assert with_["rms_to_recording_mm"] < 0.5 * without["rms_to_recording_mm"]
 
+    @pytest.mark.parametrize("plane", [[1.0, 0.0, 0.0, 0.02], [0.6, -0.8, 0.0, 0.0]])
+    def test_what_lies_below_the_cut_plane_of_the_only_camera_does_not_count(self, scenario, episode, plane):
+        """A camera high above sees all of the cloth, and its points on one side of a plane were removed. If the plane is
+        known, the truth is near to the recording, and about as many points count as were recorded."""
+        kept = episode.points @ np.float32(plane[:3]) >= plane[3]
+        recorded = replace(episode, meta={"cameras": ["above"], "viewpoints": {"above": [0.1, 0.1, 9.0]}}).select(kept)
+        known = replace(recorded, meta={**recorded.meta, "cut_planes": {"above": plane}})
+        without, with_ = (found_at(Objective(scenario, one, nuisance={}), TRUTH) for one in (recorded, known))
+        assert with_["rms_to_recording_mm"] < 0.3 * without["rms_to_recording_mm"]
+        ratio = np.array(with_["counted"]) / np.array(without["counted"])
+        assert ratio.mean() == pytest.approx(kept.mean(), abs=0.1)
+
+    def test_what_another_camera_shows_below_the_plane_counts(self, scenario, episode):
+        """Of two cameras at one place, one is cut: all counts as before."""
+        place = [0.1, 0.1, 9.0]
+        meta = {"cameras": ["one", "two"], "viewpoints": {"one": place, "two": place}}
+        planes = {"two": [0.0, 0.0, 1.0, 9.0]}
+        whole, cut, gone = (
+            found_at(Objective(scenario, replace(episode, meta=told), nuisance={}), TRUTH)["counted"]
+            for told in (meta, meta | {"cut_planes": planes}, meta | {"cut_planes": planes | {"one": planes["two"]}})
+        )
+        assert cut == whole
+        assert max(gone) == 0.0
+
+    @pytest.mark.parametrize(
+        "told",
+        [{"a": [0, 0, 1]}, {"a": [0, 0, 0, 1]}, {"a": [0, 0, math.nan, 1]}, {"a": "low"}, {"b": [0, 0, 1, 0]}, [1], "low"],
+    )
+    def test_cut_planes_that_are_none(self, scenario, episode, told):
+        meta = {"cameras": ["a"], "viewpoints": {"a": [0, 0, 1]}, "cut_planes": told}
+        with pytest.raises(EpisodeError, match="cut_planes of the episode's meta are"):
+            Objective(scenario, replace(episode, meta=meta))
+
     def test_a_frame_that_the_camera_lost_altogether_leaves_a_pose(self, scenario, episode):
         eye = {"size": [8, 1], "focal": [1, 1], "centre": [4, 0], "T_camera_scene": np.eye(4)[:3].tolist()}
         lost = np.full((episode.frame_count, 1, 1), 255, np.uint8)
@@ -258,6 +291,18 @@ class TestWhatCounts:
     def test_the_scale_is_free_where_the_episode_says_how_far_it_may_be_off(self, scenario, episode):
         assert "scale" not in Objective(scenario, episode).nuisance
         assert Objective(scenario, replace(episode, meta={"scale_sigma": 0.04})).nuisance["scale"] == 0.04
+
+    def test_the_recording_says_how_far_its_pose_may_be_off(self, scenario, episode):
+        found = Objective(scenario, replace(episode, meta={"pose_sigmas": {"x": 0.05, "tilt_x": 0.1}})).nuisance
+        assert found == Objective(scenario, episode).nuisance | {"x": 0.05, "tilt_x": 0.1}
+
+    @pytest.mark.parametrize(
+        "told",
+        [{"x": -0.01}, {"x": 0}, {"x": math.nan}, {"x": True}, {"x": "1cm"}, {"x": [0.01]}, [0.01], "x", {"east": 0.01}],
+    )
+    def test_deviations_of_the_pose_that_are_none(self, scenario, episode, told):
+        with pytest.raises(EpisodeError, match=r"pose_sigmas of an episode's meta .* remove `pose_sigmas`"):
+            Objective(scenario, replace(episode, meta={"pose_sigmas": told}))
 
     @pytest.mark.parametrize("scale", [-0.2, 0.3])
     def test_a_wrong_scale_of_the_basis_material_costs_nothing(self, scenario, episode, scale):

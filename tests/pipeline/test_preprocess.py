@@ -9,11 +9,12 @@ import pandas as pd
 import pytest
 import yaml
 
-from diffcloud.io.episodes import Episode, read_episode, write_episode
+from diffcloud.io.episodes import Clock, Episode, read_episode, write_episode
 from diffcloud.sensing.validation.episode import validate_raw_episode
 from pipeline.preprocess import PreprocessJob
 from tests.pipeline.invoke import invoke
 from tests.sensing.cloth_scene import SETTINGS, write_cloth_episode
+from tests.sensing.test_agreement import CAMERAS, LAG_S, SHIFT_M, TURN, recording
 from tests.sensing.test_validation import edit_json
 
 
@@ -176,3 +177,73 @@ def test_only_what_has_changed_is_done_again(tmp_path, several, monkeypatch):
     (tmp_path / "out/lift/b.npz").write_bytes(b"damaged")
     invoke(*command, tmp_path / "out")
     assert (tmp_path / "out/lift/b.npz").read_bytes() == fresh[Path("lift/b.npz")]
+
+
+@pytest.fixture(scope="module")
+def two_views(tmp_path_factory) -> Path:
+    """Clouds of two cameras that disagree, and settings that align them."""
+    work = tmp_path_factory.mktemp("two_views")
+    write_episode(work / "raw" / "lift" / "one.npz", recording(noise_m=0.0005, frames=12))
+    _align(work, CAMERAS)
+    return work
+
+
+def _align(work, cameras, **settings) -> Path:
+    text = yaml.safe_dump({"scenarios": ["lift"], "preprocess": {"align_cameras": list(cameras), **settings}})
+    (work / "params.yaml").write_text(text, encoding="utf-8")
+    return work / "params.yaml"
+
+
+def test_two_cameras_are_aligned_and_the_meta_says_so(two_views):
+    """The second camera's points end where they belong, and its clock offset of 50 ms is stated."""
+    before = recording(noise_m=0.0005, frames=12)
+    out = two_views / "out"
+    invoke("preprocess", two_views / "raw", "--params", two_views / "params.yaml", "--out", out)
+    episode = read_episode(out / "lift" / "one.npz")
+    assert episode.meta["agreement"]["side"]["from"] == ["one"]
+    assert episode.clocks["side"].offset_s == pytest.approx(LAG_S, abs=0.005)
+    assert episode.clocks["above"] == Clock(0.0, 0.1)
+    found = episode.meta["agreement"]["side"]
+    assert found["rms_after_m"] < 0.5 * found["rms_before_m"]
+    place = TURN.inv().apply(before.viewpoints["side"] - SHIFT_M)
+    assert np.linalg.norm(episode.viewpoints["side"] - place) < 0.005
+    again = invoke("preprocess", out, "--params", two_views / "params.yaml", "--out", two_views / "again", code=1)
+    assert "has been corrected already" in again.errors
+    assert not list((two_views / "again").rglob("*.npz"))
+
+
+def test_without_the_setting_points_stay(two_views, tmp_path):
+    (tmp_path / "params.yaml").write_text("scenarios: [lift]\npreprocess: {points: null, outlier_neighbours: 0}\n")
+    invoke("preprocess", two_views / "raw", "--params", tmp_path / "params.yaml", "--out", tmp_path / "out")
+    episode, before = read_episode(tmp_path / "out" / "lift" / "one.npz"), recording(noise_m=0.0005, frames=12)
+    np.testing.assert_array_equal(episode.points, before.points)
+    assert not {"agreement", "clocks"} & episode.meta.keys()
+
+
+@pytest.mark.parametrize(
+    ("cameras", "message"),
+    [
+        (
+            ("above", "third"),
+            "The cameras above and third cannot be compared: the recording's points name the cameras above, side.",
+        ),
+        (("side", "side"), "align_cameras takes two different cameras"),
+        (("side",), "align_cameras"),
+    ],
+)
+def test_cameras_that_cannot_be_aligned(two_views, tmp_path, cameras, message):
+    found = invoke(
+        "preprocess", two_views / "raw", "--params", _align(tmp_path, cameras), "--out", tmp_path / "out", code=1
+    )
+    assert message in found.errors
+    assert not list((tmp_path / "out").rglob("*.npz"))
+
+
+def test_clouds_in_other_units_are_not_aligned(tmp_path, params):
+    settings = yaml.safe_load(params.read_text())
+    settings["preprocess"] |= {"align_cameras": ["overhead", "side"]}
+    settings["preprocess"]["raw"] |= {"origin_m": [0.0, 0.0, 0.0], "length_unit_m": 0.35}
+    params.write_text(yaml.safe_dump(settings))
+    write_cloth_episode(tmp_path / "raw" / "lift" / "blue1", frames=1)
+    found = invoke("preprocess", tmp_path / "raw", "--params", params, "--out", tmp_path / "out", code=1)
+    assert "The scene's length unit is 0.35 m. align_cameras takes clouds in metres." in found.errors
