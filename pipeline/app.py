@@ -46,6 +46,7 @@ COMMANDS = {
     "materials": "pipeline.materials:materials",
     "discretisation": "pipeline.discretisation:discretisation",
     "simulators": "pipeline.simulators:simulators",
+    "towels": "pipeline.towels:towels",
     "bench": "pipeline.bench:bench",
     "capture": "pipeline.capture:record",
     "calibrate": "pipeline.calibrate:calibrate",

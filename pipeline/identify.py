@@ -35,6 +35,7 @@ from diffcloud.scene.scenarios import Scenario, load_scenario
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
 from diffcloud.scene.scenarios.layout import FIELDS, Found, find_layout, found_size, node_counts
 from diffcloud.sim import warm
+from diffcloud.sim.grasp import GRIP_M
 from diffcloud.sim.properties import one_set
 from diffcloud.sim.threads import use_threads
 from pipeline import ctrl_c
@@ -48,7 +49,7 @@ _DENSITY = 0.16
 _MATERIAL = {"stretching_n_m": 60.0, "bending_n_m": 1e-5, "poisson": 0.3}
 _BOUNDS = {"stretch": (0.03, 30.0), "bending": (0.03, 30.0), "mass": (0.2, 5.0)}
 _BAGS = (".bag", ".mcap", ".db3")
-_CLOTH_FIELDS = ("base", "size_m", "nodes", "material", "steps_per_frame")
+_CLOTH_FIELDS = ("base", "size_m", "nodes", "material", "grip", "grip_m", "steps_per_frame")
 _STEPS = 8
 _MOST_STEPS = 64
 _NOISE_PART = 0.5
@@ -312,6 +313,10 @@ def _cloth(
         "base": Found("lift", "a rectangular cloth on a table"),
         "size_m": Found(list(size), reason),
         "nodes": Found(list(node_counts(size)), "about 3.4 cm apart, but 5 to 13 along each side"),
+        "grip": Found(
+            "pad", "fingers level; or upright_pad (pinched from above), or pivot (a point that lets the cloth turn)"
+        ),
+        "grip_m": Found(GRIP_M, "side of the pad, or of the square that a pivot stands for; measure your gripper's [m]"),
         "material": Found(material, f"what multipliers act on; density {told}"),
         "steps_per_frame": Found(_STEPS, "doubled while finer steps move the cloth by more than half of the noise"),
     }
@@ -341,7 +346,7 @@ def _layouts(
                 raise ConfigError(f"{where}: {error}") from error
             continue
         try:
-            layout = find_layout(episode, size)
+            layout = find_layout(episode, size, 0.0 if cloth["grip"] == "pivot" else cloth["grip_m"])
         except EpisodeError as error:
             raise EpisodeError(f"{sources[name]}: {error}") from error
         for message in layout.warnings:

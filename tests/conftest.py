@@ -55,8 +55,11 @@ def rng() -> np.random.Generator:
 
 
 def small_lift(**changes: object) -> Scenario:
-    """A lift with 5 x 5 nodes and few steps of the quicker integrator, for tests that only need some motion."""
+    """A lift with 5 x 5 nodes, one of them held, and few steps of the quicker integrator, for tests that only need some
+    motion."""
     defaults: dict[str, object] = {
+        "grip": "pivot",
+        "grip_m": 0.0131,  # 0.2 edge lengths: the node as it is
         "nodes": (5, 5),
         "frames": 5,
         "steps_per_frame": 2,

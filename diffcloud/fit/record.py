@@ -65,6 +65,8 @@ class RecordingFit(_Model):
     """From cloth to recording."""
     rms_to_cloth_mm: NonNegative | None
     """From recording to cloth; the paper's measure does not look that way."""
+    grasp: Text = ""
+    """What holds the cloth; empty where it is nodes."""
     frames: list[Count]
     """That were compared."""
     frame_rms_mm: list[NonNegative]
@@ -309,6 +311,11 @@ class FitRecord(_Model):
     def finer_by(self) -> str:
         """How its mesh differs from the scenario's, for people; empty if it does not."""
         return f"edges 1/{2**self.halvings} as long" if self.halvings else ""
+
+    @property
+    def grasps(self) -> str:
+        """What holds the cloth in its recordings, for people; empty where nodes are held as they are."""
+        return "; ".join(dict.fromkeys(one.grasp for one in self.episodes if one.grasp))
 
     @property
     def values(self) -> dict[str, float]:

@@ -89,7 +89,8 @@ def whole_material(scenario: Scenario, values: Mapping[str, float]) -> WholeMate
     material = scenario.scene.material
     system, _ = scenario.scene.build()
     changed = scenario.properties(system, one_set(values))
-    stretching, bending = float(changed.stretching.mean()), float(changed.bending.mean())
+    stretching = float((changed.stretching / system.properties.stretching).mean())  # without a pivot's faces
+    bending = float(changed.bending.mean())
     area, weight = float(scenario.scene.mesh.face_area.sum()), float(changed.weight.sum())
     return WholeMaterial(
         density=weight / area,
@@ -201,7 +202,7 @@ def describe_recording(objective: Objective, run: Rollout, name: str) -> Recordi
     Args:
         name: of the recording.
     """
-    unit, space = objective.scenario.length_unit_m, objective.pose_space
+    unit, space, handles = objective.scenario.length_unit_m, objective.pose_space, objective.scenario.scene.handles
     motion = objective.match(run)
     losses, squares, ways = objective.losses(motion)[0], objective.squares(motion)[0], objective.way_squares(motion)
     cut = objective.cut
@@ -213,6 +214,7 @@ def describe_recording(objective: Objective, run: Rollout, name: str) -> Recordi
         rms_mm=to_mm * float(squares.mean()) ** 0.5,
         rms_to_recording_mm=to_mm * ways[0] ** 0.5,
         rms_to_cloth_mm=None if objective.paper else to_mm * ways[1] ** 0.5,
+        grasp="" if handles.grasp is None else handles.grasp.described(len(set(handles.nodes))),
         frames=list(objective.frames),
         frame_rms_mm=(to_mm * squares.sqrt()).tolist(),
         counted=(motion.pairs[0].weights[0] > 0).double().mean(-1).tolist(),

@@ -9,10 +9,15 @@ import numpy as np
 from diffcloud.mesh.topology import ClothMesh, IntArray
 
 _SIDES = [[0, 1], [1, 2], [2, 0]]
+_RIGHT = 1e-6
+"""Cosine below which an angle counts as right or wide."""
 
 
 def refined(mesh: ClothMesh) -> tuple[ClothMesh, IntArray]:
     """Each face cut into four at the middles of its edges.
+
+    The middles of the edges and the corner at the widest angle span a parallelogram; its shorter diagonal is cut, and of
+    equal ones that through the corner. So a grid with alternating diagonals becomes one of half the edge length.
 
     Returns:
         The mesh, whose first nodes are those of the given one, and [E, 2] the ends of the edges whose middles follow.
@@ -23,6 +28,16 @@ def refined(mesh: ClothMesh) -> tuple[ClothMesh, IntArray]:
     a, b, c = mesh.face_verts.T
     ab, bc, ca = len(mesh.verts) + of_side.reshape(-1, 3).T
     faces = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]], axis=1)  # [3, 4, F]
+    corner = mesh.verts[mesh.face_verts]
+    ways = np.roll(corner, -1, axis=1) - corner  # [F, 3, 2] from each corner to the next
+    cosine = -(ways * np.roll(ways, 1, axis=1)).sum(-1)  # times two lengths
+    length = np.linalg.norm(ways, axis=-1)
+    cosine /= length * np.roll(length, 1, axis=1)
+    wide = cosine < _RIGHT
+    for k, (start, before, after, opposite) in enumerate(((a, ca, ab, bc), (b, ab, bc, ca), (c, bc, ca, ab))):
+        cut = wide[:, k]
+        faces[:, k, cut] = np.stack([start, after, opposite])[:, cut]
+        faces[:, 3, cut] = np.stack([start, opposite, before])[:, cut]
     finer = replace(
         mesh,
         nodes=np.concatenate([mesh.nodes, mesh.nodes[edges].mean(axis=1)]),

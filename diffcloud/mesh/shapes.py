@@ -15,15 +15,16 @@ _ARC_SAMPLES = 2001
 """Of the quarter ellipse whose arc length is integrated: enough for 1e-6 of its length."""
 
 
-def grid_cloth(rows: int, columns: int, height: float, width: float, *, alternate_diagonals: bool = False) -> ClothMesh:
+def grid_cloth(rows: int, columns: int, height: float, width: float, *, through: int = 0) -> ClothMesh:
     """A flat rectangular cloth in the plane z = 0, centred on the origin, rest shape equal to its world shape.
 
-    Node (i, j) has index i·columns + j; i runs along +y (and material v), j along +x (and material u).
+    Node (i, j) has index i·columns + j; i runs along +y (and material v), j along +x (and material u). Diagonals
+    alternate, which makes bending less dependent on direction than if all ran one way.
 
     Args:
         rows, columns: node counts, at least 2 each.
         height, width: extent along y and x [m], positive.
-        alternate_diagonals: turn every second diagonal, which makes bending less dependent on direction.
+        through: index of a node where diagonals meet, as they do at every second node.
 
     Raises:
         MeshError: fewer than 2 nodes a side, or a size that is not positive.
@@ -32,10 +33,21 @@ def grid_cloth(rows: int, columns: int, height: float, width: float, *, alternat
         raise MeshError(f"A grid cloth needs at least 2 x 2 nodes, got {rows} x {columns}.")
     if not (height > 0 and width > 0):
         raise MeshError(f"A grid cloth needs a positive size in metres, got {height} x {width}.")
-    v, u = np.meshgrid(np.linspace(0, height, rows), np.linspace(0, width, columns), indexing="ij")
+    return lined_cloth(np.linspace(0, width, columns), np.linspace(0, height, rows), through=through)
+
+
+def lined_cloth(across: FloatArray, along: FloatArray, *, through: int = 0) -> ClothMesh:
+    """`grid_cloth` with grid lines at given places.
+
+    Args:
+        across: [columns] places of the lines along x, ascending from 0 to the width [m].
+        along: [rows] those along y.
+        through: index of a node where diagonals meet.
+    """
+    v, u = np.meshgrid(along, across, indexing="ij")
     verts = np.stack([u.ravel(), v.ravel()], axis=1)
-    nodes = np.column_stack([verts - [width / 2, height / 2], np.zeros(len(verts))])
-    faces = _grid_faces(rows, columns, alternate_diagonals)
+    nodes = np.column_stack([verts - verts[-1] / 2, np.zeros(len(verts))])
+    faces = _grid_faces(len(along), len(across), through)
     return ClothMesh(nodes=nodes, verts=verts, vert_node=np.arange(len(verts)), face_verts=faces)
 
 
@@ -73,7 +85,7 @@ def loop_cloth(rows: int, columns: int, width: float, circumference: float, end_
         nodes=nodes,
         verts=np.stack([u.ravel(), v.ravel()], axis=1),
         vert_node=(np.arange(rows)[:, None] * columns + np.arange(columns + 1) % columns).ravel(),
-        face_verts=_grid_faces(rows, columns + 1, alternate_diagonals=True),
+        face_verts=_grid_faces(rows, columns + 1, through=1),
     )
 
 
@@ -267,11 +279,12 @@ def sphere_surface(center: Sequence[float], radius: float, subdivisions: int = 2
     return SurfaceMesh(np.asarray(center, dtype=np.float64) + radius * nodes, faces)
 
 
-def _grid_faces(rows: int, columns: int, alternate_diagonals: bool) -> IntArray:
-    """[2 (rows - 1)(columns - 1), 3] faces of a grid whose point (i, j) has index i·columns + j."""
+def _grid_faces(rows: int, columns: int, through: int) -> IntArray:
+    """[2 (rows - 1)(columns - 1), 3] faces of a grid whose point (i, j) has index i·columns + j; diagonals meet at
+    the point `through` and at those an even number of cells away."""
     i, j = (index.ravel() for index in np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij"))
     a = i * columns + j
-    turned = ((i + j) % 2 == 1) & alternate_diagonals
+    turned = (i + j) % 2 == sum(divmod(through, columns)) % 2
     return _quad_faces(np.stack([a, a + 1, a + columns, a + columns + 1], axis=1), turned)
 
 

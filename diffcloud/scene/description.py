@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from diffcloud.mesh.refinement import refined
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.sim.build import build_system
-from diffcloud.sim.handles import Handles
+from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import Material
 from diffcloud.sim.properties import Basis
 from diffcloud.sim.simulate import init
@@ -86,17 +86,17 @@ class Scene:
 
     def finer(self) -> Scene:
         """The same scene, each face of the cloth cut into four; its first nodes are those of this one. What lies between
-        two nodes that are held alike is held like them."""
+        two nodes that are held alike is held like them: a pad keeps its size, and a pivot, which `build` scales, too."""
         mesh, edges = refined(self.mesh)
-        held = set(self.handles.handles)
-        more = [
-            replace(handle, node=place)
-            for place, (a, b) in enumerate(edges.tolist(), len(self.mesh.nodes))
-            for handle in self.handles.handles
-            if handle.node == a and replace(handle, node=b) in held
-        ]
-        handles = Handles((*self.handles.handles, *more), self.handles.stiffness, self.handles.hard)
-        return replace(self, mesh=mesh, handles=handles)
+        turned = {replace(handle, turned=Handle.turned): handle.turned for handle in self.handles.handles}
+        more: list[Handle] = []
+        for place, (a, b) in enumerate(edges.tolist(), len(self.mesh.nodes)):
+            for handle in self.handles.handles:
+                other = turned.get(replace(handle, node=b, turned=Handle.turned)) if handle.node == a else None
+                if other is not None:
+                    x, y, z = ((one + two) / 2 for one, two in zip(handle.turned, other, strict=True))
+                    more.append(replace(handle, node=place, turned=(x, y, z)))
+        return replace(self, mesh=mesh, handles=replace(self.handles, handles=(*self.handles.handles, *more)))
 
     def build(self) -> tuple[System, State]:
         """(System, State at time zero with batch 1)."""

@@ -16,6 +16,7 @@ from diffcloud.io.schema import explain
 from diffcloud.mesh.topology import ClothMesh, FloatArray, SurfaceMesh
 from diffcloud.scene.description import Scene
 from diffcloud.scene.schema import KeyframeBlock, ObstacleBlock, SceneFile, TransformBlock
+from diffcloud.sim.grasp import GRIP_M, Grasp, nodes_under_pad
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import read_material
 from diffcloud.sim.motion import Keyframe, Motion, axis_angle_quaternion
@@ -72,7 +73,9 @@ def load_scene(path: Path, *, reload_materials: bool = False) -> Scene:
         mesh=mesh,
         material=raw if reload_materials else scaled,
         mass_material=scaled if reload_materials else None,
-        handles=Handles(_handles(path, scene, mesh, motions), magic.handle_stiffness, scene.diffcloud.hard_handles),
+        handles=Handles(
+            _handles(path, scene, mesh, motions), magic.handle_stiffness, scene.diffcloud.hard_handles, _grasp(scene)
+        ),
         frame_time=scene.frame_time,
         frame_steps=scene.frame_steps,
         end_time=min(scene.end_time, (scene.end_frame or np.inf) * scene.frame_time),
@@ -176,10 +179,15 @@ def _contact(scene: SceneFile) -> ReferenceContact | None:
     return ReferenceContact.as_published() if scene.diffcloud.contact == "published" else ReferenceContact()
 
 
+def _grasp(scene: SceneFile) -> Grasp | None:
+    own = scene.diffcloud
+    return None if own.grip is None else Grasp(own.grip, GRIP_M if own.grip_m is None else own.grip_m)
+
+
 def _handles(path: Path, scene: SceneFile, mesh: ClothMesh, motions: list[Motion]) -> tuple[Handle, ...]:
     several = len({block.motion for block in scene.handles} - {None}) > 1
     step = scene.frame_time / scene.frame_steps
-    handles = []
+    handles, grasp = [], _grasp(scene)
     for index, block in enumerate(scene.handles):
         taken = step * max(1.0, np.ceil(block.start_time / step))
         # later the published scenes have it
@@ -194,9 +202,18 @@ def _handles(path: Path, scene: SceneFile, mesh: ClothMesh, motions: list[Motion
                     f"{path}: handles.{index}.nodes: node {node} does not exist, the cloth has nodes "
                     f"0..{len(mesh.nodes) - 1}."
                 )
-            motion = None if block.motion is None else motions[block.motion]
-            gripper = f"motion_{block.motion}" if several else "gripper"  # each motion is a gripper's
-            handles.append(Handle(node, motion, block.start_time, block.end_time, block.fade_time, gripper))
+        nodes, pad = block.nodes, 0
+        if grasp is not None and grasp.kind == "pad":
+            pad = index + 1
+            if len(block.nodes) == 1:
+                try:
+                    nodes = nodes_under_pad(mesh, block.nodes[0], grasp.size)
+                except SceneError as error:
+                    raise SceneError(f"{path}: handles.{index}: {error}") from error
+        motion = None if block.motion is None else motions[block.motion]
+        gripper = f"motion_{block.motion}" if several else "gripper"  # each motion is a gripper's
+        one = Handle(0, motion, block.start_time, block.end_time, block.fade_time, gripper, pad)
+        handles += [replace(one, node=node) for node in nodes]
     return tuple(handles)
 
 

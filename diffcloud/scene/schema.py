@@ -6,9 +6,9 @@ Defaults are ARCSim's. The blocks `diffcloud` are this project's own additions, 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from diffcloud.io.schema import Checked, Component, FileName, NonNegative, Positive, Vector
 from diffcloud.sim.surrounding import Integrator
@@ -126,6 +126,16 @@ class ExtensionBlock(Checked):
     """Of air that moves with the cloth, per area of it [kg/m²]."""
     linear_drag: NonNegative = 0.0
     """Beside `wind.drag`, in all directions [kg/(m²·s)]."""
+    grip: Literal["pad", "pivot"] | None = None
+    """What a handle holds: a pad around a node, or of the nodes where it names several; or a pivot. Default: nodes."""
+    grip_m: Positive | None = None
+    """Side of the pad, or of the square that a pivot stands for. Default: 0.02."""
+
+    @model_validator(mode="after")
+    def _has_a_grip_of_that_size(self) -> Self:
+        if self.grip is None and self.grip_m is not None:
+            raise ValueError("`grip_m` is the size of a `grip`, and there is none: add `grip`, or leave `grip_m` out")
+        return self
 
 
 class SceneFile(Checked):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from diffcloud.io.files import write_json
 from diffcloud.io.obj import write_cloth, write_surface
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.description import Scene
+from diffcloud.sim.handles import Handle
 from diffcloud.sim.materials import Material
 from diffcloud.sim.motion import Motion
 from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
@@ -44,6 +46,7 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
         "lagged_air": scene.integrator == "linearised"
         and around.lagged_air != (around.reference_contact == ReferenceContact.as_published()),
         "a gripper with several motions": _shared_grippers(scene),
+        "an upright pad": any(any(handle.turned) for handle in scene.handles.handles),
     }
     if any(unsaid.values()):
         named = ", ".join(name for name, lost in unsaid.items() if lost)
@@ -59,13 +62,18 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
         obstacles.append({"mesh": mesh, **obstacle})
 
     handles: list[dict[str, Any]] = []
+    pads: dict[Handle, dict[str, Any]] = {}
     for handle in scene.handles.handles:
+        if handle.pad and (pad := pads.get(replace(handle, node=0))):
+            pad["nodes"].append(handle.node)
+            continue
         block: dict[str, Any] = {"nodes": [handle.node], "start_time": handle.start, "fade_time": handle.fade}
         if math.isfinite(handle.end):
             block["end_time"] = handle.end
         if handle.motion is not None:
             block["motion"] = _number((handle.gripper, handle.motion), motions)
         handles.append(block)
+        pads[replace(handle, node=0)] = block
 
     data: dict[str, Any] = {
         "frame_time": scene.frame_time,
@@ -95,6 +103,9 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
             "linear_drag": around.linear_drag,
         },
     }
+    grasp = scene.handles.grasp
+    if grasp is not None and grasp.kind != "upright_pad":  # the motions of its nodes are all of that one
+        data["diffcloud"] |= {"grip": grasp.kind, "grip_m": grasp.size}
     if math.isfinite(scene.end_time):
         data["end_time"] = scene.end_time
     path = folder / "conf" / f"{name}.json"

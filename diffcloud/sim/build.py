@@ -7,6 +7,7 @@ import torch
 
 from diffcloud.errors import SceneError
 from diffcloud.mesh.topology import ClothMesh
+from diffcloud.sim.grasp import stretching_factors
 from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import Material
 from diffcloud.sim.properties import Properties, one_set
@@ -56,7 +57,7 @@ def build_system(
     properties = Properties(
         node_mass=torch.as_tensor((density + surrounding.added_mass) * mesh.node_area, dtype=torch.float64)[None],
         weight=torch.as_tensor(density * mesh.node_area, dtype=torch.float64)[None],
-        stretching=torch.ones(1, len(mesh.faces), dtype=torch.float64),
+        stretching=torch.as_tensor(stretching_factors(mesh, handles.nodes, handles.grasp))[None],
         bending=torch.ones(1, len(mesh.hinges.length), dtype=torch.float64),
         body_mass=torch.as_tensor(np.asarray(bodies.mass, dtype=np.float64))[None],
         **one_set(

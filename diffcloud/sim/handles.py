@@ -9,15 +9,18 @@ The published scenes put a static and a moving soft handle on the same node, whi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import SceneError
+from diffcloud.sim.grasp import Grasp
 from diffcloud.sim.motion import Motion
 
 _FADE_EPSILON = 1e-6
+_TURN_S = 0.2
+"""In which a pad turns up what it holds, from `start` on: twice the time of a usual frame."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,15 @@ class Handle:
     """Seconds over which a soft handle lets go after `end`."""
     gripper: str = "gripper"
     """Which one moves the node, if one does."""
+    pad: int = 0
+    """Number of the pad that holds the node: what lies between nodes of one pad is held like them."""
+    turned: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """By how much an upright pad displaces the node, beside its motion [m]."""
+
+    def turning(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[S, 3] of `turned` at times [S], with a smooth start and end."""
+        done = np.clip((times - self.start) / _TURN_S, 0, 1)
+        return (done**3 * (10 - 15 * done + 6 * done**2))[:, None] * np.array(self.turned)
 
 
 @dataclass(frozen=True)
@@ -63,6 +75,8 @@ class Handles:
     stiffness: float = 1e3
     """k_h of soft handles [N/m]."""
     hard: bool = False
+    grasp: Grasp | None = None
+    """What the held nodes stand for; None: nodes, as they are."""
 
     def __post_init__(self) -> None:
         nodes = [handle.node for handle in self.handles]
@@ -94,6 +108,7 @@ class Handles:
             strength[:, index] = np.where(over, 0.0, np.where(times <= handle.end, 1.0, fading))
             if handle.motion is not None:
                 linear[:, index], translation[:, index] = handle.motion.at(times)
+            translation[:, index] += handle.turning(times)
         active = strength > 0
         first = np.where(active.any(axis=0), active.argmax(axis=0), len(times))
         return HandleSchedule(strength, linear, translation, first, np.full(len(self.handles), -1))
@@ -105,7 +120,8 @@ class Handles:
             SceneError: a gripper turns what it holds, moves its nodes in different ways, begins later, or moves a node that
                 another handle keeps in place: as a track, that would be another motion.
         """
-        schedule = self.schedule(times)
+        level = replace(self, handles=tuple(replace(handle, turned=Handle.turned) for handle in self.handles))
+        schedule = level.schedule(times)
         first = np.minimum(schedule.first_step, len(times) - 1)
         moved = schedule.translation - schedule.translation[first, np.arange(len(self.handles))]
         found = np.zeros((len(times), len(self.grippers), 3))
@@ -132,7 +148,8 @@ class Handles:
                 "A gripper track was given, but no handle of this scene moves; give the grasped node a motion."
             )
         schedule = self.schedule(times)
-        schedule.translation[:, self.moving] = 0.0
+        for index in np.flatnonzero(self.moving):
+            schedule.translation[:, index] = self.handles[index].turning(times)
         schedule.linear[:, self.moving] = np.eye(3)
         # static twins of moving handles go: together they would hold the node half-way
         held = {handle.node for handle in self.handles if handle.motion is not None}

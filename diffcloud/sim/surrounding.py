@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -28,6 +29,23 @@ class ContactSettings:
     """Of the linearised integrator [m]."""
     sticking_speed: float = 1e-3
     """v_s of smooth contact: what sticks creeps slower than this [m/s]."""
+
+    def resting_height(self, weight: float, integrator: Integrator) -> float:
+        """Distance from a level obstacle at which contact carries a cloth [m].
+
+        Args:
+            weight: of the cloth per area, above 0 [N/m²].
+        """
+        thickness = self.repulsion_thickness
+        load = 2 * weight / (self.stiffness * thickness)  # of the linearised step: (1 - d/τ)²; 0 above what it can carry
+        if integrator == "linearised":
+            return thickness * max(1 - math.sqrt(load), 0.0) if self.stiffness else 0.0
+        # of the barrier, at d = y τ: ((1 - y)²/y - 2 (1 - y) ln y)/3, which falls from infinity to 0
+        low, high = 0.0, 1.0
+        for _ in range(60):
+            y = (low + high) / 2
+            low, high = (y, high) if ((1 - y) ** 2 / y - 2 * (1 - y) * math.log(y)) / 3 > load else (low, y)
+        return thickness * high
 
 
 @dataclass(frozen=True)

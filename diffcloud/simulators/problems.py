@@ -20,13 +20,13 @@ _SIZE = (0.40, 0.30)
 _CELLS = (8, 6)
 
 
-def lift(*, refinement: int = 1, alternate_diagonals: bool = False) -> Problem:
+def lift(*, refinement: int = 1) -> Problem:
     """A towel is lifted off a table by a corner, and swings when it hangs: the tutorial's motion.
 
     Args:
         refinement: parts into which each cell of the mesh is divided along both sides.
     """
-    mesh = _towel(_TABLE + _GAP, refinement, alternate_diagonals)
+    mesh = _towel(_TABLE + _GAP, refinement)
     path = _path((0.0, 0.0, 0.0, 0.0), (2.5, -0.1, -0.1, 0.45))
     return Problem("lift", mesh, TOWEL, 2.5, {len(mesh.nodes) - 1: path}, table=_TABLE)
 
@@ -119,7 +119,7 @@ def cantilever(sheet: Sheet = _BEAM, cells: int = 24) -> Known:
     length = math.sqrt(_SLENDER * sheet.bending / sheet.stretching)
     side = length / (cells + 0.5)
     columns = cells + 2
-    mesh = grid_cloth(3, columns, 2 * side, side * (columns - 1), alternate_diagonals=True)
+    mesh = grid_cloth(3, columns, 2 * side, side * (columns - 1), through=1)
     gravity = _GAMMA * sheet.bending / (sheet.density * length**3)
     sway = length**2 * math.sqrt(sheet.density / sheet.bending)  # by which bending vibrations are measured
     held: dict[int, Motion | None] = {row * columns + column: None for row in range(3) for column in (0, 1)}
@@ -153,9 +153,9 @@ def elastica(gamma: float) -> tuple[float, float]:
     return float(np.trapezoid(np.sin(slope), s)), float(np.trapezoid(np.cos(slope), s))
 
 
-def _towel(height: float, refinement: int = 1, alternate_diagonals: bool = False) -> ClothMesh:
+def _towel(height: float, refinement: int = 1) -> ClothMesh:
     columns, rows = (refinement * cells + 1 for cells in _CELLS)
-    flat = grid_cloth(rows, columns, _SIZE[1], _SIZE[0], alternate_diagonals=alternate_diagonals)
+    flat = grid_cloth(rows, columns, _SIZE[1], _SIZE[0])
     return replace(flat, nodes=flat.nodes + np.array([0.0, 0.0, height]))
 
 

@@ -190,10 +190,8 @@ def switches() -> Iterator[Pair]:
         ("friction: MuJoCo's impratio 1", same, ours.simulate, changed(impratio=1.0)),
         ("thickness: MuJoCo's nodes lie 0.6 mm lower", same, ours.simulate, changed(radius=0.0015)),
         ("thickness: MuJoCo's contacts five times softer", same, ours.simulate, changed(contact_time=0.01)),
-        ("mesh: alternate diagonals", lambda p: lift(alternate_diagonals=True), ours.simulate, with_steps(plain)),
         ("mesh: cells halved in both", lambda p: lift(refinement=2), ours.simulate, with_steps(finest)),
         ("for scale: 3 % more friction in this simulator alone", same, ours.simulate, rougher),
-        ("for scale: the same with alternate diagonals", lambda p: lift(alternate_diagonals=True), ours.simulate, rougher),
     ]
     for problem in (lift(), swing()):
         for what, change, one, two in rows + (table if problem.table is not None else []):

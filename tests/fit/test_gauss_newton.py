@@ -231,9 +231,9 @@ class TestSurface:
 
 class TestFits:
     def test_the_truth_is_found_in_few_runs(self):
-        found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=2, screen=15))
+        found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=2, screen=15, iterations=60))
         assert found.stop_reason == "converged"
-        assert found.simulations <= 60
+        assert found.simulations <= 70
         assert found.values["stretch"] / found.values["mass"] == pytest.approx(TRUTH["stretch"] / TRUTH["mass"], rel=0.05)
         noise = lifted()({name: torch.tensor([value]).double() for name, value in TRUTH.items()})
         assert found.loss <= 1.02 * float(noise)  # the fit's own points, to which it adapts
@@ -247,7 +247,8 @@ class TestFits:
             ).values["stretch"]
             for first in (0.1, 3.0)
         ]
-        np.testing.assert_allclose(ends, TRUTH["stretch"], rtol=0.02)
+        assert ends[0] == pytest.approx(ends[1], rel=0.01)
+        np.testing.assert_allclose(ends, TRUTH["stretch"], rtol=0.03)
 
     def test_a_start_that_is_given_is_followed(self):
         found = fit_gauss_newton(

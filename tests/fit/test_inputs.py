@@ -29,12 +29,15 @@ ASKED = FitSpace.build(["stretch"], fixed={"mass": 1.7})
 
 
 def scaled(scenario, part):
-    """The scenario with a cloth that is really larger, about its middle, and the gripper's way as it is."""
+    """The scenario with a cloth that is really larger, about its middle, its grasp too, and the gripper's way as it is."""
     mesh = scenario.scene.mesh
     middle = np.array([*mesh.nodes[:, :2].mean(0), 0.0])
     nodes = middle + (mesh.nodes - middle) * [1 + part, 1 + part, 1]
     larger = replace(mesh, nodes=nodes, verts=(1 + part) * mesh.verts)
-    return replace(scenario, scene=replace(scenario.scene, mesh=larger))
+    handles = scenario.scene.handles
+    if handles.grasp is not None:
+        handles = replace(handles, grasp=replace(handles.grasp, size=(1 + part) * handles.grasp.size))
+    return replace(scenario, scene=replace(scenario.scene, mesh=larger, handles=handles))
 
 
 def motion(scenario, **values):

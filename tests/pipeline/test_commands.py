@@ -33,6 +33,8 @@ from tests.scene.files import MESHES, over_moving_box, write_file, write_files
 SMALL = {
     "base": "lift",
     "nodes": [5, 5],
+    "grip": "pivot",
+    "grip_m": 0.0131,
     "frames": 5,
     "steps_per_frame": 2,
     "points": 200,

@@ -31,7 +31,7 @@ def work(tmp_path_factory):
     folder = tmp_path_factory.mktemp("finer")
     (folder / "coarse.yaml").write_text(yaml.safe_dump(SCENARIO))
     scenario = load_scenario(folder / "coarse.yaml")
-    write_episode(folder / "cloth.npz", clouds_of(scenario.finer(), points=3000, **TRUTH))
+    write_episode(folder / "cloth.npz", clouds_of(scenario.halved(1), points=3000, **TRUTH))
     return folder
 
 
@@ -95,7 +95,7 @@ def test_it_is_exported_with_that_mesh(record):
 
 def test_a_joint_fit_has_one_mesh_when_recordings_are_left_out_too(work):
     scenario = load_scenario(work / "coarse.yaml")
-    write_episode(work / "more.npz", clouds_of(scenario.finer(), points=3000, seed=6, **TRUTH))
+    write_episode(work / "more.npz", clouds_of(scenario.halved(1), points=3000, seed=6, **TRUTH))
     invoke("fit", "cloth.npz", "more.npz", *OPTIONS, "--joint", "--out", "joint")
     told = json.loads((work / "joint" / "joint.json").read_text())
     assert told["halvings"] == 1

@@ -65,7 +65,7 @@ def towel(tmp_path_factory):
         folder.mkdir()
         for index, cloud in enumerate(sampler.sample(nodes).numpy()):
             write_ply(folder / f"{index:03d}.ply", cloud + 0.001 * rng.standard_normal(cloud.shape))
-        track = np.column_stack([np.arange(9) * 0.1, nodes[:, scenario.grasped[0]].numpy()])
+        track = np.column_stack([np.arange(9) * 0.1, nodes[:, scenario.grasped].mean(1).numpy()])
         np.savetxt(folder / "gripper.csv", track, delimiter=",", header="t_s,x,y,z", comments="")
     return root
 
@@ -113,7 +113,8 @@ class TestNewUser:
         assert "  # turn at which that rectangle is smallest" in text
         layouts = yaml.safe_load(text)
         assert layouts["first"]["center_m"] == pytest.approx([0.5, 0.0], abs=0.003)
-        assert (layouts["second"]["yaw_deg"] + 35) % 180 == pytest.approx(0, abs=2)
+        apart = (layouts["second"]["yaw_deg"] + 35) % 180
+        assert min(apart, 180 - apart) < 2
         cloth = yaml.safe_load((folder / "found" / "cloth.yaml").read_text())
         assert cloth["size_m"] == [0.16, 0.12]
         assert cloth["material"]["density_kg_m2"] == 0.25
@@ -272,7 +273,8 @@ class TestRefusals:
         (work / "found").mkdir()
         (work / "found" / "cloth.yaml").write_text("[1, 2]")
         assert "must be a mapping" in invoke(*COMMAND, code=1).errors
-        whole = "base: lift\nsize_m: [0.16, 0.12]\nnodes: [5, 5]\nsteps_per_frame: 8\nmaterial: denim\n"
+        held = "grip: pad\ngrip_m: 0.02\n"
+        whole = f"base: lift\nsize_m: [0.16, 0.12]\nnodes: [5, 5]\n{held}steps_per_frame: 8\nmaterial: denim\n"
         (work / "found" / "cloth.yaml").write_text(whole.replace("nodes: [5, 5]\n", ""))
         assert "cloth.yaml lacks nodes. Put it back, or remove the whole" in invoke(*COMMAND, code=1).errors
         (work / "found" / "cloth.yaml").write_text(whole.replace("lift", "vest_hang"))

@@ -73,12 +73,14 @@ def test_the_cloth_follows_the_recorded_gripper():
     times = np.array([0.0, 0.2, 0.4])
     gripper = np.array([[[0.0, 0, 0]], [[0, 0, 0.05]], [[0, 0, 0.1]]])
     episode = Episode.from_frames([np.zeros((1, 3))] * 3, times, gripper=gripper)
-    layers = {layer.name: layer for layer in scene_layers(scenario, episode, times)}
-    cloth = np.asarray(layers["cloth, basis material"].frames)
-    held = scenario.scene.handles.nodes[0]
-    np.testing.assert_allclose(cloth[:, held, 2] - cloth[0, held, 2], [0, 0.05, 0.1], atol=1e-3)
-    np.testing.assert_array_equal(np.asarray(layers["held nodes"].frames)[0], cloth[:, held])  # the last layer: its path
-    assert np.ptp(layers["table"].frames[0][:, 2]) == 0
+    layers = scene_layers(scenario, episode, times)
+    named = {layer.name: layer for layer in layers}
+    cloth = np.asarray(named["cloth, basis material"].frames)
+    held = cloth[:, scenario.scene.handles.nodes]
+    np.testing.assert_allclose(held[..., 2] - held[0, :, 2], [[0.0] * 4, [0.05] * 4, [0.1] * 4], atol=1e-3)  # of a pad
+    paths = [layer.frames[0] for layer in layers if (layer.name, layer.kind) == ("held nodes", "line")]
+    np.testing.assert_array_equal(paths, np.moveaxis(held, 1, 0))
+    assert np.ptp(named["table"].frames[0][:, 2]) == 0
 
 
 def displaced_fold(loss_frames=(2,), compared=(1, 2, 3, 4)):

@@ -17,6 +17,7 @@ from diffcloud.io.schema import Checked
 from diffcloud.scene import Scene, load_scene
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.scene.schema import SceneFile
+from diffcloud.sim.grasp import Grasp
 from diffcloud.sim.moved import moved_surfaces
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.surrounding import ReferenceContact
@@ -76,6 +77,10 @@ def moving(name: str) -> Callable[[Scene], Any]:
 def weakly_repelled() -> Data:
     """So that impacts happen."""
     return changed(sheets_over_table(), "magic.collision_stiffness", 1.0)
+
+
+def pivoted() -> Data:
+    return changed(sheets_over_table(), "diffcloud.grip", "pivot")
 
 
 def falling_with_box() -> Data:
@@ -156,6 +161,8 @@ EFFECTS = [
     Effect("diffcloud.compression", 0.1, lambda scene: scene.material.compression, 0.1),
     Effect("diffcloud.added_mass", 0.1, around("added_mass"), 0.1),
     Effect("diffcloud.linear_drag", 0.5, around("linear_drag"), 0.5),
+    Effect("diffcloud.grip", "pivot", lambda scene: scene.handles.grasp, Grasp("pivot", 0.02)),
+    Effect("diffcloud.grip_m", 0.03, lambda scene: scene.handles.grasp, Grasp("pivot", 0.03), pivoted),
     Effect("diffcloud.damping", 0.01, lambda scene: scene.material.damping, 0.01),
 ]
 REFUSED = [

@@ -51,9 +51,9 @@ def test_linear_drag_ends_at_the_velocity_at_which_it_bears_the_weight():
 def test_a_cloth_that_hangs_still_is_as_without_air():
     """At rest only the weight counts."""
     held = tuple(Handle(node) for node in range(5))
-    runs = [rollout(cloth(handles=held, linear_drag=1.2, added_mass=added), 1200) for added in (0.0, 0.15)]
+    runs = [rollout(cloth(handles=held, linear_drag=1.2, added_mass=added), 2400) for added in (0.0, 0.15)]
     first, second = (run.positions[0, -1].numpy() for run in runs)
-    assert np.abs(runs[0].velocities[0, -1].numpy()).max() < 1e-3
+    assert max(run.velocities[0, -1].abs().max() for run in runs) < 1e-3
     np.testing.assert_allclose(first, second, atol=1e-4)
 
 

@@ -1,4 +1,4 @@
-"""A rectangular cloth over a table: the built-ins `lift` and `fold`, and a person's own cloth."""
+"""A rectangular cloth over a table: the built-ins `lift`, `fold` and `shake`, and a person's own cloth."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from pydantic import Field, model_validator
 
 from diffcloud.errors import SceneError, unknown_name
 from diffcloud.io.schema import Checked, NonNegative
-from diffcloud.mesh.shapes import grid_cloth, rectangle_surface
+from diffcloud.mesh.shapes import lined_cloth, rectangle_surface
 from diffcloud.mesh.topology import ClothMesh
-from diffcloud.scene.scenarios.options import Coordinate, Keyframes, Length, ScenarioOptions, assemble
+from diffcloud.scene.scenarios.options import Coordinate, Keyframes, Length, ScenarioOptions, assemble, chosen_material
 from diffcloud.scene.scenarios.scenario import Scenario
+from diffcloud.sim.grasp import GRIP_M, Grasp, Grip, inside, turned_up, window
+from diffcloud.sim.surrounding import ContactSettings
 
 Names = tuple[str | int, ...]
-"""Nodes: corners (left/right_bottom/top of the unrotated cloth) or indices."""
+"""Places: corners (left/right_bottom/top of the unrotated cloth), or indices of nodes of the uniform grid."""
 
 
 class Gripper(Checked):
@@ -43,14 +45,20 @@ class GridScenario(ScenarioOptions):
     yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 45.0
     """Rotation about the vertical; 45 lays a square cloth as a diamond."""
     table_height_m: Coordinate = 0.0
-    gap_m: NonNegative = 0.002
-    """Height of the cloth over the table at the start."""
+    gap_m: NonNegative = 0.0006
+    """Height of the cloth's middle surface over the table at the start: where it lies at rest, unless contact carries it
+    higher up, from where it falls. Default: half the thickness of a usual cloth."""
     grasped: Names = ()
-    """Nodes that the gripper moves."""
+    """Places where the gripper holds the cloth and moves it; those side by side are one grasp."""
     grippers: dict[str, Gripper] = Field(default_factory=dict)
     """Instead of `grasped`, where several grippers move the cloth: name -> what it does."""
     held: Names = ()
-    """Nodes that stay where they are."""
+    """Places where the cloth is held and stays."""
+    grip: Grip = "pad"
+    """What holds the cloth at each place: a pad that keeps its direction, level or upright (`upright_pad`), or a point that
+    lets it turn (`pivot`)."""
+    grip_m: Length = GRIP_M
+    """Side of the pad, or of the square that a pivot stands for."""
     loss_surface: Literal["all", "grasped_half"] = "all"
     laid_turn_deg: Annotated[float, Field(ge=0, le=45)] = 10.0
     """How far askew the cloth may lie at the start, one standard deviation; 0: not at all. Fits find it. A hand seldom lays
@@ -73,6 +81,8 @@ class GridScenario(ScenarioOptions):
         return {name: one.path for name, one in self.grippers.items() if one.path is not None}
 
 
+_NARROWEST = 0.1
+"""Times the size of a grasp: the least distance of two grid lines."""
 _SIDE = 0.2625
 """Side of the cloth of the paper's experiments [m] (0.75 release units)."""
 LIFT = GridScenario(
@@ -112,24 +122,42 @@ def grid_scenario(options: GridScenario) -> Scenario:
     """The scenario of a rectangular cloth over a table.
 
     Raises:
-        SceneError: a corner or node that does not exist.
+        SceneError: a corner or node that does not exist, a pad as large as the cloth, or too few nodes for the pads.
     """
-    columns, rows = options.nodes
-    flat = grid_cloth(rows, columns, options.size_m[1], options.size_m[0])
+    named = {name: one.grasped for name, one in options.grippers.items()} or {"gripper": options.grasped}
+    places = [_places(options, names) for names in (*named.values(), options.held)]
+    lines, pads = _pads(options, places)
+    columns = len(lines[0])
+    verts = np.stack(np.meshgrid(*lines), axis=-1).reshape(-1, 2)
+    uniform = [np.linspace(0, side, count) for side, count in zip(options.size_m, options.nodes, strict=True)]
+    first = np.array([uniform[0][places[0][0] % columns], uniform[1][places[0][0] // columns]])
+    flat = lined_cloth(*lines, through=int(np.linalg.norm(verts - first, axis=1).argmin()))
     yaw = np.deg2rad(options.yaw_deg)
     turn = np.array([[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])  # for row vectors
     start = np.array([*options.center_m, options.table_height_m + options.gap_m])
     mesh = replace(flat, nodes=flat.nodes @ turn + start)
-    named = {name: one.grasped for name, one in options.grippers.items()} or {"gripper": options.grasped}
-    grippers = {name: _named_nodes(options, nodes) for name, nodes in named.items()}
-    grasped = [*chain.from_iterable(grippers.values())]
+    held: list[list[list[int]]] = [[inside(verts, *pad).tolist() for pad in each] for each in pads or []]
+    nodes = places if pads is None else [[*chain.from_iterable(each)] for each in held]
+    numbers = {node: number for number, each in enumerate(chain.from_iterable(held), 1) for node in each}
+    turned: dict[int, tuple[float, float, float]] = {}
+    if options.grip == "upright_pad":
+        for each in chain.from_iterable(held):
+            try:
+                way = turned_up(verts[each], verts[0], verts[-1]) @ turn
+            except SceneError as error:
+                raise SceneError(f"Scenario {options.name}: {error}") from error
+            turned |= {node: (x, y, z) for node, (x, y, z) in zip(each, way.tolist(), strict=True)}
+    grasped = [*chain.from_iterable(nodes[:-1])]
     extent = 2.0 * max(options.size_m) + options.reach
     scenario = assemble(
         options,
         mesh,
-        (rectangle_surface(options.center_m, (extent, extent), options.table_height_m),),
-        grippers=grippers,
-        held=_named_nodes(options, options.held),
+        (rectangle_surface(options.center_m, (extent, extent), options.table_height_m - _sunk(options)),),
+        grippers=dict(zip(named, nodes[:-1], strict=True)),
+        held=nodes[-1],
+        grasp=Grasp(options.grip, options.grip_m),
+        pads=numbers,
+        turned=turned,
         loss_faces=_half(mesh, grasped) if options.loss_surface == "grasped_half" else None,
     )
     laid = {
@@ -141,7 +169,17 @@ def grid_scenario(options: GridScenario) -> Scenario:
     return replace(scenario, laid={name: deviation for name, deviation in laid.items() if deviation})
 
 
-def _named_nodes(options: GridScenario, names: Sequence[str | int]) -> list[int]:
+def _sunk(options: GridScenario) -> float:
+    """How far contact's table lies below the real one, so that the cloth rests where it starts [m]: contact carries a
+    cloth some 2 mm above its table, and a real cloth's middle surface lies at half its thickness."""
+    contact = ContactSettings(options.contact_stiffness, options.contact_thickness_m)
+    weight = -options.gravity[2] * chosen_material(options).density
+    if weight <= 0:
+        return 0.0
+    return max(contact.resting_height(weight, options.integrator) - options.gap_m, 0.0)
+
+
+def _places(options: GridScenario, names: Sequence[str | int]) -> list[int]:
     columns, rows = options.nodes
     corners = {
         "left_bottom": 0,
@@ -158,6 +196,65 @@ def _named_nodes(options: GridScenario, names: Sequence[str | int]) -> list[int]
             raise SceneError(f"Scenario {options.name}: node {node} does not exist, the cloth has 0..{rows * columns - 1}.")
         nodes.append(node)
     return nodes
+
+
+_Pad = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Lower and upper corner of a rectangle in material space [2] [m]."""
+
+
+def _pads(
+    options: GridScenario, places: Sequence[Sequence[int]]
+) -> tuple[list[NDArray[np.float64]], list[list[_Pad]] | None]:
+    """Grid lines across and along, and the pads of each gripper; a pivot has none, and uniform lines."""
+    uniform = [np.linspace(0, side, count) for side, count in zip(options.size_m, options.nodes, strict=True)]
+    if options.grip == "pivot":
+        return uniform, None
+    if options.grip_m >= min(options.size_m):
+        raise SceneError(
+            f"Scenario {options.name}: a pad of {options.grip_m:g} m does not fit on a cloth of {options.size_m[0]:g} x "
+            f"{options.size_m[1]:g} m. It must be smaller than both sides; give a smaller grip_m."
+        )
+    size = np.array(options.size_m)
+    pads: list[list[_Pad]] = []
+    for each in places:
+        cells = np.array([[node % options.nodes[0], node // options.nodes[0]] for node in each]).reshape(-1, 2)
+        pads.append([])
+        while len(cells):
+            near = np.zeros(len(cells), dtype=bool)
+            near[0] = True
+            while (more := (np.abs(cells[:, None] - cells[near]).max(-1) <= 1).any(1)).sum() > near.sum():
+                near = more
+            squares = [
+                window(np.array([uniform[0][i], uniform[1][j]]), np.zeros(2), size, options.grip_m) for i, j in cells[near]
+            ]
+            pads[-1].append((np.min([one for one, _ in squares], axis=0), np.max([two for _, two in squares], axis=0)))
+            cells = cells[~near]
+    ends = [[end[axis] for each in pads for pad in each for end in pad] for axis in (0, 1)]
+    return [_lines(options, axis, np.array(ends[axis])) for axis in (0, 1)], pads
+
+
+def _lines(options: GridScenario, axis: int, ends: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places of the grid lines along an axis: at both sides of the cloth and the ends of pads, and between these as
+    uniform as can be."""
+    length, count, name = options.size_m[axis], options.nodes[axis], "xy"[axis]
+    breaks = np.unique(np.round([0.0, length, *ends], 9))
+    gaps = np.diff(breaks)
+    if count < len(breaks):
+        raise SceneError(
+            f"Scenario {options.name}: {count} nodes along {name} are too few for pads that end at "
+            f"{', '.join(f'{end:.4g}' for end in breaks[1:-1])} m. Give at least {len(breaks)}, or `grip: pivot`."
+        )
+    if gaps.min() < _NARROWEST * options.grip_m:
+        raise SceneError(
+            f"Scenario {options.name}: along {name}, two ends of pads lie {1e3 * gaps.min():.2g} mm apart, too near "
+            f"for grid lines. Ends must coincide or lie {1e3 * _NARROWEST * options.grip_m:.2g} mm apart; change grip_m or "
+            "the places a little."
+        )
+    cells = np.ones(len(gaps), dtype=int)
+    for _ in range(count - len(breaks)):
+        cells[(gaps / cells).argmax()] += 1
+    parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(breaks[:-1], breaks[1:], cells, strict=True)]
+    return np.array([*np.concatenate(parts), length])
 
 
 def _half(mesh: ClothMesh, grasped: list[int]) -> NDArray[np.int64]:

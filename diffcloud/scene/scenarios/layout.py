@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from diffcloud.errors import EpisodeError
 from diffcloud.io.episodes import Episode
+from diffcloud.scene.scenarios.grid import GridScenario
+from diffcloud.sim.grasp import GRIP_M
 
-_GAP_M = 0.002
-"""Of the cloth over the table at the start, as scenarios have it."""
 _LARGEST_M = 5.0
 """Of a cloth: a larger cloud is in another unit."""
 _SMALLEST_M = 0.02
@@ -43,6 +43,8 @@ _AT_CORNER_M = 0.03
 _TRAVEL_M = 0.03
 _CELL_M = 0.034
 _NODES = (5, 13)
+_GAP_M: float = GridScenario.model_fields["gap_m"].default
+"""Of the cloth over the table at the start."""
 _FEW_POINTS = 100
 FIELDS = ("center_m", "yaw_deg", "laid_turn_deg", "table_height_m", "grasped", "rate_hz", "frames", "path")
 """Of a scenario, those that `find_layout` finds."""
@@ -76,11 +78,12 @@ def node_counts(size: tuple[float, float]) -> tuple[int, int]:
     return columns, rows
 
 
-def find_layout(episode: Episode, size: tuple[float, float]) -> Layout:
+def find_layout(episode: Episode, size: tuple[float, float], pad: float = GRIP_M) -> Layout:
     """
     Args:
         episode: in metres, z up, with the track of one gripper.
         size: of the cloth [m].
+        pad: side of what the gripper holds the cloth with; 0: a point [m].
 
     Raises:
         EpisodeError: no gripper, another unit, a cloud that is not flat and level or that holds the table, a size that is
@@ -124,10 +127,11 @@ def find_layout(episode: Episode, size: tuple[float, float]) -> Layout:
     # a rectangle looks the same after half a turn: the one that has the grasped corner at its right top is taken
     if local[0] < 0 and local[1] < 0:
         yaw, local = yaw + math.pi, -local
-    distances = np.linalg.norm(nodes - local, axis=1)
+    inner = np.maximum(half - pad / 2, 0.0)  # a pad at a rim lies inside the cloth
+    distances = np.linalg.norm(np.clip(nodes, -inner, inner) - local, axis=1)
     node = int(distances.argmin())
     if distances[node] > 0.5 * _CELL_M + _AT_CORNER_M:
-        warnings.append(f"the gripper begins {1e3 * distances[node]:.0f} mm beside the nearest node of the cloth")
+        warnings.append(f"the gripper begins {1e3 * distances[node]:.0f} mm beside the nearest place of a grasp")
     corners = {
         0: "left_bottom",
         columns - 1: "right_bottom",
@@ -144,9 +148,10 @@ def find_layout(episode: Episode, size: tuple[float, float]) -> Layout:
         "center_m": Found([round(float(part), 4) for part in centre], "middle of the rectangle around the first frame"),
         "yaw_deg": Found(round(math.degrees(yaw) % 360, 2), "turn at which that rectangle is smallest"),
         "laid_turn_deg": Found(0.0, "the first frame shows the turn; above 0, a fit finds how far it is off"),
-        "table_height_m": Found(round(table, 4), f"{1e3 * _GAP_M:.0f} mm below the middle height of the first frame"),
+        "table_height_m": Found(round(table, 5), f"{1e3 * _GAP_M:.1g} mm below the middle height of the first frame"),
         "grasped": Found(
-            [corners.get(node, node)], f"node nearest the gripper's first position, {1e3 * distances[node]:.0f} mm away"
+            [corners.get(node, node)],
+            f"where a grasp is nearest the gripper's first position, {1e3 * distances[node]:.0f} mm away",
         ),
         "rate_hz": Found(round(1 / interval, 6), f"frames are {interval:.4f} s apart"),
         "frames": Found(frames, f"the recording ends at {episode.times[-1]:.3f} s"),

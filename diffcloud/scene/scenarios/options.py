@@ -18,6 +18,7 @@ from diffcloud.scene.description import Scene
 from diffcloud.scene.scenarios.scenario import Recorder, Scenario
 from diffcloud.scene.scenarios.sheet import Sheet
 from diffcloud.scene.schema import Friction
+from diffcloud.sim.grasp import Grasp
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import Material, preset, read_material
 from diffcloud.sim.motion import Keyframe, Motion
@@ -103,7 +104,8 @@ class ScenarioOptions(Checked):
         return {}
 
 
-def _material(options: ScenarioOptions) -> Material:
+def chosen_material(options: ScenarioOptions) -> Material:
+    """The material that `options.material` names, describes, or has in a file."""
     match options.material:
         case Sheet() as sheet:
             return sheet.material(options.name)
@@ -120,6 +122,9 @@ def assemble(
     *,
     grippers: Mapping[str, Sequence[int]],
     held: Sequence[int] = (),
+    grasp: Grasp | None = None,
+    pads: Mapping[int, int] | None = None,
+    turned: Mapping[int, tuple[float, float, float]] | None = None,
     loss_faces: NDArray[np.int64] | None = None,
 ) -> Scenario:
     """The scenario of a cloth and its obstacles in their places.
@@ -127,6 +132,9 @@ def assemble(
     Args:
         grippers: name -> nodes that follow its path.
         held: nodes that stay where they are.
+        grasp: what the nodes stand for; None: nodes.
+        pads: node -> number of the pad that holds it; None: none does.
+        turned: node -> by how much an upright pad displaces it [m].
         loss_faces: faces whose surface the loss samples; None for all.
 
     Raises:
@@ -145,12 +153,15 @@ def assemble(
         motion = Motion(tuple(Keyframe(time, (x, y, z)) for time, x, y, z in path))
         handles += [Handle(node, motion, gripper=name) for node in grasped]
     handles += [Handle(node) for node in held]
+    handles = [
+        replace(one, pad=(pads or {}).get(one.node, 0), turned=(turned or {}).get(one.node, one.turned)) for one in handles
+    ]
     thickness = options.contact_thickness_m
     moving = still_air(mesh, options.air_density) if options.air == "still" else StillAir(0.0, 0.0)
     scene = Scene(
         mesh=mesh,
-        material=replace(_material(options), compression=options.compression),
-        handles=Handles(tuple(handles), hard=not options.soft_handles),
+        material=replace(chosen_material(options), compression=options.compression),
+        handles=Handles(tuple(handles), hard=not options.soft_handles, grasp=grasp),
         frame_time=1 / options.rate_hz,
         frame_steps=options.steps_per_frame,
         surrounding=Surrounding(

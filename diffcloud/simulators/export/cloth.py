@@ -25,6 +25,8 @@ from diffcloud.simulators.problem import Problem, Sheet, Track, distances
 
 WORTH_SAYING = 0.01
 """Relative difference of a stiffness, or strain of the start, above which it is said."""
+_DIGITS = 12
+"""Of paths in metres."""
 _LEVEL = np.deg2rad(0.1)
 _STRAINED = (0.0, 0.25, 0.5, 1.0)
 """Where between rest and their reference strain the tables are looked up for a material that stiffens."""
@@ -132,7 +134,10 @@ def _whole(scene: Scene, problem: Problem) -> Scene:
     """The scene in the problem's frame, with the motion that was recorded."""
     alike = ours.scene(problem)
     around = replace(scene.surrounding, obstacles=alike.surrounding.obstacles, moving=(), bodies=())
-    return replace(scene, mesh=problem.mesh, handles=alike.handles, surrounding=around, end_time=problem.seconds)
+    own = {handle.node: handle for handle in scene.handles.handles}
+    held = tuple(replace(one, pad=own[one.node].pad, gripper=own[one.node].gripper) for one in alike.handles.handles)
+    handles = replace(alike.handles, handles=held, grasp=scene.handles.grasp)
+    return replace(scene, mesh=problem.mesh, handles=handles, surrounding=around, end_time=problem.seconds)
 
 
 def _simplified(scene: Scene) -> list[str]:
@@ -144,6 +149,9 @@ def _simplified(scene: Scene) -> list[str]:
         said.append(f"There is no air; the fit has air of {around.air_density:.3g} kg/m³{moving}.")
     if not scene.handles.hard:
         said.append(f"Held nodes follow exactly; in the fit, springs of {scene.handles.stiffness:g} N/m hold them.")
+    grasp = scene.handles.grasp
+    if grasp is not None and grasp.kind == "pivot":
+        said.append(f"Held nodes are points of the mesh; in the fit, each yields as a {grasp.described(1)} does.")
     return said
 
 
@@ -245,7 +253,7 @@ def _held(scene: Scene, motion: FittedMotion, paths: NDArray[np.float64]) -> tup
         if np.ptp(path, axis=0).max() < 1e-9:
             held.setdefault(handle.node, None)
         else:
-            path = path - path[0]
+            path = np.round(path - path[0], _DIGITS)  # nodes of one pad move alike, but for rounding
             keys = tuple(Keyframe(float(time), (x, y, z)) for time, (x, y, z) in zip(times, path.tolist(), strict=True))
             held[handle.node] = Motion(keys)
     loose -= held.keys()

@@ -35,7 +35,11 @@ def together(*cloths: ClothMesh) -> ClothMesh:
 def over_box(contact: ReferenceContact, *, proximity: bool = True, height: float = 0.012, **changes: object) -> Scenario:
     """A small cloth, lifted at a corner, that falls over the edges and corners of a box without lying on them exactly."""
     scenario = small_lift(
-        contact_stiffness=1e6, contact_thickness_m=0.005, gravity=(0.0, 0.0, -30.0), gap_m=height, **changes
+        contact_stiffness=1e6,
+        contact_thickness_m=0.005,
+        gravity=(0.0, 0.0, -30.0),
+        gap_m=height,
+        **{"grip": "pad", "grip_m": 0.01, **changes},
     )
     obstacle = box((-0.047, -0.061, -0.2), (0.053, 0.043, 0.0))
     surrounding = replace(scenario.scene.surrounding, obstacles=(obstacle,), reference_contact=contact, proximity=proximity)

@@ -346,7 +346,7 @@ def test_no_impact_leaves_the_candidate_alone():
 
 def test_what_a_pass_has_left_alone_is_not_solved_again():
     """Two falls side by side are two zones; the one that needs fewer passes keeps its forces in the others."""
-    near, far = two_strips(0.04), two_strips(0.08)
+    near, far = two_strips(0.03), two_strips(0.08)
     single = [fall.resolve() for fall in (near, far)]
     count = len(near.start)
     shift = np.array([5.0, 0.0, 0.0])

@@ -64,11 +64,11 @@ def assert_near(mesh, distance: float, shifts=((0.0, 0.0),)) -> None:
         assert len(sure) > len(true)
 
 
-@pytest.mark.parametrize("alternate", [False, True])
+@pytest.mark.parametrize("through", [0, 1])
 @pytest.mark.parametrize("shape", [(8, 8), (6, 11)])
 @pytest.mark.parametrize("times", [0.8, 1.2, 2.3])
-def test_near_pairs_are_those_that_are_near_in_the_plane(shape, alternate, times):
-    mesh = grid_cloth(*shape, 0.07, 0.09, alternate_diagonals=alternate)
+def test_near_pairs_are_those_that_are_near_in_the_plane(shape, through, times):
+    mesh = grid_cloth(*shape, 0.07, 0.09, through=through)
     assert_near(mesh, times * 0.07 / (shape[0] - 1))
 
 
