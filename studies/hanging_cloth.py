@@ -108,7 +108,7 @@ def read_recording(path: Path) -> Recording:
     offsets = np.array([0, 0, -_BAR]) + np.linspace(-_SIDE / 2, _SIDE / 2, _NODES)[:, None] * [1.0, 0, 0]
     held = tool[first, None] + np.einsum("kij,nj->kni", (turn * turn[0].inv()).as_matrix(), offsets)
     moving = _moving(times, held.mean(1))
-    seen = np.isfinite(clouds).all(-1)
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(clouds).all(-1))
     first_rows = [_means(clouds[:, row], seen[:, row]) for row in (slice(0, _ROWS), slice(_ROWS, 2 * _ROWS))]
     edge = 1.5 * first_rows[0] - 0.5 * first_rows[1]  # points are in the middles of the cells of a grid over the cloth
     usable = np.isfinite(edge).all(1)
@@ -116,7 +116,7 @@ def read_recording(path: Path) -> Recording:
         raise EpisodeError(f"{path} has {usable.sum()} clouds with points near the bar; two or more are needed.")
     taken = retimed(published[usable], edge[usable, 1:], times, held.mean(1)[:, 1:])
     clouds, seen = clouds[usable], seen[usable]
-    steps = _STEP * np.arange(1, int(times[-1] / _STEP) + 1)
+    steps: Floats = _STEP * np.arange(1.0, int(times[-1] / _STEP) + 1)
     used = (taken > moving[0]) & (taken < steps[-1])
     if not used.any():
         raise EpisodeError(f"{path} has no cloud while the bar or the cloth moves; it needs some.")
@@ -388,7 +388,7 @@ def _lower_edge(recording: Recording) -> Floats:
 
 def simulated_swing(values: Mapping[str, float]) -> tuple[float, float]:
     """The same of the model, after the bar has moved by 1 cm in 0.3 s."""
-    moments = _STEP * np.arange(1, 201)
+    moments: Floats = _STEP * np.arange(1.0, 201.0)
     track = np.zeros((len(moments), _NODES, 3))
     track[..., 1] = 0.01 * np.minimum(moments / 0.3, 1.0)[:, None]
     run, _ = simulate(track, values)
