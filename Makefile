@@ -7,7 +7,7 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 # the tests start hundreds of processes; without byte code each would compile the package again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv repro test tests test-slow test-longest lint format bench acceptance comparison simulated recordings moved coverage robustness pictures docs clean
+.PHONY: venv repro test tests test-slow test-longest lint format bench acceptance comparison simulated recordings moved coverage hanging robustness pictures docs clean
 
 venv: $(STAMP)
 
@@ -135,6 +135,11 @@ coverage: venv
 	diffcloud train --scenario lift --model posterior --profile quick --target logarithmic --data $(POSTERIOR)/lift \
 	    --like $(POSTERIOR)/coverage/lift/episodes/0000.npz --out $(POSTERIOR)/regressors
 	$(BESIDE) --checkpoint $(POSTERIOR)/regressors/posterior.safetensors --markdown docs/results/coverage-posterior.md
+
+# The air around a real cloth that hangs and swings. DATA: the folder of its recordings (studies/hanging_cloth.py).
+hanging: venv
+	@test -n "$(DATA)" || { echo "Usage: make hanging DATA=DIR"; exit 2; }
+	python -m studies.hanging_cloth "$(DATA)"
 
 # Every damaged file and every fault; a sample of both is part of test-slow.
 robustness: venv

@@ -54,6 +54,14 @@ output = _console(stderr=False)
 Item = TypeVar("Item")
 Command = TypeVar("Command", bound=Callable[..., Any])
 
+Topics = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--topic",
+        help="ROS: which topic to take where several could be: of depth, colour, camera_info, joint states or tf; "
+        "repeated. TOPIC#NUMBER takes one of several publishers of joint states on it.",
+    ),
+]
 JsonFlag = Annotated[bool, typer.Option("--json", help="End standard output with one JSON object.")]
 Threads = Annotated[
     int | None,

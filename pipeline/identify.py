@@ -39,7 +39,7 @@ from diffcloud.sim.properties import one_set
 from diffcloud.sim.threads import use_threads
 from pipeline import ctrl_c
 from pipeline.config import Config, FitConfig
-from pipeline.console import JsonFlag, Threads, duration_s, errors, finish, progress_bar, warn
+from pipeline.console import JsonFlag, Threads, Topics, duration_s, errors, finish, progress_bar, warn
 from pipeline.fit_jobs import FitJob, Recording, compared
 from pipeline.preprocess import PreprocessJob
 from pipeline.workers import check_interrupt
@@ -96,6 +96,7 @@ def identify(
         str | None,
         typer.Option(help="Time for reading, fits and report (90, 60s, 3min, 1h). Then the best so far is reported."),
     ] = None,
+    topic: Topics = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
@@ -112,7 +113,7 @@ def identify(
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out takes a folder, and {out} is a file.")
     with claimed(out):
-        episodes, cloth, layouts = find_scene(recordings, out, stated, mass)
+        episodes, cloth, layouts = find_scene(recordings, out, stated, mass, topic or ())
         chosen = _chosen(parameters, cloth, mass)
         so_far = _SoFar()
         if seconds is not None:
@@ -163,19 +164,28 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def find_scene(
-    recordings: Sequence[Path], out: Path, size: tuple[float, float] | None, mass: float | None
+    recordings: Sequence[Path],
+    out: Path,
+    size: tuple[float, float] | None,
+    mass: float | None,
+    topics: Sequence[str] = (),
 ) -> tuple[dict[str, Episode], dict[str, Any], dict[str, dict[str, Any]]]:
     """Read the recordings, and find or read what cloth.yaml and recordings.yaml say of them.
+
+    Args:
+        topics: of ROS recordings, those to take where several could be (`ros_recording`).
 
     Returns:
         Recording -> episode, the cloth's fields of a scenario, and recording -> its own.
 
     Raises:
         EpisodeError: a recording that cannot be used.
-        ConfigError, SceneError: one of both files says what cannot be.
+        ConfigError, SceneError: one of both files says what cannot be, or topics without a ROS recording.
     """
     names = _names(recordings)
-    episodes = {name: _read(path, name, out) for name, path in names.items()}
+    if topics and not any(map(_is_bag, names.values())):
+        raise ConfigError("--topic chooses among the topics of a ROS recording, and none was given. Leave --topic out.")
+    episodes = {name: _read(path, name, out, topics) for name, path in names.items()}
     path = out / "recordings.yaml"
     with together():  # nothing of a scene that was not found would count in the next run
         cloth = _cloth(out, episodes, size, mass)
@@ -208,11 +218,15 @@ def _names(recordings: Sequence[Path]) -> dict[str, Path]:
     return named
 
 
-def _read(path: Path, name: str, out: Path) -> Episode:
+def _is_bag(path: Path) -> bool:
+    return path.suffix in _BAGS or (path / "metadata.yaml").is_file()
+
+
+def _read(path: Path, name: str, out: Path, topics: Sequence[str] = ()) -> Episode:
     """A recording as an episode, kept in OUT/episodes/."""
     kept = out / "episodes" / f"{name}.npz"
-    if path.suffix in _BAGS or (path / "metadata.yaml").is_file():
-        path = _unpacked(path, out / "recordings" / name)
+    if _is_bag(path):
+        path = _unpacked(path, out / "recordings" / name, topics)
     if path.is_file():
         episode = read_episode(path)
     elif (path / "episode.json").is_file():
@@ -229,8 +243,8 @@ def _read(path: Path, name: str, out: Path) -> Episode:
     return episode
 
 
-def _unpacked(bag: Path, folder: Path) -> Path:
-    """A ROS recording as a raw episode, kept in OUT/recordings/; its frames are those of `import recording`'s defaults."""
+def _unpacked(bag: Path, folder: Path, topics: Sequence[str]) -> Path:
+    """A ROS recording as a raw episode, kept in OUT/recordings/: what `import recording` makes of it by default."""
     from pipeline.importing import recording_kind, robot_description  # not above: it brings the SDK's library
 
     if recording_kind(bag) != "ros":
@@ -239,14 +253,17 @@ def _unpacked(bag: Path, folder: Path) -> Path:
             "it first, by `diffcloud import recording NAME=FILE` and a calibration."
         )
     files = sorted(bag.rglob("*")) if bag.is_dir() else [bag]
-    source = {"files": [[one.name, one.stat().st_size, one.stat().st_mtime_ns] for one in files]}
+    source: dict[str, Any] = {"files": [[one.name, one.stat().st_size, one.stat().st_mtime_ns] for one in files]}
+    if topics:
+        source["topics"] = sorted(topics)
     told = folder.with_name(f"{folder.name}.source.json")
     if not folder.is_dir():
-        write_recording(folder, ros_recording(bag, description=partial(robot_description, None)))
+        write_recording(folder, ros_recording(bag, description=partial(robot_description, None), topics=topics))
         write_json(told, source)
     elif not told.is_file() or read_json(told) != source:
         raise EpisodeError(
-            f"{folder} was made of another {bag.name} than {bag} is now. Remove {folder} to have it made anew."
+            f"{folder} was made of another {bag.name} than {bag} is now, or with other topics. Remove {folder} to have it "
+            "made anew."
         )
     return folder
 

@@ -32,7 +32,7 @@ from diffcloud.sensing.agreement import agreement, corrected
 from diffcloud.sensing.filters import without_strays
 from diffcloud.sensing.fusion import FusionSettings
 from diffcloud.sensing.visible_region import with_cut_planes
-from pipeline.console import JsonFlag, errors, finish, warn, writes
+from pipeline.console import JsonFlag, Topics, errors, finish, warn, writes
 
 _FARTHEST_M = 50.0
 """From the robot's base: no cloth hangs there."""
@@ -137,13 +137,7 @@ def recording(
     ] = None,
     world_frame: Annotated[str, typer.Option(help="ROS: the robot's base in tf.")] = "base_link",
     tool_frame: Annotated[str, typer.Option(help="ROS: the tool in tf.")] = "tool_frame",
-    topic: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="ROS: which topic to take where several could be: of depth, colour, camera_info, joint states or tf; "
-            "repeated. TOPIC#NUMBER takes one of several publishers of joint states on it."
-        ),
-    ] = None,
+    topic: Topics = None,
     joint: Annotated[
         list[str] | None, typer.Option(help="ROS: the arm's joints in order; joint_1, ... if not given.")
     ] = None,

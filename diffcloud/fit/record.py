@@ -13,7 +13,7 @@ from diffcloud.io.files import read_json
 from diffcloud.io.schema import Plain
 from diffcloud.io.timings import read_seconds
 
-SCHEMA = 9
+SCHEMA = 10
 """Of the file. Another one is refused, by name."""
 MOST_HALVINGS = 3
 """Each multiplies the nodes by about four."""
@@ -140,6 +140,10 @@ class WholeMaterial(_Model):
     friction_cloth: Friction
     air_density: NonNegative
     """[kg/m³]"""
+    added_mass: NonNegative
+    """[kg/m²] Of the air that moves with the cloth, mean over the cloth."""
+    linear_drag: NonNegative
+    """[kg/(m²·s)]"""
 
 
 class Measure(_Model):

@@ -103,8 +103,9 @@ def whole_material(scenario: Scenario, values: Mapping[str, float]) -> WholeMate
     changed = scenario.properties(system, one_set(values))
     stretching = float((changed.stretching / system.properties.stretching).mean())  # without a pivot's faces
     bending = float(changed.bending.mean())
+    area, weight = float(scenario.scene.mesh.face_area.sum()), float(changed.weight.sum())
     return WholeMaterial(
-        density=float(changed.weight.sum()) / float(scenario.scene.mesh.face_area.sum()),
+        density=weight / area,
         stretching=stretching * material.resting_stretching_stiffness,
         poisson=material.resting_poisson_ratio,
         shear=stretching * float(changed.shear) * material.resting_shear_stiffness,
@@ -114,6 +115,8 @@ def whole_material(scenario: Scenario, values: Mapping[str, float]) -> WholeMate
         friction_obstacle=float(changed.friction_obstacle),
         friction_cloth=float(changed.friction_cloth),
         air_density=float(changed.air_density),
+        added_mass=max(float(changed.node_mass.sum()) - weight, 0.0) / area,
+        linear_drag=float(changed.linear_drag),
     )
 
 

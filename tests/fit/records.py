@@ -40,6 +40,7 @@ def record_of(*recordings: RecordingFit, **changes: Any) -> FitRecord:
         "material": {
             "density": 0.2, "stretching": 6.0, "poisson": 0.0, "shear": 1.5, "compression": 1.0, "bending": 4e-6,
             "damping": 0.005, "friction_obstacle": 0.3, "friction_cloth": 0.6, "air_density": 1.2,
+            "added_mass": 0.0, "linear_drag": 0.0,
         },
         "loss": 1e-4,
         "loss_start": 2e-4,

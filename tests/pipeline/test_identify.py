@@ -32,8 +32,10 @@ from pipeline import fit_jobs, identify
 from pipeline.fit_jobs import FitJob
 from pipeline.preprocess import Cleaned, PreprocessJob
 from tests.io.ros_bag import bag
+from tests.io.test_ros_choices import desired
+from tests.io.test_ros_choices import written as rivals
 from tests.pipeline.invoke import DIFFCLOUD, environment, invoke
-from tests.sensing.table_scene import write_table_episode
+from tests.sensing.table_scene import HOME_RAD, write_table_episode
 from tests.test_architecture import check_commands
 
 SIZE = (0.16, 0.12)
@@ -245,6 +247,25 @@ class TestRefusals:
         (work / "d435.bag").write_bytes(b"#ROSBAG V2.0 /device_0/sensor_0/info")
         said = invoke("identify", "d435.bag", "--out", "found", code=1).errors
         assert "is a recording of the RealSense SDK" in said
+
+    def test_of_a_bag_with_several_topics_names_them(self, work):
+        """As `import recording` does; the topic that is named is the one that is read."""
+        rivals(work, other=desired)
+        said = invoke("identify", "bag", "--out", "found", code=1).errors
+        assert "Several publishers send the same joints at the same time: /joint_states#1" in said
+        assert "such as `--topic '/joint_states#1'`" in said
+        assert not (work / "found" / "recordings").exists()
+        for number, offset in ((1, 0.0), (2, 0.15)):
+            named = ("--topic", f"/joint_states#{number}")
+            invoke("identify", "bag", *named, "--size", "0.16x0.12", "--out", "found", code=1)  # it shows no cloth
+            log = read_raw_episode(work / "found" / "recordings" / "bag").robot
+            late = 0.004 * (number - 1)
+            np.testing.assert_allclose(log.joints_rad[:, 3], HOME_RAD[3] + 0.2 * (log.times - late) + offset, atol=1e-5)
+            said = invoke("identify", "bag", "--topic", "/tf", "--out", "found", code=1).errors
+            assert "or with other topics. Remove" in said
+            shutil.rmtree(work / "found")
+        said = invoke(*COMMAND, "--topic", "/tf", code=1).errors
+        assert "--topic chooses among the topics of a ROS recording, and none was given" in said
 
     def test_of_damaged_notes(self, work):
         (work / "found").mkdir()

@@ -173,5 +173,5 @@ def _candidates(where: str, publishers: Sequence[_Publisher], labels: dict[int, 
         return f"{where}: {problem}Only one publisher sends these joints at a time; name the topic without a number."
     return (
         f"{where}: {problem}Several publishers send the same joints at the same time: {listed}. Name the one that "
-        f"measured the arm with --topic, as in `diffcloud import recording --topic '{example}'`."
+        f"measured the arm with --topic, such as `--topic '{example}'`."
     )

@@ -109,7 +109,7 @@ def depth_cameras(topics: Mapping[str, str], where: str, named: Collection[str] 
         if other != topic and _preference(other, held[other]) == rank:
             raise EpisodeError(
                 f"{where} has several depth topics of one camera: {other} and {topic}. Name the one to take with --topic, "
-                f"as in `diffcloud import recording --topic {other}`."
+                f"such as `--topic {other}`."
             )
     if not depths:
         raise EpisodeError(f"{where} has no depth image topic; its topics are {_listed(topics)}.")

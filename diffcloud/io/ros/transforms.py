@@ -59,7 +59,7 @@ def refuse_rivals(transforms: Sequence[tuple[str, Any]], where: str) -> None:
         if len(by_topic) > 1 and not _agree([item for held in by_topic.values() for item in held]):
             raise EpisodeError(
                 f"{where}: several topics of transforms place {child!r} differently: {', '.join(sorted(by_topic))}. Name "
-                f"those to take with --topic, as in `diffcloud import recording --topic {min(by_topic)}`. Name /tf_static "
+                f"those to take with --topic, such as `--topic {min(by_topic)}`. Name /tf_static "
                 "too, if it is needed."
             )
 
