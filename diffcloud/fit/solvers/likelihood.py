@@ -430,9 +430,9 @@ class _Descent:
         """Whether the finer mesh was last simulated too far away."""
         if self._looked is None or self.reached is None:
             return True
-        asked = [index for index, one in enumerate(self.of.space.variables) if not one.doubtful]
+        asked = [not one.doubtful for one in self.of.space.variables]
         moved = (place - self._looked).abs() / self.reached.covariance.diagonal().sqrt()
-        return bool(moved[asked].max() > _REFRESH)
+        return bool((moved[: len(asked)][torch.tensor(asked)] > _REFRESH).any())
 
     def _look(self, linear: Sequence[_Linear], place: Tensor) -> None:
         """Simulate the finer mesh here."""
