@@ -55,7 +55,7 @@ def test_the_record_has_what_the_fit_knows():
     told = record.estimate
     assert record.solver == "likelihood"
     assert set(told.mean) == {"stretch"}
-    assert {"recording", "prior", "bending", "pose", "mesh", "time step", "starts"} == set(told.sources)
+    assert {"recording", "prior", "bending", "turn", "pose", "mesh", "time step", "starts"} == set(told.sources)
     assert sum(told.weights) == pytest.approx(1.0)
     assert [len(one.misfits) for one in told.recordings] == [len(one.frames) for one in record.episodes]
     assert all(one.left_out.rms_mm < 1.5 * one.rms_mm for one in record.episodes)

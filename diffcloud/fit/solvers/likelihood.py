@@ -34,6 +34,7 @@ from diffcloud.errors import DivergedError
 from diffcloud.fit.bounded import lowest_within
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.matching import Pairs
+from diffcloud.fit.names import plain_name
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis, moved_by
@@ -469,7 +470,7 @@ class _Descent:
         precision = torch.diag(of.precision)
         sources = {"recording": covariance @ (self.reached.matrix - precision) @ covariance}
         for index, one in enumerate(of.space.variables):
-            name = one.name if one.doubtful else "prior"
+            name = plain_name(one.name) if one.doubtful else "prior"
             part = of.precision[index] * torch.outer(covariance[index], covariance[index])
             sources[name] = sources.get(name, 0.0) + part
         poses = covariance[len(of.space.names) :]
