@@ -79,7 +79,10 @@ def fit(
     bound: Annotated[list[str] | None, typer.Option(help="PARAMETER=LOW:HIGH, repeatable.")] = None,
     solver: Annotated[
         str | None,
-        typer.Option(help="gauss_newton (default); adam, the paper's; cma_es or random_search, without derivatives."),
+        typer.Option(
+            help="gauss_newton (default); likelihood, whose intervals know the mesh; adam, the paper's; cma_es or "
+            "random_search, without derivatives."
+        ),
     ] = None,
     iterations: Annotated[int | None, typer.Option(help="Steps at most. Default: 20 of gauss_newton, 50 of adam.")] = None,
     simulations: Annotated[

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from diffcloud.fit.solvers import SOLVERS
 from diffcloud.sim.properties import PARAMETERS
 from pipeline import solver_race
 from pipeline.fit_jobs import FitJob, Recording
-from pipeline.solver_race import COUNTS, SCENARIOS, RaceJob, race_jobs, race_page, race_rows, race_scenario
+from pipeline.solver_race import COUNTS, RACING, SCENARIOS, RaceJob, race_jobs, race_page, race_rows, race_scenario
 from tests.pipeline.invoke import invoke
 
 
@@ -72,7 +71,7 @@ def test_a_target_is_its_cloth_turned_shifted_and_noisy(tmp_path, monkeypatch):
 def test_cells_are_medians_in_which_a_solver_that_did_not_arrive_took_for_ever():
     def solvers(*seconds):
         runs = [{"arrived": s is not None, "seconds": s or 9.0, "simulations": 10 * (s or 9)} for s in seconds]
-        return dict(zip(SOLVERS, runs, strict=True))
+        return dict(zip(RACING, runs, strict=True))
 
     records = [
         {"scenario": "lift", "count": 2, "solvers": solvers(1.0, 2.0, None, 4.0)},
@@ -104,7 +103,7 @@ def test_the_command_races_and_keeps_what_is_finished(tmp_path, monkeypatch):
     told = invoke(*arguments).result
     (record,) = told["records"]
     runs = record["solvers"]
-    assert set(runs) == set(SOLVERS)
+    assert set(runs) == set(RACING)
     assert runs["gauss_newton"]["arrived"]
     assert all(run["loss"] >= 0.99 * record["reference"] for run in runs.values())
     assert all(not math.isclose(run["seconds"], 0) for run in runs.values())

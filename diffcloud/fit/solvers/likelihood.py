@@ -469,10 +469,10 @@ class _Descent:
         place, covariance, of = self.reached.place, self.reached.covariance, self.of
         precision = torch.diag(of.precision)
         sources = {"recording": covariance @ (self.reached.matrix - precision) @ covariance}
-        for index, one in enumerate(of.space.variables):
-            name = plain_name(one.name) if one.doubtful else "prior"
+        for index, variable in enumerate(of.space.variables):
+            name = plain_name(variable.name) if variable.doubtful else "prior"
             part = of.precision[index] * torch.outer(covariance[index], covariance[index])
-            sources[name] = sources.get(name, 0.0) + part
+            sources[name] = sources[name] + part if name in sources else part
         poses = covariance[len(of.space.names) :]
         sources["pose"] = poses.T @ poses
         sources |= {name: torch.zeros_like(covariance) for name in ("mesh", "time step")}
