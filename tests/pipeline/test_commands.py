@@ -155,7 +155,7 @@ def test_a_fit_by_a_search(work, solver):
     for options, message in (
         (
             ("--starts", 2, "--iterations", 3),
-            "iterations: of solver gauss_newton or adam; starts: of solver gauss_newton or",
+            "iterations: of solver likelihood or gauss_newton or adam; starts: of solver likelihood or gauss_newton or",
         ),
         (("--screen", 3), f"screen: of solver gauss_newton or adam; not of {solver}: leave out"),
         (("--patience", 3), "patience: of solver adam"),
