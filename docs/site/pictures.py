@@ -74,8 +74,7 @@ def view(objective: Objective, values: dict[str, float]) -> None:
     motion = objective.match(objective.simulate_to_loss(one_set(values)))
     frame = objective.frames.index(FRAME)
     pairs = motion.pairs[0]
-    places = motion.pairs[0].places
-    points = objective.pose_space.moved(places.of(motion.shown(objective.pose_space)), motion.pose)[0, frame].numpy()
+    points = objective.pose_space.moved(pairs.places.of(motion.shown(objective.pose_space)), motion.pose)[0, frame].numpy()
     counts = pairs.weights[0, frame].numpy() > 0
     below = points[:, 2] < objective.cut if objective.cut is not None else np.zeros_like(counts)
     cloud = _cloud(objective)
