@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from diffcloud.fit import FitSpace, JointObjective, Objective
 from diffcloud.fit.parameters import Variable
 from diffcloud.fit.solvers import LikelihoodSettings, fit_likelihood, likelihood
 from diffcloud.fit.solvers.likelihood import Answer, Estimate, Frames
+from diffcloud.scene.scenarios import load_scenario
 from tests.conftest import small_lift
 from tests.fit.test_fit import GENTLE, clouds_of
 
@@ -183,3 +185,14 @@ class TestFits:
         monkeypatch.setattr(likelihood._Linear, "at", diverge)
         with pytest.raises(DivergedError):
             fit_likelihood(objective(), SPACE, LikelihoodSettings())
+
+    def test_bodies_stand_still_for_every_clock(self):
+        """A scene with a body beside the cloth, seen by a clock that is free."""
+        scenario = load_scenario("vest_hang")
+        scenario = replace(scenario, frames=2, scene=replace(scenario.scene, frame_steps=2))
+        assert len(scenario.scene.bodies.faces)
+        episode = clouds_of(scenario, points=300)
+        one = Objective(scenario, episode, nuisance={"lag": 0.01}, points=100)
+        space = FitSpace((Variable("stretch", 0.1, 10.0, 3.0),), {})
+        told = fit_likelihood(one, space, LikelihoodSettings(starts=1, iterations=1))
+        assert np.isfinite(told.loss)

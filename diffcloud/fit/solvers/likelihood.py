@@ -247,7 +247,9 @@ class _Linear:
     def at(recording: _Recording, place: Tensor) -> _Linear:
         objective = recording.objective
         moved = moved_by(objective, recording.space, place[None, recording.motion])
-        velocities = objective.velocities(moved.run) if objective.pose_space.moves_clocks else None
+        velocities = None
+        if objective.pose_space.moves_clocks:
+            velocities = objective.still_bodies(objective.velocities(moved.run))
         return _Linear(recording, objective.looked_at(moved.run), moved.rates, velocities)
 
     def frames(self, place: Tensor, shift: Tensor | None, asked: Tensor | None = None) -> Frames:
