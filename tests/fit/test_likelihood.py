@@ -94,7 +94,7 @@ class TestRecording:
         member = likelihood._Likelihood([Objective(SCENARIO, episode, nuisance=POSE)], SPACE, 12)
         place = member.start({"stretch": TRUTH["stretch"]}, 0.0)
         lying = self.at(member, place)
-        up = torch.zeros(1, lying.squares.shape[1], len(SCENARIO.scene.mesh.nodes), 3).double()
+        up = torch.zeros(1, lying.squares.shape[1], len(SCENARIO.finer().scene.mesh.nodes), 3).double()
         up[..., 2] = 0.0002
         asked, moved = self.at(member, place, None, up), self.at(member, place, up)
         change = (moved.slopes - lying.slopes)[1]

@@ -11,8 +11,9 @@ is twice the negative logarithm of the likelihood of n independent residuals a f
 are correlated over a cloth, so n is far below the number of points.
 
 After some time nobody can predict which fold forms: there, derivatives explode. Frames count up to a horizon, where the
-finer mesh and the given one part. The finer mesh also corrects the positions: its difference to the given mesh is added to
-the simulated nodes. What half of that difference would change is a part of the uncertainty.
+finer mesh and the given one part. Points are compared with the surface of the finer mesh: it is simulated once in a while,
+and moves from there as the given mesh does. What half of the difference between both would change is a part of the
+uncertainty.
 
 The variables are those of the space and the pose of each recording. Gauss and Newton's steps, bounded in each variable, go
 from three starts; the answers are weighed by their likelihoods.
@@ -39,7 +40,7 @@ from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.residuals import Axis, moved_by
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress
-from diffcloud.scene.scenarios import Scenario
+from diffcloud.mesh.refinement import refined
 from diffcloud.sim.threads import map_threads
 
 INDEPENDENT = 10.0
@@ -210,15 +211,20 @@ class _Recording:
         unit = objective.length_unit_m
         self.known = torch.tensor([cloud.from_surface for cloud in objective.clouds], dtype=torch.float64).T
         self.known = self.known + (_MODEL_M / unit) ** 2
-        self.finer = self.simulated_by(objective.scenario.finer())
+        _, self.edges = refined(objective.scenario.scene.mesh)
+        finer = objective.scenario.finer()
+        self.finer = Objective(
+            finer, objective.episode, nuisance=objective.nuisance, frames=objective.frames, points=objective.point_count
+        )
         times = objective.times.sort().values
         gap = float(times.diff().median()) if len(times) > 1 else _FRAME_S
         self.independent = INDEPENDENT * min(1.0, gap / _FRAME_S)
 
-    def simulated_by(self, scenario: Scenario) -> Objective:
-        """The same recording with another simulation, of which only the nodes are wanted."""
-        one = self.objective
-        return Objective(scenario, one.episode, nuisance=one.nuisance, frames=one.frames, points=1)
+    def on_finer(self, values: Tensor) -> Tensor:
+        """[..., C · V, 3] of the given mesh -> of the finer one, linear between its nodes."""
+        views = values.unflatten(-2, (len(self.objective.pose_space.clocks), -1))
+        middles = views[..., torch.as_tensor(self.edges), :].mean(-2)
+        return torch.cat([views, middles], dim=-2).flatten(-3, -2)
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
         return self.space.parameters(self.axis.bounded(place[None, self.motion]))
@@ -228,10 +234,14 @@ class _Recording:
         return self.objective.looked_at(self.objective.simulate_to_loss(self.parameters(place)))
 
     def change(self, place: Tensor, nodes: Tensor, other: Objective) -> Tensor:
-        """[1, L, C · V, 3] by which another simulation, whose first nodes are those of the mesh, moves the nodes."""
-        clocks = len(self.objective.pose_space.clocks)
-        there = other.looked_at(other.simulate_to_loss(self.parameters(place))).unflatten(-2, (clocks, -1))
-        return there[..., : nodes.shape[-2] // clocks, :].flatten(-3, -2) - nodes
+        """[1, L, C · V', 3] from the nodes of the motion to another simulation, of the finer mesh or of this one."""
+        there = other.looked_at(other.simulate_to_loss(self.parameters(place)))
+        return there - (self.on_finer(nodes) if other is self.finer else nodes)
+
+    def stepped(self) -> Objective:
+        """The same recording with twice the steps, of which only the nodes are wanted."""
+        one = self.objective
+        return Objective(one.scenario.with_steps(2), one.episode, nuisance=one.nuisance, frames=one.frames, points=1)
 
 
 @dataclass(frozen=True)
@@ -253,15 +263,17 @@ class _Linear:
     def frames(self, place: Tensor, shift: Tensor | None, asked: Tensor | None = None) -> Frames:
         """
         Args:
-            shift: [1, L, C · V, 3] added to the nodes.
+            shift: [1, L, C · V', 3] added to the nodes of the finer mesh.
             asked: likewise, whose effect on the slopes is wanted.
         """
         one = self.recording
-        objective, space = one.objective, one.objective.pose_space
+        objective, space = one.finer, one.finer.pose_space
         pose = (place[one.poses] * space.deviations)[None]
-        nodes = self.nodes if shift is None else self.nodes + shift
-        motion = objective.matched(objective.with_bodies(nodes), self.velocities, pose)
-        points, columns = objective.columns(motion, self.rates)
+        nodes = one.on_finer(self.nodes)
+        nodes = nodes if shift is None else nodes + shift
+        velocities = None if self.velocities is None else objective.still_bodies(one.on_finer(self.velocities))
+        motion = objective.matched(objective.with_bodies(nodes), velocities, pose)
+        points, columns = objective.columns(motion, one.on_finer(self.rates))
         views, ways = motion.shown(space), list[tuple[Tensor, Tensor, Tensor, Tensor]]()
         units = torch.cat([torch.ones(len(self.rates)).double(), space.deviations])[:, None, None, None, None]
         for pairs, at, moves in zip(motion.pairs, points, columns, strict=True):
@@ -479,8 +491,11 @@ class _Descent:
         misfits, apart = [], []
         for one, shift in zip(self.reached.linear, self._shifts, strict=True):
             recording = one.recording
-            stepped = recording.simulated_by(recording.objective.scenario.with_steps(2))
-            changes = {"mesh": None if shift is None else shift / 2, "time step": self._changed(one, place, stepped)}
+            step = self._changed(one, place, recording.stepped())
+            changes = {
+                "mesh": None if shift is None else shift / 2,
+                "time step": None if step is None else recording.on_finer(step),
+            }
             frames = one.frames(place, shift)
             weights = recording.independent * frames.weights
             for name, change in changes.items():
