@@ -847,7 +847,7 @@ class TestFits:
         space = FitSpace.build(["stretch"], bounds=scenario.bounds, fixed={"mass": truth["mass"]})
         space = with_doubts(space, MATERIAL_DOUBTS, [scenario])
         direct = fit_gauss_newton(objective, space, GaussNewtonSettings(starts=1))
-        assert direct.loss > 2 * objective.explained
+        assert direct.loss > 1.3 * objective.explained
         # with a threshold, a start that grows follows the first candidate at once
         found = fit_gauss_newton(objective, space, GaussNewtonSettings(threshold=objective.explained))
         assert found.best_start == 1

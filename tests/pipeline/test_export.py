@@ -144,7 +144,7 @@ class TestRefusals:
     "target", [pytest.param("mujoco", marks=pytest.mark.slow), pytest.param("newton", marks=pytest.mark.longest)]
 )
 def test_the_export_runs_and_moves_as_fitted(target, tmp_path, monkeypatch):
-    """A lift of two and a half seconds; in the last half second the cloth swings free."""
+    """A lift of two and a half seconds. After 1.2 s the cloth buckles, one way or the other."""
     pytest.importorskip(target)
     monkeypatch.chdir(tmp_path)
     write_episode(tmp_path / "lift.npz", clouds_of(load_scenario("lift"), stretch=1.2, mass=0.45))
@@ -155,4 +155,4 @@ def test_the_export_runs_and_moves_as_fitted(target, tmp_path, monkeypatch):
     assert done.result["cantilever_error"] < 0.05
     times = np.array(done.result["times_s"])
     assert times[-1] >= 2
-    assert max(np.array(done.result["rms_mm"])[times <= 2]) < 10
+    assert max(np.array(done.result["rms_mm"])[times <= 1.2]) < 10

@@ -124,7 +124,8 @@ def test_a_fold_of_a_mesh_finer_than_the_thickness_keeps_its_layers_apart(self_c
     side, scale = 0.08, 0.08 / 0.2625
     supple = Sheet(density_kg_m2=0.3, stretching_n_m=60.0, bending_n_m=1e-6)
     options = {"size_m": (side, side), "nodes": (21, 21), "self_contact": self_contact, "material": supple}
-    path = [(0.0, 0.0, 0.0, 0.0), (1.25, 0.0, 0.12 * scale, 0.26 * scale), (2.5, 0.0, 0.28 * scale, 0.003)]
+    options |= {"grip": "pivot", "grip_m": 0.001}  # a pad that is not turned over would press on the layer below
+    path = [(0.0, 0.0, 0.0, 0.0), (1.25, 0.0, 0.12 * scale, 0.26 * scale), (2.5, 0.0, 0.28 * scale, 0.006)]
     scenario = grid_scenario(FOLD.model_copy(update={**options, "path": path}))
     system, _ = scenario.scene.build()
     assert system.setup.surrounding.contact.repulsion_thickness > system.mesh.smallest_height
