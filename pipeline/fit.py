@@ -84,7 +84,9 @@ def fit(
             "random_search, without derivatives."
         ),
     ] = None,
-    iterations: Annotated[int | None, typer.Option(help="Steps at most. Default: 20 of gauss_newton, 50 of adam.")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(help="Steps at most. Default: 12 of likelihood, 20 of gauss_newton, 50 of adam.")
+    ] = None,
     simulations: Annotated[
         int | None, typer.Option(help="Of cma_es and random_search: as many at most. Default: 200.")
     ] = None,

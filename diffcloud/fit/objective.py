@@ -26,7 +26,7 @@ from diffcloud.fit.alignment import aligned
 from diffcloud.fit.inputs import Inputs
 from diffcloud.fit.matching import Matcher, Motion, Pairs, Recorded
 from diffcloud.fit.pose import PoseSpace, clocks_of, default_priors, priors_by_clock
-from diffcloud.fit.targets import read_target
+from diffcloud.fit.targets import read_target, track_displacement
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import Rollout
@@ -291,6 +291,24 @@ class Objective:
         """[B, L, C · V', 3] a rollout's nodes at the compared frames, at the offset of each of the C clocks: those of one
         clock after those of another."""
         return torch.cat([run.at(self.times + offset) for offset in self.pose_space.clocks.values()], dim=-2)
+
+    def way_to(self, variant: Scenario, parameters: Mapping[str, Tensor], nodes: Tensor) -> Tensor:
+        """[B, L, C · V, 3] from nodes of the cloth, as `looked_at` has them, to where a variant of the scenario has them.
+
+        Args:
+            variant: with other steps, or with a mesh whose first nodes are those of the scenario's.
+
+        Raises:
+            DivergedError: the variant's motion diverges.
+        """
+        system, _ = variant.scene.build()
+        steps, track = self.loss_steps * variant.scene.frame_steps // self.scenario.scene.frame_steps, None
+        if self.episode.gripper is not None:
+            moved = track_displacement(self.episode, system.handles.grippers, steps, system.time_step)
+            track = torch.as_tensor(moved)[None]
+        there = self.looked_at(Inputs.of(variant, system, steps, parameters, track).rollout())
+        clocks = len(self.pose_space.clocks)
+        return there.unflatten(-2, (clocks, -1))[..., : nodes.shape[-2] // clocks, :].flatten(-3, -2) - nodes
 
     def velocities(self, run: Rollout) -> Tensor:
         """[B, L, C · V', 3] of the same nodes: differences over a step to both sides, zero before the start."""

@@ -28,7 +28,7 @@ The pose is solved for as in `residuals`; recordings of a joint fit add up with 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,18 +36,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloud.fit.inputs import Inputs
 from diffcloud.fit.joint import AnyObjective, loss_weights, mean_loss
 from diffcloud.fit.laid import asked_as
 from diffcloud.fit.matching import Motion
-from diffcloud.fit.names import of_recording
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.pose import NUISANCE, TRIED, kind_of, priors_by_clock, set_up_of, unit_of
 from diffcloud.fit.residuals import Axis, moved_by
-from diffcloud.fit.targets import track_displacement
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sim.properties import one_set
 from diffcloud.sim.simulate import Rollout
 from diffcloud.sim.threads import map_threads
 
@@ -175,29 +171,6 @@ def finer_steps(scenario: Scenario) -> Scenario:
     return scenario.with_steps(REFINED)
 
 
-def distance_to_finer_mm(
-    objective: AnyObjective, values: Mapping[str, float], finer: Callable[[Scenario], Scenario]
-) -> tuple[float, float]:
-    """How far the motion of a finer variant of the scenario is away, RMS over nodes and compared frames, and what noise and
-    spacing of the recorded points account for [mm]; of the recording in which the first is the larger part of the second.
-
-    Args:
-        values: all parameters, the given ones too, and how the cloth lies.
-        finer: `finer_steps` or `Scenario.finer`.
-
-    Raises:
-        DivergedError: a motion diverges.
-    """
-
-    def told(recording: int) -> tuple[float, float]:
-        member, parameters = objective.members[recording], one_set(of_recording(values, recording))
-        way = _way_to(finer(member.scenario), member, parameters, member.simulate_to_loss(parameters))
-        return 1e3 * member.length_unit_m * float(way.square().sum(-1).mean().sqrt()), noise_mm(member)
-
-    with torch.no_grad():
-        return max(map_threads(told, range(len(objective.members))), key=lambda pair: pair[0] / pair[1])
-
-
 def noise_mm(objective: Objective) -> float:
     """RMS distance that noise and spacing of the recorded points account for [mm]."""
     to_mm = 1e3 * objective.length_unit_m
@@ -318,22 +291,7 @@ def _refined(objective: Objective, parameters: Mapping[str, Tensor], run: Rollou
     which takes the published step as it is."""
     if objective.paper:
         return torch.zeros_like(objective.looked_at(run))
-    return _way_to(finer_steps(objective.scenario), objective, parameters, run)
-
-
-def _way_to(finer: Scenario, objective: Objective, parameters: Mapping[str, Tensor], run: Rollout) -> Tensor:
-    """[1, L, C · V, 3] from a motion to that of a finer variant of its scenario, at its own nodes in the compared
-    frames."""
-    system, _ = finer.scene.build()
-    steps = objective.loss_steps * finer.scene.frame_steps // objective.scenario.scene.frame_steps
-    track = None
-    if objective.episode.gripper is not None:
-        moved = track_displacement(objective.episode, system.handles.grippers, steps, system.time_step)
-        track = torch.as_tensor(moved)[None]
-    fine = Inputs.of(finer, system, steps, parameters, track).rollout()
-    own, views = objective.looked_at(run), (len(objective.pose_space.clocks), -1)
-    found = objective.looked_at(fine).unflatten(-2, views)[..., : run.positions.shape[-2], :]
-    return found.flatten(-3, -2) - own
+    return objective.way_to(finer_steps(objective.scenario), parameters, objective.looked_at(run))
 
 
 def _times(objective: Objective, loss: float, scores: NDArray[np.float64]) -> float:

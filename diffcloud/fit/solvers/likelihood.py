@@ -210,15 +210,10 @@ class _Recording:
         unit = objective.length_unit_m
         self.known = torch.tensor([cloud.from_surface for cloud in objective.clouds], dtype=torch.float64).T
         self.known = self.known + (_MODEL_M / unit) ** 2
-        self.finer = self.simulated_by(objective.scenario.finer())
+        self.finer = objective.scenario.finer()
         times = objective.times.sort().values
         gap = float(times.diff().median()) if len(times) > 1 else _FRAME_S
         self.independent = INDEPENDENT * min(1.0, gap / _FRAME_S)
-
-    def simulated_by(self, scenario: Scenario) -> Objective:
-        """The same recording with another simulation, of which only the nodes are wanted."""
-        one = self.objective
-        return Objective(scenario, one.episode, nuisance=one.nuisance, frames=one.frames, points=1)
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
         return self.space.parameters(self.axis.bounded(place[None, self.motion]))
@@ -227,11 +222,9 @@ class _Recording:
         """[1, L, C · V, 3] of the cloth in the scene."""
         return self.objective.looked_at(self.objective.simulate_to_loss(self.parameters(place)))
 
-    def change(self, place: Tensor, nodes: Tensor, other: Objective) -> Tensor:
-        """[1, L, C · V, 3] by which another simulation, whose first nodes are those of the mesh, moves the nodes."""
-        clocks = len(self.objective.pose_space.clocks)
-        there = other.looked_at(other.simulate_to_loss(self.parameters(place))).unflatten(-2, (clocks, -1))
-        return there[..., : nodes.shape[-2] // clocks, :].flatten(-3, -2) - nodes
+    def change(self, place: Tensor, nodes: Tensor, variant: Scenario) -> Tensor:
+        """[1, L, C · V, 3] by which a variant of the scenario moves the nodes."""
+        return self.objective.way_to(variant, self.parameters(place), nodes)
 
 
 @dataclass(frozen=True)
@@ -380,7 +373,7 @@ class _Descent:
         self.of, self.place, self._tell = likelihood, place, tell
         self.reached: _Reached | None = None
         self._shifts: list[Tensor | None] = [None] * len(likelihood.recordings)
-        self._looked: Tensor | None = None
+        self._looked = place
         self._trace: list[tuple[float, Tensor]] = []
 
     def run(self, to_beat: float) -> Answer | None:
@@ -400,6 +393,8 @@ class _Descent:
                     raise
                 place, radius = 0.5 * (place + best.place), max(0.5 * radius, _NARROW)
                 continue
+            if best is None:
+                self._look(linear, place)
             energy, slope, matrix, square = self._terms(linear, place)
             if best is not None and energy > best.energy + allowed:
                 tried += 1
@@ -408,7 +403,7 @@ class _Descent:
                 place, radius = 0.5 * (place + best.place), max(0.5 * radius, _NARROW)
                 continue
             tried = 0
-            if self._stale(place):
+            if best is not None and self._stale(best, place):
                 self._look(linear, place)
                 energy, slope, matrix, square = self._terms(linear, place)
             self.reached = _Reached(energy, place, linear, matrix, torch.linalg.inv(matrix))
@@ -429,12 +424,10 @@ class _Descent:
         self.of.simulations += len(self.of.recordings)
         return map_threads(lambda one: _Linear.at(one, place), self.of.recordings)
 
-    def _stale(self, place: Tensor) -> bool:
+    def _stale(self, best: _Reached, place: Tensor) -> bool:
         """Whether the finer mesh was last simulated too far away."""
-        if self._looked is None or self.reached is None:
-            return True
         asked = [not one.doubtful for one in self.of.space.variables]
-        moved = (place - self._looked).abs() / self.reached.covariance.diagonal().sqrt()
+        moved = (place - self._looked).abs() / best.covariance.diagonal().sqrt()
         return bool((moved[: len(asked)][torch.tensor(asked)] > _REFRESH).any())
 
     def _look(self, linear: Sequence[_Linear], place: Tensor) -> None:
@@ -443,11 +436,11 @@ class _Descent:
         found = map_threads(lambda one: self._changed(one, place, one.recording.finer), linear)
         self._shifts = [old if new is None else new for old, new in zip(self._shifts, found, strict=True)]
 
-    def _changed(self, one: _Linear, place: Tensor, other: Objective) -> Tensor | None:
-        """By how much another simulation moves the nodes; None where it diverges."""
+    def _changed(self, one: _Linear, place: Tensor, variant: Scenario) -> Tensor | None:
+        """By how much a variant of the scenario moves the nodes; None where it diverges."""
         self.of.simulations += 1
         try:
-            return one.recording.change(place, one.nodes, other)
+            return one.recording.change(place, one.nodes, variant)
         except DivergedError:
             return None
 
@@ -481,7 +474,7 @@ class _Descent:
         misfits, apart = [], []
         for one, shift in zip(self.reached.linear, self._shifts, strict=True):
             recording = one.recording
-            stepped = recording.simulated_by(recording.objective.scenario.with_steps(2))
+            stepped = recording.objective.scenario.with_steps(2)
             changes = {"mesh": None if shift is None else shift / 2, "time step": self._changed(one, place, stepped)}
             frames = one.frames(place, shift)
             weights = recording.independent * frames.weights
