@@ -215,8 +215,8 @@ class FitConfig(Section):
     """Of likelihood, gauss_newton and adam: steps at most; by default 12, 20 and 50."""
     starts: Annotated[int, Field(ge=1, le=MOST_STARTS)] | None = None
     """Of likelihood, gauss_newton (at most) and adam: number of descents, from different places; by default 3, 8 (2 with
-    the linearised integrator) and 1. Only by default does gauss_newton also search. It lets the recording grow by default, and in joint
-    fits."""
+    the linearised integrator) and 1. Only by default does gauss_newton also search. It lets the recording grow by default,
+    and in joint fits."""
     screen: Annotated[int, Field(ge=0, le=MOST_CANDIDATES)] | None = None
     """Of gauss_newton and adam: candidates simulated once to choose the starts from; by default 24 of gauss_newton (48 with
     the linearised integrator), none of adam, whose further starts are then spread over the box."""
