@@ -212,7 +212,7 @@ def moved(cloth: Cloth, simulator: Simulator, cache: Path) -> Moved:
     centre, yaw, table = cloth.place
     cosine, sine = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
     turn = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
-    middle = np.array([*cloth.size, 0.0]) / 2
+    middle = problem.mesh.nodes.mean(0) * [1, 1, 0]
     world = (nodes - middle) @ turn + [*centre, table]
     return Moved(world, problem.mesh.faces, world[:, held].mean(1))
 
