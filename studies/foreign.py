@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation.markdown import markdown_table
-from diffcloud.io.arrays import read_npz
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.files import write_bytes, write_text
 from diffcloud.mesh.shapes import grid_cloth
@@ -195,7 +194,8 @@ def moved(cloth: Cloth, simulator: Simulator, cache: Path) -> Moved:
     path = cache / f"{simulator}-{cloth.kind}-{cloth.seed}-{cloth.motion}.npz"
     problem, held = _problem(cloth)
     if path.is_file():
-        nodes = read_npz(path, {"nodes": 3})["nodes"].astype(np.float64)
+        with np.load(path) as kept:
+            nodes = kept["nodes"].astype(np.float64)
     else:
         if simulator == "mujoco":
             settings, sheet = mujoco.stable(problem)
