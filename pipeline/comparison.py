@@ -161,7 +161,7 @@ def comparison_jobs(
         real = not recorded[name].meta.get("truth")
         jobs.append(
             Job(
-                scenario=scenario.halved(fit.halvings),
+                scenario=scenario,
                 group=group,
                 name=label,
                 fit=fit_name,
@@ -169,10 +169,8 @@ def comparison_jobs(
                 episode=recorded[name],
                 fitted=fit,
                 predictions=[network.of(recorded[name]) for network in networks],
-                # simulated targets share labels, not parameters; those of another mesh mean something else
-                transfers={one: told for one, told in others[name].items() if alone[one].halvings == fit.halvings}
-                if real and len(fit.episodes) == 1
-                else {},
+                # simulated targets share labels, not parameters
+                transfers=others[name] if real and len(fit.episodes) == 1 else {},
                 settings=config.evaluate.comparison(f"{group}/{label}"),
                 kept=kept / group / f"{label}.json",
             )

@@ -16,7 +16,6 @@ from diffcloud.evaluation.intervals import LEVEL, WITHIN
 from diffcloud.fit.doubts import MATERIAL_DOUBTS, parse_doubts
 from diffcloud.fit.laid import parse_laid
 from diffcloud.fit.pose import parse_priors
-from diffcloud.fit.record import MOST_HALVINGS
 from diffcloud.fit.solvers import SOLVERS, Settings
 from diffcloud.fit.solvers.gauss_newton import ROUGH_SCREEN, ROUGH_STARTS
 from diffcloud.io.files import read_yaml
@@ -214,9 +213,8 @@ class FitConfig(Section):
     iterations: Count | None = None
     """Of likelihood, gauss_newton and adam: steps at most; by default 12, 20 and 50."""
     starts: Annotated[int, Field(ge=1, le=MOST_STARTS)] | None = None
-    """Of likelihood, gauss_newton (at most) and adam: number of descents, from different places; by default 3, 8 (2 with
-    the linearised integrator) and 1. Only by default does gauss_newton also search. It lets the recording grow by default,
-    and in joint fits."""
+    """Of likelihood, gauss_newton and adam: number of descents, from different places; by default 3, at most 8 (2 with the
+    linearised integrator) and 1. By default, gauss_newton ends once one explains the recording or two end equally low."""
     screen: Annotated[int, Field(ge=0, le=MOST_CANDIDATES)] | None = None
     """Of gauss_newton and adam: candidates simulated once to choose the starts from; by default 24 of gauss_newton (48 with
     the linearised integrator), none of adam, whose further starts are then spread over the box."""
@@ -250,9 +248,6 @@ class FitConfig(Section):
     """The factor within which material that is not asked for is known: "bending=1.5x,drag=1.3x", or "none". It is fitted
     too, and is not a result (`fit.doubts`). Default: `MATERIAL_DOUBTS` and what the scenario says, of gauss_newton unless
     linearised, else none."""
-    halvings: Annotated[int, Field(ge=0, le=MOST_HALVINGS)] | None = None
-    """How often the mesh's edges and the step may be halved where a fit does not explain its recording, to go on from there
-    (`fit.finer`). Default: 1 of gauss_newton unless linearised, else 0."""
     joint: bool = False
     """One parameter set for all episodes, whatever their scenario: they must be of one cloth."""
 
@@ -282,8 +277,6 @@ class FitConfig(Section):
             raise ValueError("doubts: the published measure takes the rest of the material for known; leave them out")
         if self.paper and self.solver == "likelihood":
             raise ValueError("paper: the published measure has no likelihood; choose another solver, or leave it out")
-        if self.halvings and (self.paper or self.solver != "gauss_newton"):
-            raise ValueError("halvings: of solver gauss_newton, and not of the published measure; leave it out")
         if self.solver == "adam" and self.screen and not 2 <= (self.starts or 1) <= self.screen:
             raise ValueError(
                 f"screen: of adam, candidates that its further starts are chosen from; got {self.screen} for "
@@ -320,11 +313,6 @@ class FitConfig(Section):
         if self.laid is not None:
             return [parse_laid(self.laid)] * len(scenarios)
         return [dict(one.laid) if self._fits_more(scenarios) else {} for one in scenarios]
-
-    def halved_at_most(self, scenarios: Sequence[Scenario]) -> int:
-        """How often edges and step may be halved in a fit of recordings in these scenarios."""
-        default = self.solver == "gauss_newton" and self._fits_more(scenarios)
-        return int(default) if self.halvings is None else self.halvings
 
     def _fits_more(self, scenarios: Sequence[Scenario]) -> bool:
         """Whether more than what is asked for is fitted by default: where derivatives make that cheap."""

@@ -15,7 +15,7 @@ import typer
 from rich.table import Table
 
 from diffcloud.errors import ConfigError, DiffCloudError, OutputError
-from diffcloud.evaluation.intervals import LEVEL, RESTARTS, state_intervals
+from diffcloud.evaluation.intervals import LEVEL, state_intervals
 from diffcloud.fit.pose import SET_UP, PoseSpace
 from diffcloud.fit.uncertainty import finer_steps
 from diffcloud.io.episodes import Episode, read_episode, write_episode
@@ -262,21 +262,18 @@ class CoverageJob:
         fit = self.config.fit
         fit = fit.model_copy(update={"fixed": {**fit.fixed, **{name: truth[name] for name in self.known}}})
         job = FitJob(self.label, [Recording(self.scenario, self.label, episode)], fit, self.folder)
-        fitted = job.solved()
-        outcome = fitted.outcome.uninterrupted()
+        objective, outcome = job.solved()
+        outcome = outcome.uninterrupted()
         found = state_intervals(
-            fitted.objective,
+            objective,
             job.space,
             outcome.values,
             level=self.level,
             within=self.config.evaluate.within,
-            restarts=RESTARTS,
-            seen=outcome.scan,
         )
         told: dict[str, Any] = {
             "loss": outcome.loss,
             "values": outcome.values,
-            "halvings": fitted.halvings,
             "stop_reason": outcome.stop_reason,
             "simulations": outcome.simulations,
         }

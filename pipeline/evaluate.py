@@ -13,9 +13,9 @@ import typer
 from rich.table import Table
 
 from diffcloud.errors import ConfigError
-from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, Intervals, intervals_of, significant
+from diffcloud.evaluation.intervals import LEVEL, WITHIN, Intervals, intervals_of, significant
 from diffcloud.evaluation.markdown import comparison_page
-from diffcloud.evaluation.methods import scan_of, space_of
+from diffcloud.evaluation.methods import space_of
 from diffcloud.evaluation.summary import PREDICTORS, headline, label, largest_sources, sentences, tables
 from diffcloud.evaluation.summary import metrics as summary_metrics
 from diffcloud.fit import Objective, read_fit
@@ -82,8 +82,6 @@ def loss(
         if scenario is None and scene is None:
             scenario = fitted_scenario(fit, record.scenario if place is None else record.episodes[place].scenario)
     chosen = choose_scenario(scenario, scene)
-    if fit is not None:
-        chosen = chosen.halved(record.halvings)
     if paper:
         measure |= {"nuisance": None, "frames": None}  # the published measure has its own
     given = {"points": points, "frames": frame, "seed": seed, "paper": paper or None}
@@ -133,9 +131,7 @@ def intervals(
         chosen = choose_scenario(stated or fitted_scenario(fit, one.scenario), scene)
         recordings.append(Recording(chosen, one.name, read_episode(path)))
     objective = compared(record, recordings)
-    found = intervals_of(
-        record, objective, space_of(record), level=level, within=within, restarts=RESTARTS, seen=scan_of(record)
-    )
+    found = intervals_of(record, objective, space_of(record), level=level, within=within)
     if out is not None:
         write_json(with_suffix(out, ".json"), found.model_dump(mode="json"))
     if not json:
@@ -154,10 +150,6 @@ def _show_intervals(found: Intervals) -> None:
     output.print(table)
     if found.ratio is not None and found.ratio.factor is not None:
         output.print(f"stretch / mass {found.ratio.value:.3g}, within a factor of {found.ratio.factor:.3g}")
-    if found.restarts:
-        output.print(
-            "The fit had not arrived: it was started again from a lower loss, and the table is for where it ended."
-        )
     for sentence in found.sentences:
         output.print(sentence, soft_wrap=True)
 

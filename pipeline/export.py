@@ -73,7 +73,7 @@ def export(
     index = _index(record, recording, scenario)
     one = record.episodes[index]
     drawn = _draws(record, intervals or fit.parent / "intervals.json", samples, seed) if samples else []
-    chosen = choose_scenario(scenario or fitted_scenario(fit, one.scenario)).halved(record.halvings)
+    chosen = choose_scenario(scenario or fitted_scenario(fit, one.scenario))
     motion = read_motion(fit.with_suffix(".npz"), index)
     cloth = fitted_cloth(one, motion, chosen, record.values)
     former = exported_files(out)

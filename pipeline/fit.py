@@ -165,13 +165,6 @@ def fit(
             "bending=3x,mass=2x; none for no prior. Default: 10x, which decides only what the recording does not show."
         ),
     ] = None,
-    halvings: Annotated[
-        int | None,
-        typer.Option(
-            help="Where noise does not explain the misfit, halve edge length and step and go on fitting, at most this "
-            "often (0 to 3). Default: 1 of gauss_newton unless linearised, else 0."
-        ),
-    ] = None,
     joint: Annotated[
         bool | None, typer.Option("--joint", help="One parameter set for all episodes, of any scenario: one cloth.")
     ] = None,
@@ -205,7 +198,6 @@ def fit(
         laid=laid,
         prior=prior,
         doubts=doubts,
-        halvings=halvings,
         joint=joint,
     )
     every, recordings = _recordings(episodes, scenario, scene, config)
@@ -246,8 +238,7 @@ def fit(
         with none_lost():
             for job, record, error in run_all("fit", jobs, workers, patient=True):
                 if error is None:
-                    mesh = f" ({record.finer_by})" if record.finer_by else ""
-                    errors.print(f"{job.label}: loss {record.loss_start:.3e} -> {record.loss:.3e}{mesh}")
+                    errors.print(f"{job.label}: loss {record.loss_start:.3e} -> {record.loss:.3e}")
                     add(job, record)
                 else:
                     failures.append(f"{told_as(job)}: {error}")

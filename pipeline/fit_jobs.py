@@ -12,14 +12,13 @@ from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit import FitSpace, JointObjective, Objective, Progress, read_fit, write_fit
 from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.doubts import with_doubts
-from diffcloud.fit.finer import FinerFit, solve_and_refine
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.laid import with_laid
-from diffcloud.fit.left_out import leave_out_and_go_on
+from diffcloud.fit.left_out import leave_each_out
 from diffcloud.fit.priors import parameter_priors
 from diffcloud.fit.record import FitRecord, LeftOut
 from diffcloud.fit.result import describe_fit
-from diffcloud.fit.solvers import FitOutcome, Settings
+from diffcloud.fit.solvers import FitOutcome, Settings, solve
 from diffcloud.fit.solvers.outcome import FitHistory
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import read_yaml
@@ -114,7 +113,7 @@ def read_recordings(pairs: Sequence[tuple[str, Path]]) -> list[Recording]:
 
 
 def compared(record: FitRecord, recordings: Sequence[Recording]) -> AnyObjective:
-    """What a fit has minimised at its end: of the mesh that it ended with, at the frames that it began with.
+    """What a fit has minimised, at the frames that it began with.
 
     Args:
         recordings: of the fit, in their order.
@@ -123,10 +122,7 @@ def compared(record: FitRecord, recordings: Sequence[Recording]) -> AnyObjective
         ConfigError, EpisodeError: the episodes lack these frames, or are of different cloths.
     """
     return _joined(
-        [
-            Objective(one.scenario.halved(record.halvings), one.episode, **record.measured_by(place))
-            for place, one in enumerate(recordings)
-        ]
+        [Objective(one.scenario, one.episode, **record.measured_by(place)) for place, one in enumerate(recordings)]
     )
 
 
@@ -145,8 +141,6 @@ class FitJob:
     folder: Path
     init: Mapping[str, float] = field(default_factory=dict)
     """Values of the first start; the middle of the range where not given."""
-    halvings: int = 0
-    """How often edges and step of the scenario are halved to begin with."""
 
     @property
     def scenario(self) -> Scenario:
@@ -188,26 +182,24 @@ class FitJob:
             ConfigError, EpisodeError: the episodes lack the frames of the loss, an unknown frame, or different cloths.
         """
         measure = self.settings.measure()
-        return _joined([Objective(one.scenario.halved(self.halvings), one.episode, **measure) for one in self.recordings])
+        return _joined([Objective(one.scenario, one.episode, **measure) for one in self.recordings])
 
     @property
     def solver_settings(self) -> Settings:
         return replace(self.settings.solver_settings(self.scenario), init=self.init)
 
-    def solved(self, progress: Callable[[int, Progress], None] | None = None) -> FinerFit:
-        """The fit, of which nothing is written; the halvings are those after the ones to begin with.
-
-        Args:
-            progress: as of `solve_and_refine`.
+    def solved(self, progress: Callable[[Progress], None] | None = None) -> tuple[AnyObjective, FitOutcome]:
+        """The fit, of which nothing is written, and what it minimised.
 
         Raises:
             ConfigError, EpisodeError: as of `space` and `objective`.
-            DivergedError, KeyboardInterrupt: as of `solve_and_refine`.
+            DivergedError, KeyboardInterrupt: as of `solve`.
         """
-        more = self.settings.halved_at_most([one.scenario for one in self.recordings]) - self.halvings
-        return solve_and_refine(
-            self.objective(), self.space, self.solver_settings, halvings=max(more, 0), progress=progress
-        )
+        objective = self.objective()
+        outcome = solve(objective, self.space, self.solver_settings, progress=progress)
+        if outcome.estimate is not None:  # frames beyond the horizon said nothing
+            objective = objective.earliest(outcome.estimate.horizons)
+        return objective, outcome
 
     def known(self) -> FitRecord | None:
         """What this job, or an earlier one of the same inputs and code, has left; maybe interrupted."""
@@ -230,38 +222,32 @@ class FitJob:
         unit_mm = 1e3 * self.scenario.length_unit_m
 
         def show(doing: str, progress: Progress) -> None:
-            """No part that is done: how many starts, meshes and joint fits there will be is not known."""
+            """No part that is done: how many starts there will be is not known."""
             check_interrupt()
             values = "  ".join(f"{key} {progress.values[key]:.3g}" for key in space.asked.names if key in progress.values)
             step = progress.iteration if progress.simulations is None else progress.simulations
             tell(0.0, f"{doing}step {step}  best {unit_mm * progress.best**0.5:.2f} mm  {values}")
 
-        def show_progress(halvings: int, progress: Progress) -> None:
-            show("finer mesh  " if halvings else "", progress)
-
         def show_left_out(done: float, doing: str, progress: Progress) -> None:
             show(f"{doing}  ", progress)
 
         space, settings = self.space, self.solver_settings
-        fitted = self.solved(show_progress)
-        objective, outcome = fitted.objective, fitted.outcome
+        objective, outcome = self.solved(partial(show, ""))
         left, failures, interrupted = list[LeftOut](), list[str](), outcome.stop_reason == "interrupted"
-        fits = [outcome]
         if isinstance(objective, JointObjective) and not interrupted:
             try:
-                left = leave_out_and_go_on(objective, space, outcome, settings, keep=fits.append, progress=show_left_out)
+                left = leave_each_out(objective, space, outcome.values, settings, progress=show_left_out)
             except DivergedError as error:
                 failures.append(f"leaving one recording out: {error}")
             except KeyboardInterrupt:
                 interrupted = True
         names, pressed = [one.name for one in self.recordings], False
-        described = partial(describe_fit, objective, space, settings, fits[-1], episodes=names)
+        described = partial(describe_fit, objective, space, settings, outcome, episodes=names)
         try:
             result = described()
         except KeyboardInterrupt:  # a fit that may have taken minutes is not given away for the second that this takes
             result, pressed = described(), True
         record = result.record
-        record.halvings, record.finer_loss = self.halvings + fitted.halvings, fitted.finer_loss
         record.failures += failures
         record.stop_reason = "interrupted" if interrupted else record.stop_reason
         for recording, told in zip(record.episodes, left, strict=bool(left)):
@@ -294,16 +280,15 @@ class FitJob:
         )
         names = [one.name for one in self.recordings]
         result = describe_fit(objective, space, settings, outcome, episodes=names)
-        result.record.halvings, result.record.fingerprint = self.halvings, self._fingerprint
+        result.record.fingerprint = self._fingerprint
         write_fit(self.folder, self.name, result)
         return result.record
 
     @cached_property
     def _fingerprint(self) -> str:
         settings = self.settings.model_dump(exclude={"joint"})  # which the name and the recordings tell
-        more = self.settings.halved_at_most([one.scenario for one in self.recordings])
-        resolved = [self.space, self.solver_settings, more]  # what is not given is decided here, outside of these packages
-        return fingerprint([self.name, self.recordings, settings, resolved, self.halvings], packages=_CODE)
+        resolved = [self.space, self.solver_settings]  # what is not given is decided here, outside of these packages
+        return fingerprint([self.name, self.recordings, settings, resolved], packages=_CODE)
 
 
 def first_start(init: str, job: FitJob) -> dict[str, float]:

@@ -73,11 +73,11 @@ class PoseJob:
             scenario = laid(self.scenario, episode) if start == STARTS[2] else self.scenario
             turned = _TURN if start == STARTS[1] else "none"
             told = {"parameters": ["stretch"], "fixed": {"mass": hidden["mass"]}, "nuisance": nuisance, "laid": turned}
-            config = self.config.model_copy(update={**told, "halvings": 0})  # the truth has the scenario's nodes
+            config = self.config.model_copy(update=told)
             job = FitJob(self.label, [Recording(scenario, self.label, episode)], config, self.folder)
-            fitted = job.solved()
-            outcome = fitted.outcome.uninterrupted()
-            result = describe_fit(fitted.objective, job.space, job.solver_settings, outcome, episodes=[self.label])
+            objective, outcome = job.solved()
+            outcome = outcome.uninterrupted()
+            result = describe_fit(objective, job.space, job.solver_settings, outcome, episodes=[self.label])
             moved = result.motions[0].nodes[0]
             lag = result.record.nuisance.get("lag")
             found.append(

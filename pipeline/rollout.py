@@ -52,7 +52,7 @@ def rollout(
     if fit is not None and fitted is not None and scenario is None and scene is None:
         place = None if episode is None else fitted.known_place(episode.stem)
         scenario = fitted_scenario(fit, fitted.episodes[place or 0].scenario)
-    chosen = choose_scenario(scenario, scene).halved(0 if fitted is None else fitted.halvings)
+    chosen = choose_scenario(scenario, scene)
     values: dict[str, float] = {}
     if fitted is not None:
         values |= fitted.values

@@ -98,7 +98,7 @@ class RaceJob:
         job = FitJob(self.label, [recording], self._config(), self.out)
         objective, space = job.objective(), job.space
         tell(0.0, "reference")
-        wide = GaussNewtonSettings(starts=6, screen=96, scans=3, seed=self.seed)
+        wide = GaussNewtonSettings(starts=6, screen=96, seed=self.seed)
         near = GaussNewtonSettings(starts=1, screen=0, init=truth)
         lowest = min(solve(objective, space, settings).uninterrupted().loss for settings in (near, wide))
         told: dict[str, Any] = {"truth": truth, "reference": lowest, "solvers": {}}

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.io.episodes import Episode, write_episode
-from diffcloud.io.files import write_bytes, write_text
+from diffcloud.io.files import write_text
 from diffcloud.mesh.shapes import grid_cloth
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.scene.scenarios.grid import GridScenario
@@ -144,7 +144,8 @@ class Cloth:
     def place(self) -> tuple[Floats, float, float]:
         """Centre on the table [m], yaw [deg], height of the table [m]."""
         rng = np.random.default_rng([self.seed, 2, self.motion])
-        return rng.uniform(-0.03, 0.03, 2) + [0.55, 0.0], float(rng.uniform(-15, 15)), float(rng.uniform(-0.02, 0.05))
+        centre = np.array([0.55, 0.0]) + rng.uniform(-0.03, 0.03, 2)
+        return centre, float(rng.uniform(-15, 15)), float(rng.uniform(-0.02, 0.05))
 
     @cached_property
     def eyes(self) -> Floats:
@@ -428,7 +429,7 @@ def main(
     log.parent.mkdir(parents=True, exist_ok=True)
     os.environ["OMP_NUM_THREADS"] = "1"
     with ThreadPoolExecutor(jobs) as pool:
-        for case in pool.map(lambda job: fitted(*job, out, revision), missing):
+        for case in pool.map(lambda job: fitted(job[0], job[1], out, revision), missing):
             with log.open("a") as file:
                 file.write(json.dumps(case.__dict__) + "\n")
             known[case.set, case.seed, revision] = case
@@ -479,7 +480,7 @@ def _page(cases: Sequence[Case], seed: int, count: int, revision: str) -> str:
             "# Cloths that other simulators move",
             "",
             f"{count} random cloths a set are moved by MuJoCo or Newton, with {COLUMNS} × {ROWS} nodes, and seen by depth "
-            f"cameras with {1e3 * _NOISE:.0f} mm of noise. `diffcloud identify` fits each recording with the density known. "
+            f"cameras with {1e3 * _NOISE:.0f} mm of noise. `diffcloud identify` fits each recording; the density is known. "
             "Odd seeds have wide ranges of material. *Held* counts 90 % intervals of the stretching stiffness that contain "
             "the truth; a fit without an interval counts as not held. Half-widths are factors.",
             "",

@@ -8,7 +8,7 @@ from typing import Any
 
 from diffcloud.errors import DiffCloudError, DivergedError
 from diffcloud.evaluation import methods
-from diffcloud.evaluation.intervals import LEVEL, RESTARTS, WITHIN, intervals_of
+from diffcloud.evaluation.intervals import LEVEL, WITHIN, intervals_of
 from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
@@ -115,7 +115,6 @@ def compare_episode(
         "scenario": scenario.name,
         "episode": name,
         "fit": fit_name or name,
-        "halvings": fit.halvings,
         **{key: meta.get(key) for key in ("fabric", "category", "repeat", "source")},
         "category_assumed": bool(meta.get("category_assumed", False)),
         "truth": {key: float(value) for key, value in (meta.get("truth") or {}).items()},
@@ -136,10 +135,7 @@ def compare_episode(
     objective.reseed(fit.measure.seed)
     if settings.level is not None and len(fit.episodes) == 1:  # those of a joint fit are of all its recordings together
         try:
-            told_intervals = intervals_of(
-                fit, objective, space,
-                level=settings.level, within=settings.within, restarts=RESTARTS, seen=methods.scan_of(fit),
-            )  # fmt: skip
+            told_intervals = intervals_of(fit, objective, space, level=settings.level, within=settings.within)
             record["intervals"] = told_intervals.model_dump(mode="json")
         except DivergedError as error:
             record["gaps"].append({"method": "intervals", "reason": str(error), "expected": True})

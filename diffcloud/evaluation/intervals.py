@@ -9,8 +9,7 @@ only one end of the interval can miss the truth. The quantile is the smallest wi
 part of the effect (Imbens and Manski 2004). Intervals end at the bounds.
 
 Gauss and Newton's next step, which the fit has not taken, is one of its sources. No interval is stated where a fit has not
-arrived: that step is far longer than the deviations, or a loss nearby is clearly lower. `restarts` lets the fit start again
-there.
+arrived: that step is far longer than the deviations.
 """
 
 from __future__ import annotations
@@ -35,8 +34,6 @@ from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.record import FitRecord
 from diffcloud.fit.residuals import Axis
 from diffcloud.fit.result import physical_values
-from diffcloud.fit.scan import Scan, scan
-from diffcloud.fit.solvers import GaussNewtonSettings, solve
 from diffcloud.fit.uncertainty import STEP_SIZE, Uncertainty, noise_mm, uncertainty
 from diffcloud.io.files import read_json
 from diffcloud.io.schema import Plain
@@ -56,8 +53,6 @@ WITHIN = 1.5
 LEVEL = 0.9
 _PLAIN = 1e6
 """Below it numbers are written out."""
-RESTARTS = 2
-"""Of a fit that has not arrived, from a lower loss beside it."""
 _DOUBTED = 1.3
 """Multiple of the loss that noise and spacing of the points leave, where it is known what the recording misses, from which
 on a fit gets a remark (see `Objective.unexplained`)."""
@@ -139,10 +134,6 @@ class Intervals(_Model):
     """Why intervals that are stated are doubtful all the same; else empty."""
     note: str = ""
     """Why the ratio is not what a motion identifies where the mass multiplier acts on a part of the cloth; else empty."""
-    lower: dict[str, float] | None = None
-    """Where a clearly lower loss was met, from which a fit may start again."""
-    restarts: int = 0
-    """How often the fit was started again there; the values are those that it ended at."""
 
     @property
     def sentences(self) -> list[str]:
@@ -157,41 +148,26 @@ def state_intervals(
     *,
     level: float = LEVEL,
     within: float = WITHIN,
-    restarts: int = 0,
-    seen: Scan | None = None,
 ) -> Intervals:
     """
     Args:
         values: the fitted ones, of doubtful material too; intervals are of what was asked for.
         level: of the intervals.
         within: factor within which a parameter counts as identified.
-        restarts: how often Gauss–Newton may start again at a clearly lower loss that is met on the way; the intervals are
-            then those of where it ends.
-        seen: the losses beside the fitted place, where they are known; otherwise they are simulated.
 
     Raises:
         DivergedError: the fitted motion diverges.
     """
-    found, lower = _with_scan(objective, space, values, uncertainty(objective, space, values), seen)
-    if lower is not None and restarts > 0:
-        outcome = solve(objective, space, GaussNewtonSettings(starts=1, screen=0, init=lower)).uninterrupted()
-        told_again = state_intervals(
-            objective, space, outcome.values,
-            level=level, within=within, restarts=restarts - 1, seen=outcome.scan,
-        )  # fmt: skip
-        return told_again.model_copy(update={"restarts": told_again.restarts + 1})
+    found = uncertainty(objective, space, values)
     space = space.asked
     deviations = np.sqrt(np.maximum(found.covariance.diagonal(), 1e-300))
-    arrived = lower is None and bool((np.abs(found.step) <= _STEP * deviations).all())
+    arrived = bool((np.abs(found.step) <= _STEP * deviations).all())
     found = replace(found, sources={**found.sources, "next step": np.outer(found.step, found.step)})
     misfit = [_misfit(member, loss) for member, loss in zip(objective.members, found.losses.tolist(), strict=True)]
     rms, accounted, excess = max(misfit, key=lambda each: each[2])
     explains = objective.paper or excess <= 1
     reason = ""
-    if explains and lower is not None:
-        near = ",".join(f"{name}={lower[name]:.3g}" for name in space.names)
-        reason = f"the fit has not arrived: the loss is lower at {near}; fit again with `diffcloud fit --init {near}`"
-    elif explains and not arrived:
+    if explains and not arrived:
         reason = "the fit has not arrived: its next step is longer than the interval; fit again with more iterations"
     elif not explains:
         reason = (
@@ -200,7 +176,7 @@ def state_intervals(
         )
         if not all(member.episode.viewpoints for member in objective.members):
             reason += "; if cameras saw only a part of it, import the clouds with `--camera NAME=x,y,z`"
-    told = _Told(arrived, explains, reason, "" if reason else _remark(objective, found), lower)
+    told = _Told(arrived, explains, reason, "" if reason else _remark(objective, found))
     return _intervals(found, space, values, objective.members[0].scenario, told, level=level, within=within)
 
 
@@ -212,7 +188,6 @@ class _Told:
     explains: bool
     reason: str = ""
     remark: str = ""
-    lower: dict[str, float] | None = None
 
 
 def _intervals(
@@ -296,7 +271,6 @@ def _intervals(
         reason=fit.reason,
         remark=fit.remark,
         note="" if ratio is None else _node_set_note(scenario),
-        lower=fit.lower,
     )
 
 
@@ -307,21 +281,19 @@ def intervals_of(
     *,
     level: float = LEVEL,
     within: float = WITHIN,
-    restarts: int = 0,
-    seen: Scan | None = None,
 ) -> Intervals:
     """Of a fit, as its solver knows them: `likelihood` has found them itself, for others see `state_intervals`.
 
     Args:
         objective: what the fit has minimised.
-        level, within, restarts, seen: as of `state_intervals`; the last two only of other solvers.
+        level, within: as of `state_intervals`.
 
     Raises:
         DivergedError: the fitted motion diverges.
     """
     told = record.estimate
     if told is None:
-        return state_intervals(objective, space, record.free, level=level, within=within, restarts=restarts, seen=seen)
+        return state_intervals(objective, space, record.free, level=level, within=within)
     count = len(told.mean)
     sources = {name: np.array(rows) for name, rows in told.sources.items()}
     sources["noise"] = sources.pop("recording")
@@ -368,36 +340,6 @@ def _remark(objective: AnyObjective, found: Uncertainty) -> str:
         f"the loss is {excess:.1f} times what noise and spacing of the points leave, and a right fit of an exact "
         "model stays below about 1.25 times: the fit may have ended in a wrong minimum, or the model lacks something"
     )
-
-
-def _with_scan(
-    objective: AnyObjective, space: FitSpace, values: Mapping[str, float], found: Uncertainty, seen: Scan | None
-) -> tuple[Uncertainty, dict[str, float] | None]:
-    """The uncertainty with one more source: along the scan's axes, how much further than noise and priors say the loss is
-    hardly higher. And the values of a clearly lower loss, if the scan meets one.
-
-    Hardly higher is what these two make of it: along an axis of curvature H, their variance V raises the loss by H V at one
-    deviation. A quadratic loss reaches no further than they say, and the source is zero.
-
-    Args:
-        values: the fitted ones.
-        seen: the scan of the solver; without it, the losses are simulated.
-    """
-    axis = Axis.of(space)
-    centre = axis.places(torch.tensor([values[name] for name in space.names], dtype=torch.float64))
-    if seen is None:
-        seen, _ = scan(objective, space, centre, torch.from_numpy(found.curvature))
-    place = seen.lower(centre, found.loss)
-    lower = None if place is None else dict(zip(space.names, axis.bounded(place[None])[0].tolist(), strict=True))
-    quantile = noise_quantile(found.clusters, 0.9)
-    directions = seen.directions[:, [not variable.doubtful for variable in space.variables]]
-    known = torch.from_numpy(found.of_noise_and_priors)
-    variance = torch.einsum("ai,ij,aj->a", directions, known, directions)
-    curvature = torch.einsum("ai,ij,aj->a", seen.directions, torch.from_numpy(found.curvature), seen.directions)
-    hidden = seen.losses <= found.loss + quantile**2 * (curvature * variance)[:, None]
-    reach = torch.where(hidden, seen.lengths.abs(), 0.0).amax(-1) / quantile
-    spread = (directions.T * (reach.square() - variance).clamp(min=0.0)) @ directions
-    return replace(found, sources={**found.sources, "nearly as low": spread.numpy()}), lower
 
 
 def read_intervals(path: Path, space: FitSpace) -> Intervals:

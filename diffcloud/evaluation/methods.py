@@ -16,7 +16,6 @@ from diffcloud.fit import AdamSettings, CmaEsSettings, FitRecord, FitSpace, Obje
 from diffcloud.fit.laid import variables_of
 from diffcloud.fit.names import of_recording
 from diffcloud.fit.parameters import Variable
-from diffcloud.fit.scan import Scan
 from diffcloud.fit.solvers import SOLVER_NAMES, SOLVERS, FitOutcome, SearchSettings
 
 Rival = Literal["single_start", "middle", "random_search", "cma_es"]
@@ -62,11 +61,6 @@ def space_of(fit: FitRecord) -> FitSpace:
             variables.append(Variable(name, *entry.bounds, entry.prior, entry.centre, entry.doubtful))
     laid = variables_of([one.nuisance for one in fit.episodes], length_unit_m=fit.length_unit_m)
     return FitSpace((*variables, *laid), fixed)
-
-
-def scan_of(fit: FitRecord) -> Scan | None:
-    """The losses beside the fitted place; None if the solver has not looked around there."""
-    return None if fit.scan is None else Scan.of(fit.scan)
 
 
 def fitted(fit: FitRecord, recording: int) -> Estimate:

@@ -74,7 +74,6 @@ class StatedIntervals(Intervals):
     level: Annotated[float, Field(gt=0, lt=1)]
     within: Annotated[float, Field(gt=1, le=1e6)]
     remark: Text
-    restarts: int
     note: Text
 
 
@@ -84,7 +83,6 @@ class ComparisonRecord(Checked):
     scenario: Text
     episode: Text
     fit: Text
-    halvings: int
     fabric: Text | None
     category: Text | None
     repeat: int | None

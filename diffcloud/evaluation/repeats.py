@@ -21,7 +21,7 @@ def fit_of(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """One row per episode with a fit of its own: scenario, episode, fabric, category, repeat, halvings, loss, and a column
+    """One row per episode with a fit of its own: scenario, episode, fabric, category, repeat, loss, and a column
     per parameter but those fitted too because they are not known exactly, with `ratio` of stretch to mass where both are
     there. Joint fits are left out: their recordings agree because they were made to."""
     rows = []
@@ -29,7 +29,7 @@ def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         fit = fit_of(record)
         if fit is None or record["fit"] != record["episode"]:
             continue
-        row = {key: record[key] for key in ("scenario", "episode", "fabric", "category", "repeat", "halvings")}
+        row = {key: record[key] for key in ("scenario", "episode", "fabric", "category", "repeat")}
         if record["truth"]:
             row["fabric"] = None  # a simulated target has known parameters; its label names no cloth that is met again
         row |= {"loss": fit["loss"]}
@@ -41,14 +41,13 @@ def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def repeatability(fits: pd.DataFrame) -> pd.DataFrame:
-    """Spread of each parameter over the repeats of a fabric in a scenario, of fits with the same mesh: on another one, a
-    parameter means something else.
+    """Spread of each parameter over the repeats of a fabric in a scenario.
 
     Returns:
         scenario, fabric, parameter, repeats, median, factor: the largest fitted value over the smallest.
     """
     rows = []
-    for (scenario, fabric, _), group in _fabrics(fits, ["scenario", "fabric", "halvings"]):
+    for (scenario, fabric), group in _fabrics(fits, ["scenario", "fabric"]):
         if len(group) < 2:
             continue
         for name in _positive(group):
@@ -99,14 +98,14 @@ def transfer(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def consistency(fits: pd.DataFrame) -> pd.DataFrame:
-    """Whether two motions give one fabric the same parameters, of fits whose meshes were halved as often.
+    """Whether two motions give one fabric the same parameters.
 
     Returns:
         fabric, parameter, first, second: scenarios; value_first, value_second: geometric means over the repeats; factor:
         the larger over the smaller.
     """
     rows = []
-    for (fabric, _), group in _fabrics(fits, ["fabric", "halvings"]):
+    for (fabric,), group in _fabrics(fits, ["fabric"]):
         scenarios = dict(list(group.groupby("scenario", sort=False)))
         for first, second in combinations(scenarios, 2):
             for name in _positive(group):
@@ -154,5 +153,5 @@ def _fabrics(fits: pd.DataFrame, by: list[str]) -> list[tuple[tuple[str, ...], p
 
 def _positive(group: pd.DataFrame) -> list[str]:
     """Parameters whose logarithms exist, in all rows."""
-    labels = {"scenario", "episode", "fabric", "category", "repeat", "halvings", "loss"}
+    labels = {"scenario", "episode", "fabric", "category", "repeat", "loss"}
     return [str(name) for name in group.columns if name not in labels and bool((group[name].astype(float) > 0).all())]

@@ -166,7 +166,7 @@ def interval_table(records: Records) -> pd.DataFrame:
             row |= {"ratio": ratio.get("value"), "ratio_factor": ratio.get("factor")}
             row |= {"combination": None if told["best"] is None else str(Combination.model_validate(told["best"]))}
             row |= {"sources": largest_sources(told["sources"], name), "level": told["level"], "reason": told["reason"]}
-            row |= {"restarts": told["restarts"], "remark": told["remark"], "note": told["note"]}
+            row |= {"remark": told["remark"], "note": told["note"]}
             row |= dict(zip(("posterior_low", "posterior_high"), _posterior(record, name), strict=True))
             rows.append(row)
     return pd.DataFrame(rows)
@@ -428,12 +428,6 @@ def _identified(table: pd.DataFrame) -> list[str]:
                 f"{row['scenario']} / {row['episode']}: fit and posterior disagree on {row['parameter']} by more than "
                 f"their widths: {fitted} and {told}. Believe neither before you know why."
             )
-    again = table[(table["reason"] == "") & (table["restarts"] > 0)].drop_duplicates(["scenario", "episode"])
-    for row in again.to_dict("records"):
-        found.append(
-            f"{row['scenario']} / {row['episode']}: the fit had not arrived; it was started again from a lower loss "
-            "nearby, and the intervals are for where it ended."
-        )
     return found
 
 

@@ -83,10 +83,6 @@ class JointObjective:
         """As of `Objective`, of every one."""
         return JointObjective([one.thinned(most) for one in self.members])
 
-    def halved(self) -> JointObjective:
-        """As of `Objective`, of every one."""
-        return JointObjective([one.halved() for one in self.members])
-
     def _mean(self, losses: Sequence[float]) -> float:
         return float(mean_loss(torch.tensor(losses, dtype=torch.float64)[:, None], paper=self.paper))
 

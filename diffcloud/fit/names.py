@@ -42,19 +42,6 @@ def without_recording(named: Mapping[str, T], recording: int) -> dict[str, T]:
     return found
 
 
-def with_recording(others: Mapping[str, T], own: Mapping[str, T], recording: int) -> dict[str, T]:
-    """The inverse of `without_recording`.
-
-    Args:
-        own: what is the recording's own, under plain names.
-    """
-    found = dict[str, T]()
-    for name, value in others.items():
-        plain, mark, number = name.partition(_OWN)
-        found[f"{plain}{_OWN}{int(number) + (int(number) >= recording)}" if mark else name] = value
-    return {**found, **{f"{name}{_OWN}{recording}": value for name, value in own.items()}}
-
-
 def of_all(each: Sequence[Mapping[str, T]]) -> dict[str, T]:
     """Puts together what is told of how the cloth lies in each recording, under the names of a joint fit; `of_recording`
     takes it apart again."""

@@ -180,20 +180,6 @@ class Objective:
         """The recorded clouds of the L compared frames."""
         return self._target.clouds
 
-    def halved(self) -> Objective:
-        """The same with half the edge length and half the step."""
-        finer = Objective(
-            self.scenario.halved(1),
-            self.episode,
-            paper=self.paper,
-            nuisance=self.nuisance,
-            frames=self.frames,  # whatever the finer motion says of the cut
-            points=self.asked_points,
-            seed=self._seed,
-        )
-        finer.asked_frames = self.asked_frames
-        return finer
-
     def reseed(self, seed: int) -> None:
         """Draw the common random numbers anew."""
         self._seed = seed

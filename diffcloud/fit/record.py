@@ -13,10 +13,8 @@ from diffcloud.io.files import read_json
 from diffcloud.io.schema import Plain
 from diffcloud.io.timings import read_seconds
 
-SCHEMA = 10
+SCHEMA = 11
 """Of the file. Another one is refused, by name."""
-MOST_HALVINGS = 3
-"""Each multiplies the nodes by about four."""
 
 LARGEST = 1e12
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
@@ -184,25 +182,6 @@ class History(_Model):
         return self
 
 
-class ScanRecord(_Model):
-    """Losses beside the fitted place, on the axis of the fit: a directions, n places along each; k parameters that are
-    fitted, doubtful ones among them."""
-
-    directions: list[list[Annotated[float, Field(ge=-1e3, le=1e3)]]]
-    """[a][k]"""
-    lengths: list[list[Annotated[float, Field(ge=-1e3, le=1e3)]]]
-    """[a][n]"""
-    losses: list[list[NonNegative | None]]
-    """[a][n] with priors; None of what diverged, or grew beyond `LARGEST`."""
-
-    @model_validator(mode="after")
-    def _has_one_shape(self) -> Self:
-        counts = {len(row) for row in self.lengths} | {len(row) for row in self.losses}
-        if not (len(self.directions) == len(self.lengths) == len(self.losses) > 0 and len(counts) == 1 and 0 not in counts):
-            raise ValueError("directions [a][k], lengths [a][n] and losses [a][n] must be of one shape")
-        return self
-
-
 class Followed(_Model):
     """How far the model follows one recording."""
 
@@ -254,7 +233,7 @@ class FitRecord(_Model):
     """[squared length unit, mean over points], by the fit's own random points, without priors; of a joint fit the geometric
     mean over its recordings, with `paper` the plain one."""
     loss_start: NonNegative
-    """At `start`, on the scenario's own mesh, with priors."""
+    """At `start`, with priors."""
     loss_resampled: NonNegative
     """Mean over fresh points, which the fit could not adapt to."""
     rms_mm: NonNegative
@@ -269,30 +248,15 @@ class FitRecord(_Model):
     """Parameters of the first start, the given ones too, and how the cloth lies, named as in `free`."""
     best_start: Annotated[int, Field(ge=0, le=1_000_000)]
     measure: Measure
-    halvings: Annotated[int, Field(ge=0, le=MOST_HALVINGS)] = 0
-    """How often edges and step of the scenario were halved, because what was coarser did not explain the recordings:
-    parameters are of the mesh after that (`Scenario.halved`)."""
-    finer_loss: NonNegative | None = None
-    """With priors, where a fit after one more halving ended or was given up; it was tried because this mesh does not
-    explain the recordings, and hardly helped."""
     settings: dict[str, Annotated[int, Field(ge=0)] | bool | NonNegative | None]
     """Of the solver."""
     history: History
-    """On the scenario's own mesh at first, and on finer ones as far as starts went on there."""
-    scan: ScanRecord | None
-    """Of the place where it ended; None if the solver has not looked around there."""
     estimate: EstimateRecord | None = None
     """Of the solver `likelihood`."""
     failures: list[str]
     """Of starts that diverged."""
     fingerprint: Text = ""
     """Of inputs and code, by which a later call knows a finished fit."""
-
-    @model_validator(mode="after")
-    def _scans_what_is_fitted(self) -> Self:
-        if self.scan is not None and {len(row) for row in self.scan.directions} != {len(self.free)}:
-            raise ValueError("scan.directions must hold one number for each fitted parameter")
-        return self
 
     def laid_in(self, recording: RecordingFit | None) -> dict[str, float]:
         """Name -> value, of how the cloth lies when a recording's motion begins (`fit.laid`), as the simulator takes it.
@@ -342,11 +306,6 @@ class FitRecord(_Model):
         one = self.episodes[recording]
         pose = {name: entry.prior for name, entry in one.nuisance.items() if entry.of == "pose"}
         return {**self.measure.model_dump(), "nuisance": pose, "frames": one.frames}
-
-    @property
-    def finer_by(self) -> str:
-        """How its mesh differs from the scenario's, for people; empty if it does not."""
-        return f"edges 1/{2**self.halvings} as long" if self.halvings else ""
 
     @property
     def grasps(self) -> str:

@@ -76,12 +76,6 @@ class Axis:
         """The same, no digit beyond a bound; a derivative would end there."""
         return torch.minimum(torch.maximum(self.values(places), self.low), self.high)
 
-    def room(self, places: Tensor, steps: Tensor) -> Tensor:
-        """[n] how many times steps [n, k] from places [n, k] the bounds leave; infinite for a step of nothing."""
-        low, high = self.ends
-        ahead = torch.where(steps > 0, high - places, low - places)
-        return torch.where(steps == 0, torch.inf, ahead / steps).amin(-1).clamp(min=0.0)
-
 
 @dataclass(frozen=True)
 class Linearisation:

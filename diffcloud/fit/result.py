@@ -194,7 +194,6 @@ def describe_fit(
         ),
         settings={name: value for name, value in asdict(settings).items() if name != "init"},
         history=_history(outcome),
-        scan=None if outcome.scan is None else outcome.scan.record(),
         estimate=None if outcome.estimate is None else _estimate(outcome.estimate, members),
         failures=[*outcome.failures, *_cut_short(members, runs, episodes)],
     )
@@ -349,8 +348,7 @@ def _as_far_as_both_go(
     objective: Objective, values: Mapping[str, float], start_values: Mapping[str, float]
 ) -> tuple[Rollout, Rollout]:
     """The rollouts with fitted and first values over the whole scenario, or up to the last frame before one diverges. First
-    values that diverge within the compared frames (on a finer mesh than that which they were tried on) are replaced by the
-    fitted ones.
+    values that diverge within the compared frames are replaced by the fitted ones.
 
     Raises:
         DivergedError: the fitted ones, within the compared frames.

@@ -172,7 +172,7 @@ def _fit_row(index: int, entry: EpisodeEntry, names: Sequence[str]) -> list[Cell
     true_ratio = row.get("true_ratio")
     return [
         Cell(entry.name, episode=index),
-        Cell(entry.scenario, note=", ".join(filter(None, (fit.finer_by, fit.grasps)))),
+        Cell(entry.scenario, note=fit.grasps),
         Cell(str(entry.episode.meta.get("fabric", ""))),
         number(row["rms_start_mm"], 1),
         replace(number(row["rms_mm"], 1), strong=True),

@@ -19,7 +19,6 @@ def record(
     stated: bool = True,
     gaps: list[dict[str, Any]] | None = None,
     landscape: bool = False,
-    halvings: int = 0,
     reason: str = "",
 ) -> dict[str, Any]:
     """One episode; `methods` and `transfers` give losses."""
@@ -28,7 +27,6 @@ def record(
         "scenario": scenario,
         "episode": episode,
         "fit": fit or episode,
-        "halvings": halvings,
         "fabric": fabric,
         "category": "medium",
         "category_assumed": True,
@@ -102,7 +100,6 @@ def _intervals(stretch: float, reason: str) -> dict[str, Any]:
         "clusters": 16,
         "covariance": [[0.1, 0.098], [0.098, 0.1]],
         "arrived": True,
-        "restarts": 0,
         "explains": not reason,
         "reason": reason,
         "remark": "" if reason else "the loss is 1.7 times what noise leaves",

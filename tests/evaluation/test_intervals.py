@@ -7,17 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy.stats import norm, t
 
 from diffcloud.evaluation import intervals as module
-from diffcloud.evaluation.intervals import RESTARTS, significant, state_intervals
+from diffcloud.evaluation.intervals import significant, state_intervals
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.fit import FitSpace, Objective
-from diffcloud.fit.scan import scan
 from diffcloud.fit.uncertainty import STEP_SIZE, Uncertainty, noise_mm, uncertainty
 from tests.conftest import small_lift
-from tests.evaluation.bowls import Bowl
 from tests.fit.test_fit import clouds_of
 
 VALUES = {"stretch": 0.7, "mass": 1.0}
@@ -34,9 +31,7 @@ def objective():
 def told(objective, monkeypatch):
     """Intervals of stated variances."""
 
-    def tell(
-        sources, *, space=SPACE, values=VALUES, step=0.0, refined=0.0, clusters=16, lower=None, loss=1.0, **options,
-    ):  # fmt: skip
+    def tell(sources, *, space=SPACE, values=VALUES, step=0.0, refined=0.0, clusters=16, loss=1.0, **options):
         k = len(space.names)
         moves = np.broadcast_to(refined, k)
         places = np.log([values[name] for name in space.names])
@@ -45,7 +40,6 @@ def told(objective, monkeypatch):
         losses = np.array([loss * objective.noise_loss])
         found = Uncertainty(space.names, places, losses, 1.0, covariances, moves, clusters, np.full(k, step), np.eye(k))
         monkeypatch.setattr(module, "uncertainty", lambda *arguments, **given: found)
-        monkeypatch.setattr(module, "_with_scan", lambda objective, space, values, found, seen: (found, lower))
         return state_intervals(objective, space, values, **options)
 
     return tell
@@ -168,26 +162,6 @@ class TestVerdicts:
         assert moving.ratio.factor == pytest.approx(still.ratio.factor)  # both go the same way
         assert moving.sources["next step"]["stretch"] == pytest.approx(0.15)
 
-    def test_one_that_a_scan_finds_lower_losses_beside_has_none(self, told):
-        found = told({"noise": np.diag([0.01, 0.01])}, lower={"stretch": 1.3, "mass": 1.0})
-        assert found.parameters["stretch"].verdict == "the fit has not arrived"
-        assert "the loss is lower at stretch=1.3,mass=1;" in found.reason
-
-    def test_it_starts_again_from_a_lower_loss(self, objective):
-        """From far off, whose own interval would not be stated."""
-        found = state_intervals(objective, SPACE, {"stretch": 2.5, "mass": 1.0}, restarts=RESTARTS)
-        assert found.restarts > 0
-        assert found.arrived
-        ended = {name: entry.value for name, entry in found.parameters.items()}
-        here, truth = (float(objective({k: torch.tensor([v]).double() for k, v in one.items()})) for one in (ended, VALUES))
-        assert here <= truth
-        assert found.ratio.low < 0.7 < found.ratio.high
-
-    def test_where_none_is_lower_it_stays(self, objective):
-        found = state_intervals(objective, SPACE, VALUES, restarts=RESTARTS)
-        assert found.restarts == 0
-        assert found.parameters["stretch"].value == VALUES["stretch"]
-
     def test_a_misfit_far_above_the_noise_is_no_statement_on_the_cloth(self, told, objective):
         found = told({"noise": np.diag([0.01, 0.01])}, loss=2.1)
         assert not found.explains
@@ -217,52 +191,6 @@ class TestVerdicts:
         found = told({"noise": np.diag([0.01, 0.01])}, loss=2.1 if why == "not explained" else 1.7)
         assert found.remark == ""
         assert found.explains == (why != "not explained")
-
-
-class Wells(Bowl):
-    """Losses in stretch alone: 1 + (u / 0.3)², and at u = 0.5 a narrow second minimum as deep as stated."""
-
-    depth = 0.0
-
-    def __call__(self, parameters):
-        away = parameters["stretch"].log()
-        return 1 + (away / 0.3).square() - self.depth * (-(((away - 0.25) / 0.03) ** 2)).exp()
-
-
-class TestScan:
-    SPACE = FitSpace.build(["stretch"])
-    QUANTILE = t.ppf(0.95, 15)
-    VARIANCE = 0.2 * 0.3**2 / QUANTILE**2
-
-    def found(self, depth, seen=None):
-        well = Wells()
-        well.depth = depth
-        sources, curvature = {"noise": np.array([[self.VARIANCE]])}, np.array([[1 / 0.3**2]])
-        found = Uncertainty(("stretch",), np.zeros(1), np.ones(1), 1.0, sources, np.zeros(1), 16, np.zeros(1), curvature)
-        return module._with_scan(well, self.SPACE, {"stretch": 1.0}, found, seen)
-
-    def test_another_minimum_that_noise_hides_widens_the_interval(self):
-        """At the quantile of the deviation the loss is 20 % higher. So is the second minimum, which lies further away."""
-        smooth, lower = self.found(0.0)
-        assert lower is None
-        assert smooth.sources["nearly as low"].item() == 0.0
-        rough, lower = self.found(0.6)
-        assert lower is None
-        assert rough.sources["nearly as low"].item() == pytest.approx((0.25 / self.QUANTILE) ** 2 - self.VARIANCE)
-        told, _ = self.found(0.4)
-        assert told.sources["nearly as low"].item() == 0.0  # there it is 30 % higher
-
-    def test_a_lower_loss_is_told(self):
-        _, lower = self.found(1.2)
-        assert lower["stretch"] == pytest.approx(math.exp(0.25))
-
-    def test_what_the_solver_saw_is_not_simulated_again(self):
-        """Its losses count, not those of the objective at hand."""
-        well = Wells()
-        well.depth = 0.6
-        seen, _ = scan(well, self.SPACE, torch.zeros(1).double(), torch.ones(1, 1).double())
-        told, _ = self.found(0.0, seen)
-        assert told.sources["nearly as low"] == self.found(0.6)[0].sources["nearly as low"]
 
 
 def test_the_misfit_is_the_fits_own(objective):

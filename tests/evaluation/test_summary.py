@@ -122,16 +122,6 @@ class TestRepeats:
         assert repeatability(parameter_table(joint)).empty
         pd.testing.assert_frame_equal(parameter_table(records() + joint), parameter_table(records()))
 
-    def test_parameters_of_different_meshes_are_not_compared(self):
-        mixed = [
-            record("lift", "tan1"),
-            record("lift", "tan2", halvings=1),
-            record("fold", "tan1", halvings=1, stretch=3.0),
-        ]
-        table = parameter_table(mixed)
-        assert repeatability(table).empty
-        assert consistency(table).set_index("parameter").loc["stretch", "factor"] == pytest.approx(3.0)
-
     def test_transfer_between_own_fit_and_middle(self):
         (row,) = transfer(records()).to_dict("records")
         assert (row["source"], row["target"]) == ("tan2", "tan1")

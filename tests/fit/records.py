@@ -56,7 +56,6 @@ def record_of(*recordings: RecordingFit, **changes: Any) -> FitRecord:
         "measure": Measure(paper=False, nuisance={}, frames=None, points=None, seed=0),
         "settings": {"smoothing": 0.0, "resample": False},
         "history": History(names=["stretch"], loss=[[0.2], [0.1]], values=[[[1.0]], [[1.5]]], gradient_norm=[]),
-        "scan": None,
         "failures": [],
     }  # fmt: skip
     return FitRecord.model_validate(told | changes)

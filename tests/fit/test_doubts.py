@@ -14,11 +14,9 @@ from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_ne
 from diffcloud.fit.doubts import MATERIAL_DOUBTS, parse_doubts, with_doubts
 from diffcloud.fit.parameters import Variable
 from diffcloud.fit.residuals import Axis
-from diffcloud.fit.scan import scan
 from diffcloud.scene.scenarios import load_scenario
 from pipeline.config import FitConfig
 from tests.conftest import small_lift
-from tests.evaluation.bowls import Bowl
 from tests.fit.slopes import linearised
 from tests.fit.test_fit import GENTLE, clouds_of
 
@@ -148,15 +146,6 @@ def test_a_stiffer_hinge_than_stated_does_not_bend_the_fit():
     assert off[1] < 0.01
     assert doubted.loss < 0.1 * exact.loss
     assert doubted.values["bending"] == pytest.approx(1.8, rel=0.02)
-
-
-def test_a_scan_takes_it_along():
-    """Directions are of what is asked for; along them, what is doubtful is where the loss is lowest to second order."""
-    space = FitSpace((Variable("stretch", 0.1, 10.0), Variable("mass", 0.01, 100.0, 1.5, 1.0, doubtful=True)), {})
-    curvature = torch.tensor([[2.0, -0.6], [-0.6, 0.4]]).double()
-    found, _ = scan(Bowl(), space, torch.zeros(2).double(), curvature)
-    assert found.directions.abs().tolist() == [pytest.approx([1.0, 1.5])]
-    assert float(found.directions @ curvature @ torch.tensor([0.0, 1.0]).double()) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_the_defaults_are_parameters():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,13 +14,9 @@ from diffcloud.errors import DivergedError
 from diffcloud.fit import FitSpace, GaussNewtonSettings, JointObjective, Objective, fit_gauss_newton, residuals
 from diffcloud.fit.batches import batch_losses
 from diffcloud.fit.bounded import lowest_within
-from diffcloud.fit.doubts import MATERIAL_DOUBTS, with_doubts
 from diffcloud.fit.laid import with_laid
-from diffcloud.fit.priors import INDEPENDENT
 from diffcloud.fit.residuals import Axis, Linearisation, linearise
-from diffcloud.fit.scan import scan
 from diffcloud.fit.solvers import gauss_newton
-from diffcloud.scene import load_scenario
 from tests.conftest import paper_objective, small_lift
 from tests.fit.slopes import linearised
 from tests.fit.test_fit import GENTLE, clouds_of
@@ -63,27 +58,6 @@ def beside(loss, *, slope=0.0, lowest=0.5):
         1,
         (sides, torch.tensor([[2.0], [lowest]]).double()),
     )
-
-
-class TestAxis:
-    def test_the_room_ahead_ends_at_the_nearest_bound(self):
-        """Along random steps, a little less is inside and a little more is not; along an axis, the others do not count."""
-        axis = Axis.of(SPACE)
-        low, high = axis.ends
-        generator = torch.Generator().manual_seed(2)
-        places = low + (high - low) * torch.rand(40, 2, generator=generator, dtype=torch.float64)
-        steps = torch.randn(40, 2, generator=generator, dtype=torch.float64)
-        steps[:10, 0] = 0.0
-        room = axis.room(places, steps)[:, None]
-
-        def inside(part):
-            reached = places + part * room * steps
-            return ((reached >= low) & (reached <= high)).all(-1)
-
-        assert inside(0.999).all()
-        assert not inside(1.001).any()
-        assert axis.room(places, torch.zeros_like(steps)).isinf().all()
-        assert axis.room(high[None], torch.ones(1, 2)) == 0.0
 
 
 class TestLinearisation:
@@ -267,44 +241,6 @@ class TestFits:
         assert found.loss_start == pytest.approx(float(batch_losses(objective, SPACE, best[None])), rel=1e-9)
         assert found.simulations == 8 + 2
 
-    @pytest.mark.parametrize("init", [{}, {"stretch": 3.0}])
-    def test_the_first_start_has_doubtful_material_as_it_most_likely_is_the_others_as_it_may_be(self, init, monkeypatch):
-        monkeypatch.setattr(Objective, "explained", 1e-12)
-        monkeypatch.setattr(Objective, "knows_gaps", True)
-        monkeypatch.setattr(gauss_newton, "_MISFIT", math.inf)
-        objective = lifted(nuisance={})
-        space = with_doubts(SPACE, {"bending": 1.5}, [objective.scenario])
-        settings = GaussNewtonSettings(starts=3, screen=7, iterations=1, init=init)
-        found = fit_gauss_newton(objective, space, settings)
-        losses, values = torch.stack(found.history.losses), torch.stack(found.history.values)
-        began = [values[losses[:, start].isfinite().int().argmax(), start] for start in range(3)]
-        spread = space.starts(8, seed=0, first=init)[0]
-        likely = spread.clone()
-        likely[:, 2] = 1.0
-        early = objective.until(0.5)
-        usual, doubted = (batch_losses(early, space, places).argsort() for places in (likely, spread[1:]))
-        expected = [likely[0], likely[usual[usual > 0][0]]] if init else [likely[usual[0]]]
-        expected += [spread[1:][place] for place in doubted]
-        torch.testing.assert_close(torch.stack(began), torch.stack(expected[:3]))
-        assert found.simulations == 8 + 7 + 3 * 2
-        monkeypatch.setattr(Objective, "explained", 1.0)
-        assert fit_gauss_newton(objective, space, settings).simulations == 8 + 2
-
-    def test_a_second_screen_that_diverges_does_not_cost_the_first_end(self, monkeypatch):
-        monkeypatch.setattr(Objective, "explained", 1e-12)
-        objective = lifted(nuisance={})
-        space = with_doubts(SPACE, {"bending": 1.5}, [objective.scenario])
-
-        def losses(objective, space, values):
-            found = batch_losses(objective, space, values)
-            return torch.where(values[:, 2] == 1.0, found, math.inf)
-
-        monkeypatch.setattr(gauss_newton, "batch_losses", losses)
-        settings = GaussNewtonSettings(starts=1, screen=7)
-        alone, several = (fit_gauss_newton(objective, space, replace(settings, starts=starts)) for starts in (1, 2))
-        assert several.simulations > alone.simulations + 7
-        assert several.loss <= alone.loss
-
     def test_without_a_screen_starts_are_spread(self):
         found = fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(starts=3, screen=0, iterations=1))
         assert found.simulations == 6
@@ -359,8 +295,6 @@ class TestFits:
 
     def test_starts_are_followed_one_after_the_other_until_one_explains_the_recording(self, monkeypatch):
         settings, fits = GaussNewtonSettings(starts=3, screen=7), []
-        monkeypatch.setattr(Objective, "knows_gaps", True)
-        monkeypatch.setattr(gauss_newton, "_MISFIT", math.inf)  # the model may be right, however high the loss
         for explained, threshold in ((1e-12, 0.0), (1.0, 0.0), (1.0, 1e-30)):  # never, at once, not low enough
             monkeypatch.setattr(Objective, "explained", explained)
             fits.append(fit_gauss_newton(lifted(), SPACE, replace(settings, threshold=threshold)))
@@ -369,50 +303,20 @@ class TestFits:
         assert begun[1][1:] == [0, 0]
         assert begun[0][0] > begun[0][1] > begun[0][2] > 0
         assert enough.simulations < every.simulations == lower.simulations
-        assert enough.scan is None  # nothing lower is looked for
-        assert every.scan is not None
         assert enough.stop_reason == every.stop_reason == "converged"
+
+    def test_two_equal_ends_are_enough_unless_a_number_of_starts_or_a_threshold_is_given(self, monkeypatch):
         monkeypatch.setattr(Objective, "explained", 1e-12)
-        monkeypatch.setattr(Objective, "knows_gaps", False)  # then two equal ends are enough, but not with a threshold
-        monkeypatch.setattr(gauss_newton, "EQUALLY", math.inf)
+        monkeypatch.setattr(gauss_newton, "_EQUALLY", math.inf)
+        monkeypatch.setattr(gauss_newton, "_MOST", 3)
         followed = [
             sum(torch.stack(found.history.losses).isfinite().any(0).tolist())
             for found in (
-                fit_gauss_newton(lifted(), SPACE, replace(settings, threshold=threshold)) for threshold in (0.0, 1e-30)
+                fit_gauss_newton(lifted(), SPACE, GaussNewtonSettings(screen=7, iterations=3, **given))
+                for given in ({}, {"threshold": 1e-30}, {"starts": 3})
             )
         ]
-        assert followed == [2, 3]
-
-    @pytest.mark.parametrize("measure", [{"nuisance": {}}, {"paper": True}], ids=["all frames", "one frame"])
-    def test_where_the_first_start_explains_too_little_three_begin_with_the_first_frames(self, monkeypatch, measure):
-        """A recording of one frame has no beginning."""
-        monkeypatch.setattr(Objective, "knows_gaps", True)
-        monkeypatch.setattr("diffcloud.fit.solvers.gauss_newton._MOST", 1)
-        objective, parts = lifted(**measure), []
-        monkeypatch.setattr(Objective, "explained", 0.5 * objective.explained)
-        until = Objective.until
-        monkeypatch.setattr(Objective, "until", lambda self, part: parts.append(part) or until(self, part))
-        found = fit_gauss_newton(objective, SPACE, GaussNewtonSettings(screen=7, iterations=8, scans=0))
-        starts = torch.stack(found.history.losses).isfinite().any(0)
-        if "paper" in measure:
-            assert len(starts) == 2  # the best candidate, and the one that a search finds
-            return
-        assert len(starts) == 5
-        assert bool(starts.all())
-        assert parts == [0.5, 0.4, 0.6, 0.8, 0.5, 0.75, 0.4, 0.6, 0.8]  # the screen's first
-        assert found.values["stretch"] / found.values["mass"] == pytest.approx(TRUTH["stretch"] / TRUTH["mass"], rel=0.05)
-
-    @pytest.mark.parametrize(
-        ("count", "stages"),
-        [
-            (6, [([5, 6], 0), ([5, 6], 16)]),
-            (7, [([5, 6, 7], 0), ([5, 6, 7], 16)]),
-            (12, [([5, 8, 10, 12], 0), ([6, 9, 12], 16), ([5, 8, 10, 12], 16)]),
-        ],
-    )
-    def test_a_recording_of_few_frames_grows_in_fewer_steps(self, count, stages):
-        growths = gauss_newton._growths(lifted(nuisance={}, frames=range(1, count + 1)))
-        assert [([len(one.frames) for one in growth], draws) for growth, draws in growths] == stages
+        assert followed == [2, 3, 3]
 
     def test_a_step_is_the_lowest_between_the_bounds(self, rng):
         """Cutting off a step at a bound may lead uphill, which looked like the end of a descent."""
@@ -441,114 +345,6 @@ class TestFits:
         tried = way.propose(torch.full((2,), -1.0).double(), torch.full((2,), 1.0).double())
         torch.testing.assert_close(tried, torch.tensor([-0.1 - 0.99 * 0.01, -1.0]).double(), atol=0.01, rtol=0)
         assert way._predicted > 0
-
-    @pytest.mark.parametrize(
-        "corner", [(0.0, 0.0), (-2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)], ids=["none", "lower", "upper", "across"]
-    )
-    def test_draws_stay_in_the_valley_between_the_bounds(self, corner):
-        """Of two variables, the difference is known within 1 % and the sum hardly; the box cuts the valley off."""
-        bounds = (math.exp(-2.0), math.exp(2.0))
-        axis = Axis.of(FitSpace.build(["stretch", "mass"], bounds={"stretch": bounds, "mass": bounds}))
-        known, wide = torch.tensor([1.0, -1.0]).double(), torch.tensor([1.0, 1.0]).double()
-        curvature = (known[:, None] * known / 0.01**2 + wide[:, None] * wide / 3.0**2) / INDEPENDENT
-        found = Linearisation(torch.ones(1).double(), torch.zeros(1, 2).double(), curvature[None], 1)
-        way = gauss_newton._Way(torch.tensor(corner, dtype=torch.float64), found, 3)
-        near, far = (
-            gauss_newton._drawn(way, 16, 1, axis, widening, torch.Generator().manual_seed(0)) for widening in (1.0, 4.0)
-        )
-        for drawn in (near, far):
-            assert bool(((drawn >= -2 - 1e-12) & (drawn <= 2 + 1e-12)).all())
-        off, farther = ((drawn - way.place) @ known for drawn in (near, far))
-        inside = corner[0] == corner[1] == 0.0
-        if inside:
-            torch.testing.assert_close(farther, 4 * off)  # though the box cuts the valley off
-        assert float(off.abs().max()) < 3.5 * 0.01
-        if corner != (-2.0, 2.0):  # there, the valley ends
-            along = near @ wide
-            assert float(along.max() - along.min()) > 1.0
-        assert len(near.unique(dim=0)) > 8
-
-    def test_while_none_goes_on_draws_reach_farther(self, monkeypatch):
-        monkeypatch.setattr(Objective, "knows_gaps", True)
-        objective, widths = lifted(nuisance={}), []
-        stages = [objective.until(0.5), objective]
-        drawn = gauss_newton._drawn
-
-        def watched(way, draws, recordings, axis, widening, generator):
-            widths.append(widening)
-            return drawn(way, draws, recordings, axis, widening, generator)
-
-        monkeypatch.setattr(gauss_newton, "_drawn", watched)
-        place = Axis.of(SPACE).places(torch.tensor([list(TRUTH.values())], dtype=torch.float64))[0]
-        settings, known, spent = GaussNewtonSettings(iterations=1), objective.explained, []
-        for early, later in ((1.0, 1.0), (1.0, 0.01), (0.01, 0.01)):  # a wrong beginning says little of what goes on
-            levels = {len(stages[0].frames): early * known, len(stages[1].frames): later * known}
-            monkeypatch.setattr(Objective, "explained", property(lambda self, levels=levels: levels[len(self.frames)]))
-            spent.append(gauss_newton._grown(stages, 16, SPACE, place, settings, 0, Axis.of(SPACE), lambda _: None)[1])
-        gauss_newton._grown(stages, 0, SPACE, place, settings, 0, Axis.of(SPACE), lambda _: None)  # draws none
-        assert widths == [1.0, 1.0, 2.0, 4.0, 1.0]
-        assert spent[1] - spent[0] == 2 * 16
-        assert spent[2] == spent[0]
-
-    def test_ends_are_equal_only_if_they_come_from_different_candidates(self):
-        """One candidate's own two descents, from the whole recording and from its beginning, are no two witnesses."""
-        place = torch.zeros(1, dtype=torch.float64)
-        found = Linearisation(torch.ones(1).double(), torch.zeros(1, 1).double(), torch.eye(1).double()[None], 1)
-        ways = gauss_newton._Ways([], 3, torch.zeros(1, dtype=torch.bool))
-        for origin in (0, 0):
-            ways.begin(gauss_newton._Start(place, origin), place, found)
-        unknown, wrong, all_of_them = (
-            gauss_newton._Enough(0.5, misfit, witnesses) for misfit, witnesses in ((0.0, 3), (2.0, 3), (2.0, math.inf))
-        )
-        assert not any(ways.enough(when) for when in (unknown, wrong))
-        ways.begin(gauss_newton._Start(place, 1), place, found)
-        assert ways.enough(unknown)
-        assert not ways.enough(wrong)  # where it is known that so high a loss is wrong
-        ways.begin(gauss_newton._Start(place, 2), place, found)
-        assert ways.enough(wrong)
-        assert not ways.enough(all_of_them)
-
-    @pytest.mark.parametrize(
-        ("options", "knows", "loss", "enough"),
-        [
-            ({}, True, 0.9, True),
-            ({}, True, 1.05, False),
-            ({}, True, 25.0, False),
-            ({}, True, 27.0, True),  # the model must be wrong
-            ({}, False, 1.2, True),
-            ({"starts": 4}, True, 1.05, False),
-            ({"starts": 4}, True, 0.9, True),
-            ({"threshold": 0.5}, True, 0.9, False),
-            ({"threshold": 0.5}, True, 31.0, False),
-            ({"threshold": 0.5}, True, 0.4, True),
-        ],
-    )
-    def test_two_equally_low_ends_are_enough_where_the_model_must_be_wrong(self, options, knows, loss, enough):
-        recording = SimpleNamespace(explained=1.0, knows_gaps=knows)
-        place = torch.zeros(1, dtype=torch.float64)
-        found = Linearisation(torch.tensor([loss]).double(), torch.zeros(1, 1).double(), torch.eye(1).double()[None], 1)
-        ways = gauss_newton._Ways([], 3, torch.zeros(1, dtype=torch.bool))
-        for origin in (0, 1):
-            ways.begin(gauss_newton._Start(place, origin), place, found)
-        assert ways.enough(gauss_newton._Enough.of(recording, GaussNewtonSettings(**options))) == enough
-
-    @pytest.mark.parametrize(
-        ("knows", "losses", "enough"),
-        [
-            (True, (31.0, 32.4), True),
-            (True, (31.0, 33.0), False),
-            (True, (1.05, 1.08), False),
-            (False, (31.0, 32.4), False),
-        ],
-        ids=["the model is wrong", "apart", "the model may be right", "nobody knows"],
-    )
-    def test_where_the_model_must_be_wrong_ends_are_equally_low_within_five_per_cent(self, knows, losses, enough):
-        recording, place = SimpleNamespace(explained=1.0, knows_gaps=knows), torch.zeros(1, dtype=torch.float64)
-        ways = gauss_newton._Ways([], 3, torch.zeros(1, dtype=torch.bool))
-        for origin, loss in enumerate(losses):
-            found = Linearisation(torch.tensor([loss]).double(), torch.zeros(1, 1).double(), torch.eye(1).double()[None], 1)
-            ways.begin(gauss_newton._Start(place, origin), place, found)
-        assert ways.enough(gauss_newton._Enough.of(recording, GaussNewtonSettings())) == enough
 
     def test_a_step_in_vain_makes_the_next_one_shorter_and_a_good_one_longer(self):
         """The lowest place of a flat valley lies 20 away."""
@@ -643,90 +439,6 @@ class TestFits:
         way.judge(way.propose(-ends, ends), beside(1.0))
         assert way.end == "iterations"
 
-    def test_what_is_held_goes_free_before_a_lower_place_is_tried(self):
-        way, ends = gauss_newton._Way(ZERO, beside(1.0), 20, held=torch.tensor([True])), 9 + 0 * ZERO
-        way.judge(way.propose(-ends, ends), beside(1.0))
-        assert way.propose(-ends, ends).tolist() == [0.0]  # free now, and nowhere to go
-        way.judge(way.propose(-ends, ends), beside(1.0))
-        assert way.propose(-ends, ends).tolist() == pytest.approx([-0.05])
-
-    @pytest.mark.parametrize(("passed", "end"), [(0.5, None), (1.2, "converged")])
-    def test_near_a_better_one_a_way_goes_on_to_a_lower_place_alone(self, passed, end):
-        ways = gauss_newton._Ways([], 9, torch.zeros(1, dtype=torch.bool))
-        ways.begin(gauss_newton._Start(ZERO, 0), ZERO, beside(1.0, lowest=1.5))
-        ways.begin(gauss_newton._Start(ZERO + 0.3, 1), ZERO + 0.3, beside(2.0, lowest=passed))
-        ways.judge(ways.every[1], ZERO + 0.015, beside(1.05, lowest=passed))
-        assert ways.every[1].end == end
-
-    def test_a_start_that_is_not_about_to_be_of_use_is_given_up(self):
-        """Nothing is looked for around its end, either."""
-        settings = GaussNewtonSettings(starts=1, screen=0)
-        whole = fit_gauss_newton(lifted(), SPACE, settings)
-        losses = [float(row[0]) for row in whole.history.losses]
-        within_reach = fit_gauss_newton(lifted(), SPACE, settings, of_use=(losses[0] + whole.loss) / 2)
-        assert (within_reach.values, within_reach.simulations) == (whole.values, whole.simulations)
-        assert whole.scan is not None
-        beyond = fit_gauss_newton(lifted(), SPACE, settings, of_use=0.5 * whole.loss)
-        assert beyond.scan is None
-        assert 1 < len(beyond.history.losses) < len(losses)
-        assert beyond.loss < losses[0]
-
-    @pytest.mark.parametrize("there", [math.inf, 1.5])
-    def test_a_lower_place_that_derivatives_do_not_confirm_costs_nothing(self, monkeypatch, there):
-        """Of a scan, which takes motions alone: one beside them diverges, or the loss there is higher after all."""
-        settings = GaussNewtonSettings(starts=1, screen=0)
-        plain = fit_gauss_newton(lifted(), SPACE, settings)
-
-        def seen(objective, space, place, curvature):
-            found, spent = scan(objective, space, place, curvature)
-            return replace(
-                found, losses=torch.where(found.losses == found.losses.min(), 0.5 * plain.loss, found.losses)
-            ), spent
-
-        def failing(objective, space, places):
-            found = linearise(objective, space, places)
-            beside = float(
-                (places[0] - Axis.of(space).places(torch.tensor(list(plain.values.values())).double())).abs().max()
-            )
-            return replace(found, losses=there * found.losses) if beside > 0.03 and scanned else found
-
-        def scanning(*given):
-            scanned.append(True)
-            return seen(*given)
-
-        scanned = []
-        monkeypatch.setattr(gauss_newton, "scan", scanning)
-        monkeypatch.setattr(gauss_newton, "linearise", failing)
-        found = fit_gauss_newton(lifted(), SPACE, settings)
-        assert scanned
-        assert (found.values, found.loss) == (plain.values, plain.loss)
-        centre = Axis.of(SPACE).places(torch.tensor(list(plain.values.values())).double())
-        assert found.scan.lower(centre, found.loss) is None
-
-    @pytest.mark.parametrize(
-        ("second", "witnesses", "misfit", "order"),
-        [
-            (1.0, 4, 0.9, ["1", "2", "search", "grown", "again"]),
-            (0.5, 4, 0.4, ["1", "2", "grown", "again", "search"]),
-            (0.5, 4, 1.1, ["1", "grown", "2", "again", "search"]),
-            (1.0, 4, 1.1, ["1", "2", "search", "grown", "again"]),
-            (1.0, math.inf, 0.9, None),
-        ],
-        ids=["all agree", "the second one does not", "the model may be right", "and all agree", "agreeing says nothing"],
-    )
-    def test_starts_that_grow_wait_while_the_best_end_is_not_alone(self, second, witnesses, misfit, order):
-        place, curvature = torch.zeros(1, dtype=torch.float64), torch.eye(1).double()[None]
-        names = {"grown": (0, True), "again": (0, True), "1": (1, False), "2": (2, False), "search": (-1, False)}
-        starts = {gauss_newton._Start(place.clone(), o, grows=grows): name for name, (o, grows) in names.items()}
-        ways, start, taken = gauss_newton._Ways(list(starts), 3, torch.zeros(1, dtype=torch.bool)), None, []
-        for loss in (1.0, second, *[1.0] * 4):
-            found = Linearisation(torch.tensor([loss]).double(), torch.zeros(1, 1).double(), curvature, 1)
-            ways.begin(start or gauss_newton._Start(place, 0), place, found)
-            if ways.waiting:
-                start = ways.following(gauss_newton._Enough(0.1, misfit, witnesses))
-                taken.append(starts[start])
-        assert taken == (order or list(names))
-
     def test_candidates_are_compared_by_fewer_points(self, monkeypatch):
         """One frame has all of a scenario's."""
 
@@ -742,117 +454,10 @@ class TestFits:
         )
         assert screened == [100]
 
-    @pytest.mark.parametrize(
-        ("recordings", "settings", "grows"),
-        [
-            (2, {}, True),
-            (2, {"starts": 1}, True),
-            (2, {"threshold": 1e-9}, True),
-            (2, {"init": {"stretch": 1.2}}, False),
-            (1, {}, False),
-            (1, {"starts": 1}, False),
-        ],
-        ids=["joint", "of one start", "with a threshold", "a start is given", "one recording", "and one start"],
-    )
-    def test_in_a_joint_fit_a_start_that_grows_comes_first(self, monkeypatch, recordings, settings, grows):
-        """Before anything else is simulated with derivatives."""
-
-        def stop(name):
-            def stopped(*given):
-                begun.append(name)
-                raise KeyboardInterrupt
-
-            return stopped
-
-        begun = []
-        monkeypatch.setattr(gauss_newton, "_grown", stop("grown"))
-        monkeypatch.setattr(gauss_newton, "linearise", stop("candidate"))
-        joint = JointObjective([lifted(nuisance={})] * recordings)
-        with pytest.raises(KeyboardInterrupt):
-            fit_gauss_newton(joint, SPACE, GaussNewtonSettings(screen=3, **settings))
-        assert begun == ["grown" if grows else "candidate"]
-
     def test_a_joint_fit_follows_as_many_starts_as_are_asked_for(self):
         pair = JointObjective([lifted(nuisance={}), lifted(nuisance={})])
         settings = GaussNewtonSettings(screen=3, iterations=1, starts=2)
         assert len(fit_gauss_newton(pair, SPACE, settings).history.losses[-1]) == 2
-
-    def test_rough_losses_never_grow(self, monkeypatch):
-        monkeypatch.setattr(gauss_newton, "_growths", lambda _: pytest.fail("it grows"))
-        pair = JointObjective(rough_pair(nuisance={}))
-        fit_gauss_newton(pair, SPACE, GaussNewtonSettings(screen=3, iterations=1, starts=2))
-
-    def test_a_joint_fit_tells_of_its_progress_from_the_first_frames_on(self):
-        pair, told = JointObjective([lifted(nuisance={}), lifted(nuisance={})]), []
-        found = fit_gauss_newton(pair, SPACE, GaussNewtonSettings(screen=3), progress=told.append)
-        assert found.values["stretch"] == pytest.approx(TRUTH["stretch"], rel=0.05)
-        assert [one.iteration for one in told[:2]] == [0, 0]
-        assert len(told) > found.iterations + 1  # while it grows, too
-        assert told[0].values.keys() == found.values.keys()
-        assert told[-1].best == found.loss
-
-    @pytest.mark.parametrize("after", [1, 3])
-    def test_what_has_grown_first_is_kept_when_interrupted(self, after):
-        pair, told = JointObjective([lifted(nuisance={}), lifted(nuisance={})]), []
-
-        def interrupt(progress):
-            told.append(progress)
-            if len(told) == after:
-                raise KeyboardInterrupt
-
-        found = fit_gauss_newton(pair, SPACE, GaussNewtonSettings(screen=3), progress=interrupt)
-        assert len(told) == after
-        assert found.stop_reason == "interrupted"
-        assert found.values == pytest.approx(dict(told[-1].values))
-        place = torch.tensor([list(found.values.values())], dtype=torch.float64)
-        assert found.loss == pytest.approx(float(batch_losses(pair, SPACE, place)))
-
-    def test_how_the_cloth_lies_waits_in_the_first_candidate(self):
-        place, curvature = torch.zeros(2, dtype=torch.float64), torch.eye(2).double()[None]
-        held = torch.tensor([False, True])
-        kinds = [True, False, True, False]  # whether a start grows
-        starts = [gauss_newton._Start(place.clone(), 0, grows=grows) for grows in kinds]
-        ways = gauss_newton._Ways(starts, 3, held)
-        when = gauss_newton._Enough(0.1, 0.9, 4)
-        order = []
-        while ways.waiting:
-            start = ways.following(when)
-            found = Linearisation(torch.ones(1).double(), torch.zeros(1, 2).double(), curvature, 1)
-            ways.begin(start, place, found)
-            order.append((start.grows, ways.every[-1]._held is not None))
-        assert order[:2] == [(True, False), (False, True)]
-        assert not any(waits for _, waits in order[2:])
-
-    def test_a_start_that_grows_tells_of_its_progress(self, monkeypatch):
-        """So that Ctrl-C ends it, also in a worker."""
-        monkeypatch.setattr(Objective, "knows_gaps", True)
-        objective = lifted(nuisance={})
-        monkeypatch.setattr(Objective, "explained", 0.5 * objective.explained)
-        told = []
-
-        def interrupt(progress):
-            told.append(progress.iteration)
-            if told.count(progress.iteration) == 3:
-                raise KeyboardInterrupt
-
-        found = fit_gauss_newton(objective, SPACE, GaussNewtonSettings(screen=7), progress=interrupt)
-        assert found.stop_reason == "interrupted"
-        assert found.loss == float(found.history.losses[-1].min())
-
-    @pytest.mark.slow
-    def test_a_fold_that_goes_astray_is_found_from_its_beginning(self):
-        """A heavy cloth folds over in another way than the nearest minimum has it."""
-        scenario, truth = load_scenario("fold"), {"stretch": 1.0, "mass": 2.5}
-        objective = Objective(scenario, clouds_of(scenario, points=1500, **truth), nuisance={})
-        space = FitSpace.build(["stretch"], bounds=scenario.bounds, fixed={"mass": truth["mass"]})
-        space = with_doubts(space, MATERIAL_DOUBTS, [scenario])
-        direct = fit_gauss_newton(objective, space, GaussNewtonSettings(starts=1))
-        assert direct.loss > 1.3 * objective.explained
-        # with a threshold, a start that grows follows the first candidate at once
-        found = fit_gauss_newton(objective, space, GaussNewtonSettings(threshold=objective.explained))
-        assert found.best_start == 1
-        assert found.loss < objective.explained
-        assert found.values["stretch"] == pytest.approx(truth["stretch"], rel=0.01)
 
     def test_the_truth_explains_a_recording_and_others_do_not(self):
         objective = lifted(nuisance={})
@@ -868,7 +473,7 @@ class TestFits:
         assert objective.explained == pytest.approx(2.0 / 1.25 * whole)
 
     def test_a_first_start_beyond_the_bounds_begins_at_the_bound(self):
-        settings = GaussNewtonSettings(starts=1, screen=0, scans=0, init={"stretch": 40.0, "mass": 1.0})
+        settings = GaussNewtonSettings(starts=1, screen=0, init={"stretch": 40.0, "mass": 1.0})
         found = fit_gauss_newton(lifted(), SPACE, settings)
         assert found.history.values[0][0].tolist() == pytest.approx([float(Axis.of(SPACE).high[0]), 1.0])
         assert found.loss < float(found.history.losses[0][0])

@@ -149,7 +149,7 @@ def test_the_size_of_a_cloth_is_found():
     assert recorded.gripper is not None
     short = recorded.gripper[:1] + (recorded.gripper - recorded.gripper[:1]) / 1.05
     objective = Objective(SCENARIO, replace(recorded, gripper=short), nuisance={})
-    settings = GaussNewtonSettings(starts=1, screen=0, scans=0, init={"stretch": 1.0})
+    settings = GaussNewtonSettings(starts=1, screen=0, init={"stretch": 1.0})
     space = with_laid(ASKED, [{"size": 0.1, "track": 0.1}], [SCENARIO])
     plain, sized = (fit_gauss_newton(objective, one, settings) for one in (ASKED, space))
     assert sized.values["size"] == pytest.approx(math.log(1 + LARGER), abs=0.005)
@@ -167,7 +167,7 @@ def test_depths_that_are_too_large_are_no_property_of_the_cloth():
     camera = np.array([1.2, 0.1, 0.9])
     large = replace(right, points=(camera + 1.04 * (right.points - camera)).astype(np.float32))
     shifts = {"x": 0.1, "y": 0.1, "z": 0.1}
-    settings = GaussNewtonSettings(starts=1, screen=0, scans=0, init={"stretch": 1.0})
+    settings = GaussNewtonSettings(starts=1, screen=0, init={"stretch": 1.0})
 
     def found(recorded, nuisance):
         objective = Objective(SCENARIO, recorded, nuisance=nuisance)

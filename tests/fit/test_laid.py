@@ -14,7 +14,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.evaluation.methods import space_of
 from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton, read_fit, write_fit
 from diffcloud.fit.laid import laid_nodes, parse_laid, with_laid
-from diffcloud.fit.names import of_all, of_recording, with_recording, without_recording
+from diffcloud.fit.names import of_all, of_recording, without_recording
 from diffcloud.fit.residuals import Axis
 from diffcloud.fit.result import describe_fit
 from diffcloud.fit.uncertainty import uncertainty
@@ -114,9 +114,6 @@ class TestSpace:
         joint = of_all(each)
         assert [of_recording(joint, number) for number in range(3)] == each
         assert without_recording(joint, 1) == of_all([each[0], each[2]])
-        for number, own in enumerate(each):
-            others = without_recording(joint, number)
-            assert with_recording(others, {name: own[name] for name in own if name != "size"}, number) == joint
         assert of_all(each[:1]) == each[0]
 
     def test_a_scenario_says_how_its_cloths_may_lie(self):
@@ -161,7 +158,7 @@ SPACE = with_laid(ASKED, [{"turn": 0.1, "shape": 0.01}], [SCENARIO])
 
 @pytest.fixture(scope="module")
 def fits(objective):
-    settings = GaussNewtonSettings(starts=1, screen=0, scans=0, init={"stretch": 1.0})
+    settings = GaussNewtonSettings(starts=1, screen=0, init={"stretch": 1.0})
     return [(space, settings, fit_gauss_newton(objective, space, settings)) for space in (ASKED, SPACE)]
 
 
@@ -208,11 +205,11 @@ def test_it_is_told_as_nuisance_and_read_back(objective, fits, tmp_path):
 
 
 def test_a_fit_may_begin_with_a_turn_to_the_other_side(objective):
-    settings = GaussNewtonSettings(iterations=1, starts=1, screen=0, scans=0, init={"stretch": 1.0, "turn": -0.1})
+    settings = GaussNewtonSettings(iterations=2, starts=1, screen=0, init={"stretch": 1.0, "turn": -0.1})
     outcome = fit_gauss_newton(objective, SPACE, settings)
     record = describe_fit(objective, SPACE, settings, outcome, episodes=["e"]).record
     assert record.start["turn"] == pytest.approx(-0.1)
-    assert outcome.values["turn"] > 0.0  # it need not wait
+    assert outcome.values["turn"] > 0.0
 
 
 def test_intervals_know_what_it_leaves_open(objective, fits):
@@ -221,21 +218,3 @@ def test_intervals_know_what_it_leaves_open(objective, fits):
     assert {"turn", "shape"} <= set(found.sources)
     assert not WAVES & set(found.sources)
     assert {"turn", "shape"} <= found.besides
-
-
-def test_one_start_has_it_wait_and_others_do_not(objective, fits, monkeypatch):
-    """Else more minima are wrong; and a cloth that lies askew would always be taken for another material first."""
-    (stretch, turn), (_, _, outcome) = (SPACE.names.index(name) for name in ("stretch", "turn")), fits[1]
-    first = torch.stack([values[0] for values in outcome.history.values])
-    waiting = int((first[:, turn] == 0).sum())
-    assert 2 < waiting < len(first)
-    assert not first[:waiting, turn].any()
-    assert first[waiting:, turn].all()
-    assert first[0, stretch] != first[waiting - 1, stretch]
-    alone = with_laid(ASKED, [{"turn": 0.1}], [SCENARIO])
-    settings = GaussNewtonSettings(starts=1, screen=0, scans=0, iterations=1, init={"stretch": 1.0})
-    assert fit_gauss_newton(objective, alone, settings).values["turn"] != 0  # fewer steps so, and no worse ends
-    monkeypatch.setattr(type(objective), "explained", 0.0)  # so that the second one is followed
-    settings = GaussNewtonSettings(starts=2, screen=0, scans=0, iterations=3)
-    second = torch.stack([values[1] for values in fit_gauss_newton(objective, SPACE, settings).history.values])
-    assert second[-1, turn] != 0

@@ -315,7 +315,7 @@ class TestStopped:
 
         words = [*COMMAND, "--parameters", "stretch"]
         with monkeypatch.context() as patch:
-            patch.setattr(fit_jobs, "solve_and_refine", stop)
+            patch.setattr(fit_jobs, "solve", stop)
             told = invoke(*words, code=130).result
         check_unfinished(Path("found"), told, "interrupted", "Ctrl-C was pressed")
         assert told["explains"] is None

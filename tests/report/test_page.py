@@ -61,13 +61,6 @@ def test_a_number_that_is_not_known_is_a_dash():
     assert "nan" not in main_of(page_of())
 
 
-def test_a_finer_mesh_than_the_scenarios_is_told():
-    one = entry()
-    assert "as long" not in main_of(page_of(one))
-    one.fit.halvings = 2
-    assert "edges 1/4 as long" in main_of(page_of(one))
-
-
 def test_the_summary_says_how_close_a_fit_comes():
     close = entry()
     close.row["fitted_ratio"] = 2.2 * 1.003

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
-
-from diffcloud.fit.scan import Scan
 
 if TYPE_CHECKING:
     from diffcloud.fit.solvers.likelihood import Estimate
@@ -60,25 +58,8 @@ class FitOutcome:
     history: FitHistory
     failures: tuple[str, ...] = ()
     """Messages of starts that diverged."""
-    scan: Scan | None = None
-    """Of the place where it ended, which then has no lower minimum beside it."""
     estimate: Estimate | None = None
     """Of the solver `likelihood`, which knows its uncertainty."""
-
-    def gone_on(self, further: FitOutcome) -> FitOutcome:
-        """This fit, whose best start went on by itself, with what came of that."""
-        history, column = self.history, self.best_start
-        rows = [(history.losses, further.history.losses), (history.values, further.history.values)]
-        rows += [(history.gradients, further.history.gradients)] if history.gradients else []
-        longer = [[*one, *(torch.cat([one[-1][:column], row, one[-1][column + 1 :]]) for row in new)] for one, new in rows]
-        return replace(
-            further,
-            best_start=column,
-            simulations=self.simulations + further.simulations,
-            seconds=self.seconds + further.seconds,
-            history=FitHistory(history.names, *longer),
-            failures=(*self.failures, *further.failures),
-        )
 
     def uninterrupted(self) -> FitOutcome:
         """This fit, for who has no use for one that Ctrl-C has cut short.
