@@ -198,7 +198,7 @@ class FitJob:
         objective = self.objective()
         outcome = solve(objective, self.space, self.solver_settings, progress=progress)
         if outcome.estimate is not None:  # frames beyond the horizon said nothing
-            objective = objective.earliest(outcome.estimate.horizons)
+            objective = _joined(outcome.estimate.members)
         return objective, outcome
 
     def known(self) -> FitRecord | None:

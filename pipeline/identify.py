@@ -52,6 +52,7 @@ _BOUNDS = {"stretch": (0.03, 30.0), "bending": (0.03, 30.0), "mass": (0.2, 5.0)}
 _BAGS = (".bag", ".mcap", ".db3")
 _CLOTH_FIELDS = ("base", "size_m", "nodes", "material", "grip", "grip_m", "steps_per_frame")
 _STEPS = 16
+_GRIP_KNOWN = 1.5
 _TRANSFERS, _GAIN = 1.25, 0.5
 _Fitted = tuple[FitRecord, AnyObjective, FitJob]
 """A fit, what it minimised, and the job."""
@@ -300,6 +301,7 @@ def _cloth(
             "pad", "fingers level; or upright_pad (pinched from above), or pivot (a point that lets the cloth turn)"
         ),
         "grip_m": Found(GRIP_M, "side of the pad, or of the square that a pivot stands for; measure your gripper's [m]"),
+        "grip_known_within": Found(_GRIP_KNOWN, "factor within which grip_m is known; 1.05 if you have measured it"),
         "material": Found(material, f"what multipliers act on; density {told}"),
         **{name: Found(value, "usual; fitted too, within `doubts`") for name, value in _AROUND.items()},
         "doubts": Found(_DOUBTS, "factors within which what nobody asks for is known"),

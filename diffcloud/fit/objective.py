@@ -180,6 +180,20 @@ class Objective:
         """The recorded clouds of the L compared frames."""
         return self._target.clouds
 
+    def of(self, scenario: Scenario) -> Objective:
+        """The same recording compared with another scenario of it."""
+        found = Objective(
+            scenario,
+            self.episode,
+            paper=self.paper,
+            nuisance=self.nuisance,
+            frames=self.frames,
+            points=self.asked_points,
+            seed=self._seed,
+        )
+        found.asked_frames = self.asked_frames
+        return found
+
     def reseed(self, seed: int) -> None:
         """Draw the common random numbers anew."""
         self._seed = seed

@@ -299,6 +299,12 @@ def _usable(
 
 
 def _found_cut(system: System, episode: Episode, unit: float) -> float | None:
+    """The height below which nothing was recorded: of the cut planes where each camera has one, at the cloth's middle, else
+    as the points show it."""
+    planes = episode.cut_planes
+    if planes and planes.keys() >= episode.viewpoints.keys() and all(plane[2] > 0 for plane in planes.values()):
+        x, y, _ = system.mesh.nodes.mean(axis=0)
+        return min(float(d - a * x - b * y) / float(c) for a, b, c, d in planes.values())
     low = float(np.quantile(episode.points[:, 2], _LOWEST))
     return low if low > system.mesh.nodes[:, 2].min() + _CUT_M / unit else None
 

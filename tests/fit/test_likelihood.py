@@ -15,6 +15,7 @@ from diffcloud.fit.parameters import Variable
 from diffcloud.fit.solvers import LikelihoodSettings, fit_likelihood, likelihood
 from diffcloud.fit.solvers.likelihood import Answer, Estimate, Frames
 from diffcloud.scene.scenarios import load_scenario
+from diffcloud.scene.scenarios.grid import LIFT, GridScenario, grid_scenario
 from tests.conftest import small_lift
 from tests.fit.test_fit import GENTLE, clouds_of
 
@@ -76,7 +77,7 @@ class TestRecording:
     def at(self, member, place, shift=None, asked=None):
         (recording,) = member.recordings
         with torch.no_grad():
-            return likelihood._Linear.at(recording, place).frames(place, shift, asked)
+            return likelihood._Linear.at(recording, place).frames(place, likelihood._Changes(shift), asked)
 
     def test_slopes_are_those_of_the_squares(self, member):
         """By material and pose, forth and back, in all frames but those in which points begin to count."""
@@ -110,6 +111,60 @@ class TestRecording:
             assert member.horizons(member.start({}, 0.0)) == (count,)
 
 
+class TestGrasp:
+    def scenario(self, size, within=1.5):
+        options = {"nodes": (7, 7), "size_m": (0.3, 0.3), "frames": 10, "steps_per_frame": 8, "air": "none"}
+        options |= {"grip_m": size, "grip_known_within": within, "laid_turn_deg": 0.0}
+        return grid_scenario(GridScenario.model_validate({**LIFT.model_dump(), **options}))
+
+    def test_what_it_changes_is_that_of_the_simulated_ones(self, generator):
+        smaller, larger = torch.randn(2, 1, 3, 5, 3, generator=generator).double()
+        first, second = likelihood._in_powers([smaller, larger])
+        torch.testing.assert_close(first + second, larger)
+        torch.testing.assert_close(second - first, smaller)
+        first, second = likelihood._in_powers([smaller])
+        torch.testing.assert_close(second - first, smaller)
+        assert likelihood._in_powers([smaller, None]) is None
+        assert likelihood._in_powers([]) is None
+
+    def test_its_slope_is_that_of_the_squares(self):
+        episode = clouds_of(self.scenario(0.03), points=2000)
+        whole = likelihood._Likelihood([Objective(self.scenario(0.02), episode, nuisance=POSE)], SPACE, 12)
+        (recording,), place = whole.recordings, whole.start({}, 0.0)
+        assert len(place) == len(SPACE.names) + len(POSE) + 1
+        linear = likelihood._Linear.at(recording, place)
+        grips = [recording.change(place, linear.nodes, other) for other in recording.regripped]
+        assert len(grips) == 2
+        changes, step, column = likelihood._Changes(None, likelihood._in_powers(grips)), 1e-3, len(SPACE.names)
+        place[-1] = 0.5
+        away = torch.zeros_like(place)
+        away[-1] = step
+        above, below = (linear.frames(place + sign * away, changes).squares for sign in (1, -1))
+        central, told = (above - below) / (4 * step), linear.frames(place, changes).slopes[..., column]
+        # from recorded points to the surface; the other way, points jump between faces, whose areas change
+        torch.testing.assert_close(told[1], central[1], rtol=1e-3, atol=1e-3 * float(central[1].abs().max()))
+
+    @pytest.mark.slow
+    def test_a_grasp_that_was_stated_too_small_is_found(self):
+        """Stretching would make up for it."""
+        truth = {"stretch": 5.0, "mass": 1.0}
+        episode = clouds_of(self.scenario(0.024, 1.0).finer(), points=2000, **truth)
+        space = FitSpace((Variable("stretch", 0.03, 300.0, 10.0, 1.0),), {"mass": 1.0})
+        believed, found = (
+            fit_likelihood(
+                Objective(self.scenario(0.016, within), episode, nuisance={}), space, LikelihoodSettings()
+            ).estimate
+            for within in (1.0, 1.5)
+        )
+        grip = found.grip + float(found.best.place[-1])
+        assert 0.4 < grip < 1.3  # the truth is one deviation larger
+        off, believed_off = (math.log(one.values["stretch"] / truth["stretch"]) for one in (found, believed))
+        assert believed_off > 0.5
+        assert abs(off) < 0.4 * believed_off
+        assert {"grasp"} == {*found.sources} - {*believed.sources}
+        assert found.members[0].scenario.scene.handles.grasp.size == pytest.approx(0.016 * 1.5**found.grip)
+
+
 class TestMixture:
     def answers(self, *energies):
         return tuple(
@@ -121,14 +176,14 @@ class TestMixture:
         )  # fmt: skip
 
     def test_equally_likely_answers(self):
-        found = Estimate(FitSpace((SPACE.variables[0],), {}), self.answers(3.0, 3.0), (5,), 2)
+        found = Estimate(FitSpace((SPACE.variables[0],), {}), self.answers(3.0, 3.0), (), 0.0, 2)
         assert found.weights.tolist() == [0.5, 0.5]
         assert float(found.mean) == 0.5
         assert float(found.covariance) == pytest.approx(0.5 + 0.25)
         assert float(found.sources["starts"]) == pytest.approx(0.25)
 
     def test_an_unlikely_one_hardly_counts(self):
-        found = Estimate(FitSpace((SPACE.variables[0],), {}), self.answers(0.0, 40.0), (5,), 2)
+        found = Estimate(FitSpace((SPACE.variables[0],), {}), self.answers(0.0, 40.0), (), 0.0, 2)
         assert float(found.mean) < 1e-8
         assert float(found.covariance) == pytest.approx(0.5, abs=1e-7)
 

@@ -239,12 +239,23 @@ class TestWhatCounts:
         place = [0.1, 0.1, 9.0]
         meta = {"cameras": ["one", "two"], "viewpoints": {"one": place, "two": place}}
         planes = {"two": [0.0, 0.0, 1.0, 9.0]}
-        whole, cut, gone = (
+        whole, cut = (
             found_at(Objective(scenario, replace(episode, meta=told), nuisance={}), TRUTH)["counted"]
-            for told in (meta, meta | {"cut_planes": planes}, meta | {"cut_planes": planes | {"one": planes["two"]}})
+            for told in (meta, meta | {"cut_planes": planes})
         )
         assert cut == whole
-        assert max(gone) == 0.0
+        with pytest.raises(EpisodeError, match="of the cloth lies above the cut, 9.000 m"):
+            Objective(scenario, replace(episode, meta=meta | {"cut_planes": planes | {"one": planes["two"]}}))
+
+    def test_frames_are_those_with_enough_above_the_lowest_cut_plane(self, scenario, episode):
+        """Also where the points alone would not show that they were cut."""
+        meta = {"cameras": ["one", "two"], "viewpoints": {"one": [0.1, 0.1, 9.0], "two": [0.1, 0.2, 9.0]}}
+        heights = episode.points[:, 2]
+        low, high = (float(np.quantile(heights, part)) for part in (0.5, 0.7))
+        planes = {"one": [0.0, 0.0, 1.0, high], "two": [0.0, 0.0, 2.0, 2 * low]}
+        told = Objective(scenario, replace(episode, meta=meta | {"cut_planes": planes}), nuisance={})
+        assert told.cut == pytest.approx(low)
+        assert len(told.frames) < len(Objective(scenario, replace(episode, meta=meta), nuisance={}).frames)
 
     @pytest.mark.parametrize(
         "told",

@@ -14,8 +14,9 @@ After some time nobody can predict which fold forms: there, derivatives explode.
 finer mesh and the given one part. The finer mesh also corrects the positions: its difference to the given mesh is added to
 the simulated nodes. What half of that difference would change is a part of the uncertainty.
 
-The variables are those of the space and the pose of each recording. Gauss and Newton's steps, bounded in each variable, go
-from three starts; the answers are weighed by their likelihoods.
+The variables are those of the space, the pose of each recording, and the size of the grasp where that is not known. What
+the grasp's size changes is interpolated between three sizes; the first start tells which ones. Gauss and Newton's steps,
+bounded in each variable, go from three starts; the answers are weighed by their likelihoods.
 """
 
 from __future__ import annotations
@@ -24,13 +25,14 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloud.errors import DivergedError
+from diffcloud.errors import DivergedError, SceneError
 from diffcloud.fit.bounded import lowest_within
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.matching import Pairs
@@ -74,6 +76,10 @@ _EDGE = 1e-6
 """Distance from a bound, where nothing would pull back."""
 _FAR = 100.0
 """Bound on a pose, in deviations."""
+_FAR_GRIP = 2.0
+"""And on the size of a grasp: what it changes is known in between -1 and 1."""
+_REGRIP = 0.3
+"""From there on, it is simulated with the size that the first start has found."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +132,8 @@ class Answer:
     """Where one start ended."""
 
     place: Tensor
-    """[K] variables of the space on their axis, and then the pose of each recording in deviations of its prior."""
+    """[K] variables of the space on their axis; then the pose of each recording and, last, the size of the grasp where it
+    is not known, in deviations of their priors."""
     covariance: Tensor
     """[K, K]"""
     sources: Mapping[str, Tensor]
@@ -149,8 +156,10 @@ class Estimate:
     space: FitSpace
     answers: tuple[Answer, ...]
     """Of all starts that were followed to their end, the likeliest first."""
-    horizons: tuple[int, ...]
-    """Of each recording, how many of its compared frames count."""
+    members: tuple[Objective, ...]
+    """The recordings up to their horizons, with the grasp that was simulated."""
+    grip: float
+    """Of these, in deviations from the size that was given."""
     simulations: int
     interrupted: bool = False
 
@@ -193,18 +202,33 @@ class Estimate:
         return dict(zip(self.space.names, axis.bounded(self.best.place[: len(self.space.names)]).tolist(), strict=True))
 
 
+def _regripped(scenario: Scenario) -> list[Scenario]:
+    """With a smaller grasp and, where its pad holds the same nodes, a larger one; none where its size is known."""
+    if scenario.regrip is None:
+        return []
+    smaller = scenario.regrip(-1.0)
+    try:
+        larger = scenario.regrip(1.0)
+    except SceneError:  # too large for the cloth
+        return [smaller]
+    return [smaller, larger] if larger.scene.handles.nodes == scenario.scene.handles.nodes else [smaller]
+
+
 class _Recording:
     """One recording up to its horizon, on the given mesh and the finer one."""
 
-    def __init__(self, objective: Objective, space: FitSpace, columns: Tensor, first_pose: int) -> None:
+    def __init__(self, objective: Objective, space: FitSpace, columns: Tensor, first_pose: int, grip: int) -> None:
         """
         Args:
             space: of this recording, and the places of its variables among all.
             first_pose: place of the first variable of its pose.
+            grip: place of the grasp's size.
         """
         self.objective, self.space, self.axis = objective, space, Axis.of(space)
         poses = len(objective.pose_space.names)
-        self.columns = torch.cat([columns, first_pose + torch.arange(poses)])
+        self.regripped, self.grip = _regripped(objective.scenario), grip
+        of_grip = [grip] if self.regripped else []
+        self.columns = torch.cat([columns, torch.tensor(of_grip, dtype=torch.long), first_pose + torch.arange(poses)])
         self.motion = columns
         self.poses = slice(first_pose, first_pose + poses)
         unit = objective.length_unit_m
@@ -228,6 +252,15 @@ class _Recording:
 
 
 @dataclass(frozen=True)
+class _Changes:
+    """By how much variants of one scenario move the nodes, [1, L, C · V, 3] each; None: not known."""
+
+    finer: Tensor | None = None
+    grip: tuple[Tensor, Tensor] | None = None
+    """By a grasp g standard deviations larger, in powers of g: the first and the second one."""
+
+
+@dataclass(frozen=True)
 class _Linear:
     """The motion of one recording at a place, and how it changes."""
 
@@ -245,20 +278,25 @@ class _Linear:
             velocities = objective.still_bodies(objective.velocities(moved.run))
         return _Linear(recording, objective.looked_at(moved.run), moved.rates, velocities)
 
-    def frames(self, place: Tensor, shift: Tensor | None, asked: Tensor | None = None) -> Frames:
+    def frames(self, place: Tensor, changes: _Changes, asked: Tensor | None = None) -> Frames:
         """
         Args:
-            shift: [1, L, C · V, 3] added to the nodes.
-            asked: likewise, whose effect on the slopes is wanted.
+            asked: [1, L, C · V, 3] of the nodes, whose effect on the slopes is wanted.
         """
         one = self.recording
         objective, space = one.objective, one.objective.pose_space
         pose = (place[one.poses] * space.deviations)[None]
-        nodes = self.nodes if shift is None else self.nodes + shift
+        nodes, rates, shift = self.nodes, self.rates, changes.finer
+        if shift is not None:
+            nodes = nodes + shift
+        if one.regripped:
+            first, second = changes.grip or (torch.zeros_like(nodes), torch.zeros_like(nodes))
+            off = place[one.grip]
+            nodes, rates = nodes + off * first + off**2 * second, torch.cat([rates, (first + 2 * off * second)[None]])
         motion = objective.matched(objective.with_bodies(nodes), self.velocities, pose)
-        points, columns = objective.columns(motion, self.rates)
+        points, columns = objective.columns(motion, rates)
         views, ways = motion.shown(space), list[tuple[Tensor, Tensor, Tensor, Tensor]]()
-        units = torch.cat([torch.ones(len(self.rates)).double(), space.deviations])[:, None, None, None, None]
+        units = torch.cat([torch.ones(len(rates)).double(), space.deviations])[:, None, None, None, None]
         for pairs, at, moves in zip(motion.pairs, points, columns, strict=True):
             normals = pairs.normals
             if normals is None:
@@ -304,23 +342,49 @@ def _squared(shift: Tensor) -> Tensor:
     return shift[0].square().sum(-1).mean(-1)
 
 
+def _in_powers(grips: Sequence[Tensor | None]) -> tuple[Tensor, Tensor] | None:
+    """What a smaller grasp changes, and maybe a larger one, in powers of its size."""
+    known = [one for one in grips if one is not None]
+    if not grips or len(known) < len(grips):
+        return None
+    if len(known) == 1:
+        return -known[0], torch.zeros_like(known[0])
+    smaller, larger = known
+    return (larger - smaller) / 2, (larger + smaller) / 2
+
+
 class _Likelihood:
     """Φ of all recordings."""
 
-    def __init__(self, objectives: Sequence[Objective], space: FitSpace, iterations: int) -> None:
+    def __init__(self, objectives: Sequence[Objective], space: FitSpace, iterations: int, grip: float = 0.0) -> None:
+        """
+        Args:
+            grip: of the scenarios, in deviations from the size that was given.
+        """
         self.space, self.axis, self.iterations = space, Axis.of(space), iterations
-        self.recordings, self.simulations = list[_Recording](), 0
+        self.recordings, self.simulations, self.grip = list[_Recording](), 0, grip
         variables = count = len(space.names)
+        last = variables + sum(len(one.pose_space.names) for one in objectives)
         for index, objective in enumerate(objectives):
             own, columns = space.of_recording(index)
-            self.recordings.append(_Recording(objective, own, columns, count))
+            self.recordings.append(_Recording(objective, own, columns, count, last))
             count += len(objective.pose_space.names)
-        steps, poses = space.prior_steps(), torch.ones(count - variables, dtype=torch.float64)
+        asked = [index for index, one in enumerate(space.variables) if not one.doubtful]
+        self.asked = torch.tensor(asked, dtype=torch.long)
+        self.changes = [_Changes() for _ in self.recordings]
+        self.looked: Tensor | None = None
+        """Where these were last found."""
+        self.knows_grip = not any(one.regripped for one in self.recordings)
+        self.poses = count - variables
+        steps, poses = space.prior_steps(), torch.ones(self.poses + (not self.knows_grip), dtype=torch.float64)
         self.precision = torch.cat([torch.where(steps > 0, 1 / steps.square(), 0.0), poses])
         low, high = self.axis.ends
-        self.low, self.high = torch.cat([low + _EDGE, -_FAR * poses]), torch.cat([high - _EDGE, _FAR * poses])
+        far = _FAR * poses
+        far[self.poses :] = _FAR_GRIP
+        self.low, self.high = torch.cat([low + _EDGE, -far]), torch.cat([high - _EDGE, far])
         centres = [0.0 if one.deviation is not None else one.centre for one in space.variables]
         self.centre = torch.cat([self.axis.places(torch.tensor(centres, dtype=torch.float64)), 0 * poses])
+        self.centre[count:] = -grip
 
     def inside(self, place: Tensor) -> Tensor:
         return torch.minimum(torch.maximum(place, self.low), self.high)
@@ -348,18 +412,42 @@ class _Likelihood:
             if name in init:
                 place[index] = self.axis.places(torch.full((len(self.space.names),), init[name]).double())[index]
         place[0] += offset
+        place[len(self.space.names) :] = 0.0
         return self.inside(place)
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """Φ at a place, and how it changes."""
+
+    energy: float
+    slope: Tensor
+    """[K] half of it."""
+    matrix: Tensor
+    """[K, K] half of the Gauss–Newton matrix."""
+    square: float
+    """Mean squared distance."""
+
+    @cached_property
+    def covariance(self) -> Tensor:
+        return torch.linalg.inv(self.matrix)
+
+    @property
+    def deviations(self) -> Tensor:
+        return self.covariance.diagonal().sqrt()
 
 
 @dataclass(frozen=True)
 class _Reached:
     """The last place of a descent that counts."""
 
-    energy: float
     place: Tensor
     linear: list[_Linear]
-    matrix: Tensor
-    covariance: Tensor
+    terms: _Terms
+
+    @property
+    def energy(self) -> float:
+        return self.terms.energy
 
 
 class _Descent:
@@ -372,8 +460,6 @@ class _Descent:
         """
         self.of, self.place, self._tell = likelihood, place, tell
         self.reached: _Reached | None = None
-        self._shifts: list[Tensor | None] = [None] * len(likelihood.recordings)
-        self._looked = place
         self._trace: list[tuple[float, Tensor]] = []
 
     def run(self, to_beat: float) -> Answer | None:
@@ -393,48 +479,58 @@ class _Descent:
                     raise
                 place, radius = 0.5 * (place + best.place), max(0.5 * radius, _NARROW)
                 continue
-            if best is None:
+            if of.looked is None:
                 self._look(linear, place)
-            energy, slope, matrix, square = self._terms(linear, place)
-            if best is not None and energy > best.energy + allowed:
+            terms = self._terms(linear, place)
+            if best is not None and terms.energy > best.energy + allowed:
                 tried += 1
                 if tried > _HALVINGS:
                     break
                 place, radius = 0.5 * (place + best.place), max(0.5 * radius, _NARROW)
                 continue
             tried = 0
-            if best is not None and self._stale(best, place):
+            step = self._step(terms, place, radius)
+            if bool((step[of.asked].abs() < radius).all()) and self._stale(terms, place):  # on its way it need not know
                 self._look(linear, place)
-                energy, slope, matrix, square = self._terms(linear, place)
-            self.reached = _Reached(energy, place, linear, matrix, torch.linalg.inv(matrix))
-            self._trace.append((square, place))
-            self._tell(len(self._trace), square, place)
-            box = torch.full_like(place, radius)
-            step = lowest_within(matrix, slope, torch.maximum(-box, of.low - place), torch.minimum(box, of.high - place))
+                terms = self._terms(linear, place)
+                step = self._step(terms, place, radius)
+            self.reached = _Reached(place, linear, terms)
+            self._trace.append((terms.square, place))
+            self._tell(len(self._trace), terms.square, place)
             if len(self._trace) >= _FEWEST_STEPS:
-                if bool((step.abs() < _SMALL * self.reached.covariance.diagonal().sqrt()).all()):
+                if bool((step.abs() < _SMALL * terms.deviations).all()):
                     return self.answer(converged=True)
-                gain = -float(2 * slope @ step + step @ matrix @ step)
-                if energy - _GAINS * gain > to_beat + _BEHIND:
+                gain = -float(2 * terms.slope @ step + step @ terms.matrix @ step)
+                if terms.energy - _GAINS * gain > to_beat + _BEHIND:
                     return None
             place, radius = of.inside(place + step), min(1.5 * radius, _RADIUS)
         return self.answer(converged=False)
+
+    def _step(self, terms: _Terms, place: Tensor, radius: float) -> Tensor:
+        box = torch.full_like(place, radius)
+        low, high = torch.maximum(-box, self.of.low - place), torch.minimum(box, self.of.high - place)
+        return lowest_within(terms.matrix, terms.slope, low, high)
 
     def _linear(self, place: Tensor) -> list[_Linear]:
         self.of.simulations += len(self.of.recordings)
         return map_threads(lambda one: _Linear.at(one, place), self.of.recordings)
 
-    def _stale(self, best: _Reached, place: Tensor) -> bool:
+    def _stale(self, terms: _Terms, place: Tensor) -> bool:
         """Whether the finer mesh was last simulated too far away."""
-        asked = [not one.doubtful for one in self.of.space.variables]
-        moved = (place - self._looked).abs() / best.covariance.diagonal().sqrt()
-        return bool((moved[: len(asked)][torch.tensor(asked)] > _REFRESH).any())
+        assert self.of.looked is not None
+        away = (place - self.of.looked).abs() / terms.deviations
+        return bool((away[self.of.asked] > _REFRESH).any())
 
     def _look(self, linear: Sequence[_Linear], place: Tensor) -> None:
-        """Simulate the finer mesh here."""
-        self._looked = place
-        found = map_threads(lambda one: self._changed(one, place, one.recording.finer), linear)
-        self._shifts = [old if new is None else new for old, new in zip(self._shifts, found, strict=True)]
+        """Simulate the finer mesh here, and another grasp."""
+        self.of.looked = place
+
+        def look(one: _Linear, old: _Changes) -> _Changes:
+            finer = self._changed(one, place, one.recording.finer)
+            grips = [self._changed(one, place, other) for other in one.recording.regripped]
+            return _Changes(old.finer if finer is None else finer, _in_powers(grips) or old.grip)
+
+        self.of.changes = map_threads(lambda pair: look(*pair), [*zip(linear, self.of.changes, strict=True)])
 
     def _changed(self, one: _Linear, place: Tensor, variant: Scenario) -> Tensor | None:
         """By how much a variant of the scenario moves the nodes; None where it diverges."""
@@ -444,43 +540,45 @@ class _Descent:
         except DivergedError:
             return None
 
-    def _terms(self, linear: Sequence[_Linear], place: Tensor) -> tuple[float, Tensor, Tensor, float]:
-        """Φ, half of its slope and Gauss–Newton matrix, and the mean squared distance."""
+    def _terms(self, linear: Sequence[_Linear], place: Tensor) -> _Terms:
         of, squares = self.of, list[float]()
         off = torch.where(of.precision > 0, place - of.centre, 0.0)
         energy, slope, matrix = float((of.precision * off.square()).sum()), of.precision * off, torch.diag(of.precision)
-        for one, shift in zip(linear, self._shifts, strict=True):
-            frames, n, columns = one.frames(place, shift), one.recording.independent, one.recording.columns
+        for one, changes in zip(linear, self.of.changes, strict=True):
+            frames, n, columns = one.frames(place, changes), one.recording.independent, one.recording.columns
             energy += n * frames.energy()
             weights = n * frames.weights
             slope[columns] += torch.einsum("wl,wlk->k", weights, frames.slopes)
             matrix[columns[:, None], columns] += torch.einsum("wl,wlab->ab", weights, frames.curvatures)
             squares.append(float(frames.squares.mean()))
-        return energy, slope, matrix, float(np.mean(squares))
+        return _Terms(energy, slope, matrix, float(np.mean(squares)))
 
     def answer(self, *, converged: bool) -> Answer:
         """Of the place that was reached."""
         assert self.reached is not None
-        place, covariance, of = self.reached.place, self.reached.covariance, self.of
+        place, terms, of = self.reached.place, self.reached.terms, self.of
+        covariance = terms.covariance
         precision = torch.diag(of.precision)
-        sources = {"recording": covariance @ (self.reached.matrix - precision) @ covariance}
+        sources = {"recording": covariance @ (terms.matrix - precision) @ covariance}
         for index, variable in enumerate(of.space.variables):
             name = plain_name(variable.name) if variable.doubtful else "prior"
             part = of.precision[index] * torch.outer(covariance[index], covariance[index])
             sources[name] = sources[name] + part if name in sources else part
-        poses = covariance[len(of.space.names) :]
+        poses = covariance[len(of.space.names) : len(of.space.names) + of.poses]
         sources["pose"] = poses.T @ poses
+        if not of.knows_grip:
+            sources["grasp"] = torch.outer(covariance[-1], covariance[-1])
         sources |= {name: torch.zeros_like(covariance) for name in ("mesh", "time step")}
         misfits, apart = [], []
-        for one, shift in zip(self.reached.linear, self._shifts, strict=True):
-            recording = one.recording
+        for one, known in zip(self.reached.linear, self.of.changes, strict=True):
+            recording, shift = one.recording, known.finer
             stepped = recording.objective.scenario.with_steps(2)
             changes = {"mesh": None if shift is None else shift / 2, "time step": self._changed(one, place, stepped)}
-            frames = one.frames(place, shift)
+            frames = one.frames(place, known)
             weights = recording.independent * frames.weights
             for name, change in changes.items():
                 if change is not None:
-                    pulled = torch.einsum("wl,wlk->k", weights, one.frames(place, shift, change).shifted)
+                    pulled = torch.einsum("wl,wlk->k", weights, one.frames(place, known, change).shifted)
                     moved = covariance[:, recording.columns] @ pulled
                     sources[name] = sources[name] + torch.outer(moved, moved)
             misfits.append(frames.misfits.tolist())
@@ -512,39 +610,71 @@ def estimate(
         DivergedError: the motion diverges from every start.
         KeyboardInterrupt: before the first place was compared.
     """
-    whole = _Likelihood(objective.members, space, settings.iterations)
-    first = whole.start(settings.init, 0.0)
-    horizons = whole.horizons(first)
-    likelihood = _Likelihood(objective.earliest(horizons).members, space, settings.iterations)
-    answers, failures, interrupted = list[Answer](), list[DivergedError](), False
-    for number in range(settings.starts):
+    likelihood = _up_to_horizon(objective.members, space, settings)
+    answers, failures, descent = list[Answer](), list[DivergedError](), None
 
-        def tell(step: int, square: float, place: Tensor, number: int = number) -> None:
+    def follow(number: int, place: Tensor) -> Answer | None:
+        nonlocal descent
+
+        def tell(step: int, square: float, place: Tensor) -> None:
             if progress is not None:
                 values = likelihood.axis.values(place[: len(space.names)]).tolist()
                 progress(number, step, square, dict(zip(space.names, values, strict=True)))
 
-        away = _START * ((number + 1) // 2) * (1 if number % 2 else -1)
-        descent = _Descent(likelihood, likelihood.start(settings.init, away), tell)
+        descent = _Descent(likelihood, place, tell)
         try:
-            found = descent.run(min((one.energy for one in answers), default=math.inf))
+            return descent.run(min((one.energy for one in answers), default=math.inf))
         except DivergedError as error:
             failures.append(error)
-            continue
-        except KeyboardInterrupt:
-            interrupted = True
-            if not answers and descent.reached is None:
+            return None
+
+    interrupted, simulations = False, 0
+    try:
+        for number in range(settings.starts):
+            away = _START * ((number + 1) // 2) * (1 if number % 2 else -1)
+            found = follow(number, likelihood.start(settings.init, away))
+            off = 0.0 if number or found is None or likelihood.knows_grip else float(found.place[-1])
+            if found is not None and abs(off) > _REGRIP:
+                simulations += likelihood.simulations
+                place = torch.cat([found.place[:-1], torch.zeros(1, dtype=torch.float64)])
+                likelihood = _up_to_horizon(objective.members, space, settings, off, place)
+                found = follow(number, place)
+            if found is not None:
+                answers.append(found)
+    except KeyboardInterrupt:
+        interrupted = True
+        if not answers:
+            if descent is None or descent.reached is None:
                 raise
-            if not answers:
-                answers.append(descent.answer(converged=False))
-            break
-        if found is not None:
-            answers.append(found)
+            answers.append(descent.answer(converged=False))
     if not answers:
         raise failures[0]
     answers.sort(key=lambda one: one.energy)
-    simulations = whole.simulations + likelihood.simulations
-    return Estimate(space, tuple(answers), horizons, simulations, interrupted)
+    members = tuple(one.objective for one in likelihood.recordings)
+    return Estimate(space, tuple(answers), members, likelihood.grip, simulations + likelihood.simulations, interrupted)
+
+
+def _up_to_horizon(
+    members: Sequence[Objective],
+    space: FitSpace,
+    settings: LikelihoodSettings,
+    grip: float = 0.0,
+    place: Tensor | None = None,
+) -> _Likelihood:
+    """Of the frames that count.
+
+    Args:
+        grip: in deviations from the size that was given.
+        place: where the horizon is looked for; by default where the first start begins.
+    """
+    if grip:
+        members = [one.of(one.scenario.regrip(grip)) if one.scenario.regrip else one for one in members]
+    whole = _Likelihood(members, space, settings.iterations, grip)
+    horizons = whole.horizons(whole.start(settings.init, 0.0) if place is None else place)
+    known = [one.earliest([count]) for one, count in zip(members, horizons, strict=True)]
+    found = _Likelihood(known, space, settings.iterations, grip)
+    found.simulations = whole.simulations
+    return found
 
 
 def fit_likelihood(

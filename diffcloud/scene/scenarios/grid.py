@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Annotated, Literal
 
@@ -59,6 +59,8 @@ class GridScenario(ScenarioOptions):
     lets it turn (`pivot`)."""
     grip_m: Length = GRIP_M
     """Side of the pad, or of the square that a pivot stands for."""
+    grip_known_within: Annotated[float, Field(ge=1, le=3)] = 1.0
+    """The factor within which `grip_m` is known, one standard deviation; 1: exactly. Fits by `likelihood` allow for it."""
     loss_surface: Literal["all", "grasped_half"] = "all"
     laid_turn_deg: Annotated[float, Field(ge=0, le=45)] = 10.0
     """How far askew the cloth may lie at the start, one standard deviation; 0: not at all. Fits find it. A hand seldom lays
@@ -166,7 +168,24 @@ def grid_scenario(options: GridScenario) -> Scenario:
         "size": options.laid_size,
         "track": options.laid_track,
     }
-    return replace(scenario, laid={name: deviation for name, deviation in laid.items() if deviation})
+    laid = {name: deviation for name, deviation in laid.items() if deviation}
+    regrip = _Regrip(options) if options.grip_known_within > 1 else None
+    return replace(scenario, laid=laid, regrip=regrip)
+
+
+@dataclass(frozen=True)
+class _Regrip:
+    """A scenario with another size of its grasp."""
+
+    options: GridScenario
+
+    def __call__(self, deviations: float) -> Scenario:
+        """
+        Raises:
+            SceneError: a pad as large as the cloth.
+        """
+        size = self.options.grip_m * self.options.grip_known_within**deviations
+        return grid_scenario(self.options.model_copy(update={"grip_m": size}))
 
 
 def _sunk(options: GridScenario) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -57,6 +57,8 @@ class Scenario:
     laid: Mapping[str, float] = field(default_factory=dict)
     """How far the cloth's start, its size and the gripper's path may be off, which fits find: `turn` [rad], `shape` [m],
     `size` and `track` [1] (`fit.laid`) -> standard deviation."""
+    regrip: Callable[[float], Scenario] | None = None
+    """The same with a grasp so many standard deviations larger; None: its size is known."""
 
     @property
     def steps(self) -> int:
@@ -76,7 +78,7 @@ class Scenario:
 
     def with_steps(self, times: int) -> Scenario:
         """The same experiment with so many times the steps."""
-        return replace(self, scene=replace(self.scene, frame_steps=times * self.scene.frame_steps))
+        return replace(self, scene=replace(self.scene, frame_steps=times * self.scene.frame_steps), regrip=None)
 
     def finer(self) -> Scenario:
         """The same experiment on a mesh with half the edge length (`Scene.finer`). What lies between two nodes of a set
@@ -88,7 +90,7 @@ class Scenario:
             for name, nodes in self.node_sets.items()
         }
         faces = None if self.loss_faces is None else (4 * self.loss_faces[:, None] + np.arange(4)).reshape(-1)
-        return replace(self, scene=self.scene.finer(), node_sets=sets, loss_faces=faces)
+        return replace(self, scene=self.scene.finer(), node_sets=sets, loss_faces=faces, regrip=None)
 
     def check_parameters(self, names: Iterable[str]) -> None:
         """
