@@ -7,7 +7,7 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 # the tests start hundreds of processes; without byte code each would compile the package again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv repro test tests test-slow test-longest lint format bench acceptance comparison simulated recordings moved coverage hanging robustness pictures docs clean
+.PHONY: venv repro test tests test-slow test-longest lint format bench acceptance comparison simulated recordings moved coverage coverage-quick coverage-own hanging robustness pictures docs clean
 
 venv: $(STAMP)
 
@@ -112,6 +112,14 @@ moved: venv
 	        --out docs/results/moved-$$kind.md $(NUISANCE); \
 	done
 
+# How often intervals hold the truth on cloths that MuJoCo and Newton move. What is finished is kept: build/foreign.
+FOREIGN := python -m studies.foreign
+coverage: venv
+	$(FOREIGN) --sets towels,cut,one_camera,untold,folds,newton,joint --markdown docs/results/foreign.md
+
+coverage-quick: venv
+	$(FOREIGN) --count 8
+
 # How often intervals hold the truth: drawn cloths, recorded, fitted, and held against what was drawn; truths that fits do not
 # expect; and fresh recordings of the same cloths. Then, in a folder of its own, the same for a posterior trained on simulated
 # lifts of uncertain material, as those cameras see them, beside fits. Five hours on two cores; what is finished is kept.
@@ -120,7 +128,7 @@ COUNTED := diffcloud coverage --params docs/results/coverage.yaml
 COVERAGE := $(COUNTED) --out build/coverage
 BESIDE := $(COUNTED) --out $(POSTERIOR)/coverage --seed 6985324 --recordings 24 --scenario lift
 DRAWN := --seed 82037895
-coverage: venv
+coverage-own: venv
 	$(COVERAGE) $(DRAWN) --recordings 200 --fix mass
 	$(COVERAGE) $(DRAWN) --recordings 200
 	$(COVERAGE) --fix mass --scenario lift --scenario fold --seed 7775397 --recordings 16 --truth refined

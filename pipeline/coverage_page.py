@@ -260,7 +260,7 @@ def coverage_page(counts: Counts) -> str:
         + "Rows named after a network are its predictions of the same recordings (`--checkpoint`); the prior of a "
         "posterior is the distribution that its training draws had, which may be wider than that of these truths. "
         * networks
-        + "Command: `make coverage`.",
+        + "Command: `make coverage-own`.",
         "",
         *markdown_table(HEAD, rows),
         "",
