@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -442,10 +442,23 @@ def _fit(
         if ended is None and not (out / "fit.json").exists():
             ended = job.begun()  # an earlier run's fit is worth more than the place where this one begins
         if ended is not None:
-            so_far.fitted = ended, compared(ended, members), job
+            so_far.fitted = ended, compared(ended, _with_grip_found(members, ended, out)), job
         raise
     check_interrupt()
-    so_far.fitted = record, compared(record, members), job
+    so_far.fitted = record, compared(record, _with_grip_found(members, record, out)), job
+
+
+def _with_grip_found(members: Sequence[Recording], record: FitRecord, out: Path) -> list[Recording]:
+    """The recordings in scenarios with the grasp that was found; their files have it too."""
+    found = None if record.estimate is None else record.estimate.grip_m
+    if found is None:
+        return list(members)
+    told = []
+    for one in members:
+        path = _stage(out) / f"{one.name}.yaml"
+        write_text(path, yaml.safe_dump({**_fields(path), "grip_m": found, "grip_known_within": 1.0}, sort_keys=False))
+        told.append(replace(one, scenario=load_scenario(path)))
+    return told
 
 
 def _intervals(so_far: _SoFar, *, level: float, within: float) -> Intervals:
@@ -520,6 +533,8 @@ def _findings(so_far: _SoFar, status: Status) -> list[str]:
     elif not found.explains:
         lines.append(f"The model does not explain the recordings: {found.reason}.")
     lines += follows(record)
+    if record.estimate is not None and record.estimate.grip_m is not None:
+        lines.append(f"The grasp is {1e3 * record.estimate.grip_m:.0f} mm wide, as the fit found it.")
     lines.append(_validation(record, objective))
     if found is not None and found.explains:
         lines += found.sentences

@@ -205,6 +205,8 @@ class EstimateRecord(_Model):
     weights: list[Annotated[float, Field(ge=0, le=1)]]
     """Of these."""
     recordings: list[Followed] = Field(min_length=1)
+    grip_m: Annotated[float, Field(gt=0, le=10)] | None = None
+    """Size of the grasp that was found, with which the fit is simulated; None where it was known."""
 
     @model_validator(mode="after")
     def _has_one_shape(self) -> Self:

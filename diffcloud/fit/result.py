@@ -410,7 +410,10 @@ def _estimate(found: Estimate, members: Sequence[Objective]) -> EstimateRecord:
     def told(place: Tensor) -> dict[str, float]:
         return dict(zip(names, axis.bounded(place[: len(found.space.names)])[asked].tolist(), strict=True))
 
+    scenario = members[0].scenario
+    grasp = None if found.grip is None else scenario.scene.handles.grasp
     return EstimateRecord(
+        grip_m=None if grasp is None else grasp.size * scenario.length_unit_m,
         mean=told(found.mean),
         sources={name: part[asked][:, asked].tolist() for name, part in found.sources.items()},
         starts=[told(one.place) for one in found.answers],

@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -157,9 +157,9 @@ class Estimate:
     answers: tuple[Answer, ...]
     """Of all starts that were followed to their end, the likeliest first."""
     members: tuple[Objective, ...]
-    """The recordings up to their horizons, with the grasp that was simulated."""
-    grip: float
-    """Of these, in deviations from the size that was given."""
+    """The recordings up to their horizons, with the grasp that was found."""
+    grip: float | None
+    """Of these, in deviations from the size that was given; None: it is known."""
     simulations: int
     interrupted: bool = False
 
@@ -650,8 +650,25 @@ def estimate(
     if not answers:
         raise failures[0]
     answers.sort(key=lambda one: one.energy)
-    members = tuple(one.objective for one in likelihood.recordings)
-    return Estimate(space, tuple(answers), members, likelihood.grip, simulations + likelihood.simulations, interrupted)
+    simulations += likelihood.simulations
+    if likelihood.knows_grip:
+        members, grip = [one.objective for one in likelihood.recordings], None
+    else:
+        grip = likelihood.grip + float(answers[0].place[-1])
+        counts = [len(one.objective.frames) for one in likelihood.recordings]
+        found_so = [_known(one) for one in _gripped(objective.members, grip)]
+        members = [one.earliest([count]) for one, count in zip(found_so, counts, strict=True)]
+    return Estimate(space, tuple(answers), tuple(members), grip, simulations, interrupted)
+
+
+def _gripped(members: Sequence[Objective], grip: float) -> Sequence[Objective]:
+    """With a grasp so many deviations larger than stated, where its size is not known."""
+    return [one.of(one.scenario.regrip(grip)) if grip and one.scenario.regrip else one for one in members]
+
+
+def _known(objective: Objective) -> Objective:
+    """With the grasp as its scenario has it."""
+    return objective.of(replace(objective.scenario, regrip=None))
 
 
 def _up_to_horizon(
@@ -667,8 +684,7 @@ def _up_to_horizon(
         grip: in deviations from the size that was given.
         place: where the horizon is looked for; by default where the first start begins.
     """
-    if grip:
-        members = [one.of(one.scenario.regrip(grip)) if one.scenario.regrip else one for one in members]
+    members = _gripped(members, grip)
     whole = _Likelihood(members, space, settings.iterations, grip)
     horizons = whole.horizons(whole.start(settings.init, 0.0) if place is None else place)
     known = [one.earliest([count]) for one, count in zip(members, horizons, strict=True)]
