@@ -155,7 +155,7 @@ def time_identify() -> float:
         track = np.column_stack([np.arange(len(nodes)) / towel.rate_hz, nodes[:, scenario.grasped[0]]])
         np.savetxt(recording / "gripper.csv", track, delimiter=",", header="t_s,x,y,z", comments="")
         begin = time.perf_counter()
-        identify([recording], Path(folder) / "found", size="0.40x0.30", mass=0.24, threads=thread_count())
+        identify([recording], Path(folder) / "found", size="0.40x0.30", mass="0.24", threads=thread_count())
         return time.perf_counter() - begin
 
 

@@ -82,7 +82,9 @@ def identify(
     ],
     out: Annotated[Path, typer.Option(help="Folder: cloth.yaml, recordings.yaml, fit.json, report.html.")],
     size: Annotated[str | None, typer.Option(help="Sides in metres, such as 0.40x0.30. Default: as seen.")] = None,
-    mass: Annotated[float | None, typer.Option(help="Weighed mass of the cloth, in kg per square metre.")] = None,
+    mass: Annotated[
+        str | None, typer.Option(help="Weighed mass of the cloth, in kg per square metre, such as 0.24 or 0.24+-0.01.")
+    ] = None,
     parameters: Annotated[
         str | None, typer.Option(help="Comma-separated. Default: stretch,bending, and mass if it was not weighed.")
     ] = None,
@@ -107,15 +109,16 @@ def identify(
     level, within = level or LEVEL, WITHIN if within is None else within
     if within <= 1:
         raise ConfigError(f"--within takes a factor above 1, got {within:g}.")
-    if mass is not None and not (0 < mass < math.inf):
-        raise ConfigError(f"--mass is in kg per square metre, above 0, got {mass:g}.")
+    weighed = None if mass is None else _weighed(mass)
     stated = None if size is None else _sides(size)
     seconds = None if budget is None else duration_s(budget, "--budget")
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out takes a folder, and {out} is a file.")
     with claimed(out):
-        episodes, cloth, layouts = find_scene(recordings, out, stated, mass, topic or ())
-        chosen = _chosen(parameters, cloth, mass)
+        episodes, cloth, layouts = find_scene(recordings, out, stated, None if weighed is None else weighed[0], topic or ())
+        if weighed is not None and weighed[1]:
+            cloth = _with_mass(cloth, *weighed)
+        chosen = _chosen(parameters, cloth, weighed)
         so_far = _SoFar()
         if seconds is not None:
             seconds = max(_FITTING * seconds - (time.monotonic() - began), 1.0)
@@ -390,16 +393,41 @@ def _inline(value: Any) -> str:
     return text.strip().removesuffix("...").strip()
 
 
-def _chosen(parameters: str | None, cloth: Mapping[str, Any], mass: float | None) -> FitConfig:
-    names = ["stretch", "bending", *(["mass"] if mass is None else [])]
+def _weighed(text: str) -> tuple[float, float]:
+    """Mass and its standard deviation [kg/m²], of 0.24 or 0.24+-0.01."""
+    value, _, error = text.replace("±", "+-").partition("+-")
+    try:
+        mass, deviation = float(value), float(error or 0.0)
+    except ValueError:
+        mass = deviation = math.nan
+    if not (0 < mass < math.inf and 0 <= deviation < mass / 2):
+        raise ConfigError(
+            f"--mass is in kg per square metre, above 0, and may have a standard deviation below half of it, as in "
+            f"0.24+-0.01; got {text!r}."
+        )
+    return mass, deviation
+
+
+def _with_mass(cloth: Mapping[str, Any], mass: float, deviation: float) -> dict[str, Any]:
+    """The cloth with a weighed mass that is not exact: the fit allows for it."""
+    material = {**_material(cloth), "density_kg_m2": mass}
+    return {**cloth, "material": material, "doubts": {**cloth.get("doubts", {}), "mass": 1 + deviation / mass}}
+
+
+def _material(cloth: Mapping[str, Any]) -> dict[str, Any]:
+    material = cloth.get("material")
+    if not isinstance(material, dict) or material.get("density_kg_m2") is None:
+        raise ConfigError("--mass goes with a material of stated density_kg_m2 in cloth.yaml.")
+    return material
+
+
+def _chosen(parameters: str | None, cloth: Mapping[str, Any], weighed: tuple[float, float] | None) -> FitConfig:
+    names = ["stretch", "bending", *(["mass"] if weighed is None else [])]
     if parameters is not None:
         names = [name.strip() for name in parameters.split(",")]
     fixed = {}
-    if mass is not None:
-        density = cloth.get("material", {}).get("density_kg_m2") if isinstance(cloth.get("material"), dict) else None
-        if density is None:
-            raise ConfigError("--mass goes with a material of stated density_kg_m2 in cloth.yaml.")
-        fixed = {"mass": mass / float(density)}
+    if weighed is not None and not weighed[1]:
+        fixed = {"mass": weighed[0] / float(_material(cloth)["density_kg_m2"])}
     bounds = {name: list(pair) for name, pair in _BOUNDS.items() if name in names}
     return FitConfig.model_validate({"parameters": names, "fixed": fixed, "bounds": bounds, "solver": "likelihood"})
 
@@ -533,8 +561,6 @@ def _findings(so_far: _SoFar, status: Status) -> list[str]:
     elif not found.explains:
         lines.append(f"The model does not explain the recordings: {found.reason}.")
     lines += follows(record)
-    if record.estimate is not None and record.estimate.grip_m is not None:
-        lines.append(f"The grasp is {1e3 * record.estimate.grip_m:.0f} mm wide, as the fit found it.")
     lines.append(_validation(record, objective))
     if found is not None and found.explains:
         lines += found.sentences
@@ -548,6 +574,8 @@ def _findings(so_far: _SoFar, status: Status) -> list[str]:
                 ends = f", {found.level:.0%} interval {digits(entry.physical_low)} to {digits(entry.physical_high)}"
                 improve = f" (improve first: {first})" if first else ""
         lines.append(f"{name}: {digits(told['physical'])} {told['physical_unit']}{ends}: {verdict}{improve}.")
+    if record.estimate is not None and record.estimate.grip_m is not None:
+        lines.append(f"The grasp is {1e3 * record.estimate.grip_m:.0f} mm wide, as the fit found it.")
     return lines
 
 

@@ -244,7 +244,7 @@ class TestWhatCounts:
             for told in (meta, meta | {"cut_planes": planes})
         )
         assert cut == whole
-        with pytest.raises(EpisodeError, match="of the cloth lies above the cut, 9.000 m"):
+        with pytest.raises(EpisodeError, match=r"of the cloth lies above the cut, 9\.000 m"):
             Objective(scenario, replace(episode, meta=meta | {"cut_planes": planes | {"one": planes["two"]}}))
 
     def test_frames_are_those_with_enough_above_the_lowest_cut_plane(self, scenario, episode):

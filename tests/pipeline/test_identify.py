@@ -127,6 +127,25 @@ class TestNewUser:
         assert done.result["findings"][0].startswith("The model follows first")
         assert 0.2 < min(done.result["horizons_s"].values()) <= max(done.result["horizons_s"].values()) <= 0.8
 
+    def test_a_mass_that_is_not_exact_is_a_source(self, found):
+        """A tenth of the mass is a tenth of the stiffness: a motion tells their ratio."""
+        folder, done = found
+        with contextlib.chdir(folder):
+            words = [*COMMAND[:-1], "weighed", "--mass", "0.25+-0.05", "--parameters", "stretch"]
+            told = invoke(*words).result["parameters"]["stretch"]
+            sources = json.loads(Path("weighed/intervals.json").read_text())["sources"]
+        assert sources["mass"]["stretch"] == pytest.approx(0.18, abs=0.06)
+        exact = done.result["parameters"]["stretch"]
+        assert told["high"] / told["low"] > exact["high"] / exact["low"]
+
+    def test_the_grasp_that_was_found_is_in_the_scenarios(self, found):
+        folder, done = found
+        size = json.loads((folder / "found/fit.json").read_text())["estimate"]["grip_m"]
+        assert f"The grasp is {1e3 * size:.0f} mm wide, as the fit found it." in done.result["findings"]
+        for name in ("first", "second"):
+            scenario = yaml.safe_load((folder / f"found/scenarios/{name}.yaml").read_text())
+            assert (scenario["grip_m"], scenario["grip_known_within"]) == (pytest.approx(size), 1.0)
+
     def test_other_commands_take_what_it_wrote(self, found):
         folder, _ = found
         with contextlib.chdir(folder):
@@ -153,7 +172,7 @@ class TestNewUser:
             monkeypatch.setattr(FitJob, "run", stopped)
             with pytest.raises(KeyboardInterrupt):
                 identify.identify(
-                    [Path("recorded/first"), Path("recorded/second")], Path("found"), parameters="stretch", mass=0.25
+                    [Path("recorded/first"), Path("recorded/second")], Path("found"), parameters="stretch", mass="0.25"
                 )
             assert before == {one: one.read_bytes() for one in before}
 
@@ -217,6 +236,8 @@ class TestRefusals:
             (("--size", "0.40x0.30"), "was stated. Check --size"),
             (("--size", "big"), "--size takes two sides in metres"),
             (("--mass", -1), "--mass is in kg per square metre"),
+            (("--mass", "0.25+-0.2"), "below half of it, as in 0.24+-0.01"),
+            (("--mass", "light"), "got 'light'"),
             (("--within", 0.5), "--within takes a factor above 1"),
             (("--out", "recorded/first/gripper.csv"), "--out takes a folder"),
         ],
