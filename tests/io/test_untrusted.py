@@ -198,26 +198,3 @@ def test_a_fit_whose_history_has_no_shape_is_refused(tmp_path):
     (tmp_path / "f.json").write_text(json.dumps(told))
     with pytest.raises(ConfigError, match="damaged fit: history"):
         read_fit(tmp_path / "f.json")
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"lengths": [[-0.1]]},
-        {"losses": []},
-        {"directions": [[1.0, 0.0]]},
-        {"directions": [[float("inf")]]},
-        {"losses": [[-1.0, 0.2]]},
-    ],
-)
-def test_a_fit_whose_scan_has_no_shape_is_refused(tmp_path, changes):
-    from tests.fit.records import record_of
-
-    scan = {"directions": [[1.0]], "lengths": [[-0.1, 0.1]], "losses": [[0.2, None]]}
-    told = record_of(scan=scan).plain()
-    (tmp_path / "f.json").write_text(json.dumps(told))
-    assert read_fit(tmp_path / "f.json").scan.losses == [[0.2, None]]
-    told["scan"] |= changes
-    (tmp_path / "f.json").write_text(json.dumps(told))
-    with pytest.raises(ConfigError, match=r"f\.json"):
-        read_fit(tmp_path / "f.json")
