@@ -96,9 +96,9 @@ def identify(
         float | None, typer.Option(help="Factor within which a parameter counts as identified. Default: 1.5.")
     ] = None,
     budget: Annotated[
-        str | None,
-        typer.Option(help="Time for reading, fits and report (90, 60s, 3min, 1h). Then the best so far is reported."),
-    ] = None,
+        str,
+        typer.Option(help="Time for reading, fits and report (90, 60s, 3min, 1h, none). Then the best so far is reported."),
+    ] = "5min",
     topic: Topics = None,
     threads: Threads = None,
     json: JsonFlag = False,
@@ -111,7 +111,7 @@ def identify(
         raise ConfigError(f"--within takes a factor above 1, got {within:g}.")
     weighed = None if mass is None else _weighed(mass)
     stated = None if size is None else _sides(size)
-    seconds = None if budget is None else duration_s(budget, "--budget")
+    seconds = None if budget == "none" else duration_s(budget, "--budget")
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out takes a folder, and {out} is a file.")
     with claimed(out):
@@ -550,7 +550,9 @@ def _findings(so_far: _SoFar, status: Status) -> list[str]:
     found, lines = so_far.intervals, list[str]()
     if status != "finished":
         why, again = (
-            ("Ctrl-C was pressed", "") if status == "interrupted" else ("the time of --budget was over", " without it")
+            ("Ctrl-C was pressed", "")
+            if status == "interrupted"
+            else ("the time of --budget was over", " with --budget none")
         )
         lines.append(f"Unfinished: {why}. These are the best parameters so far. Run the same command{again} to finish.")
     if found is None:

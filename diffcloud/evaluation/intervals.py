@@ -48,7 +48,7 @@ Verdict = Literal[
     "the model does not explain the recording",
     "the fit has not arrived",
 ]
-WITHIN = 1.5
+WITHIN = 2.0
 """A parameter counts as identified if its interval ends within this factor of the fitted value."""
 LEVEL = 0.9
 _PLAIN = 1e6
