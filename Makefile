@@ -156,6 +156,7 @@ robustness: venv
 # The pictures of README and docs/concepts.md, from what `make repro` leaves in data/.
 pictures: venv
 	python docs/site/pictures.py
+	python docs/site/physics_figures.py
 	python docs/site/motion.py
 
 # The site of docs/, README and all commands, as files that open from disk: build/site/index.html.
