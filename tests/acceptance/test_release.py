@@ -173,7 +173,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
     def never(*arguments, **options):
         raise AssertionError("fitted or compared again")
 
-    monkeypatch.setattr(pipeline.fit_jobs, "solve_and_refine", never)
+    monkeypatch.setattr(pipeline.fit_jobs, "solve", never)
     monkeypatch.setattr(pipeline.comparison, "compare_episode", never)
     assert invoke(*command).result["metrics"]["comparison"] == found
     assert "No published episode matches" in invoke("evaluate", "release", release, "--only", "shirt*", code=1).errors
