@@ -32,19 +32,20 @@ from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.files import write_text
 from diffcloud.mesh.shapes import grid_cloth
-from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
+from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios.grid import GridScenario
 from diffcloud.sensing.recorder import caster
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.simulators import mujoco, newton
 from diffcloud.simulators.problem import REST_HEIGHT, Problem, Sheet, installed
+from diffcloud.simulators.towels import COUNTS, one_way
 from pipeline.identify import find_scene
 
 Floats = NDArray[np.float64]
 Kind = Literal["lift", "fold"]
 Simulator = Literal["mujoco", "newton"]
 
-COLUMNS, ROWS = 25, 19
+COLUMNS, ROWS = COUNTS
 """Nodes of the foreign cloth."""
 _SECONDS, _RATE, _KEYS = 1.5, 10.0, 81
 _NOISE = 0.002
@@ -224,7 +225,7 @@ def moved(cloth: Cloth, simulator: Simulator, cache: Path) -> Moved:
 def _problem(cloth: Cloth) -> tuple[Problem, list[int]]:
     flat = grid_cloth(ROWS, COLUMNS, cloth.size[1], cloth.size[0])
     mesh = replace(flat, nodes=np.column_stack([flat.nodes[:, :2], np.full(len(flat.nodes), REST_HEIGHT)]))
-    mesh = _one_way(mesh)
+    mesh = one_way(mesh, COLUMNS, through=True)
     held = [COLUMNS * row + column for row in (ROWS - 2, ROWS - 1) for column in (COLUMNS - 2, COLUMNS - 1)]
     problem = Problem(
         "cloth",
@@ -238,13 +239,6 @@ def _problem(cloth: Cloth) -> tuple[Problem, list[int]]:
         rate=_RATE,
     )
     return problem, held
-
-
-def _one_way(mesh: ClothMesh) -> ClothMesh:
-    """All diagonals in one direction: this simulator's alternate."""
-    a = np.arange(len(mesh.nodes)).reshape(-1, COLUMNS)[:-1, :-1].ravel()
-    b, c, d = a + 1, a + COLUMNS, a + COLUMNS + 1
-    return replace(mesh, face_verts=np.array([[a, b, d], [a, d, c]]).transpose(2, 0, 1).reshape(-1, 3))
 
 
 def seen(motion: Moved, cloth: Cloth, cameras: int, *, cut: bool) -> Episode:

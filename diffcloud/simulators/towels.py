@@ -95,7 +95,7 @@ def _truth(one: Towel) -> Track:
     columns, rows = COUNTS
     corner = [columns * row + column for row in (rows - 2, rows - 1) for column in (columns - 2, columns - 1)]
     flat = grid_cloth(rows, columns, one.size[1], one.size[0])
-    mesh = _one_way(flat, columns, through=True)
+    mesh = one_way(flat, columns, through=True)
     problem = _lifted(one, mesh, corner)
     settings, sheet = mujoco.stable(problem)
     return mujoco.simulate(replace(problem, sheet=sheet), settings)
@@ -105,7 +105,7 @@ def _problem(one: Towel, nodes: tuple[int, int], model: str) -> Problem:
     options: dict[str, object] = {"size_m": one.size, "nodes": nodes, "yaw_deg": 0.0, "grip_m": one.pad}
     options |= {"name": "towel"} if model == PAD else {"name": "towel", "grip": "pivot"}
     scene = grid_scenario(GridScenario.model_validate({**LIFT.model_dump(), **options})).scene
-    mesh = scene.mesh if model == PAD else _one_way(scene.mesh, nodes[0], through=False)
+    mesh = scene.mesh if model == PAD else one_way(scene.mesh, nodes[0], through=False)
     return _lifted(one, mesh, scene.handles.nodes)
 
 
@@ -115,7 +115,7 @@ def _lifted(one: Towel, mesh: ClothMesh, held: list[int]) -> Problem:
     return Problem("towel", level, one.sheet, _SECONDS, moved, table=0.0, friction=one.friction, rate=_RATE)
 
 
-def _one_way(mesh: ClothMesh, columns: int, *, through: bool) -> ClothMesh:
+def one_way(mesh: ClothMesh, columns: int, *, through: bool) -> ClothMesh:
     """A grid's mesh with all diagonals in one direction, through its last corner or across it."""
     a = np.arange(len(mesh.nodes)).reshape(-1, columns)[:-1, :-1].ravel()
     b, c, d = a + 1, a + columns, a + columns + 1
