@@ -165,6 +165,11 @@ class Objective:
         return self._target.space
 
     @property
+    def compared(self) -> int:
+        """Frames of all recordings."""
+        return len(self._target.frames)
+
+    @property
     def times(self) -> Tensor:
         """[L] of the compared frames [s]."""
         return self._target.times
