@@ -213,7 +213,7 @@ class FitConfig(Section):
     iterations: Count | None = None
     """Of likelihood, gauss_newton and adam: steps at most; by default 12, 20 and 50."""
     starts: Annotated[int, Field(ge=1, le=MOST_STARTS)] | None = None
-    """Of likelihood, gauss_newton and adam: number of descents, from different places; by default 3, at most 8 (2 with the
+    """Of likelihood, gauss_newton and adam: number of descents, from different places; by default 3, at most 4 (2 with the
     linearised integrator) and 1. By default, gauss_newton ends once one explains the recording or two end equally low."""
     screen: Annotated[int, Field(ge=0, le=MOST_CANDIDATES)] | None = None
     """Of gauss_newton and adam: candidates simulated once to choose the starts from; by default 24 of gauss_newton (48 with

@@ -93,9 +93,8 @@ def fit(
     starts: Annotated[
         int | None,
         typer.Option(
-            help="Places to descend from. Of gauss_newton at most so many, the best candidates only (in a joint fit, the "
-            "first one fits the first frames, then more and more of them). Default of gauss_newton: 8, also three "
-            "that begin with the first frames, and one from a search (linearised: 2 and no others); of adam: 1."
+            help="Places to descend from. Default of likelihood: 3; of gauss_newton: at most 4, the best candidates "
+            "(linearised: 2); of adam: 1."
         ),
     ] = None,
     screen: Annotated[

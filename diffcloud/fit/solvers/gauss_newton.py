@@ -55,8 +55,8 @@ _REACH = 2 * STEP
 """The least radius after a step to a place beside: twice the distance of the differences."""
 _SAME = 0.02
 """A start that comes as close to a better one, on the axis, leaves the rest of the way to it."""
-_MOST = 8
-"""Starts that are followed, unless fewer are enough."""
+_MOST = 4
+"""Starts that are followed, unless fewer are enough: from the first half of a recording, most come to the same end."""
 _EQUALLY = 1.01
 """Losses within this factor are equally low."""
 _SCREENED, _SCREENED_POINTS = 0.5, 500
@@ -76,7 +76,7 @@ class GaussNewtonSettings:
     screen: int = 24
     """Candidates beside the first that are simulated once, without derivatives; 0: the starts are taken unseen."""
     starts: int | None = None
-    """The best of them, followed one after the other: so many, or by default at most 8, as far as it takes."""
+    """The best of them, followed one after the other: so many, or by default at most 4, as far as it takes."""
     seed: int = 0
     """Of the candidates."""
     init: Mapping[str, float] = field(default_factory=dict)
