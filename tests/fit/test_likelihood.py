@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -143,6 +144,16 @@ class TestGrasp:
         central, told = (above - below) / (4 * step), linear.frames(place, changes).slopes[..., column]
         # from recorded points to the surface; the other way, points jump between faces, whose areas change
         torch.testing.assert_close(told[1], central[1], rtol=1e-3, atol=1e-3 * float(central[1].abs().max()))
+
+    def test_one_that_does_not_fit_is_left_out(self):
+        """On a cloth of 30 cm, a pad of 20 cm may be half as large, and not twice."""
+        wide = self.scenario(0.2, 2.0)
+        assert [one.scene.handles.grasp.size for one in likelihood._regripped(wide)] == [pytest.approx(0.1)]
+        member = SimpleNamespace(scenario=wide)
+        assert likelihood._that_fits([member], -1.0) == -1.0
+        assert likelihood._that_fits([member], 0.9) == 0.225
+        assert likelihood._that_fits([member], 40.0) == 0.0
+        assert likelihood._that_fits([SimpleNamespace(scenario=SCENARIO)], 3.0) == 3.0
 
     @pytest.mark.slow
     def test_a_grasp_that_was_stated_too_small_is_found(self):

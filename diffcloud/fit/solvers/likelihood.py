@@ -203,15 +203,17 @@ class Estimate:
 
 
 def _regripped(scenario: Scenario) -> list[Scenario]:
-    """With a smaller grasp and, where its pad holds the same nodes, a larger one; none where its size is known."""
+    """With a smaller grasp and, where its pad fits and holds the same nodes, a larger one; none where its size is known, or
+    no smaller pad fits on the mesh."""
     if scenario.regrip is None:
         return []
-    smaller = scenario.regrip(-1.0)
+    found = list[Scenario]()
     try:
+        found.append(scenario.regrip(-1.0))
         larger = scenario.regrip(1.0)
-    except SceneError:  # too large for the cloth
-        return [smaller]
-    return [smaller, larger] if larger.scene.handles.nodes == scenario.scene.handles.nodes else [smaller]
+    except SceneError:
+        return found
+    return [*found, larger] if larger.scene.handles.nodes == scenario.scene.handles.nodes else found
 
 
 class _Recording:
@@ -633,7 +635,9 @@ def estimate(
         for number in range(settings.starts):
             away = _START * ((number + 1) // 2) * (1 if number % 2 else -1)
             found = follow(number, likelihood.start(settings.init, away))
-            off = 0.0 if number or found is None or likelihood.knows_grip else float(found.place[-1])
+            off = 0.0
+            if number == 0 and found is not None and not likelihood.knows_grip:
+                off = _that_fits(objective.members, float(found.place[-1]))
             if found is not None and abs(off) > _REGRIP:
                 simulations += likelihood.simulations
                 place = torch.cat([found.place[:-1], torch.zeros(1, dtype=torch.float64)])
@@ -654,7 +658,7 @@ def estimate(
     if likelihood.knows_grip:
         members, grip = [one.objective for one in likelihood.recordings], None
     else:
-        grip = likelihood.grip + float(answers[0].place[-1])
+        grip = _that_fits(objective.members, likelihood.grip + float(answers[0].place[-1]))
         counts = [len(one.objective.frames) for one in likelihood.recordings]
         found_so = [_known(one) for one in _gripped(objective.members, grip)]
         members = [one.earliest([count]) for one, count in zip(found_so, counts, strict=True)]
@@ -664,6 +668,19 @@ def estimate(
 def _gripped(members: Sequence[Objective], grip: float) -> Sequence[Objective]:
     """With a grasp so many deviations larger than stated, where its size is not known."""
     return [one.of(one.scenario.regrip(grip)) if grip and one.scenario.regrip else one for one in members]
+
+
+def _that_fits(members: Sequence[Objective], grip: float) -> float:
+    """So much of a change of the grasp that its pad fits on the cloth and on the mesh."""
+    for part in (1.0, 0.75, 0.5, 0.25):
+        try:
+            for one in members:
+                if one.scenario.regrip is not None:
+                    one.scenario.regrip(part * grip)
+        except SceneError:
+            continue
+        return part * grip
+    return 0.0
 
 
 def _known(objective: Objective) -> Objective:
