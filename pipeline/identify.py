@@ -83,10 +83,14 @@ def identify(
     out: Annotated[Path, typer.Option(help="Folder: cloth.yaml, recordings.yaml, fit.json, report.html.")],
     size: Annotated[str | None, typer.Option(help="Sides in metres, such as 0.40x0.30. Default: as seen.")] = None,
     mass: Annotated[
-        str | None, typer.Option(help="Weighed mass of the cloth, in kg per square metre, such as 0.24 or 0.24+-0.01.")
+        str | None, typer.Option(help="Weighed mass over area, in kg per square metre, such as 0.24 or 0.24+-0.01.")
     ] = None,
     parameters: Annotated[
-        str | None, typer.Option(help="Comma-separated. Default: stretch,bending, and mass if it was not weighed.")
+        str | None,
+        typer.Option(
+            help="Main parameters, comma-separated; `doubts` of cloth.yaml are fitted too. Default: stretch,bending, and "
+            "mass if it was not weighed."
+        ),
     ] = None,
     level: Annotated[
         float | None,

@@ -87,8 +87,9 @@ def page(found: Mapping[str, FitRecord]) -> str:
             "",
             *markdown_table(["pair", "factor"], [[name, f"{factor:.2f}"] for name, factor in pairs]),
             "",
-            "The misfit is several times the noise of the points, and several values end at bounds. So the values predict "
-            "these motions, and are no properties of the fabrics: such cloth hardly stretches when it is lifted or folded.",
+            "The misfit is several times the noise of the points, and several values end at bounds. So the values "
+            "reproduce these motions, and are no properties of the fabrics: such cloth hardly stretches when it is lifted "
+            "or folded.",
             "",
             "`python -m studies.recorded EPISODES` makes this page.",
             "",
