@@ -83,7 +83,7 @@ class TestFits:
     def test_one_clock_for_both_finds_neither(self, scenario, episode):
         common, recording = fitted(scenario, replace(episode, meta={}), lag=0.002)
         assert list(recording["nuisance"])[-1] == "lag"
-        assert min(abs(common[name] / TRUTH[name] - 1) for name in TRUTH) > 0.2
+        assert min(abs(common[name] / TRUTH[name] - 1) for name in TRUTH) > 0.1  # both clocks: a few per cent
         assert recording["rms_mm"] > 2.0
 
     def test_stated_offsets_hold_where_clocks_are_not_free(self, scenario):

@@ -200,7 +200,7 @@ class TestCoverage:
         assert "level 0.9" in invoke(*COVERAGE, "--recordings", 1, "--level", 0.8, code=1).errors
         (work / "out/small/free/0007.json").rename(work / "out/small/free/0000.json")
         path = work / "out/small/free/0000.json"
-        assert json.loads(path.read_text())["intervals"]["within"] == 1.5
+        assert json.loads(path.read_text())["intervals"]["within"] == 2.0
         (work / "params.yaml").write_text(yaml.safe_dump({**PARAMS, "evaluate": {"within": 1.2}}))
         invoke(*COVERAGE, "--recordings", 1)
         assert json.loads(path.read_text())["intervals"]["within"] == 1.2
