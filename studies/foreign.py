@@ -30,10 +30,11 @@ from numpy.typing import NDArray
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.io.episodes import Episode, write_episode
-from diffcloud.io.files import write_text
+from diffcloud.io.files import write_npz, write_text
 from diffcloud.mesh.shapes import grid_cloth
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios.grid import GridScenario
+from diffcloud.sensing.cameras import looking_at
 from diffcloud.sensing.recorder import caster
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.simulators import mujoco, newton
@@ -210,10 +211,7 @@ def moved(cloth: Cloth, simulator: Simulator, cache: Path) -> Moved:
         nodes = nodes.astype(np.float32)
         if not np.isfinite(nodes).all():
             raise ConfigError(f"{simulator} did not simulate the {cloth.kind} of cloth {cloth.seed}.")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.stem}.{os.getpid()}.npz")
-        np.savez_compressed(temporary, nodes=nodes)
-        temporary.replace(path)
+        write_npz(path, nodes=nodes)
     centre, yaw, table = cloth.place
     cosine, sine = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
     turn = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
@@ -263,11 +261,7 @@ def seen(motion: Moved, cloth: Cloth, cameras: int, *, cut: bool) -> Episode:
 
 def _rays(eye: Floats) -> NDArray[np.float32]:
     """[H, W, 6] of the pixels of a camera that looks at the middle of the motion."""
-    forward = np.array([0.52, 0.0, 0.12]) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0, 1])
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
+    right, down, forward = looking_at(eye, [0.52, 0.0, 0.12])[:3, :3].T
     x = (np.arange(_WIDTH) + 0.5 - _WIDTH / 2) / _FOCAL
     y = (np.arange(_HEIGHT) + 0.5 - _HEIGHT / 2) / _FOCAL
     ways = forward + x[None, :, None] * right + y[:, None, None] * down

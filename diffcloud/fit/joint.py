@@ -62,11 +62,6 @@ class JointObjective:
         """As of `Objective`: the geometric mean of all, infinity if it is not known of one what it misses."""
         return self._mean([one.unexplained for one in self.members])
 
-    @property
-    def compared(self) -> int:
-        """Frames of all recordings."""
-        return sum(one.compared for one in self.members)
-
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Losses [B], as of `Objective`.
 

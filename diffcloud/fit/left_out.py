@@ -50,6 +50,7 @@ def leave_each_out(
         DivergedError: a motion diverges.
         KeyboardInterrupt: Ctrl-C.
     """
+    objective.reseed(settings.seed)  # a solver may have drawn other points
     told, count = [], len(objective.members)
     for index, member in enumerate(objective.members):
         shown = None if progress is None else partial(progress, index / count, f"leaving out {index + 1} of {count}")

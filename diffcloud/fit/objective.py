@@ -165,11 +165,6 @@ class Objective:
         return self._target.space
 
     @property
-    def compared(self) -> int:
-        """Frames of all recordings."""
-        return len(self._target.frames)
-
-    @property
     def times(self) -> Tensor:
         """[L] of the compared frames [s]."""
         return self._target.times
@@ -187,17 +182,20 @@ class Objective:
 
     def of(self, scenario: Scenario) -> Objective:
         """The same recording compared with another scenario of it."""
-        found = Objective(
+        found = self._anew(scenario, self.frames)
+        found.asked_frames = self.asked_frames
+        return found
+
+    def _anew(self, scenario: Scenario, frames: Sequence[int]) -> Objective:
+        return Objective(
             scenario,
             self.episode,
             paper=self.paper,
             nuisance=self.nuisance,
-            frames=self.frames,
+            frames=frames,
             points=self.asked_points,
             seed=self._seed,
         )
-        found.asked_frames = self.asked_frames
-        return found
 
     def reseed(self, seed: int) -> None:
         """Draw the common random numbers anew."""
@@ -456,15 +454,7 @@ class Objective:
         """
         (count,) = counts
         chosen = sorted(self.times.argsort(stable=True)[:count].tolist())
-        return Objective(
-            self.scenario,
-            self.episode,
-            paper=self.paper,
-            nuisance=self.nuisance,
-            frames=[self.frames[each] for each in chosen],
-            points=self.asked_points,
-            seed=self._seed,
-        )
+        return self._anew(self.scenario, [self.frames[each] for each in chosen])
 
     def thinned(self, most: int) -> Objective:
         """The same with at most so many points sampled per frame. Where no pose is solved for, points cost little beside

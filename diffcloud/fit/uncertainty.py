@@ -89,12 +89,6 @@ class Uncertainty:
     """What was fitted too, under priors: doubtful material and the pose."""
 
     @property
-    def of_noise_and_priors(self) -> NDArray[np.float64]:
-        """[k, k] part of the covariance that the loss itself knows of."""
-        names = self.sources.keys() & {"noise", "prior", *self.besides}
-        return np.sum([self.sources[name] for name in names], axis=0)
-
-    @property
     def covariance(self) -> NDArray[np.float64]:
         """[k, k]"""
         return np.sum(list(self.sources.values()), axis=0)

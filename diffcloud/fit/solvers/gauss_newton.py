@@ -99,12 +99,14 @@ def fit_gauss_newton(
     began = time.perf_counter()
     axis = Axis.of(space)
     most = settings.starts or _MOST
-    places, simulations = _starts(objective, space, settings, axis, most)
+    early = objective.until(_SCREENED)
+    places, simulations = _starts(early, space, settings, axis, most)
     history, ways = FitHistory(space.names), list[_Way]()
     reason: StopReason = "iterations"
-
-    early = objective.until(_SCREENED)
-    halved = settings.screen > 0 and early.compared < objective.compared and all(map(by_tangents, objective.members))
+    shorter = any(
+        len(one.frames) < len(all_of.frames) for one, all_of in zip(early.members, objective.members, strict=True)
+    )
+    halved = settings.screen > 0 and shorter and all(map(by_tangents, objective.members))
 
     def looked(place: Tensor, of: AnyObjective = objective) -> Linearisation:
         nonlocal simulations
@@ -270,10 +272,13 @@ class _Way:
 
 
 def _starts(
-    objective: AnyObjective, space: FitSpace, settings: GaussNewtonSettings, axis: Axis, most: int
+    early: AnyObjective, space: FitSpace, settings: GaussNewtonSettings, axis: Axis, most: int
 ) -> tuple[Tensor, int]:
     """Places [B, k] to start at, at least so many, the best ones first, but a given one before all; and how many
     simulations it took to tell. A first start beyond a bound is taken to the bound.
+
+    Args:
+        early: the recordings as far as candidates are compared.
 
     Raises:
         DivergedError: all candidates.
@@ -284,13 +289,13 @@ def _starts(
         return axis.places(values), 0
     doubtful = torch.tensor([one.doubtful and one.deviation is None for one in space.variables])
     values = torch.where(doubtful, values[0], values)
-    losses = batch_losses(objective.until(_SCREENED).thinned(_SCREENED_POINTS), space, values)
+    losses = batch_losses(early.thinned(_SCREENED_POINTS), space, values)
     if not math.isfinite(float(losses.min())):
         raise DivergedError(0, [], f"all {count} candidates diverged")
     order = losses.argsort()
     if settings.init:
         order = torch.cat([torch.zeros(1, dtype=torch.long), order[order > 0]])
-    return axis.places(values[order]), count * len(objective.members)
+    return axis.places(values[order]), count * len(early.members)
 
 
 def _remember(history: FitHistory, ways: Sequence[_Way], waiting: Tensor, axis: Axis) -> None:

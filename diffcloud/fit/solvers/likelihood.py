@@ -544,7 +544,7 @@ class _Descent:
 
     def _terms(self, linear: Sequence[_Linear], place: Tensor) -> _Terms:
         of, squares = self.of, list[float]()
-        off = torch.where(of.precision > 0, place - of.centre, 0.0)
+        off = of.off_centre(place)
         energy, slope, matrix = float((of.precision * off.square()).sum()), of.precision * off, torch.diag(of.precision)
         for one, changes in zip(linear, self.of.changes, strict=True):
             frames, n, columns = one.frames(place, changes), one.recording.independent, one.recording.columns
