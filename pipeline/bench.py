@@ -18,12 +18,10 @@ from rich.table import Table
 from diffcloud.clouds import SurfaceSampler
 from diffcloud.fit.benchmark import time_contact, time_episode, time_matching
 from diffcloud.io.clouds import write_ply
-from diffcloud.io.files import write_text
 from diffcloud.scene.scenarios import GridScenario, Scenario, built_in, grid_scenario, make_scenario
 from diffcloud.sim.threads import thread_count, use_threads
-from pipeline.console import JsonFlag, Threads, errors, finish, output, progress_bar, show
+from pipeline.console import JsonFlag, Threads, finish, output, progress_bar, show
 from pipeline.scenario_options import SceneFile, choose_scenario
-from pipeline.workers import run_all
 
 _BATCHES = (1, 16, 64)
 _SIDES = (16, 32, 64)
@@ -47,18 +45,6 @@ def bench(
     identify: Annotated[
         bool, typer.Option("--identify", help="Instead, how long `diffcloud identify` takes for the tutorial's towel.")
     ] = False,
-    fits: Annotated[
-        Path | None,
-        typer.Option(
-            help="Instead, race the solvers of `diffcloud fit` on drawn cloths; this folder keeps what is finished."
-        ),
-    ] = None,
-    targets: Annotated[int, typer.Option(min=1, max=1000, help="With --fits: drawn cloths of each scenario.")] = 3,
-    seed: Annotated[int, typer.Option(min=0, help="With --fits: random seed of the cloths.")] = 0,
-    workers: Annotated[
-        int, typer.Option(min=1, max=1024, help="With --fits: how many targets to run at once, each on one thread.")
-    ] = 1,
-    markdown: Annotated[Path | None, typer.Option(help="With --fits: write the table to this Markdown file too.")] = None,
     threads: Threads = None,
     json: JsonFlag = False,
 ) -> None:
@@ -75,9 +61,6 @@ def bench(
             output.print(f"identify, one lift of the towel, {thread_count()} threads: {seconds:.0f} s")
         finish({"threads": thread_count(), "identify_seconds": seconds}, json)
         return
-    if fits is not None:
-        _race(fits, targets=targets, seed=seed, workers=workers, markdown=markdown, json=json)
-        return
     published = {} if scene is None else {"release_lift": scene}
     timings, matchings = run_benchmarks(published, repeats=repeats), matching_benchmarks(repeats=repeats)
     show(benchmark_table(timings), json)
@@ -86,26 +69,6 @@ def bench(
         table.add_row(*row)
     show(table, json)
     finish({"threads": thread_count(), "timings": timings, "matchings": matchings}, json)
-
-
-def _race(out: Path, *, targets: int, seed: int, workers: int, markdown: Path | None, json: bool) -> None:
-    from pipeline.solver_race import HEAD, race_jobs, race_page, race_rows  # not above: only this needs them
-
-    records, failures = [], []
-    for job, record, error in run_all("bench", race_jobs(targets, seed, out), workers):
-        if error is None:
-            records.append(record)
-        else:
-            failures.append(f"{job.label}: {error}")
-            errors.print(failures[-1], soft_wrap=True)
-    rows = race_rows(records)
-    table = Table(*HEAD)
-    for row in rows:
-        table.add_row(*row)
-    show(table, json)
-    if markdown is not None:
-        write_text(markdown, race_page(rows, seed))
-    finish({"out": str(out), "records": records, "failures": failures}, json)
 
 
 def run_benchmarks(published: Mapping[str, Path], *, repeats: int) -> list[dict[str, Any]]:

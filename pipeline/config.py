@@ -17,7 +17,6 @@ from diffcloud.fit.doubts import MATERIAL_DOUBTS, parse_doubts
 from diffcloud.fit.laid import parse_laid
 from diffcloud.fit.pose import parse_priors
 from diffcloud.fit.solvers import SOLVERS, Settings
-from diffcloud.fit.solvers.gauss_newton import ROUGH_SCREEN, ROUGH_STARTS
 from diffcloud.io.files import read_yaml
 from diffcloud.io.raw_episodes import ScenePlacement
 from diffcloud.io.schema import Checked, Component, NonNegative, Positive, Vector, explain
@@ -29,7 +28,7 @@ from diffcloud.sensing.fusion import FusionSettings
 from diffcloud.sensing.recorder import RecorderSettings
 
 _MOST, _FACTOR = 10_000_000, 1e6
-MOST_STARTS, MOST_CANDIDATES = 100, 10_000
+MOST_STARTS = 100
 """Of a fit. A start takes minutes, a candidate about a second."""
 Count = Annotated[int, Field(ge=1, le=_MOST)]
 CountOrNone = Annotated[int, Field(ge=0, le=_MOST)]
@@ -197,7 +196,7 @@ class SimulateConfig(Section):
 
 SMOOTHING = 0.5
 """Default of adam's."""
-_OF_SOLVERS = ("iterations", "starts", "screen", "learning_rate", "patience", "smoothing", "resample", "simulations")
+_OF_SOLVERS = ("iterations", "starts", "learning_rate", "smoothing", "resample", "simulations")
 """Options that not every solver has: one does if its settings have a field of that name."""
 
 
@@ -207,22 +206,15 @@ class FitConfig(Section):
     parameters: Names = ["stretch", "mass"]
     bounds: dict[str, Bounds] = {}
     fixed: dict[str, Component] = {}
-    solver: Literal["likelihood", "gauss_newton", "adam", "cma_es", "random_search"] = "gauss_newton"
+    solver: Literal["likelihood", "adam", "cma_es", "random_search"] = "likelihood"
     """`likelihood` gives each frame a variance, and knows what the model cannot predict; `adam` is the paper's; `cma_es`
-    and `random_search` need no derivatives."""
+    and `random_search` need no derivatives. Only the first gives intervals."""
     iterations: Count | None = None
-    """Of likelihood, gauss_newton and adam: steps at most; by default 12, 20 and 50."""
+    """Of likelihood and adam: steps of a start at most; by default 12 and 50."""
     starts: Annotated[int, Field(ge=1, le=MOST_STARTS)] | None = None
-    """Of likelihood, gauss_newton and adam: number of descents, from different places; by default 3, at most 4 (2 with the
-    linearised integrator) and 1. By default, gauss_newton ends once one explains the recording or two end equally low."""
-    screen: Annotated[int, Field(ge=0, le=MOST_CANDIDATES)] | None = None
-    """Of gauss_newton and adam: candidates simulated once to choose the starts from; by default 24 of gauss_newton (48 with
-    the linearised integrator), none of adam, whose further starts are then spread over the box."""
+    """Of likelihood and adam: number of descents, from different places; by default 3 and 1."""
     learning_rate: Positive | None = None
     """Of adam; the scenario's own if not given."""
-    patience: CountOrNone | None = None
-    """Of adam: iterations without a lower loss after which a further start restarts near the best point found; 0: never;
-    by default 10."""
     smoothing: NonNegative | None = None
     """Of adam: standard deviation, on the sigmoid's axis, of the first start's perturbed copies, whose gradients are
     averaged; 0: the plain gradient, as the paper has it; by default 0.5."""
@@ -241,13 +233,15 @@ class FitConfig(Section):
     not given, all of them, as `fit.pose.default_priors` says."""
     laid: Name | None = None
     """How the cloth may lie other than as its scenario has it, and how far off: "turn=5deg,shape=5mm,size=2%", or "none"
-    (`fit.laid`). Default: what the scenario says, in implicit fits by gauss_newton; else none."""
+    (`fit.laid`). Default: what the scenario says, of likelihood with the implicit integrator; else none."""
     prior: Name | None = None
     """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""
     doubts: Name | None = None
     """The factor within which material that is not asked for is known: "bending=1.5x,drag=1.3x", or "none". It is fitted
-    too, and is not a result (`fit.doubts`). Default: `MATERIAL_DOUBTS` and what the scenario says, of gauss_newton unless
-    linearised, else none."""
+    too, and is not a result (`fit.doubts`). Default: `MATERIAL_DOUBTS` and what the scenario says, of likelihood with
+    the implicit integrator; else none."""
+    model_error: bool = True
+    """Of likelihood: whether cloth and simulator may differ. False for recordings that this simulator made on this mesh."""
     joint: bool = False
     """One parameter set for all episodes, whatever their scenario: they must be of one cloth."""
 
@@ -276,12 +270,7 @@ class FitConfig(Section):
         if self.paper and parse_doubts(self.doubts or "none"):
             raise ValueError("doubts: the published measure takes the rest of the material for known; leave them out")
         if self.paper and self.solver == "likelihood":
-            raise ValueError("paper: the published measure has no likelihood; choose another solver, or leave it out")
-        if self.solver == "adam" and self.screen and not 2 <= (self.starts or 1) <= self.screen:
-            raise ValueError(
-                f"screen: of adam, candidates that its further starts are chosen from; got {self.screen} for "
-                f"{self.starts or 1} start(s). Give at least 2 starts and as many candidates or more, or leave it out"
-            )
+            raise ValueError("paper: the published measure has no likelihood; choose another solver, such as adam")
         if foreign := [name for name in self._solver_options() if self.solver not in _solvers_with(name)]:
             told = "; ".join(f"{name}: of solver {' or '.join(_solvers_with(name))}" for name in foreign)
             raise ValueError(f"{told}; not of {self.solver}: leave out, or choose that solver")
@@ -317,18 +306,18 @@ class FitConfig(Section):
     def _fits_more(self, scenarios: Sequence[Scenario]) -> bool:
         """Whether more than what is asked for is fitted by default: where derivatives make that cheap."""
         implicit = all(one.scene.integrator == "implicit" for one in scenarios)
-        return not self.paper and self.solver in ("gauss_newton", "likelihood") and implicit
+        return not self.paper and self.solver == "likelihood" and implicit
 
     def solver_settings(self, scenario: Scenario) -> Settings:
         """Of the solver, with what the scenario says where nothing is given."""
         given: dict[str, Any] = {}
         if self.solver == "adam":
-            given |= {"learning_rate": scenario.learning_rate, "patience": 10, "smoothing": SMOOTHING}
-        elif self.solver == "gauss_newton" and scenario.scene.integrator == "linearised":
-            given |= {"screen": ROUGH_SCREEN, "starts": ROUGH_STARTS}
+            given |= {"learning_rate": scenario.learning_rate, "smoothing": SMOOTHING}
         own = scenario.threshold if self.paper else 0.0
         given["seed"] = self.seed
-        if self.solver != "likelihood":
+        if self.solver == "likelihood":
+            given["model_error"] = self.model_error
+        else:
             given["threshold"] = own if self.threshold is None else self.threshold
         return SOLVERS[self.solver](**given | self._solver_options())
 

@@ -15,9 +15,9 @@ import typer
 from rich.table import Table
 
 from diffcloud.errors import ConfigError, DiffCloudError, OutputError
-from diffcloud.evaluation.intervals import LEVEL, state_intervals
+from diffcloud.evaluation.intervals import LEVEL, intervals_of
 from diffcloud.fit.pose import SET_UP, PoseSpace
-from diffcloud.fit.uncertainty import finer_steps
+from diffcloud.fit.result import describe_fit
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import files_in, read_json, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint, kept_record
@@ -49,6 +49,8 @@ if TYPE_CHECKING:
 _RECORDS = ("mesh", "io", "sim", "scene", "clouds", "sensing")
 """Packages whose source decides what is recorded."""
 _CODE = (*_RECORDS, "fit", "evaluation")
+_FINER_STEPS = 4
+"""Times as many steps of the truths `refined` and `finer`."""
 _LAID_M = 0.01
 """Deviation by which a cloth is laid beside its place."""
 Truth = Literal["same", "refined", "finer"]
@@ -260,17 +262,13 @@ class CoverageJob:
         episode = self.episode(truth, tell)
         tell(0.5, "fit")
         fit = self.config.fit
-        fit = fit.model_copy(update={"fixed": {**fit.fixed, **{name: truth[name] for name in self.known}}})
+        fixed = {**fit.fixed, **{name: truth[name] for name in self.known}}
+        fit = fit.model_copy(update={"fixed": fixed, "model_error": self.kind != "same"})
         job = FitJob(self.label, [Recording(self.scenario, self.label, episode)], fit, self.folder)
         objective, outcome = job.solved()
         outcome = outcome.uninterrupted()
-        found = state_intervals(
-            objective,
-            job.space,
-            outcome.values,
-            level=self.level,
-            within=self.config.evaluate.within,
-        )
+        fitted = describe_fit(objective, job.space, job.solver_settings, outcome, episodes=[self.label]).record
+        found = intervals_of(fitted, job.space, self.scenario, level=self.level, within=self.config.evaluate.within)
         told: dict[str, Any] = {
             "loss": outcome.loss,
             "values": outcome.values,
@@ -286,7 +284,7 @@ class CoverageJob:
 
     def _true_scenario(self) -> Scenario:
         """With the steps and the mesh of the truth."""
-        true = self.scenario if self.kind == "same" else finer_steps(self.scenario)
+        true = self.scenario if self.kind == "same" else self.scenario.with_steps(_FINER_STEPS)
         return true.finer() if self.kind == "finer" else true
 
     def episode(self, truth: Mapping[str, float], tell: Tell) -> Episode:

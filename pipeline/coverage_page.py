@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 
 from diffcloud.errors import ConfigError
-from diffcloud.evaluation.intervals import LEVEL, noise_quantile
+from diffcloud.evaluation.intervals import LEVEL
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.io.files import files_in, read_json
@@ -108,8 +109,8 @@ def _count(records: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
             continue
         for source, deviations in told["sources"].items():
             sources.setdefault(source, []).append(deviations[name])
-        if "noise" in told["sources"]:
-            alone += off <= noise_quantile(told["clusters"], told["level"]) * told["sources"]["noise"][name]
+        if "recording" in told["sources"]:
+            alone += off <= NormalDist().inv_cdf(0.5 + told["level"] / 2) * told["sources"]["recording"][name]
     return {
         "n": len(records),
         "stated": len(widths),

@@ -40,7 +40,7 @@ from pipeline.console import (
     show,
     with_suffix,
 )
-from pipeline.fit_jobs import Recording, compared, joint_fit
+from pipeline.fit_jobs import joint_fit
 from pipeline.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario
 
 app = typer.Typer(help="Measure parameters, and compare methods.")
@@ -105,7 +105,6 @@ def loss(
 @app.command()
 def intervals(
     fit: Annotated[Path, typer.Argument(help="JSON of a fit.")],
-    episodes: Annotated[list[Path], typer.Argument(help="Its episode, or all episodes of a joint fit in their order.")],
     scenario: ScenarioName = None,
     scene: SceneFile = None,
     level: Annotated[float, typer.Option(min=0.01, max=0.999, help="Share of intervals meant to hold the truth.")] = LEVEL,
@@ -117,21 +116,10 @@ def intervals(
     """Intervals of a fit's parameters, a verdict for each, and where the uncertainty comes from."""
     use_threads(threads)
     record = read_fit(fit)
-    if len(episodes) != len(record.episodes):
-        names = ", ".join(one.name for one in record.episodes)
-        raise ConfigError(f"{fit} is a fit to {len(record.episodes)} episodes ({names}), {len(episodes)} were given.")
     if within <= 1:
         raise ConfigError(f"--within takes a factor above 1, got {within:g}.")
-    recordings = []
-    for place, (path, one) in enumerate(zip(episodes, record.episodes, strict=True)):
-        if path.stem != one.name:
-            raise ConfigError(f"Recording {place + 1} of {fit} is {one.name}, and {path} was given in its place.")
-        single = len(episodes) == 1 or one.scenario == record.scenario
-        stated = scenario if scenario is not None and single else None
-        chosen = choose_scenario(stated or fitted_scenario(fit, one.scenario), scene)
-        recordings.append(Recording(chosen, one.name, read_episode(path)))
-    objective = compared(record, recordings)
-    found = intervals_of(record, objective, space_of(record), level=level, within=within)
+    chosen = choose_scenario(scenario or fitted_scenario(fit, record.scenario), scene)
+    found = intervals_of(record, space_of(record), chosen, level=level, within=within)
     if out is not None:
         write_json(with_suffix(out, ".json"), found.model_dump(mode="json"))
     if not json:
@@ -143,12 +131,12 @@ def _show_intervals(found: Intervals) -> None:
     table = Table("parameter", "value", "from", "to", "SI", "verdict", "improve first")
     for name, entry in found.parameters.items():
         digits = significant(entry.low, entry.high)
-        ends = ("–", "–") if entry.low is None else (digits(entry.low), digits(entry.high))
-        physical = "" if entry.physical_low is None else f"{digits(entry.physical_low)} to {digits(entry.physical_high)} "
+        ends = digits(entry.low), digits(entry.high)
+        physical = f"{digits(entry.physical_low)} to {digits(entry.physical_high)} "
         sources = largest_sources(found.sources, name)
         table.add_row(name, digits(entry.value), *ends, f"{physical}{entry.physical_unit}", entry.verdict, sources)
     output.print(table)
-    if found.ratio is not None and found.ratio.factor is not None:
+    if found.ratio is not None:
         output.print(f"stretch / mass {found.ratio.value:.3g}, within a factor of {found.ratio.factor:.3g}")
     for sentence in found.sentences:
         output.print(sentence, soft_wrap=True)

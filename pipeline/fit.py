@@ -80,34 +80,15 @@ def fit(
     solver: Annotated[
         str | None,
         typer.Option(
-            help="gauss_newton (default); likelihood, whose intervals know the mesh; adam, the paper's; cma_es or "
-            "random_search, without derivatives."
+            help="likelihood (default), with intervals; adam, the paper's; cma_es or random_search, without derivatives."
         ),
     ] = None,
-    iterations: Annotated[
-        int | None, typer.Option(help="Steps at most. Default: 12 of likelihood, 20 of gauss_newton, 50 of adam.")
-    ] = None,
+    iterations: Annotated[int | None, typer.Option(help="Steps at most. Default: 12 of likelihood, 50 of adam.")] = None,
     simulations: Annotated[
         int | None, typer.Option(help="Of cma_es and random_search: as many at most. Default: 200.")
     ] = None,
-    starts: Annotated[
-        int | None,
-        typer.Option(
-            help="Places to descend from. Default of likelihood: 3; of gauss_newton: at most 4, the best candidates "
-            "(linearised: 2); of adam: 1."
-        ),
-    ] = None,
-    screen: Annotated[
-        int | None,
-        typer.Option(
-            help="Simulate this many candidates, start from the best. Default of gauss_newton: 24; 48 if linearised."
-        ),
-    ] = None,
+    starts: Annotated[int | None, typer.Option(help="Places to descend from. Default: 3 of likelihood, 1 of adam.")] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Of adam. Default: the scenario's.")] = None,
-    patience: Annotated[
-        int | None,
-        typer.Option(help="Of adam: move a further start beside the best after so many iterations in vain; 0: never."),
-    ] = None,
     init: Annotated[
         str,
         typer.Option(
@@ -120,9 +101,7 @@ def fit(
     threshold: Annotated[
         float | None, typer.Option(help="Stop below this loss; default: never, with --paper the scenario's.")
     ] = None,
-    points: Annotated[
-        int | None, typer.Option(help="Sampled per frame (500 at most when candidates are compared).")
-    ] = None,
+    points: Annotated[int | None, typer.Option(help="Sampled per frame.")] = None,
     frame: Annotated[list[int] | None, typer.Option(help="Frame to compare, repeatable; default: all usable ones.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of all random numbers.")] = None,
     resample: Annotated[bool | None, typer.Option(help="Of adam: new points in each iteration.")] = None,
@@ -153,7 +132,7 @@ def fit(
         str | None,
         typer.Option(
             help="Fit roughly known material too, unreported: bending=1.5x,drag=1.3x (the rest is exact), or none. Default "
-            "of gauss_newton unless linearised: 1.5x of bending and damping, 1.3x of drag and frictions, 3x of "
+            "of likelihood unless linearised: 1.5x of bending and damping, 1.3x of drag and frictions, 3x of "
             "compression, unless the scenario's doubts say otherwise."
         ),
     ] = None,
@@ -184,8 +163,6 @@ def fit(
         simulations=simulations,
         learning_rate=learning_rate,
         starts=starts,
-        screen=screen,
-        patience=patience,
         smoothing=smoothing,
         threshold=threshold,
         points=points,

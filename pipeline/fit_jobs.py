@@ -18,7 +18,7 @@ from diffcloud.fit.left_out import leave_each_out
 from diffcloud.fit.priors import parameter_priors
 from diffcloud.fit.record import FitRecord, LeftOut
 from diffcloud.fit.result import describe_fit
-from diffcloud.fit.solvers import FitOutcome, Settings, solve
+from diffcloud.fit.solvers import FitOutcome, LikelihoodSettings, Settings, solve
 from diffcloud.fit.solvers.outcome import FitHistory
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import read_yaml
@@ -234,7 +234,7 @@ class FitJob:
         space, settings = self.space, self.solver_settings
         objective, outcome = self.solved(partial(show, ""))
         left, failures, interrupted = list[LeftOut](), list[str](), outcome.stop_reason == "interrupted"
-        if isinstance(objective, JointObjective) and not interrupted:
+        if isinstance(objective, JointObjective) and isinstance(settings, LikelihoodSettings) and not interrupted:
             try:
                 left = leave_each_out(objective, space, outcome.values, settings, progress=show_left_out)
             except DivergedError as error:

@@ -433,7 +433,7 @@ def _chosen(parameters: str | None, cloth: Mapping[str, Any], weighed: tuple[flo
     if weighed is not None and not weighed[1]:
         fixed = {"mass": weighed[0] / float(_material(cloth)["density_kg_m2"])}
     bounds = {name: list(pair) for name, pair in _BOUNDS.items() if name in names}
-    return FitConfig.model_validate({"parameters": names, "fixed": fixed, "bounds": bounds, "solver": "likelihood"})
+    return FitConfig.model_validate({"parameters": names, "fixed": fixed, "bounds": bounds})
 
 
 def _stage(out: Path) -> Path:
@@ -496,7 +496,7 @@ def _with_grip_found(members: Sequence[Recording], record: FitRecord, out: Path)
 def _intervals(so_far: _SoFar, *, level: float, within: float) -> Intervals:
     assert so_far.fitted is not None
     record, objective, _ = so_far.fitted
-    return intervals_of(record, objective, space_of(record), level=level, within=within)
+    return intervals_of(record, space_of(record), objective.members[0].scenario, level=level, within=within)
 
 
 def _validation(record: FitRecord, objective: AnyObjective) -> str:
@@ -576,9 +576,8 @@ def _findings(so_far: _SoFar, status: Status) -> list[str]:
         if found is not None:
             entry, verdict = found.parameters[name], told["verdict"]
             first = largest_sources(found.sources, name, 2)
-            if entry.low is not None:
-                ends = f", {found.level:.0%} interval {digits(entry.physical_low)} to {digits(entry.physical_high)}"
-                improve = f" (improve first: {first})" if first else ""
+            ends = f", {found.level:.0%} interval {digits(entry.physical_low)} to {digits(entry.physical_high)}"
+            improve = f" (improve first: {first})" if first else ""
         lines.append(f"{name}: {digits(told['physical'])} {told['physical_unit']}{ends}: {verdict}{improve}.")
     if record.estimate is not None and record.estimate.grip_m is not None:
         lines.append(f"The grasp is {1e3 * record.estimate.grip_m:.0f} mm wide, as the fit found it.")
@@ -621,7 +620,7 @@ def _result(so_far: _SoFar, findings: Sequence[str], status: Status) -> dict[str
         "status": status,
         "parameters": _parameters(so_far),
         "rms_mm": record.rms_mm,
-        "explains": None if found is None else found.explains and found.arrived,
+        "explains": None if found is None else found.explains,
         "reason": "" if found is None else found.reason,
         "remark": "" if found is None else found.remark,
         "horizons_s": {

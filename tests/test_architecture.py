@@ -147,7 +147,7 @@ def test_every_setting_can_be_set_in_an_experiment(tmp_path):
     for name in leaves(yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8"))):
         shutil.copy(ROOT / "params.yaml", path)
         apply_overrides(path, [f"{name}=null"])
-    changes = ["fit.seed=3", "fit.fixed.mass=1.2", "fit.bounds.stretch=[0.5,2]", "fit.solver=cma_es", "fit.screen=null"]
+    changes = ["fit.seed=3", "fit.fixed.mass=1.2", "fit.bounds.stretch=[0.5,2]", "fit.solver=cma_es"]
     shutil.copy(ROOT / "params.yaml", path)
     apply_overrides(path, [*changes, "fit.simulations=50", "preprocess.raw.origin_m=[1,2,3]"])
     config = load_config(path)

@@ -1,7 +1,7 @@
 """Comparing methods on equal terms, and what can be known of the parameters."""
 
 from diffcloud.evaluation.episode import RIVALS, ComparisonSettings, EpisodeRecord, compare_episode
-from diffcloud.evaluation.intervals import Intervals, state_intervals
+from diffcloud.evaluation.intervals import Intervals, intervals_of
 from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter
@@ -16,6 +16,6 @@ __all__ = [
     "Intervals",
     "Rival",
     "compare_episode",
+    "intervals_of",
     "loss_landscape",
-    "state_intervals",
 ]

@@ -1,4 +1,4 @@
-"""The sums over all pairs that a fit's step needs, in a kernel. What they mean: `fit.matching`."""
+"""The sums over all pairs from which a pose is found, in a kernel. What they mean: `fit.matching`."""
 
 from __future__ import annotations
 
@@ -11,15 +11,13 @@ from diffcloud.sim.compiled.data import Floats, Ints
 
 
 class Surfaces(NamedTuple):
-    """B motions of V nodes at L frames, V / C nodes for each of C clocks. Axis B of velocities or rates has length one
-    where all motions share them; so has axis L of velocities where all frames do."""
+    """B motions of V nodes at L frames, V / C nodes for each of C clocks. Axis B or L of velocities has length one where
+    all motions, or all frames, share them."""
 
     nodes: Floats
     """[B, L, V, 3]"""
     velocities: Floats
     """Likewise; empty: none."""
-    rates: Floats
-    """[k, B, L, V', 3] by k variables of the first V' / C nodes of each clock; the others stand still."""
 
 
 class Placements(NamedTuple):
@@ -70,16 +68,13 @@ def sum_terms(
     slope: Floats,
     curvature: Floats,
 ) -> None:
-    """Add up the loss [B], half of its slope [B, k + d] and of its curvature [B, k + d, k + d], by what moves the nodes and
-    by the pose.
+    """Add up the loss [B], half of its slope [B, d] and of its curvature [B, d, d], by the pose.
 
     Args:
         cap: largest distance that counts as itself.
         hidden: loss of a frame in which no place counts.
     """
-    own, clocks = surfaces.rates.shape[0], placements.lag.shape[1]
-    each, cloth = surfaces.nodes.shape[2] // clocks, surfaces.rates.shape[3] // clocks
-    count = own + len(placements.shift_rates)
+    each, count = surfaces.nodes.shape[2] // placements.lag.shape[1], len(placements.shift_rates)
     moves, own_normals = surfaces.velocities.size > 0, pairs.normals.size == 0
     c0, c1, c2 = placements.centre[0], placements.centre[1], placements.centre[2]
     along, beside = np.empty(count), np.empty(count)
@@ -89,7 +84,7 @@ def sum_terms(
         m10, m11, m12 = matrix[1, 0], matrix[1, 1], matrix[1, 2]
         m20, m21, m22 = matrix[2, 0], matrix[2, 1], matrix[2, 2]
         for f in range(surfaces.nodes.shape[1]):
-            nodes, rates = surfaces.nodes[b, f], surfaces.rates[:, min(b, surfaces.rates.shape[1] - 1), f]
+            nodes = surfaces.nodes[b, f]
             velocities = _of(surfaces.velocities, b, f) if moves else nodes
             corners, barycentric = _of(pairs.corners, b, f), _of(pairs.barycentric, b, f)
             points, weights = _of(pairs.points, b, f), _of(pairs.weights, b, f)
@@ -102,7 +97,7 @@ def sum_terms(
                 total += weight
                 i, j, k = corners[pair, 0], corners[pair, 1], corners[pair, 2]
                 clock = i // each
-                lag, bodies = placements.lag[b, clock], clock * (each - cloth)  # nodes before these that have no rates
+                lag = placements.lag[b, clock]
                 u, v, w = barycentric[pair, 0], barycentric[pair, 1], barycentric[pair, 2]
                 p0, p1, p2 = _inside(nodes, i, j, k, u, v, w)
                 v0 = v1 = v2 = 0.0
@@ -133,22 +128,14 @@ def sum_terms(
                 if size > 0.0:
                     t0, t1, t2 = t0 / size, t1 / size, t2 / size
                 for row in range(count):
-                    if row < own:
-                        s0 = s1 = s2 = 0.0
-                        if i - clock * each < cloth:
-                            s0, s1, s2 = _inside(rates[row], i - bodies, j - bodies, k - bodies, u, v, w)
-                        r0 = m00 * s0 + m01 * s1 + m02 * s2
-                        r1 = m10 * s0 + m11 * s1 + m12 * s2
-                        r2 = m20 * s0 + m21 * s1 + m22 * s2
-                    else:
-                        turn, shift = matrix_rates[row - own], placements.shift_rates[row - own]
-                        late = placements.lag_rates[row - own, clock]
-                        r0 = turn[0, 0] * p0 + turn[0, 1] * p1 + turn[0, 2] * p2 + shift[0]
-                        r1 = turn[1, 0] * p0 + turn[1, 1] * p1 + turn[1, 2] * p2 + shift[1]
-                        r2 = turn[2, 0] * p0 + turn[2, 1] * p1 + turn[2, 2] * p2 + shift[2]
-                        r0 += late * (m00 * v0 + m01 * v1 + m02 * v2)
-                        r1 += late * (m10 * v0 + m11 * v1 + m12 * v2)
-                        r2 += late * (m20 * v0 + m21 * v1 + m22 * v2)
+                    turn, shift = matrix_rates[row], placements.shift_rates[row]
+                    late = placements.lag_rates[row, clock]
+                    r0 = turn[0, 0] * p0 + turn[0, 1] * p1 + turn[0, 2] * p2 + shift[0]
+                    r1 = turn[1, 0] * p0 + turn[1, 1] * p1 + turn[1, 2] * p2 + shift[1]
+                    r2 = turn[2, 0] * p0 + turn[2, 1] * p1 + turn[2, 2] * p2 + shift[2]
+                    r0 += late * (m00 * v0 + m01 * v1 + m02 * v2)
+                    r1 += late * (m10 * v0 + m11 * v1 + m12 * v2)
+                    r2 += late * (m20 * v0 + m21 * v1 + m22 * v2)
                     slope[b, row] += weight * (r0 * x + r1 * y + r2 * z)
                     along[row], beside[row] = r0 * n0 + r1 * n1 + r2 * n2, r0 * t0 + r1 * t1 + r2 * t2
                     for column in range(row + 1):
@@ -188,11 +175,11 @@ def _across(nodes: Floats, velocities: Floats, lag: float, i: int, j: int, k: in
 
 
 def compile_terms() -> None:
-    """Compile what a fit's step needs."""
+    """Compile what finding a pose needs."""
     points = np.zeros((1, 1, 3, 3))
-    surfaces = Surfaces(points, points, points[None])
+    surfaces = Surfaces(points, points)
     placements = Placements(
         np.zeros(3), np.eye(3)[None], np.zeros((1, 3)), np.zeros((1, 1)), np.eye(3)[None, None], np.eye(3)[:1], np.eye(1)
     )
     pairs = Partners(np.zeros((1, 1, 3, 3), np.int64), points, points, points, np.ones((1, 1, 3)), np.ones(1))
-    sum_terms(surfaces, placements, pairs, 1.0, 1.0, np.zeros(1), np.zeros((1, 2)), np.zeros((1, 2, 2)))
+    sum_terms(surfaces, placements, pairs, 1.0, 1.0, np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1, 1)))

@@ -4,7 +4,7 @@ How noisy a recording is, and how well the simulator can explain it, is not know
 next. With a variance of its own for each, the likelihood of all is highest where the geometric mean of their losses is
 lowest:
 
-    loss = (∏ loss_i)^(1/n),      half of its slope = loss / n  Σ g_i / loss_i,      curvature = loss / n  Σ H_i / loss_i
+    loss = (∏ loss_i)^(1/n)
 
 so that each weighs by its own misfit, and a part gained in one counts as much as in another. The paper's measure takes the
 plain mean.
@@ -47,21 +47,6 @@ class JointObjective:
     def length_unit_m(self) -> float:
         return self.members[0].length_unit_m
 
-    @property
-    def knows_gaps(self) -> bool:
-        """As of `Objective`, of every one."""
-        return all(one.knows_gaps for one in self.members)
-
-    @property
-    def explained(self) -> float:
-        """As of `Objective`."""
-        return self._mean([one.explained for one in self.members])
-
-    @property
-    def unexplained(self) -> float:
-        """As of `Objective`: the geometric mean of all, infinity if it is not known of one what it misses."""
-        return self._mean([one.unexplained for one in self.members])
-
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Losses [B], as of `Objective`.
 
@@ -71,20 +56,9 @@ class JointObjective:
         own = [(one, of_recording(parameters, index)) for index, one in enumerate(self.members)]
         return mean_loss(torch.stack(map_threads(lambda pair: pair[0](pair[1]), own)), paper=self.paper)
 
-    def until(self, part: float) -> JointObjective:
-        """As of `Objective`, of every one."""
-        return JointObjective([one.until(part) for one in self.members])
-
     def earliest(self, counts: Sequence[int]) -> JointObjective:
         """As of `Objective`, with a count for each."""
         return JointObjective([one.earliest([count]) for one, count in zip(self.members, counts, strict=True)])
-
-    def thinned(self, most: int) -> JointObjective:
-        """As of `Objective`, of every one."""
-        return JointObjective([one.thinned(most) for one in self.members])
-
-    def _mean(self, losses: Sequence[float]) -> float:
-        return float(mean_loss(torch.tensor(losses, dtype=torch.float64)[:, None], paper=self.paper))
 
     def reseed(self, seed: int) -> None:
         """Draw the common random numbers anew."""
@@ -99,21 +73,6 @@ AnyObjective = Objective | JointObjective
 def mean_loss(losses: Tensor, *, paper: bool) -> Tensor:
     """[n, B] of n recordings -> [B]."""
     return losses.mean(0) if paper or len(losses) == 1 else losses.clamp(min=_TINY).log().mean(0).exp()
-
-
-def mean_terms(terms: Sequence[tuple[Tensor, Tensor, Tensor]], *, paper: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Loss [B], half of its slope [B, k] and curvature [B, k, k] from those of each recording."""
-    losses, slopes, curvatures = (torch.stack(part) for part in zip(*terms, strict=True))
-    weights = loss_weights(losses, paper=paper)
-    slope, curvature = (weights[..., None] * slopes).sum(0), (weights[..., None, None] * curvatures).sum(0)
-    return mean_loss(losses, paper=paper), slope, curvature
-
-
-def loss_weights(losses: Tensor, *, paper: bool) -> Tensor:
-    """[n, B] derivatives of the mean loss by those of n recordings."""
-    if paper or len(losses) == 1:
-        return torch.full_like(losses, 1 / len(losses))
-    return mean_loss(losses, paper=paper) / losses.clamp(min=_TINY) / len(losses)
 
 
 def check_same_cloth(first: Scenario, other: Scenario) -> None:

@@ -16,16 +16,9 @@ from diffcloud.fit.laid import is_laid
 from diffcloud.fit.names import of_recording, plain_name, without_recording
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.record import LeftOut
-from diffcloud.fit.solvers import (
-    GaussNewtonSettings,
-    LikelihoodSettings,
-    Progress,
-    Settings,
-    solve,
-)
+from diffcloud.fit.solvers import LikelihoodSettings, Progress, solve
 from diffcloud.sim.properties import one_set
 
-_STEPS = 10
 Tell = Callable[[float, str, Progress], None]
 """What a progress display gets: the part of the recordings that have been left out, what is done now, and the progress of
 the current fit."""
@@ -35,7 +28,7 @@ def leave_each_out(
     objective: JointObjective,
     space: FitSpace,
     values: Mapping[str, float],
-    settings: Settings = GaussNewtonSettings(),
+    settings: LikelihoodSettings = LikelihoodSettings(),
     *,
     progress: Tell | None = None,
 ) -> list[LeftOut]:
@@ -44,7 +37,7 @@ def leave_each_out(
 
     Args:
         values: fitted to all, named as `fit.names` says.
-        settings: of the joint fit; a descent by Gauss–Newton, but where it was by `likelihood`.
+        settings: of the joint fit.
 
     Raises:
         DivergedError: a motion diverges.
@@ -74,11 +67,9 @@ def _from(
     objective: AnyObjective,
     space: FitSpace,
     values: Mapping[str, float],
-    settings: Settings,
+    settings: LikelihoodSettings,
     progress: Callable[[Progress], None] | None,
 ) -> dict[str, float]:
     """The fitted values at the end of a descent from these."""
-    further: Settings = GaussNewtonSettings(iterations=_STEPS, starts=1, screen=0, init=values)
-    if isinstance(settings, LikelihoodSettings):
-        further = replace(settings, starts=1, init=values)
+    further = replace(settings, starts=1, init=values)
     return solve(objective, space, further, progress=progress).uninterrupted().values

@@ -70,16 +70,6 @@ class Pairs:
         found = (self.weights * (moved - self.partners).square().sum(-1).clamp(max=cap**2)).sum(-1)
         return torch.where(self.weights.sum(-1) > 0, found, self.share * cap**2)
 
-    def scores(self, moved: Tensor, rates: Tensor, cap: float) -> Tensor:
-        """[k, B, L, N] what each pair adds to half of the slope.
-
-        Args:
-            rates: [k, B, L, N, 3] of the places.
-        """
-        away = moved - self.partners
-        weights = torch.where(away.square().sum(-1) < cap**2, self.weights, 0.0)
-        return weights * (rates * away).sum(-1)
-
 
 @dataclass(frozen=True)
 class Motion:
@@ -98,22 +88,20 @@ class Motion:
         """[B, L, C · V, 3] where the nodes are when the recording looks at them."""
         return _shown(self.nodes, self.velocities, self.pose, space)
 
-    def terms(self, space: PoseSpace, rates: Tensor | None, cap: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Loss [B], half of its slope [B, k + d] and of its curvature [B, k + d, k + d], by k variables and the pose.
+    def terms(self, space: PoseSpace, cap: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Loss [B], half of its slope [B, d] and of its curvature [B, d, d], by the pose.
 
         Args:
-            rates: [k, B, L, C · V', 3] of the first V' nodes of each clock, the cloth's; None: k is 0.
             cap: largest distance that counts as itself.
         """
         from diffcloud.fit.curvature import Partners, Placements, Surfaces, sum_terms  # numba takes a moment to import
 
         nodes, none = self.nodes, self.nodes.new_zeros(0, 1, 1, 3)
         moving = none if self.velocities is None else self.velocities
-        changes = nodes.new_zeros(0, 1, nodes.shape[1], 1, 3) if rates is None else rates
-        self._check(space, rates)
-        surfaces = Surfaces(_array(nodes), _array(moving, 0, 1), _array(changes, 1))
+        self._check(space)
+        surfaces = Surfaces(_array(nodes), _array(moving, 0, 1))
         placements = Placements(*map(_array, space.placements(self.pose)))
-        count = len(surfaces.rates) + self.pose.shape[1]
+        count = self.pose.shape[1]
         loss, slope, curvature = (nodes.new_zeros(len(nodes), *[count] * order) for order in range(3))
         sums = loss.numpy(), slope.numpy(), curvature.numpy()
         for one in self.pairs:
@@ -124,14 +112,13 @@ class Motion:
             sum_terms(surfaces, placements, partners, cap, one.share * cap**2, *sums)
         return loss, slope, curvature
 
-    def _check(self, space: PoseSpace, rates: Tensor | None) -> None:
+    def _check(self, space: PoseSpace) -> None:
         """Assert the shapes on which the kernel, which checks no bounds, relies."""
         batch, frames = self.nodes.shape[:2]
         assert self.pose.shape == (batch, len(space.names))
         assert not space.moves_clocks or self.velocities is not None
         assert self.nodes.shape[2] % len(space.clocks) == 0
         assert self.velocities is None or self.velocities.shape == self.nodes.shape
-        assert rates is None or rates.shape[1:3] == (batch, frames)
         for one in self.pairs:
             shape = (batch, frames, one.weights.shape[2])
             each = [one.places.nodes, one.places.barycentric, one.partners, *([] if one.normals is None else [one.normals])]

@@ -8,10 +8,8 @@ pose.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -39,14 +37,6 @@ _FEWEST = 200
 """Points of a frame, however many frames share the scenario's."""
 _NEAR_M = 0.008
 """A layer of cloth that lies so close over another does not hide it: a camera sees both as one."""
-_EXPLAINED, _EXPLAINED_BY_CAMERAS = 1.25, 2.0
-"""Times what noise and spacing account for. Of the four scenarios, right motions have 0.65 to 1.1 of it, descents that stop
-early because the loss around is rough up to 1.23, and wrong minima at least 1.3, most of them more than 1.7. Where it is
-not known which pixels cameras lost, right motions have 1.4 to 4."""
-_UNEXPLAINED = 2.0
-"""Times what noise and spacing leave, where it is known what the recording misses: above, the model does not explain the
-recording. Of random cloths that this simulator moved, right fits have had 1.23 times that loss at most (folds of finer
-steps 1.9), wrong minima 1.3 at least."""
 _FEW = 5
 """Frames by which a pose is found before all have their say."""
 _FIRST_CAPS = (np.inf, np.inf, 4.0, 4.0, 2.0, 2.0, *[1.0] * 10)
@@ -137,28 +127,6 @@ class Objective:
     def cut(self) -> float | None:
         """Height below which nothing was recorded; simulated points do not count there."""
         return self._target.cut
-
-    @property
-    def knows_gaps(self) -> bool:
-        """Whether it is known what of the cloth the recording misses: there is no camera, or lost pixels are recorded."""
-        seen_by_cameras = self.episode.viewpoints or self.episode.camera is not None
-        return not self.paper and (bool(self._target.lost) or not seen_by_cameras)
-
-    @property
-    def noise_loss(self) -> float:
-        """About the loss that noise and spacing of its points leave of the right motion; zero in the paper's measure."""
-        return 0.0 if self.paper else self._target.noise_loss
-
-    @property
-    def explained(self) -> float:
-        """Up to this loss, a motion explains the recording; it is somewhat above `noise_loss`. Where nobody knows what
-        cameras missed of the cloth, a right motion may have more. Zero in the paper's measure."""
-        return (_EXPLAINED if self.knows_gaps else _EXPLAINED_BY_CAMERAS) * self.noise_loss
-
-    @property
-    def unexplained(self) -> float:
-        """Above this loss, the model cannot explain the recording; infinity where it is not known what that misses."""
-        return _UNEXPLAINED * self.noise_loss if self.knows_gaps else math.inf
 
     @property
     def pose_space(self) -> PoseSpace:
@@ -341,7 +309,7 @@ class Objective:
             other, _ = self._follow(nodes, velocities, first * space.unscaled, _CAPS)
             losses = []
             for one in (pose, other):
-                losses.append(self.terms(matcher(one), None)[0] * space.prior_factor(one))
+                losses.append(self.terms(matcher(one))[0] * space.prior_factor(one))
                 matcher.look_anew()
             pose = torch.where((losses[1] < losses[0])[:, None], other, pose)
         return pose, matcher
@@ -373,7 +341,7 @@ class Objective:
             def terms(
                 poses: Tensor, factor: float, entries: Tensor | None, matcher: Matcher = matcher
             ) -> tuple[Tensor, Tensor, Tensor]:
-                return self.terms(matcher(poses, entries), None, factor=factor)
+                return self.terms(matcher(poses, entries), factor=factor)
 
             pose = aligned(space, pose, terms, factors)
         matcher.look_anew()
@@ -393,20 +361,19 @@ class Objective:
             near=_NEAR_M / self._unit,
         )
 
-    def terms(self, motion: Motion, rates: Tensor | None, *, factor: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
-        """Loss [B], half of its slope [B, k + d] and curvature [B, k + d, k + d], without the prior of the pose.
+    def terms(self, motion: Motion, *, factor: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
+        """Loss [B], half of its slope [B, d] and curvature [B, d, d] by the pose, without its prior.
 
         Args:
-            rates: [k, B, L, C · V', 3] of the cloth's nodes by k variables; None for none.
             factor: of the cap.
         """
-        return motion.terms(self.pose_space, rates, self.cap * factor)
+        return motion.terms(self.pose_space, self.cap * factor)
 
     def columns(self, motion: Motion, rates: Tensor) -> tuple[list[Tensor], list[Tensor]]:
         """For each kind of pairs, where its places lie in the recording [B, L, N, 3], and their rates [k + d, B, L, N, 3].
 
         Args:
-            rates: as of `terms`.
+            rates: [k, B, L, C · V', 3] of the cloth's nodes by k variables.
         """
         space = self._target.space
         here = motion.shown(space)
@@ -421,31 +388,6 @@ class Objective:
             every.append(torch.cat([torch.stack(own), space.rates(points, motion.pose, velocities, clock)]))
         return moved, every
 
-    def freed(self, nuisance: Mapping[str, float]) -> Objective:
-        """The same with another pose space.
-
-        Args:
-            nuisance: free variables, with the standard deviations of their priors [m, rad, s].
-        """
-        other = copy(self)
-        target = self._target
-        centre, clocks = target.space.centre, target.space.clocks
-        space = PoseSpace.build(nuisance, centre, length_unit_m=self.length_unit_m, clocks=clocks)
-        other.nuisance, other._target, other._first = dict(nuisance), replace(target, space=space), None
-        other.loss_steps = other._steps_to_loss()
-        return other
-
-    def until(self, part: float) -> Objective:
-        """The same on this part of its compared frames, the earliest ones, but a few at least."""
-        other = copy(self)
-        kept = max(math.ceil(part * len(self.frames)), min(_FEW, len(self.frames)))
-        chosen = sorted(self.times.argsort(stable=True)[:kept].tolist())
-        other._target = self._target.at(chosen)
-        if not self.paper:
-            other._recorded = self._recorded_in(chosen)
-        other.loss_steps = other._steps_to_loss()
-        return other
-
     def earliest(self, counts: Sequence[int]) -> Objective:
         """The same on its earliest compared frames.
 
@@ -455,16 +397,6 @@ class Objective:
         (count,) = counts
         chosen = sorted(self.times.argsort(stable=True)[:count].tolist())
         return self._anew(self.scenario, [self.frames[each] for each in chosen])
-
-    def thinned(self, most: int) -> Objective:
-        """The same with at most so many points sampled per frame. Where no pose is solved for, points cost little beside
-        the simulation, so all of them stay."""
-        if len(self.sampler.choice) <= most or not self.pose_space.names:
-            return self
-        other = copy(self)
-        other.asked_points = most
-        other.reseed(self._seed)
-        return other
 
     def with_bodies(self, positions: Tensor) -> Tensor:
         """[..., C · V', 3] nodes of the cloth -> with those of the bodies beside it, in the default measure."""

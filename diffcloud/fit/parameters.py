@@ -184,13 +184,6 @@ class FitSpace:
                 values[1:, index] = self.variables[index].spread(part)
         return torch.as_tensor(values), torch.arange(count) > 0
 
-    def moved(self, values: Tensor, parts: Tensor) -> Tensor:
-        """[..., k] values moved by these parts of themselves, or of the range where the lower bound is zero, inside the
-        bounds."""
-        low, high = self._bounds(values)
-        moved = torch.where(low > 0, values * parts.exp(), values + (high - low) * parts)
-        return torch.minimum(torch.maximum(moved, low), high)
-
     def parameters(self, values: Tensor) -> dict[str, Tensor]:
         """[B, k] -> parameters of the simulator, the fixed ones too, name -> [B]."""
         columns = dict(zip(self.names, values.unbind(-1), strict=True))

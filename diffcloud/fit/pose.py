@@ -47,8 +47,6 @@ SET_UP = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.005, 
 """Standard deviations of a calibrated set-up [m, rad, s]: of its cameras against the robot, and of its clock."""
 LAID = {"x": 0.1, "y": 0.1, "yaw": math.radians(30)}
 """Of where a hand lays a cloth that the scene places [m, rad]."""
-TRIED = {**SET_UP, "scale": 0.01}
-"""A small change of each variable, in the same units."""
 _RESOLVED = {"m": 3e-4, "rad": 1.5e-3, "s": 3e-4, "1": 1.5e-3}
 """A step as small as this is the last one to a pose; what is left changes little."""
 _ANGLES = ("tilt_x", "tilt_y", "yaw")

@@ -245,7 +245,7 @@ class FitRecord(_Model):
     """Runs of the simulator; one with derivatives counts once. Those of fits that leave a recording out do not."""
     seconds: NonNegative | None = Field(default=None, exclude=True)
     """Wall time, which lies beside the file (`io.timings`); None where it is not known."""
-    stop_reason: Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
+    stop_reason: Literal["converged", "iterations", "simulations", "threshold", "interrupted"]
     start: dict[str, Value]
     """Parameters of the first start, the given ones too, and how the cloth lies, named as in `free`."""
     best_start: Annotated[int, Field(ge=0, le=1_000_000)]

@@ -16,6 +16,7 @@ from torch import Tensor
 from diffcloud.errors import ConfigError, DivergedError
 from diffcloud.fit.joint import AnyObjective, mean_loss
 from diffcloud.fit.laid import described_laid, is_laid
+from diffcloud.fit.likelihood import Estimate
 from diffcloud.fit.names import of_recording
 from diffcloud.fit.objective import Objective
 from diffcloud.fit.parameters import FitSpace
@@ -33,7 +34,6 @@ from diffcloud.fit.record import (
 )
 from diffcloud.fit.residuals import Axis
 from diffcloud.fit.solvers import SOLVER_NAMES, FitOutcome, Settings
-from diffcloud.fit.solvers.likelihood import Estimate
 from diffcloud.io.arrays import read_npz
 from diffcloud.io.files import together, write_json, write_npz
 from diffcloud.io.timings import write_timings

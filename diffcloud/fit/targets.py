@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -98,20 +97,6 @@ class Target:
             planes = self.planes[list(cameras)]
             found |= points @ planes[:, :3].T < planes[:, 3]
         return found
-
-    @cached_property
-    def noise_loss(self) -> float:
-        """What noise and spacing of the points leave of the default loss [squared length unit]."""
-        if len(self.views) == 1:
-            return float(np.mean([cloud.from_surface for cloud in self.clouds]))
-        left, points = [], []
-        for view in self.views:
-            for cloud, whole in zip(view, self.clouds, strict=True):
-                to_point, to_surface = cloud.from_surface
-                denser = (whole.spacing / cloud.spacing) ** 2 if cloud.spacing > 0 else 1.0  # another camera's points
-                left.append((to_point * min(denser, 1.0) + to_surface) / 2)
-                points.append(len(cloud.points))
-        return float(np.average(left, weights=points))
 
     def at(self, chosen: Sequence[int]) -> Target:
         """The same with some of its frames, by their places among these."""

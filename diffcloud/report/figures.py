@@ -256,7 +256,7 @@ def _landscape(record: Mapping[str, Any]) -> Figure | None:
 
 def _draw_ellipse(axis: Axes, record: Mapping[str, Any]) -> None:
     told, names = record["intervals"], record["landscape"]["names"]
-    if told is None or list(told["parameters"]) != names or not told["arrived"]:
+    if told is None or list(told["parameters"]) != names:
         return
     turn = np.linspace(0, 2 * np.pi, 200)
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1) * np.sqrt(-2 * np.log(1 - told["level"]))

@@ -16,16 +16,15 @@ def intervals_table(found: Intervals) -> Table:
 def _row(found: Intervals, name: str) -> list[Cell]:
     entry = found.parameters[name]
     digits = significant(entry.low, entry.high)
-    stated = entry.low is not None
     return [
         Cell(name),
         Cell(digits(entry.value), sort=entry.value),
-        Cell(f"{digits(entry.low)} to {digits(entry.high)}" if stated else "none"),
+        Cell(f"{digits(entry.low)} to {digits(entry.high)}"),
         Cell(
             f"{digits(entry.physical)} {entry.physical_unit}",
             sort=entry.physical,
-            note=f"{digits(entry.physical_low)} to {digits(entry.physical_high)}" if stated else "",
+            note=f"{digits(entry.physical_low)} to {digits(entry.physical_high)}",
         ),
         Cell(entry.verdict),
-        Cell(largest_sources(found.sources, name) if stated else ""),
+        Cell(largest_sources(found.sources, name)),
     ]

@@ -28,7 +28,7 @@ PARAMS = {
     "scenarios": ["lift"],
     "episodes": {"per_scenario": 1, "image_size": [106, 60]},
     "preprocess": {"raw": {"refine": False, "flying_m": 0.1}, "points": 300},
-    "fit": {"iterations": 1, "screen": 3, "points": 200},
+    "fit": {"iterations": 1, "points": 200},
     "train": {"scenarios": ["fold"]},
     "evaluate": {"draws": 1, "rivals": ["middle"], "level": None},
 }

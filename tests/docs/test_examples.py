@@ -30,7 +30,7 @@ SMALLER = {
     "visibility": "--size 2",
     "simulate": "--train 4 --test 5",
     "train": "--epochs 1 --points 32",
-    "fit": "--starts 1 --screen 0 --iterations 1 --points 200",
+    "fit": "--starts 1 --iterations 1 --points 200",
     "gradients": "--pairs 1",
     "identify": "--parameters stretch",
     "evaluate loss": "--points 200",
@@ -49,7 +49,6 @@ LEFT = {
     "python -m diffcloud.hardware.examples": "runs until it is ended",
     "diffcloud import recording overhead=a.db3": "recordings of two cameras, made by the SDK of their maker",
     "diffcloud episode watch": "runs until it is ended",
-    "diffcloud bench --fits": "an hour, and has a test of its own",
     ".venv/bin/python -m pytest": "a test of its own",
 }
 """Beginnings of commands that are not run -> what they need, or why."""

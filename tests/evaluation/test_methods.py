@@ -62,7 +62,7 @@ def test_one_start_is_the_first_of_many():
     found = first_start(summary, SPACE)
     assert found.values == pytest.approx(alone.values, rel=1e-12)
     assert found.simulations == 13
-    assert first_start(summary.model_copy(update={"solver": "gauss_newton"}), SPACE) is None
+    assert first_start(summary.model_copy(update={"solver": "likelihood"}), SPACE) is None
     for change in ({"smoothing": 0.5}, {"resample": True}):
         assert first_start(summary.model_copy(update={"settings": summary.settings | change}), SPACE) is None
     assert first_start(summary.model_copy(update={"stop_reason": "threshold"}), SPACE) is None
@@ -91,7 +91,7 @@ def test_an_interrupted_rival_is_no_result(rival, monkeypatch):
         rival(Bowl())
 
 
-@pytest.mark.parametrize(("solver", "gradients"), [("gauss_newton", True), ("adam", True), ("random_search", False)])
+@pytest.mark.parametrize(("solver", "gradients"), [("likelihood", True), ("adam", True), ("random_search", False)])
 def test_a_fit_by_a_search_had_no_gradients(solver, gradients):
     assert fitted(record_of(solver=solver), 0).gradients is gradients
 

@@ -10,14 +10,14 @@ import torch
 import yaml
 
 from diffcloud.errors import ConfigError, SceneError
-from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton
+from diffcloud.fit import FitSpace, LikelihoodSettings, Objective, fit_likelihood
 from diffcloud.fit.doubts import MATERIAL_DOUBTS, parse_doubts, with_doubts
 from diffcloud.fit.parameters import Variable
 from diffcloud.fit.residuals import Axis
 from diffcloud.scene.scenarios import load_scenario
 from pipeline.config import FitConfig
 from tests.conftest import small_lift
-from tests.fit.slopes import linearised
+from tests.fit.rates import check_rates
 from tests.fit.test_fit import GENTLE, clouds_of
 
 SCENARIO = small_lift(**{**GENTLE, "integrator": "implicit", "points": 800})
@@ -125,11 +125,14 @@ def objective():
     return Objective(SCENARIO, clouds_of(SCENARIO, points=3000, stretch=0.6, mass=1.7), nuisance={})
 
 
-def test_the_prior_is_about_what_is_known(objective):
+def test_the_prior_is_about_what_is_known():
     space = with_doubts(FitSpace.build(["stretch"], fixed={"bending": 2.0}), {"bending": 1.5}, [SCENARIO])
     factor = space.prior_factor(torch.tensor([[7.0, 2.0], [1.0, 3.0], [1.0, 2 / 1.5**2]]).double(), 1)
     assert factor.log().tolist() == pytest.approx([0.0, 0.01, 0.04])
-    linearised(objective, space, Axis.of(space).places(torch.tensor([[0.8, 1.2]]).double()))
+
+
+def test_it_moves_the_cloth_as_what_is_asked_for(objective):
+    check_rates(objective, BENT, Axis.of(BENT).places(torch.tensor([[0.8, 1.2]]).double()))
 
 
 def test_a_stiffer_hinge_than_stated_does_not_bend_the_fit():
@@ -137,9 +140,9 @@ def test_a_stiffer_hinge_than_stated_does_not_bend_the_fit():
     band = replace(load_scenario("band_stretch"), points=800)
     objective = Objective(band, clouds_of(band, points=2000, stretch=3.0, mass=2.0, bending=1.8), nuisance={})
     asked = FitSpace.build(["stretch"], fixed={"mass": 2.0})
-    settings = GaussNewtonSettings(starts=1, screen=0, init={"stretch": 2.5})
+    settings = LikelihoodSettings(starts=1, model_error=False, init={"stretch": 2.5})
     exact, doubted = (
-        fit_gauss_newton(objective, space, settings) for space in (asked, with_doubts(asked, {"bending": 1.5}, [band]))
+        fit_likelihood(objective, space, settings) for space in (asked, with_doubts(asked, {"bending": 1.5}, [band]))
     )
     off = [abs(math.log(found.values["stretch"] / 3.0)) for found in (exact, doubted)]
     assert off[0] > 0.1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -363,74 +362,22 @@ def test_what_shows_is_that_of_the_recorded_motion():
         visibility_map(scenario, episode=clouds_of(scenario, gripper=False, stretch=1.0, mass=1.0), size=2)
 
 
-def test_screened_starts_are_the_best_candidates():
-    scenario = small_lift()
-    objective = paper_objective(scenario, clouds_of(scenario, stretch=0.4, mass=1.5))
-    space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
-    outcome = fit_adam(objective, space, AdamSettings(starts=4, screen=15, iterations=0))
-    candidates, _ = space.starts(16, seed=0)
-    with torch.no_grad():
-        losses = objective(space.parameters(candidates))
-    expected = torch.cat([losses[:1], losses[1:].sort().values[:3]])
-    assert torch.allclose(outcome.history.losses[0], expected, rtol=1e-9)
-    assert outcome.simulations == 15 + 4
-
-
 class Rough:
     """The squared logarithmic distance to a place, in ripples that are a sixth of a unit wide."""
 
-    length_unit_m = 1.0
     members = (None,)
-
-    def __init__(self, height: float = 0.05) -> None:
-        self.height = height
-        self.system = SimpleNamespace(device=torch.device("cpu"), dtype=torch.float64)
 
     def __call__(self, parameters):
         away = torch.stack([(parameters["stretch"] / 0.13).log(), (parameters["mass"] / 7.0).log()])
-        return (away.square() + self.height * (1 - (40 * away).cos())).sum(0)
+        return (away.square() + 1 - (40 * away).cos()).sum(0)
 
 
 def test_smoothed_gradients_find_the_valley_of_a_rough_loss():
     """Where ripples are as steep as ten valleys, the exact gradient goes nowhere."""
     space = FitSpace.build(["stretch", "mass"])
-    exact = fit_adam(Rough(1.0), space, AdamSettings(iterations=60))
-    found = [fit_adam(Rough(1.0), space, AdamSettings(iterations=60, smoothing=0.5, seed=seed)) for seed in range(4)]
+    exact = fit_adam(Rough(), space, AdamSettings(iterations=60))
+    found = [fit_adam(Rough(), space, AdamSettings(iterations=60, smoothing=0.5, seed=seed)) for seed in range(4)]
     assert max(one.loss for one in found) < 0.1 * exact.loss
-
-
-class TestPatience:
-    SPACE = FitSpace.build(["stretch", "mass"])
-
-    def fits(self, seeds=4, **options):
-        return [
-            fit_adam(Rough(), self.SPACE, AdamSettings(starts=9, iterations=50, seed=seed, patience=patience, **options))
-            for seed in range(seeds)
-            for patience in (0, 5)
-        ]
-
-    def test_starts_beside_the_best_find_lower_losses_of_a_rough_landscape(self):
-        found = self.fits(24)  # geometric means of 64: 0.16, within a factor of 1.4
-        without, with_ = found[::2], found[1::2]
-        assert np.mean([np.log(b.loss / a.loss) for a, b in zip(without, with_, strict=True)]) < np.log(0.5)
-        assert [a.simulations for a in without] == [b.simulations for b in with_]
-
-    @pytest.mark.parametrize("smoothing", [0.0, 0.3])
-    def test_the_first_start_stays_the_papers(self, smoothing):
-        found = self.fits(smoothing=smoothing)
-        for without, with_ in zip(found[::2], found[1::2], strict=True):
-            for key in ("losses", "values"):
-                a, b = (torch.stack(getattr(outcome.history, key)) for outcome in (without, with_))
-                assert torch.equal(a[:, 0], b[:, 0])
-                assert not torch.equal(a, b)
-
-    def test_moved_values_stay_inside_the_bounds(self):
-        space = FitSpace.build(["stretch", "friction_obstacle"])
-        values = torch.tensor([[9.0, 0.01], [0.2, 0.5]], dtype=torch.float64)
-        high = space.variables[1].high
-        expected = torch.tensor([[10.0, 0.0], [0.2 * math.exp(-0.3), 0.5 + 0.1 * high]], dtype=torch.float64)
-        parts = torch.tensor([[0.5, -0.2], [-0.3, 0.1]], dtype=torch.float64)
-        torch.testing.assert_close(space.moved(values, parts), expected)
 
 
 class TestGradientAgreement:

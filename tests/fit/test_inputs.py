@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from diffcloud.errors import ConfigError, SceneError
-from diffcloud.fit import FitSpace, GaussNewtonSettings, Objective, fit_gauss_newton
+from diffcloud.fit import FitSpace, LikelihoodSettings, Objective, fit_likelihood
 from diffcloud.fit.inputs import Inputs
 from diffcloud.fit.laid import with_laid
 from diffcloud.scene.scenarios import load_scenario
@@ -19,7 +19,7 @@ from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.properties import one_set
 from tests.conftest import small_lift
-from tests.fit.slopes import linearised
+from tests.fit.rates import check_rates
 from tests.fit.test_fit import GENTLE, clouds_of
 
 LINEAR = Sheet(density_kg_m2=0.15, stretching_n_m=80.0, bending_n_m=2e-5, damping_s=0.01)
@@ -136,11 +136,11 @@ class TestTrack:
             handles.own_track(np.linspace(0.1, 1.0, 10))
 
 
-def test_slopes_are_those_of_the_loss():
+def test_rates_are_those_of_the_motion():
     space = with_laid(ASKED, [{"turn": 0.1, "shape": 0.01, "size": 0.05, "track": 0.05}], [SCENARIO])
     objective = Objective(SCENARIO, clouds_of(SCENARIO, points=2000, stretch=0.6, mass=1.7, size=0.05), nuisance={})
     places = torch.randn(1, len(space.names), generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 0.3
-    linearised(objective, space, places, rtol=1e-6, atol=1e-12)
+    check_rates(objective, space, places, rtol=1e-6, atol=1e-12)
 
 
 def test_the_size_of_a_cloth_is_found():
@@ -149,9 +149,9 @@ def test_the_size_of_a_cloth_is_found():
     assert recorded.gripper is not None
     short = recorded.gripper[:1] + (recorded.gripper - recorded.gripper[:1]) / 1.05
     objective = Objective(SCENARIO, replace(recorded, gripper=short), nuisance={})
-    settings = GaussNewtonSettings(starts=1, screen=0, init={"stretch": 1.0})
+    settings = LikelihoodSettings(starts=1, model_error=False, init={"stretch": 1.0})
     space = with_laid(ASKED, [{"size": 0.1, "track": 0.1}], [SCENARIO])
-    plain, sized = (fit_gauss_newton(objective, one, settings) for one in (ASKED, space))
+    plain, sized = (fit_likelihood(objective, one, settings) for one in (ASKED, space))
     assert sized.values["size"] == pytest.approx(math.log(1 + LARGER), abs=0.005)
     assert sized.values["track"] == pytest.approx(math.log(1.05), abs=0.01)
     off = [abs(math.log(one.values["stretch"] / 0.6)) for one in (plain, sized)]
@@ -167,11 +167,11 @@ def test_depths_that_are_too_large_are_no_property_of_the_cloth():
     camera = np.array([1.2, 0.1, 0.9])
     large = replace(right, points=(camera + 1.04 * (right.points - camera)).astype(np.float32))
     shifts = {"x": 0.1, "y": 0.1, "z": 0.1}
-    settings = GaussNewtonSettings(starts=1, screen=0, init={"stretch": 1.0})
+    settings = LikelihoodSettings(starts=1, model_error=False, init={"stretch": 1.0})
 
     def found(recorded, nuisance):
         objective = Objective(SCENARIO, recorded, nuisance=nuisance)
-        values = fit_gauss_newton(objective, ASKED, settings).values
+        values = fit_likelihood(objective, ASKED, settings).values
         pose = objective.pose(objective.simulate_to_loss(one_set({"stretch": values["stretch"], "mass": 1.7})))
         return math.log(values["stretch"] / 0.6), float(pose[0, -1])
 

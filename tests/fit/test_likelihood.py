@@ -12,9 +12,13 @@ import torch
 
 from diffcloud.errors import DivergedError
 from diffcloud.fit import FitSpace, JointObjective, Objective
+from diffcloud.fit.likelihood import Answer, Estimate, LikelihoodSettings, energy
+from diffcloud.fit.likelihood.energy import Likelihood
+from diffcloud.fit.likelihood.frames import Frames
+from diffcloud.fit.likelihood.grasp import in_powers, regripped, that_fits
+from diffcloud.fit.likelihood.recording import Changes, Linear
 from diffcloud.fit.parameters import Variable
-from diffcloud.fit.solvers import LikelihoodSettings, fit_likelihood, likelihood
-from diffcloud.fit.solvers.likelihood import Answer, Estimate, Frames
+from diffcloud.fit.solvers import fit_likelihood
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.scene.scenarios.grid import LIFT, GridScenario, grid_scenario
 from tests.conftest import small_lift
@@ -35,7 +39,7 @@ def objective(scenario=SCENARIO, **changes):
 
 @pytest.fixture(scope="module")
 def member():
-    return likelihood._Likelihood([objective()], SPACE, 12)
+    return Likelihood([objective()], SPACE, LikelihoodSettings())
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +82,7 @@ class TestRecording:
     def at(self, member, place, shift=None, asked=None):
         (recording,) = member.recordings
         with torch.no_grad():
-            return likelihood._Linear.at(recording, place).frames(place, likelihood._Changes(shift), asked)
+            return Linear.at(recording, place).frames(place, Changes(shift), asked)
 
     def test_slopes_are_those_of_the_squares(self, member):
         """By material and pose, forth and back, in all frames but those in which points begin to count."""
@@ -95,7 +99,7 @@ class TestRecording:
     def test_what_a_shift_of_the_nodes_does_to_the_slopes(self):
         """Where the cloth lies as it was recorded, from recorded points to the surface."""
         episode = clouds_of(SCENARIO, points=2000, **TRUTH)
-        member = likelihood._Likelihood([Objective(SCENARIO, episode, nuisance=POSE)], SPACE, 12)
+        member = Likelihood([Objective(SCENARIO, episode, nuisance=POSE)], SPACE, LikelihoodSettings())
         place = member.start({"stretch": TRUTH["stretch"]}, 0.0)
         lying = self.at(member, place)
         up = torch.zeros(1, lying.squares.shape[1], len(SCENARIO.scene.mesh.nodes), 3).double()
@@ -107,8 +111,8 @@ class TestRecording:
 
     def test_frames_count_up_to_where_the_meshes_part(self, member, monkeypatch):
         for apart, count in ((1.0, 12), (1e-9, 1)):
-            monkeypatch.setattr(likelihood, "_GONE_M", apart)
-            monkeypatch.setattr(likelihood, "_PART_M", apart)
+            monkeypatch.setattr(energy, "_GONE_M", apart)
+            monkeypatch.setattr(energy, "_PART_M", apart)
             assert member.horizons(member.start({}, 0.0)) == (count,)
 
 
@@ -120,23 +124,23 @@ class TestGrasp:
 
     def test_what_it_changes_is_that_of_the_simulated_ones(self, generator):
         smaller, larger = torch.randn(2, 1, 3, 5, 3, generator=generator).double()
-        first, second = likelihood._in_powers([smaller, larger])
+        first, second = in_powers([smaller, larger])
         torch.testing.assert_close(first + second, larger)
         torch.testing.assert_close(second - first, smaller)
-        first, second = likelihood._in_powers([smaller])
+        first, second = in_powers([smaller])
         torch.testing.assert_close(second - first, smaller)
-        assert likelihood._in_powers([smaller, None]) is None
-        assert likelihood._in_powers([]) is None
+        assert in_powers([smaller, None]) is None
+        assert in_powers([]) is None
 
     def test_its_slope_is_that_of_the_squares(self):
         episode = clouds_of(self.scenario(0.03), points=2000)
-        whole = likelihood._Likelihood([Objective(self.scenario(0.02), episode, nuisance=POSE)], SPACE, 12)
+        whole = Likelihood([Objective(self.scenario(0.02), episode, nuisance=POSE)], SPACE, LikelihoodSettings())
         (recording,), place = whole.recordings, whole.start({}, 0.0)
         assert len(place) == len(SPACE.names) + len(POSE) + 1
-        linear = likelihood._Linear.at(recording, place)
+        linear = Linear.at(recording, place)
         grips = [recording.change(place, linear.nodes, other) for other in recording.regripped]
         assert len(grips) == 2
-        changes, step, column = likelihood._Changes(None, likelihood._in_powers(grips)), 1e-3, len(SPACE.names)
+        changes, step, column = Changes(None, in_powers(grips)), 1e-3, len(SPACE.names)
         place[-1] = 0.5
         away = torch.zeros_like(place)
         away[-1] = step
@@ -148,12 +152,12 @@ class TestGrasp:
     def test_one_that_does_not_fit_is_left_out(self):
         """On a cloth of 30 cm, a pad of 20 cm may be half as large, and not twice."""
         wide = self.scenario(0.2, 2.0)
-        assert [one.scene.handles.grasp.size for one in likelihood._regripped(wide)] == [pytest.approx(0.1)]
+        assert [one.scene.handles.grasp.size for one in regripped(wide)] == [pytest.approx(0.1)]
         member = SimpleNamespace(scenario=wide)
-        assert likelihood._that_fits([member], -1.0) == -1.0
-        assert likelihood._that_fits([member], 0.9) == 0.225
-        assert likelihood._that_fits([member], 40.0) == 0.0
-        assert likelihood._that_fits([SimpleNamespace(scenario=SCENARIO)], 3.0) == 3.0
+        assert that_fits([member], -1.0) == -1.0
+        assert that_fits([member], 0.9) == 0.225
+        assert that_fits([member], 40.0) == 0.0
+        assert that_fits([SimpleNamespace(scenario=SCENARIO)], 3.0) == 3.0
 
     @pytest.mark.slow
     def test_a_grasp_that_was_stated_too_small_is_found(self):
@@ -239,7 +243,7 @@ class TestFits:
         def press(*given):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(likelihood._Linear, "at", press)
+        monkeypatch.setattr(Linear, "at", press)
         with pytest.raises(KeyboardInterrupt):
             fit_likelihood(objective(), SPACE, LikelihoodSettings())
 
@@ -247,9 +251,22 @@ class TestFits:
         def diverge(*given):
             raise DivergedError(3, [0], "no number", {})
 
-        monkeypatch.setattr(likelihood._Linear, "at", diverge)
+        monkeypatch.setattr(Linear, "at", diverge)
         with pytest.raises(DivergedError):
             fit_likelihood(objective(), SPACE, LikelihoodSettings())
+
+    def test_of_its_own_motion_all_frames_count_and_nothing_is_lacking(self):
+        """The mesh parts from the finer one early, and the recording is on the same mesh."""
+        episode = clouds_of(SCENARIO, points=2000, **TRUTH)
+        one = Objective(SCENARIO, episode, nuisance=POSE)
+        told = fit_likelihood(one, SPACE, LikelihoodSettings(starts=1, model_error=False)).estimate
+        assert told.best.converged
+        assert {"recording", "prior", "bending", "pose", "mesh", "time step"} == set(told.best.sources)
+        assert all(float(told.best.sources[name].abs().max()) == 0 for name in ("mesh", "time step"))
+        assert len(told.members[0].frames) == len(one.frames)
+        deviation = float(told.covariance[0, 0].sqrt())
+        assert abs(float(told.mean[0]) - math.log(TRUTH["stretch"])) < 1.645 * deviation
+        assert deviation < 0.05
 
     def test_bodies_stand_still_for_every_clock(self):
         """A scene with a body beside the cloth, seen by a clock that is free."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -81,6 +82,32 @@ def at_points(moved):
     return SurfacePoints(nodes, torch.full_like(moved, 1 / 3))
 
 
+class TestSurface:
+    """What a recorded cloud tells of the surface that it was taken from."""
+
+    def test_normals_of_a_sphere(self, generator):
+        points = torch.randn(3000, 3, generator=generator, dtype=torch.float64)
+        points /= points.norm(dim=-1, keepdim=True)
+        cloud = NeighbourIndex(points)
+        assert float((cloud.normals * points).sum(-1).abs().min()) > 0.98
+        assert cloud.spacing == pytest.approx(0.5 * math.sqrt(4 * math.pi / 3000), rel=0.1)  # of a Poisson process
+
+    @pytest.mark.parametrize("count", [1, 2])
+    def test_too_few_points_have_none(self, count):
+        cloud = NeighbourIndex(torch.rand(count, 3, dtype=torch.float64))
+        assert bool((cloud.normals == 0).all())
+        assert cloud.spacing == 0.0
+        assert cloud.from_surface == (0.0, 0.0)
+
+    def test_how_far_points_and_their_surface_are_apart(self, generator):
+        """Of a Poisson process on a plane, E|x - nearest|² = 1 / (π density); across it, the points' own noise."""
+        points = torch.rand(20_000, 3, generator=generator, dtype=torch.float64)
+        points[:, 2] = 1e-4 * torch.randn(20_000, generator=generator, dtype=torch.float64)
+        along, across = NeighbourIndex(points).from_surface
+        assert along == pytest.approx(1 / (math.pi * 20_000), rel=0.1)
+        assert across**0.5 == pytest.approx(1e-4 * (1 + 1 / 12) ** 0.5, rel=0.1)
+
+
 class TestForth:
     def test_below_the_cut_nothing_counts(self, generator):
         moved = torch.rand(2, 1, 40, 3, generator=generator, dtype=torch.float64)
@@ -98,16 +125,18 @@ class TestForth:
             torch.testing.assert_close((moved[:, frame] - pairs.partners[:, frame]).norm(dim=-1), expected)
 
 
-NO_POSE = PoseSpace.build({}, torch.zeros(3, dtype=torch.float64), length_unit_m=1.0)
+CENTRE = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
+POSED = PoseSpace.build({name: 0.1 for name in NUISANCE if name != "lag"}, CENTRE, length_unit_m=1.0)
 
 
 def some_motion(generator, *, count=30):
-    """Two motions at three frames, whose nodes are the places themselves."""
+    """Two motions at three frames, whose nodes are the places themselves, at two poses."""
     moved, partners = torch.rand(2, 2, 3, count, 3, generator=generator, dtype=torch.float64)
     normals = torch.nn.functional.normalize(torch.randn(moved.shape, generator=generator, dtype=torch.float64), dim=-1)
     weights = torch.rand(moved.shape[:3], generator=generator, dtype=torch.float64)
     pairs = Pairs(at_points(moved), partners, normals, torch.full((3,), 0.1, dtype=torch.float64), weights, 1.0)
-    return Motion(moved, None, torch.zeros(2, 0, dtype=torch.float64), (pairs,))
+    pose = 0.1 * torch.randn(2, len(POSED.names), generator=generator, dtype=torch.float64)
+    return Motion(moved, None, pose, (pairs,))
 
 
 class TestTerms:
@@ -115,30 +144,31 @@ class TestTerms:
     def test_the_slope_is_half_of_the_gradient(self, generator, cap):
         motion = some_motion(generator)
         (pairs,) = motion.pairs
-        rates = torch.randn(4, *motion.nodes.shape, generator=generator, dtype=torch.float64)
-        loss, slope, _ = motion.terms(NO_POSE, rates, cap)
-        leaf = motion.nodes.clone().requires_grad_()
-        found = pairs.losses(leaf, cap).sum(-1)
-        (gradient,) = torch.autograd.grad(found.sum(), leaf)
+        loss, slope, _ = motion.terms(POSED, cap)
+        pose = motion.pose.clone().requires_grad_()
+        found = pairs.losses(POSED.moved(motion.nodes, pose), cap).sum(-1)
+        (gradient,) = torch.autograd.grad(found.sum(), pose)
         torch.testing.assert_close(loss, found.detach())
-        torch.testing.assert_close(2 * slope, torch.einsum("kblni,blni->bk", rates, gradient))
+        torch.testing.assert_close(2 * slope, gradient)
 
     def test_the_curvature_is_between_sliding_and_being_bound(self, generator):
         """A move along the normal counts in full, one along the surface less, and never more than if bound to a point."""
         motion = some_motion(generator)
         (pairs,) = motion.pairs
-        rates = torch.randn(3, *motion.nodes.shape, generator=generator, dtype=torch.float64)
-        _, _, curvature = motion.terms(NO_POSE, rates, torch.inf)
+        _, _, curvature = motion.terms(POSED, torch.inf)
+        rates = POSED.rates(motion.nodes, motion.pose, None, torch.zeros_like(pairs.weights, dtype=torch.long))
         bound = torch.einsum("jblni,kblni,bln->bjk", rates, rates, pairs.weights)
         assert bool((torch.linalg.eigvalsh(bound - curvature) > 0).all())
         assert bool((torch.linalg.eigvalsh(curvature) > 0).all())
-        _, _, whole = motion.terms(NO_POSE, pairs.normals[None], torch.inf)
-        torch.testing.assert_close(whole[:, 0, 0], pairs.weights.sum((1, 2)))
+        for axis, name in enumerate("xyz"):
+            along = torch.nn.functional.one_hot(torch.tensor(axis), 3).double().expand_as(pairs.partners)
+            _, _, whole = replace(motion, pairs=(replace(pairs, normals=along),)).terms(POSED, torch.inf)
+            own = POSED.names.index(name)
+            torch.testing.assert_close(whole[:, own, own], pairs.weights.sum((1, 2)))
 
     def test_what_is_farther_than_the_cap_draws_at_nothing(self, generator):
         motion = some_motion(generator)
-        rates = torch.randn(2, *motion.nodes.shape, generator=generator, dtype=torch.float64)
-        loss, slope, curvature = motion.terms(NO_POSE, rates, 1e-6)
+        loss, slope, curvature = motion.terms(POSED, 1e-6)
         torch.testing.assert_close(loss, 1e-12 * motion.pairs[0].weights.sum((1, 2)))
         assert float(slope.abs().max()) == float(curvature.abs().max()) == 0.0
 
@@ -166,11 +196,7 @@ class TestTermsOfPosedFaces:
 
     @pytest.fixture
     def space(self, free):
-        return PoseSpace.build(dict.fromkeys(free, 0.1), torch.tensor([0.3, -0.2, 0.1]).double(), length_unit_m=1.0)
-
-    @pytest.fixture
-    def rates(self, motion, generator):
-        return self.randn(generator, 2, *motion.nodes[:, :, : -self.BODY].shape)
+        return PoseSpace.build(dict.fromkeys(free, 0.1), CENTRE, length_unit_m=1.0)
 
     @staticmethod
     def randn(generator, *shape):
@@ -180,59 +206,47 @@ class TestTermsOfPosedFaces:
     def places(motion, space, nodes, pose):
         return space.moved(motion.pairs[0].places.of(replace(motion, nodes=nodes, pose=pose).shown(space)), pose)
 
-    def columns(self, motion, space, rates):
-        """[B, L, N, 3, k + d] derivatives of the places in the recording by what moves the nodes, and by the pose."""
-
-        def at(own, pose):
-            still = torch.nn.functional.pad(rates, (0, 0, 0, self.BODY))
-            return self.places(motion, space, motion.nodes + torch.einsum("bk,kblni->blni", own, still), pose)
-
-        own = torch.zeros(3, len(rates), dtype=torch.float64)
-        found = torch.autograd.functional.jacobian(at, (own, motion.pose))
+    def columns(self, motion, space):
+        """[B, L, N, 3, d] derivatives of the places in the recording by the pose."""
+        found = torch.autograd.functional.jacobian(lambda pose: self.places(motion, space, motion.nodes, pose), motion.pose)
         same = range(3)  # of the batch
-        return torch.cat([of[same, ..., same, :] for of in found], dim=-1)
+        return found[same, ..., same, :]
 
-    def test_the_slope_is_half_of_the_gradient(self, motion, space, rates):
-        loss, slope, _ = motion.terms(space, rates, 0.4)
+    def test_the_slope_is_half_of_the_gradient(self, motion, space):
+        loss, slope, _ = motion.terms(space, 0.4)
         (pairs,) = motion.pairs
         moved = self.places(motion, space, motion.nodes, motion.pose).requires_grad_()
         found = pairs.losses(moved, 0.4).sum(-1)
         (gradient,) = torch.autograd.grad(found.sum(), moved)
         torch.testing.assert_close(loss, found.detach())
-        torch.testing.assert_close(2 * slope, torch.einsum("blnik,blni->bk", self.columns(motion, space, rates), gradient))
+        torch.testing.assert_close(2 * slope, torch.einsum("blnik,blni->bk", self.columns(motion, space), gradient))
         assert 0 < int((gradient == 0).all(-1).sum()) < gradient[..., 0].numel()  # some are beyond the cap
 
-    def test_they_slide_along_the_faces(self, motion, space, rates):
+    def test_they_slide_along_the_faces(self, motion, space):
         """As along stated normals that are the faces'."""
         (pairs,) = motion.pairs
         corners = pairs.places.corners(motion.shown(space))
         across = torch.linalg.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
         normals = torch.nn.functional.normalize(space.carried(across, motion.pose), dim=-1)
-        expected = replace(motion, pairs=(replace(pairs, normals=normals),)).terms(space, rates, 0.4)
-        for found, of in zip(motion.terms(space, rates, 0.4), expected, strict=True):
+        expected = replace(motion, pairs=(replace(pairs, normals=normals),)).terms(space, 0.4)
+        for found, of in zip(motion.terms(space, 0.4), expected, strict=True):
             torch.testing.assert_close(found, of)
 
-    def test_the_curvature_is_that_of_the_columns(self, motion, space, rates):
+    def test_the_curvature_is_that_of_the_columns(self, motion, space):
         (pairs,) = motion.pairs
         normals = torch.nn.functional.normalize(torch.ones_like(pairs.partners), dim=-1)
-        _, _, curvature = replace(motion, pairs=(replace(pairs, normals=normals),)).terms(space, rates, torch.inf)
+        _, _, curvature = replace(motion, pairs=(replace(pairs, normals=normals),)).terms(space, torch.inf)
         away = self.places(motion, space, motion.nodes, motion.pose) - pairs.partners
         beside = away - (away * normals).sum(-1, keepdim=True) * normals
         beside = beside / (beside.square().sum(-1, keepdim=True) + pairs.spacing[:, None, None] ** 2).sqrt()
-        columns = self.columns(motion, space, rates)
+        columns = self.columns(motion, space)
         expected = 0.0
         for way in (normals, beside):
             along = torch.einsum("blnik,blni->blnk", columns, way)
             expected = expected + torch.einsum("blnj,blnk,bln->bjk", along, along, pairs.weights)
         torch.testing.assert_close(curvature, expected)
 
-    def test_without_variables_of_the_motion_those_of_the_pose_are_left(self, motion, space, rates):
-        loss, slope, curvature = motion.terms(space, rates, 0.4)
-        found = motion.terms(space, None, 0.4)
-        for one, of in zip(found, (loss, slope[:, 2:], curvature[:, 2:, 2:]), strict=True):
-            torch.testing.assert_close(one, of)
-
-    def test_what_motions_and_frames_share_need_not_be_copied(self, motion, space, rates):
+    def test_what_motions_and_frames_share_need_not_be_copied(self, motion, space):
         (pairs,) = motion.pairs
         shared = motion.velocities[:1, :1].expand(3, 2, -1, -1)
         partners, weights = pairs.partners[:, :1].expand(-1, 2, -1, -1), pairs.weights[:, :1].expand(-1, 2, -1)
@@ -240,9 +254,8 @@ class TestTermsOfPosedFaces:
         (of,) = whole.pairs
         places = SurfacePoints(of.places.nodes.clone(), of.places.barycentric.contiguous())
         copied = replace(of, places=places, partners=of.partners.contiguous(), weights=of.weights.contiguous())
-        every = rates[:, :1].expand(-1, 3, -1, -1, -1)
-        expected = replace(whole, velocities=shared.contiguous(), pairs=(copied,)).terms(space, every.contiguous(), 0.4)
-        for found, one in zip(whole.terms(space, every, 0.4), expected, strict=True):
+        expected = replace(whole, velocities=shared.contiguous(), pairs=(copied,)).terms(space, 0.4)
+        for found, one in zip(whole.terms(space, 0.4), expected, strict=True):
             assert torch.equal(found, one)
 
     def test_a_frame_in_which_nothing_counts_and_positions_that_are_no_numbers_lose_as_they_do(self, motion, space):
@@ -252,7 +265,7 @@ class TestTermsOfPosedFaces:
         nodes = motion.nodes.clone()
         nodes[1, 0, 3] = torch.nan
         motion = replace(motion, nodes=nodes, pairs=(replace(pairs, weights=weights),))
-        loss, slope, _ = motion.terms(space, None, 0.4)
+        loss, slope, _ = motion.terms(space, 0.4)
         expected = motion.pairs[0].losses(self.places(motion, space, nodes, motion.pose), 0.4).sum(-1)
         torch.testing.assert_close(loss, expected, equal_nan=True)
         assert loss.isnan().tolist() == [False, True, False]
@@ -260,24 +273,22 @@ class TestTermsOfPosedFaces:
 
     def test_a_face_without_area_has_no_normal(self, motion, space):
         nodes = motion.nodes[..., :1, :].expand(motion.nodes.shape)
-        _, _, curvature = replace(motion, nodes=nodes, velocities=torch.zeros_like(nodes)).terms(space, None, torch.inf)
+        _, _, curvature = replace(motion, nodes=nodes, velocities=torch.zeros_like(nodes)).terms(space, torch.inf)
         assert bool(curvature.isfinite().all())
 
-    def test_what_does_not_belong_together_is_refused(self, motion, space, rates, free):
+    def test_what_does_not_belong_together_is_refused(self, motion, space, free):
         (pairs,) = motion.pairs
         with pytest.raises(AssertionError):
-            replace(motion, pose=motion.pose[:1]).terms(space, rates, 0.4)
+            replace(motion, pose=motion.pose[:1]).terms(space, 0.4)
         with pytest.raises(AssertionError):
-            motion.terms(space, rates[:, :, :1], 0.4)
-        with pytest.raises(AssertionError):
-            replace(motion, pairs=(replace(pairs, partners=pairs.partners[:2]),)).terms(space, rates, 0.4)
+            replace(motion, pairs=(replace(pairs, partners=pairs.partners[:2]),)).terms(space, 0.4)
         if "lag" in free:
             with pytest.raises(AssertionError):
-                replace(motion, velocities=None).terms(space, rates, 0.4)
+                replace(motion, velocities=None).terms(space, 0.4)
 
-    def test_all_pairs_count(self, motion, space, rates):
-        twice = replace(motion, pairs=(*motion.pairs, *motion.pairs)).terms(space, rates, 0.4)
-        for found, once in zip(twice, motion.terms(space, rates, 0.4), strict=True):
+    def test_all_pairs_count(self, motion, space):
+        twice = replace(motion, pairs=(*motion.pairs, *motion.pairs)).terms(space, 0.4)
+        for found, once in zip(twice, motion.terms(space, 0.4), strict=True):
             torch.testing.assert_close(found, 2 * once)
 
 

@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 PARAMS = {
     "scenarios": ["small"],
     "train": {"scenarios": ["other"], "models": ["mlp"]},
-    "fit": {"iterations": 3, "starts": 2, "screen": 3},
+    "fit": {"iterations": 3, "starts": 2},
     "evaluate": {"draws": 2, "landscapes": ["*/tan1"], "landscape_size": 3},
     "report": {"overlay_points": 50},
 }
@@ -117,7 +117,7 @@ def test_tables_hold_methods_repeats_and_transfer(work):
 
 
 def test_recordings_of_a_joint_fit_are_compared_each_as_it_lay(work):
-    told = ("--joint", "--laid", "turn=5deg", "--starts", 1, "--screen", 0, "--iterations", 2)
+    told = ("--joint", "--laid", "turn=5deg", "--starts", 1, "--iterations", 2)
     invoke(
         "fit", "--params", "params.yaml", *told, "--scenario", "small", "--out", "data/fits/small", "data/episodes/small"
     )
@@ -191,7 +191,7 @@ def test_episodes_may_be_called_by_numbers_and_a_bound_be_zero(tmp_path, monkeyp
     (tmp_path / "small.yaml").write_text(yaml.safe_dump(SMALL))
     changes = {
         "scenarios": ["small.yaml"],
-        "fit": {"parameters": ["stretch", "damping"], "starts": 1, "screen": 0, "iterations": 1},
+        "fit": {"parameters": ["stretch", "damping"], "starts": 1, "iterations": 1},
     }
     changes["evaluate"] = PARAMS["evaluate"] | {"landscapes": ["small/001"], "rivals": ["middle"], "level": None}
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(PARAMS | changes | {"scenarios": ["small"]}))

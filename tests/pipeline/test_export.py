@@ -32,12 +32,12 @@ def fitted(tmp_path_factory):
         options = ("--scenario", "scenarios/small.yaml", "--parameters", "stretch,bending", "--out", ".")
         invoke("fit", *options, "--iterations", 1, "--joint", "e1.npz", "e2.npz")
     told = {
-        "level": 0.9, "within": 1.5, "ratio": None, "best": None, "worst": None, "sources": {}, "clusters": 20,
-        "covariance": [[0.04, 0.0], [0.0, 0.01]], "arrived": True, "explains": True, "reason": "",
+        "level": 0.9, "within": 1.5, "ratio": None, "best": None, "worst": None, "sources": {},
+        "covariance": [[0.04, 0.0], [0.0, 0.01]], "explains": True, "reason": "",
         "parameters": {
             name: {
-                "value": 1.0, "low": None, "high": None, "physical": 1.0, "physical_low": None,
-                "physical_high": None, "physical_unit": "", "factor": None, "at_bounds": [], "verdict": "identified",
+                "value": 1.0, "low": 0.5, "high": 2.0, "physical": 1.0, "physical_low": 0.5,
+                "physical_high": 2.0, "physical_unit": "", "factor": 2.0, "at_bounds": [], "verdict": "identified",
             }
             for name in ("stretch", "bending")
         },
@@ -131,7 +131,7 @@ class TestRefusals:
 
     def test_intervals_that_say_nothing(self, work):
         told = json.loads((work / "intervals.json").read_text())
-        (work / "intervals.json").write_text(json.dumps({**told, "reason": "the fit has not arrived"}))
+        (work / "intervals.json").write_text(json.dumps({**told, "reason": "the cloth is far from the recording"}))
         command = ("export", "joint.json", "--to", "obj", "--samples", 2, "--out", "o")
         assert "Nothing can be drawn" in invoke(*command, code=1).errors
         del told["parameters"]["bending"]
@@ -148,7 +148,7 @@ def test_the_export_runs_and_moves_as_fitted(target, tmp_path, monkeypatch):
     pytest.importorskip(target)
     monkeypatch.chdir(tmp_path)
     write_episode(tmp_path / "lift.npz", clouds_of(load_scenario("lift"), stretch=1.2, mass=0.45))
-    quick = ("--starts", 1, "--screen", 0, "--iterations", 1, "--init", "stretch=1.2,mass=0.45")
+    quick = ("--starts", 1, "--iterations", 1, "--init", "stretch=1.2,mass=0.45")
     invoke("fit", "--scenario", "lift", "--out", ".", *quick, "lift.npz")
     done = invoke("export", "lift.json", "--to", target, "--check", "--out", "out")
     assert done.result["strip_error"] < 0.05

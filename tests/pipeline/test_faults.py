@@ -66,7 +66,7 @@ def work(tmp_path, monkeypatch):
         "scenarios": ["small"],
         "preprocess": {"outlier_neighbours": 5},
         "train": {"profile": "quick", "epochs": 2, "points": 24},
-        "fit": {"iterations": 1, "screen": 3},
+        "fit": {"iterations": 1},
     }
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(params))
     for number in (1, 2):

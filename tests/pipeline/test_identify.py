@@ -21,8 +21,8 @@ import yaml
 from diffcloud.clouds import SurfaceSampler
 from diffcloud.errors import EpisodeError
 from diffcloud.fit import read_fit
+from diffcloud.fit.likelihood.descent import Descent
 from diffcloud.fit.result import read_motion
-from diffcloud.fit.solvers import likelihood
 from diffcloud.io.clouds import read_cloud, write_ply
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.raw_episodes import read_raw_episode
@@ -352,7 +352,7 @@ class TestStopped:
 
     def test_one_start_that_has_ended_has_an_interval(self, work, monkeypatch):
         """Ctrl-C during the second one."""
-        whole = likelihood._Descent.run
+        whole = Descent.run
 
         def run(descent, to_beat):
             if to_beat < np.inf:
@@ -360,7 +360,7 @@ class TestStopped:
             return whole(descent, to_beat)
 
         with monkeypatch.context() as patch:
-            patch.setattr(likelihood._Descent, "run", run)
+            patch.setattr(Descent, "run", run)
             told = invoke(*COMMAND, "--parameters", "stretch", code=130).result
         check_unfinished(Path("found"), told, "interrupted", "Ctrl-C was pressed")
         entry = told["parameters"]["stretch"]

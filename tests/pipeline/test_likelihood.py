@@ -28,7 +28,6 @@ SCENARIO = {
 }
 OPTIONS = (
     "--scenario", "small.yaml", "--parameters", "stretch", "--fix", "mass=1.7", "--doubts", "bending=1.5x",
-    "--solver", "likelihood",
 )  # fmt: skip
 
 
@@ -62,7 +61,7 @@ def test_the_record_has_what_the_fit_knows():
 
 
 def test_intervals_are_those_of_the_record():
-    told = invoke("evaluate", "intervals", "fits/joint.json", "one.npz", "two.npz").result
+    told = invoke("evaluate", "intervals", "fits/joint.json").result
     record = read_fit(Path("fits/joint.json"))
     entry, variance = told["parameters"]["stretch"], sum(part[0][0] for part in record.estimate.sources.values())
     assert entry["value"] == pytest.approx(record.estimate.mean["stretch"])
@@ -78,7 +77,7 @@ def test_a_recording_that_the_model_does_not_follow_is_told(tmp_path):
         one["misfits"] = [25.0] * len(one["misfits"])
     path = tmp_path / "joint.json"
     path.write_text(json.dumps(data))
-    told = invoke("evaluate", "intervals", path, "one.npz", "two.npz", "--scenario", "small.yaml").result
+    told = invoke("evaluate", "intervals", path, "--scenario", "small.yaml").result
     assert not told["explains"]
     assert "in one the cloth is 5.0 times as far from the recording" in told["reason"]
     assert told["parameters"]["stretch"]["verdict"] == "the model does not explain the recording"
@@ -100,5 +99,5 @@ def test_a_damaged_estimate_is_refused(tmp_path, change, message):
 
 
 def test_the_published_measure_has_none():
-    told = invoke("fit", "one.npz", *OPTIONS[:-4], *OPTIONS[-2:], "--paper", "--out", "never", code=1)
+    told = invoke("fit", "one.npz", *OPTIONS[:-2], "--paper", "--out", "never", code=1)
     assert "the published measure has no likelihood" in told.errors

@@ -28,7 +28,7 @@ PARAMS = {
     "scenarios": ["small"],
     "episodes": {"per_scenario": 1},
     "preprocess": {"raw": {"flying_m": 0.03}, "outlier_deviations": 5},
-    "fit": {"iterations": 1, "screen": 3},
+    "fit": {"iterations": 1},
     "evaluate": {"draws": 1},
 }
 
@@ -195,7 +195,12 @@ def test_the_pose_of_a_heavy_displaced_cloth_is_the_true_one(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     heavy = {"per_scenario": 1, "hidden_range": [2.8, 3.0], "beside": [30, 0]}
     scene = {**SMALL, "frames": 10, "path": [[0, 0, 0, 0], [1.0, 0, -0.1, 0.3]]}
-    settings = {"scenarios": ["small"], "episodes": heavy, "preprocess": PARAMS["preprocess"]}
+    settings = {
+        "scenarios": ["small"],
+        "episodes": heavy,
+        "preprocess": PARAMS["preprocess"],
+        "fit": {"model_error": False},
+    }
     Path("raw/scenes").mkdir(parents=True)
     Path("raw/scenes/small.yaml").write_text(yaml.safe_dump(scene), encoding="utf-8")
     Path("params.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")

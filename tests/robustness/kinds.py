@@ -46,7 +46,7 @@ PARAMS = {
     "episodes": {"per_scenario": 1, "image_size": [106, 60]},
     "preprocess": {"outlier_neighbours": 5, "points": 200},
     "simulate": {"scenarios": ["small"], "train": 8, "test": 4},
-    "fit": {"iterations": 2, "screen": 4},
+    "fit": {"iterations": 2},
     "train": {"scenarios": ["small"], "models": ["mlp"], "profile": "quick", "epochs": 2, "points": 24},
     "evaluate": {"draws": 1, "rivals": ["middle"], "landscapes": ["small/small_hidden1"], "landscape_size": 3},
     "report": {},

@@ -1,7 +1,7 @@
 """Solvers: from an objective and a space of bounded variables to the best place found. One file each.
 
-`likelihood` finds the likeliest parameters and their uncertainty. `gauss_newton` and `adam` descend along derivatives of
-the loss; `cma_es` and `random_search` are searches, which ask for losses alone.
+`likelihood` finds the likeliest parameters and their uncertainty. `adam` descends along the gradient of the loss, as in the
+paper; `cma_es` and `random_search` are searches, which ask for losses alone.
 """
 
 from __future__ import annotations
@@ -9,20 +9,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from diffcloud.fit.joint import AnyObjective
+from diffcloud.fit.likelihood import LikelihoodSettings
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.solvers.adam import AdamSettings, fit_adam
 from diffcloud.fit.solvers.cma_es import CmaEsSettings, fit_cma_es
-from diffcloud.fit.solvers.gauss_newton import GaussNewtonSettings, fit_gauss_newton
-from diffcloud.fit.solvers.likelihood import LikelihoodSettings, fit_likelihood
+from diffcloud.fit.solvers.likelihood import fit_likelihood
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
 from diffcloud.fit.solvers.random_search import RandomSearchSettings, fit_random_search
 from diffcloud.fit.solvers.search import SearchSettings
 
-Settings = LikelihoodSettings | GaussNewtonSettings | AdamSettings | CmaEsSettings | RandomSearchSettings
+Settings = LikelihoodSettings | AdamSettings | CmaEsSettings | RandomSearchSettings
 
 SOLVERS: Mapping[str, type[Settings]] = {
     "likelihood": LikelihoodSettings,
-    "gauss_newton": GaussNewtonSettings,
     "adam": AdamSettings,
     "cma_es": CmaEsSettings,
     "random_search": RandomSearchSettings,
@@ -38,7 +37,6 @@ __all__ = [
     "CmaEsSettings",
     "FitHistory",
     "FitOutcome",
-    "GaussNewtonSettings",
     "LikelihoodSettings",
     "Progress",
     "RandomSearchSettings",
@@ -47,7 +45,6 @@ __all__ = [
     "StopReason",
     "fit_adam",
     "fit_cma_es",
-    "fit_gauss_newton",
     "fit_likelihood",
     "fit_random_search",
     "solve",
@@ -70,8 +67,6 @@ def solve(
     match settings:
         case LikelihoodSettings():
             return fit_likelihood(objective, space, settings, progress=progress)
-        case GaussNewtonSettings():
-            return fit_gauss_newton(objective, space, settings, progress=progress)
         case AdamSettings():
             return fit_adam(objective, space, settings, progress=progress)
         case CmaEsSettings():

@@ -11,13 +11,11 @@ import torch
 from torch import Tensor
 
 from diffcloud.errors import DivergedError
-from diffcloud.fit.batches import batch_losses, posterior_losses
+from diffcloud.fit.batches import posterior_losses
 from diffcloud.fit.joint import AnyObjective
 from diffcloud.fit.parameters import FitSpace
 from diffcloud.fit.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
 
-_NEAREST, _FARTHEST = 0.01, 0.3
-"""Of starts that are moved beside the best iterate, as parts of its values."""
 _COPIES = 8
 """Perturbed ones of the first start, in antithetic pairs; even."""
 
@@ -45,15 +43,6 @@ class AdamSettings:
     """
     init: Mapping[str, float] = field(default_factory=dict)
     """Values of the first start; the middle of the range where not given."""
-    screen: int = 0
-    """Candidates that are simulated once, without gradients; the further starts are the best of them. 0: starts are spread
-    over the box unseen. Where the loss is rough or has many valleys, a start near the right one is worth more than
-    many iterations from elsewhere, and a simulation without gradient costs less than half."""
-    patience: int = 0
-    """Iterations without a lower loss of its own after which a further start is taken beside the best iterate of all; 0:
-    never. A few per cent from a minimum a rough loss can be ten times as high, and steps of one size pass it by. What is
-    moved searches at scales from 1 to 30 % of the values, with steps to match. The first start is never moved: it stays
-    the paper's descent."""
 
 
 def fit_adam(
@@ -72,10 +61,10 @@ def fit_adam(
         KeyboardInterrupt: interrupted before the first loss.
     """
     began = time.perf_counter()
-    start_values, logarithmic, simulations = _starts(objective, space, settings)
-    iterates = [row.clone().requires_grad_(True) for row in space.unbounded(start_values, logarithmic)]
-    optimiser = torch.optim.Adam([{"params": [row]} for row in iterates], lr=settings.learning_rate)
-    patience = _Patience(settings)
+    start_values, logarithmic = space.starts(settings.starts, seed=settings.seed, first=settings.init)
+    start_values, simulations = start_values.double(), 0
+    unbounded = space.unbounded(start_values, logarithmic).requires_grad_()
+    optimiser = torch.optim.Adam([unbounded], lr=settings.learning_rate)
     generator = torch.Generator().manual_seed(settings.seed)
     alive = torch.ones(settings.starts, dtype=torch.bool)
     history = FitHistory(space.names)
@@ -86,8 +75,6 @@ def fit_adam(
         for iteration in range(settings.iterations + 1):
             if settings.resample and iteration:
                 objective.reseed(settings.seed + iteration)
-            unbounded = torch.stack(iterates)
-            unbounded.retain_grad()
             owner, noise = _trials(settings, unbounded, generator)
             optimiser.zero_grad()
             while True:
@@ -130,12 +117,6 @@ def fit_adam(
                 break
             if iteration < settings.iterations:
                 optimiser.step()
-                for start in patience.spent_by(losses, alive):
-                    place, scale = patience.place_beside(best.values, space)
-                    with torch.no_grad():
-                        iterates[start].copy_(space.unbounded(place[None], logarithmic[start, None])[0])
-                    optimiser.state.pop(iterates[start])  # the old place's moments
-                    optimiser.param_groups[start]["lr"] = settings.learning_rate * scale
     except KeyboardInterrupt:
         if not history.losses:
             raise
@@ -160,47 +141,6 @@ class _Best:
     start: int
     values: Tensor
     """[k]"""
-
-
-class _Patience:
-    """Which starts go on beside the best iterate, and where."""
-
-    def __init__(self, settings: AdamSettings) -> None:
-        self._iterations = settings.patience
-        self._lowest = [math.inf] * settings.starts
-        self._in_vain = [0] * settings.starts
-        self._generator = torch.Generator().manual_seed(settings.seed)  # its own: the first start's noise stays the same
-
-    def spent_by(self, losses: Tensor, alive: Tensor) -> list[int]:
-        """After an iteration with these losses [B]: starts to move, whose count begins anew."""
-        moved = []
-        for start, (loss, lives) in enumerate(zip(losses.tolist(), alive.tolist(), strict=True)):
-            lower = loss < self._lowest[start]
-            self._lowest[start] = min(loss, self._lowest[start])
-            self._in_vain[start] = 0 if lower else self._in_vain[start] + 1
-            if start > 0 and lives and 0 < self._iterations <= self._in_vain[start]:
-                self._lowest[start], self._in_vain[start] = math.inf, 0
-                moved.append(start)
-        return moved
-
-    def place_beside(self, values: Tensor, space: FitSpace) -> tuple[Tensor, float]:
-        """A random place [k] beside values [k], and the scale of how far that is, as a part of them."""
-        scale = _FARTHEST * (_NEAREST / _FARTHEST) ** float(torch.rand(1, generator=self._generator))
-        noise = scale * torch.randn(len(values), generator=self._generator).to(values)
-        return space.moved(values, noise), scale
-
-
-def _starts(objective: AnyObjective, space: FitSpace, settings: AdamSettings) -> tuple[Tensor, Tensor, int]:
-    """Initial values [B, k], which scale each uses [B], and how many simulations it took to choose them."""
-    screened = settings.starts > 1 and settings.screen >= settings.starts
-    count = 1 + settings.screen if screened else settings.starts
-    values, logarithmic = space.starts(count, seed=settings.seed, first=settings.init)
-    values = values.double()
-    if not screened:
-        return values, logarithmic, 0
-    order = batch_losses(objective, space, values[1:]).argsort()[: settings.starts - 1] + 1
-    chosen = torch.cat([order.new_zeros(1), order])
-    return values[chosen], logarithmic[chosen], settings.screen * len(objective.members)
 
 
 def _trials(settings: AdamSettings, unbounded: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from diffcloud.fit.solvers.likelihood import Estimate
+    from diffcloud.fit.likelihood import Estimate
 
-StopReason = Literal["converged", "rough", "iterations", "simulations", "threshold", "interrupted"]
-"""`converged`: the best start cannot get lower by more than a ten-thousandth, or a thousandth where the loss is rough; or
-the candidates of a search lie together. `rough`: steps along its slope lower the loss no more. `threshold`: low enough.
+StopReason = Literal["converged", "iterations", "simulations", "threshold", "interrupted"]
+"""`converged`: the best start has arrived, or the candidates of a search lie together. `threshold`: low enough.
 `iterations`, or `simulations` of a search: none of them yet."""
 
 
