@@ -15,7 +15,7 @@ venv: $(STAMP)
 # needs one would compile for itself. --no-compile: of 23,000 files the stages import 5,000, and importing them once compiles
 # these, in a third of the time; open3d by our own import, which also finds libusb on a machine that has none
 IMPORTED := cma, diffcloud.regressors.training, dvc.commands.repro, dvc.repo, dvclive, matplotlib.backends.backend_agg, \
-	pipeline.evaluate, pipeline.preprocess, pipeline.report, pipeline.train, trimesh
+	diffcloud.cli.evaluate, diffcloud.cli.preprocess, diffcloud.cli.report, diffcloud.cli.train, trimesh
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -63,19 +63,19 @@ format: venv
 	ruff check --fix .
 
 bench: venv
-	diffcloud bench
+	python -m studies bench
 
 # RELEASE: the folder of the published data that holds lift_real_pcls/ and conf/.
 # REFERENCE: a folder of recorded reference trajectories; by default `diffsim` beside the published data, if it is there.
 REFERENCE ?= $(wildcard $(RELEASE)/../../diffsim)
 acceptance: venv
 	@test -n "$(RELEASE)" || { echo "Usage: make acceptance RELEASE=DIR [REFERENCE=DIR]"; exit 2; }
-	diffcloud acceptance --release "$(RELEASE)" $(if $(REFERENCE),--reference "$(REFERENCE)") --out docs/results
+	python -m studies acceptance --release "$(RELEASE)" $(if $(REFERENCE),--reference "$(REFERENCE)") --out docs/results
 
 # the published data, all methods: RELEASE as above, REFERENCE_FITS a JSON with the reference simulator's own fits
 comparison: venv
 	@test -n "$(RELEASE)" || { echo "Usage: make comparison RELEASE=DIR [REFERENCE_FITS=FILE]"; exit 2; }
-	diffcloud evaluate release "$(RELEASE)" $(if $(REFERENCE_FITS),--reference "$(REFERENCE_FITS)") --markdown docs/results/comparison.md
+	python -m studies published "$(RELEASE)" $(if $(REFERENCE_FITS),--reference "$(REFERENCE_FITS)") --markdown docs/results/comparison.md
 
 # The paper's simulated experiment on the built-in band and vest: ten targets each, networks, every method.
 SIMULATED := build/simulated
@@ -97,7 +97,7 @@ RECORDINGS_PARAMS := docs/results/raw-recordings.yaml
 recordings: venv
 	diffcloud episodes --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/raw
 	diffcloud preprocess --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/clouds $(RECORDINGS)/raw
-	diffcloud recordings --params $(RECORDINGS_PARAMS) --recorded $(RECORDINGS)/raw --episodes $(RECORDINGS)/clouds \
+	python -m studies recordings --params $(RECORDINGS_PARAMS) --recorded $(RECORDINGS)/raw --episodes $(RECORDINGS)/clouds \
 	    --out docs/results/raw-recordings.md
 
 # Synthetic raw recordings whose cameras and cloth are not where they are said to be.
@@ -108,12 +108,12 @@ moved: venv
 	    params=docs/results/moved-$$kind.yaml; \
 	    diffcloud episodes --params $$params --out $(MOVED)/$$kind/raw; \
 	    diffcloud preprocess --params $$params --out $(MOVED)/$$kind/clouds $(MOVED)/$$kind/raw; \
-	    diffcloud recordings --params $$params --recorded $(MOVED)/$$kind/raw --episodes $(MOVED)/$$kind/clouds \
+	    python -m studies recordings --params $$params --recorded $(MOVED)/$$kind/raw --episodes $(MOVED)/$$kind/clouds \
 	        --out docs/results/moved-$$kind.md $(NUISANCE); \
 	done
 
 # How often intervals hold the truth on cloths that MuJoCo and Newton move. What is finished is kept: build/foreign.
-FOREIGN := python -m studies.foreign
+FOREIGN := python -m studies foreign
 coverage: venv
 	$(FOREIGN) --sets towels,cut,one_camera,untold,folds,newton,joint --markdown docs/results/foreign.md
 
@@ -124,7 +124,7 @@ coverage-quick: venv
 # expect; and fresh recordings of the same cloths. Then, in a folder of its own, the same for a posterior trained on simulated
 # lifts of uncertain material, as those cameras see them, beside fits. Five hours on two cores; what is finished is kept.
 POSTERIOR := build/coverage-posterior
-COUNTED := diffcloud coverage --params docs/results/coverage.yaml
+COUNTED := python -m studies coverage --params docs/results/coverage.yaml
 COVERAGE := $(COUNTED) --out build/coverage
 BESIDE := $(COUNTED) --out $(POSTERIOR)/coverage --seed 6985324 --recordings 24 --scenario lift
 DRAWN := --seed 82037895
@@ -147,7 +147,7 @@ coverage-own: venv
 # The air around a real cloth that hangs and swings. DATA: the folder of its recordings (studies/hanging_cloth.py).
 hanging: venv
 	@test -n "$(DATA)" || { echo "Usage: make hanging DATA=DIR"; exit 2; }
-	python -m studies.hanging_cloth "$(DATA)"
+	python -m studies hanging "$(DATA)"
 
 # Every damaged file and every fault; a sample of both is part of test-slow.
 robustness: venv

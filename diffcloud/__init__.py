@@ -10,7 +10,8 @@ Imports run one way (a test holds this):
     regressors <- mesh, clouds, io
     sensing   <-  mesh, clouds, io
     hardware  <-  sensing, io                  (cameras and arm; their packages are imported when one is opened)
-    report    <-  everything but pipeline
+    report    <-  everything above
+    cli       <-  everything; nothing imports it but pipeline (the stages of `dvc repro`) and studies
 """
 
 __version__ = "0.1.0"

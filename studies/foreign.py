@@ -1,6 +1,6 @@
 """How often do intervals hold the truth? Cloths that MuJoCo and Newton move, as depth cameras see them.
 
-    python -m studies.foreign --seed SEED [--sets towels,folds] [--count 30] [--out build/foreign]
+    python -m studies foreign --seed SEED [--sets towels,folds] [--count 30] [--out build/foreign]
 
 Every other cloth is drawn from a wide range. `diffcloud identify` fits each recording as a user would; the study writes
 what is told into cloth.yaml and recordings.yaml. Motions are kept by seed and every fit is a line of OUT/log.jsonl, so a
@@ -27,6 +27,7 @@ import typer
 import yaml
 from numpy.typing import NDArray
 
+from diffcloud.cli.identify import find_scene
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.io.episodes import Episode, write_episode
@@ -40,7 +41,6 @@ from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.simulators import mujoco, newton
 from diffcloud.simulators.problem import REST_HEIGHT, Problem, Sheet, installed
 from diffcloud.simulators.towels import COUNTS, one_way
-from pipeline.identify import find_scene
 
 Floats = NDArray[np.float64]
 Kind = Literal["lift", "fold"]
@@ -319,7 +319,7 @@ def fitted(one: Set, seed: int, out: Path, revision: str) -> Case:
     for path, cloth in zip(paths, cloths, strict=True):
         write_episode(path, seen(moved(cloth, one.simulator, out / "motions"), cloth, one.cameras, cut=one.cut))
     _tell(one, folder / "found", names, paths)
-    command = [sys.executable, "-m", "pipeline", "identify", *map(str, paths), "--out", str(folder / "found")]
+    command = [sys.executable, "-m", "diffcloud", "identify", *map(str, paths), "--out", str(folder / "found")]
     command += ["--mass", f"{cloths[0].sheet.density:.4f}", "--json"]
     with (folder / "messages.txt").open("wb") as messages, (folder / "result.json").open("wb") as result:
         process = subprocess.Popen(command, stdout=result, stderr=messages)
@@ -406,7 +406,7 @@ def main(
     seed: Annotated[
         int | None, typer.Option(min=0, help="Of the first cloth. Default: digits of the commit's hash.")
     ] = None,
-    sets: Annotated[str, typer.Option(help="Comma-separated: " + ", ".join(one.name for one in SETS) + ".")] = "towels",
+    sets: Annotated[str, typer.Option(help="Comma-separated names of sets of recordings.")] = "towels",
     count: Annotated[int, typer.Option(min=1, help="Cloths of each set at most.")] = 30,
     out: Annotated[Path, typer.Option(help="Folder of motions, fits and the log.")] = Path("build/foreign"),
     markdown: Annotated[Path | None, typer.Option(help="Page of results.")] = None,
@@ -487,7 +487,7 @@ def _page(cases: Sequence[Case], seed: int, count: int, revision: str) -> str:
             "Odd seeds have wide ranges of material. *Held* counts 90 % intervals of the stretching stiffness that contain "
             "the truth; a fit without an interval counts as not held. Half-widths are factors.",
             "",
-            f"`python -m studies.foreign --seed {seed} --count {count}`, commit {revision[:12]}.",
+            f"`python -m studies foreign --seed {seed} --count {count}`, commit {revision[:12]}.",
             "",
             *[f"- *{one.name}*: {one.about}." for one in SETS if any(case.set == one.name for case in cases)],
             "",

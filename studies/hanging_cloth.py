@@ -1,6 +1,6 @@
 """Does air move with a cloth? Fourteen recordings of a real one that hangs from a bar, swings with it, and swings freely.
 
-    python -m studies.hanging_cloth FOLDER
+    python -m studies hanging FOLDER
 
 Added mass and drag are fitted to three recordings and predict the others, for which only the pose is fitted. FOLDER holds
 NPZ files, in the robot's frame, z up [m, s]: `cloud_times` [F] when a cloud was published, `clouds` [F, 64, 3] eight rows

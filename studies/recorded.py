@@ -1,6 +1,6 @@
 """How close do default fits come to the published recordings, and do repeats of one fabric agree?
 
-    python -m studies.recorded EPISODES [--fits build/recorded]
+    python -m studies recorded EPISODES [--fits build/recorded]
 
 EPISODES is what `diffcloud import release --trajectories` writes. Finished fits are kept.
 """
@@ -46,7 +46,7 @@ def main(
             raise ConfigError(
                 f"{episodes / scenario} holds no episodes: `diffcloud import release --trajectories` writes them."
             )
-        command = [sys.executable, "-m", "pipeline", "fit", "--scenario", scenario, "--out", str(fits / scenario)]
+        command = [sys.executable, "-m", "diffcloud", "fit", "--scenario", scenario, "--out", str(fits / scenario)]
         subprocess.run([*command, "--workers", str(workers), *map(str, files)], check=True)
         found |= {file.stem: read_fit(fits / scenario / f"{file.stem}.json") for file in files}
     write_text(markdown, page(found))
@@ -91,7 +91,7 @@ def page(found: Mapping[str, FitRecord]) -> str:
             "reproduce these motions, and are no properties of the fabrics: such cloth hardly stretches when it is lifted "
             "or folded.",
             "",
-            "`python -m studies.recorded EPISODES` makes this page.",
+            "`python -m studies recorded EPISODES` makes this page.",
             "",
         ]
     )

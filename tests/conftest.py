@@ -40,7 +40,7 @@ def pytest_xdist_auto_num_workers() -> int:
 def _one_worker() -> Iterator[None]:
     """Commands that a test runs in its own process run their jobs there too, unless it gives --workers."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipeline.workers.cores", lambda: 1)
+        patch.setattr("diffcloud.cli.workers.cores", lambda: 1)
         yield
 
 

@@ -12,6 +12,7 @@ import yaml
 from pydantic import BaseModel
 
 ROOT = Path(__file__).parents[1]
+CLI = ROOT / "diffcloud" / "cli"
 ALLOWED = {
     "mesh": set(),
     "io": {"mesh"},
@@ -53,12 +54,13 @@ def test_imports_run_one_way(package):
     for path in (ROOT / "diffcloud" / package).rglob("*.py"):
         extra = (packages(path) & ALLOWED.keys()) - ALLOWED[package] - {package}
         assert not extra, f"{path.relative_to(ROOT)} imports {sorted(extra)}"
-        assert not any(name.split(".")[0] == "pipeline" for name in imported(path)), path
+        assert "cli" not in packages(path), path
+        assert not {name.split(".")[0] for name in imported(path)} & {"pipeline", "studies"}, path
 
 
 def test_every_package_is_in_the_table():
     found = {path.name for path in (ROOT / "diffcloud").iterdir() if (path / "__init__.py").is_file()}
-    assert found == set(ALLOWED)
+    assert found == {*ALLOWED, "cli"}
 
 
 def test_meshes_and_kernels_know_no_torch():
@@ -70,22 +72,22 @@ def test_meshes_and_kernels_know_no_torch():
 
 
 SAME_RESULTS = {"console", "ctrl_c", "lazy", "predict", "scenario_options"}
-"""Modules of `pipeline` that decide nothing of what a stage of the default parameters writes."""
+"""Modules of `cli` that decide nothing of what a stage of the default parameters writes."""
 
 
 def pipeline_modules(stage: str) -> set[str]:
     """What a stage's command imports, itself or by the comparison."""
-    own = imported(ROOT / "pipeline" / f"{stage}.py")
-    return own | imported(ROOT / "pipeline" / "comparison.py") if "pipeline.comparison" in own else own
+    own = imported(CLI / f"{stage}.py")
+    return own | imported(CLI / "comparison.py") if "diffcloud.cli.comparison" in own else own
 
 
 def needed_packages(stage: str) -> set[str]:
     """Sub-packages a stage's command reaches, through whatever those import."""
     seen: set[str] = set()
-    todo = packages(ROOT / "pipeline" / f"{stage}.py") & ALLOWED.keys()
-    if "pipeline.comparison" in pipeline_modules(stage):
-        todo |= packages(ROOT / "pipeline" / "comparison.py") & ALLOWED.keys()
-    if "scenario_options" in (ROOT / "pipeline" / f"{stage}.py").read_text(encoding="utf-8"):
+    todo = packages(CLI / f"{stage}.py") & ALLOWED.keys()
+    if "diffcloud.cli.comparison" in pipeline_modules(stage):
+        todo |= packages(CLI / "comparison.py") & ALLOWED.keys()
+    if "scenario_options" in (CLI / f"{stage}.py").read_text(encoding="utf-8"):
         todo |= {"scene"}
     while todo:
         package = todo.pop()
@@ -103,14 +105,14 @@ def stages() -> dict:
 def test_stage_dependencies_are_the_imports(stage):
     listed = {Path(dep).name for dep in stages()[stage]["deps"] if dep.startswith("diffcloud/") and not dep.endswith(".py")}
     assert listed == needed_packages(stage)
-    imports = {name.split(".")[1] for name in pipeline_modules(stage) if name.startswith("pipeline.")}
+    imports = {name.split(".")[2] for name in pipeline_modules(stage) if name.startswith("diffcloud.cli.")}
     modules = {stage, *imports} - SAME_RESULTS
-    assert {f"pipeline/{name}.py" for name in modules} <= set(stages()[stage]["deps"])
+    assert {f"diffcloud/cli/{name}.py" for name in modules} <= set(stages()[stage]["deps"])
 
 
 def test_stage_parameters_are_sections_of_the_configuration():
+    from diffcloud.cli.config import Config
     from diffcloud.sim.properties import PARAMETERS
-    from pipeline.config import Config
 
     written = yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8"))
     used = {name.partition(".")[0] for stage in stages().values() for name in stage.get("params", [])}
@@ -141,7 +143,7 @@ def test_every_setting_can_be_set_in_an_experiment(tmp_path):
     """By `dvc exp run -S`, which takes keys that the file states; and what is set is what a stage reads."""
     from dvc.utils.hydra import apply_overrides
 
-    from pipeline.config import load_config
+    from diffcloud.cli.config import load_config
 
     path = tmp_path / "params.yaml"
     for name in leaves(yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8"))):
@@ -160,18 +162,20 @@ def test_every_stage_command_exists():
 
 
 def test_stages_run_the_code_of_the_checkout():
-    assert all(stage["cmd"].startswith("python -m pipeline ") for stage in stages().values())
+    for name, stage in stages().items():
+        assert stage["cmd"].startswith(f"python -m pipeline.{name} ")
+        assert f'stage("{name}")' in (ROOT / "pipeline" / f"{name}.py").read_text(encoding="utf-8")
 
 
 def check_commands(stages: dict) -> None:
     """What stages run are commands and options of this package."""
     from typer.main import get_command
 
-    from pipeline.app import app
+    from diffcloud.cli.app import app
 
     commands = get_command(app).commands
     for stage in stages.values():
-        words = stage["cmd"].removeprefix("python -m pipeline ").removeprefix("diffcloud ").split()
+        words = stage["cmd"].removeprefix("python -m pipeline.").removeprefix("diffcloud ").split()
         assert words[0] in commands
         options = {option for parameter in commands[words[0]].params for option in parameter.opts}
         assert {word for word in words if word.startswith("--")} <= options

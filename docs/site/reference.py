@@ -18,9 +18,9 @@ from typing import Any
 
 import typer
 
+from diffcloud.cli import config as settings
+from diffcloud.cli.app import app
 from diffcloud.sensing.fusion import FusionSettings
-from pipeline import config as settings
-from pipeline.app import app
 
 ROOT = Path(__file__).parents[2]
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
+from diffcloud.cli.config import SMOOTHING
 from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
 from diffcloud.io.imports import release_episodes
 from diffcloud.scene import load_scenario
 from diffcloud.sim import Properties, rollout, rollout_tangents
-from pipeline.acceptance import SCENES, _simulated_clouds
-from pipeline.config import SMOOTHING
+from studies.acceptance import SCENES, _simulated_clouds
 
 # positions of the reference simulator (float32 prints) at given steps: scenario, (stretch, mass), step, node, position
 REFERENCE = [
@@ -152,9 +152,9 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
 
     import yaml
 
-    import pipeline.comparison
-    import pipeline.fit_jobs
-    from tests.pipeline.invoke import invoke
+    import diffcloud.cli.comparison
+    import diffcloud.cli.fit_jobs
+    from tests.cli.invoke import invoke
 
     monkeypatch.chdir(tmp_path)
     profile = yaml.safe_load(
@@ -163,7 +163,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
     profile["fit"] |= {"iterations": 2, "starts": 2, "smoothing": 0.0}
     profile["evaluate"] |= {"draws": 2, "landscapes": []}
     Path("quick.yaml").write_text(yaml.safe_dump(profile))
-    command = ("evaluate", "release", release, "--params", "quick.yaml", "--only", "*/fold_tan*", "--markdown", "c.md")
+    command = ("published", release, "--params", "quick.yaml", "--only", "*/fold_tan*", "--markdown", "c.md")
     found = invoke(*command).result["metrics"]["comparison"]
     assert set(found["methods"]["release_fold"]) >= {"diffcloud", "cma_es", "published_mlp", "published_meteornet"}
     assert set(found["verdicts"]["release_fold"]) == {"stretch", "mass"}
@@ -173,7 +173,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
     def never(*arguments, **options):
         raise AssertionError("fitted or compared again")
 
-    monkeypatch.setattr(pipeline.fit_jobs, "solve", never)
-    monkeypatch.setattr(pipeline.comparison, "compare_episode", never)
+    monkeypatch.setattr(diffcloud.cli.fit_jobs, "solve", never)
+    monkeypatch.setattr(diffcloud.cli.comparison, "compare_episode", never)
     assert invoke(*command).result["metrics"]["comparison"] == found
-    assert "No published episode matches" in invoke("evaluate", "release", release, "--only", "shirt*", code=1).errors
+    assert "No published episode matches" in invoke("published", release, "--only", "shirt*", code=1).errors

@@ -15,10 +15,10 @@ from diffcloud.io.clouds import write_ply
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.sensing.cameras import inverse
+from tests.cli.invoke import invoke
 from tests.docs.examples import Example, examples, read
 from tests.fit.test_fit import clouds_of
 from tests.io.test_recordings import bag
-from tests.pipeline.invoke import invoke
 from tests.sensing.charuco_scene import gripper_poses
 from tests.sensing.cloth_scene import INTRINSICS, views, write_cloth_episode
 from tests.sensing.table_scene import SERIALS, poses, write_table_episode

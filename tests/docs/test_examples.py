@@ -15,12 +15,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
-from pipeline import bench
+from studies import bench
+from studies.__main__ import app as studies
+from tests.cli.invoke import invoke
 from tests.docs.examples import PAGES, ROOT, Example, examples, mentions, read
 from tests.docs.kitchen import PREPARED, STAND_INS, write
 from tests.docs.site import reference
-from tests.pipeline.invoke import invoke
 
 RELEASE = os.environ.get("DIFFCLOUD_RELEASE")
 DATA = "PATH/pysim"
@@ -31,10 +33,9 @@ SMALLER = {
     "simulate": "--train 4 --test 5",
     "train": "--epochs 1 --points 32",
     "fit": "--starts 1 --iterations 1 --points 200",
-    "gradients": "--pairs 1",
     "identify": "--parameters stretch",
     "evaluate loss": "--points 200",
-    "evaluate release": "--only release_lift/lift_tan --allow-missing --workers 1",
+    "published": "--only release_lift/lift_tan --allow-missing --workers 1",
     "bench": "--repeats 1",
     "export fits/towel.json --to mujoco --samples": "--samples 2",
 }
@@ -53,14 +54,18 @@ LEFT = {
 }
 """Beginnings of commands that are not run -> what they need, or why."""
 
-SLOW = ("gradients", "evaluate release")
-"""Beginnings of diffcloud commands that run with the slow tests only, and are parsed in the others."""
+SLOW = ("python -m studies published",)
+"""Beginnings of commands that run with the slow tests only, and are parsed in the others."""
 
 WITH_EXAMPLES = [page for page in PAGES if examples(read(page))]
 
 
 def parse(words: tuple[str, ...]) -> None:
     """Read a command line as the command itself does, to its last option; run nothing."""
+    if words[0] == "python":
+        study = get_command(studies).commands[words[3]]
+        study.make_context(words[3], list(words[4:]))
+        return
     path = reference.command_of(" ".join(words))
     assert path is not None, f"no such command: {shlex.join(words)}"
     rest = list(words[1 + len(path) :])
@@ -76,20 +81,20 @@ def run(example: Example, *, slow: bool) -> None:
         write(example, Path.cwd())
     elif example.kind == "python":
         exec(compile(example.text, "example", "exec"), {})
+    elif words[0] == "diffcloud" or words[:3] == ("python", "-m", "studies"):
+        parse(words)
+        own = words[3:] if words[0] == "python" else words[1:]
+        later = not slow and example.text.startswith(SLOW)
+        absent = RELEASE is None and any(DATA in word or "release" in word for word in words)
+        if not (later or absent or example.text.startswith(tuple(LEFT))):
+            more = [option for name, option in SMALLER.items() if shlex.join(own).startswith(name)]
+            with not_yet_captured(words):
+                invoke(*own, *shlex.split(" ".join(more)))
     elif words[0] == "python" and words[1] != "-m":
         runpy.run_path(words[1])
     elif words[0] == "make":
         targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
         assert words[1] in targets, f"no such target: {example.text}"
-    elif words[0] == "diffcloud":
-        parse(words)
-        rest = shlex.join(words[1:])
-        later = not slow and rest.startswith(SLOW)
-        absent = RELEASE is None and any(DATA in word or "release" in word for word in words)
-        if not (later or absent or example.text.startswith(tuple(LEFT))):
-            more = [option for name, option in SMALLER.items() if rest.startswith(name)]
-            with not_yet_captured(words):
-                invoke(*words[1:], *shlex.split(" ".join(more)))
     else:
         assert example.text.replace("'", "").startswith(tuple(LEFT)), f"neither run nor listed in LEFT: {example.text}"
         missing = [word for word in words if word.startswith("tests/") and not (ROOT / word).exists()]
@@ -142,9 +147,7 @@ def test_what_a_page_shows_works(page, folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "page", [p for p in WITH_EXAMPLES if any(e.text.removeprefix("diffcloud ").startswith(SLOW) for e in examples(read(p)))]
-)
+@pytest.mark.parametrize("page", [p for p in WITH_EXAMPLES if any(e.text.startswith(SLOW) for e in examples(read(p)))])
 def test_what_a_page_shows_works_whole(page, folder):
     follow(page, folder, slow=True)
 
@@ -154,14 +157,14 @@ def test_nothing_is_left_out_in_vain():
     for beginning in LEFT:
         assert any(text.startswith(beginning) for text in texts), beginning
     for beginning in SLOW:
-        assert any(text.startswith(f"diffcloud {beginning}") for text in texts), beginning
+        assert any(text.startswith(beginning) for text in texts), beginning
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_commands_and_options_that_the_prose_names_exist(page):
     options = {
         option
-        for command in reference.commands().values()
+        for command in [*reference.commands().values(), *get_command(studies).commands.values()]
         for p in command.params
         for option in (*p.opts, *p.secondary_opts)
     }

@@ -9,13 +9,13 @@ import pytest
 import torch
 import yaml
 
+from diffcloud.cli.config import FitConfig
 from diffcloud.errors import ConfigError, SceneError
 from diffcloud.fit import FitSpace, LikelihoodSettings, Objective, fit_likelihood
 from diffcloud.fit.doubts import MATERIAL_DOUBTS, parse_doubts, with_doubts
 from diffcloud.fit.parameters import Variable
 from diffcloud.fit.residuals import Axis
 from diffcloud.scene.scenarios import load_scenario
-from pipeline.config import FitConfig
 from tests.conftest import small_lift
 from tests.fit.rates import check_rates
 from tests.fit.test_fit import GENTLE, clouds_of

@@ -11,8 +11,6 @@ import torch
 
 from diffcloud.errors import ConfigError, DivergedError, EpisodeError
 from diffcloud.fit import AdamSettings, FitSpace, JointObjective, Objective, fit_adam
-from diffcloud.fit.agreement import Agreement, gradient_agreement, random_parameters
-from diffcloud.fit.benchmark import time_contact
 from diffcloud.fit.inputs import Inputs
 from diffcloud.fit.record import FittedParameter, read_fit
 from diffcloud.fit.result import describe_fit, read_motion, write_fit
@@ -21,6 +19,8 @@ from diffcloud.fit.visibility import visibility_map
 from diffcloud.io.episodes import Episode
 from diffcloud.scene import load_scenario
 from diffcloud.sim.properties import one_set
+from studies.gradient_agreement import Agreement, gradient_agreement, random_parameters
+from studies.timings import time_contact
 from tests.conftest import paper_objective, small_lift
 
 
@@ -383,7 +383,7 @@ def test_smoothed_gradients_find_the_valley_of_a_rough_loss():
 class TestGradientAgreement:
     def test_smooth_losses_agree(self, monkeypatch):
         """In the air, where only truncation is between them, and kinks of the material's table, if the step is longer."""
-        monkeypatch.setattr("diffcloud.fit.agreement.STEP", 1e-5)
+        monkeypatch.setattr("studies.gradient_agreement.STEP", 1e-5)
         scenario = small_lift(gap_m=0.5)
         (found,) = gradient_agreement(scenario, np.array([[0.5, 0.3], [2.0, 1.5], [1.2, 0.8]]))
         assert found.same_sign.all()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from diffcloud.cli.config import FitConfig
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation.methods import space_of
 from diffcloud.fit import FitSpace, LikelihoodSettings, Objective, fit_likelihood, read_fit, write_fit
@@ -20,7 +21,6 @@ from diffcloud.fit.result import describe_fit
 from diffcloud.scene.scenarios import load_scenario, make_scenario
 from diffcloud.scene.scenarios.grid import LIFT
 from diffcloud.sim.properties import one_set
-from pipeline.config import FitConfig
 from tests.conftest import small_lift
 from tests.fit.rates import check_rates
 from tests.fit.test_fit import GENTLE, clouds_of

@@ -19,10 +19,10 @@ from diffcloud.io.files import write_json
 from diffcloud.io.raw_episodes import CameraInfo, read_raw_episode
 from diffcloud.sensing.robot import gen3
 from diffcloud.sensing.validation.episode import validate_raw_episode
+from tests.cli.invoke import invoke
 from tests.hardware.drivers import Dated, Metres, Silent, Undead, write_images
 from tests.hardware.kortex.opening import in_process
 from tests.hardware.kortex.server import FakeArm
-from tests.pipeline.invoke import invoke
 
 EXAMPLE = "diffcloud.hardware.examples.simulated_ur5e:SimulatedUR5e"
 FOLDER = "diffcloud.hardware.examples.folder_camera:FolderCamera"

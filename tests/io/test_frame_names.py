@@ -12,7 +12,7 @@ from diffcloud.errors import EpisodeError
 from diffcloud.io.frame_names import named_frames
 from diffcloud.io.imports import cloud_folder
 from diffcloud.io.raw_episodes import read_raw_episode
-from tests.pipeline.invoke import invoke
+from tests.cli.invoke import invoke
 from tests.sensing.table_scene import poses, table_depth, write_table_episode
 
 EPOCH = 1_305_031_102_160_407_000

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from diffcloud.cli.config import load_config, updated
 from diffcloud.errors import DiffCloudError, EpisodeError
 from diffcloud.io.arrays import read_npy, read_npz
 from diffcloud.io.clouds import read_cloud
@@ -31,8 +32,7 @@ from diffcloud.io.tables import numbers, read_csv
 from diffcloud.io.urdf import read_urdf
 from diffcloud.regressors import Regressor
 from diffcloud.scene.scenarios import load_scenario
-from pipeline.config import load_config, updated
-from tests.pipeline.invoke import environment
+from tests.cli.invoke import environment
 
 READERS = {
     "yaml": read_yaml,
@@ -248,7 +248,7 @@ def test_a_name_that_is_not_in_the_systems_encoding(tmp_path):
 @pytest.mark.parametrize("locale", [{"LC_ALL": "C"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}])
 def test_commands_in_any_locale(tmp_path, name, locale):
     (tmp_path / os.fsdecode(name)).write_text("base: lift\nframes: 0\n")
-    command = [sys.executable, "-m", "pipeline.app", "rollout", "--scenario", name, "--out", "m.npz", "--json"]
+    command = [sys.executable, "-m", "diffcloud.cli.app", "rollout", "--scenario", name, "--out", "m.npz", "--json"]
     told = subprocess.run(command, cwd=tmp_path, env=environment() | locale, capture_output=True, timeout=120, check=False)
     assert told.returncode == 1
     text = told.stderr.decode("ascii", errors="replace").strip()

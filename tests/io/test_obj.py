@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from diffcloud.cli.scenario_options import limits
 from diffcloud.errors import MeshError
 from diffcloud.io.obj import STRETCHED, other_lengths, read_cloth, read_surface, write_cloth, write_surface
 from diffcloud.mesh import grid_cloth
 from diffcloud.scene.scenarios import load_scenario
-from pipeline.scenario_options import limits
 
 
 def write(path, text):

@@ -10,7 +10,7 @@ import pytest
 from diffcloud.errors import EmptyCloudError, EpisodeError
 from diffcloud.io.clouds import read_cloud
 from diffcloud.io.pcd import lzf_decompressed
-from tests.pipeline.invoke import invoke
+from tests.cli.invoke import invoke
 
 POINTS = np.array([[0.4, -0.12, 0.02], [0.55, 0.25, 0.0], [0.7, 0.125, 1.5], [-0.25, 0.5, 0.75]])
 WHOLE = np.array([[1, 2, 3], [4, 50, 6], [100, 8, 9], [7, 0, 11]])

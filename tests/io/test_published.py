@@ -15,8 +15,8 @@ from diffcloud.io.imports import release_episodes
 from diffcloud.io.published import RECORDED_START_M, RELEASE_UNIT_M, in_clouds_frame, read_trajectories, recorded_episode
 from diffcloud.io.published_cameras import published_set_ups
 from diffcloud.scene.scenarios import load_scenario
+from tests.cli.invoke import invoke
 from tests.io.test_imports import make_clouds
-from tests.pipeline.invoke import invoke
 
 FRAMES = 25
 NAMES = {"lift": "lift_navy2", "fold": "fold_tan"}

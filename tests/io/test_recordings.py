@@ -15,8 +15,8 @@ from diffcloud.io.images import write_color
 from diffcloud.io.raw_episodes import CameraInfo, read_raw_episode
 from diffcloud.io.recordings import RecordedFrame, Recording, read_joint_log, write_recording
 from diffcloud.sensing.validation.episode import validate_raw_episode
+from tests.cli.invoke import invoke
 from tests.io.ros_bag import FRAMES, START, TOOL, bag
-from tests.pipeline.invoke import invoke
 from tests.sensing.table_scene import HOME_RAD, INTRINSICS, poses, table_depth, write_table_episode
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from diffcloud.io.raw_episodes import read_raw_episode
+from tests.cli.invoke import invoke
 from tests.io.ros_bag import ARM, FRAMES, START, Bag, Habits
-from tests.pipeline.invoke import invoke
 from tests.sensing.table_scene import HOME_RAD, INTRINSICS, poses
 
 ROWS = 2 * FRAMES + 4

@@ -17,8 +17,8 @@ from diffcloud.io.ros.files import opened
 from diffcloud.io.ros.messages import color_image
 from diffcloud.io.rvl import decode_rvl
 from diffcloud.sensing.robot import gen3
+from tests.cli.invoke import invoke
 from tests.io.ros_bag import FRAMES, START, Bag, Habits, bag, rvl
-from tests.pipeline.invoke import invoke
 from tests.sensing.table_scene import HOME_RAD, INTRINSICS, poses, table_depth
 
 KINDS = pytest.mark.parametrize("kind", ["rosbag1", "rosbag2"])

@@ -15,7 +15,7 @@ from diffcloud.regressors import Regressor
 from diffcloud.regressors.posterior import Posterior
 from diffcloud.regressors.training import LEVELS, train_regressor
 from diffcloud.report.regressors import TrainingEntry, errors_table, training_data
-from tests.pipeline.invoke import invoke
+from tests.cli.invoke import invoke
 from tests.regressors.simulated import sagging_sheet
 from tests.regressors.test_checkpoints import episode, regressor
 from tests.regressors.test_training import TINY

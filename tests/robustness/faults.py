@@ -23,7 +23,7 @@ from typing import Any, Literal, get_args
 
 import psutil
 
-from tests.pipeline.invoke import DIFFCLOUD, environment
+from tests.cli.invoke import DIFFCLOUD, environment
 from tests.robustness.inputs import SEED
 from tests.robustness.kinds import REPORT, STAGES
 

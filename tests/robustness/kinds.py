@@ -15,6 +15,9 @@ import numpy as np
 import torch
 import yaml
 
+from diffcloud.cli.config import load_config
+from diffcloud.cli.identify import find_scene
+from diffcloud.cli.report import table_rows
 from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, check_file
 from diffcloud.fit import Objective, read_fit
 from diffcloud.io.calibrations import Calibration, CameraCalibration, read_calibration, write_calibration
@@ -27,13 +30,10 @@ from diffcloud.io.simulated import SimulatedSet
 from diffcloud.scene.scenarios.catalogue import built_in
 from diffcloud.sensing.robot import Robot
 from diffcloud.sensing.validation.episode import validate_raw_episode
-from pipeline.config import load_config
-from pipeline.identify import find_scene
-from pipeline.report import table_rows
+from tests.cli.invoke import ROOT, environment
 from tests.conftest import small_lift
 from tests.fit.test_fit import clouds_of
 from tests.io.ros_bag import Bag, Habits
-from tests.pipeline.invoke import ROOT, environment
 from tests.scene.files import sheet_over_box, write_file, write_files
 from tests.sensing.table_scene import INTRINSICS, poses
 
@@ -151,7 +151,7 @@ def command(arguments: str) -> Callable[[], None]:
     """`diffcloud` with these arguments, in this process."""
 
     def run() -> None:
-        from pipeline.app import main
+        from diffcloud.cli.app import main
 
         sys.argv = ["diffcloud", *arguments.split()]
         main()
@@ -242,15 +242,9 @@ def warm_up() -> None:
     """Import and compile in this process what its forks would each import and compile."""
     import matplotlib.figure
 
-    import pipeline.evaluate_release
-    import pipeline.export
-    import pipeline.importing
-    import pipeline.predict
-    import pipeline.preprocess
-    import pipeline.report
-    import pipeline.rollout
+    import studies.published
 
-    del matplotlib, pipeline
+    del matplotlib, studies
     import_open3d()
     torch.set_num_threads(1)
     for integrator in ("linearised", "implicit"):

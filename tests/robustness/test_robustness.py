@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from tests.pipeline.invoke import ROOT, environment
+from tests.cli.invoke import ROOT, environment
 from tests.robustness import damage
 from tests.robustness.isolated import read_alone
 from tests.robustness.kinds import KINDS

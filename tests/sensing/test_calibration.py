@@ -17,7 +17,7 @@ from diffcloud.sensing.calibration.charuco import CameraViews, CharucoBoard, Vie
 from diffcloud.sensing.calibration.checkerboard import onto_plane, register_checkerboard, rigid_motion
 from diffcloud.sensing.calibration.hand_eye import calibrate_hand_eye, find_views, still_pose
 from diffcloud.sensing.cameras import depth_points, inverse, project, rays, transform
-from tests.pipeline.invoke import invoke
+from tests.cli.invoke import invoke
 from tests.sensing.charuco_scene import BOARD, CAMERAS, GRIPPER_BOARD, INTRINSICS, board_depth, gripper_poses, render
 
 LENS = (0.12, -0.25, 0.001, -0.0007, 0.08)

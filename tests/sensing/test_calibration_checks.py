@@ -18,7 +18,7 @@ from diffcloud.sensing.calibration.charuco import CameraViews, View
 from diffcloud.sensing.calibration.checks import CameraEvidence, judge_hand_eye
 from diffcloud.sensing.calibration.hand_eye import calibrate_hand_eye
 from diffcloud.sensing.cameras import inverse, project, transform
-from tests.pipeline.invoke import invoke
+from tests.cli.invoke import invoke
 from tests.sensing.charuco_scene import BOARD, CAMERAS, GRIPPER_BOARD, INTRINSICS, gripper_poses
 from tests.sensing.test_calibration import write_board_episode
 

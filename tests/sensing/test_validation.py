@@ -13,7 +13,7 @@ from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.images import write_depth
 from diffcloud.sensing.cameras import rays
 from diffcloud.sensing.validation.episode import validate_raw_episode
-from tests.pipeline.invoke import invoke
+from tests.cli.invoke import invoke
 from tests.sensing.table_scene import INTRINSICS, SERIALS, poses, write_table_episode
 
 

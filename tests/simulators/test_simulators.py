@@ -1,7 +1,7 @@
 """Problems for several simulators: known answers, a third opinion, and the others where they are installed.
 
 `tests/physics/test_known_answers.py` has the same strip and elastica under mesh refinement, with the linearised integrator.
-Here they are those of `diffcloud simulators`: the implicit one, a Poisson's ratio, and the meshes that all simulators get.
+Here they are those of the study `simulators`: the implicit one, a Poisson's ratio, and the meshes that all simulators get.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def test_a_missing_simulator_says_how_to_install_it(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [strip, cantilever])
 def test_mujoco_and_newton_know_the_answers(known):
-    """Vertex block descent, which converges slowly, is in `tests/pipeline/test_export.py`."""
+    """Vertex block descent, which converges slowly, is in `tests/diffcloud/cli/test_export.py`."""
     pytest.importorskip("mujoco")
     pytest.importorskip("newton")
     test = known()

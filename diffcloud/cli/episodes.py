@@ -1,0 +1,195 @@
+"""`diffcloud episodes`: the first stage. Makes synthetic recordings; a person's own lie in raw/."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+from numpy.typing import NDArray
+
+from diffcloud.cli.config import EpisodesConfig, load_config
+from diffcloud.cli.console import JsonFlag, ParamsFile, Workers, errors, finish, writes
+from diffcloud.cli.scenario_options import choose_scenario
+from diffcloud.cli.workers import Tell, run_all
+from diffcloud.errors import ConfigError, DiffCloudError
+from diffcloud.io.episodes import write_episode
+from diffcloud.io.files import staged
+from diffcloud.io.manifests import remove_files, write_manifest
+from diffcloud.io.raw_episodes import raw_episode_files, read_description
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sensing.depth_camera import DepthNoise, published_cameras
+from diffcloud.sensing.recorder import ClothMotion, record
+from diffcloud.sensing.whole_surface import sample_surface
+from diffcloud.sim.properties import PARAMETERS
+from diffcloud.sim.simulate import rollout
+from diffcloud.sim.system import System
+
+_HIDDEN = ("stretch", "mass")
+
+
+@writes()
+def episodes(
+    out: Annotated[Path, typer.Option(help="Folder; episodes go to OUT/<scenario>/<episode>, raw or .npz.")],
+    params: ParamsFile = None,
+    workers: Workers = None,
+    json: JsonFlag = False,
+) -> None:
+    """Make synthetic recordings of every scenario."""
+    config = load_config(params)
+    settings = config.episodes
+    jobs = [EpisodesJob(name, index, settings, out / name) for index, name in enumerate(config.scenarios)]
+    if not settings.per_scenario:
+        jobs = []
+        write_manifest(out, [])
+    written = {}
+    for job, names, error in run_all("episodes", jobs, workers):
+        if error is not None:
+            raise DiffCloudError(error)
+        written[job.scenario] = names
+        errors.print(f"{job.scenario}: {', '.join(names)}")
+    finish({"out": str(out), "episodes": written}, json)
+
+
+@dataclass(frozen=True)
+class EpisodesJob:
+    """The recordings of one scenario."""
+
+    scenario: str
+    index: int
+    """Of the scenario among all; its random numbers depend on it."""
+    settings: EpisodesConfig
+    out: Path
+
+    @property
+    def label(self) -> str:
+        return self.scenario
+
+    def run(self, tell: Tell) -> list[str]:
+        """Make them; their names."""
+        scenario = choose_scenario(self.scenario)
+        return _synthetic(scenario, self.settings, self.index, self.out, lambda _, text: tell(0.0, text))
+
+
+def _synthetic(
+    scenario: Scenario, config: EpisodesConfig, index: int, out: Path, tell: Callable[[int, str], None]
+) -> list[str]:
+    """Simulate cloths of hidden parameters and record them: by depth cameras as raw episodes, or by their whole surface."""
+    rng = np.random.default_rng([config.seed, index])
+    hidden = hidden_parameters(scenario, config, rng)
+    system, nodes, times = simulated_frames(scenario, hidden)
+    names = []
+    for repeat in range(config.per_scenario):
+        name, seed = f"{scenario.name}_hidden{repeat + 1}", int(rng.integers(2**31))
+        meta: dict[str, Any] = {
+            "scenario": scenario.name,
+            "fabric": f"hidden{repeat + 1}",
+            "repeat": 1,
+            "truth": {key: float(values[repeat]) for key, values in hidden.items()},
+        }
+        record_motion(scenario, system, nodes[repeat], times, out, name, config, seed=seed, meta=meta, tell=tell)
+        names.append(name)
+    return names
+
+
+def simulated_frames(
+    scenario: Scenario, values: Mapping[str, NDArray[np.float64]]
+) -> tuple[System, NDArray[np.float64], NDArray[np.float64]]:
+    """The scenario's system, and its motions [E, T, V, 3] at the times [T] of its frames [s], at parameters [E] by name.
+
+    Raises:
+        DivergedError: a motion diverges.
+    """
+    system, _ = scenario.scene.build()
+    properties = scenario.properties(system, {name: torch.as_tensor(column) for name, column in values.items()})
+    with torch.no_grad():
+        run = rollout(system, scenario.steps, properties=properties)
+    steps = scenario.scene.frame_steps
+    return system, run.positions[:, ::steps].numpy(), run.times[::steps].numpy()
+
+
+def record_motion(
+    scenario: Scenario,
+    system: System,
+    nodes: NDArray[np.float64],
+    times: NDArray[np.float64],
+    out: Path,
+    name: str,
+    config: EpisodesConfig,
+    *,
+    seed: int,
+    meta: Mapping[str, Any],
+    noise: DepthNoise | None = None,
+    tell: Callable[[int, str], None] = lambda done, text: None,
+) -> None:
+    """Record one simulated motion as the scenario says: its whole surface in OUT/NAME.npz, or by depth cameras in the raw
+    episode OUT/NAME.
+
+    Args:
+        nodes: [T, V, 3] of the cloth at times [T].
+        seed: of the recorder's noise.
+        noise: of depth cameras; by default what `config` says.
+        tell: called with (frames done, text).
+
+    Raises:
+        ConfigError: several grippers before depth cameras, or something else is where the raw episode would be.
+    """
+    obstacles, faces = scenario.scene.surrounding.obstacles, system.mesh.faces
+    if scenario.recorder == "whole_surface":
+        obstacle = obstacles[0] if obstacles else None
+        told = {**meta, "source": "synthetic"}
+        episode = sample_surface(nodes, faces, times, obstacle, points=scenario.points, seed=seed, meta=told)
+        write_episode(out / f"{name}.npz", episode)
+        return
+    if len(grippers := system.handles.grippers) > 1:
+        raise ConfigError(
+            f"Scenario {scenario.name} has the grippers {', '.join(grippers)}, but the recorder by depth cameras "
+            "has one arm; choose recorder: whole_surface."
+        )
+    _replaceable(out / name, "synthetic")  # refused before it is recorded
+    height = float(obstacles[0].nodes[:, 2].max()) if obstacles else float(nodes[0, :, 2].min())
+    motion = ClothMotion(nodes, faces, times, scenario.grasped, height)
+    cameras = published_cameras(*config.image_size, noise=noise or DepthNoise(subpixel_px=config.subpixel_px))
+    with staged(out / name) as folder:
+        record(folder, motion, cameras, settings=config.recorder(), seed=seed, meta=meta, tell=tell)
+        _clear(out / name, "synthetic")
+
+
+def _replaceable(folder: Path, source: str) -> list[str]:
+    """Files of the recording of this source that an earlier run left.
+
+    Raises:
+        ConfigError: something else is there.
+    """
+    if not folder.exists():
+        return []
+    own, others = raw_episode_files(folder)
+    if "episode.json" not in own or read_description(folder).get("source") != source:
+        raise ConfigError(f"{folder} exists and is no {source} recording; choose another --out, or move it away.")
+    if others:
+        raise ConfigError(f"{folder} holds other files ({', '.join(others[:5])}) that would be lost; move them away.")
+    return own
+
+
+def _clear(folder: Path, source: str) -> None:
+    remove_files(folder, _replaceable(folder, source))
+    with suppress(OSError):  # not there, or a hidden file of the system's is
+        folder.rmdir()
+
+
+def hidden_parameters(
+    scenario: Scenario, config: EpisodesConfig, rng: np.random.Generator
+) -> dict[str, NDArray[np.float64]]:
+    """Hidden multipliers, name -> [episodes]: as the paper draws them for its simulated targets (uniform over the fit's
+    bounds), or log-uniform over the configured range for recordings by cameras."""
+    if scenario.recorder == "whole_surface":
+        low, high = np.transpose([scenario.bounds.get(name, PARAMETERS[name].bounds) for name in _HIDDEN])
+        drawn = rng.uniform(low, high, (config.per_scenario, len(_HIDDEN)))  # more episodes leave the first as they are
+        return dict(zip(_HIDDEN, drawn.T, strict=True))
+    low, high = np.log(config.hidden_range)
+    return {name: np.exp(rng.uniform(low, high, config.per_scenario)) for name in _HIDDEN}

@@ -1,0 +1,139 @@
+"""`diffcloud init`: what `diffcloud identify` wrote becomes a project of DVC, in place."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from diffcloud.cli.console import JsonFlag, errors, finish
+from diffcloud.errors import ConfigError
+from diffcloud.evaluation.intervals import LEVEL, WITHIN, read_intervals
+from diffcloud.evaluation.methods import space_of
+from diffcloud.fit import FitRecord, read_fit
+from diffcloud.io.files import files_in, read_yaml, together, write_text
+from diffcloud.io.timings import NAME
+
+_PARAMS = """\
+# Settings for the stages of dvc.yaml. A stage runs again when its section or a file that it reads has changed.
+identify:
+  options: {options}  # all of `diffcloud identify --help` but --out
+export:
+  to: mujoco  # newton, isaac, arcsim or obj
+"""
+_DVC = """\
+# episodes/ -> fit.json, intervals.json, report.html -> exported/
+# A new recording of the cloth is one more file in episodes/.
+stages:
+  identify:
+    cmd: diffcloud identify ${identify.options} --out . episodes/*.npz
+    params: [identify]
+    deps: [episodes, cloth.yaml, recordings.yaml]
+    metrics:
+      - intervals.json:
+          cache: false
+    outs:
+      - report.html
+      - scenarios:
+          persist: true
+      - fit.json:
+          persist: true
+      - fit.npz:
+          persist: true
+      - stages:
+          persist: true  # finished fits; the command checks which still belong to these recordings
+
+  export:
+    cmd: diffcloud export fit.json --to ${export.to} --out exported
+    params: [export]
+    deps: [fit.json, fit.npz, scenarios]
+    outs: [exported]
+"""
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(help="What `diffcloud identify` wrote (its --out).")],
+    json: JsonFlag = False,
+) -> None:
+    """Make a DVC project of what `diffcloud identify` wrote: dvc.yaml and params.yaml beside its files, which stay."""
+    record = _identified(folder)
+    pages = {"params.yaml": _PARAMS.format(options=_options(folder, record)), "dvc.yaml": _DVC}
+    for name in pages:
+        if (folder / name).exists():
+            raise ConfigError(
+                f"{folder / name} is there already: this folder is a project. Remove it to have it written anew."
+            )
+    if _above(folder, ".dvc") is None:
+        _start_dvc(folder)
+    ignored = folder / ".dvcignore"
+    before = ignored.read_text(encoding="utf-8") if ignored.is_file() else ""
+    pattern = NAME.format("*")
+    pages |= {} if pattern in before else {".dvcignore": f"{before}{pattern}\n"}
+    with together():
+        for name, text in pages.items():
+            write_text(folder / name, text)
+    errors.print(f"Wrote {folder / 'dvc.yaml'}, {folder / 'params.yaml'}. Next: cd {shlex.quote(str(folder))} && dvc repro")
+    finish({"files": [str(folder / name) for name in pages]}, json)
+
+
+def _above(folder: Path, name: str) -> Path | None:
+    """The folder, or its nearest parent, that has an entry of that name."""
+    return next((one for one in (folder.resolve(), *folder.resolve().parents) if (one / name).exists()), None)
+
+
+def _start_dvc(folder: Path) -> None:
+    """
+    Raises:
+        ConfigError: DVC refused, or is not installed.
+    """
+    git = _above(folder, ".git")
+    kind = ["--no-scm"] if git is None else [] if git == folder.resolve() else ["--subdir"]
+    done = subprocess.run(
+        [sys.executable, "-m", "dvc", "init", "--quiet", *kind], cwd=folder, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise ConfigError(f"`dvc init` failed in {folder}: {' '.join((done.stderr or done.stdout).split())[-300:]}")
+
+
+def _identified(folder: Path) -> FitRecord:
+    """The fit that `diffcloud identify` left there.
+
+    Raises:
+        ConfigError: it did not finish there, or a recording is no longer there.
+    """
+    needed = ["cloth.yaml", "recordings.yaml", "fit.json", "fit.npz", "intervals.json", "report.html"]
+    if missing := [name for name in needed if not (folder / name).is_file()]:
+        raise ConfigError(
+            f"{folder} lacks {', '.join(missing)}, which `diffcloud identify` writes. Run "
+            f"`diffcloud identify RECORDING --out {shlex.quote(str(folder))}` first."
+        )
+    record = read_fit(folder / "fit.json")
+    there = {path.stem for path in files_in(folder / "episodes", ".npz")}
+    if gone := [one.name for one in record.episodes if one.name not in there]:
+        raise ConfigError(
+            f"{folder / 'episodes'} lacks {', '.join(gone)}, recordings of the fit; run `diffcloud identify` again."
+        )
+    return record
+
+
+def _options(folder: Path, record: FitRecord) -> str:
+    """Options with which `diffcloud identify` arrives at the same fit."""
+    options = ["--parameters", ",".join(record.fitted)]
+    if (mass := record.parameters.get("mass")) is not None and mass.fixed:
+        try:
+            density = float(read_yaml(folder / "cloth.yaml", error=ConfigError)["material"]["density_kg_m2"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ConfigError(
+                f"{folder / 'cloth.yaml'} has no material.density_kg_m2, by which the fitted mass was weighed; "
+                "run `diffcloud identify` again."
+            ) from error
+        options += ["--mass", f"{mass.value * density:.12g}"]
+    told = read_intervals(folder / "intervals.json", space_of(record).asked)
+    for name, value, usual in (("level", told.level, LEVEL), ("within", told.within, WITHIN)):
+        if value != usual:
+            options += [f"--{name}", f"{value:g}"]
+    return shlex.join(options)

@@ -1,0 +1,153 @@
+"""`diffcloud report`: one self-contained page about all fits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+import diffcloud
+from diffcloud.cli.config import load_config
+from diffcloud.cli.console import JsonFlag, ParamsFile, errors, finish, writes
+from diffcloud.cli.fit_jobs import fit_file
+from diffcloud.cli.scenario_options import choose_scenario, fitted_scenario
+from diffcloud.errors import ConfigError
+from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, check_file
+from diffcloud.evaluation.summary import tables as comparison_tables
+from diffcloud.fit import read_fit
+from diffcloud.fit.result import read_motion
+from diffcloud.io.episodes import read_episode
+from diffcloud.io.files import read_json, together, write_bytes, write_text
+from diffcloud.io.tables import read_csv
+from diffcloud.report import (
+    ComparisonEntry,
+    EpisodeEntry,
+    TrainingEntry,
+    build_page,
+    comparison_figures,
+    overlay_figure,
+)
+from diffcloud.scene.scenarios.release import RELEASE
+
+
+@writes(".html")
+def report(
+    out: Annotated[Path, typer.Option(help="HTML file.")] = Path("reports/index.html"),
+    fits: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.json and .npz.")] = Path("data/fits"),
+    episodes: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.npz.")] = Path("data/episodes"),
+    regressors: Annotated[Path, typer.Option(help="Folder with <scenario>/<model>/training.json; may lack any.")] = Path(
+        "data/regressors"
+    ),
+    tables: Annotated[Path, typer.Option(help="Folder written by `diffcloud evaluate`.")] = Path("reports/tables"),
+    params: ParamsFile = None,
+    json: JsonFlag = False,
+) -> None:
+    """Write the report page."""
+    config = load_config(params)
+    table = tables / "fits.csv"
+    if not table.is_file():
+        raise ConfigError(f"No such table: {table}; run `diffcloud evaluate` first.")
+    entries: list[EpisodeEntry] = []
+    loss_frames: dict[str, tuple[int, ...]] = {}
+    rows = table_rows(table)
+    check_file(list[FitRow], table, rows)
+    for known in rows:
+        scenario, name = str(known["scenario"]), str(known["episode"])
+        path = fit_file(fits, scenario, name)
+        fit = read_fit(path)
+        if scenario not in loss_frames:
+            loss_frames[scenario] = _loss_frames(path, scenario)
+        known = {"rms_start_mm": float("nan"), "rms_other_frames_mm": float("nan"), **known}
+        index = next((i for i, one in enumerate(fit.episodes) if one.scenario == scenario), 0)
+        source = fit.episodes[index].name
+        entries.append(
+            EpisodeEntry(
+                scenario=scenario,
+                name=name,
+                row=known,
+                fit=fit,
+                recording=fit.episodes[index],
+                episode=read_episode(episodes / scenario / f"{source}.npz"),
+                motion=read_motion(path.with_suffix(".npz"), index),
+                pictures=_pictures(episodes / scenario, source),
+                loss_frames=loss_frames[scenario],
+            )
+        )
+    trainings = [
+        TrainingEntry.read(path)
+        for name in config.scenarios
+        for path in sorted((regressors / name).glob("*/training.json"))
+    ]
+    environment = {
+        "commands": "diffcloud episodes, preprocess, simulate, fit, train, evaluate, report (dvc.yaml)",
+        "parameters": "params.yaml" if params is None else str(params),
+        "seed of the fits": str(config.fit.seed),
+        "seed of the comparison": str(config.evaluate.seed),
+        "diffcloud": diffcloud.__version__,  # what differs by run or machine lies beside each fit (`io.timings`)
+    }
+    comparison = _comparison(tables, entries)
+    predictions = table_rows(tables / "predictions.csv")
+    check_file(list[PredictionRow], tables / "predictions.csv", predictions)
+    page = build_page(
+        entries,
+        title=config.report.title,
+        overlay_points=config.report.overlay_points,
+        environment=environment,
+        predictions=predictions,
+        trainings=trainings,
+        comparison=comparison,
+    )
+    with together():
+        for figure in comparison.figures:
+            write_text(out.parent / "figures" / f"{figure.name}.svg", figure.svg)
+            write_bytes(out.parent / "figures" / f"{figure.name}.png", figure.png)
+        write_text(out, page)
+    errors.print(f"Wrote {out} ({len(page) / 1e6:.1f} MB).")
+    finish({"out": str(out), "episodes": len(entries), "bytes": len(page.encode())}, json)
+
+
+def _loss_frames(fit: Path, scenario: str) -> tuple[int, ...]:
+    """Of the scenario of a fit. Those of a published one are known without its scene file, which is not asked for here."""
+    if scenario in RELEASE:
+        return (RELEASE[scenario].loss_frame,)
+    return choose_scenario(fitted_scenario(fit, scenario)).loss_frames
+
+
+def _comparison(folder: Path, entries: list[EpisodeEntry]) -> ComparisonEntry:
+    """What `diffcloud evaluate` has left, with its figures.
+
+    Raises:
+        ConfigError: it has left nothing, or something else.
+    """
+    whole = read_json(folder / "comparison.json", error=ConfigError)
+    check_file(ComparisonFile, folder / "comparison.json", whole)
+    records, failures = whole["records"], whole["failures"]
+    references = {(scenario, name): float(loss) for scenario, name, loss in whole["references"]}
+    told = comparison_tables(records, {}, references)
+    histories = {(entry.scenario, entry.name): entry.fit.history for entry in entries}
+    figures = comparison_figures(told, records, histories)
+    overlays = overlay_figure(entries)
+    return ComparisonEntry(told, records, failures, [*figures, *([overlays] if overlays else [])])
+
+
+def _pictures(folder: Path, name: str) -> dict[str, bytes]:
+    """Of a raw episode, as `diffcloud preprocess` left them; none of other episodes."""
+    kinds = {"mask": "masked (red) and kept as cloth (green)", "cloud": "merged cloud from above, along y and along x"}
+    files = {caption: folder / f"{name}.{kind}.png" for kind, caption in kinds.items()}
+    return {caption: path.read_bytes() for caption, path in files.items() if path.is_file()}
+
+
+_NAMES = ("scenario", "episode", "model")
+"""Columns of tables that stay text, whatever episodes are called."""
+
+
+def table_rows(table: Path) -> list[dict[str, Any]]:
+    """Rows of a table as column -> value, without what is not known; none if there is no such table."""
+    if not table.is_file():
+        return []
+    return [
+        {str(key): value for key, value in row.items() if not (isinstance(value, float) and np.isnan(value))}
+        for row in read_csv(table, kind="table", error=ConfigError, text=_NAMES).to_dict("records")
+    ]

@@ -1,0 +1,94 @@
+"""Options that choose a scenario, shared by several commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from diffcloud.cli.console import warn
+from diffcloud.errors import ConfigError
+
+if TYPE_CHECKING:
+    from diffcloud.scene.scenarios import Scenario
+    from diffcloud.scene.scenarios.catalogue import Options
+
+OWN_SCENARIOS = Path("raw/scenes")
+"""A person's own scenario files, found by name."""
+
+ScenarioName = Annotated[
+    str | None,
+    typer.Option(
+        "--scenario",
+        help="lift, fold, band_stretch, vest_hang, shake, recorded_lift, recorded_fold, release_lift, release_fold, "
+        f"release_hang, release_band, a YAML file, or the name of one in {OWN_SCENARIOS}.",
+    ),
+]
+SceneFile = Annotated[Path | None, typer.Option("--scene", help="ARCSim scene JSON.")]
+
+
+def choose_scenario(name: str | None, scene: Path | None = None) -> Scenario:
+    """Load a scenario and say what of its scene is not simulated."""
+    from diffcloud.scene.scenarios import SCENARIO_NAMES, load_scenario  # takes seconds, which help does without
+
+    if name is not None and name not in SCENARIO_NAMES and _own(name).is_file():
+        name = str(_own(name))
+    scenario = load_scenario(name, scene)
+    for message in limits(scenario):
+        warn(message)
+    return scenario
+
+
+def scenario_options(name: str) -> Options:
+    """The fields of a built-in scenario, or of a person's own one, to vary.
+
+    Raises:
+        ConfigError, SceneError: neither, or a damaged file.
+    """
+    from diffcloud.scene.scenarios import SCENARIO_NAMES, built_in, read_options
+
+    return read_options(_own(name)) if name not in SCENARIO_NAMES and _own(name).is_file() else built_in(name)
+
+
+def fitted_scenario(fit: Path, name: str) -> str:
+    """The scenario of a fit, by the name that the fit gives: the file that `diffcloud identify` wrote beside the fit, a
+    built-in or the person's own one of that name, or a file in the current folder.
+
+    Args:
+        fit: the JSON file.
+
+    Raises:
+        ConfigError: none of these.
+    """
+    from diffcloud.scene.scenarios import SCENARIO_NAMES
+
+    beside, here = fit.parent / "scenarios" / f"{name}.yaml", Path(f"{name}.yaml")
+    if beside.is_file():
+        return str(beside)
+    if name in SCENARIO_NAMES or _own(name).is_file():
+        return name
+    if here.is_file():
+        return str(here)
+    raise ConfigError(f"{fit} is a fit in the scenario {name}, which is not known here; give its YAML file by --scenario.")
+
+
+def _own(name: str) -> Path:
+    return OWN_SCENARIOS / f"{name}.yaml"
+
+
+def limits(scenario: Scenario) -> list[str]:
+    """What the scene asks for and the contact model lacks, and whether its cloth is drawn to another scale."""
+    from diffcloud.io.obj import STRETCHED, other_lengths
+
+    factor, told = other_lengths(scenario.scene.mesh)
+    doubts = [f"In the mesh of {scenario.name}, {told}"] if factor > STRETCHED else []
+    surrounding = scenario.scene.surrounding
+    meshes = [index for index, obstacle in enumerate(surrounding.obstacles) if obstacle.plane() is None]
+    if not meshes or surrounding.reference_contact is not None or scenario.scene.integrator == "implicit":
+        return doubts
+    return [
+        *doubts,
+        f"Obstacles {meshes} of {scenario.name} are not planar. Contact of this scene is simulated with planes only: the "
+        "cloth passes through these, and results are valid until the first such contact.",
+    ]

@@ -1,0 +1,171 @@
+"""`diffcloud view`: a page to look at episodes, before and after a fit."""
+
+from __future__ import annotations
+
+import webbrowser
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+
+from diffcloud.cli.config import load_config
+from diffcloud.cli.console import (
+    JsonFlag,
+    ParamsFile,
+    episode_files,
+    errors,
+    finish,
+    progress_bar,
+    refuse_many,
+    told_progress,
+    writes,
+)
+from diffcloud.cli.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario
+from diffcloud.fit.record import FitRecord, read_fit
+from diffcloud.io.episodes import Episode, read_episode
+from diffcloud.io.files import write_text
+
+if TYPE_CHECKING:
+    from diffcloud.report.overlay import Layer, Overlay
+    from diffcloud.sensing.fusion import Seen
+
+_MOST_EPISODES = 50
+"""On a page, where each takes about a second and a megabyte."""
+_PHOTOGRAPH_PX = 900
+"""Widest row of the cameras' images."""
+
+
+@writes(".html")
+def view(
+    episodes: Annotated[list[Path], typer.Argument(help="Episode files (.npz), folders of them, or raw episodes.")],
+    out: Annotated[Path, typer.Option(help="HTML file.")] = Path("view.html"),
+    scenario: ScenarioName = None,
+    scene: SceneFile = None,
+    fit: Annotated[Path | None, typer.Option(help="JSON of a fit to these episodes: its motion and pose.")] = None,
+    frames: Annotated[int, typer.Option(min=1, max=1000, help="Of an episode that are shown, evenly spread.")] = 60,
+    points: Annotated[int, typer.Option(min=1, max=100_000, help="Of a cloud that are shown.")] = 2000,
+    open_: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
+    params: ParamsFile = None,
+    json: JsonFlag = False,
+) -> None:
+    """Look at episodes: clouds, cloth, gripper, table and cameras over time, on one page that needs no network.
+
+    A scenario, given or named by the episode, adds its cloth under the recorded gripper.
+    A fit adds the fitted cloth, before and after its pose was found.
+    Raw episodes are made into clouds, and their images show what was masked.
+    """
+    from diffcloud.report.view import build_view
+
+    record = None if fit is None else read_fit(fit)
+    overlays, facts = [], []
+    paths = [path for given in episodes for path in ([given] if _is_raw(given) else episode_files([given]))]
+    refuse_many(paths, _MOST_EPISODES, "A page shows", "Give fewer episodes, or make several pages")
+    for path in told_progress("drawing", [path.absolute() for path in paths]):  # "." has no name
+        seen = _raw(path, params) if _is_raw(path) else _Shown(read_episode(path), {})
+        chosen = _spread(seen.episode.frame_count, frames)
+        layers, told = _layers(path, seen.episode, chosen, points, (scenario, scene), fit, record)
+        overlays.append(_overlay(path.stem, seen, chosen, layers))
+        facts += [(path.stem, line) for line in (_about(seen.episode), *told)]
+    note = "Masked pixels are red, what was kept as cloth is green." if any(one.photographs for one in overlays) else ""
+    title = paths[0].absolute().stem if len(paths) == 1 else f"{len(paths)} episodes"
+    page = build_view(overlays, title=title, note=note, facts=facts)
+    write_text(out, page)
+    errors.print(f"Wrote {out} ({len(page) / 1e6:.1f} MB).", soft_wrap=True)
+    if open_:
+        webbrowser.open(out.resolve().as_uri())
+    finish({"out": str(out), "episodes": len(overlays), "bytes": len(page.encode())}, json)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """An episode, and of a raw one a JPEG for each frame."""
+
+    episode: Episode
+    photographs: Mapping[int, bytes]
+
+
+def _layers(
+    path: Path,
+    episode: Episode,
+    frames: list[int],
+    points: int,
+    named: tuple[str | None, Path | None],
+    fit: Path | None,
+    record: FitRecord | None,
+) -> tuple[list[Layer], list[str]]:
+    """What is drawn of one episode, and what the table says of it."""
+    from diffcloud.report.overlay import fitted_layers, recorded_layers
+    from diffcloud.report.view import scene_layers, table_layers, unposed_layer
+    from diffcloud.scene.scenarios import SCENARIO_NAMES
+
+    times = episode.times[frames]
+    name, scene = named
+    meant = episode.meta.get("scenario")
+    if fit is None and name is None and scene is None and meant in SCENARIO_NAMES:
+        name = str(meant)
+    alone = fit is None and name is None and scene is None
+    layers = recorded_layers(episode, frames, points=points, rng=np.random.default_rng(0), gripper=alone)
+    if fit is not None and record is not None:
+        from diffcloud.fit.result import read_motion
+
+        place = record.place_of(path.stem, name)
+        recording, motion = record.episodes[place], read_motion(fit.with_suffix(".npz"), place)
+        found = choose_scenario(name or (None if scene else fitted_scenario(fit, recording.scenario)), scene)
+        layers += fitted_layers(motion, times)
+        layers += [unposed_layer(found, recording, motion, times), *table_layers(found, motion.nodes.reshape(-1, 3))]
+        values = ", ".join(f"{key} {value:.3g}" for key, value in record.values.items())
+        return layers, [f"fitted in {recording.scenario}: {values}; RMS {recording.rms_mm:.1f} mm"]
+    if alone:
+        return layers, ["no scenario: the recording alone"]
+    chosen = choose_scenario(name, scene)
+    return layers + scene_layers(chosen, episode, times), [f"scenario {chosen.name}, basis material"]
+
+
+def _overlay(name: str, seen: _Shown, frames: list[int], layers: list[Layer]) -> Overlay:
+    from diffcloud.report.overlay import Overlay
+
+    photographs = [seen.photographs[frame] for frame in frames] if seen.photographs else []
+    return Overlay(name, frames, seen.episode.times[frames], layers, photographs=photographs)
+
+
+def _about(episode: Episode) -> str:
+    sizes = np.diff(episode.offsets)
+    grippers = "no gripper track" if episode.gripper is None else f"grippers: {', '.join(episode.grippers)}"
+    cameras = ", ".join(episode.viewpoints) or "not known"
+    return (
+        f"{episode.frame_count} frames over {episode.times[-1] - episode.times[0]:.2f} s, {sizes.min()} to {sizes.max()} "
+        f"points a frame, {grippers}, cameras: {cameras}"
+    )
+
+
+def _is_raw(path: Path) -> bool:
+    return (path / "episode.json").is_file()
+
+
+def _raw(path: Path, params: Path | None) -> _Shown:
+    """A raw episode as `diffcloud preprocess` makes clouds of it."""
+    from diffcloud.cli.preprocess import aligned, robot_mask
+    from diffcloud.io.images import encode_jpeg
+    from diffcloud.io.raw_episodes import read_raw_episode
+    from diffcloud.sensing.fusion import fuse
+    from diffcloud.sensing.pictures import mask_picture
+
+    config = load_config(params).preprocess
+    settings = config.raw
+    raw = read_raw_episode(path)
+    photographs: dict[int, bytes] = {}
+
+    def watch(frame: int, parts: Mapping[str, Seen]) -> None:
+        photographs[frame] = encode_jpeg(mask_picture(raw.cameras, parts), width=_PHOTOGRAPH_PX)
+
+    with progress_bar(f"fusing {path.name}", len(next(iter(raw.cameras.values())).frames)) as update:
+        episode = fuse(raw, robot_mask(settings), settings.fusion(), tell=update, watch=watch)
+    return _Shown(aligned(episode, config, path.name, raw), photographs)
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """At most so many frames, the first and the last among them."""
+    return [int(frame) for frame in np.unique(np.linspace(0, count - 1, min(count, most)).round())]

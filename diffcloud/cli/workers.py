@@ -1,0 +1,161 @@
+"""Many independent jobs, in this process or in several."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Protocol, TypeVar
+
+from diffcloud.cli import ctrl_c
+from diffcloud.cli.console import progress_bar
+from diffcloud.cli.fork_server import worker_context
+from diffcloud.cli.lazy import imports
+from diffcloud.cli.memory import keep_freed_memory
+from diffcloud.errors import DiffCloudError
+from diffcloud.sim.threads import cores, use_threads
+
+Tell = Callable[[float, str], None]
+"""What a job may call with (fraction done, text)."""
+
+_stop: Event | None = None
+"""Of a worker: set when Ctrl-C was pressed."""
+
+
+class Job(Protocol):
+    """Travels to another process, and so does what it gives."""
+
+    @property
+    def label(self) -> str:
+        """What a progress display shows."""
+
+    def run(self, tell: Tell) -> Any:
+        """
+        Raises:
+            DiffCloudError: an error of this job alone; the others go on.
+        """
+
+
+AnyJob = TypeVar("AnyJob", bound=Job)
+
+
+def run_all(
+    title: str, jobs: Sequence[AnyJob], workers: int | None, *, patient: bool = False
+) -> Iterator[tuple[AnyJob, Any, str | None]]:
+    """(job, what it gave, message of its error) in the order of the jobs.
+
+    Args:
+        workers: processes, each with one thread; 1: this one; None: one per core.
+        patient: after Ctrl-C, wait for running jobs, which look at `check_interrupt`; else their processes end at once.
+
+    Raises:
+        DiffCloudError: a process died.
+        KeyboardInterrupt: Ctrl-C.
+    """
+    workers = cores() if workers is None else workers
+    with progress_bar(title, len(jobs)) as update:
+        if workers == 1 or len(jobs) < 2:
+            _one_thread()
+            for index, job in enumerate(jobs):
+                update(index, job.label)
+                yield (job, *_attempt(job, partial(_tell, update, index, job.label)))
+            return
+        context = worker_context()
+        stop = context.Event()
+        with (
+            # jobs travel in files: a pool whose processes have ended waits for ever to send them what does not fit into a
+            # pipe (Python before 3.11.5, gh-94777)
+            TemporaryDirectory(prefix="diffcloud-") as folder,
+            ProcessPoolExecutor(
+                min(workers, len(jobs)), mp_context=context, initializer=_begin, initargs=(stop, patient)
+            ) as pool,
+        ):
+            results = [pool.submit(_attempt_stored, _stored(job, Path(folder) / str(i))) for i, job in enumerate(jobs)]
+            try:
+                for index, (job, result) in enumerate(zip(jobs, results, strict=True)):
+                    found = result.result()
+                    update(index + 1, job.label)
+                    yield (job, *found)
+            except BrokenProcessPool as error:
+                raise DiffCloudError(
+                    "A worker process died, probably because memory ran out. Try fewer --workers."
+                ) from error
+            except BaseException:  # Ctrl-C, or nobody wants the rest
+                stop.set()
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+
+def check_interrupt() -> None:
+    """For a job, now and then.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C was pressed; of a worker, in its parent; here, and a library has dropped the exception.
+    """
+    if (_stop is not None and _stop.is_set()) or ctrl_c.was_pressed():
+        raise KeyboardInterrupt
+
+
+def _attempt(job: Job, tell: Tell = lambda done, text: None) -> tuple[Any, str | None]:
+    try:
+        return job.run(tell), None
+    except DiffCloudError as error:
+        return None, str(error)
+
+
+def _stored(job: Job, path: Path) -> Path:
+    path.write_bytes(pickle.dumps(job))
+    return path
+
+
+def _attempt_stored(path: Path) -> tuple[Any, str | None]:
+    with imports():
+        job: Job = pickle.loads(path.read_bytes())  # which this program has just written
+    path.unlink()
+    return _attempt(job)
+
+
+def _tell(update: Callable[[float, str], None], index: int, label: str, done: float, text: str) -> None:
+    update(index + done, f"{label}  {text}")
+
+
+def _one_thread() -> None:
+    """Of torch, also where the environment allows it more: sums in several threads may end in other last bits."""
+    with imports():
+        import torch  # here, not as this module is imported: by now the collector waits
+    torch.set_num_threads(1)
+
+
+def _begin(stop: Event, patient: bool) -> None:
+    """Of a worker: Ctrl-C is the parent's, and one thread is its share of the cores."""
+    global _stop
+    _stop = stop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _one_thread()
+    use_threads(1)
+    keep_freed_memory()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    if not patient:
+        threading.Thread(target=_end_at, args=(stop,), daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A process that is killed cannot tell its workers; without this they would wait for it forever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _end_at(stop: Event) -> None:
+    stop.wait()
+    os._exit(0)

@@ -1,0 +1,225 @@
+"""`python -m studies recordings`: synthetic raw recordings against their truth, as clouds and through a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from diffcloud.cli.config import EpisodesConfig, FitConfig, load_config
+from diffcloud.cli.console import JsonFlag, ParamsFile, Workers, finish, output, progress_bar, writes
+from diffcloud.cli.scenario_options import choose_scenario
+from diffcloud.cli.workers import run_all
+from diffcloud.errors import ConfigError, DiffCloudError
+from diffcloud.fit import FitSpace, Objective, solve
+from diffcloud.fit.pose import parse_priors
+from diffcloud.io.episodes import Episode, read_episode
+from diffcloud.io.files import folders_in, write_text
+from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sensing.evaluation import CloudFigures, evaluate_clouds, visible_clouds
+from diffcloud.sensing.recorder import Truth, read_truth
+from studies.recorded_poses import PoseJob, pose_page, pose_rows
+
+
+@writes(".md")
+def recordings(
+    recorded: Annotated[Path, typer.Option(help="Folder with raw <scenario>/<episode>/ of `diffcloud episodes`.")],
+    episodes: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.npz of `diffcloud preprocess`.")],
+    out: Annotated[Path, typer.Option(help="Markdown file.")],
+    fits: Annotated[bool, typer.Option(help="Also fit each: raw clouds, noise-free clouds, one camera.")] = True,
+    nuisance: Annotated[
+        list[str] | None,
+        typer.Option(help="Instead, fit with this nuisance, and compare the pose found with the true one; repeatable."),
+    ] = None,
+    workers: Workers = None,
+    params: ParamsFile = None,
+    json: JsonFlag = False,
+) -> None:
+    """Measure masks, clouds and fits of synthetic raw recordings against what was recorded; writes Markdown tables."""
+    config = load_config(params)
+    found = [
+        (name, path)
+        for name in config.scenarios
+        for path in folders_in(recorded / name)
+        if (path / "episode.json").is_file() and (path / "truth").is_dir()
+    ]
+    if not found:
+        raise ConfigError(f"{recorded} holds no synthetic raw episodes of {', '.join(config.scenarios)}.")
+    if nuisance:
+        for one in nuisance:
+            parse_priors(one)  # refused before anything is fitted
+        jobs = [
+            PoseJob(choose_scenario(name), folder, episodes / name / f"{folder.name}.npz", tuple(nuisance), config.fit)
+            for name, folder in found
+        ]
+        _poses(jobs, workers, out, config.episodes, json)
+        return
+    measured: list[tuple[str, CloudFigures, Mapping[str, Any]]] = []
+    fitted: list[_Fits] = []
+    with progress_bar("recordings", len(found)) as update:
+        for index, (name, folder) in enumerate(found):
+            update(index, folder.name)
+            raw, truth = read_raw_episode(folder), read_truth(folder)
+            episode = read_episode(episodes / name / f"{folder.name}.npz")
+            measured.append((folder.name, evaluate_clouds(episode, raw, truth), episode.meta["quality"]))
+            if fits:
+                fitted.append(_fit_all(choose_scenario(name), folder.name, episode, raw, truth, config.fit))
+                write_text(out, _page(measured, fitted, config.fit))  # what is done is kept
+    page = _page(measured, fitted, config.fit)
+    write_text(out, page)
+    if not json:
+        output.print(page)
+    finish({"out": str(out), "episodes": len(measured), **_summary(measured, fitted)}, json)
+
+
+def _poses(jobs: list[PoseJob], workers: int | None, out: Path, recorded: EpisodesConfig, json: bool) -> None:
+    done, failures = [], []
+    for job, told, error in run_all("recordings", jobs, workers):
+        if error is None:
+            done.append(told)
+        else:
+            failures.append(f"{job.label}: {error}")
+    if done:
+        page = pose_page(pose_rows(done), [fits[0] for fits in done], recorded)
+        write_text(out, page)
+        if not json:
+            output.print(page)
+    finish({"out": str(out), "recordings": done}, json)
+    if failures:
+        raise DiffCloudError(
+            f"{len(failures)} of {len(jobs)} recordings failed and are not on the page. {'; '.join(failures)}"
+        )
+
+
+@dataclass(frozen=True)
+class _Fits:
+    """Ratios of stretch to mass that fits found."""
+
+    episode: str
+    true: float
+    raw: float
+    noise_free: float
+    overhead: float
+
+
+def _fit_all(scenario: Scenario, name: str, episode: Episode, raw: RawEpisode, truth: Truth, config: FitConfig) -> _Fits:
+    hidden = episode.meta["truth"]
+    held = raw.placement.to_scene(truth.nodes[:, scenario.grasped].mean(axis=1))[:, None]
+    clouds = [raw.placement.to_scene(cloud) for cloud in visible_clouds(raw, truth)]
+    seen_from = {"viewpoints": episode.meta["viewpoints"]}
+    noise_free = Episode.from_frames(clouds, episode.times, gripper=held, meta=seen_from)
+    ratios = [_ratio(scenario, cloud, hidden["mass"], config) for cloud in (episode, noise_free, _of_first_camera(episode))]
+    return _Fits(name, hidden["stretch"] / hidden["mass"], *ratios)
+
+
+def _ratio(scenario: Scenario, episode: Episode, mass: float, config: FitConfig) -> float:
+    """Fitted stretch over the weighed mass. With both free, bending and air hardly tell them apart (docs/concepts.md)."""
+    objective = Objective(scenario, episode, **config.measure())
+    space = FitSpace.build(["stretch"], bounds={**scenario.bounds, **config.bounds}, fixed={"mass": mass})
+    return solve(objective, space, config.solver_settings(scenario)).uninterrupted().values["stretch"] / mass
+
+
+def _of_first_camera(episode: Episode) -> Episode:
+    assert episode.camera is not None  # clouds of raw episodes say so
+    assert episode.lost is not None
+    frames = [
+        episode.frame(index)[episode.camera[episode.offsets[index] : episode.offsets[index + 1]] == 0]
+        for index in range(episode.frame_count)
+    ]
+    first = episode.meta["cameras"][0]
+    seen_from = {key: {first: episode.meta[key][first]} for key in ("viewpoints", "pinholes")}
+    alone = Episode.from_frames(frames, episode.times, gripper=episode.gripper, meta=seen_from)
+    return replace(alone, lost=np.packbits(episode.lost_pixels(0).reshape(len(frames), 1, -1), axis=-1))
+
+
+def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: list[_Fits], config: FitConfig) -> str:
+    lines = [
+        "# Raw recordings against their truth",
+        "",
+        "Synthetic raw episodes (`diffcloud episodes`), made into clouds by `diffcloud preprocess`, compared with the "
+        "truth that only the recorder knows. Robot and table: part of the merged clouds' points that show them. Lost: part "
+        "of the visible cloth's measurements that is not in the cloud, over frames in which the cloth moves, and in which "
+        "it lies flat. Distances are RMS over a frame: mean and greatest over the frames. Command: `make recordings`.",
+        "",
+        "| episode | points | robot % | table % | lost % | lost flat % | cloud to cloth mm | cloth to cloud mm | "
+        "camera moved mm | arm thicker mm | log late ms |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, figures, quality in measured:
+        part = _parts(figures)
+        refined = quality.get("refinement")
+        shifts = "–" if refined is None else ", ".join(f"{1e3 * v:.1f}" for v in list(refined["shift_m"].values())[1:])
+        tail = "– | –" if refined is None else f"{1e3 * refined['skin_m']:.1f} | {1e3 * refined['lag_s']:.0f}"
+        lines.append(
+            f"| {name} | {figures.points.min()}–{figures.points.max()} | {_percent(part['robot'], 2)} | "
+            f"{_percent(part['table'], 2)} | {_percent(part['lost'], 1)} | {_percent(part['lost_flat'], 1)} | "
+            f"{_millimetres(figures.cloud_to_cloth_m)} | {_millimetres(figures.cloth_to_cloud_m)} | {shifts} | {tail} |"
+        )
+    if fitted:
+        lines += [
+            "",
+            "## Fits",
+            "",
+            "Stretch-to-mass ratio of a cloth that has been weighed (mass fixed at its truth), fitted by "
+            f"{config.solver}. "
+            "The noise-free cloud is what both cameras see of the cloth, without noise, holes or masks; the gripper is "
+            "then where it truly was.",
+            "",
+            "| episode | true | noise-free | raw | raw, overhead only |",
+            "|---|---|---|---|---|",
+            *(
+                f"| {fit.episode} | {fit.true:.3f} | {_off(fit.noise_free, fit)} | {_off(fit.raw, fit)} | "
+                f"{_off(fit.overhead, fit)} |"
+                for fit in fitted
+            ),
+            "",
+            *(f"- {text}" for text in _counts(fitted)),
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _parts(figures: CloudFigures) -> dict[str, float | None]:
+    """None where no frame is of the kind that it is about."""
+    points, flat = figures.points.sum(), figures.flat
+    return {
+        "robot": float(figures.robot.sum() / points),
+        "table": float(figures.table.sum() / points),
+        "lost": float(figures.lost[~flat].mean()) if (~flat).any() else None,
+        "lost_flat": float(figures.lost[flat].mean()) if flat.any() else None,
+    }
+
+
+def _percent(part: float | None, digits: int) -> str:
+    return "–" if part is None else f"{100 * part:.{digits}f}"
+
+
+def _millimetres(values: Any) -> str:
+    return f"{1e3 * values.mean():.1f}, {1e3 * values.max():.1f}"
+
+
+def _off(ratio: float, fit: _Fits) -> str:
+    return f"{ratio:.3f} ({100 * (ratio / fit.true - 1):+.0f} %)"
+
+
+def _near(ratio: float, fit: _Fits, part: float) -> bool:
+    return abs(ratio / fit.true - 1) <= part
+
+
+def _counts(fitted: list[_Fits]) -> list[str]:
+    known = [fit for fit in fitted if _near(fit.noise_free, fit, 0.1)]
+    return [
+        f"noise-free within 10 %: {len(known)} of {len(fitted)}",
+        f"of these, raw within 20 %: {sum(_near(fit.raw, fit, 0.2) for fit in known)} of {len(known)}",
+        f"of these, raw of the overhead camera alone within 20 %: {sum(_near(fit.overhead, fit, 0.2) for fit in known)} of "
+        f"{len(known)}",
+    ]
+
+
+def _summary(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: list[_Fits]) -> dict[str, Any]:
+    figures = {name: _parts(found) for name, found, _ in measured}
+    return {"clouds": figures, "fits": _counts(fitted) if fitted else []}

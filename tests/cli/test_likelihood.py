@@ -1,0 +1,103 @@
+"""`--solver likelihood` through the commands: other commands take what the fit knows of its uncertainty from its record."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from diffcloud.errors import ConfigError
+from diffcloud.fit import read_fit
+from diffcloud.io.episodes import write_episode
+from diffcloud.scene.scenarios import load_scenario
+from tests.cli.invoke import invoke
+from tests.fit.test_fit import clouds_of
+
+TRUTH = {"stretch": 0.6, "mass": 1.7}
+SCENARIO = {
+    "base": "lift",
+    "nodes": [5, 5],
+    "grip": "pivot",
+    "frames": 8,
+    "steps_per_frame": 3,
+    "rate_hz": 10.0,
+    "points": 1500,
+    "path": [[0, 0, 0, 0], [0.8, 0, -0.1, 0.25]],
+}
+OPTIONS = (
+    "--scenario", "small.yaml", "--parameters", "stretch", "--fix", "mass=1.7", "--doubts", "bending=1.5x",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("likelihood")
+    (folder / "small.yaml").write_text(yaml.safe_dump(SCENARIO))
+    finer = load_scenario(folder / "small.yaml").finer()
+    for seed, name in ((5, "one"), (6, "two")):
+        write_episode(folder / f"{name}.npz", clouds_of(finer, points=2000, seed=seed, **TRUTH))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        invoke("fit", "one.npz", "two.npz", *OPTIONS, "--joint", "--out", "fits")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def here(work, monkeypatch):
+    monkeypatch.chdir(work)
+
+
+def test_the_record_has_what_the_fit_knows():
+    record = read_fit(Path("fits/joint.json"))
+    told = record.estimate
+    assert record.solver == "likelihood"
+    assert set(told.mean) == {"stretch"}
+    assert {"recording", "prior", "bending", "turn", "pose", "mesh", "time step", "starts"} == set(told.sources)
+    assert sum(told.weights) == pytest.approx(1.0)
+    assert [len(one.misfits) for one in told.recordings] == [len(one.frames) for one in record.episodes]
+    assert all(one.left_out.rms_mm < 1.5 * one.rms_mm for one in record.episodes)
+
+
+def test_intervals_are_those_of_the_record():
+    told = invoke("evaluate", "intervals", "fits/joint.json").result
+    record = read_fit(Path("fits/joint.json"))
+    entry, variance = told["parameters"]["stretch"], sum(part[0][0] for part in record.estimate.sources.values())
+    assert entry["value"] == pytest.approx(record.estimate.mean["stretch"])
+    assert entry["high"] / entry["value"] == pytest.approx(entry["value"] / entry["low"])
+    assert entry["high"] / entry["value"] == pytest.approx(2.718281828 ** (1.6448536 * variance**0.5), rel=1e-4)
+    assert entry["low"] < TRUTH["stretch"] < entry["high"]
+    assert told["explains"]
+
+
+def test_a_recording_that_the_model_does_not_follow_is_told(tmp_path):
+    data = json.loads(Path("fits/joint.json").read_text())
+    for one in data["estimate"]["recordings"]:
+        one["misfits"] = [25.0] * len(one["misfits"])
+    path = tmp_path / "joint.json"
+    path.write_text(json.dumps(data))
+    told = invoke("evaluate", "intervals", path, "--scenario", "small.yaml").result
+    assert not told["explains"]
+    assert "in one the cloth is 5.0 times as far from the recording" in told["reason"]
+    assert told["parameters"]["stretch"]["verdict"] == "the model does not explain the recording"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"weights": [1.0, 0.5, 0.1, 0.2]}, "starts and weights must be as long as each other"),
+        ({"sources": {"recording": [[1.0, 0.0]]}}, "sources must hold"),
+    ],
+)
+def test_a_damaged_estimate_is_refused(tmp_path, change, message):
+    data = json.loads(Path("fits/joint.json").read_text())
+    data["estimate"] |= change
+    (tmp_path / "joint.json").write_text(json.dumps(data))
+    with pytest.raises(ConfigError, match=message):
+        read_fit(tmp_path / "joint.json")
+
+
+def test_the_published_measure_has_none():
+    told = invoke("fit", "one.npz", *OPTIONS[:-2], "--paper", "--out", "never", code=1)
+    assert "the published measure has no likelihood" in told.errors
