@@ -1,17 +1,76 @@
 """DiffCloud: simulator parameters of a real cloth from the point clouds of its motion.
 
+    import diffcloud as dc
+
+    recording = dc.load_recording("lift1.npz")
+    scenes = dc.find_scenes([recording], size=(0.40, 0.30), density=0.24)
+    found = dc.fit([recording], scenes)
+    print(found)
+    dc.export(found, "mujoco", "mujoco", samples=20)
+
+What is public is in `__all__`. It is imported when it is first used. Lengths are in metres, z points up.
+
 Imports run one way (a test holds this):
 
     mesh, io  <-  sim  <-  scene
-    clouds    <-  mesh, io
-    fit       <-  sim, scene, clouds
-    datasets  <-  sim, scene, clouds
-    evaluation <- fit, scene, clouds
+    clouds     <- mesh, io
+    estimation <- sim, scene, clouds
+    identification, evaluation <- estimation
+    datasets   <- sim, scene, clouds
     regressors <- mesh, clouds, io
-    sensing   <-  mesh, clouds, io
-    hardware  <-  sensing, io                  (cameras and arm; their packages are imported when one is opened)
-    report    <-  everything above
-    cli       <-  everything; nothing imports it but pipeline (the stages of `dvc repro`) and studies
+    sensing    <- mesh, clouds, io
+    hardware   <- sensing, io                  (cameras and arm; their packages are imported when one is opened)
+    report, library <- everything above
+    cli        <- everything; nothing imports it but pipeline (the stages of `dvc repro`) and studies
 """
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from diffcloud.errors import DiffCloudError
+
+if TYPE_CHECKING:
+    from diffcloud.estimation.settings import FitSettings
+    from diffcloud.io.episodes import Episode
+    from diffcloud.library import (
+        Estimate,
+        Fit,
+        Scene,
+        chamfer,
+        export,
+        find_scenes,
+        fit,
+        load_recording,
+        sample_surface,
+    )
+
 __version__ = "0.1.0"
+
+_PLACES = {"FitSettings": "diffcloud.estimation.settings", "Episode": "diffcloud.io.episodes"}
+"""Public name -> module, of those that are not in `library`."""
+__all__ = [
+    "DiffCloudError",
+    "Episode",
+    "Estimate",
+    "Fit",
+    "FitSettings",
+    "Scene",
+    "chamfer",
+    "export",
+    "find_scenes",
+    "fit",
+    "load_recording",
+    "sample_surface",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'diffcloud' has no attribute {name!r}")
+    return getattr(import_module(_PLACES.get(name, "diffcloud.library")), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

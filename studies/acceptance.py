@@ -12,15 +12,15 @@ import numpy as np
 import torch
 import typer
 
-from diffcloud.cli.config import SMOOTHING
 from diffcloud.cli.console import errors, output, progress_bar, warn, writes
 from diffcloud.cli.scenario_options import choose_scenario
 from diffcloud.clouds.losses import one_sided_chamfer
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import ConfigError
+from diffcloud.estimation import AdamSettings, FitSpace, Objective, fit_adam
+from diffcloud.estimation.settings import SMOOTHING
 from diffcloud.evaluation.markdown import markdown_table
-from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
 from diffcloud.io.files import files_in, write_bytes, write_text
 from diffcloud.io.imports import release_episodes
 from diffcloud.scene.scenarios import PAPER_THRESHOLD, load_scenario

@@ -17,14 +17,15 @@ from rich.table import Table
 from diffcloud.cli.config import Config, EpisodesConfig, load_config
 from diffcloud.cli.console import JsonFlag, ParamsFile, Workers, errors, finish, show, warn, writes
 from diffcloud.cli.episodes import hidden_parameters, record_motion, simulated_frames
-from diffcloud.cli.fit_jobs import FitJob, Recording
+from diffcloud.cli.fit_jobs import FitJob
 from diffcloud.cli.preprocess import PreprocessJob
 from diffcloud.cli.scenario_options import choose_scenario
 from diffcloud.cli.workers import Tell, run_all
 from diffcloud.errors import ConfigError, DiffCloudError, OutputError
+from diffcloud.estimation.pose import SET_UP, PoseSpace
+from diffcloud.estimation.result import describe_fit
+from diffcloud.estimation.task import Recording
 from diffcloud.evaluation.intervals import LEVEL, intervals_of
-from diffcloud.fit.pose import SET_UP, PoseSpace
-from diffcloud.fit.result import describe_fit
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import files_in, read_json, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint, kept_record
@@ -48,7 +49,7 @@ if TYPE_CHECKING:
 
 _RECORDS = ("mesh", "io", "sim", "scene", "clouds", "sensing")
 """Packages whose source decides what is recorded."""
-_CODE = (*_RECORDS, "fit", "evaluation")
+_CODE = (*_RECORDS, "estimation", "evaluation")
 _FINER_STEPS = 4
 """Times as many steps of the truths `refined` and `finer`."""
 _LAID_M = 0.01
@@ -248,8 +249,8 @@ class CoverageJob:
         return found
 
     def set_up(self) -> dict[str, float]:
-        """Errors of the set-up, drawn as fits doubt it, name of `fit.pose` -> value [m, rad, s]; and how far beside its
-        place the cloth is laid with its gripper, `laid_x` and `laid_y` [m]."""
+        """Errors of the set-up, drawn as fits doubt it, name of `estimation.pose` -> value [m, rad, s]; and how far
+        beside its place the cloth is laid with its gripper, `laid_x` and `laid_y` [m]."""
         rng = self._random(2)
         deviations = {**SET_UP, "laid_x": _LAID_M, "laid_y": _LAID_M}
         return {name: deviation * float(rng.standard_normal()) for name, deviation in deviations.items()}
@@ -265,10 +266,10 @@ class CoverageJob:
         fixed = {**fit.fixed, **{name: truth[name] for name in self.known}}
         fit = fit.model_copy(update={"fixed": fixed, "model_error": self.kind != "same"})
         job = FitJob(self.label, [Recording(self.scenario, self.label, episode)], fit, self.folder)
-        objective, outcome = job.solved()
+        objective, outcome = job.task.solved()
         outcome = outcome.uninterrupted()
-        fitted = describe_fit(objective, job.space, job.solver_settings, outcome, episodes=[self.label]).record
-        found = intervals_of(fitted, job.space, self.scenario, level=self.level, within=self.config.evaluate.within)
+        fitted = describe_fit(objective, job.task.space, job.task.solver_settings, outcome, episodes=[self.label]).record
+        found = intervals_of(fitted, job.task.space, self.scenario, level=self.level, within=self.config.evaluate.within)
         told: dict[str, Any] = {
             "loss": outcome.loss,
             "values": outcome.values,

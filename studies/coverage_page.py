@@ -250,7 +250,7 @@ def coverage_page(counts: Counts) -> str:
         "",
         "Cloths of drawn parameters are simulated, recorded (`lift` and `fold` by two depth cameras through "
         f"`preprocess`, the others by their whole surface), fitted, and the {level} interval is held against the truth. "
-        "Material that is not asked for is off by the factors that fits state (`fit.doubts`); cameras and clock are "
+        "Material that is not asked for is off by the factors that fits state (`estimation.doubts`); cameras and clock are "
         "off by what they assume of a calibrated set-up (2 mm and 0.3° along and about each axis, and 2 ms, as "
         "standard deviations; `preprocess` measures the clock anew), and the cloth is displaced by about a centimetre. "
         "Errors and half-widths are of the natural logarithm: 0.1 is about 10 %. A fit that fails or states no "

@@ -12,11 +12,12 @@ from diffcloud.cli.comparison import compare, comparison_jobs
 from diffcloud.cli.config import Config, load_config
 from diffcloud.cli.console import JsonFlag, Threads, Workers, errors, finish, writes
 from diffcloud.cli.evaluate import AllowMissing, MarkdownFile, stop_if_missing, write_evaluation
-from diffcloud.cli.fit_jobs import FitJob, Recording
+from diffcloud.cli.fit_jobs import FitJob
 from diffcloud.cli.report import report
 from diffcloud.cli.scenario_options import choose_scenario
 from diffcloud.cli.workers import run_all
 from diffcloud.errors import ConfigError
+from diffcloud.estimation.task import Recording
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.files import read_json
 from diffcloud.io.imports import release_episodes

@@ -19,8 +19,8 @@ import numpy as np
 import typer
 
 from diffcloud.errors import ConfigError
+from diffcloud.estimation.record import FitRecord, read_fit
 from diffcloud.evaluation.markdown import markdown_table
-from diffcloud.fit.record import FitRecord, read_fit
 from diffcloud.io.files import write_text
 
 SCENARIOS = ("recorded_lift", "recorded_fold")

@@ -13,14 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from diffcloud.cli.config import EpisodesConfig, FitConfig
-from diffcloud.cli.fit_jobs import FitJob, Recording
+from diffcloud.cli.config import EpisodesConfig
+from diffcloud.cli.fit_jobs import FitJob
 from diffcloud.cli.scenario_options import scenario_options
 from diffcloud.cli.workers import Tell
 from diffcloud.errors import ConfigError, EpisodeError
+from diffcloud.estimation.result import describe_fit
+from diffcloud.estimation.settings import FitSettings
+from diffcloud.estimation.task import Recording
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.evaluation.summary import percent
-from diffcloud.fit.result import describe_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
 from diffcloud.scene.scenarios import GridScenario, Scenario, make_scenario
@@ -54,7 +56,7 @@ class PoseJob:
     """Raw episode with its truth."""
     episode: Path
     nuisance: tuple[str, ...]
-    config: FitConfig
+    config: FitSettings
 
     @property
     def label(self) -> str:
@@ -75,9 +77,9 @@ class PoseJob:
             told = {"parameters": ["stretch"], "fixed": {"mass": hidden["mass"]}, "nuisance": nuisance, "laid": turned}
             config = self.config.model_copy(update=told)
             job = FitJob(self.label, [Recording(scenario, self.label, episode)], config, self.folder)
-            objective, outcome = job.solved()
+            objective, outcome = job.task.solved()
             outcome = outcome.uninterrupted()
-            result = describe_fit(objective, job.space, job.solver_settings, outcome, episodes=[self.label])
+            result = describe_fit(objective, job.task.space, job.task.solver_settings, outcome, episodes=[self.label])
             moved = result.motions[0].nodes[0]
             lag = result.record.nuisance.get("lag")
             found.append(

@@ -10,13 +10,14 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from diffcloud.cli.config import EpisodesConfig, FitConfig, load_config
+from diffcloud.cli.config import EpisodesConfig, load_config
 from diffcloud.cli.console import JsonFlag, ParamsFile, Workers, finish, output, progress_bar, writes
 from diffcloud.cli.scenario_options import choose_scenario
 from diffcloud.cli.workers import run_all
 from diffcloud.errors import ConfigError, DiffCloudError
-from diffcloud.fit import FitSpace, Objective, solve
-from diffcloud.fit.pose import parse_priors
+from diffcloud.estimation import FitSpace, Objective, solve
+from diffcloud.estimation.pose import parse_priors
+from diffcloud.estimation.settings import FitSettings
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import folders_in, write_text
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
@@ -107,7 +108,7 @@ class _Fits:
     overhead: float
 
 
-def _fit_all(scenario: Scenario, name: str, episode: Episode, raw: RawEpisode, truth: Truth, config: FitConfig) -> _Fits:
+def _fit_all(scenario: Scenario, name: str, episode: Episode, raw: RawEpisode, truth: Truth, config: FitSettings) -> _Fits:
     hidden = episode.meta["truth"]
     held = raw.placement.to_scene(truth.nodes[:, scenario.grasped].mean(axis=1))[:, None]
     clouds = [raw.placement.to_scene(cloud) for cloud in visible_clouds(raw, truth)]
@@ -117,7 +118,7 @@ def _fit_all(scenario: Scenario, name: str, episode: Episode, raw: RawEpisode, t
     return _Fits(name, hidden["stretch"] / hidden["mass"], *ratios)
 
 
-def _ratio(scenario: Scenario, episode: Episode, mass: float, config: FitConfig) -> float:
+def _ratio(scenario: Scenario, episode: Episode, mass: float, config: FitSettings) -> float:
     """Fitted stretch over the weighed mass. With both free, bending and air hardly tell them apart (docs/concepts.md)."""
     objective = Objective(scenario, episode, **config.measure())
     space = FitSpace.build(["stretch"], bounds={**scenario.bounds, **config.bounds}, fixed={"mass": mass})
@@ -137,7 +138,7 @@ def _of_first_camera(episode: Episode) -> Episode:
     return replace(alone, lost=np.packbits(episode.lost_pixels(0).reshape(len(frames), 1, -1), axis=-1))
 
 
-def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: list[_Fits], config: FitConfig) -> str:
+def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: list[_Fits], config: FitSettings) -> str:
     lines = [
         "# Raw recordings against their truth",
         "",

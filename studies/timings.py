@@ -11,7 +11,7 @@ from torch import Tensor
 
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
-from diffcloud.fit.matching import nearest_places, pairs_forth
+from diffcloud.estimation.matching import nearest_places, pairs_forth
 from diffcloud.mesh import grid_cloth, sphere_surface
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.build import build_system

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffcloud.fit import Objective
+from diffcloud.estimation import Objective
 from diffcloud.io.simulated import SimulatedSet
 from diffcloud.mesh import grid_cloth
 from diffcloud.scene.scenarios import Scenario, built_in, grid_scenario

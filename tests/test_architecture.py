@@ -20,14 +20,15 @@ ALLOWED = {
     "scene": {"mesh", "io", "sim"},
     "clouds": {"mesh", "io"},
     "datasets": {"mesh", "io", "sim", "scene", "clouds"},
-    "fit": {"mesh", "io", "sim", "scene", "clouds"},
+    "estimation": {"mesh", "io", "sim", "scene", "clouds"},
     "regressors": {"mesh", "io", "clouds"},
-    "evaluation": {"mesh", "io", "sim", "scene", "clouds", "fit"},
-    "simulators": {"mesh", "io", "sim", "scene", "fit"},
+    "evaluation": {"mesh", "io", "sim", "scene", "clouds", "estimation"},
+    "identification": {"mesh", "io", "sim", "scene", "estimation"},
+    "simulators": {"mesh", "io", "sim", "scene", "estimation"},
     "sensing": {"mesh", "io", "clouds"},
     "hardware": {"mesh", "io", "clouds", "sensing"},
     "live": {"mesh", "io", "clouds", "sensing"},
-    "report": {"mesh", "io", "sim", "scene", "clouds", "fit", "regressors", "sensing", "evaluation"},
+    "report": {"mesh", "io", "sim", "scene", "clouds", "estimation", "regressors", "sensing", "evaluation"},
 }
 """Sub-package -> the sub-packages it may import; all may import errors."""
 

@@ -49,7 +49,7 @@ COMMANDS = {
     "doctor": "diffcloud.cli.doctor:doctor",
 }
 """Name -> where it lies; it is imported when it is run."""
-_PARALLEL = ("episodes", "preprocess", "fit", "train", "evaluate", "coverage", "recordings", "bench")
+_PARALLEL = ("episodes", "preprocess", "fit", "train", "evaluate", "coverage", "recordings")
 """Commands that run their jobs through `diffcloud.cli.workers`."""
 
 app = typer.Typer(

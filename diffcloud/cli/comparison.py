@@ -14,11 +14,11 @@ from diffcloud.cli.config import Config
 from diffcloud.cli.fit_jobs import joint_fit
 from diffcloud.cli.workers import Tell, run_all
 from diffcloud.errors import CheckpointError, DiffCloudError, EpisodeError
+from diffcloud.estimation import FitRecord, read_fit
 from diffcloud.evaluation import ComparisonSettings, EpisodeRecord, Estimate, Gap, compare_episode
 from diffcloud.evaluation.methods import predicted
 from diffcloud.evaluation.repeats import other_repeats
 from diffcloud.evaluation.summary import PREDICTORS
-from diffcloud.fit import FitRecord, read_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import files_in, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint, kept_record
@@ -26,7 +26,7 @@ from diffcloud.io.timings import read_seconds, read_timings
 from diffcloud.regressors import Regressor, predict_episode
 from diffcloud.scene.scenarios import Scenario
 
-_CODE = ("mesh", "io", "sim", "scene", "clouds", "fit", "evaluation")
+_CODE = ("mesh", "io", "sim", "scene", "clouds", "estimation", "evaluation")
 """Packages whose source decides the numbers of a finished episode."""
 
 _MOST_REASONS = 5

@@ -51,7 +51,7 @@ def _compile() -> None:
             ("linearised steps", "diffcloud.sim.warm:linearised"),
             ("nearest neighbours", "diffcloud.clouds.neighbours:compile_neighbours"),
             ("nearest places", "diffcloud.clouds.surface:compile_surface"),
-            ("poses", "diffcloud.fit.curvature:compile_terms"),
+            ("poses", "diffcloud.estimation.curvature:compile_terms"),
         ],
     ]
     with progress_bar("compiling", sum(map(len, work))) as update:

@@ -30,14 +30,14 @@ from diffcloud.cli.console import (
 from diffcloud.cli.fit_jobs import joint_fit
 from diffcloud.cli.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario
 from diffcloud.errors import ConfigError
+from diffcloud.estimation import Objective, read_fit
+from diffcloud.estimation.pose import parse_priors
+from diffcloud.estimation.result import describe_recording
 from diffcloud.evaluation.intervals import LEVEL, WITHIN, Intervals, intervals_of, significant
 from diffcloud.evaluation.markdown import comparison_page
 from diffcloud.evaluation.methods import space_of
 from diffcloud.evaluation.summary import PREDICTORS, headline, label, largest_sources, sentences, tables
 from diffcloud.evaluation.summary import metrics as summary_metrics
-from diffcloud.fit import Objective, read_fit
-from diffcloud.fit.pose import parse_priors
-from diffcloud.fit.result import describe_recording
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import claimed, files_in, together, write_json, write_text
 from diffcloud.sim.properties import check_values, one_set

@@ -13,7 +13,7 @@ from rich.table import Table
 from diffcloud.cli.console import JsonFlag, errors, finish, progress_bar, show, warn, writes
 from diffcloud.cli.scenario_options import ScenarioName, choose_scenario, fitted_scenario
 from diffcloud.errors import ConfigError
-from diffcloud.fit.record import FitRecord, RecordingFit, read_fit
+from diffcloud.estimation.record import FitRecord, RecordingFit, read_fit
 from diffcloud.io.files import together
 from diffcloud.io.manifests import remove_files
 
@@ -61,7 +61,7 @@ def export(
     json: JsonFlag = False,
 ) -> None:
     """Write a fitted cloth for another simulator: mesh, material in SI units, and the recorded motion of what is held."""
-    from diffcloud.fit.result import read_motion
+    from diffcloud.estimation.result import read_motion
     from diffcloud.simulators.export.cloth import fitted_cloth
     from diffcloud.simulators.export.write import exported_files, write_export
 
@@ -112,7 +112,7 @@ def export(
 
 
 def _about(fit: Path, one: RecordingFit, scenario: Scenario, values: Mapping[str, float]) -> dict[str, Any]:
-    from diffcloud.fit.result import whole_material
+    from diffcloud.estimation.result import whole_material
 
     return {
         "fit": fit.name,

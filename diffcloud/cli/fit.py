@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from diffcloud.cli.config import Config, load_config, updated
+from diffcloud.cli.config import Config, load_config
 from diffcloud.cli.console import (
     JsonFlag,
     ParamsFile,
@@ -28,14 +28,16 @@ from diffcloud.cli.console import (
     writes,
 )
 from diffcloud.cli.ctrl_c import none_lost
-from diffcloud.cli.fit_jobs import JOINT, FitJob, Recording, first_start, read_recordings, remove_stale, stated_recordings
+from diffcloud.cli.fit_jobs import JOINT, FitJob, first_start, read_recordings, remove_stale, stated_recordings
 from diffcloud.cli.scenario_options import ScenarioName, SceneFile, choose_scenario
 from diffcloud.cli.workers import run_all
 from diffcloud.errors import ConfigError, DiffCloudError
-from diffcloud.fit import FitRecord, FitSpace
+from diffcloud.estimation import FitRecord, FitSpace
+from diffcloud.estimation.task import Recording
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import files_in, folders_in
 from diffcloud.io.manifests import read_manifest, write_manifest
+from diffcloud.settings import updated
 from diffcloud.sim.threads import use_threads
 
 _MOST_JOINT = 100
@@ -187,8 +189,8 @@ def fit(
     jobs = [replace(job, init=first_start(init, job)) for job in jobs]
     # everything is read before anything is fitted: a damaged last file must not cost the first ones' time
     for job in told_progress("checking", jobs):
-        job.objective()
-    space = jobs[0].space.asked
+        job.task.objective()
+    space = jobs[0].task.space.asked
     table = Table("episode", "start", "final", "rms mm", *space.names, "iterations", "seconds", "stopped by")
     results: dict[str, Any] = {}
     failures: list[str] = []

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
 
-from diffcloud.cli.config import FitConfig
 from diffcloud.cli.console import assignments, episode_files, errors, told_progress
 from diffcloud.cli.scenario_options import choose_scenario
 from diffcloud.cli.workers import Tell, check_interrupt
-from diffcloud.errors import ConfigError, DivergedError
-from diffcloud.fit import FitSpace, JointObjective, Objective, Progress, read_fit, write_fit
-from diffcloud.fit.batches import batch_losses
-from diffcloud.fit.doubts import with_doubts
-from diffcloud.fit.joint import AnyObjective
-from diffcloud.fit.laid import with_laid
-from diffcloud.fit.left_out import leave_each_out
-from diffcloud.fit.priors import parameter_priors
-from diffcloud.fit.record import FitRecord, LeftOut
-from diffcloud.fit.result import describe_fit
-from diffcloud.fit.solvers import FitOutcome, LikelihoodSettings, Settings, solve
-from diffcloud.fit.solvers.outcome import FitHistory
-from diffcloud.io.episodes import Episode, read_episode
+from diffcloud.errors import ConfigError
+from diffcloud.estimation import Progress, read_fit, write_fit
+from diffcloud.estimation.record import FitRecord
+from diffcloud.estimation.result import FitResult
+from diffcloud.estimation.settings import FitSettings
+from diffcloud.estimation.task import FitTask, Recording
+from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import read_yaml
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
@@ -33,18 +25,9 @@ from diffcloud.scene.scenarios import Scenario
 
 JOINT = "joint"
 """Name of the fit of one parameter set to all recordings."""
-_CODE = ("mesh", "io", "sim", "scene", "clouds", "fit")
+_CODE = ("mesh", "io", "sim", "scene", "clouds", "estimation")
 """Packages whose source decides the numbers of a fit."""
 _MOST_RECORDINGS = 1000
-
-
-@dataclass(frozen=True)
-class Recording:
-    """An episode and the scenario that simulates it."""
-
-    scenario: Scenario
-    name: str
-    episode: Episode
 
 
 def fit_file(fits: Path, scenario: str, name: str) -> Path:
@@ -112,35 +95,20 @@ def read_recordings(pairs: Sequence[tuple[str, Path]]) -> list[Recording]:
     return [Recording(scenarios[name], file.stem, read_episode(file)) for name, file in told_progress("reading", files)]
 
 
-def compared(record: FitRecord, recordings: Sequence[Recording]) -> AnyObjective:
-    """What a fit has minimised, at the frames that it began with.
-
-    Args:
-        recordings: of the fit, in their order.
-
-    Raises:
-        ConfigError, EpisodeError: the episodes lack these frames, or are of different cloths.
-    """
-    return _joined(
-        [Objective(one.scenario, one.episode, **record.measured_by(place)) for place, one in enumerate(recordings)]
-    )
-
-
-def _joined(members: Sequence[Objective]) -> AnyObjective:
-    """One recording's objective is that of a fit, several are a joint one's."""
-    return members[0] if len(members) == 1 else JointObjective(members)
-
-
 @dataclass(frozen=True)
 class FitJob:
-    """One parameter set for one or several recordings. A finished fit of the same inputs by the same code is kept."""
+    """A fit with its files. A finished one of the same inputs by the same code is kept."""
 
     name: str
     recordings: Sequence[Recording]
-    settings: FitConfig
+    settings: FitSettings
     folder: Path
     init: Mapping[str, float] = field(default_factory=dict)
     """Values of the first start; the middle of the range where not given."""
+
+    @property
+    def task(self) -> FitTask:
+        return FitTask(self.recordings, self.settings, self.init)
 
     @property
     def scenario(self) -> Scenario:
@@ -156,50 +124,6 @@ class FitJob:
     def files(self) -> tuple[Path, Path]:
         """What `run` writes."""
         return self.folder / f"{self.name}.json", self.folder / f"{self.name}.npz"
-
-    @property
-    def space(self) -> FitSpace:
-        """
-        Raises:
-            ConfigError: bounds, priors, doubts or fixed values that do not fit the parameters, or a start that the
-                recordings have none of.
-        """
-        settings = self.settings
-        for recording in self.recordings:
-            recording.scenario.check_parameters([*settings.parameters, *settings.fixed])
-        bounds = {**self.scenario.bounds, **settings.bounds}
-        space = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed)
-        ranges = {variable.name: (variable.low, variable.high) for variable in space.variables}
-        priors = parameter_priors("none" if settings.paper else settings.prior, space.names, ranges)
-        space = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed, priors=priors)
-        scenarios = [recording.scenario for recording in self.recordings]
-        space = with_doubts(space, settings.known_within(scenarios), scenarios)
-        return with_laid(space, settings.laid_within(scenarios), scenarios)
-
-    def objective(self) -> AnyObjective:
-        """
-        Raises:
-            ConfigError, EpisodeError: the episodes lack the frames of the loss, an unknown frame, or different cloths.
-        """
-        measure = self.settings.measure()
-        return _joined([Objective(one.scenario, one.episode, **measure) for one in self.recordings])
-
-    @property
-    def solver_settings(self) -> Settings:
-        return replace(self.settings.solver_settings(self.scenario), init=self.init)
-
-    def solved(self, progress: Callable[[Progress], None] | None = None) -> tuple[AnyObjective, FitOutcome]:
-        """The fit, of which nothing is written, and what it minimised.
-
-        Raises:
-            ConfigError, EpisodeError: as of `space` and `objective`.
-            DivergedError, KeyboardInterrupt: as of `solve`.
-        """
-        objective = self.objective()
-        outcome = solve(objective, self.space, self.solver_settings, progress=progress)
-        if outcome.estimate is not None:  # frames beyond the horizon said nothing
-            objective = _joined(outcome.estimate.members)
-        return objective, outcome
 
     def known(self) -> FitRecord | None:
         """What this job, or an earlier one of the same inputs and code, has left; maybe interrupted."""
@@ -219,42 +143,20 @@ class FitJob:
         known = self.known()
         if known is not None and known.stop_reason != "interrupted":
             return known
-        unit_mm = 1e3 * self.scenario.length_unit_m
+        unit_mm, asked = 1e3 * self.scenario.length_unit_m, self.task.space.asked.names
 
         def show(doing: str, progress: Progress) -> None:
             """No part that is done: how many starts there will be is not known."""
             check_interrupt()
-            values = "  ".join(f"{key} {progress.values[key]:.3g}" for key in space.asked.names if key in progress.values)
+            values = "  ".join(f"{key} {progress.values[key]:.3g}" for key in asked if key in progress.values)
             step = progress.iteration if progress.simulations is None else progress.simulations
             tell(0.0, f"{doing}step {step}  best {unit_mm * progress.best**0.5:.2f} mm  {values}")
 
         def show_left_out(done: float, doing: str, progress: Progress) -> None:
             show(f"{doing}  ", progress)
 
-        space, settings = self.space, self.solver_settings
-        objective, outcome = self.solved(partial(show, ""))
-        left, failures, interrupted = list[LeftOut](), list[str](), outcome.stop_reason == "interrupted"
-        if isinstance(objective, JointObjective) and isinstance(settings, LikelihoodSettings) and not interrupted:
-            try:
-                left = leave_each_out(objective, space, outcome.values, settings, progress=show_left_out)
-            except DivergedError as error:
-                failures.append(f"leaving one recording out: {error}")
-            except KeyboardInterrupt:
-                interrupted = True
-        names, pressed = [one.name for one in self.recordings], False
-        described = partial(describe_fit, objective, space, settings, outcome, episodes=names)
-        try:
-            result = described()
-        except KeyboardInterrupt:  # a fit that may have taken minutes is not given away for the second that this takes
-            result, pressed = described(), True
-        record = result.record
-        record.failures += failures
-        record.stop_reason = "interrupted" if interrupted else record.stop_reason
-        for recording, told in zip(record.episodes, left, strict=bool(left)):
-            recording.left_out = told
-        record.fingerprint = self._fingerprint
-        write_fit(self.folder, self.name, result)
-        if interrupted or pressed:
+        record = self._written(self.task.fitted(partial(show, ""), show_left_out))
+        if record.stop_reason == "interrupted":
             raise KeyboardInterrupt
         return record
 
@@ -265,21 +167,9 @@ class FitJob:
         Raises:
             DivergedError: the motion diverges there.
         """
-        objective, space, settings, began = self.objective(), self.space, self.solver_settings, time.perf_counter()
-        values = space.starts(1, seed=settings.seed, first=self.init)[0].double()
-        losses = batch_losses(objective, space, values)
-        history = FitHistory(space.names, [losses], [values])
-        outcome = FitOutcome(
-            values=dict(zip(space.names, values[0].tolist(), strict=True)),
-            loss=float(losses[0]),
-            best_start=0,
-            simulations=len(objective.members),
-            stop_reason="interrupted",
-            seconds=time.perf_counter() - began,
-            history=history,
-        )
-        names = [one.name for one in self.recordings]
-        result = describe_fit(objective, space, settings, outcome, episodes=names)
+        return self._written(self.task.begun())
+
+    def _written(self, result: FitResult) -> FitRecord:
         result.record.fingerprint = self._fingerprint
         write_fit(self.folder, self.name, result)
         return result.record
@@ -287,7 +177,10 @@ class FitJob:
     @cached_property
     def _fingerprint(self) -> str:
         settings = self.settings.model_dump(exclude={"joint"})  # which the name and the recordings tell
-        resolved = [self.space, self.solver_settings]  # what is not given is decided here, outside of these packages
+        resolved = [
+            self.task.space,
+            self.task.solver_settings,
+        ]  # decided by defaults of other packages
         return fingerprint([self.name, self.recordings, settings, resolved], packages=_CODE)
 
 
@@ -301,13 +194,13 @@ def first_start(init: str, job: FitJob) -> dict[str, float]:
         return {}
     if "=" in init:
         stated = assignments(init.split(","), "--init")
-        job.space.check_start(stated)
+        job.task.space.check_start(stated)
         return stated
     # imported here: the fits of the pipeline start elsewhere, and must not be stale when a regressor changes
     from diffcloud.cli.predict import predicted_start
 
     found = [predicted_start(init, one.scenario.name, one.episode) for one in job.recordings]
-    return job.space.nearest({name: sum(values[name] for values in found) / len(found) for name in found[0]})
+    return job.task.space.nearest({name: sum(values[name] for values in found) / len(found) for name in found[0]})
 
 
 def remove_stale(out: Path, jobs: Sequence[FitJob]) -> None:

@@ -17,18 +17,21 @@ import yaml
 
 import diffcloud
 from diffcloud.cli import ctrl_c
-from diffcloud.cli.config import Config, FitConfig
+from diffcloud.cli.config import Config
 from diffcloud.cli.console import JsonFlag, Threads, Topics, duration_s, errors, finish, progress_bar, warn
-from diffcloud.cli.fit_jobs import FitJob, Recording, compared
+from diffcloud.cli.fit_jobs import FitJob
 from diffcloud.cli.preprocess import PreprocessJob
 from diffcloud.cli.workers import check_interrupt
 from diffcloud.errors import ConfigError, DiffCloudError, EpisodeError
+from diffcloud.estimation import FitRecord, JointObjective, Objective
+from diffcloud.estimation.joint import AnyObjective
+from diffcloud.estimation.result import physical_values, read_motion
+from diffcloud.estimation.settings import FitSettings
+from diffcloud.estimation.task import Recording, compared
 from diffcloud.evaluation.intervals import FOLLOWS, LEVEL, WITHIN, Intervals, intervals_of, significant
 from diffcloud.evaluation.methods import space_of
 from diffcloud.evaluation.summary import largest_sources
-from diffcloud.fit import FitRecord, JointObjective, Objective
-from diffcloud.fit.joint import AnyObjective
-from diffcloud.fit.result import physical_values, read_motion
+from diffcloud.identification import fit_settings, found_cloth, with_density
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import claimed, read_json, read_yaml, together, write_bytes, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint
@@ -38,21 +41,13 @@ from diffcloud.io.ros.recording import ros_recording
 from diffcloud.report import EpisodeEntry, build_page
 from diffcloud.scene.scenarios import Scenario, load_scenario
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
-from diffcloud.scene.scenarios.layout import FIELDS, Found, find_layout, found_size, node_counts
+from diffcloud.scene.scenarios.layout import FIELDS, Found, find_layout
 from diffcloud.sim import warm
-from diffcloud.sim.grasp import GRIP_M
 from diffcloud.sim.properties import one_set
 from diffcloud.sim.threads import use_threads
 
-_DENSITY = 0.16
-_MATERIAL = {"stretching_n_m": 60.0, "bending_n_m": 5e-6, "poisson": 0.2, "damping_s": 0.002}
-_AROUND = {"friction_obstacle": 0.4, "compression": 0.5}
-_DOUBTS = {"friction_obstacle": 2.0, "compression": 3.0, "shear": 1.2, "damping": 2.5}
-_BOUNDS = {"stretch": (0.03, 30.0), "bending": (0.03, 30.0), "mass": (0.2, 5.0)}
 _BAGS = (".bag", ".mcap", ".db3")
 _CLOTH_FIELDS = ("base", "size_m", "nodes", "material", "grip", "grip_m", "steps_per_frame")
-_STEPS = 16
-_GRIP_KNOWN = 1.5
 _TRANSFERS, _GAIN = 1.25, 0.5
 _Fitted = tuple[FitRecord, AnyObjective, FitJob]
 """A fit, what it minimised, and the job."""
@@ -121,8 +116,9 @@ def identify(
     with claimed(out):
         episodes, cloth, layouts = find_scene(recordings, out, stated, None if weighed is None else weighed[0], topic or ())
         if weighed is not None and weighed[1]:
-            cloth = _with_mass(cloth, *weighed)
-        chosen = _chosen(parameters, cloth, weighed)
+            cloth = with_density(cloth, *weighed)
+        named = None if parameters is None else [name.strip() for name in parameters.split(",")]
+        chosen = fit_settings(named, cloth, weighed)
         so_far = _SoFar()
         if seconds is not None:
             seconds = max(_FITTING * seconds - (time.monotonic() - began), 1.0)
@@ -291,29 +287,7 @@ def _cloth(
         if isinstance(fields.get("material"), str) and fields["material"].endswith(".json"):
             fields["material"] = str((out / fields["material"]).resolve())  # scenarios are written to another folder
         return fields
-    size, reason = stated, "as stated"
-    if size is None:
-        sides = np.array([found_size(episode) for episode in episodes.values()])
-        size = tuple(np.round(np.median(sides, axis=0), 3).tolist())
-        reason = "rectangle around the first frames" + (
-            f"; recordings differ by up to {np.ptp(sides, axis=0).max():.3f} m" if len(sides) > 1 else ""
-        )
-    told = "as weighed" if mass is not None else "usual for a knit; fitted"
-    material = {"density_kg_m2": mass or _DENSITY, **_MATERIAL}
-    found = {
-        "base": Found("lift", "a rectangular cloth on a table"),
-        "size_m": Found(list(size), reason),
-        "nodes": Found(list(node_counts(size)), "13 along the longer side, and at least 5 along the other"),
-        "grip": Found(
-            "pad", "fingers level; or upright_pad (pinched from above), or pivot (a point that lets the cloth turn)"
-        ),
-        "grip_m": Found(GRIP_M, "side of the pad, or of the square that a pivot stands for; measure your gripper's [m]"),
-        "grip_known_within": Found(_GRIP_KNOWN, "factor within which grip_m is known; 1.05 if you have measured it"),
-        "material": Found(material, f"what multipliers act on; density {told}"),
-        **{name: Found(value, "usual; fitted too, within `doubts`") for name, value in _AROUND.items()},
-        "doubts": Found(_DOUBTS, "factors within which what nobody asks for is known"),
-        "steps_per_frame": Found(_STEPS, "finer steps move a lifted cloth by less than the noise"),
-    }
+    found = found_cloth(list(episodes.values()), stated, mass)
     write_text(path, _yaml(found))
     return {name: entry.value for name, entry in found.items()}
 
@@ -412,30 +386,6 @@ def _weighed(text: str) -> tuple[float, float]:
     return mass, deviation
 
 
-def _with_mass(cloth: Mapping[str, Any], mass: float, deviation: float) -> dict[str, Any]:
-    """The cloth with a weighed mass that is not exact: the fit allows for it."""
-    material = {**_material(cloth), "density_kg_m2": mass}
-    return {**cloth, "material": material, "doubts": {**cloth.get("doubts", {}), "mass": 1 + deviation / mass}}
-
-
-def _material(cloth: Mapping[str, Any]) -> dict[str, Any]:
-    material = cloth.get("material")
-    if not isinstance(material, dict) or material.get("density_kg_m2") is None:
-        raise ConfigError("--mass goes with a material of stated density_kg_m2 in cloth.yaml.")
-    return material
-
-
-def _chosen(parameters: str | None, cloth: Mapping[str, Any], weighed: tuple[float, float] | None) -> FitConfig:
-    names = ["stretch", "bending", *(["mass"] if weighed is None else [])]
-    if parameters is not None:
-        names = [name.strip() for name in parameters.split(",")]
-    fixed = {}
-    if weighed is not None and not weighed[1]:
-        fixed = {"mass": weighed[0] / float(_material(cloth)["density_kg_m2"])}
-    bounds = {name: list(pair) for name, pair in _BOUNDS.items() if name in names}
-    return FitConfig.model_validate({"parameters": names, "fixed": fixed, "bounds": bounds})
-
-
 def _stage(out: Path) -> Path:
     """The folder of the scenarios of an unfinished fit."""
     return out / "stages" / "scenarios"
@@ -457,7 +407,7 @@ def _fit(
     episodes: Mapping[str, Episode],
     cloth: Mapping[str, Any],
     layouts: Mapping[str, Mapping[str, Any]],
-    settings: FitConfig,
+    settings: FitSettings,
 ) -> None:
     """
     Args:

@@ -12,9 +12,9 @@ import typer
 
 from diffcloud.cli.console import JsonFlag, errors, finish
 from diffcloud.errors import ConfigError
+from diffcloud.estimation import FitRecord, read_fit
 from diffcloud.evaluation.intervals import LEVEL, WITHIN, read_intervals
 from diffcloud.evaluation.methods import space_of
-from diffcloud.fit import FitRecord, read_fit
 from diffcloud.io.files import files_in, read_yaml, together, write_text
 from diffcloud.io.timings import NAME
 

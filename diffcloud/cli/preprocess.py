@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from diffcloud.cli.config import PreprocessConfig, RawConfig, load_config, updated
+from diffcloud.cli.config import PreprocessConfig, RawConfig, load_config
 from diffcloud.cli.console import JsonFlag, ParamsFile, Workers, errors, finish, warn, writes
 from diffcloud.cli.workers import Tell, run_all
 from diffcloud.errors import ConfigError, EpisodeError
@@ -29,6 +29,7 @@ from diffcloud.sensing.fusion import Seen, fuse
 from diffcloud.sensing.masking import RobotMask
 from diffcloud.sensing.pictures import cloud_picture, mask_picture
 from diffcloud.sensing.robot import Robot, gen3
+from diffcloud.settings import updated
 
 PICTURES = ("mask", "cloud")
 """Of a raw episode: <episode>.<kind>.png beside its clouds."""

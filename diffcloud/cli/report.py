@@ -14,10 +14,10 @@ from diffcloud.cli.console import JsonFlag, ParamsFile, errors, finish, writes
 from diffcloud.cli.fit_jobs import fit_file
 from diffcloud.cli.scenario_options import choose_scenario, fitted_scenario
 from diffcloud.errors import ConfigError
+from diffcloud.estimation import read_fit
+from diffcloud.estimation.result import read_motion
 from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, check_file
 from diffcloud.evaluation.summary import tables as comparison_tables
-from diffcloud.fit import read_fit
-from diffcloud.fit.result import read_motion
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import read_json, together, write_bytes, write_text
 from diffcloud.io.tables import read_csv

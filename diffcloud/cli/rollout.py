@@ -13,10 +13,10 @@ import typer
 from diffcloud.cli.console import JsonFlag, assignments, errors, finish, progress_bar, warn, writes
 from diffcloud.cli.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario, limits
 from diffcloud.errors import ConfigError, DivergedError
-from diffcloud.fit.inputs import Inputs
-from diffcloud.fit.record import RecordingFit, read_fit
-from diffcloud.fit.result import recorded_pose
-from diffcloud.fit.targets import track_displacement
+from diffcloud.estimation.inputs import Inputs
+from diffcloud.estimation.record import RecordingFit, read_fit
+from diffcloud.estimation.result import recorded_pose
+from diffcloud.estimation.targets import track_displacement
 from diffcloud.io.clouds import write_ply
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import together, write_npz

@@ -8,11 +8,12 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from diffcloud.cli.config import load_config, updated
+from diffcloud.cli.config import load_config
 from diffcloud.cli.console import JsonFlag, ParamsFile, Threads, errors, finish, progress_bar, show, warn, writes
 from diffcloud.cli.ctrl_c import none_lost
 from diffcloud.cli.scenario_options import ScenarioName, SceneFile, choose_scenario
 from diffcloud.datasets import ParameterBox, ParameterDraws, SimulationPlan, simulate_set
+from diffcloud.settings import updated
 from diffcloud.sim.threads import use_threads
 
 _INTERRUPTED = 130

@@ -12,7 +12,7 @@ import torch
 import typer
 from rich.table import Table
 
-from diffcloud.cli.config import TrainConfig, load_config, updated
+from diffcloud.cli.config import TrainConfig, load_config
 from diffcloud.cli.console import JsonFlag, ParamsFile, Workers, errors, finish, known, show, writes
 from diffcloud.cli.ctrl_c import none_lost
 from diffcloud.cli.workers import Tell, run_all
@@ -29,6 +29,7 @@ from diffcloud.regressors import (
     TrainingSettings,
     profile_settings,
 )
+from diffcloud.settings import updated
 
 _INTERRUPTED = 130
 _CODE = ("mesh", "io", "clouds", "regressors")

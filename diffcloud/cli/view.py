@@ -24,7 +24,7 @@ from diffcloud.cli.console import (
     writes,
 )
 from diffcloud.cli.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario
-from diffcloud.fit.record import FitRecord, read_fit
+from diffcloud.estimation.record import FitRecord, read_fit
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import write_text
 
@@ -109,7 +109,7 @@ def _layers(
     alone = fit is None and name is None and scene is None
     layers = recorded_layers(episode, frames, points=points, rng=np.random.default_rng(0), gripper=alone)
     if fit is not None and record is not None:
-        from diffcloud.fit.result import read_motion
+        from diffcloud.estimation.result import read_motion
 
         place = record.place_of(path.stem, name)
         recording, motion = record.episodes[place], read_motion(fit.with_suffix(".npz"), place)

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from diffcloud.cli.console import JsonFlag, finish, output, show
 from diffcloud.cli.scenario_options import ScenarioName, SceneFile, choose_scenario
-from diffcloud.fit.visibility import visibility_map
+from diffcloud.estimation.visibility import visibility_map
 from diffcloud.io.episodes import read_episode
 
 

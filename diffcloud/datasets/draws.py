@@ -142,7 +142,7 @@ class ParameterDraws:
     scenario: str
     seed: int
     doubts: Mapping[str, float] = field(default_factory=dict)
-    """Other material that differs from run to run, known within a factor of one deviation (`fit.doubts`)."""
+    """Other material that differs from run to run, known within a factor of one deviation (`estimation.doubts`)."""
 
     def __post_init__(self) -> None:
         if self.kind == "modes" and self.scenario not in MODES:

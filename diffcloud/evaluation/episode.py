@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from diffcloud.errors import DiffCloudError
+from diffcloud.estimation import AdamSettings, CmaEsSettings, FitRecord, FitSpace, Objective, RandomSearchSettings
+from diffcloud.estimation.names import of_recording
 from diffcloud.evaluation import methods
 from diffcloud.evaluation.intervals import LEVEL, WITHIN, intervals_of
 from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
-from diffcloud.fit import AdamSettings, CmaEsSettings, FitRecord, FitSpace, Objective, RandomSearchSettings
-from diffcloud.fit.names import of_recording
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 

@@ -1,6 +1,6 @@
 """What a fit says of the parameters: intervals with a level, a verdict for each, and what to improve first.
 
-The covariance is the one that `fit.likelihood` has found. On the axis of the fit (a factor up and down for
+The covariance is the one that `estimation.likelihood` has found. On the axis of the fit (a factor up and down for
 multipliers) an interval reaches to both sides as far as the variance's root times the quantile of the normal distribution.
 Intervals end at the bounds.
 """
@@ -20,10 +20,10 @@ from pydantic import ConfigDict, ValidationError
 from scipy.special import ndtri
 
 from diffcloud.errors import ConfigError
-from diffcloud.fit.parameters import FitSpace
-from diffcloud.fit.record import FitRecord
-from diffcloud.fit.residuals import Axis
-from diffcloud.fit.result import physical_values
+from diffcloud.estimation.parameters import FitSpace
+from diffcloud.estimation.record import FitRecord
+from diffcloud.estimation.residuals import Axis
+from diffcloud.estimation.result import physical_values
 from diffcloud.io.files import read_json
 from diffcloud.io.schema import Plain
 from diffcloud.scene.scenarios import Scenario

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from diffcloud.fit import FitSpace, Objective
-from diffcloud.fit.batches import batch_losses
-from diffcloud.fit.record import History
+from diffcloud.estimation import FitSpace, Objective
+from diffcloud.estimation.batches import batch_losses
+from diffcloud.estimation.record import History
 
 
 def loss_landscape(

@@ -1,8 +1,9 @@
 """Methods that name the parameters of an episode, on equal terms.
 
 Each gives one parameter set: the fit, a network's prediction, or a rival without gradients or learning. Rivals that search
-are the solvers of `fit.solvers`; they see the objective that the fit sees (frames, points, common random numbers, bounds),
-may simulate as often as the fit (as one start of it, where that was Adam's), and stop below the same threshold.
+are the solvers of `estimation.solvers`; they see the objective that the fit sees (frames, points, common random
+numbers, bounds), may simulate as often as the fit (as one start of it, where that was Adam's), and stop below the same
+threshold.
 """
 
 from __future__ import annotations
@@ -12,11 +13,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from diffcloud.fit import AdamSettings, CmaEsSettings, FitRecord, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
-from diffcloud.fit.laid import variables_of
-from diffcloud.fit.names import of_recording
-from diffcloud.fit.parameters import Variable
-from diffcloud.fit.solvers import SOLVER_NAMES, SOLVERS, FitOutcome, SearchSettings
+from diffcloud.estimation import (
+    AdamSettings,
+    CmaEsSettings,
+    FitRecord,
+    FitSpace,
+    Objective,
+    RandomSearchSettings,
+    fit_adam,
+    solve,
+)
+from diffcloud.estimation.laid import variables_of
+from diffcloud.estimation.names import of_recording
+from diffcloud.estimation.parameters import Variable
+from diffcloud.estimation.solvers import SOLVER_NAMES, SOLVERS, FitOutcome, SearchSettings
 
 Rival = Literal["single_start", "middle", "random_search", "cma_es"]
 """What the comparison can run by itself."""

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from diffcloud.estimation.laid import is_laid
 from diffcloud.evaluation.intervals import Combination, significant
 from diffcloud.evaluation.methods import PHASES
 from diffcloud.evaluation.repeats import consistency, fit_of, parameter_table, repeatability, transfer
-from diffcloud.fit.laid import is_laid
 
 LABELS = {
     "diffcloud": "DiffCloud",

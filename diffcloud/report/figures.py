@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from diffcloud.estimation.record import History
 from diffcloud.evaluation.summary import Tables, label, percent
-from diffcloud.fit.record import History
 from diffcloud.report.overlay import states_at
 
 if TYPE_CHECKING:

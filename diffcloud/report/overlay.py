@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from diffcloud.fit.result import FittedMotion
+from diffcloud.estimation.result import FittedMotion
 from diffcloud.io.episodes import ONLY_GRIPPER, Episode
 from diffcloud.mesh.topology import SurfaceMesh
 

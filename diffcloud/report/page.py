@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from diffcloud.estimation.record import FitRecord, FittedParameter, RecordingFit
+from diffcloud.estimation.result import FittedMotion
 from diffcloud.evaluation.intervals import Intervals
 from diffcloud.evaluation.summary import percent
-from diffcloud.fit.record import FitRecord, FittedParameter, RecordingFit
-from diffcloud.fit.result import FittedMotion
 from diffcloud.io.episodes import Episode
 from diffcloud.report.comparison import (
     ComparisonEntry,

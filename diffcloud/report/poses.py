@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffcloud.fit.laid import asked_as
-from diffcloud.fit.record import FitRecord, RecordingFit
+from diffcloud.estimation.laid import asked_as
+from diffcloud.estimation.record import FitRecord, RecordingFit
 from diffcloud.report.tables import UNKNOWN, Cell, Table, number, part, table
 
 _SHOWN = {"m": (1e3, "mm", 1), "rad": (180 / math.pi, "°", 1), "s": (1e3, "ms", 1), "1": (1e2, "%", 1)}

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from diffcloud.fit.record import RecordingFit
-from diffcloud.fit.result import FittedMotion, recorded_pose
-from diffcloud.fit.targets import track_displacement
+from diffcloud.estimation.record import RecordingFit
+from diffcloud.estimation.result import FittedMotion, recorded_pose
+from diffcloud.estimation.targets import track_displacement
 from diffcloud.io.episodes import Episode
 from diffcloud.mesh.shapes import rectangle_surface
 from diffcloud.report.overlay import Layer, Overlay, body_layers, held_layers, states_at

@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from diffcloud.fit.result import FittedMotion, read_motion
+from diffcloud.estimation.result import FittedMotion, read_motion
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.report.overlay import states_at
 

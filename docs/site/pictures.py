@@ -10,11 +10,11 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from diffcloud.fit import FitSpace, Objective
-from diffcloud.fit.batches import batch_losses
-from diffcloud.fit.doubts import MATERIAL_DOUBTS
-from diffcloud.fit.priors import DEFAULT_FACTOR
-from diffcloud.fit.record import read_fit
+from diffcloud.estimation import FitSpace, Objective
+from diffcloud.estimation.batches import batch_losses
+from diffcloud.estimation.doubts import MATERIAL_DOUBTS
+from diffcloud.estimation.priors import DEFAULT_FACTOR
+from diffcloud.estimation.record import read_fit
 from diffcloud.io.episodes import read_episode
 from diffcloud.report.figures import INK, new_canvas, svg_of
 from diffcloud.scene import load_scenario

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from diffcloud.cli.config import SMOOTHING
-from diffcloud.fit import AdamSettings, FitSpace, Objective, fit_adam
+from diffcloud.estimation import AdamSettings, FitSpace, Objective, fit_adam
+from diffcloud.estimation.settings import SMOOTHING
 from diffcloud.io.imports import release_episodes
 from diffcloud.scene import load_scenario
 from diffcloud.sim import Properties, rollout, rollout_tangents

@@ -16,13 +16,13 @@ import pytest
 import yaml
 
 import diffcloud.cli.comparison
-from diffcloud.fit import read_fit
+from diffcloud.estimation import read_fit
 from diffcloud.io.episodes import write_episode
 from diffcloud.io.files import claimed
 from tests.cli.invoke import invoke
 from tests.cli.test_commands import SMALL
 from tests.conftest import small_lift
-from tests.fit.test_fit import clouds_of
+from tests.estimation.test_fit import clouds_of
 
 ROOT = Path(__file__).parents[2]
 PARAMS = {

@@ -15,7 +15,7 @@ from diffcloud.scene.scenarios import load_scenario
 from tests.cli.invoke import invoke
 from tests.cli.test_commands import SMALL
 from tests.conftest import small_lift
-from tests.fit.test_fit import clouds_of
+from tests.estimation.test_fit import clouds_of
 
 MATERIAL = {"density_kg_m2": 0.2, "stretching_n_m": 50.0, "bending_n_m": 1e-5, "poisson": 0.3}
 

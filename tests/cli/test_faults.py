@@ -19,7 +19,7 @@ from diffcloud.io.simulated import write_simulated
 from tests.cli.invoke import DIFFCLOUD, environment, invoke, run_process
 from tests.cli.test_commands import SMALL
 from tests.conftest import small_lift
-from tests.fit.test_fit import clouds_of
+from tests.estimation.test_fit import clouds_of
 from tests.regressors.simulated import sagging_sheet
 
 ALONE = ("--params", "params.yaml", "--workers", 1)

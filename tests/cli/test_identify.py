@@ -18,14 +18,15 @@ import pytest
 import torch
 import yaml
 
+import diffcloud as dc
 from diffcloud.cli import fit_jobs, identify
 from diffcloud.cli.fit_jobs import FitJob
 from diffcloud.cli.preprocess import Cleaned, PreprocessJob
 from diffcloud.clouds import SurfaceSampler
 from diffcloud.errors import EpisodeError
-from diffcloud.fit import read_fit
-from diffcloud.fit.likelihood.descent import Descent
-from diffcloud.fit.result import read_motion
+from diffcloud.estimation import read_fit
+from diffcloud.estimation.likelihood.descent import Descent
+from diffcloud.estimation.result import read_motion
 from diffcloud.io.clouds import read_cloud, write_ply
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.raw_episodes import read_raw_episode
@@ -608,3 +609,18 @@ class TestProject:
 def test_a_recording_may_have_any_name(name):
     """Among the keys of recordings.yaml, where a number, a date or a word of YAML would be no name."""
     assert yaml.safe_load(f"{identify._inline(name)}:\n  a: 1") == {name: {"a": 1}}
+
+
+@pytest.mark.slow
+def test_the_library_finds_the_same(work):
+    """From the same folders to the last bit of the fit."""
+    told = invoke(*COMMAND, "--parameters", "stretch").result
+    recordings = [dc.load_recording(Path("recorded") / name) for name in ("first", "second")]
+    scenes = dc.find_scenes(recordings, size=SIZE, density=0.25)
+    settings = scenes[0].settings.model_copy(update={"parameters": ["stretch"]})
+    found = dc.fit(recordings, scenes, settings)
+    entry, estimate = told["parameters"]["stretch"], found.parameters["stretching"]
+    assert (estimate.value, *estimate.interval) == (entry["physical"], entry["low"], entry["high"])
+    assert [one.left_out.rms_mm for one in found.record.episodes] == [
+        one.left_out.rms_mm for one in read_fit(Path("found/fit.json")).episodes
+    ]

@@ -9,11 +9,11 @@ import pytest
 import yaml
 
 from diffcloud.errors import ConfigError
-from diffcloud.fit import read_fit
+from diffcloud.estimation import read_fit
 from diffcloud.io.episodes import write_episode
 from diffcloud.scene.scenarios import load_scenario
 from tests.cli.invoke import invoke
-from tests.fit.test_fit import clouds_of
+from tests.estimation.test_fit import clouds_of
 
 TRUTH = {"stretch": 0.6, "mass": 1.7}
 SCENARIO = {

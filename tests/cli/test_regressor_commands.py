@@ -26,7 +26,7 @@ from diffcloud.regressors.training import train_regressor
 from tests.cli.invoke import DIFFCLOUD, environment
 from tests.cli.test_commands import SMALL
 from tests.conftest import small_lift
-from tests.fit.test_fit import clouds_of
+from tests.estimation.test_fit import clouds_of
 from tests.regressors.simulated import sagging_sheet
 from tests.regressors.test_checkpoints import regressor
 

@@ -19,7 +19,7 @@ from diffcloud.io.episodes import write_episode
 from diffcloud.scene.scenarios import load_scenario
 from tests.cli.invoke import ROOT
 from tests.cli.test_likelihood import SCENARIO
-from tests.fit.test_fit import clouds_of
+from tests.estimation.test_fit import clouds_of
 
 pytestmark = pytest.mark.slow
 

@@ -17,7 +17,7 @@ from diffcloud.scene.scenarios import load_scenario
 from diffcloud.sensing.cameras import inverse
 from tests.cli.invoke import invoke
 from tests.docs.examples import Example, examples, read
-from tests.fit.test_fit import clouds_of
+from tests.estimation.test_fit import clouds_of
 from tests.io.test_recordings import bag
 from tests.sensing.charuco_scene import gripper_poses
 from tests.sensing.cloth_scene import INTRINSICS, views, write_cloth_episode

@@ -10,12 +10,12 @@ import pytest
 from scipy.stats import norm
 
 from diffcloud.errors import ConfigError
+from diffcloud.estimation import FitSpace
+from diffcloud.estimation.record import EstimateRecord, Followed
 from diffcloud.evaluation.intervals import intervals_of, significant
 from diffcloud.evaluation.summary import largest_sources
-from diffcloud.fit import FitSpace
-from diffcloud.fit.record import EstimateRecord, Followed
 from tests.conftest import small_lift
-from tests.fit.records import record_of
+from tests.estimation.records import record_of
 
 VALUES = {"stretch": 0.7, "mass": 1.0}
 SPACE = FitSpace.build(["stretch", "mass"], priors={"stretch": 10.0, "mass": 10.0})

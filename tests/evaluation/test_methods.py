@@ -8,6 +8,11 @@ import pytest
 import torch
 
 from diffcloud.errors import DivergedError
+from diffcloud.estimation import AdamSettings, CmaEsSettings, RandomSearchSettings, fit_adam, solve
+from diffcloud.estimation.batches import batch_losses, without_diverged
+from diffcloud.estimation.parameters import Variable
+from diffcloud.estimation.record import History
+from diffcloud.estimation.solvers import SOLVER_NAMES
 from diffcloud.evaluation.methods import (
     clipped,
     first_start,
@@ -18,14 +23,9 @@ from diffcloud.evaluation.methods import (
     single_start,
     space_of,
 )
-from diffcloud.fit import AdamSettings, CmaEsSettings, RandomSearchSettings, fit_adam, solve
-from diffcloud.fit.batches import batch_losses, without_diverged
-from diffcloud.fit.parameters import Variable
-from diffcloud.fit.record import History
-from diffcloud.fit.solvers import SOLVER_NAMES
 from diffcloud.sim.properties import one_set
+from tests.estimation.records import parameter_of, record_of
 from tests.evaluation.bowls import SPACE, Bowl
-from tests.fit.records import parameter_of, record_of
 
 
 def loss_of(bowl, values):

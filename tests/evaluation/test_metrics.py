@@ -11,14 +11,14 @@ import torch
 
 from diffcloud.clouds import NeighbourIndex, chamfer
 from diffcloud.errors import DivergedError
+from diffcloud.estimation import AdamSettings, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
+from diffcloud.estimation.record import History
+from diffcloud.estimation.result import describe_fit
 from diffcloud.evaluation import ComparisonSettings, EpisodeMeter, Estimate, Gap, compare_episode, loss_landscape
 from diffcloud.evaluation.metrics import success_threshold
-from diffcloud.fit import AdamSettings, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
-from diffcloud.fit.record import History
-from diffcloud.fit.result import describe_fit
 from diffcloud.io.episodes import Episode
 from tests.conftest import paper_objective, small_lift
-from tests.fit.test_fit import clouds_of
+from tests.estimation.test_fit import clouds_of
 
 TRUTH = {"stretch": 0.8, "mass": 1.5}
 OTHER = {"stretch": 4.0, "mass": 0.4}

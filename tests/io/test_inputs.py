@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from diffcloud.cli.config import load_config, updated
+from diffcloud.cli.config import load_config
 from diffcloud.errors import DiffCloudError, EpisodeError
 from diffcloud.io.arrays import read_npy, read_npz
 from diffcloud.io.clouds import read_cloud
@@ -32,6 +32,7 @@ from diffcloud.io.tables import numbers, read_csv
 from diffcloud.io.urdf import read_urdf
 from diffcloud.regressors import Regressor
 from diffcloud.scene.scenarios import load_scenario
+from diffcloud.settings import updated
 from tests.cli.invoke import environment
 
 READERS = {

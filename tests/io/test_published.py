@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from diffcloud.fit import Objective
-from diffcloud.fit.pose import default_priors
+from diffcloud.estimation import Objective
+from diffcloud.estimation.pose import default_priors
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.imports import release_episodes
 from diffcloud.io.published import RECORDED_START_M, RELEASE_UNIT_M, in_clouds_frame, read_trajectories, recorded_episode

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from diffcloud.errors import ConfigError, DiffCloudError, EpisodeError
-from diffcloud.fit.record import read_fit
+from diffcloud.estimation.record import read_fit
 from diffcloud.io import files, inputs, tables
 from diffcloud.io.arrays import read_npy, read_npz
 from diffcloud.io.files import read_json, read_yaml
@@ -191,7 +191,7 @@ class TestTables:
 
 
 def test_a_fit_whose_history_has_no_shape_is_refused(tmp_path):
-    from tests.fit.records import record_of
+    from tests.estimation.records import record_of
 
     told = record_of().plain()
     told["history"]["values"] = told["history"]["values"][:-1]

@@ -7,11 +7,11 @@ import re
 
 import numpy as np
 
-from diffcloud.fit.result import FittedMotion
+from diffcloud.estimation.result import FittedMotion
 from diffcloud.io.episodes import Episode
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.report import EpisodeEntry, build_page
-from tests.fit.records import record_of, recording_of
+from tests.estimation.records import record_of, recording_of
 
 _TRIANGLE = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 2)
 

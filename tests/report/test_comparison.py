@@ -8,8 +8,8 @@ from xml.etree import ElementTree
 
 import pytest
 
+from diffcloud.estimation.record import History
 from diffcloud.evaluation.summary import tables
-from diffcloud.fit.record import History
 from diffcloud.report import ComparisonEntry, comparison_figures
 from diffcloud.report.comparison import comparison_failures, comparison_overview
 from tests.evaluation.records import record, records

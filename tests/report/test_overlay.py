@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 
-from diffcloud.fit.pose import PoseSpace
-from diffcloud.fit.result import recorded_pose
+from diffcloud.estimation.pose import PoseSpace
+from diffcloud.estimation.result import recorded_pose
 from diffcloud.io.episodes import Episode
 from diffcloud.report import overlay_figure
 from diffcloud.report.overlay import Layer, Overlay, held_layers, recorded_layers, states_at
 from diffcloud.report.view import build_view, scene_layers, unposed_layer
 from diffcloud.scene.scenarios import load_scenario
-from tests.fit.records import recording_of
+from tests.estimation.records import recording_of
 from tests.report.pages import entry, overlays_of, page_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")

@@ -9,7 +9,7 @@ import subprocess
 
 import pytest
 
-from diffcloud.fit.record import FittedParameter
+from diffcloud.estimation.record import FittedParameter
 from tests.report.pages import entry, main_of, page_of
 
 NASTY = "<!--<script>alert(1)</script>&amp;\u2028'\""

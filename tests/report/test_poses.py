@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from diffcloud.fit.record import LeftOut, NuisanceValue
+from diffcloud.estimation.record import LeftOut, NuisanceValue
 from diffcloud.report.poses import poses_table
 from tests.report.pages import entry
 

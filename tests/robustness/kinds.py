@@ -18,8 +18,8 @@ import yaml
 from diffcloud.cli.config import load_config
 from diffcloud.cli.identify import find_scene
 from diffcloud.cli.report import table_rows
+from diffcloud.estimation import Objective, read_fit
 from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, check_file
-from diffcloud.fit import Objective, read_fit
 from diffcloud.io.calibrations import Calibration, CameraCalibration, read_calibration, write_calibration
 from diffcloud.io.clouds import import_open3d
 from diffcloud.io.files import read_json
@@ -32,7 +32,7 @@ from diffcloud.sensing.robot import Robot
 from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.cli.invoke import ROOT, environment
 from tests.conftest import small_lift
-from tests.fit.test_fit import clouds_of
+from tests.estimation.test_fit import clouds_of
 from tests.io.ros_bag import Bag, Habits
 from tests.scene.files import sheet_over_box, write_file, write_files
 from tests.sensing.table_scene import INTRINSICS, poses

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from diffcloud.errors import ConfigError
-from diffcloud.fit.result import physical_values
+from diffcloud.estimation.result import physical_values
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.sim.properties import PARAMETERS, check_values
 from tests.conftest import small_lift

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from diffcloud.errors import ConfigError
-from diffcloud.fit.record import NuisanceValue
-from diffcloud.fit.result import FittedMotion
+from diffcloud.estimation.record import NuisanceValue
+from diffcloud.estimation.result import FittedMotion
 from diffcloud.io.obj import read_cloth
 from diffcloud.mesh.shapes import grid_cloth
 from diffcloud.scene.load import load_scene
@@ -26,7 +26,7 @@ from diffcloud.simulators.export.write import TARGETS, write_export
 from diffcloud.simulators.problem import Sheet
 from diffcloud.simulators.problems import cantilever, strip
 from tests.conftest import small_lift
-from tests.fit.records import recording_of
+from tests.estimation.records import recording_of
 
 ISOTROPIC = {"density_kg_m2": 0.2, "stretching_n_m": 50.0, "bending_n_m": 1e-5, "poisson": 0.3}
 VALUES = {"stretch": 0.7, "mass": 1.3, "bending": 2.0, "damping": 0.01, "drag": 0.5, "friction_obstacle": 0.4}

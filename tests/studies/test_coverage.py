@@ -18,7 +18,7 @@ from studies.coverage_page import counted, counts_of, coverage_page
 from tests.cli.invoke import invoke
 from tests.cli.test_commands import SMALL as LIFT
 from tests.conftest import small_lift
-from tests.fit.test_fit import clouds_of
+from tests.estimation.test_fit import clouds_of
 from tests.regressors.test_checkpoints import regressor
 
 SMALL = {**LIFT, "recorder": "whole_surface"}

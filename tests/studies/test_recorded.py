@@ -6,7 +6,7 @@ import pytest
 
 from diffcloud.errors import ConfigError
 from studies import recorded as study
-from tests.fit.records import parameter_of, record_of, recording_of
+from tests.estimation.records import parameter_of, record_of, recording_of
 
 
 def fit(name, stretch, rms=8.0, **changes):

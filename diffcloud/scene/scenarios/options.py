@@ -49,7 +49,8 @@ class ScenarioOptions(Checked):
     """The part of its stretching stiffness with which the cloth resists compression in its plane. Fabric wrinkles instead,
     finer than most meshes (docs/physics.md, wrinkles)."""
     doubts: dict[str, Annotated[float, Field(gt=1, le=MOST_DOUBT)]] = Field(default_factory=dict)
-    """Material that is known less well, or better, than usual: parameter -> factor of one deviation (`fit.doubts`)."""
+    """Material that is known less well, or better, than usual: parameter -> factor of one deviation
+    (`estimation.doubts`)."""
     path: Keyframes
     """The gripper's displacement."""
     frames: Annotated[int, Field(ge=1, le=100_000)] = 25

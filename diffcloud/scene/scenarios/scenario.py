@@ -53,10 +53,10 @@ class Scenario:
     """Overrides of the parameters' own bounds."""
     recorder: Recorder = "depth_cameras"
     doubts: Mapping[str, float] = field(default_factory=dict)
-    """Material -> factor of one deviation, where it is known less well, or better, than usual (`fit.doubts`)."""
+    """Material -> factor of one deviation, where it is known less well, or better, than usual (`estimation.doubts`)."""
     laid: Mapping[str, float] = field(default_factory=dict)
     """How far the cloth's start, its size and the gripper's path may be off, which fits find: `turn` [rad], `shape` [m],
-    `size` and `track` [1] (`fit.laid`) -> standard deviation."""
+    `size` and `track` [1] (`estimation.laid`) -> standard deviation."""
     regrip: Callable[[float], Scenario] | None = None
     """The same with a grasp so many standard deviations larger; None: its size is known."""
 

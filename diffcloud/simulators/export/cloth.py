@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from diffcloud.errors import ConfigError, DivergedError
-from diffcloud.fit.pose import PoseSpace
-from diffcloud.fit.record import RecordingFit
-from diffcloud.fit.result import FittedMotion, recorded_pose
+from diffcloud.estimation.pose import PoseSpace
+from diffcloud.estimation.record import RecordingFit
+from diffcloud.estimation.result import FittedMotion, recorded_pose
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.scene.description import Scene
 from diffcloud.scene.scenarios import Scenario

@@ -1,0 +1,103 @@
+"""One set of parameters for several recordings of one cloth, which may show different motions.
+
+How noisy a recording is, and how well the simulator can explain it, is not known beforehand and differs from one to the
+next. With a variance of its own for each, the likelihood of all is highest where the geometric mean of their losses is
+lowest:
+
+    loss = (∏ loss_i)^(1/n)
+
+so that each weighs by its own misfit, and a part gained in one counts as much as in another. The paper's measure takes the
+plain mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from diffcloud.errors import ConfigError
+from diffcloud.estimation.names import of_recording
+from diffcloud.estimation.objective import Objective
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.properties import PARAMETERS
+from diffcloud.sim.threads import map_threads
+
+_TINY = 1e-300
+_SAME = 1e-6
+
+
+class JointObjective:
+    """Losses of a batch of parameter sets on several recordings."""
+
+    def __init__(self, members: Sequence[Objective]) -> None:
+        """
+        Raises:
+            ConfigError: of different measures or length units, or of cloths that parameters do not mean the same in.
+        """
+        self.members = tuple(members)
+        self.paper = members[0].paper
+        if any(one.paper != self.paper for one in members):
+            raise ConfigError("A joint fit compares all recordings in one measure: the paper's, or the default one.")
+        for one in members[1:]:
+            check_same_cloth(members[0].scenario, one.scenario)
+
+    @property
+    def length_unit_m(self) -> float:
+        return self.members[0].length_unit_m
+
+    def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Losses [B], as of `Objective`.
+
+        Args:
+            parameters: name -> [B]; what is one recording's own is named as `estimation.names` says.
+        """
+        own = [(one, of_recording(parameters, index)) for index, one in enumerate(self.members)]
+        return mean_loss(torch.stack(map_threads(lambda pair: pair[0](pair[1]), own)), paper=self.paper)
+
+    def earliest(self, counts: Sequence[int]) -> JointObjective:
+        """As of `Objective`, with a count for each."""
+        return JointObjective([one.earliest([count]) for one, count in zip(self.members, counts, strict=True)])
+
+    def reseed(self, seed: int) -> None:
+        """Draw the common random numbers anew."""
+        for one in self.members:
+            one.reseed(seed)
+
+
+AnyObjective = Objective | JointObjective
+"""What a solver minimises: `members`, losses of parameters, `reseed`."""
+
+
+def mean_loss(losses: Tensor, *, paper: bool) -> Tensor:
+    """[n, B] of n recordings -> [B]."""
+    return losses.mean(0) if paper or len(losses) == 1 else losses.clamp(min=_TINY).log().mean(0).exp()
+
+
+def check_same_cloth(first: Scenario, other: Scenario) -> None:
+    """
+    Raises:
+        ConfigError: a multiplier does not mean the same in both; says which, and what it is in each.
+    """
+    for told, one, two in (
+        ("are in length units of", first.length_unit_m, other.length_unit_m),
+        ("move mass and stiffness of nodes", _sets(first), _sets(other)),
+        ("have a compression of", first.scene.material.compression, other.scene.material.compression),
+    ):
+        if one != two:
+            raise ConfigError(f"A joint fit is of one cloth: {first.name} and {other.name} {told} {one} and {two}.")
+    for parameter in PARAMETERS.values():
+        if parameter.basis in ("stretching", "shear", "bending", "density"):
+            values = first.scene.basis(parameter.basis), other.scene.basis(parameter.basis)
+            unit = "" if parameter.unit == "–" else f" {parameter.unit}"
+            if abs(values[0] - values[1]) > _SAME * max(values):
+                raise ConfigError(
+                    f"A joint fit is of one cloth, whose {parameter.name} = 1 means {values[0]:g}{unit} in "
+                    f"{first.name} and {values[1]:g} in {other.name}. Give both scenarios the same material."
+                )
+
+
+def _sets(scenario: Scenario) -> dict[str, int]:
+    """Parameter -> how many nodes it acts on, of those that act on a part of the cloth."""
+    return {name: len(nodes) for name, nodes in scenario.node_sets.items()}

@@ -1,0 +1,213 @@
+"""A descent of Φ from one start, and what is known where it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffcloud.errors import DivergedError
+from diffcloud.estimation.bounded import lowest_within
+from diffcloud.estimation.laid import asked_as
+from diffcloud.estimation.likelihood.energy import Likelihood, Terms
+from diffcloud.estimation.likelihood.frames import squared
+from diffcloud.estimation.likelihood.grasp import in_powers
+from diffcloud.estimation.likelihood.recording import Changes, Linear
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.threads import map_threads
+
+_RADIUS = 1.0
+"""Of a step, in each variable."""
+_SMALL = 0.25
+"""A step this small ends a descent, in standard deviations."""
+_FEWEST_STEPS = 3
+"""Of a descent."""
+_RISE = 0.02
+"""By which Φ may rise, for each independent residual."""
+_HALVINGS = 3
+_REFRESH = 1.0
+"""Standard deviations after which the finer mesh is simulated anew."""
+_NARROW = 0.05
+"""Least bound on a step, where a start diverges or rises."""
+_GAINS, _BEHIND = 3.0, 20.0
+"""A start ends where so many times what its next step promises would leave its Φ so far above the best."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Where one start ended."""
+
+    place: Tensor
+    """[K] variables of the space on their axis; then the pose of each recording and, last, the size of the grasp where it
+    is not known, in deviations of their priors."""
+    covariance: Tensor
+    """[K, K]"""
+    sources: Mapping[str, Tensor]
+    """Source -> its part of the covariance [K, K]."""
+    energy: float
+    """Φ"""
+    converged: bool
+    misfits: tuple[list[float], ...]
+    """Of each recording, c of its frames."""
+    apart_m: tuple[list[float], ...]
+    """Of each recording, how far the finer mesh is in its frames, RMS over the nodes."""
+    trace: tuple[tuple[float, Tensor], ...]
+    """Mean squared distance and place at each step."""
+
+
+@dataclass(frozen=True)
+class Reached:
+    """The last place of a descent that counts."""
+
+    place: Tensor
+    linear: list[Linear]
+    terms: Terms
+
+    @property
+    def energy(self) -> float:
+        return self.terms.energy
+
+
+class Descent:
+    """From one start."""
+
+    def __init__(self, likelihood: Likelihood, place: Tensor, tell: Callable[[int, float, Tensor], None]) -> None:
+        """
+        Args:
+            tell: takes step, mean squared distance, and place.
+        """
+        self.of, self.place, self._tell = likelihood, place, tell
+        self.reached: Reached | None = None
+        self._trace: list[tuple[float, Tensor]] = []
+
+    def run(self, to_beat: float) -> Answer | None:
+        """Where it ends; None where it falls behind.
+
+        Args:
+            to_beat: Φ of a better answer.
+        """
+        of, place, radius, tried = self.of, self.place, _RADIUS, 0
+        allowed = _RISE * sum(one.independent * len(one.objective.frames) for one in of.recordings)
+        for _ in range(of.iterations):
+            best = self.reached
+            try:
+                linear = self._linear(place)
+            except DivergedError:
+                if best is None:
+                    raise
+                place, radius = 0.5 * (place + best.place), max(0.5 * radius, _NARROW)
+                continue
+            if of.looked is None:
+                self._look(linear, place)
+            terms = self._terms(linear, place)
+            if best is not None and terms.energy > best.energy + allowed:
+                tried += 1
+                if tried > _HALVINGS:
+                    break
+                place, radius = 0.5 * (place + best.place), max(0.5 * radius, _NARROW)
+                continue
+            tried = 0
+            step = self._step(terms, place, radius)
+            if bool((step[of.asked].abs() < radius).all()) and self._stale(terms, place):  # on its way it need not know
+                self._look(linear, place)
+                terms = self._terms(linear, place)
+                step = self._step(terms, place, radius)
+            self.reached = Reached(place, linear, terms)
+            self._trace.append((terms.square, place))
+            self._tell(len(self._trace), terms.square, place)
+            if len(self._trace) >= _FEWEST_STEPS:
+                if bool((step.abs() < _SMALL * terms.deviations).all()):
+                    return self.answer(converged=True)
+                gain = -float(2 * terms.slope @ step + step @ terms.matrix @ step)
+                if terms.energy - _GAINS * gain > to_beat + _BEHIND:
+                    return None
+            place, radius = of.inside(place + step), min(1.5 * radius, _RADIUS)
+        return self.answer(converged=False)
+
+    def _step(self, terms: Terms, place: Tensor, radius: float) -> Tensor:
+        box = torch.full_like(place, radius)
+        low, high = torch.maximum(-box, self.of.low - place), torch.minimum(box, self.of.high - place)
+        return lowest_within(terms.matrix, terms.slope, low, high)
+
+    def _linear(self, place: Tensor) -> list[Linear]:
+        self.of.simulations += len(self.of.recordings)
+        return map_threads(lambda one: Linear.at(one, place), self.of.recordings)
+
+    def _stale(self, terms: Terms, place: Tensor) -> bool:
+        """Whether the finer mesh was last simulated too far away."""
+        assert self.of.looked is not None
+        away = (place - self.of.looked).abs() / terms.deviations
+        return bool((away[self.of.asked] > _REFRESH).any())
+
+    def _look(self, linear: Sequence[Linear], place: Tensor) -> None:
+        """Simulate the finer mesh here, and another grasp."""
+        self.of.looked = place
+
+        def look(one: Linear, old: Changes) -> Changes:
+            finer = self._changed(one, place, one.recording.finer) if one.recording.model_error else None
+            grips = [self._changed(one, place, other) for other in one.recording.regripped]
+            return Changes(old.finer if finer is None else finer, in_powers(grips) or old.grip)
+
+        self.of.changes = map_threads(lambda pair: look(*pair), [*zip(linear, self.of.changes, strict=True)])
+
+    def _changed(self, one: Linear, place: Tensor, variant: Scenario) -> Tensor | None:
+        """By how much a variant of the scenario moves the nodes; None where it diverges."""
+        self.of.simulations += 1
+        try:
+            return one.recording.change(place, one.nodes, variant)
+        except DivergedError:
+            return None
+
+    def _terms(self, linear: Sequence[Linear], place: Tensor) -> Terms:
+        of, squares = self.of, list[float]()
+        off = of.off_centre(place)
+        energy, slope, matrix = float((of.precision * off.square()).sum()), of.precision * off, torch.diag(of.precision)
+        for one, changes in zip(linear, self.of.changes, strict=True):
+            frames, n, columns = one.frames(place, changes), one.recording.independent, one.recording.columns
+            energy += n * frames.energy()
+            weights = n * frames.weights
+            slope[columns] += torch.einsum("wl,wlk->k", weights, frames.slopes)
+            matrix[columns[:, None], columns] += torch.einsum("wl,wlab->ab", weights, frames.curvatures)
+            squares.append(float(frames.squares.mean()))
+        return Terms(energy, slope, matrix, float(np.mean(squares)))
+
+    def answer(self, *, converged: bool) -> Answer:
+        """Of the place that was reached."""
+        assert self.reached is not None
+        place, terms, of = self.reached.place, self.reached.terms, self.of
+        covariance = terms.covariance
+        precision = torch.diag(of.precision)
+        sources = {"recording": covariance @ (terms.matrix - precision) @ covariance}
+        for index, variable in enumerate(of.space.variables):
+            name = asked_as(variable.name) if variable.doubtful else "prior"
+            part = of.precision[index] * torch.outer(covariance[index], covariance[index])
+            sources[name] = sources[name] + part if name in sources else part
+        poses = covariance[len(of.space.names) : len(of.space.names) + of.poses]
+        sources["pose"] = poses.T @ poses
+        if not of.knows_grip:
+            sources["grasp"] = torch.outer(covariance[-1], covariance[-1])
+        sources |= {name: torch.zeros_like(covariance) for name in ("mesh", "time step")}
+        misfits, apart = [], []
+        for one, known in zip(self.reached.linear, self.of.changes, strict=True):
+            recording, shift = one.recording, known.finer
+            changes = dict[str, Tensor | None]()
+            if recording.model_error:
+                stepped = recording.objective.scenario.with_steps(2)
+                changes = {"mesh": None if shift is None else shift / 2, "time step": self._changed(one, place, stepped)}
+            frames = one.frames(place, known)
+            weights = recording.independent * frames.weights
+            for name, change in changes.items():
+                if change is not None:
+                    pulled = torch.einsum("wl,wlk->k", weights, one.frames(place, known, change).shifted)
+                    moved = covariance[:, recording.columns] @ pulled
+                    sources[name] = sources[name] + torch.outer(moved, moved)
+            misfits.append(frames.misfits.tolist())
+            away = torch.zeros(len(frames.misfits)).double() if shift is None else squared(shift).sqrt()
+            apart.append((away * recording.objective.length_unit_m).tolist())
+        total = torch.stack([*sources.values()]).sum(0)
+        return Answer(
+            place, total, sources, self.reached.energy, converged, tuple(misfits), tuple(apart), tuple(self._trace)
+        )

@@ -1,0 +1,143 @@
+"""Φ of all recordings, over the variables of the space, the poses, and the size of the grasp."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from diffcloud.estimation.likelihood.frames import squared
+from diffcloud.estimation.likelihood.grasp import gripped
+from diffcloud.estimation.likelihood.recording import Changes, Recording
+from diffcloud.estimation.likelihood.settings import LikelihoodSettings
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
+from diffcloud.estimation.residuals import Axis
+from diffcloud.sim.threads import map_threads
+
+_PART_M, _GONE_M = 0.004, 0.010
+"""Difference to the finer mesh, RMS over the nodes, at which the horizon is: after `_LEAST_S`, and before it."""
+_LEAST_S = 1.2
+"""A first guess of the material may part too early."""
+_FAR = 100.0
+"""Bound on a pose, in deviations."""
+_FAR_GRIP = 2.0
+"""And on the size of a grasp: what it changes is known in between -1 and 1."""
+_EDGE = 1e-6
+"""Distance from a bound, where nothing would pull back."""
+
+
+class Likelihood:
+    """Φ of all recordings."""
+
+    def __init__(
+        self, objectives: Sequence[Objective], space: FitSpace, settings: LikelihoodSettings, grip: float = 0.0
+    ) -> None:
+        """
+        Args:
+            grip: of the scenarios, in deviations from the size that was given.
+        """
+        self.space, self.axis, self.iterations = space, Axis.of(space), settings.iterations
+        self.recordings, self.simulations, self.grip = list[Recording](), 0, grip
+        variables = count = len(space.names)
+        last = variables + sum(len(one.pose_space.names) for one in objectives)
+        for index, objective in enumerate(objectives):
+            own, columns = space.of_recording(index)
+            self.recordings.append(Recording(objective, own, columns, count, last, model_error=settings.model_error))
+            count += len(objective.pose_space.names)
+        asked = [index for index, one in enumerate(space.variables) if not one.doubtful]
+        self.asked = torch.tensor(asked, dtype=torch.long)
+        self.changes = [Changes() for _ in self.recordings]
+        self.looked: Tensor | None = None
+        """Where these were last found."""
+        self.knows_grip = not any(one.regripped for one in self.recordings)
+        self.poses = count - variables
+        steps, poses = space.prior_steps(), torch.ones(self.poses + (not self.knows_grip), dtype=torch.float64)
+        self.precision = torch.cat([torch.where(steps > 0, 1 / steps.square(), 0.0), poses])
+        low, high = self.axis.ends
+        far = _FAR * poses
+        far[self.poses :] = _FAR_GRIP
+        self.low, self.high = torch.cat([low + _EDGE, -far]), torch.cat([high - _EDGE, far])
+        centres = [0.0 if one.deviation is not None else one.centre for one in space.variables]
+        self.centre = torch.cat([self.axis.places(torch.tensor(centres, dtype=torch.float64)), 0 * poses])
+        self.centre[count:] = -grip
+
+    @property
+    def frames(self) -> int:
+        """Compared, of all recordings."""
+        return sum(len(one.objective.frames) for one in self.recordings)
+
+    def inside(self, place: Tensor) -> Tensor:
+        return torch.minimum(torch.maximum(place, self.low), self.high)
+
+    def off_centre(self, place: Tensor) -> Tensor:
+        return torch.where(self.precision > 0, place - self.centre, 0.0)
+
+    def horizons(self, place: Tensor) -> tuple[int, ...]:
+        """Of each recording, how many of its frames come before the finer mesh parts from the given one."""
+
+        def one(recording: Recording) -> int:
+            change = recording.change(place, recording.nodes(place), recording.finer)
+            apart = squared(change).sqrt() * recording.objective.length_unit_m
+            times, order = recording.objective.times.sort(stable=True)
+            gone = torch.nonzero(apart[order] > torch.where(times > _LEAST_S, _PART_M, _GONE_M))
+            return max(int(gone[0]), 1) if len(gone) else len(apart)
+
+        self.simulations += 2 * len(self.recordings)
+        return tuple(map_threads(one, self.recordings))
+
+    def start(self, init: Mapping[str, float], offset: float) -> Tensor:
+        """[K] these values, else the centres of the priors, and with the first variable so far off on its axis."""
+        place = self.centre.clone()
+        for index, name in enumerate(self.space.names):
+            if name in init:
+                place[index] = self.axis.places(torch.full((len(self.space.names),), init[name]).double())[index]
+        place[0] += offset
+        place[len(self.space.names) :] = 0.0
+        return self.inside(place)
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Φ at a place, and how it changes."""
+
+    energy: float
+    slope: Tensor
+    """[K] half of it."""
+    matrix: Tensor
+    """[K, K] half of the Gauss–Newton matrix."""
+    square: float
+    """Mean squared distance."""
+
+    @cached_property
+    def covariance(self) -> Tensor:
+        return torch.linalg.inv(self.matrix)
+
+    @property
+    def deviations(self) -> Tensor:
+        return self.covariance.diagonal().sqrt()
+
+
+def up_to_horizon(
+    members: Sequence[Objective],
+    space: FitSpace,
+    settings: LikelihoodSettings,
+    grip: float = 0.0,
+    place: Tensor | None = None,
+) -> Likelihood:
+    """Of the frames that count.
+
+    Args:
+        grip: in deviations from the size that was given.
+        place: where the horizon is looked for; by default where the first start begins.
+    """
+    members = gripped(members, grip)
+    whole = Likelihood(members, space, settings, grip)
+    horizons = whole.horizons(whole.start(settings.init, 0.0) if place is None else place)
+    known = [one.earliest([count]) for one, count in zip(members, horizons, strict=True)]
+    found = Likelihood(known, space, settings, grip)
+    found.simulations = whole.simulations
+    return found

@@ -1,0 +1,162 @@
+"""Descents from several starts, weighed by their likelihoods."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloud.errors import DivergedError
+from diffcloud.estimation.joint import AnyObjective
+from diffcloud.estimation.likelihood.descent import Answer, Descent
+from diffcloud.estimation.likelihood.energy import Likelihood, up_to_horizon
+from diffcloud.estimation.likelihood.grasp import gripped, known, that_fits
+from diffcloud.estimation.likelihood.settings import LikelihoodSettings
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
+from diffcloud.estimation.residuals import Axis
+
+_START = math.log(4.5)
+"""Between starts, in the logarithm of the stretching."""
+_REGRIP = 0.3
+"""From there on, it is simulated with the size that the first start has found."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A fit of one or several recordings."""
+
+    space: FitSpace
+    answers: tuple[Answer, ...]
+    """Of all starts that were followed to their end, the likeliest first."""
+    members: tuple[Objective, ...]
+    """The recordings up to their horizons, with the grasp that was found."""
+    grip: float | None
+    """Of these, in deviations from the size that was given; None: it is known."""
+    simulations: int
+    interrupted: bool = False
+
+    @property
+    def best(self) -> Answer:
+        return self.answers[0]
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """[A] of the answers, by their likelihoods."""
+        energies = np.array([one.energy for one in self.answers])
+        found = np.exp(-0.5 * (energies - energies.min()))
+        return np.asarray(found / found.sum())
+
+    @property
+    def mean(self) -> Tensor:
+        """[K] of the mixture of all answers."""
+        return torch.from_numpy(self.weights) @ torch.stack([one.place for one in self.answers])
+
+    @property
+    def sources(self) -> dict[str, Tensor]:
+        """Source -> its part of the mixture's covariance [K, K]; `starts` is what the answers differ by."""
+        apart, mean = torch.zeros_like(self.best.covariance), self.mean
+        found = {name: torch.zeros_like(apart) for name in self.best.sources}
+        for weight, one in zip(self.weights.tolist(), self.answers, strict=True):
+            apart += weight * torch.outer(one.place - mean, one.place - mean)
+            for name, part in one.sources.items():
+                found[name] += weight * part
+        return {**found, "starts": apart}
+
+    @property
+    def covariance(self) -> Tensor:
+        """[K, K] of the mixture."""
+        return torch.stack([*self.sources.values()]).sum(0)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Of the likeliest answer."""
+        axis = Axis.of(self.space)
+        return dict(zip(self.space.names, axis.bounded(self.best.place[: len(self.space.names)]).tolist(), strict=True))
+
+
+@torch.no_grad()
+def estimate(
+    objective: AnyObjective,
+    space: FitSpace,
+    settings: LikelihoodSettings,
+    *,
+    progress: Callable[[int, int, float, dict[str, float]], None] | None = None,
+) -> Estimate:
+    """The parameters that recordings show, by the rules at the head of this module. Ctrl-C ends the fit and keeps the best
+    so far.
+
+    Args:
+        objective: of the recordings, with the frames that may count.
+        space: variables and their priors.
+        progress: takes the number of the start, the step, the mean squared distance and the values.
+
+    Raises:
+        DivergedError: the motion diverges from every start.
+        KeyboardInterrupt: before the first place was compared.
+    """
+    likelihood = up_to_horizon(objective.members, space, settings)
+    answers, failures, descent = list[Answer](), list[DivergedError](), None
+
+    def follow(number: int, place: Tensor, likelihood: Likelihood, to_beat: float = math.inf) -> Answer | None:
+        nonlocal descent
+
+        def tell(step: int, square: float, place: Tensor) -> None:
+            if progress is not None:
+                values = likelihood.axis.values(place[: len(space.names)]).tolist()
+                progress(number, step, square, dict(zip(space.names, values, strict=True)))
+
+        descent = Descent(likelihood, place, tell)
+        try:
+            return descent.run(to_beat)
+        except DivergedError as error:
+            failures.append(error)
+            return None
+
+    interrupted, simulations = False, 0
+    try:
+        for number in range(settings.starts):
+            away = _START * ((number + 1) // 2) * (1 if number % 2 else -1)
+            lowest = min((one.energy for one in answers), default=math.inf)
+            found = follow(number, likelihood.start(settings.init, away), likelihood, lowest)
+            off = 0.0
+            if number == 0 and found is not None and not likelihood.knows_grip:
+                off = that_fits(objective.members, float(found.place[-1]))
+            if found is not None and abs(off) > _REGRIP:
+                simulations += likelihood.simulations
+                place = torch.cat([found.place[:-1], torch.zeros(1, dtype=torch.float64)])
+                likelihood = up_to_horizon(objective.members, space, settings, off, place)
+                found = follow(number, place, likelihood)
+            if found is not None:
+                answers.append(found)
+        every = sum(len(one.frames) for one in objective.members)
+        if answers and not settings.model_error and likelihood.frames < every:
+            best = min(answers, key=lambda one: one.energy)
+            whole = Likelihood(objective.members, space, settings)
+            found = follow(settings.starts, best.place, whole)
+            if found is not None and found.converged:
+                simulations, likelihood, answers = simulations + likelihood.simulations, whole, [found]
+    except KeyboardInterrupt:
+        interrupted = True
+        if not answers:
+            if descent is None or descent.reached is None:
+                raise
+            answers.append(descent.answer(converged=False))
+            likelihood = descent.of
+    if not answers:
+        raise failures[0]
+    answers.sort(key=lambda one: one.energy)
+    simulations += likelihood.simulations
+    if likelihood.knows_grip:
+        members, grip = [one.objective for one in likelihood.recordings], None
+    else:
+        grip = that_fits(objective.members, likelihood.grip + float(answers[0].place[-1]))
+        counts = [len(one.objective.frames) for one in likelihood.recordings]
+        found_so = [known(one) for one in gripped(objective.members, grip)]
+        members = [one.earliest([count]) for one, count in zip(found_so, counts, strict=True)]
+    return Estimate(space, tuple(answers), tuple(members), grip, simulations, interrupted)

@@ -1,0 +1,55 @@
+"""Random search: independent draws, uniform on the axis of `residuals.Axis`; what any other method must be better than."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloud.estimation.joint import AnyObjective
+from diffcloud.estimation.parameters import FitSpace
+from diffcloud.estimation.solvers.outcome import FitOutcome, Progress
+from diffcloud.estimation.solvers.search import SearchSettings, search
+
+_BATCH = 16
+"""Draws simulated together: enough for the threads of a common machine, few enough to stop soon below a threshold."""
+
+
+@dataclass(frozen=True)
+class RandomSearchSettings(SearchSettings):
+    """Of one random search."""
+
+
+def fit_random_search(
+    objective: AnyObjective,
+    space: FitSpace,
+    settings: RandomSearchSettings,
+    *,
+    progress: Callable[[Progress], None] | None = None,
+) -> FitOutcome:
+    """The best of the first parameter set and of draws, which are log-uniform where the lower bound is positive.
+
+    Ctrl-C ends the fit and keeps the best so far. A larger budget begins with the draws of a smaller one.
+
+    Raises:
+        DivergedError: every draw diverged.
+        KeyboardInterrupt: interrupted before the first loss.
+    """
+    return search(objective, space, settings, lambda first: _Draws(len(first), settings.seed), progress=progress)
+
+
+class _Draws:
+    """Independent of the losses."""
+
+    converged = False
+
+    def __init__(self, variables: int, seed: int) -> None:
+        self._variables, self._generator = variables, np.random.default_rng(seed)
+
+    def ask(self) -> NDArray[np.float64]:
+        return self._generator.random((_BATCH, self._variables))
+
+    def tell(self, losses: NDArray[np.float64]) -> None:
+        pass

@@ -1,0 +1,331 @@
+"""One episode as the loss takes it: which frames, which points, and the gripper's track."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffcloud.clouds.neighbours import NeighbourIndex
+from diffcloud.errors import EpisodeError
+from diffcloud.estimation.pose import ONE_CLOCK, PoseSpace, clocks_of
+from diffcloud.io.episodes import Episode
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.simulate import rollout
+from diffcloud.sim.system import System
+
+_CUT_M = 0.002
+"""If the lowest points lie so far above the lowest node of the cloth at its start, the recording was cut there."""
+_LOWEST = 0.005
+"""Part of the recorded points that may lie below the cut: noise."""
+_USABLE, _NEARLY, _TOO_LITTLE = 0.5, 0.8, 0.05
+"""Part of the cloth above the cut in a frame that counts; where no frame has it, this part of the most that any has; and
+what is too little in any case."""
+_MOST = 30
+"""Usable frames that are compared where none are named: neighbours in a quick recording say nearly the same."""
+_OUT_OF_REACH = 1e9
+_UNSURE_M = 0.005
+"""A recorded point whose depth is so uncertain counts half."""
+
+
+@dataclass(frozen=True)
+class LostPixels:
+    """Where one camera could not have seen the cloth: in lost pixels, and in those beside them, which show a place that is
+    half lost. (In a lift with the right parameters, the one point in eighty that lay there made up half of the loss.)"""
+
+    T_camera_scene: Tensor
+    """[3, 4]"""
+    lens: Tensor
+    """[2, 2] (fx, fy) and (cx, cy)."""
+    pixels: Tensor
+    """bool [L, H, W]"""
+
+    def blind(self, points: Tensor) -> Tensor:
+        """bool [B, L, N] of points [B, L, N, 3] in the recording's frame: behind the camera, beside its image, or in a lost
+        pixel."""
+        frames, height, width = self.pixels.shape
+        x, y, z = (points @ self.T_camera_scene[:, :3].T + self.T_camera_scene[:, 3]).unbind(-1)
+        (fx, fy), (cx, cy) = self.lens.tolist()
+        depth = z.clamp(min=1e-9)
+        column, row = (fx * x / depth + cx).round(), (fy * y / depth + cy).round()
+        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)  # no number is not inside
+        place = torch.where(inside, row * width + column, 0.0).long() + torch.arange(frames)[:, None] * height * width
+        return ~inside | self.pixels.flatten()[place]
+
+
+@dataclass(frozen=True)
+class Target:
+    """One episode in the loss; L frames."""
+
+    frames: tuple[int, ...]
+    """[L] numbers of the episode's frames."""
+    times: Tensor
+    """[L] [s]"""
+    clouds: tuple[NeighbourIndex, ...]
+    """[L] of all cameras."""
+    views: tuple[tuple[NeighbourIndex, ...], ...]
+    """[C][L] what was recorded by each clock of `space`; where that is nothing, a point out of reach."""
+    sure: tuple[tuple[Tensor, ...], ...]
+    """[C][L] how much each of its points counts; nothing where it recorded nothing."""
+    cut: float | None
+    """Height below which nothing was recorded."""
+    viewpoints: Tensor | None
+    """[cameras, 3], in the recording's frame; None where they are not known."""
+    lost: tuple[LostPixels, ...]
+    """What each of these cameras lost; empty where that is not known."""
+    planes: Tensor | None
+    """[cameras, 4] (a, b, c, d) in the recording's frame: each camera's points with a x + b y + c z < d were removed; None
+    where nothing was."""
+    watching: tuple[list[int], ...]
+    """[C] which of these cameras go by each clock."""
+    space: PoseSpace
+    track: Tensor | None
+    """[1, S, G, 3] displacement of the grippers."""
+
+    def blind(self, cameras: Sequence[int], points: Tensor) -> Tensor | None:
+        """bool [B, L, N, C] which of these cameras could not have recorded points [B, L, N, 3] in the recording's frame,
+        whatever stands before them; None if that is not known."""
+        if not self.lost and self.planes is None:
+            return None
+        found = torch.zeros(*points.shape[:-1], len(cameras), dtype=torch.bool)
+        if self.lost:
+            found |= torch.stack([self.lost[camera].blind(points) for camera in cameras], dim=-1)
+        if self.planes is not None:
+            planes = self.planes[list(cameras)]
+            found |= points @ planes[:, :3].T < planes[:, 3]
+        return found
+
+    def at(self, chosen: Sequence[int]) -> Target:
+        """The same with some of its frames, by their places among these."""
+        chosen = list(chosen)
+        first = chosen == list(range(len(chosen)))
+        index = slice(len(chosen)) if first else chosen  # a slice is a view: lost pixels are many to copy
+        return replace(
+            self,
+            frames=tuple(self.frames[one] for one in chosen),
+            times=self.times[index],
+            clouds=tuple(self.clouds[one] for one in chosen),
+            views=tuple(tuple(view[one] for one in chosen) for view in self.views),
+            sure=tuple(tuple(sure[one] for one in chosen) for sure in self.sure),
+            lost=tuple(replace(one, pixels=one.pixels[index]) for one in self.lost),
+        )
+
+
+def read_target(
+    scenario: Scenario,
+    system: System,
+    episode: Episode,
+    named: Sequence[int] | None,
+    *,
+    whole: bool,
+    nuisance: Mapping[str, float],
+) -> Target:
+    """
+    Args:
+        named: frames to compare, negative ones counted from the end; None for every usable one.
+        whole: whether all of a recording counts; else it is looked for a height below which nothing was recorded, and for
+            where the cameras stood and when they looked.
+        nuisance: variables of the pose with the deviations of their priors [m, rad, s].
+
+    Raises:
+        EpisodeError: a frame that the episode lacks, one after the end of the simulation, none that is usable, other
+            grippers than the scene's, viewpoints that are no positions, cut planes that are no planes, or clocks of other
+            cameras.
+        ConfigError: an unknown variable of the pose.
+    """
+    unit = scenario.length_unit_m
+    clocks = ONE_CLOCK if whole else clocks_of(episode)
+    track = None
+    if episode.gripper is not None:
+        moved = track_displacement(episode, system.handles.grippers, scenario.steps, system.time_step)
+        track = torch.as_tensor(moved, dtype=torch.float64)[None]
+    height = None if whole else _found_cut(system, episode, unit)
+    frames = (
+        _spread(_usable(scenario, system, episode, track, height, max(clocks.values())))
+        if named is None
+        else list(dict.fromkeys(_checked(scenario, episode, frame) for frame in named))
+    )
+    clouds = tuple(NeighbourIndex(torch.as_tensor(episode.frame(frame), dtype=torch.float64)) for frame in frames)
+    views, sure = [clouds], [tuple(_sure(episode, frame) for frame in frames)]
+    watching = [[] if whole else list(range(len(episode.viewpoints)))]
+    if clocks is not ONE_CLOCK:
+        views, sure = map(list, zip(*(_of_camera(episode, frames, camera) for camera in range(len(clocks))), strict=True))
+        watching = _watching(episode)
+    centre = torch.as_tensor(episode.points.mean(0, dtype=np.float64))  # of all frames, so that a pose holds for others too
+    return Target(
+        tuple(frames),
+        torch.as_tensor(episode.times[frames], dtype=torch.float64),
+        clouds,
+        tuple(views),
+        tuple(sure),
+        height,
+        None if whole or not episode.viewpoints else torch.from_numpy(np.stack(list(episode.viewpoints.values()))),
+        () if whole else _lost(episode, frames),
+        None if whole else _planes(episode),
+        tuple(watching),
+        PoseSpace.build(nuisance, centre, length_unit_m=unit, clocks=clocks),
+        track,
+    )
+
+
+def _of_camera(
+    episode: Episode, frames: Sequence[int], camera: int
+) -> tuple[tuple[NeighbourIndex, ...], tuple[Tensor, ...]]:
+    """What one camera recorded in each frame, and how much each of its points counts."""
+    assert episode.camera is not None
+    views, sure = [], []
+    for frame in frames:
+        own = episode.camera[episode.offsets[frame] : episode.offsets[frame + 1]] == camera
+        points = torch.as_tensor(episode.frame(frame)[own], dtype=torch.float64)
+        views.append(NeighbourIndex(points if len(points) else torch.full((1, 3), _OUT_OF_REACH, dtype=torch.float64)))
+        sure.append(_sure(episode, frame)[own] if len(points) else torch.zeros(1, dtype=torch.float64))
+    return tuple(views), tuple(sure)
+
+
+def _watching(episode: Episode) -> list[list[int]]:
+    """
+    Raises:
+        EpisodeError: a camera whose place is known, but whose clock is not, or the reverse.
+    """
+    standing = list(episode.viewpoints)
+    if standing and set(standing) != set(episode.clocks):
+        raise EpisodeError(
+            f"The episode's meta has viewpoints of {', '.join(standing)} and, with `clocks`, the cameras "
+            f"{', '.join(episode.clocks)}; both must name the same cameras."
+        )
+    return [[standing.index(camera)] if standing else [] for camera in episode.clocks]
+
+
+def _lost(episode: Episode, frames: Sequence[int]) -> tuple[LostPixels, ...]:
+    """
+    Raises:
+        EpisodeError: the cameras that lost something are not those whose places are known.
+    """
+    if episode.lost is None:
+        return ()
+    if list(episode.meta["pinholes"]) != list(episode.viewpoints):
+        raise EpisodeError(
+            f"The episode's meta has pinholes of {', '.join(episode.meta['pinholes'])} and viewpoints of "
+            f"{', '.join(episode.viewpoints) or 'no camera'}; both must name the same cameras, in the same order."
+        )
+    found = enumerate(episode.pinholes)
+    return tuple(
+        LostPixels(
+            torch.from_numpy(pinhole.T_camera_scene),
+            torch.tensor([pinhole.focal, pinhole.centre], dtype=torch.float64),
+            _widened(torch.from_numpy(episode.lost_pixels(camera)[list(frames)])),
+        )
+        for camera, pinhole in found
+    )
+
+
+def _planes(episode: Episode) -> Tensor | None:
+    """Of the cameras whose places are known; of one whose points were not cut, zeros, which cut nothing."""
+    planes = episode.cut_planes
+    found = [planes.get(name, np.zeros(4)) for name in episode.viewpoints]
+    return torch.from_numpy(np.stack(found)) if planes and found else None
+
+
+def _widened(pixels: Tensor) -> Tensor:
+    """bool [L, H, W] by one pixel to all sides."""
+    return torch.nn.functional.max_pool2d(pixels[:, None].float(), 3, stride=1, padding=1)[:, 0] > 0
+
+
+def _spread(frames: list[int]) -> list[int]:
+    """As many as are compared, evenly spread, the last among them."""
+    if len(frames) <= _MOST:
+        return frames
+    return [frames[index] for index in np.unique(np.linspace(0, len(frames) - 1, _MOST).round().astype(int))]
+
+
+def _end(scenario: Scenario) -> float:
+    """Of what can be compared [s]."""
+    return scenario.steps * scenario.scene.time_step + 0.5 * scenario.scene.frame_time
+
+
+def _checked(scenario: Scenario, episode: Episode, frame: int) -> int:
+    episode.frame(frame)  # raises
+    if episode.times[frame] > _end(scenario):
+        raise EpisodeError(
+            f"A loss frame lies at {episode.times[frame]:.3f} s, but scenario {scenario.name} simulates only "
+            f"{scenario.steps * scenario.scene.time_step:.3f} s. Use a scenario with more frames, or another loss frame."
+        )
+    return frame % episode.frame_count
+
+
+def _usable(
+    scenario: Scenario, system: System, episode: Episode, track: Tensor | None, cut: float | None, late: float
+) -> list[int]:
+    """Frames after the start, within the simulation, with enough of the cloth of the basis above the cut.
+
+    Args:
+        late: largest offset of a clock [s].
+    """
+    end = _end(scenario) - max(late, 0.0)
+    frames = [index for index, time in enumerate(episode.times) if 0 < time <= end]
+    if cut is not None and frames:
+        with torch.no_grad():
+            run = rollout(system, scenario.steps, track=track, drop_diverged=True)
+        heights = run.at(torch.as_tensor(episode.times[frames]))[0, ..., 2]
+        above = ((heights >= cut) | heights.isnan()).double().mean(-1)  # of a motion that diverges nothing is known
+        enough = max(min(_USABLE, _NEARLY * float(above.max())), _TOO_LITTLE)
+        frames = [frame for frame, part in zip(frames, above.tolist(), strict=True) if part >= enough]
+    if not frames:
+        unit, simulated = scenario.length_unit_m, scenario.steps * scenario.scene.time_step
+        told = "" if cut is None else f", at most {_TOO_LITTLE:.0%} of the cloth lies above the cut, {cut * unit:.3f} m"
+        raise EpisodeError(
+            f"No frame of the episode can be compared: they lie at {episode.times[0]:.3f} to {episode.times[-1]:.3f} s, "
+            f"scenario {scenario.name} simulates {simulated:.3f} s{told}. Name some with --frame, or check times and crops."
+        )
+    return frames
+
+
+def _found_cut(system: System, episode: Episode, unit: float) -> float | None:
+    """The height below which nothing was recorded: of the cut planes where each camera has one, at the cloth's middle, else
+    as the points show it."""
+    planes = episode.cut_planes
+    if planes and planes.keys() >= episode.viewpoints.keys() and all(plane[2] > 0 for plane in planes.values()):
+        x, y, _ = system.mesh.nodes.mean(axis=0)
+        return min(float(d - a * x - b * y) / float(c) for a, b, c, d in planes.values())
+    low = float(np.quantile(episode.points[:, 2], _LOWEST))
+    return low if low > system.mesh.nodes[:, 2].min() + _CUT_M / unit else None
+
+
+def _sure(episode: Episode, frame: int) -> Tensor:
+    """How much each point of a frame counts, by its `sigma`."""
+    begin, end = episode.offsets[frame], episode.offsets[frame + 1]
+    if episode.sigma is None:
+        return torch.ones(int(end - begin), dtype=torch.float64)
+    sigma = torch.as_tensor(episode.sigma[begin:end], dtype=torch.float64)
+    return 1 / (1 + (sigma / _UNSURE_M) ** 2)
+
+
+def track_displacement(episode: Episode, grippers: Sequence[str], steps: int, time_step: float) -> np.ndarray:
+    """[S, G, 3] displacement of the scene's grippers since time zero at the end of each step [m].
+
+    A cubic spline through the recorded positions, constant after the last. Recorded positions begin with the motion: a
+    track whose first frame is later than time zero is held at its first position until then.
+
+    Raises:
+        EpisodeError: other grippers were recorded than the scene has. (A single one needs no name.)
+    """
+    assert episode.gripper is not None
+    if len(grippers) == len(episode.grippers) == 1:
+        recorded = [0]
+    elif set(grippers) == set(episode.grippers):
+        recorded = [episode.grippers.index(name) for name in grippers]
+    else:
+        raise EpisodeError(
+            f"The scene's grippers are {', '.join(grippers) or 'none'}, the episode's {', '.join(episode.grippers)}; give "
+            "both the same names, in the scenario's `grippers` or in the tracks that are imported."
+        )
+    if len(episode.times) < 2:
+        return np.zeros((steps, len(grippers), 3))
+    times, positions = episode.times, episode.gripper[:, recorded]
+    at = np.clip(np.cumsum(np.full(steps, time_step)), times[0], times[-1])
+    from scipy.interpolate import CubicSpline  # slow to import, and needed for recorded grippers alone
+
+    return np.asarray(CubicSpline(times, positions)(at) - positions[0])

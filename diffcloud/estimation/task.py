@@ -1,0 +1,165 @@
+"""One fit of one or several recordings of a cloth, from its settings to its result. Commands and the library run it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from diffcloud.errors import DivergedError
+from diffcloud.estimation.batches import batch_losses
+from diffcloud.estimation.doubts import with_doubts
+from diffcloud.estimation.joint import AnyObjective, JointObjective
+from diffcloud.estimation.laid import with_laid
+from diffcloud.estimation.left_out import Tell, leave_each_out
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
+from diffcloud.estimation.priors import parameter_priors
+from diffcloud.estimation.record import FitRecord, LeftOut
+from diffcloud.estimation.result import FitResult, describe_fit
+from diffcloud.estimation.settings import FitSettings
+from diffcloud.estimation.solvers import FitHistory, FitOutcome, LikelihoodSettings, Progress, Settings, solve
+from diffcloud.io.episodes import Episode
+from diffcloud.scene.scenarios import Scenario
+
+
+@dataclass(frozen=True)
+class Recording:
+    """An episode and the scenario that simulates it."""
+
+    scenario: Scenario
+    name: str
+    episode: Episode
+
+
+def compared(record: FitRecord, recordings: Sequence[Recording]) -> AnyObjective:
+    """What a fit has minimised, at the frames that it began with.
+
+    Args:
+        recordings: of the fit, in their order.
+
+    Raises:
+        ConfigError, EpisodeError: the episodes lack these frames, or are of different cloths.
+    """
+    return _joined(
+        [Objective(one.scenario, one.episode, **record.measured_by(place)) for place, one in enumerate(recordings)]
+    )
+
+
+def _joined(members: Sequence[Objective]) -> AnyObjective:
+    """One recording's objective is that of a fit, several are a joint one's."""
+    return members[0] if len(members) == 1 else JointObjective(members)
+
+
+@dataclass(frozen=True)
+class FitTask:
+    """One parameter set for one or several recordings."""
+
+    recordings: Sequence[Recording]
+    settings: FitSettings = field(default_factory=FitSettings)
+    init: Mapping[str, float] = field(default_factory=dict)
+    """Values of the first start; the middle of the range where not given."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """Of the first recording."""
+        return self.recordings[0].scenario
+
+    @property
+    def space(self) -> FitSpace:
+        """
+        Raises:
+            ConfigError: bounds, priors, doubts or fixed values that do not fit the parameters, or a start that the
+                recordings have none of.
+        """
+        settings = self.settings
+        for recording in self.recordings:
+            recording.scenario.check_parameters([*settings.parameters, *settings.fixed])
+        bounds = {**self.scenario.bounds, **settings.bounds}
+        space = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed)
+        ranges = {variable.name: (variable.low, variable.high) for variable in space.variables}
+        priors = parameter_priors("none" if settings.paper else settings.prior, space.names, ranges)
+        space = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed, priors=priors)
+        scenarios = [recording.scenario for recording in self.recordings]
+        space = with_doubts(space, settings.known_within(scenarios), scenarios)
+        return with_laid(space, settings.laid_within(scenarios), scenarios)
+
+    def objective(self) -> AnyObjective:
+        """
+        Raises:
+            ConfigError, EpisodeError: the episodes lack the frames of the loss, an unknown frame, or different cloths.
+        """
+        measure = self.settings.measure()
+        return _joined([Objective(one.scenario, one.episode, **measure) for one in self.recordings])
+
+    @property
+    def solver_settings(self) -> Settings:
+        return replace(self.settings.solver_settings(self.scenario), init=self.init)
+
+    def solved(self, progress: Callable[[Progress], None] | None = None) -> tuple[AnyObjective, FitOutcome]:
+        """The fit, of which nothing is written, and what it minimised.
+
+        Raises:
+            ConfigError, EpisodeError: as of `space` and `objective`.
+            DivergedError, KeyboardInterrupt: as of `solve`.
+        """
+        objective = self.objective()
+        outcome = solve(objective, self.space, self.solver_settings, progress=progress)
+        if outcome.estimate is not None:  # frames beyond the horizon said nothing
+            objective = _joined(outcome.estimate.members)
+        return objective, outcome
+
+    def fitted(self, progress: Callable[[Progress], None] | None = None, left_out: Tell | None = None) -> FitResult:
+        """The fit with all that is told of it. Ctrl-C ends it, and the best so far is returned, with that reason.
+
+        Args:
+            progress: of the fit.
+            left_out: of the predictions of each recording from the others.
+
+        Raises:
+            ConfigError, EpisodeError: as of `space` and `objective`.
+            DivergedError: every start diverged.
+            KeyboardInterrupt: before a first loss, or while the result was described.
+        """
+        space, settings = self.space, self.solver_settings
+        objective, outcome = self.solved(progress)
+        left, failures, interrupted = list[LeftOut](), list[str](), outcome.stop_reason == "interrupted"
+        if isinstance(objective, JointObjective) and isinstance(settings, LikelihoodSettings) and not interrupted:
+            try:
+                left = leave_each_out(objective, space, outcome.values, settings, progress=left_out)
+            except DivergedError as error:
+                failures.append(f"leaving one recording out: {error}")
+            except KeyboardInterrupt:
+                interrupted = True
+        names = [one.name for one in self.recordings]
+        try:
+            result = describe_fit(objective, space, settings, outcome, episodes=names)
+        except KeyboardInterrupt:  # a fit that may have taken minutes is not given away for the second that this takes
+            result, interrupted = describe_fit(objective, space, settings, outcome, episodes=names), True
+        record = result.record
+        record.failures += failures
+        record.stop_reason = "interrupted" if interrupted else record.stop_reason
+        for recording, told in zip(record.episodes, left, strict=bool(left)):
+            recording.left_out = told
+        return result
+
+    def begun(self) -> FitResult:
+        """The place where the fit begins, as a fit that was interrupted there.
+
+        Raises:
+            DivergedError: the motion diverges there.
+        """
+        objective, space, settings, began = self.objective(), self.space, self.solver_settings, time.perf_counter()
+        values = space.starts(1, seed=settings.seed, first=self.init)[0].double()
+        losses = batch_losses(objective, space, values)
+        history = FitHistory(space.names, [losses], [values])
+        outcome = FitOutcome(
+            values=dict(zip(space.names, values[0].tolist(), strict=True)),
+            loss=float(losses[0]),
+            best_start=0,
+            simulations=len(objective.members),
+            stop_reason="interrupted",
+            seconds=time.perf_counter() - began,
+            history=history,
+        )
+        return describe_fit(objective, space, settings, outcome, episodes=[one.name for one in self.recordings])

@@ -1,0 +1,70 @@
+"""How far neighbouring parameter sets drive the cloth apart: what a camera could tell from one another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from diffcloud.errors import EpisodeError
+from diffcloud.estimation.targets import track_displacement
+from diffcloud.io.episodes import Episode
+from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.simulate import rollout
+
+
+@dataclass(frozen=True)
+class VisibilityMap:
+    """A grid of stretch (rows) x mass (columns) multipliers."""
+
+    grid: NDArray[np.float64]
+    """[n] multipliers of both axes."""
+    along_stretch_mm: NDArray[np.float64]
+    """[n - 1, n] RMS node distance between neighbours in stretch [mm]."""
+    along_mass_mm: NDArray[np.float64]
+    """[n, n - 1]"""
+
+    def visible_fraction(self, noise_mm: float) -> float:
+        """Part of all neighbouring pairs that differ by more than the noise."""
+        pairs = np.concatenate([self.along_stretch_mm.ravel(), self.along_mass_mm.ravel()])
+        return float((pairs > noise_mm).mean())
+
+
+def visibility_map(
+    scenario: Scenario, *, episode: Episode | None = None, size: int = 5, linear: bool = False
+) -> VisibilityMap:
+    """Simulate the grid over the bounds [0.1, 10]² and compare neighbours.
+
+    Only nodes of the loss surface count: at the first loss frame of the scenario's own motion, or over all frames of the
+    motion that an episode's gripper made.
+
+    Raises:
+        EpisodeError: an episode without a gripper track.
+    """
+    grid = np.linspace(0.1, 10, size) if linear else np.logspace(-1, 1, size)
+    stretch, mass = (torch.as_tensor(axis.ravel()) for axis in np.meshgrid(grid, grid, indexing="ij"))
+    system, _ = scenario.scene.build()
+    properties = scenario.properties(system, {"stretch": stretch, "mass": mass})
+    per_frame = scenario.scene.frame_steps
+    if episode is None:
+        steps, track = scenario.loss_frames[0] % (scenario.frames + 1) * per_frame, None
+        first = steps
+    elif episode.gripper is None:
+        raise EpisodeError("The episode has no gripper track: leave it out to test the scenario's own motion.")
+    else:
+        frames = min(scenario.frames, int(np.ceil(episode.times[-1] / scenario.scene.frame_time - 1e-6)))
+        steps, first = frames * per_frame, per_frame
+        track = torch.as_tensor(track_displacement(episode, system.handles.grippers, steps, system.time_step))
+        track = track.expand(size * size, *track.shape)
+    with torch.no_grad():
+        run = rollout(system, steps, properties=properties, track=track)
+    faces = system.mesh.faces if scenario.loss_faces is None else system.mesh.faces[scenario.loss_faces]
+    nodes = run.positions[:, first::per_frame, np.unique(faces)].numpy().reshape(size, size, -1, 3)
+
+    def distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+        rms: NDArray[np.float64] = 1e3 * scenario.length_unit_m * np.sqrt(((a - b) ** 2).sum(-1).mean(-1))
+        return rms
+
+    return VisibilityMap(grid, distance(nodes[1:], nodes[:-1]), distance(nodes[:, 1:], nodes[:, :-1]))

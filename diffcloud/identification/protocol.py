@@ -1,0 +1,91 @@
+"""The cloth and the settings of a fit that `identify` and the library begin with, each with its reason."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from diffcloud.errors import ConfigError
+from diffcloud.estimation.settings import FitSettings
+from diffcloud.io.episodes import Episode
+from diffcloud.scene.scenarios.layout import Found, found_size, node_counts
+from diffcloud.sim.grasp import GRIP_M
+
+_DENSITY = 0.16
+_MATERIAL = {"stretching_n_m": 60.0, "bending_n_m": 5e-6, "poisson": 0.2, "damping_s": 0.002}
+_AROUND = {"friction_obstacle": 0.4, "compression": 0.5}
+_DOUBTS = {"friction_obstacle": 2.0, "compression": 3.0, "shear": 1.2, "damping": 2.5}
+_BOUNDS = {"stretch": (0.03, 30.0), "bending": (0.03, 30.0), "mass": (0.2, 5.0)}
+_STEPS = 16
+_GRIP_KNOWN = 1.5
+
+
+def found_cloth(
+    episodes: Sequence[Episode], size: tuple[float, float] | None = None, density: float | None = None
+) -> dict[str, Found]:
+    """Fields of a scenario that all recordings of one cloth share, each with its reason.
+
+    Args:
+        size: sides [m]; by default as the first frames show them.
+        density: weighed [kg/m²].
+    """
+    reason = "as stated"
+    if size is None:
+        sides = np.array([found_size(episode) for episode in episodes])
+        size = tuple(np.round(np.median(sides, axis=0), 3).tolist())
+        reason = "rectangle around the first frames" + (
+            f"; recordings differ by up to {np.ptp(sides, axis=0).max():.3f} m" if len(sides) > 1 else ""
+        )
+    told = "as weighed" if density is not None else "usual for a knit; fitted"
+    material = {"density_kg_m2": density or _DENSITY, **_MATERIAL}
+    return {
+        "base": Found("lift", "a rectangular cloth on a table"),
+        "size_m": Found(list(size), reason),
+        "nodes": Found(list(node_counts(size)), "13 along the longer side, and at least 5 along the other"),
+        "grip": Found(
+            "pad", "fingers level; or upright_pad (pinched from above), or pivot (a point that lets the cloth turn)"
+        ),
+        "grip_m": Found(GRIP_M, "side of the pad, or of the square that a pivot stands for; measure your gripper's [m]"),
+        "grip_known_within": Found(_GRIP_KNOWN, "factor within which grip_m is known; 1.05 if you have measured it"),
+        "material": Found(material, f"what multipliers act on; density {told}"),
+        **{name: Found(value, "usual; fitted too, within `doubts`") for name, value in _AROUND.items()},
+        "doubts": Found(_DOUBTS, "factors within which what nobody asks for is known"),
+        "steps_per_frame": Found(_STEPS, "finer steps move a lifted cloth by less than the noise"),
+    }
+
+
+def with_density(cloth: Mapping[str, Any], density: float, deviation: float) -> dict[str, Any]:
+    """The cloth with a weighed mass that is not exact: the fit allows for it."""
+    material = {**_material(cloth), "density_kg_m2": density}
+    return {**cloth, "material": material, "doubts": {**cloth.get("doubts", {}), "mass": 1 + deviation / density}}
+
+
+def _material(cloth: Mapping[str, Any]) -> dict[str, Any]:
+    material = cloth.get("material")
+    if not isinstance(material, dict) or material.get("density_kg_m2") is None:
+        raise ConfigError("--mass goes with a material of stated density_kg_m2 in cloth.yaml.")
+    return material
+
+
+def fit_settings(
+    parameters: Sequence[str] | None, cloth: Mapping[str, Any], weighed: tuple[float, float] | None
+) -> FitSettings:
+    """
+    Args:
+        parameters: to find; by default stretching, bending, and the mass if it was not weighed.
+        cloth: fields of `found_cloth`.
+        weighed: density and its standard deviation [kg/m²].
+
+    Raises:
+        ConfigError: a weighed density with a material of none.
+    """
+    names = ["stretch", "bending", *(["mass"] if weighed is None else [])]
+    if parameters is not None:
+        names = list(parameters)
+    fixed = {}
+    if weighed is not None and not weighed[1]:
+        fixed = {"mass": weighed[0] / float(_material(cloth)["density_kg_m2"])}
+    bounds = {name: list(pair) for name, pair in _BOUNDS.items() if name in names}
+    return FitSettings.model_validate({"parameters": names, "fixed": fixed, "bounds": bounds})

@@ -1,0 +1,393 @@
+"""The library, which `import diffcloud as dc` offers: from recordings to a fitted cloth, in SI units.
+
+Commands do the same with files: `identify` runs the same fit, from the same settings, as `fit` here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+import yaml
+from torch import Tensor
+
+from diffcloud.clouds.losses import one_sided_chamfer
+from diffcloud.clouds.neighbours import NeighbourIndex
+from diffcloud.clouds.sampling import SurfaceSampler
+from diffcloud.errors import ConfigError, EpisodeError, unknown_name
+from diffcloud.estimation.record import FitRecord
+from diffcloud.estimation.result import FitResult, FittedMotion, physical_values, whole_material, write_fit
+from diffcloud.estimation.settings import FitSettings
+from diffcloud.estimation.solvers import Progress
+from diffcloud.estimation.task import FitTask, Recording
+from diffcloud.evaluation.intervals import LEVEL, WITHIN, Intervals, draws, intervals_of
+from diffcloud.evaluation.methods import space_of
+from diffcloud.identification import fit_settings, found_cloth, with_density
+from diffcloud.io.episodes import Episode, read_episode
+from diffcloud.io.files import together, write_json, write_text
+from diffcloud.io.imports import cloud_folder
+from diffcloud.scene.scenarios import Scenario, load_scenario
+from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
+from diffcloud.scene.scenarios.layout import find_layout
+from diffcloud.sim.properties import PARAMETERS
+from diffcloud.sim.simulate import Rollout, rollout
+from diffcloud.simulators.export.cloth import fitted_cloth
+from diffcloud.simulators.export.write import Target, write_export
+
+_NAMES = {
+    "stretch": "stretching",
+    "mass": "density",
+    "drag": "air_density",
+    "friction_obstacle": "friction",
+    "friction_cloth": "self_friction",
+}
+"""Parameter of a fit -> quantity, where their names differ."""
+_PARAMETERS = {_NAMES.get(name, name): name for name in PARAMETERS if name != "mass"}
+"""Quantity -> parameter that sets it."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a fit says of one quantity."""
+
+    value: float
+    unit: str
+    interval: tuple[float, float] | None
+    """None: the solver knows no uncertainty."""
+    level: float
+    """Probability of the interval."""
+    status: str
+    """`identified`, or why it is not; empty without an interval."""
+    deviations: Mapping[str, float] = field(default_factory=dict)
+    """Source of uncertainty -> standard deviation of the logarithm, the largest first."""
+
+    def __str__(self) -> str:
+        ends = "" if self.interval is None else f" ({self.interval[0]:.3g} to {self.interval[1]:.3g}), {self.status}"
+        return f"{self.value:.3g} {self.unit}{ends}"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A cloth, what moves it, and what is around it."""
+
+    name: str
+    options: Mapping[str, Any]
+    """Fields of a YAML scenario (docs/scenarios.md)."""
+    settings: FitSettings = field(default_factory=FitSettings)
+    """Of a fit, unless others are given."""
+
+    @staticmethod
+    def load(source: str | Path) -> Scene:
+        """A built-in scenario by its name, or a YAML file.
+
+        Raises:
+            ConfigError, SceneError: unknown, or a file with something that cannot be.
+        """
+        if not str(source).endswith((".yaml", ".yml")):
+            load_scenario(source)  # raises
+            return Scene(str(source), {"base": str(source)})
+        path = Path(source)
+        told = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
+        load_scenario(path)  # raises
+        return Scene(path.stem, dict(told or {}))
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """As the simulator takes it."""
+        if set(self.options) == {"base"}:
+            return load_scenario(str(self.options["base"]))
+        return make_scenario(own_options(self.options, self.name, f"scene {self.name}", folder=Path()))
+
+    def simulate(self, quantities: Mapping[str, float | Tensor] | None = None, seconds: float | None = None) -> Rollout:
+        """The motion with other material than the scene's.
+
+        Args:
+            quantities: such as {"stretching": 40.0} in SI units, numbers or tensors of shape [] or [B]; the motion is
+                differentiable in tensors. Names are those of `Fit.parameters`.
+            seconds: simulated; by default all of the scene's motion.
+
+        Returns:
+            `positions` and `velocities` [B, S + 1, V, 3] in float64, [m] and [m/s], at `times` [S + 1] [s].
+
+        Raises:
+            ConfigError: an unknown quantity, or more than one batch size.
+            DivergedError: names step and batch entries.
+        """
+        scenario = self.scenario
+        system, _ = scenario.scene.build()
+        values = dict[str, Tensor]()
+        for name, value in (quantities or {}).items():
+            if name not in _PARAMETERS:
+                raise ConfigError(unknown_name("quantity", name, _PARAMETERS))
+            parameter = PARAMETERS[_PARAMETERS[name]]
+            unit = 1.0 if parameter.basis is None else scenario.scene.basis(parameter.basis)
+            values[parameter.name] = torch.as_tensor(value, dtype=torch.float64).reshape(-1) / unit
+        count = max((len(value) for value in values.values()), default=1)
+        values = {name: value.expand(count) if len(value) == 1 else value for name, value in values.items()}
+        steps = scenario.steps if seconds is None else max(round(seconds / scenario.scene.time_step), 1)
+        return rollout(system, steps, properties=scenario.properties(system, values))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A cloth that was fitted to one or several recordings."""
+
+    parameters: Mapping[str, Estimate]
+    """Quantity -> what is known of it, in SI units."""
+    status: str
+    """`fits_to_noise`, `model_error`, `not_converged`, `interrupted`, or `no_uncertainty` of a solver that knows none."""
+    residual: float
+    """RMS distance between simulated and recorded points [m]."""
+    horizons: Mapping[str, float]
+    """Recording -> until when its frames counted [s]; empty where the solver knows no horizon."""
+    scenes: Sequence[Scene]
+    """With the grasp that was found."""
+    record: FitRecord
+    """All that is known, as `fit.json` has it."""
+    intervals: Intervals | None
+    motions: Sequence[FittedMotion]
+    """Of each recording, with the fitted values."""
+
+    def __str__(self) -> str:
+        lines = [f"{self.status}, residual {1e3 * self.residual:.1f} mm"]
+        return "\n".join([*lines, *(f"{name}: {told}" for name, told in self.parameters.items())])
+
+    def sample(self, count: int, seed: int = 0) -> pd.DataFrame:
+        """Cloths as probable as the recordings leave them: a row each, a column for each quantity in SI units.
+
+        Raises:
+            ConfigError: there are no intervals, or the model does not follow the recordings.
+        """
+        if self.intervals is None:
+            raise ConfigError("Only a fit by the solver likelihood knows how uncertain it is; fit again with it.")
+        drawn = pd.DataFrame(draws(self.intervals, space_of(self.record).asked, count, seed))
+        units = {name: entry.physical / entry.value for name, entry in self.intervals.parameters.items()}
+        return (drawn * units).rename(columns=_NAMES)
+
+    def save(self, folder: str | Path) -> Path:
+        """Write fit.json, fit.npz, intervals.json and scenarios/, which `diffcloud export`, `view` and `rollout` read.
+
+        Returns:
+            The path of fit.json.
+        """
+        folder = Path(folder)
+        with together():
+            path = write_fit(folder, "fit", FitResult(self.record, list(self.motions)))
+            for scene in self.scenes:
+                text = yaml.safe_dump(dict(scene.options), sort_keys=False)
+                write_text(folder / "scenarios" / f"{scene.name}.yaml", text)
+            if self.intervals is not None:
+                write_json(folder / "intervals.json", self.intervals.model_dump(mode="json"))
+        return path
+
+
+def load_recording(
+    path: str | Path, *, grippers: Mapping[str, str | Path] | None = None, rate_hz: float | None = None
+) -> Episode:
+    """A recording from an episode file, or from a folder of numbered clouds.
+
+    Args:
+        path: `.npz`, or a folder of `.npy`, `.ply`, `.xyz` or `.pcd` files in metres, z up.
+        grippers: of a folder, name -> CSV with the columns t_s, x, y, z; by default its gripper.csv.
+        rate_hz: of a folder, where neither the CSV nor the file names have times.
+
+    Raises:
+        EpisodeError: missing or damaged; what other recordings need is said.
+    """
+    path = Path(path)
+    if path.is_file():
+        return read_episode(path)
+    if not path.is_dir():
+        raise EpisodeError(f"No such recording: {path}.")
+    if grippers is None:
+        if not (path / "gripper.csv").is_file():
+            raise EpisodeError(
+                f"{path} holds no gripper.csv with the columns t_s, x, y, z [m], one row a frame. Name other files with "
+                "`grippers`, or make an episode of a bag by `diffcloud import recording`."
+            )
+        grippers = {"gripper": path / "gripper.csv"}
+    return cloud_folder(path, grippers={name: Path(file) for name, file in grippers.items()}, rate_hz=rate_hz)
+
+
+def find_scenes(
+    recordings: Sequence[Episode],
+    *,
+    size: tuple[float, float] | None = None,
+    density: float | tuple[float, float] | None = None,
+    grip: float | None = None,
+) -> list[Scene]:
+    """A scene for each recording of one rectangular cloth that lies flat at first and is held by one corner or more.
+
+    Args:
+        size: sides [m]; by default as the first frames show them.
+        density: weighed mass over area [kg/m²], or that and its standard deviation; by default it is fitted.
+        grip: side of the gripper's pad [m]; by default 20 mm, and fits find it.
+
+    Raises:
+        EpisodeError: a recording that shows something else; names the reason.
+    """
+    weighed = None if density is None else density if isinstance(density, tuple) else (float(density), 0.0)
+    fields = found_cloth(recordings, size, None if weighed is None else weighed[0])
+    cloth: dict[str, Any] = {name: found.value for name, found in fields.items()}
+    if grip is not None:
+        cloth |= {"grip_m": grip, "grip_known_within": 1.0}
+    if weighed is not None and weighed[1]:
+        cloth = with_density(cloth, *weighed)
+    settings, scenes = fit_settings(None, cloth, weighed), list[Scene]()
+    sides = (float(cloth["size_m"][0]), float(cloth["size_m"][1]))
+    for number, recording in enumerate(recordings, 1):
+        layout = find_layout(recording, sides, float(cloth["grip_m"]))
+        options = {**cloth, **{name: found.value for name, found in layout.fields.items()}}
+        scenes.append(Scene(f"recording_{number}", options, settings))
+    return scenes
+
+
+def fit(
+    recordings: Episode | Sequence[Episode],
+    scenes: Scene | Sequence[Scene],
+    settings: FitSettings | None = None,
+    *,
+    level: float = LEVEL,
+    within: float = WITHIN,
+    progress: Callable[[Progress], None] | None = None,
+) -> Fit:
+    """Estimate the parameters of one cloth from one or several recordings. Ctrl-C returns the best so far.
+
+    Args:
+        scenes: one for each recording.
+        settings: by default those of the first scene.
+        level: probability of the intervals.
+        within: factor to each side within which a parameter counts as identified.
+        progress: told after each step.
+
+    Raises:
+        ConfigError, EpisodeError: what does not belong together; names it.
+        DivergedError: the motion diverges from every start.
+        KeyboardInterrupt: Ctrl-C before the first step.
+    """
+    episodes = [recordings] if isinstance(recordings, Episode) else list(recordings)
+    chosen = [scenes] if isinstance(scenes, Scene) else list(scenes)
+    if len(episodes) != len(chosen) or not episodes:
+        raise ConfigError(f"Each recording takes one scene; got {len(episodes)} recordings and {len(chosen)} scenes.")
+    pairs = zip(chosen, episodes, strict=True)
+    members = [Recording(scene.scenario, scene.name, episode) for scene, episode in pairs]
+    result = FitTask(members, settings or chosen[0].settings).fitted(
+        progress, None if progress is None else lambda done, doing, told: progress(told)
+    )
+    record = result.record
+    told = record.estimate
+    if told is not None and told.grip_m is not None:
+        found = {"grip_m": told.grip_m, "grip_known_within": 1.0}
+        chosen = [replace(scene, options={**scene.options, **found}) for scene in chosen]
+    scenario = chosen[0].scenario
+    intervals = None if told is None else intervals_of(record, space_of(record), scenario, level=level, within=within)
+    names = [one.name for one in record.episodes]
+    return Fit(
+        parameters=_estimates(record, intervals, scenario, level),
+        status=_status(record, intervals),
+        residual=record.rms_mm / 1e3,
+        horizons={} if told is None else dict(zip(names, (one.horizon_s for one in told.recordings), strict=True)),
+        scenes=tuple(chosen),
+        record=record,
+        intervals=intervals,
+        motions=tuple(result.motions),
+    )
+
+
+def _estimates(record: FitRecord, intervals: Intervals | None, scenario: Scenario, level: float) -> dict[str, Estimate]:
+    if intervals is None:
+        asked = space_of(record).asked.names
+        told = physical_values(scenario, {name: record.values[name] for name in asked})
+        return {_NAMES.get(n, n): Estimate(p.physical, p.physical_unit, None, level, "") for n, p in told.items()}
+    return {
+        _NAMES.get(name, name): Estimate(
+            entry.physical,
+            entry.physical_unit,
+            (entry.physical_low, entry.physical_high),
+            intervals.level,
+            entry.verdict,
+            {source: row[name] for source, row in intervals.sources.items()},
+        )
+        for name, entry in intervals.parameters.items()
+    }
+
+
+def _status(record: FitRecord, intervals: Intervals | None) -> str:
+    if record.stop_reason == "interrupted":
+        return "interrupted"
+    if intervals is not None and not intervals.explains:
+        return "model_error"
+    if record.stop_reason not in ("converged", "threshold"):
+        return "not_converged"
+    return "fits_to_noise" if intervals is not None else "no_uncertainty"
+
+
+def export(fit: Fit, to: Target, out: str | Path, *, recording: int = 0, samples: int = 0, seed: int = 0) -> Path:
+    """Write the fitted cloth for another simulator: mesh, material in SI units, and the motion of what is held.
+
+    Args:
+        to: mujoco, newton, isaac, arcsim, or obj.
+        out: folder; files that are there stay.
+        recording: whose motion is exported.
+        samples: further cloths, drawn as `Fit.sample` does, in `sample_0000` and so on.
+
+    Returns:
+        The folder.
+
+    Raises:
+        SceneError: what the target cannot say.
+        ConfigError: samples of a fit without intervals.
+    """
+    out, one, scenario = Path(out), fit.record.episodes[recording], fit.scenes[recording].scenario
+    motion, values = fit.motions[recording], [fit.record.values]
+    if samples:
+        if fit.intervals is None:
+            raise ConfigError("Only a fit by the solver likelihood knows how uncertain it is; leave samples out.")
+        values += [{**values[0], **drawn} for drawn in draws(fit.intervals, space_of(fit.record).asked, samples, seed)]
+    with together():
+        for number, each in enumerate(values):
+            folder = out if number == 0 else out / f"sample_{number - 1:04d}"
+            about = {
+                "recording": one.name,
+                "rms_mm": one.rms_mm,
+                "parameters": dict(each),
+                "material": whole_material(scenario, each).model_dump(),
+            }
+            write_export(fitted_cloth(one, motion, scenario, each), to, folder, about)
+    return out
+
+
+def sample_surface(nodes: Tensor, faces: Any, count: int, *, seed: int = 0) -> Tensor:
+    """Points on a surface, uniform by area of the first mesh; differentiable in the nodes.
+
+    Args:
+        nodes: [..., V, 3]
+        faces: [F, 3]
+        seed: the same one gives the same places on the surface.
+
+    Returns:
+        [..., count, 3]
+    """
+    generator = torch.Generator().manual_seed(seed)
+    sampler = SurfaceSampler.build(torch.as_tensor(np.asarray(faces)), count, generator=generator, dtype=nodes.dtype)
+    return sampler.sample(nodes)
+
+
+def chamfer(points: Tensor, target: Any) -> Tensor:
+    """Mean squared distance from points to their nearest recorded ones (the paper's one-sided Chamfer distance);
+    differentiable in the points.
+
+    Args:
+        points: [..., N, 3] [m]
+        target: [M, 3] recorded [m]
+
+    Returns:
+        [...] [m²]
+    """
+    return one_sided_chamfer(points, NeighbourIndex(torch.as_tensor(np.asarray(target), dtype=points.dtype)))
