@@ -155,8 +155,9 @@ class FitJob:
         def show_left_out(done: float, doing: str, progress: Progress) -> None:
             show(f"{doing}  ", progress)
 
-        record = self._written(self.task.fitted(partial(show, ""), show_left_out))
-        if record.stop_reason == "interrupted":
+        result = self.task.fitted(partial(show, ""), show_left_out)
+        record = self._written(result)
+        if result.pressed or record.stop_reason == "interrupted":
             raise KeyboardInterrupt
         return record
 

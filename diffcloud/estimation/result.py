@@ -78,6 +78,8 @@ class FitResult:
     """The JSON file."""
     motions: list[FittedMotion]
     """The NPZ file: one for each recording."""
+    pressed: bool = False
+    """Whether Ctrl-C was pressed after the last step: nothing is lost, and who asked for the fit may want to stop."""
 
 
 def physical_values(scenario: Scenario, values: Mapping[str, float]) -> dict[str, FittedParameter]:

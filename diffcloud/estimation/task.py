@@ -119,7 +119,7 @@ class FitTask:
         Raises:
             ConfigError, EpisodeError: as of `space` and `objective`.
             DivergedError: every start diverged.
-            KeyboardInterrupt: before a first loss, or while the result was described.
+            KeyboardInterrupt: before a first loss, or a second time while the result is described.
         """
         space, settings = self.space, self.solver_settings
         objective, outcome = self.solved(progress)
@@ -135,7 +135,7 @@ class FitTask:
         try:
             result = describe_fit(objective, space, settings, outcome, episodes=names)
         except KeyboardInterrupt:  # a fit that may have taken minutes is not given away for the second that this takes
-            result, interrupted = describe_fit(objective, space, settings, outcome, episodes=names), True
+            result = replace(describe_fit(objective, space, settings, outcome, episodes=names), pressed=True)
         record = result.record
         record.failures += failures
         record.stop_reason = "interrupted" if interrupted else record.stop_reason

@@ -153,7 +153,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
     import yaml
 
     import diffcloud.cli.comparison
-    import diffcloud.cli.fit_jobs
+    import diffcloud.estimation.task
     from tests.cli.invoke import invoke
 
     monkeypatch.chdir(tmp_path)
@@ -173,7 +173,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
     def never(*arguments, **options):
         raise AssertionError("fitted or compared again")
 
-    monkeypatch.setattr(diffcloud.cli.fit_jobs, "solve", never)
+    monkeypatch.setattr(diffcloud.estimation.task, "solve", never)
     monkeypatch.setattr(diffcloud.cli.comparison, "compare_episode", never)
     assert invoke(*command).result["metrics"]["comparison"] == found
     assert "No published episode matches" in invoke("published", release, "--only", "shirt*", code=1).errors

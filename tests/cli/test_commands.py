@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 import yaml
 
-from diffcloud.cli import fit_jobs
-from diffcloud.estimation import Objective, read_fit
+from diffcloud.estimation import Objective, read_fit, task
 from diffcloud.estimation.pose import NUISANCE
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.obj import read_cloth, read_surface
@@ -276,7 +275,7 @@ def test_interrupted_fit_leaves_the_best_so_far_and_goes_on(work, monkeypatch):
 
 
 def test_a_ctrl_c_after_the_last_step_does_not_cost_the_fit(work, monkeypatch):
-    real, pressed = fit_jobs.describe_fit, []
+    real, pressed = task.describe_fit, []
 
     def describe(*arguments, **options):
         if not pressed:
@@ -284,7 +283,7 @@ def test_a_ctrl_c_after_the_last_step_does_not_cost_the_fit(work, monkeypatch):
             raise KeyboardInterrupt
         return real(*arguments, **options)
 
-    monkeypatch.setattr(fit_jobs, "describe_fit", describe)
+    monkeypatch.setattr(task, "describe_fit", describe)
     command = ("fit", "--scenario", "small.yaml", "--out", "fits", "--solver", "adam", "--iterations", 2, "e1.npz")
     run(*command, cwd=work, code=130)
     first = json.loads((work / "fits" / "e1.json").read_text())

@@ -19,12 +19,12 @@ import torch
 import yaml
 
 import diffcloud as dc
-from diffcloud.cli import fit_jobs, identify
+from diffcloud.cli import identify
 from diffcloud.cli.fit_jobs import FitJob
 from diffcloud.cli.preprocess import Cleaned, PreprocessJob
 from diffcloud.clouds import SurfaceSampler
 from diffcloud.errors import EpisodeError
-from diffcloud.estimation import read_fit
+from diffcloud.estimation import read_fit, task
 from diffcloud.estimation.likelihood.descent import Descent
 from diffcloud.estimation.result import read_motion
 from diffcloud.io.clouds import read_cloud, write_ply
@@ -337,7 +337,7 @@ class TestStopped:
 
         words = [*COMMAND, "--parameters", "stretch"]
         with monkeypatch.context() as patch:
-            patch.setattr(fit_jobs, "solve", stop)
+            patch.setattr(task, "solve", stop)
             told = invoke(*words, code=130).result
         check_unfinished(Path("found"), told, "interrupted", "Ctrl-C was pressed")
         assert told["explains"] is None

@@ -140,6 +140,7 @@ def quick(folder: Path) -> None:
 
 PREPARED = {
     "README.md": own_clouds,
+    "docs/library.md": own_clouds,
     "docs/calibration.md": board,
     "docs/concepts.md": motions,
     "docs/capture.md": lab,
