@@ -40,7 +40,7 @@ def invoke(*arguments: object, code: int = 0, answer: str | None = None) -> Invo
     """Run with --json and check the exit status; `answer` is typed at prompts."""
     done = CliRunner().invoke(app if arguments[0] in COMMANDS else studies, [*map(str, arguments), "--json"], input=answer)
     errors, status = done.stderr, done.exit_code
-    if isinstance(done.exception, DiffCloudError):  # as diffcloud.cli.app.main reports it
+    if isinstance(done.exception, DiffCloudError):  # as diffcloud.cli.app.run reports it
         errors, status = errors + str(done.exception), 1
     elif done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception

@@ -258,6 +258,7 @@ class TestUnforeseen:
                 raise error
 
             monkeypatch.setattr(diffcloud.cli.app, "app", fails)
+            monkeypatch.setattr(diffcloud.cli.app.ctrl_c, "listen", lambda: None)  # it would, for all later tests too
             monkeypatch.setattr(diffcloud.cli.app.tempfile, "tempdir", str(tmp_path))
             monkeypatch.setattr(diffcloud.cli.app.sys, "argv", ["diffcloud", *arguments])
             with pytest.raises(SystemExit) as stopped:
