@@ -166,7 +166,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
     command = ("published", release, "--params", "quick.yaml", "--only", "*/fold_tan*", "--markdown", "c.md")
     found = invoke(*command).result["metrics"]["comparison"]
     assert set(found["methods"]["release_fold"]) >= {"diffcloud", "cma_es", "published_mlp", "published_meteornet"}
-    assert set(found["verdicts"]["release_fold"]) == {"stretch", "mass"}
+    assert "verdicts" not in found  # Adam knows no intervals
     assert "fold_tan2" in Path("c.md").read_text(encoding="utf-8")
     assert Path("reports/release/index.html").is_file()
 
