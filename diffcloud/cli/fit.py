@@ -109,7 +109,11 @@ def fit(
     resample: Annotated[bool | None, typer.Option(help="Of adam: new points in each iteration.")] = None,
     paper: Annotated[
         bool | None,
-        typer.Option("--paper", help="The published measure: from cloth to recording only, at the loss frames, no pose."),
+        typer.Option(
+            "--paper",
+            help="The published measure: from cloth to recording only, at the loss frames, no pose; by adam unless "
+            "--solver names another.",
+        ),
     ] = None,
     nuisance: Annotated[
         str | None,
@@ -155,6 +159,8 @@ def fit(
     """Fit episodes. Ctrl-C writes the best so far and stops; the same command keeps what is finished and goes on."""
     use_threads(threads)
     config = load_config(params)
+    if paper and solver is None and config.fit.solver == "likelihood":  # which that measure has not
+        solver = "adam"
     settings = updated(
         config.fit,
         parameters=None if parameters is None else [name.strip() for name in parameters.split(",")],

@@ -99,5 +99,7 @@ def test_a_damaged_estimate_is_refused(tmp_path, change, message):
 
 
 def test_the_published_measure_has_none():
-    told = invoke("fit", "one.npz", *OPTIONS[:-2], "--paper", "--out", "never", code=1)
-    assert "the published measure has no likelihood" in told.errors
+    known = ("fit", "one.npz", *OPTIONS[:-2], "--paper", "--out", "papers")
+    assert "the published measure has no likelihood" in invoke(*known, "--solver", "likelihood", code=1).errors
+    invoke(*known, "--iterations", 1)
+    assert read_fit(Path("papers/one.json")).solver == "adam"
