@@ -5,6 +5,7 @@ Commands do the same with files: `identify` runs the same fit, from the same set
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -30,7 +31,7 @@ from diffcloud.evaluation.intervals import LEVEL, WITHIN, Intervals, draws, inte
 from diffcloud.evaluation.methods import space_of
 from diffcloud.identification import fit_settings, found_cloth, with_density
 from diffcloud.io.episodes import Episode, read_episode
-from diffcloud.io.files import together, write_json, write_text
+from diffcloud.io.files import read_yaml, together, write_json, write_text
 from diffcloud.io.imports import cloud_folder
 from diffcloud.scene.scenarios import Scenario, load_scenario
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
@@ -65,7 +66,8 @@ class Estimate:
     status: str
     """`identified`, or why it is not; empty without an interval."""
     deviations: Mapping[str, float] = field(default_factory=dict)
-    """Source of uncertainty -> standard deviation of the logarithm, the largest first."""
+    """Source of uncertainty -> standard deviation, the largest first: of the logarithm, or of the part of the range where
+    the lower bound is zero."""
 
     def __str__(self) -> str:
         ends = "" if self.interval is None else f" ({self.interval[0]:.3g} to {self.interval[1]:.3g}), {self.status}"
@@ -93,13 +95,15 @@ class Scene:
             load_scenario(source)  # raises
             return Scene(str(source), {"base": str(source)})
         path = Path(source)
-        told = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
         load_scenario(path)  # raises
-        return Scene(path.stem, dict(told or {}))
+        told = dict(read_yaml(path, error=ConfigError) or {})
+        if isinstance(material := told.get("material"), str) and material.endswith(".json"):
+            told["material"] = str((path.parent / material).resolve())
+        return Scene(path.stem, told)
 
     @cached_property
     def scenario(self) -> Scenario:
-        """As the simulator takes it."""
+        """What the simulator and fits run."""
         if set(self.options) == {"base"}:
             return load_scenario(str(self.options["base"]))
         return make_scenario(own_options(self.options, self.name, f"scene {self.name}", folder=Path()))
@@ -145,7 +149,7 @@ class Fit:
     residual: float
     """RMS distance between simulated and recorded points [m]."""
     horizons: Mapping[str, float]
-    """Recording -> until when its frames counted [s]; empty where the solver knows no horizon."""
+    """Recording -> time of the last frame that counted [s]; empty where the solver has no horizon."""
     scenes: Sequence[Scene]
     """With the grasp that was found."""
     record: FitRecord
@@ -159,7 +163,7 @@ class Fit:
         return "\n".join([*lines, *(f"{name}: {told}" for name, told in self.parameters.items())])
 
     def sample(self, count: int, seed: int = 0) -> pd.DataFrame:
-        """Cloths as probable as the recordings leave them: a row each, a column for each quantity in SI units.
+        """Parameter sets drawn from the posterior: a row each, a column for each quantity in SI units.
 
         Raises:
             ConfigError: there are no intervals, or the model does not follow the recordings.
@@ -243,6 +247,8 @@ def find_scenes(
     sides = (float(cloth["size_m"][0]), float(cloth["size_m"][1]))
     for number, recording in enumerate(recordings, 1):
         layout = find_layout(recording, sides, float(cloth["grip_m"]))
+        for message in layout.warnings:
+            warnings.warn(f"Recording {number}: {message}.", stacklevel=2)
         options = {**cloth, **{name: found.value for name, found in layout.fields.items()}}
         scenes.append(Scene(f"recording_{number}", options, settings))
     return scenes
@@ -275,6 +281,9 @@ def fit(
     chosen = [scenes] if isinstance(scenes, Scene) else list(scenes)
     if len(episodes) != len(chosen) or not episodes:
         raise ConfigError(f"Each recording takes one scene; got {len(episodes)} recordings and {len(chosen)} scenes.")
+    names = [scene.name for scene in chosen]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"Two scenes are named {max(names, key=names.count)}; give each a name of its own.")
     pairs = zip(chosen, episodes, strict=True)
     members = [Recording(scene.scenario, scene.name, episode) for scene, episode in pairs]
     result = FitTask(members, settings or chosen[0].settings).fitted(
@@ -287,7 +296,6 @@ def fit(
         chosen = [replace(scene, options={**scene.options, **found}) for scene in chosen]
     scenario = chosen[0].scenario
     intervals = None if told is None else intervals_of(record, space_of(record), scenario, level=level, within=within)
-    names = [one.name for one in record.episodes]
     return Fit(
         parameters=_estimates(record, intervals, scenario, level),
         status=_status(record, intervals),
@@ -312,7 +320,7 @@ def _estimates(record: FitRecord, intervals: Intervals | None, scenario: Scenari
             (entry.physical_low, entry.physical_high),
             intervals.level,
             entry.verdict,
-            {source: row[name] for source, row in intervals.sources.items()},
+            dict(sorted(((source, row[name]) for source, row in intervals.sources.items()), key=lambda one: -one[1])),
         )
         for name, entry in intervals.parameters.items()
     }

@@ -92,7 +92,7 @@ def identify(
         typer.Option(min=0.01, max=0.999, help="Share of intervals that should contain the truth. Default: 0.9."),
     ] = None,
     within: Annotated[
-        float | None, typer.Option(help="Factor within which a parameter counts as identified. Default: 1.5.")
+        float | None, typer.Option(help="Factor within which a parameter counts as identified. Default: 2.")
     ] = None,
     budget: Annotated[
         str,

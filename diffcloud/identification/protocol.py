@@ -49,9 +49,9 @@ def found_cloth(
         ),
         "grip_m": Found(GRIP_M, "side of the pad, or of the square that a pivot stands for; measure your gripper's [m]"),
         "grip_known_within": Found(_GRIP_KNOWN, "factor within which grip_m is known; 1.05 if you have measured it"),
-        "material": Found(material, f"what multipliers act on; density {told}"),
+        "material": Found(material, f"nominal material; density {told}"),
         **{name: Found(value, "usual; fitted too, within `doubts`") for name, value in _AROUND.items()},
-        "doubts": Found(_DOUBTS, "factors within which what nobody asks for is known"),
+        "doubts": Found(_DOUBTS, "priors of what is fitted too: factors of one standard deviation"),
         "steps_per_frame": Found(_STEPS, "finer steps move a lifted cloth by less than the noise"),
     }
 
@@ -72,7 +72,8 @@ def _material(cloth: Mapping[str, Any]) -> dict[str, Any]:
 def fit_settings(
     parameters: Sequence[str] | None, cloth: Mapping[str, Any], weighed: tuple[float, float] | None
 ) -> FitSettings:
-    """
+    """Settings of the fit of such a cloth.
+
     Args:
         parameters: to find; by default stretching, bending, and the mass if it was not weighed.
         cloth: fields of `found_cloth`.

@@ -176,4 +176,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
     monkeypatch.setattr(diffcloud.estimation.task, "solve", never)
     monkeypatch.setattr(diffcloud.cli.comparison, "compare_episode", never)
     assert invoke(*command).result["metrics"]["comparison"] == found
-    assert "No published episode matches" in invoke("published", release, "--only", "shirt*", code=1).errors
+    assert (
+        "No published episode matches"
+        in invoke("published", release, "--params", "quick.yaml", "--only", "shirt*", code=1).errors
+    )

@@ -105,6 +105,8 @@ class TestFit:
     def test_each_recording_takes_a_scene(self, scene, recording):
         with pytest.raises(dc.DiffCloudError, match="2 recordings and 1 scenes"):
             dc.fit([recording, recording], [scene])
+        with pytest.raises(dc.DiffCloudError, match="Two scenes are named small"):
+            dc.fit([recording, recording], [scene, scene])
 
 
 class TestScene:
@@ -116,6 +118,9 @@ class TestScene:
         assert mine.scenario.frames == load_scenario(tmp_path / "mine.yaml").frames
         with pytest.raises(dc.DiffCloudError, match="lft"):
             dc.Scene.load("lft")
+        (tmp_path / "damaged.yaml").write_text("nodes: [5,")
+        with pytest.raises(dc.DiffCloudError, match=r"damaged\.yaml"):
+            dc.Scene.load(tmp_path / "damaged.yaml")
 
     def test_a_motion_changes_with_its_material_as_its_gradient_says(self, scene):
         def height(stretching):
