@@ -23,13 +23,13 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import ConfigError, EpisodeError, unknown_name
 from diffcloud.estimation.record import FitRecord
-from diffcloud.estimation.result import FitResult, FittedMotion, physical_values, whole_material, write_fit
+from diffcloud.estimation.result import FitResult, FittedMotion, physical_values, write_fit
 from diffcloud.estimation.settings import FitSettings
 from diffcloud.estimation.solvers import Progress
 from diffcloud.estimation.task import FitTask, Recording
 from diffcloud.evaluation.intervals import LEVEL, WITHIN, Intervals, draws, intervals_of
 from diffcloud.evaluation.methods import space_of
-from diffcloud.identification import fit_settings, found_cloth, with_density
+from diffcloud.identification import fit_settings, found_cloth, known_grip, with_density
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import read_yaml, together, write_json, write_text
 from diffcloud.io.imports import cloud_folder
@@ -39,7 +39,7 @@ from diffcloud.scene.scenarios.layout import find_layout
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import Rollout, rollout
 from diffcloud.simulators.export.cloth import fitted_cloth
-from diffcloud.simulators.export.write import Target, write_export
+from diffcloud.simulators.export.write import Target, described, write_export, write_samples
 
 _NAMES = {
     "stretch": "stretching",
@@ -240,7 +240,7 @@ def find_scenes(
     fields = found_cloth(recordings, size, None if weighed is None else weighed[0])
     cloth: dict[str, Any] = {name: found.value for name, found in fields.items()}
     if grip is not None:
-        cloth |= {"grip_m": grip, "grip_known_within": 1.0}
+        cloth |= known_grip(grip)
     if weighed is not None and weighed[1]:
         cloth = with_density(cloth, *weighed)
     settings, scenes = fit_settings(None, cloth, weighed), list[Scene]()
@@ -292,8 +292,7 @@ def fit(
     record = result.record
     told = record.estimate
     if told is not None and told.grip_m is not None:
-        found = {"grip_m": told.grip_m, "grip_known_within": 1.0}
-        chosen = [replace(scene, options={**scene.options, **found}) for scene in chosen]
+        chosen = [replace(scene, options={**scene.options, **known_grip(told.grip_m)}) for scene in chosen]
     scenario = chosen[0].scenario
     intervals = None if told is None else intervals_of(record, space_of(record), scenario, level=level, within=within)
     return Fit(
@@ -353,21 +352,14 @@ def export(fit: Fit, to: Target, out: str | Path, *, recording: int = 0, samples
         ConfigError: samples of a fit without intervals.
     """
     out, one, scenario = Path(out), fit.record.episodes[recording], fit.scenes[recording].scenario
-    motion, values = fit.motions[recording], [fit.record.values]
+    motion, values, drawn = fit.motions[recording], fit.record.values, list[dict[str, float]]()
     if samples:
         if fit.intervals is None:
             raise ConfigError("Only a fit by the solver likelihood knows how uncertain it is; leave samples out.")
-        values += [{**values[0], **drawn} for drawn in draws(fit.intervals, space_of(fit.record).asked, samples, seed)]
+        drawn = [{**values, **each} for each in draws(fit.intervals, space_of(fit.record).asked, samples, seed)]
     with together():
-        for number, each in enumerate(values):
-            folder = out if number == 0 else out / f"sample_{number - 1:04d}"
-            about = {
-                "recording": one.name,
-                "rms_mm": one.rms_mm,
-                "parameters": dict(each),
-                "material": whole_material(scenario, each).model_dump(),
-            }
-            write_export(fitted_cloth(one, motion, scenario, each), to, folder, about)
+        write_export(fitted_cloth(one, motion, scenario, values), to, out, described(one, scenario, values))
+        write_samples(one, motion, scenario, drawn, to, out, {})
     return out
 
 

@@ -11,7 +11,7 @@ from diffcloud.io.schema import Checked, Component, Vector, explain
 
 _MOST, _FACTOR = 10_000_000, 1e6
 MOST_STARTS = 100
-"""Of a fit. A start takes minutes, a candidate about a second."""
+"""Of a fit. A start takes seconds to minutes."""
 Count = Annotated[int, Field(ge=1, le=_MOST)]
 CountOrNone = Annotated[int, Field(ge=0, le=_MOST)]
 """Zero: there is none, or it is left out."""

@@ -22,6 +22,8 @@ COMMANDS = {
     "towels": "studies.towels:towels",
 }
 """Name -> where it lies; it is imported when it is run."""
+_PARALLEL = ("coverage", "published", "recordings")
+"""Studies that run their jobs through `diffcloud.cli.workers`."""
 
 app = typer.Typer(
     cls=lazy_group(COMMANDS),
@@ -37,4 +39,4 @@ def studies() -> None:
 
 
 if __name__ == "__main__":
-    run(app, COMMANDS)
+    run(app, COMMANDS, _PARALLEL)

@@ -9,7 +9,7 @@ import stat
 import sys
 import tempfile
 import traceback
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -49,7 +49,7 @@ COMMANDS = {
     "doctor": "diffcloud.cli.doctor:doctor",
 }
 """Name -> where it lies; it is imported when it is run."""
-_PARALLEL = ("episodes", "preprocess", "fit", "train", "evaluate", "coverage", "recordings")
+_PARALLEL = ("episodes", "preprocess", "fit", "train", "evaluate")
 """Commands that run their jobs through `diffcloud.cli.workers`."""
 
 app = typer.Typer(
@@ -70,7 +70,7 @@ def diffcloud(
 
 def main() -> None:
     """`diffcloud`."""
-    run(app, COMMANDS)
+    run(app, COMMANDS, _PARALLEL)
 
 
 def stage(name: str) -> None:
@@ -79,11 +79,12 @@ def stage(name: str) -> None:
     main()
 
 
-def run(app: typer.Typer, places: Mapping[str, str]) -> None:
+def run(app: typer.Typer, places: Mapping[str, str], parallel: Collection[str]) -> None:
     """Run, and turn the project's own errors into a message and exit status 1; any other, into where its traceback is.
 
     Args:
         places: of its commands.
+        parallel: commands that run their jobs through `diffcloud.cli.workers`.
     """
     _have_a_home()
     keep_freed_memory()
@@ -93,7 +94,7 @@ def run(app: typer.Typer, places: Mapping[str, str]) -> None:
             stream.reconfigure(errors="backslashreplace")
     try:
         refuse_undecoded(sys.argv[1:])
-        if sys.argv[1:2] and sys.argv[1] in _PARALLEL and sys.argv[1] in places:
+        if sys.argv[1:2] and sys.argv[1] in parallel:
             begin_importing(places[sys.argv[1]].partition(":")[0], sys.argv[1:])
         with ctrl_c.none_lost():
             app()

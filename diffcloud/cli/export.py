@@ -13,14 +13,11 @@ from rich.table import Table
 from diffcloud.cli.console import JsonFlag, errors, finish, progress_bar, show, warn, writes
 from diffcloud.cli.scenario_options import ScenarioName, choose_scenario, fitted_scenario
 from diffcloud.errors import ConfigError
-from diffcloud.estimation.record import FitRecord, RecordingFit, read_fit
+from diffcloud.estimation.record import FitRecord, read_fit
 from diffcloud.io.files import together
 from diffcloud.io.manifests import remove_files
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from diffcloud.scene.scenarios import Scenario
     from diffcloud.simulators.export.check import Checked, Runnable
 
 TargetName = Literal["mujoco", "newton", "isaac", "arcsim", "obj"]
@@ -63,7 +60,7 @@ def export(
     """Write a fitted cloth for another simulator: mesh, material in SI units, and the recorded motion of what is held."""
     from diffcloud.estimation.result import read_motion
     from diffcloud.simulators.export.cloth import fitted_cloth
-    from diffcloud.simulators.export.write import exported_files, write_export
+    from diffcloud.simulators.export.write import described, exported_files, write_export, write_samples
 
     if check and to not in _RUNNABLE:
         raise ConfigError(f"--check runs {' and '.join(_RUNNABLE)}; {to} cannot be run here.")
@@ -76,14 +73,10 @@ def export(
     chosen = choose_scenario(scenario or fitted_scenario(fit, one.scenario))
     motion = read_motion(fit.with_suffix(".npz"), index)
     cloth = fitted_cloth(one, motion, chosen, record.values)
-    former = exported_files(out)
+    former, about = exported_files(out), {"fit": fit.name}
     with together():
-        names, left_out = write_export(cloth, to, out, _about(fit, one, chosen, record.values))
-        written = set(names)
-        for number, values in enumerate(drawn):
-            sample, folder = fitted_cloth(one, motion, chosen, values), out / f"sample_{number:04d}"
-            of_sample, _ = write_export(sample, to, folder, {"sample": number, **_about(fit, one, chosen, values)})
-            written |= {f"{folder.name}/{name}" for name in of_sample}
+        names, left_out = write_export(cloth, to, out, {**about, **described(one, chosen, record.values)})
+        written = {*names, *write_samples(one, motion, chosen, drawn, to, out, about)}
     remove_files(out, sorted(former - written))
     for sentence in left_out:
         warn(sentence)
@@ -109,19 +102,6 @@ def export(
         _show(found, to, json)
         told |= _numbers(found)
     finish(told, json)
-
-
-def _about(fit: Path, one: RecordingFit, scenario: Scenario, values: Mapping[str, float]) -> dict[str, Any]:
-    from diffcloud.estimation.result import whole_material
-
-    return {
-        "fit": fit.name,
-        "recording": one.name,
-        "rms_mm": one.rms_mm,
-        "parameters": dict(values),
-        "pose": {name: entry.model_dump() for name, entry in one.nuisance.items()},
-        "material": whole_material(scenario, values).model_dump(),
-    }
 
 
 def _draws(record: FitRecord, path: Path, count: int, seed: int) -> list[dict[str, float]]:

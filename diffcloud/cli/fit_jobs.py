@@ -106,7 +106,7 @@ class FitJob:
     init: Mapping[str, float] = field(default_factory=dict)
     """Values of the first start; the middle of the range where not given."""
 
-    @property
+    @cached_property
     def task(self) -> FitTask:
         return FitTask(self.recordings, self.settings, self.init)
 
@@ -181,7 +181,7 @@ class FitJob:
         resolved = [
             self.task.space,
             self.task.solver_settings,
-        ]  # decided by defaults of other packages
+        ]  # with defaults from outside of these packages
         return fingerprint([self.name, self.recordings, settings, resolved], packages=_CODE)
 
 

@@ -31,7 +31,7 @@ from diffcloud.estimation.task import Recording, compared
 from diffcloud.evaluation.intervals import FOLLOWS, LEVEL, WITHIN, Intervals, intervals_of, significant
 from diffcloud.evaluation.methods import space_of
 from diffcloud.evaluation.summary import largest_sources
-from diffcloud.identification import fit_settings, found_cloth, with_density
+from diffcloud.identification import fit_settings, found_cloth, known_grip, with_density
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import claimed, read_json, read_yaml, together, write_bytes, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint
@@ -438,7 +438,7 @@ def _with_grip_found(members: Sequence[Recording], record: FitRecord, out: Path)
     told = []
     for one in members:
         path = _stage(out) / f"{one.name}.yaml"
-        write_text(path, yaml.safe_dump({**_fields(path), "grip_m": found, "grip_known_within": 1.0}, sort_keys=False))
+        write_text(path, yaml.safe_dump({**_fields(path), **known_grip(found)}, sort_keys=False))
         told.append(replace(one, scenario=load_scenario(path)))
     return told
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 from diffcloud.errors import DivergedError
 from diffcloud.estimation.batches import batch_losses
@@ -65,7 +66,7 @@ class FitTask:
         """Of the first recording."""
         return self.recordings[0].scenario
 
-    @property
+    @cached_property
     def space(self) -> FitSpace:
         """
         Raises:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -130,7 +131,7 @@ class _Known:
     quantile: float
     """Deviations to each side."""
 
-    @property
+    @cached_property
     def covariance(self) -> NDArray[np.float64]:
         """[k, k]"""
         return np.sum(list(self.sources.values()), axis=0)

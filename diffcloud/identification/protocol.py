@@ -56,6 +56,11 @@ def found_cloth(
     }
 
 
+def known_grip(size: float) -> dict[str, float]:
+    """Fields of a cloth whose grasp has this size for certain [m]."""
+    return {"grip_m": size, "grip_known_within": 1.0}
+
+
 def with_density(cloth: Mapping[str, Any], density: float, deviation: float) -> dict[str, Any]:
     """The cloth with a weighed mass that is not exact: the fit allows for it."""
     material = {**_material(cloth), "density_kg_m2": density}

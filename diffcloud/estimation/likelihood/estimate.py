@@ -88,7 +88,7 @@ def estimate(
     *,
     progress: Callable[[int, int, float, dict[str, float]], None] | None = None,
 ) -> Estimate:
-    """The parameters that recordings show, by the rules at the head of this module. Ctrl-C ends the fit and keeps the best
+    """The parameters that recordings show, by the rules of `estimation.likelihood`. Ctrl-C ends the fit and keeps the best
     so far.
 
     Args:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from diffcloud.estimation.matching import Pairs
 
-_TINY = 1e-12
+TINY = 1e-12
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ def one_way(
     """
     across = (away * normals).sum(-1, keepdim=True) * normals
     along = away - across
-    along = along / (along.square().sum(-1, keepdim=True) + pairs.spacing[:, None, None].square()).sqrt().clamp(min=_TINY)
-    counts = (pairs.weights / pairs.weights.sum(-1, keepdim=True).clamp(min=_TINY))[0]
+    along = along / (along.square().sum(-1, keepdim=True) + pairs.spacing[:, None, None].square()).sqrt().clamp(min=TINY)
+    counts = (pairs.weights / pairs.weights.sum(-1, keepdim=True).clamp(min=TINY))[0]
     squares = away.square().sum(-1)[0]
     near = torch.where(squares < cap**2, counts, 0.0)
     mean = torch.where(counts.sum(-1) > 0, (counts * squares.clamp(max=cap**2)).sum(-1), cap**2)

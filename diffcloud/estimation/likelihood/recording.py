@@ -8,7 +8,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from diffcloud.estimation.likelihood.frames import Frames, one_way, squared
+from diffcloud.estimation.likelihood.frames import TINY, Frames, one_way, squared
 from diffcloud.estimation.likelihood.grasp import regripped
 from diffcloud.estimation.objective import Objective
 from diffcloud.estimation.parameters import FitSpace
@@ -21,7 +21,6 @@ _FRAME_S = 0.1
 """Frames that are closer share these."""
 _MODEL_M = 0.001
 """What no simulator of cloth predicts better."""
-_TINY = 1e-12
 
 
 class Recording:
@@ -121,7 +120,7 @@ class Linear:
             if normals is None:
                 first, second, third = pairs.places.corners(views).unbind(-2)
                 normals = torch.linalg.cross(second - first, third - first)
-                normals = space.carried(normals / normals.norm(dim=-1, keepdim=True).clamp(min=_TINY), pose)
+                normals = space.carried(normals / normals.norm(dim=-1, keepdim=True).clamp(min=TINY), pose)
             moved = None if asked is None else space.carried(pairs.places.of(objective.still_bodies(asked)), pose)
             ways.append(one_way(pairs, at - pairs.partners, normals, units * moves, moved, objective.cap))
         squares, slopes, curvatures, shifted = (torch.stack(part) for part in zip(*ways, strict=True))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -12,12 +12,15 @@ import numpy as np
 
 from diffcloud import __version__
 from diffcloud.errors import DiffCloudError
+from diffcloud.estimation.record import RecordingFit
+from diffcloud.estimation.result import FittedMotion, whole_material
 from diffcloud.io.files import read_json, together, write_json, write_npz, write_text
 from diffcloud.io.obj import write_cloth, write_surface
+from diffcloud.scene.scenarios import Scenario
 from diffcloud.scene.write import write_scene
 from diffcloud.simulators import mujoco
 from diffcloud.simulators.explicit import neo_hookean_gain
-from diffcloud.simulators.export.cloth import WORTH_SAYING, ExportedCloth, start_strain
+from diffcloud.simulators.export.cloth import WORTH_SAYING, ExportedCloth, fitted_cloth, start_strain
 from diffcloud.simulators.export.isaac import layer
 from diffcloud.simulators.problem import Problem
 
@@ -32,6 +35,51 @@ WRITTEN_FOR: dict[Target, str] = {
 }
 _MOST_POISSON = 0.49
 """MuJoCo and Isaac Sim make a membrane of a solid, whose ratio is below 0.5; a sheet's may be larger."""
+
+
+def described(one: RecordingFit, scenario: Scenario, values: Mapping[str, float]) -> dict[str, Any]:
+    """What `cloth.json` holds of a fit.
+
+    Args:
+        one: the recording whose motion is exported.
+        values: of all parameters.
+    """
+    return {
+        "recording": one.name,
+        "rms_mm": one.rms_mm,
+        "parameters": dict(values),
+        "pose": {name: entry.model_dump() for name, entry in one.nuisance.items()},
+        "material": whole_material(scenario, values).model_dump(),
+    }
+
+
+def write_samples(
+    one: RecordingFit,
+    motion: FittedMotion,
+    scenario: Scenario,
+    drawn: Sequence[Mapping[str, float]],
+    target: Target,
+    folder: Path,
+    about: Mapping[str, Any],
+) -> set[str]:
+    """The same cloth with other parameters, each in a folder `sample_0000` and so on.
+
+    Args:
+        drawn: values of all parameters, for each sample.
+        about: what else each `cloth.json` shall hold.
+
+    Returns:
+        The files, as paths inside of the folder.
+
+    Raises:
+        SceneError: as of `write_export`.
+    """
+    written = set[str]()
+    for number, values in enumerate(drawn):
+        sample, place = fitted_cloth(one, motion, scenario, values), folder / f"sample_{number:04d}"
+        names, _ = write_export(sample, target, place, {"sample": number, **about, **described(one, scenario, values)})
+        written |= {f"{place.name}/{name}" for name in names}
+    return written
 
 
 def write_export(
