@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloud.arcsim.contact.nearest import pairs_at
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.estimation.matching import nearest_places, pairs_forth
@@ -18,7 +19,6 @@ from diffcloud.sim.build import build_system
 from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import preset
 from diffcloud.sim.properties import scaled_properties
-from diffcloud.sim.reference.nearest import pairs_at
 from diffcloud.sim.simulate import rollout, rollout_tangents
 from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
 from diffcloud.sim.system import System

@@ -9,6 +9,7 @@ import numpy as np
 import typer
 
 import diffcloud
+from diffcloud.arcsim.release import RELEASE
 from diffcloud.cli.config import load_config
 from diffcloud.cli.console import JsonFlag, ParamsFile, errors, finish, writes
 from diffcloud.cli.fit_jobs import fit_file
@@ -29,7 +30,6 @@ from diffcloud.report import (
     comparison_figures,
     overlay_figure,
 )
-from diffcloud.scene.scenarios.release import RELEASE
 
 
 @writes(".html")

@@ -12,15 +12,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from diffcloud import arcsim
+from diffcloud.arcsim.contact.impact_zones import PASSES
 from diffcloud.errors import DivergedError, UnresolvedContactError
-from diffcloud.sim import implicit, linearised, status
+from diffcloud.sim import implicit, status
 from diffcloud.sim.compiled.data import Floats, Motion, Parameters, Timing
 from diffcloud.sim.handles import HandleSchedule
 from diffcloud.sim.held import Held
 from diffcloud.sim.plausibility import Motion as Course
 from diffcloud.sim.plausibility import implausible
 from diffcloud.sim.properties import Properties
-from diffcloud.sim.reference.impact_zones import PASSES
 from diffcloud.sim.scenery import Scenery
 from diffcloud.sim.system import System
 from diffcloud.sim.terms import TERMS, kernels
@@ -45,7 +46,7 @@ class Batch:
         self.held = _held(system, self.schedule)
         all_times = np.concatenate([[0.0], times])
         self.times = torch.as_tensor(all_times)
-        self._integrator: Any = implicit if system.setup.integrator == "implicit" else linearised
+        self._integrator: Any = implicit if system.setup.integrator == "implicit" else arcsim
         self._scenery = _scenery(system).at(all_times)
         self._progress = progress
 

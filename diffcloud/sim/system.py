@@ -8,8 +8,9 @@ from typing import Any
 
 from torch import Tensor
 
+from diffcloud import arcsim
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
-from diffcloud.sim import implicit, linearised
+from diffcloud.sim import implicit
 from diffcloud.sim.handles import Handles
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.rigid.bodies import Bodies, BodyState
@@ -52,7 +53,7 @@ class System:
     @cached_property
     def scene(self) -> Any:
         """What the kernels of the integrator are given."""
-        integrator = implicit if self.setup.integrator == "implicit" else linearised
+        integrator = implicit if self.setup.integrator == "implicit" else arcsim
         return integrator.build_scene(self.setup, self.time_step)
 
 

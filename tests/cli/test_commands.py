@@ -24,10 +24,10 @@ from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.obj import read_cloth, read_surface
 from diffcloud.io.timings import read_seconds
 from diffcloud.scene.scenarios import load_scenario
+from tests.arcsim.files import MESHES, over_moving_box, write_file, write_files
 from tests.cli.invoke import DIFFCLOUD, ROOT, Invoked, environment, invoke
 from tests.conftest import small_lift
 from tests.estimation.test_fit import clouds_of
-from tests.scene.files import MESHES, over_moving_box, write_file, write_files
 
 SMALL = {
     "base": "lift",

@@ -14,8 +14,8 @@ from diffcloud.scene import load_scene
 from diffcloud.sim.properties import scaled_properties
 from diffcloud.sim.simulate import Rollout, rollout
 from diffcloud.sim.system import System
+from tests.arcsim.files import Data, over_moving_box, sheet_over_box, write_file, write_files
 from tests.physics.test_rigid_contact import momenta
-from tests.scene.files import Data, over_moving_box, sheet_over_box, write_file, write_files
 from tests.sim.contact.penetration import find_penetrations
 
 CORNERS = [0, 4, 20, 24]

@@ -30,11 +30,11 @@ from diffcloud.io.simulated import SimulatedSet
 from diffcloud.scene.scenarios.catalogue import built_in
 from diffcloud.sensing.robot import Robot
 from diffcloud.sensing.validation.episode import validate_raw_episode
+from tests.arcsim.files import sheet_over_box, write_file, write_files
 from tests.cli.invoke import ROOT, environment
 from tests.conftest import small_lift
 from tests.estimation.test_fit import clouds_of
 from tests.io.ros_bag import Bag, Habits
-from tests.scene.files import sheet_over_box, write_file, write_files
 from tests.sensing.table_scene import INTRINSICS, poses
 
 SCENARIO = {

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 
+from diffcloud.arcsim.load import load_scene
+from diffcloud.arcsim.write import write_scene
 from diffcloud.errors import SceneError
 from diffcloud.mesh import ClothMesh, grid_cloth
 from diffcloud.mesh.refinement import refined
-from diffcloud.scene.load import load_scene
 from diffcloud.scene.scenarios import Scenario, load_scenario
 from diffcloud.scene.scenarios.catalogue import built_in, own_options
 from diffcloud.scene.scenarios.grid import GridScenario, grid_scenario
-from diffcloud.scene.write import write_scene
 from diffcloud.sim.grasp import Grasp
 from diffcloud.sim.simulate import rollout
-from tests.scene.files import sheets_over_table, write_file, write_files
+from tests.arcsim.files import sheets_over_table, write_file, write_files
 
 
 def lift(**changes: object) -> Scenario:

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
+from diffcloud.arcsim.load import load_scene
 from diffcloud.errors import ConfigError
 from diffcloud.estimation.record import NuisanceValue
 from diffcloud.estimation.result import FittedMotion
 from diffcloud.io.obj import read_cloth
 from diffcloud.mesh.shapes import grid_cloth
-from diffcloud.scene.load import load_scene
 from diffcloud.scene.scenarios import built_in, load_scenario, make_scenario
 from diffcloud.sim.materials import TABLE_ENTRY_TO_STRETCHING, isotropic, preset
 from diffcloud.sim.properties import one_set

@@ -8,13 +8,13 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from diffcloud.arcsim.release import PAPER_THRESHOLD
 from diffcloud.errors import SceneError
 from diffcloud.io.published import RELEASE_UNIT_M
 from diffcloud.io.schema import NonNegative
 from diffcloud.mesh.shapes import box_surface, cylinder_surface, loop_cloth
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios.options import Coordinate, Length, ScenarioOptions, assemble
-from diffcloud.scene.scenarios.release import PAPER_THRESHOLD
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.scene.scenarios.sheet import Sheet
 

@@ -8,14 +8,14 @@ from typing import Literal, overload
 
 from pydantic import ValidationError
 
+from diffcloud.arcsim.load import load_scene
+from diffcloud.arcsim.release import RELEASE, release_scenario
 from diffcloud.errors import ConfigError, SceneError, unknown_name
 from diffcloud.io.files import read_yaml
 from diffcloud.io.schema import explain
-from diffcloud.scene.load import load_scene
 from diffcloud.scene.scenarios.band import BAND_STRETCH, BandScenario, band_scenario
 from diffcloud.scene.scenarios.grid import FOLD, LIFT, SHAKE, GridScenario, grid_scenario
 from diffcloud.scene.scenarios.recorded import RECORDED
-from diffcloud.scene.scenarios.release import RELEASE, release_scenario
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.scene.scenarios.vest import VEST_HANG, VestScenario, vest_scenario
 

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
+from diffcloud.arcsim.schema import Friction
 from diffcloud.errors import SceneError, unknown_name
 from diffcloud.io.schema import Checked, NonNegative, Vector
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.scene.description import Scene
 from diffcloud.scene.scenarios.scenario import Recorder, Scenario
 from diffcloud.scene.scenarios.sheet import Sheet
-from diffcloud.scene.schema import Friction
 from diffcloud.sim.grasp import Grasp
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import Material, preset, read_material

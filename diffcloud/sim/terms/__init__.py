@@ -5,6 +5,8 @@ A new force is a file here and a line in `TERMS`.
 
 from importlib import import_module
 
+from diffcloud.arcsim.contact.frames import EDGE_EDGE_MEETING, POINT_FACE_MEETING
+from diffcloud.arcsim.contact.proximity import PROXIMITY_EDGE_EDGE, PROXIMITY_POINT_FACE
 from diffcloud.sim.compiled.module import terms_module
 from diffcloud.sim.contact.barrier import (
     BARRIER_EDGE_EDGE,
@@ -13,8 +15,6 @@ from diffcloud.sim.contact.barrier import (
     BARRIER_POINT_FACE,
     BARRIER_POINT_POINT,
 )
-from diffcloud.sim.reference.frames import EDGE_EDGE_MEETING, POINT_FACE_MEETING
-from diffcloud.sim.reference.proximity import PROXIMITY_EDGE_EDGE, PROXIMITY_POINT_FACE
 from diffcloud.sim.rigid.spin import SPIN
 from diffcloud.sim.terms.term import Term
 

@@ -11,13 +11,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from diffcloud import __version__
+from diffcloud.arcsim.write import write_scene
 from diffcloud.errors import DiffCloudError
 from diffcloud.estimation.record import RecordingFit
 from diffcloud.estimation.result import FittedMotion, whole_material
 from diffcloud.io.files import read_json, together, write_json, write_npz, write_text
 from diffcloud.io.obj import write_cloth, write_surface
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.scene.write import write_scene
 from diffcloud.simulators import mujoco
 from diffcloud.simulators.explicit import neo_hookean_gain
 from diffcloud.simulators.export.cloth import WORTH_SAYING, ExportedCloth, fitted_cloth, start_strain

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from diffcloud.sim.contact.surface import Surface
+from tests.arcsim.twins.meeting import EDGES, Floats, meeting, on_both, spans, square
 from tests.sim.twins.broad_phase import listed, may_touch
-from tests.sim.twins.meeting import EDGES, Floats, meeting, on_both, spans, square
 
 NEVER = np.inf
 _NEARLY_REAL = 1e-9

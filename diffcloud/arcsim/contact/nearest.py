@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffcloud.arcsim.contact.frames import covers, cross3, dot3, frame_at, height
+from diffcloud.arcsim.contact.neighbours import Neighbours, meeting, neighbours_of, no_neighbours
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
-from diffcloud.sim.contact.neighbours import Neighbours, meeting, neighbours_of, no_neighbours
 from diffcloud.sim.contact.surface import Surface, SurfaceBox, boxed
-from diffcloud.sim.reference.frames import covers, cross3, dot3, frame_at, height
 
 _OUTSIDE = 1e-6
 _PARALLEL = 1e-12

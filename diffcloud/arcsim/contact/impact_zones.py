@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffcloud.arcsim.contact.dual import applied, gram, solve_dual
+from diffcloud.arcsim.contact.impact_times import NEVER, first_impact
+from diffcloud.arcsim.contact.neighbours import Neighbours, meeting, neighbours_of
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
 from diffcloud.sim.compiled.sorting import ascending
-from diffcloud.sim.contact.neighbours import Neighbours, meeting, neighbours_of
 from diffcloud.sim.contact.surface import SurfaceBox
-from diffcloud.sim.reference.dual import applied, gram, solve_dual
-from diffcloud.sim.reference.impact_times import NEVER, first_impact
 
 PASSES = 100
 _TIME_TIE = 1e-4

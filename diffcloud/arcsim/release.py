@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from diffcloud.arcsim.load import load_scene
 from diffcloud.errors import SceneError
 from diffcloud.io.published import RELEASE_UNIT_M
-from diffcloud.scene.load import load_scene
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.sim.surrounding import ReferenceContact
 

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.arcsim.contact.impact_zones import TOUCH, resolve
+from diffcloud.arcsim.contact.nearest import nearest_pairs
+from diffcloud.arcsim.contact.neighbours import no_neighbours
+from diffcloud.arcsim.matrix import linear_system, pattern_with
+from diffcloud.arcsim.record import Kept, nothing_kept, remember, with_impacts
+from diffcloud.arcsim.scene import Scene
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters
 from diffcloud.sim.compiled.sparse import cholesky, solve
-from diffcloud.sim.contact.neighbours import no_neighbours
 from diffcloud.sim.contact.surface import boxed
 from diffcloud.sim.held import Held, aim, first_anchors, holders, take_anchors
-from diffcloud.sim.linearised.matrix import linear_system, pattern_with
-from diffcloud.sim.linearised.record import Kept, nothing_kept, remember, with_impacts
-from diffcloud.sim.linearised.scene import Scene
-from diffcloud.sim.reference.impact_zones import TOUCH, resolve
-from diffcloud.sim.reference.nearest import nearest_pairs
 from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE, NOT_POSITIVE_DEFINITE, UNRESOLVED
 
 _LARGEST = 1e100

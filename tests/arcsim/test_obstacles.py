@@ -11,16 +11,15 @@ import numpy as np
 import pytest
 import torch
 
+from diffcloud.arcsim.schema import BodyBlock, ExtensionBlock
 from diffcloud.errors import MeshError, SceneError
 from diffcloud.scene import load_scene, write_scene
-from diffcloud.scene.schema import BodyBlock, ExtensionBlock
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.moved import moved_surfaces
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
-from tests.docs.examples import ROOT
-from tests.scene.files import (
+from tests.arcsim.files import (
     MESHES,
     changed,
     over_movable_box,
@@ -30,6 +29,7 @@ from tests.scene.files import (
     write_file,
     write_files,
 )
+from tests.docs.examples import ROOT
 from tests.scene.test_scene import assert_same
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from diffcloud.sim.contact.surface import Surface
-from tests.sim.twins.meeting import EDGES, Floats, meeting, on_both, square
+from tests.arcsim.twins.meeting import EDGES, Floats, meeting, on_both, square
 
 
 @dataclass

@@ -14,8 +14,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 
+from diffcloud.arcsim.contact.frames import Kind, frame
 from diffcloud.sim.compiled.trace import Vector, dot, larger, maximum, norm, total, where
-from diffcloud.sim.reference.frames import Kind, frame
 from diffcloud.sim.terms.term import Element, Term
 
 _TINY = 1e-12

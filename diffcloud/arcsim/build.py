@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.arcsim.contact.impact_zones import Projection
+from diffcloud.arcsim.contact.nearest import Repulsion, held_slots
+from diffcloud.arcsim.scene import Scene
 from diffcloud.sim.contact.surface import contact_surface
-from diffcloud.sim.linearised.scene import Scene
-from diffcloud.sim.reference.impact_zones import Projection
-from diffcloud.sim.reference.nearest import Repulsion, held_slots
 from diffcloud.sim.surrounding import ReferenceContact
 from diffcloud.sim.terms.elements import elements
 from diffcloud.sim.terms.planes import half_spaces

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.arcsim.scene import Scene
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
 from diffcloud.sim.compiled.sparse import Pattern, add_assemble, find_slot, hold, widened
-from diffcloud.sim.linearised.scene import Scene
 from diffcloud.sim.terms import kernels
 
 _assemble = kernels.assemble

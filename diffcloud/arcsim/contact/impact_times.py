@@ -10,9 +10,9 @@ from math import sqrt
 
 import numpy as np
 
+from diffcloud.arcsim.contact.frames import covers, cross3, dot3, frame_at, height
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats
-from diffcloud.sim.reference.frames import covers, cross3, dot3, frame_at, height
 
 _ITERATIONS = 80
 _TIME = 1e-15

@@ -9,13 +9,13 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from pydantic import ValidationError
 
+from diffcloud.arcsim.schema import KeyframeBlock, ObstacleBlock, SceneFile, TransformBlock
 from diffcloud.errors import SceneError
 from diffcloud.io.files import read_json
 from diffcloud.io.obj import read_cloth, read_surface
 from diffcloud.io.schema import explain
 from diffcloud.mesh.topology import ClothMesh, FloatArray, SurfaceMesh
 from diffcloud.scene.description import Scene
-from diffcloud.scene.schema import KeyframeBlock, ObstacleBlock, SceneFile, TransformBlock
 from diffcloud.sim.grasp import GRIP_M, Grasp, nodes_under_pad
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import read_material

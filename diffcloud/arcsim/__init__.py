@@ -10,9 +10,9 @@ their nodes. (`implicit` has the converged step.)
 `step` has the episode, `adjoint` and `tangent` its derivatives.
 """
 
-from diffcloud.sim.linearised.adjoint import reverse
-from diffcloud.sim.linearised.build import build_scene
-from diffcloud.sim.linearised.step import simulate
-from diffcloud.sim.linearised.tangent import tangents
+from diffcloud.arcsim.adjoint import reverse
+from diffcloud.arcsim.build import build_scene
+from diffcloud.arcsim.step import simulate
+from diffcloud.arcsim.tangent import tangents
 
 __all__ = ["build_scene", "reverse", "simulate", "tangents"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from diffcloud.arcsim.contact.neighbours import meeting, neighbours_of, no_neighbours
 from diffcloud.compiled import kernel
-from diffcloud.sim.contact.neighbours import meeting, neighbours_of, no_neighbours
 from tests.sim.contact.scenes import crumpled
 from tests.sim.twins import broad_phase as twin
 

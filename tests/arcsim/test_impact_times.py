@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.polynomial import Polynomial
 
-from diffcloud.sim.reference.impact_times import NEVER, coplanarity_cubic, first_impact, unit_root
+from diffcloud.arcsim.contact.impact_times import NEVER, coplanarity_cubic, first_impact, unit_root
 from diffcloud.sim.terms import kernels
-from tests.sim.twins import impacts
-from tests.sim.twins.meeting import meeting, on_both, square
+from tests.arcsim.twins import impacts
+from tests.arcsim.twins.meeting import meeting, on_both, square
 
 KINDS = pytest.mark.parametrize("kind", [0, 1], ids=["point-face", "edge-edge"])
 

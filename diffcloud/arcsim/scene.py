@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from diffcloud.arcsim.contact.impact_zones import Projection
+from diffcloud.arcsim.contact.nearest import Repulsion
 from diffcloud.sim.compiled.data import Floats
 from diffcloud.sim.compiled.sparse import Pattern
 from diffcloud.sim.contact.surface import Surface
-from diffcloud.sim.reference.impact_zones import Projection
-from diffcloud.sim.reference.nearest import Repulsion
 
 
 class Scene(NamedTuple):

@@ -5,16 +5,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.arcsim.adjoint import candidates, factor_of, restore, stop_at_planes
+from diffcloud.arcsim.contact.impact_derivatives import resolve_tangent
+from diffcloud.arcsim.matrix import repelling
+from diffcloud.arcsim.record import Kept
+from diffcloud.arcsim.scene import Scene
+from diffcloud.arcsim.step import mobility, still
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Motion, Parameters, Timing
 from diffcloud.sim.compiled.sparse import solve
 from diffcloud.sim.held import Held, aim, aim_tangent, first_anchors, holders, take_anchors_tangent
-from diffcloud.sim.linearised.adjoint import candidates, factor_of, restore, stop_at_planes
-from diffcloud.sim.linearised.matrix import repelling
-from diffcloud.sim.linearised.record import Kept
-from diffcloud.sim.linearised.scene import Scene
-from diffcloud.sim.linearised.step import mobility, still
-from diffcloud.sim.reference.impact_derivatives import resolve_tangent
 from diffcloud.sim.terms import kernels
 
 _tangent = kernels.tangent

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffcloud.arcsim.contact.impact_zones import Impacts, no_impacts
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
-from diffcloud.sim.reference.impact_zones import Impacts, no_impacts
 
 
 class Kept(NamedTuple):

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.arcsim.contact.impact_derivatives import resolve_reverse
+from diffcloud.arcsim.matrix import linear_system, pattern_with, repelling
+from diffcloud.arcsim.record import Kept
+from diffcloud.arcsim.scene import Scene
+from diffcloud.arcsim.step import displace, mobility, project, still, with_obstacles
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
 from diffcloud.sim.compiled.sparse import cholesky, solve
 from diffcloud.sim.held import Held, aim, aim_reverse, first_anchors_reverse, holders, take_anchors_reverse
-from diffcloud.sim.linearised.matrix import linear_system, pattern_with, repelling
-from diffcloud.sim.linearised.record import Kept
-from diffcloud.sim.linearised.scene import Scene
-from diffcloud.sim.linearised.step import displace, mobility, project, still, with_obstacles
-from diffcloud.sim.reference.impact_derivatives import resolve_reverse
 from diffcloud.sim.terms import kernels
 
 _reverse = kernels.reverse

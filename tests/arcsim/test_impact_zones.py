@@ -8,13 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from diffcloud.compiled import kernel
-from diffcloud.mesh import ClothMesh, SurfaceMesh, grid_cloth
-from diffcloud.sim.contact.neighbours import no_neighbours
-from diffcloud.sim.contact.surface import Surface, contact_surface
-from diffcloud.sim.reference.dual import HARD, REGULAR, applied, gram, least_distance, solve_active, solve_dual
-from diffcloud.sim.reference.impact_derivatives import resolve_reverse, resolve_tangent
-from diffcloud.sim.reference.impact_zones import (
+from diffcloud.arcsim.contact.dual import HARD, REGULAR, applied, gram, least_distance, solve_active, solve_dual
+from diffcloud.arcsim.contact.impact_derivatives import resolve_reverse, resolve_tangent
+from diffcloud.arcsim.contact.impact_zones import (
     PASSES,
     TOUCH,
     Impacts,
@@ -25,8 +21,12 @@ from diffcloud.sim.reference.impact_zones import (
     take_zone,
     zones,
 )
+from diffcloud.arcsim.contact.neighbours import no_neighbours
+from diffcloud.compiled import kernel
+from diffcloud.mesh import ClothMesh, SurfaceMesh, grid_cloth
+from diffcloud.sim.contact.surface import Surface, contact_surface
+from tests.arcsim.twins import impacts as twin
 from tests.sim.contact.scenes import box, together
-from tests.sim.twins import impacts as twin
 
 THICKNESS = 5e-4
 CHOICES = Projection(THICKNESS, 0.0, 0.0)

@@ -12,16 +12,16 @@ import pytest
 import torch
 from pydantic import BaseModel
 
+from diffcloud.arcsim.schema import SceneFile
 from diffcloud.errors import SceneError
 from diffcloud.io.schema import Checked
 from diffcloud.scene import Scene, load_scene
 from diffcloud.scene.scenarios import load_scenario
-from diffcloud.scene.schema import SceneFile
 from diffcloud.sim.grasp import Grasp
 from diffcloud.sim.moved import moved_surfaces
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.surrounding import ReferenceContact
-from tests.scene.files import (
+from tests.arcsim.files import (
     Data,
     changed,
     over_movable_box,
