@@ -12,7 +12,7 @@ What is public is in `__all__`. It is imported when it is first used. Lengths ar
 
 Imports run one way (a test holds this):
 
-    mesh, io  <-  sim  <-  scene
+    mesh, io  <-  sim  <-  scene  <-  arcsim   (sim and scene name modules of arcsim in registries)
     clouds     <- mesh, io
     estimation <- sim, scene, clouds
     identification, evaluation <- estimation

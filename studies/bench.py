@@ -82,13 +82,13 @@ def run_benchmarks(published: Mapping[str, Path], *, repeats: int) -> list[dict[
     jobs += [(name, choose_scenario(name), 1) for name in names[1:]]
     for name in names:
         own = choose_scenario(name)
-        jobs.append((f"{name}, linearised", replace(own, scene=own.scene.stepped("linearised")), 1))
-    jobs += [("lift, linearised, 25 steps", _short(built_in("lift")), batch) for batch in _BATCHES]
+        jobs.append((f"{name}, arcsim", replace(own, scene=own.scene.stepped("arcsim")), 1))
+    jobs += [("lift, arcsim, 25 steps", _short(built_in("lift")), batch) for batch in _BATCHES]
     for name, scene in published.items():
         scenario = choose_scenario(name, scene)
         jobs += [(name, scenario, batch) for batch in _BATCHES]
     for side in _SIDES:
-        jobs.append((f"lift {side} x {side}, linearised, 25 steps", _short(_finer(side)), 1))
+        jobs.append((f"lift {side} x {side}, arcsim, 25 steps", _short(_finer(side)), 1))
     timings = []
     with progress_bar("bench", len(jobs)) as update:
         for index, (name, scenario, batch) in enumerate(jobs):
@@ -213,6 +213,6 @@ def _finer(side: int) -> GridScenario:
 
 def _short(options: GridScenario) -> Scenario:
     """25 steps, as many as the published episodes have, and of their kind."""
-    update = {"steps_per_frame": 1, "rate_hz": 25.0, "frames": 25, "integrator": "linearised"}
+    update = {"steps_per_frame": 1, "rate_hz": 25.0, "frames": 25, "integrator": "arcsim"}
     scenario = grid_scenario(options.model_copy(update=update))
     return replace(scenario, loss_frames=(-1,))

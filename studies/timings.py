@@ -153,7 +153,7 @@ def time_contact(side: int, *, steps: int = 25, repeats: int = 3) -> ContactTimi
             time_step=0.01,
             handles=Handles(()),
             surrounding=surrounding,
-            integrator="linearised",
+            integrator="arcsim",
         )
 
     contact = ContactSettings(1e5, 0.004, 0.0004)

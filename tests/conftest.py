@@ -65,7 +65,7 @@ def small_lift(**changes: object) -> Scenario:
         "steps_per_frame": 2,
         "rate_hz": 10.0,
         "points": 200,
-        "integrator": "linearised",
+        "integrator": "arcsim",
         "path": [(0.0, 0.0, 0.0, 0.0), (0.5, 0.0, -0.05, 0.15)],
     }
     return grid_scenario(built_in("lift").model_copy(update={**defaults, **changes}))

@@ -16,8 +16,8 @@ CLI = ROOT / "diffcloud" / "cli"
 ALLOWED = {
     "mesh": set(),
     "io": {"mesh"},
-    "sim": {"mesh", "io", "arcsim"},
-    "scene": {"mesh", "io", "sim", "arcsim"},
+    "sim": {"mesh", "io"},
+    "scene": {"mesh", "io", "sim"},
     "arcsim": {"mesh", "io", "sim", "scene"},
     "clouds": {"mesh", "io"},
     "datasets": {"mesh", "io", "sim", "scene", "clouds"},
@@ -32,6 +32,8 @@ ALLOWED = {
     "report": {"mesh", "io", "sim", "scene", "clouds", "estimation", "regressors", "sensing", "evaluation"},
 }
 """Sub-package -> the sub-packages it may import; all may import errors."""
+REGISTERED = {"sim": {"arcsim"}, "scene": {"arcsim"}}
+"""Sub-package -> those whose modules its registry names (`sim.integrators`, `scene.registry`); imported on first use."""
 
 
 def imported(path: Path) -> set[str]:
@@ -94,6 +96,7 @@ def needed_packages(stage: str) -> set[str]:
     while todo:
         package = todo.pop()
         seen.add(package)
+        todo |= REGISTERED.get(package, set()) - seen
         for path in (ROOT / "diffcloud" / package).rglob("*.py"):
             todo |= (packages(path) & ALLOWED.keys()) - seen
     return seen

@@ -1,4 +1,8 @@
-"""The linearised backward-Euler step, ARCSim's, as an equation for the velocity change u.
+"""Compatibility with ARCSim and DiffSim, which the published experiments used: their integrator, scene files and scenes.
+
+`sim.integrators` and `scene.registry` name this package's modules; nothing else in `sim` and `scene` does.
+
+The integrator is one linearised backward-Euler step, an equation for the velocity change u:
 
     r(u) = m u - Δt f(u) = 0,   v = v₀ + u,   x = x₀ + Δt v
 
@@ -7,12 +11,7 @@
 The equation is linear: ∂r/∂u is the assembled matrix. β is stiffness-proportional damping. Hard handles replace the rows of
 their nodes. (`implicit` has the converged step.)
 
-`step` has the episode, `adjoint` and `tangent` its derivatives.
+`integrator` is what the simulation calls, `step` has the episode, `adjoint` and `tangent` its derivatives, `contact`
+repulsion, friction and impacts. `load` and `write` have the scene files, `schema` their fields, `release` the published
+experiments.
 """
-
-from diffcloud.arcsim.adjoint import reverse
-from diffcloud.arcsim.build import build_scene
-from diffcloud.arcsim.step import simulate
-from diffcloud.arcsim.tangent import tangents
-
-__all__ = ["build_scene", "reverse", "simulate", "tangents"]

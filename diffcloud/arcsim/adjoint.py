@@ -1,4 +1,4 @@
-"""Gradients of an episode of linearised steps, from its end to its start: one solve per step, with the factor of the step.
+"""Gradients of an episode of ARCSim's steps, from its end to its start: one solve per step, with the factor of the step.
 
 For a step's equation r(u, p) = 0 and the gradient g by u, the matrix A y = g gives the gradient -yᵀ ∂r/∂p by all that the
 equation reads.
@@ -13,12 +13,12 @@ from diffcloud.arcsim.matrix import linear_system, pattern_with, repelling
 from diffcloud.arcsim.record import Kept
 from diffcloud.arcsim.scene import Scene
 from diffcloud.arcsim.step import displace, mobility, project, still, with_obstacles
+from diffcloud.arcsim.terms import kernels
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
 from diffcloud.sim.compiled.sparse import cholesky, solve
 from diffcloud.sim.held import Held, aim, aim_reverse, first_anchors_reverse, holders, take_anchors_reverse
-from diffcloud.sim.terms import kernels
 
 _reverse = kernels.reverse
 _point_face_reverse = kernels.proximity_point_face_reverse

@@ -6,19 +6,21 @@ import numpy as np
 
 from diffcloud.arcsim.contact.impact_zones import Projection
 from diffcloud.arcsim.contact.nearest import Repulsion, held_slots
+from diffcloud.arcsim.contact.planes import stopping_planes
 from diffcloud.arcsim.scene import Scene
+from diffcloud.arcsim.terms import TERMS, kernels
 from diffcloud.sim.contact.surface import contact_surface
 from diffcloud.sim.surrounding import ReferenceContact
 from diffcloud.sim.terms.elements import elements
-from diffcloud.sim.terms.planes import half_spaces
 from diffcloud.sim.terms.term import Setup
 
 
 def build_scene(setup: Setup, time_step: float) -> Scene:
+    """Everything constant in a run with steps so long [s]."""
     surrounding, mesh = setup.surrounding, setup.mesh
     choices = surrounding.reference_contact
     numbers = surrounding.contact
-    terms, of = elements(setup)
+    terms, of = elements(setup, TERMS, kernels)
     obstacles = surrounding.obstacles if choices is not None else ()
     surface = contact_surface(mesh, obstacles, all_edges=True)
     points = np.concatenate([o.nodes for o in obstacles] + [np.zeros((0, 3))])
@@ -27,7 +29,7 @@ def build_scene(setup: Setup, time_step: float) -> Scene:
     if choices is not None:
         held = held_slots(surface, repulsion, np.concatenate([mesh.nodes, points]))
         repulsion = repulsion._replace(held=held)
-    normals, offsets = half_spaces(mesh, surrounding)
+    normals, offsets = stopping_planes(mesh, surrounding)
     return Scene(
         terms,
         of,

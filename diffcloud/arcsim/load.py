@@ -23,7 +23,7 @@ from diffcloud.sim.motion import Keyframe, Motion, axis_angle_quaternion
 from diffcloud.sim.rigid.bodies import Bodies
 from diffcloud.sim.rigid.body import RigidBody
 from diffcloud.sim.scenery import MovingObstacle
-from diffcloud.sim.surrounding import ContactSettings, Integrator, ReferenceContact, Surrounding
+from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
 
 _SUPPORTED_SWITCHES = {"remeshing", "proximity", "strainlimiting", "separation", "popfilter", "plasticity"}
 """Of `disable`: those whose stage this simulator has (proximity), or never runs anyway."""
@@ -148,7 +148,7 @@ def _contradictions(block: ObstacleBlock, scene: SceneFile) -> Iterator[str]:
         yield "diffcloud: of movable obstacles only; leave it out, or set `movable` to 1 and leave `motion` out"
     if block.diffcloud.density is not None and block.diffcloud.mass is not None:
         yield "diffcloud: give either `density` or `mass`"
-    if scene.diffcloud.integrator == "linearised":
+    if scene.diffcloud.integrator == "arcsim":
         advice = 'set `diffcloud.integrator` to "implicit" or leave it out'
         if block.is_body:
             yield f"movable: rigid bodies need the implicit integrator; {advice}, or set `movable` (default 1) to 0"
@@ -156,9 +156,9 @@ def _contradictions(block: ObstacleBlock, scene: SceneFile) -> Iterator[str]:
             yield f"motion: moving obstacles need the implicit integrator; {advice}"
 
 
-def _integrator(scene: SceneFile) -> Integrator:
+def _integrator(scene: SceneFile) -> str:
     moves = any(block.is_body or block.motion is not None for block in scene.obstacles)
-    return scene.diffcloud.integrator or ("implicit" if moves else "linearised")
+    return scene.diffcloud.integrator or ("implicit" if moves else "arcsim")
 
 
 def _body(place: str, block: ObstacleBlock, mesh: SurfaceMesh) -> RigidBody:
@@ -174,7 +174,7 @@ def _body(place: str, block: ObstacleBlock, mesh: SurfaceMesh) -> RigidBody:
 
 
 def _contact(scene: SceneFile) -> ReferenceContact | None:
-    if _integrator(scene) == "implicit" or scene.diffcloud.contact == "planes":
+    if _integrator(scene) != "arcsim" or scene.diffcloud.contact == "planes":
         return None
     return ReferenceContact.as_published() if scene.diffcloud.contact == "published" else ReferenceContact()
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from diffcloud.arcsim.scene import Scene
+from diffcloud.arcsim.terms import kernels
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters, Timing
 from diffcloud.sim.compiled.sparse import Pattern, add_assemble, find_slot, hold, widened
-from diffcloud.sim.terms import kernels
 
 _assemble = kernels.assemble
 _PointFace, _EdgeEdge = kernels.ProximityPointFace, kernels.ProximityEdgeEdge

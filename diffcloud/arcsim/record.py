@@ -1,4 +1,4 @@
-"""What an episode of linearised steps keeps for its derivatives."""
+"""What an episode of ARCSim's steps keeps for its derivatives."""
 
 from __future__ import annotations
 

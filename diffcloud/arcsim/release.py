@@ -9,12 +9,9 @@ import numpy as np
 
 from diffcloud.arcsim.load import load_scene
 from diffcloud.errors import SceneError
-from diffcloud.io.published import RELEASE_UNIT_M
+from diffcloud.io.published import PAPER_THRESHOLD, RELEASE_UNIT_M
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.sim.surrounding import ReferenceContact
-
-PAPER_THRESHOLD = 5e-4
-"""Stop below this one-sided Chamfer loss, in squared length units of the release (paper, section IV-F)."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +51,7 @@ RELEASE = {
 }
 
 
-def release_scenario(name: str, path: Path) -> Scenario:
+def load_experiment(name: str, path: Path) -> Scenario:
     """A published experiment on its scene file.
 
     Args:
@@ -66,7 +63,7 @@ def release_scenario(name: str, path: Path) -> Scenario:
     settings = RELEASE[name]
     scene = load_scene(path, reload_materials=True)
     surrounding = replace(scene.surrounding, reference_contact=ReferenceContact.as_published(), lagged_air=True)
-    scene = replace(scene, integrator="linearised", surrounding=surrounding)
+    scene = replace(scene, integrator="arcsim", surrounding=surrounding)
     faces, nodes = settings.loss_faces, settings.mass_nodes
     for what, index, count in (("face", faces, len(scene.mesh.faces)), ("node", nodes, len(scene.mesh.nodes))):
         if index and max(index) >= count:

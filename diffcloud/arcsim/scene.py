@@ -1,4 +1,4 @@
-"""What the kernels of the linearised step are given."""
+"""What the kernels of ARCSim's step are given."""
 
 from __future__ import annotations
 
@@ -9,6 +9,12 @@ from diffcloud.arcsim.contact.nearest import Repulsion
 from diffcloud.sim.compiled.data import Floats
 from diffcloud.sim.compiled.sparse import Pattern
 from diffcloud.sim.contact.surface import Surface
+from diffcloud.sim.status import FIRST_OWN
+
+NOT_POSITIVE_DEFINITE = FIRST_OWN
+"""A status: the step matrix cannot be factorised."""
+UNRESOLVED = FIRST_OWN + 1
+"""A status: impacts that passes of detection and projection did not resolve."""
 
 
 class Scene(NamedTuple):

@@ -10,10 +10,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from diffcloud.io.schema import Checked, Component, FileName, NonNegative, Positive, Vector
-from diffcloud.sim.surrounding import Integrator
+from diffcloud.io.schema import Checked, Component, FileName, Friction, NonNegative, Positive, Vector
+from diffcloud.sim.integrators import IntegratorName
 
-Friction = Annotated[float, Field(ge=0, le=100)]
 _MANY = 200
 """Obstacles, handles or motions of a scene."""
 Switch = Literal[
@@ -112,12 +111,12 @@ class ExtensionBlock(Checked):
     """What ARCSim cannot say."""
 
     hard_handles: bool = False
-    integrator: Integrator | None = None
-    """"implicit": converged steps with smooth contact. Default: "linearised", ARCSim's, unless an obstacle moves."""
+    integrator: IntegratorName | None = None
+    """"implicit": converged steps with smooth contact. Default: "arcsim", ARCSim's, unless an obstacle moves."""
     shaped: bool = False
     """Whether hinges are at rest as the mesh stands, not flat."""
     contact: Literal["meshes", "published", "planes"] = "meshes"
-    """Of the linearised integrator: with all meshes and the cloth itself; the same with ARCSim's quirks, which the
+    """Of the arcsim integrator: with all meshes and the cloth itself; the same with ARCSim's quirks, which the
     published experiments need; or with planes only."""
     damping: NonNegative | None = None
     compression: Annotated[float, Field(ge=0, le=1)] = 1.0

@@ -1,4 +1,4 @@
-"""An episode of linearised steps: one linear system each, then what is in the way."""
+"""An episode of ARCSim's steps: one linear system each, then what is in the way."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from diffcloud.arcsim.contact.nearest import nearest_pairs
 from diffcloud.arcsim.contact.neighbours import no_neighbours
 from diffcloud.arcsim.matrix import linear_system, pattern_with
 from diffcloud.arcsim.record import Kept, nothing_kept, remember, with_impacts
-from diffcloud.arcsim.scene import Scene
+from diffcloud.arcsim.scene import NOT_POSITIVE_DEFINITE, UNRESOLVED, Scene
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints, Motion, Parameters
 from diffcloud.sim.compiled.sparse import cholesky, solve
 from diffcloud.sim.contact.surface import boxed
 from diffcloud.sim.held import Held, aim, first_anchors, holders, take_anchors
-from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE, NOT_POSITIVE_DEFINITE, UNRESOLVED
+from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE
 
 _LARGEST = 1e100
 """[m] A coordinate beyond this is none any more: differences of its kind are not finite."""

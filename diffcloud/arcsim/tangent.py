@@ -1,4 +1,4 @@
-"""How an episode of linearised steps changes along K directions, carried from its start to its end with the steps'
+"""How an episode of ARCSim's steps changes along K directions, carried from its start to its end with the steps'
 factors."""
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from diffcloud.arcsim.matrix import repelling
 from diffcloud.arcsim.record import Kept
 from diffcloud.arcsim.scene import Scene
 from diffcloud.arcsim.step import mobility, still
+from diffcloud.arcsim.terms import kernels
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Motion, Parameters, Timing
 from diffcloud.sim.compiled.sparse import solve
 from diffcloud.sim.held import Held, aim, aim_tangent, first_anchors, holders, take_anchors_tangent
-from diffcloud.sim.terms import kernels
 
 _tangent = kernels.tangent
 _point_face_tangent = kernels.proximity_point_face_tangent

@@ -30,8 +30,8 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
 
     Raises:
         SceneError: what the format cannot say: masses that come from another material than the tables (the published
-            experiments' reload), further forces, a gripper with several motions, contact of the linearised integrator that
-            is none of the three that have a name, and some settings of the implicit integrator.
+            experiments' reload), further forces, a gripper with several motions, contact of the arcsim integrator that is
+            none of the three that have a name, and some settings of the implicit integrator.
     """
     folder = Path(folder)
     if scene.mass_material is not None:
@@ -43,7 +43,7 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
         "forces": bool(around.forces),
         "contact.sticking_speed": around.contact.sticking_speed != ContactSettings().sticking_speed,
         "reference_contact": around.reference_contact not in (None, ReferenceContact(), ReferenceContact.as_published()),
-        "lagged_air": scene.integrator == "linearised"
+        "lagged_air": scene.integrator == "arcsim"
         and around.lagged_air != (around.reference_contact == ReferenceContact.as_published()),
         "a gripper with several motions": _shared_grippers(scene),
         "an upright pad": any(any(handle.turned) for handle in scene.handles.handles),

@@ -48,7 +48,7 @@ def _compile() -> None:
     work = [  # two processes that take equally long
         [("implicit steps", "diffcloud.sim.warm:implicit")],
         [
-            ("linearised steps", "diffcloud.sim.warm:linearised"),
+            ("steps of ARCSim", "diffcloud.sim.warm:arcsim"),
             ("nearest neighbours", "diffcloud.clouds.neighbours:compile_neighbours"),
             ("nearest places", "diffcloud.clouds.surface:compile_surface"),
             ("poses", "diffcloud.estimation.curvature:compile_terms"),

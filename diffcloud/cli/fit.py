@@ -138,7 +138,7 @@ def fit(
         str | None,
         typer.Option(
             help="Fit roughly known material too, unreported: bending=1.5x,drag=1.3x (the rest is exact), or none. Default "
-            "of likelihood unless linearised: 1.5x of bending and damping, 1.3x of drag and frictions, 3x of "
+            "of likelihood with the implicit integrator: 1.5x of bending and damping, 1.3x of drag and frictions, 3x of "
             "compression, unless the scenario's doubts say otherwise."
         ),
     ] = None,

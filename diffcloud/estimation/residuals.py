@@ -3,7 +3,7 @@
 Variables are fitted on an axis of their own: the logarithm of a value whose lower bound is positive, the standard
 deviations off zero of one with a normal prior, else the part of its range. Where the integrator's derivatives hold over
 finite distances (the implicit one: docs/results/gradients.md), they are forward tangents, from one simulation. The
-linearised integrator's contact is rough: there, motions a finite step to both sides give the differences.
+arcsim integrator's contact is rough: there, motions a finite step to both sides give the differences.
 """
 
 from __future__ import annotations

@@ -24,6 +24,8 @@ from diffcloud.io.published_cameras import SetUp, published_set_ups, recognised
 
 RELEASE_UNIT_M = 0.35
 """One length unit of the published recordings [m]."""
+PAPER_THRESHOLD = 5e-4
+"""Stop below this one-sided Chamfer loss, in squared length units of the release (paper, section IV-F)."""
 RECORDED_RATE_HZ = 10.0
 """Of the robot's commands and of the clouds (paper, section IV-D): row j of a track is where the gripper was in cloud j."""
 RECORDED_START_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(

@@ -20,6 +20,8 @@ Component = Annotated[float, Field(ge=-_FARTHEST, le=_FARTHEST)]
 Vector = tuple[Component, Component, Component]
 Positive = Annotated[float, Field(gt=0, le=_MOST)]
 NonNegative = Annotated[float, Field(ge=0, le=_MOST)]
+Friction = Annotated[float, Field(ge=0, le=100)]
+"""A Coulomb coefficient [-]."""
 FileName = Annotated[str, Field(max_length=250)]
 """Longer ones no file system has."""
 

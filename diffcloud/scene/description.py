@@ -9,10 +9,11 @@ from diffcloud.mesh.refinement import refined
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.sim.build import build_system
 from diffcloud.sim.handles import Handle, Handles
+from diffcloud.sim.integrators import load_integrator
 from diffcloud.sim.materials import Material
 from diffcloud.sim.properties import Basis
 from diffcloud.sim.simulate import init
-from diffcloud.sim.surrounding import Integrator, Order, ReferenceContact, Surrounding
+from diffcloud.sim.surrounding import Order, Surrounding
 from diffcloud.sim.system import State, System
 
 
@@ -30,10 +31,10 @@ class Scene:
     """[s]"""
     surrounding: Surrounding = field(default_factory=Surrounding)
     mass_material: Material | None = None
-    """Gives the node masses where it differs from `material` (see `load.load_scene`)."""
-    integrator: Integrator = "implicit"
-    """"implicit": converged steps with smooth contact and rigid bodies; "linearised": ARCSim's steps. The one
-    default; scene files of ARCSim and the `release_*` experiments name theirs."""
+    """Gives the node masses where it differs from `material` (see `arcsim.load.load_scene`)."""
+    integrator: str = "implicit"
+    """A key of `sim.integrators.INTEGRATORS`. "implicit": converged steps with smooth contact and rigid bodies; "arcsim":
+    ARCSim's steps. The one default; scene files of ARCSim and the `release_*` experiments name theirs."""
     order: Order = 2
     """Of the implicit integrator: 2, BDF2, or 1, backward Euler, which scenes with rigid bodies always have."""
     shaped: bool = False
@@ -78,10 +79,13 @@ class Scene:
             case "body_mass":
                 return float(self.build()[0].properties.body_mass.sum()) if self.surrounding.bodies else 0.0
 
-    def stepped(self, integrator: Integrator, order: Order = 2) -> Scene:
-        """The same scene with an integrator and the contact that is its own."""
-        contact = (self.surrounding.reference_contact or ReferenceContact()) if integrator == "linearised" else None
-        surrounding = replace(self.surrounding, reference_contact=contact)
+    def stepped(self, integrator: str, order: Order = 2) -> Scene:
+        """The same scene with an integrator and the contact that is its own.
+
+        Raises:
+            SceneError: no such integrator.
+        """
+        surrounding = load_integrator(integrator).with_contact(self.surrounding)
         return replace(self, integrator=integrator, order=order, surrounding=surrounding)
 
     def finer(self) -> Scene:

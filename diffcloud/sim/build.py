@@ -9,10 +9,11 @@ from diffcloud.errors import SceneError
 from diffcloud.mesh.topology import ClothMesh
 from diffcloud.sim.grasp import stretching_factors
 from diffcloud.sim.handles import Handles
+from diffcloud.sim.integrators import load_integrator
 from diffcloud.sim.materials import Material
 from diffcloud.sim.properties import Properties, one_set
 from diffcloud.sim.rigid.bodies import Bodies
-from diffcloud.sim.surrounding import Integrator, Order, Surrounding
+from diffcloud.sim.surrounding import Order, Surrounding
 from diffcloud.sim.system import System
 from diffcloud.sim.terms.term import Setup
 
@@ -25,7 +26,7 @@ def build_system(
     handles: Handles,
     surrounding: Surrounding | None = None,
     mass_material: Material | None = None,
-    integrator: Integrator,
+    integrator: str,
     order: Order = 2,
     shaped: bool = False,
 ) -> System:
@@ -35,20 +36,19 @@ def build_system(
         time_step: [s].
         mass_material: material whose density gives the node masses, where it differs from `material` (the published
             experiments reload their tables after the masses were computed).
-        integrator: "implicit" for the converged step with smooth contact and rigid bodies, "linearised" for ARCSim's.
+        integrator: a key of `integrators.INTEGRATORS`. "implicit" is the converged step with smooth contact and rigid
+            bodies, "arcsim" is ARCSim's.
         order: of the implicit integrator: 2 for BDF2, 1 for backward Euler, which scenes with rigid bodies always have.
         shaped: whether the cloth's hinges are at rest as the mesh stands, not flat.
 
     Raises:
-        SceneError: a time step that is not positive, or a handle on a node that does not exist.
+        SceneError: a time step that is not positive, a handle on a node that does not exist, no such integrator, or a
+            surrounding that it cannot simulate.
     """
     surrounding = surrounding or Surrounding()
     if not time_step > 0:
         raise SceneError(f"The time step must be positive, got {time_step} s.")
-    if integrator == "linearised" and (surrounding.moving or surrounding.bodies):
-        raise SceneError("Moving obstacles and rigid bodies need the implicit integrator.")
-    if integrator == "implicit" and surrounding.reference_contact is not None:
-        raise SceneError("Contact by proximity and impact zones belongs to the linearised integrator.")
+    load_integrator(integrator).check(surrounding)
     for node in handles.nodes:
         if not 0 <= node < len(mesh.nodes):
             raise SceneError(f"A handle holds node {node}, but the cloth has nodes 0..{len(mesh.nodes) - 1}.")

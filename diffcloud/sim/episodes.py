@@ -5,26 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloud import arcsim
-from diffcloud.arcsim.contact.impact_zones import PASSES
-from diffcloud.errors import DivergedError, UnresolvedContactError
-from diffcloud.sim import implicit, status
-from diffcloud.sim.compiled.data import Floats, Motion, Parameters, Timing
+from diffcloud.errors import DivergedError
+from diffcloud.sim import status
+from diffcloud.sim.compiled.data import Floats, Parameters
 from diffcloud.sim.handles import HandleSchedule
 from diffcloud.sim.held import Held
+from diffcloud.sim.integrators import Derivatives, Episode, Outcome
 from diffcloud.sim.plausibility import Motion as Course
 from diffcloud.sim.plausibility import implausible
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.scenery import Scenery
 from diffcloud.sim.system import System
-from diffcloud.sim.terms import TERMS, kernels
 from diffcloud.sim.threads import run_all
 
 FACTOR_MEMORY = 256 * 2**20
@@ -46,7 +43,7 @@ class Batch:
         self.held = _held(system, self.schedule)
         all_times = np.concatenate([[0.0], times])
         self.times = torch.as_tensor(all_times)
-        self._integrator: Any = implicit if system.setup.integrator == "implicit" else arcsim
+        self._integrator = system.integrator
         self._scenery = _scenery(system).at(all_times)
         self._progress = progress
 
@@ -63,25 +60,12 @@ class Batch:
         self._parameters = [self._read([one[entry] for one in properties]) for entry in range(count)]
         self._control = np.zeros((count, 2), np.int64)
         self._anchors = np.zeros((count, len(self.held.node), 3))
-        self._fault = np.zeros((count, 6))
-        self._ends: list[Any] = [None] * count
+        self._ends: list[Outcome] = [Outcome(status.INTERRUPTED, 0, None)] * count
         limit = FACTOR_MEMORY // (_BLOCK * count) if keep else -1
 
         def job(entry: int) -> None:
-            self._ends[entry] = self._integrator.simulate(
-                self.system.scene,
-                self.held,
-                self._parameters[entry],
-                self._track[entry],
-                *self._obstacles,
-                self._anchors[entry],
-                self.positions[entry],
-                self.velocities[entry],
-                *self._bodies(self.poses[entry]),
-                limit,
-                self._control[entry],
-                *([self._fault[entry]] if self._is_implicit else []),
-            )
+            episode = self._episode(entry)
+            self._ends[entry] = self._integrator.simulate(self.system.scene, episode, limit, self._control[entry])
 
         self._run(job, count)
         return tuple(torch.from_numpy(array) for array in (self.positions, self.velocities, self.poses))  # type: ignore[return-value]
@@ -93,25 +77,15 @@ class Batch:
         found = [np.zeros_like(array) for array in self._inputs]
 
         def job(entry: int) -> None:
-            parameters = self._parameters[entry]
-            gradients = Parameters(*(np.zeros_like(array) for array in parameters))
-            done = self._ends[entry][1] + 1  # what was not simulated has no derivative, not even zero times what it holds
+            outcome = self._ends[entry]
+            done = outcome.step + 1  # what was not simulated has no derivative, not even zero times what it holds
+            gradients = Parameters(*(np.zeros_like(array) for array in self._parameters[entry]))
+            states = (array[entry, :done] for array in (position, velocity, pose))
             self._integrator.reverse(
                 self.system.scene,
-                self.held,
-                parameters,
-                self._track[entry],
-                *self._obstacles,
-                self._anchors[entry],
-                self.positions[entry, :done],
-                self.velocities[entry, :done],
-                *self._bodies(self.poses[entry, :done]),
-                self._ends[entry][2],
-                position[entry, :done],
-                velocity[entry, :done],
-                *self._bodies(pose[entry, :done]),
-                gradients,
-                found[3][entry],
+                self._episode(entry, done),
+                outcome,
+                Derivatives(gradients, found[3][entry], *states),
             )
             for array, first in zip(found, (position, velocity, pose), strict=False):
                 array[entry] = first[entry, 0]
@@ -128,28 +102,16 @@ class Batch:
         found = np.empty((count, self.steps + 1, *position.shape[:1], *position.shape[2:]))
 
         def job(entry: int) -> None:
-            parameters = self._parameters[entry]
-            moves = self._read_rates(parameters, [one[:, entry] for one in properties])
+            moves = self._read_rates(self._parameters[entry], [one[:, entry] for one in properties])
             velocity_rates = np.empty_like(found[entry])
             found[entry, 0], velocity_rates[0] = position[:, entry], velocity[:, entry]
             pose_rates = np.empty((self.steps + 1, directions, *pose.shape[2:]))
             pose_rates[0] = pose[:, entry]
             self._integrator.tangents(
                 self.system.scene,
-                self.held,
-                parameters,
-                moves,
-                self._track[entry],
-                np.ascontiguousarray(track[:, entry]),
-                *self._obstacles,
-                self._anchors[entry],
-                self.positions[entry],
-                self.velocities[entry],
-                *self._bodies(self.poses[entry]),
-                self._ends[entry][2],
-                found[entry],
-                velocity_rates,
-                *self._bodies(pose_rates),
+                self._episode(entry),
+                self._ends[entry],
+                Derivatives(moves, np.ascontiguousarray(track[:, entry]), found[entry], velocity_rates, pose_rates),
             )
 
         self._run(job, count)
@@ -158,9 +120,9 @@ class Batch:
     def diverged(self) -> dict[int, DivergedError]:
         """What is wrong with entries of the last simulation."""
         found = {}
-        for entry, (end, step, kept) in enumerate(self._ends):
-            fault = self._failed(entry, end, step, kept) if end != status.DONE else None
-            last = self.steps if fault is None else step
+        for entry, outcome in enumerate(self._ends):
+            fault = self._failed(entry, outcome) if outcome.status != status.DONE else None
+            last = self.steps if fault is None else outcome.step
             earlier = implausible(self._course(entry, last), partial(self._stored, entry)) if last else None
             if earlier is not None:
                 fault = DivergedError(earlier[0], [entry], earlier[1])
@@ -170,17 +132,18 @@ class Batch:
 
     # --- arrays ------------------------------------------------------------------------------------------------------
 
-    @property
-    def _is_implicit(self) -> bool:
-        return self._integrator is implicit
-
-    @property
-    def _obstacles(self) -> tuple[Floats, ...]:
-        """What the implicit step takes beside the others."""
-        return (self._scenery,) if self._is_implicit else ()
-
-    def _bodies(self, array: Floats) -> tuple[Floats, ...]:
-        return (array,) if self._is_implicit else ()
+    def _episode(self, entry: int, states: int | None = None) -> Episode:
+        """An entry's arrays, up to so many states."""
+        return Episode(
+            self.held,
+            self._parameters[entry],
+            self._track[entry],
+            self._scenery,
+            self._anchors[entry],
+            self.positions[entry, :states],
+            self.velocities[entry, :states],
+            self.poses[entry, :states],
+        )
 
     def _over_time(self, first: Floats) -> Floats:
         """[B, S + 1, ...] that begins with [B, ...]; the rest is NaN."""
@@ -191,7 +154,7 @@ class Batch:
     def _read(self, properties: Sequence[Floats]) -> Parameters:
         """Of one entry, in the order of `_PROPERTIES`."""
         fields = dict(zip(_PROPERTIES, map(np.atleast_1d, properties), strict=True))
-        inverse = np.zeros(self.system.scene.surface.point_count)
+        inverse = np.zeros(self._integrator.points(self.system.scene))
         inverse[: len(fields["node_mass"])] = 1 / fields["node_mass"]
         handles = len(self.held.node)
         return Parameters(**fields, inverse_mass=inverse, hold=np.zeros(handles), target=np.zeros((handles, 3)))
@@ -201,7 +164,7 @@ class Batch:
         flat = (np.ascontiguousarray(one.reshape(len(one), -1)) for one in properties)
         fields = dict(zip(_PROPERTIES, flat, strict=True))
         directions, nodes = fields["node_mass"].shape
-        inverse = np.zeros((directions, self.system.scene.surface.point_count))
+        inverse = np.zeros((directions, self._integrator.points(self.system.scene)))
         inverse[:, :nodes] = -fields["node_mass"] / parameters.node_mass**2
         hold = np.zeros((directions, len(self.held.node)))
         return Parameters(**fields, inverse_mass=inverse, hold=hold, target=np.zeros((*hold.shape, 3)))
@@ -220,30 +183,10 @@ class Batch:
 
     # --- what became of them -----------------------------------------------------------------------------------------
 
-    def _failed(self, entry: int, end: int, step: int, kept: Any) -> DivergedError:
-        match end:
-            case status.NOT_POSITIVE_DEFINITE:
-                return DivergedError(step + 1, [entry], "the step matrix is not positive definite")
-            case status.UNRESOLVED:
-                kind, *points = kept.impacts.met[kept.impacts.used[0] - 1].tolist()
-                name = "edge-edge" if kind else "point-face"
-                return UnresolvedContactError(step + 1, [entry], f"the {name} pair of points {points}", PASSES)
-            case status.STUCK:
-                return DivergedError(step + 1, [entry], self._stuck(entry))
-        return DivergedError(step + 1, [entry], "positions are not finite")
-
-    def _stuck(self, entry: int) -> str:
-        change, kind, *points = self._fault[entry].tolist()
-        name = ("point-face", "edge-edge")[int(kind)] if 0 <= kind < 2 else "no"
-        closest = f"{name} pair of points {[int(point) for point in points if point >= 0]}"
-        if kind == 2:
-            closest = f"point {int(points[0])} and half-space {int(points[1])}"
-        of = self._parameters[entry]
-        return (
-            f"the implicit step did not converge (relative change {change:.1e}; closest: {closest}); sub-steps did not "
-            f"help (mean stretching multiplier {of.stretching.mean():.3g}, mean node mass {of.node_mass.mean():.3g} kg). "
-            "Try a smaller time step, a thicker or stiffer contact, or slower handles"
-        )
+    def _failed(self, entry: int, outcome: Outcome) -> DivergedError:
+        if outcome.status >= status.FIRST_OWN:
+            return self._integrator.fault(entry, self._episode(entry), outcome)
+        return DivergedError(outcome.step + 1, [entry], "positions are not finite")
 
     def _course(self, entry: int, last: int) -> Course:
         """The motion up to a step, for `implausible`."""
@@ -266,16 +209,12 @@ class Batch:
             wind=float(np.linalg.norm(system.setup.surrounding.wind)),
             velocities=self.velocities[entry, 0],
             others=np.concatenate([moving, bodies], axis=1),
-            push=sum(term.push(system.setup) for term in TERMS),
+            push=sum(term.push(system.setup) for term in self._integrator.terms),
         )
 
     def _stored(self, entry: int, step: int) -> float:
         """Elastic energy [J]."""
-        nodes = self.positions[entry, step]
-        rest, energy = np.zeros_like(nodes), np.zeros(1)
-        motion = Motion(nodes, rest, rest, rest)
-        kernels.energy(self.system.scene.terms, self._parameters[entry], motion, Timing(self.system.time_step, 0.0), energy)
-        return float(energy[0])
+        return self._integrator.energy(self.system.scene, self._parameters[entry], self.positions[entry, step])
 
 
 def _scenery(system: System) -> Scenery:

@@ -1,10 +1,7 @@
 """How an episode can end."""
 
 DONE = 0
-NOT_POSITIVE_DEFINITE = 1
-NOT_FINITE = 2
-UNRESOLVED = 3
-"""Impacts of a step that passes of detection and projection did not resolve."""
-STUCK = 4
-"""An implicit step that did not converge."""
-INTERRUPTED = 5
+NOT_FINITE = 1
+INTERRUPTED = 2
+FIRST_OWN = 16
+"""Numbers from here on are an integrator's own; its `fault` explains them."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -13,7 +12,6 @@ from diffcloud.sim.scenery import MovingObstacle
 
 _ARCSIM_SMALLEST = 1e-6
 
-Integrator = Literal["implicit", "linearised"]
 Order = Literal[1, 2]
 
 
@@ -26,26 +24,9 @@ class ContactSettings:
     repulsion_thickness: float = 3e-3
     """τ, and d̂ of smooth contact [m] (ARCSim's default is 1e-3)."""
     projection_thickness: float = 3e-4
-    """Of the linearised integrator [m]."""
+    """Of the arcsim integrator [m]."""
     sticking_speed: float = 1e-3
     """v_s of smooth contact: what sticks creeps slower than this [m/s]."""
-
-    def resting_height(self, weight: float, integrator: Integrator) -> float:
-        """Distance from a level obstacle at which contact carries a cloth [m].
-
-        Args:
-            weight: of the cloth per area, above 0 [N/m²].
-        """
-        thickness = self.repulsion_thickness
-        load = 2 * weight / (self.stiffness * thickness)  # of the linearised step: (1 - d/τ)²; 0 above what it can carry
-        if integrator == "linearised":
-            return thickness * max(1 - math.sqrt(load), 0.0) if self.stiffness else 0.0
-        # of the barrier, at d = y τ: ((1 - y)²/y - 2 (1 - y) ln y)/3, which falls from infinity to 0
-        low, high = 0.0, 1.0
-        for _ in range(60):
-            y = (low + high) / 2
-            low, high = (y, high) if ((1 - y) ** 2 / y - 2 * (1 - y) * math.log(y)) / 3 > load else (low, y)
-        return thickness * high
 
 
 @dataclass(frozen=True)
@@ -85,12 +66,12 @@ class Surrounding:
     linear_drag: float = 0.0
     """In all directions [kg/(m²·s)]."""
     lagged_air: bool = False
-    """Whether drag is that before the linearised step, as in ARCSim, where light cloth in dense air explodes."""
+    """Whether drag is that before the step, as in ARCSim, where light cloth in dense air explodes."""
     friction_cloth: float = 0.6
     friction_obstacle: float = 0.3
     contact: ContactSettings = field(default_factory=ContactSettings)
     proximity: bool = True
-    """Of the linearised step: whether planes, and other meshes, repel and rub (off: only projection and impacts)."""
+    """Of the arcsim integrator: whether planes, and other meshes, repel and rub (off: only projection and impacts)."""
     self_contact: bool = True
     """Whether the cloth meets itself (implicit integrator); without, layers pass through each other in quicker steps."""
     obstacles: tuple[SurfaceMesh, ...] = ()

@@ -8,10 +8,9 @@ from typing import Any
 
 from torch import Tensor
 
-from diffcloud import arcsim
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
-from diffcloud.sim import implicit
 from diffcloud.sim.handles import Handles
+from diffcloud.sim.integrators import Integrator, load_integrator
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.rigid.bodies import Bodies, BodyState
 from diffcloud.sim.terms.term import Setup
@@ -50,11 +49,14 @@ class System:
         """Of the obstacles that follow a motion."""
         return sum(len(moving.mesh.nodes) for moving in self.setup.surrounding.moving)
 
+    @property
+    def integrator(self) -> Integrator:
+        return load_integrator(self.setup.integrator)
+
     @cached_property
     def scene(self) -> Any:
         """What the kernels of the integrator are given."""
-        integrator = implicit if self.setup.integrator == "implicit" else arcsim
-        return integrator.build_scene(self.setup, self.time_step)
+        return self.integrator.build(self.setup, self.time_step)
 
 
 @dataclass(frozen=True)

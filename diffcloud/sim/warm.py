@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 import torch
@@ -11,32 +10,34 @@ import torch
 from diffcloud.mesh.shapes import grid_cloth, rectangle_surface
 from diffcloud.sim.build import build_system
 from diffcloud.sim.handles import Handle, Handles
+from diffcloud.sim.integrators import load_integrator
 from diffcloud.sim.materials import isotropic
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.simulate import rollout, rollout_tangents
-from diffcloud.sim.surrounding import ReferenceContact, Surrounding
-
-
-def linearised() -> None:
-    """Kernels of the linearised step."""
-    _episode("linearised", ReferenceContact())
+from diffcloud.sim.surrounding import Surrounding
 
 
 def implicit() -> None:
     """Kernels of the implicit step."""
-    _episode("implicit", None)
+    _episode("implicit")
 
 
-def _episode(integrator: Literal["linearised", "implicit"], contact: ReferenceContact | None) -> None:
+def arcsim() -> None:
+    """Kernels of ARCSim's step."""
+    _episode("arcsim")
+
+
+def _episode(name: str) -> None:
     mesh = grid_cloth(3, 3, 0.1, 0.1)
     mesh = replace(mesh, nodes=np.add(mesh.nodes, (0.0, 0.0, 0.002)))
+    table = rectangle_surface((0.0, 0.0), (1.0, 1.0), 0.0)
     system = build_system(
         mesh,
         isotropic("any", density=0.2, stretching=50.0, bending=1e-5),
         time_step=0.01,
         handles=Handles((Handle(0),)),
-        surrounding=Surrounding(obstacles=(rectangle_surface((0.0, 0.0), (1.0, 1.0), 0.0),), reference_contact=contact),
-        integrator=integrator,
+        surrounding=load_integrator(name).with_contact(Surrounding(obstacles=(table,))),
+        integrator=name,
     )
     given = system.properties
     rollout(

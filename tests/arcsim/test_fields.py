@@ -260,4 +260,4 @@ def test_there_is_one_default_integrator(tmp_path):
     made = Scene(lift.mesh, lift.material, lift.handles, frame_time=0.1)
     assert made.integrator == lift.integrator == "implicit"
     assert made.build()[0].setup.integrator == "implicit"
-    assert load_scene(write_file(write_files(tmp_path), sheet_over_box(movable=0))).integrator == "linearised"
+    assert load_scene(write_file(write_files(tmp_path), sheet_over_box(movable=0))).integrator == "arcsim"

@@ -9,7 +9,7 @@ import pytest
 from numpy.polynomial import Polynomial
 
 from diffcloud.arcsim.contact.impact_times import NEVER, coplanarity_cubic, first_impact, unit_root
-from diffcloud.sim.terms import kernels
+from diffcloud.arcsim.terms import kernels
 from tests.arcsim.twins import impacts
 from tests.arcsim.twins.meeting import meeting, on_both, square
 

@@ -119,7 +119,7 @@ def test_impacts_that_cannot_be_resolved_are_named():
 
 def test_the_implicit_integrator_is_refused():
     scenario = over_box(ReferenceContact())
-    with pytest.raises(SceneError, match="linearised integrator"):
+    with pytest.raises(SceneError, match="arcsim integrator"):
         replace(scenario.scene, integrator="implicit").build()
 
 

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import torch
 
+from diffcloud.arcsim.load import load_scene
 from diffcloud.arcsim.schema import BodyBlock, ExtensionBlock
+from diffcloud.arcsim.write import write_scene
 from diffcloud.errors import MeshError, SceneError
-from diffcloud.scene import load_scene, write_scene
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.moved import moved_surfaces
@@ -29,8 +30,8 @@ from tests.arcsim.files import (
     write_file,
     write_files,
 )
+from tests.arcsim.test_scene import assert_same
 from tests.docs.examples import ROOT
-from tests.scene.test_scene import assert_same
 
 
 @pytest.fixture
@@ -44,7 +45,7 @@ def test_what_moves_decides_the_integrator(folder):
     pushed = load_scene(write_file(folder, sheet_over_box()))
     driven = load_scene(write_file(folder, over_moving_box()))
     for scene, integrator, counts in (
-        (standing, "linearised", (1, 0, 0)),
+        (standing, "arcsim", (1, 0, 0)),
         (driven, "implicit", (0, 1, 0)),
         (pushed, "implicit", (0, 0, 1)),
     ):
@@ -129,9 +130,9 @@ def test_obstacles_that_contradict_themselves_are_refused(folder, obstacle, mess
         (over_movable_box(), r"obstacles.0.movable: .*set `diffcloud.integrator` to .*or set `movable` .*to 0"),
     ],
 )
-def test_the_linearised_integrator_moves_no_obstacles(folder, data, message):
+def test_the_arcsim_integrator_moves_no_obstacles(folder, data, message):
     with pytest.raises(SceneError, match=message):
-        load_scene(write_file(folder, changed(data, "diffcloud.integrator", "linearised")))
+        load_scene(write_file(folder, changed(data, "diffcloud.integrator", "arcsim")))
 
 
 @pytest.mark.parametrize("mass", [{}, {"mass": 0.02}, {"density": 200.0}])
@@ -168,7 +169,7 @@ def test_a_written_scene_has_the_same_obstacles(folder, tmp_path, mass):
         ({"surrounding": Surrounding(contact=ContactSettings(sticking_speed=1e-4))}, "sticking_speed"),
         ({"surrounding": Surrounding(forces={"wind_box": {}})}, "forces"),
         ({"surrounding": Surrounding(reference_contact=ReferenceContact(residue=1e-3))}, "reference_contact"),
-        ({"surrounding": Surrounding(lagged_air=True), "integrator": "linearised"}, "lagged_air"),
+        ({"surrounding": Surrounding(lagged_air=True), "integrator": "arcsim"}, "lagged_air"),
         (
             {"handles": Handles((Handle(0, Motion((Keyframe(0.0),))), Handle(1, Motion((Keyframe(1.0),)))))},
             "a gripper with several motions",
@@ -210,7 +211,7 @@ def test_all_published_scenes_load_and_run(release: Path):
     assert len(found) >= 6
     for path in found:
         scene = load_scene(path)
-        assert scene.integrator == "linearised", path
+        assert scene.integrator == "arcsim", path
         system, _ = scene.build()
         with torch.no_grad():
             run = rollout(system, 3 * scene.frame_steps)

@@ -38,7 +38,7 @@ def test_a_node_that_two_slopes_stop_in_one_step(angles):
             proximity=False,
             friction_obstacle=0.0,
         ),
-        integrator="linearised",
+        integrator="arcsim",
     )
     high = torch.as_tensor(mesh.nodes)[None] + torch.tensor([0.003, 0.002, 0.03], dtype=torch.float64)
     down = torch.zeros_like(high) + torch.tensor([0.0, 0.3, -4.0], dtype=torch.float64)

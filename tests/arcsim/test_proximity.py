@@ -11,12 +11,12 @@ import torch
 
 from diffcloud.arcsim.contact.nearest import Repulsion, held_slots, pairs_at
 from diffcloud.arcsim.matrix import linear_system, pattern_with
+from diffcloud.arcsim.terms import kernels
 from diffcloud.mesh import ClothMesh, SurfaceMesh, grid_cloth
 from diffcloud.mesh.topology import directed_edges
 from diffcloud.sim.compiled.data import Motion, Parameters, Timing
 from diffcloud.sim.contact.surface import Surface, contact_surface
 from diffcloud.sim.surrounding import ReferenceContact
-from diffcloud.sim.terms import kernels
 from tests.arcsim.twins import proximity as twin
 from tests.arcsim.twins.meeting import meeting
 from tests.sim.contact.scenes import box, crumpled, over_box, together

@@ -578,8 +578,8 @@ def test_a_study_of_gradients_goes_on_where_it_stopped(work):
     assert run(*options, "--pairs", 3, cwd=work).result["pairs"] == 3
     assert (work / "pairs.csv").read_text().splitlines()[:3] == first
     assert "other pairs" in run(*options, "--pairs", 3, "--seed", 1, cwd=work, code=1).errors
-    other = run(*options, "--pairs", 3, "--integrator", "linearised", cwd=work, code=1).errors
-    assert re.search("holds pairs of small implicit [0-9a-f]{16}, not of small linearised", " ".join(other.split()))
+    other = run(*options, "--pairs", 3, "--integrator", "arcsim", cwd=work, code=1).errors
+    assert re.search("holds pairs of small implicit [0-9a-f]{16}, not of small arcsim", " ".join(other.split()))
     (work / "small.yaml").write_text(yaml.safe_dump(SMALL | {"steps_per_frame": SMALL["steps_per_frame"] + 1}))
     assert "holds pairs of small implicit" in run(*options, "--pairs", 3, cwd=work, code=1).errors
 
@@ -596,5 +596,5 @@ def test_a_study_of_steps_and_meshes_writes_its_page(work):
     run("discretisation", "--scenario", "tiny.yaml", "--cuts", 1, "--out", "page.md", cwd=work)
     page = (work / "page.md").read_text()
     assert "| tiny | implicit, BDF2 | 2 (default) |" in page
-    assert "| tiny | linearised | 32 |" in page
+    assert "| tiny | arcsim | 32 |" in page
     assert "## Meshes" in page

@@ -242,7 +242,7 @@ def test_a_cloth_of_one_face_moves_without_hinges():
         surrounding=surrounding,
         frame_time=0.1,
         frame_steps=8,
-        integrator="linearised",
+        integrator="arcsim",
     ).build()[0]
     fallen = rollout(system, 8).positions[0, -1] - torch.as_tensor(mesh.nodes)
     assert fallen[:, 2].numpy() == pytest.approx(np.full(3, -0.5 * 9.81 * 0.1**2), rel=0.15)

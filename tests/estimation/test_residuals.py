@@ -38,7 +38,7 @@ def test_differences_agree_with_tangents(monkeypatch):
     """Of the same motion, with a step so short that the differences are as good."""
     monkeypatch.setattr(residuals, "STEP", 1e-4)
     objective, found = lifted(), []
-    for integrator in ("implicit", "linearised"):  # which of both ways is taken
+    for integrator in ("implicit", "arcsim"):  # which of both ways is taken
         scenario = objective.scenario
         objective.scenario = replace(scenario, scene=replace(scenario.scene, integrator=integrator))
         with torch.no_grad():
@@ -48,7 +48,7 @@ def test_differences_agree_with_tangents(monkeypatch):
     torch.testing.assert_close(by_differences.rates, by_tangents.rates, rtol=1e-3, atol=1e-6)
 
 
-@pytest.mark.parametrize("integrator", ["implicit", "linearised"])
+@pytest.mark.parametrize("integrator", ["implicit", "arcsim"])
 def test_at_a_bound_motions_change_too(integrator):
     """Differences are halved there, and nothing is simulated beyond."""
     objective, asked = lifted(integrator=integrator), []
@@ -63,7 +63,7 @@ def test_at_a_bound_motions_change_too(integrator):
 
 def test_a_difference_that_diverges_names_its_place(monkeypatch):
     """The second place's: 5 % above it the cloth is too stiff, though not there."""
-    objective, real = lifted(integrator="linearised"), Objective.simulate_to_loss
+    objective, real = lifted(integrator="arcsim"), Objective.simulate_to_loss
 
     def broken(self, parameters):
         bad = (parameters["stretch"] > 9.0).nonzero().flatten().tolist()

@@ -38,7 +38,7 @@ from tests.io.ros_bag import Bag, Habits
 from tests.sensing.table_scene import INTRINSICS, poses
 
 SCENARIO = {
-    "nodes": [4, 4], "frames": 4, "steps_per_frame": 1, "points": 200, "integrator": "linearised",
+    "nodes": [4, 4], "frames": 4, "steps_per_frame": 1, "points": 200, "integrator": "arcsim",
     "path": [[0.0, 0.0, 0.0, 0.0], [0.4, 0.0, -0.03, 0.09]],
 }  # fmt: skip
 PARAMS = {
@@ -247,7 +247,7 @@ def warm_up() -> None:
     del matplotlib, studies
     import_open3d()
     torch.set_num_threads(1)
-    for integrator in ("linearised", "implicit"):
+    for integrator in ("arcsim", "implicit"):
         scenario = small_lift(integrator=integrator)
         parameters = {"stretch": torch.ones(1, dtype=torch.float64)}
         Objective(scenario, clouds_of(scenario, stretch=1.0))(parameters)

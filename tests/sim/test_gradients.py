@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from diffcloud.scene.scenarios import built_in, grid_scenario
+from diffcloud.sim.integrators import INTEGRATORS
 from tests.conftest import shaken, small_lift
 from tests.sim.directional import SCALARS, STEPS, STILL_AIR, Episode, directions
 
@@ -76,7 +77,7 @@ def test_short_episodes(gap, compression):
         assert central <= 1e-5, name
 
 
-@pytest.mark.parametrize("integrator", ["linearised", "implicit"])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_tracks_of_two_grippers(integrator):
     """A direction of the track moves both."""
     episode = Episode.build(shaken(gap_m=FREE_FALL_GAP, integrator=integrator, nodes=(4, 4)), 4)

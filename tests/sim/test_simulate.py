@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from diffcloud.arcsim.terms import TERMS
 from diffcloud.errors import DivergedError, SceneError
 from diffcloud.mesh import SurfaceMesh, box_surface, grid_cloth
 from diffcloud.sim import Rollout, episodes, init, rollout
@@ -20,7 +21,6 @@ from diffcloud.sim.materials import isotropic
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.rigid.body import RigidBody
 from diffcloud.sim.surrounding import ContactSettings, Surrounding
-from diffcloud.sim.terms import TERMS
 from diffcloud.sim.threads import use_threads
 from tests.conftest import shaken, small_lift
 from tests.sim.twins.forces import Forces
@@ -30,7 +30,7 @@ G = 9.81
 
 
 def cloth_system(
-    handles=(), *, hard=True, dt=0.01, height=1.0, obstacles=(), friction=0.3, air=0.0, integrator="linearised", **options
+    handles=(), *, hard=True, dt=0.01, height=1.0, obstacles=(), friction=0.3, air=0.0, integrator="arcsim", **options
 ):
     mesh = grid_cloth(5, 5, 0.2, 0.2)
     mesh = replace(mesh, nodes=mesh.nodes + np.array([0, 0, height]))
@@ -215,7 +215,7 @@ class TestHandles:
         run = rollout(system, 10, track=track)
         torch.testing.assert_close(run.positions[0, 1:, node], run.positions[0, :1, node] + track[0, :, 0])
 
-    @pytest.mark.parametrize("integrator", ["linearised", "implicit"])
+    @pytest.mark.parametrize("integrator", ["arcsim", "implicit"])
     def test_each_gripper_has_a_track_of_its_own(self, integrator):
         scenario = shaken(integrator=integrator, held=("left_bottom",))
         system, _ = scenario.scene.build()

@@ -31,7 +31,7 @@ def cloth(mesh=None, handles=(), integrator="implicit", **air):
     )
 
 
-@pytest.mark.parametrize("integrator", ["implicit", "linearised"])
+@pytest.mark.parametrize("integrator", ["implicit", "arcsim"])
 def test_a_falling_cloth_accelerates_by_the_share_of_its_weight(integrator):
     """(ρ + m) z'' = -ρ g: nothing else acts."""
     run = rollout(cloth(grid_cloth(4, 4, 0.3, 0.3), integrator=integrator, added_mass=0.4 * MATERIAL.density), 20)

@@ -9,13 +9,13 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
+from diffcloud.arcsim.terms import TERMS
 from diffcloud.errors import SceneError
 from diffcloud.mesh import SurfaceMesh, grid_cloth
 from diffcloud.sim.compiled.data import Motion, Parameters
 from diffcloud.sim.compiled.trace import Graph
 from diffcloud.sim.materials import TABLE_ENTRY_TO_STRETCHING, Material, isotropic
 from diffcloud.sim.surrounding import ContactSettings, Surrounding
-from diffcloud.sim.terms import TERMS
 from diffcloud.sim.terms.stretching import _sampled
 from tests.sim.twins import terms as twins
 from tests.sim.twins.forces import Forces, term_of, twin_force

@@ -1,6 +1,6 @@
 """Problems for several simulators: known answers, a third opinion, and the others where they are installed.
 
-`tests/physics/test_known_answers.py` has the same strip and elastica under mesh refinement, with the linearised integrator.
+`tests/physics/test_known_answers.py` has the same strip and elastica under mesh refinement, with the arcsim integrator.
 Here they are those of the study `simulators`: the implicit one, a Poisson's ratio, and the meshes that all simulators get.
 """
 

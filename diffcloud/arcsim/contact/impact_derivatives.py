@@ -12,11 +12,11 @@ import numpy as np
 
 from diffcloud.arcsim.contact.dual import gram
 from diffcloud.arcsim.contact.impact_zones import Impacts, Projection, move, take_zone, zones
+from diffcloud.arcsim.terms import kernels
 from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.copying import copy_to
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.dense import lu, lu_solve
-from diffcloud.sim.terms import kernels
 
 _point_face_reverse, _edge_edge_reverse = kernels.point_face_meeting_reverse, kernels.edge_edge_meeting_reverse
 _point_face_tangent, _edge_edge_tangent = kernels.point_face_meeting_tangent, kernels.edge_edge_meeting_tangent

@@ -1,4 +1,4 @@
-"""Repulsion and lagged friction between meshes, as forces of the linearised step (ARCSim).
+"""Repulsion and lagged friction between meshes, as forces of ARCSim's step.
 
 A pair at distance h, with n turned so that h > 0, violates the thickness τ by c = max(τ - h, 0). Energy K c³/(6 τ) with
 K = k_c times the smaller area; force K c²/(2 τ) along n, stiffness K c/τ, shared over the four points by the weights w.

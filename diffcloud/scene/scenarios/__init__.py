@@ -6,8 +6,7 @@ carry the settings of the experiments published with the paper and take their sc
 person's own scenario is a YAML file that starts from a built-in and changes what differs.
 """
 
-from diffcloud.arcsim.release import PAPER_THRESHOLD
-from diffcloud.io.published import RELEASE_UNIT_M
+from diffcloud.io.published import PAPER_THRESHOLD, RELEASE_UNIT_M
 from diffcloud.scene.scenarios.band import BandScenario, band_scenario
 from diffcloud.scene.scenarios.catalogue import SCENARIO_NAMES, built_in, load_scenario, make_scenario, read_options
 from diffcloud.scene.scenarios.grid import GridScenario, grid_scenario

@@ -8,9 +8,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from diffcloud.arcsim.release import PAPER_THRESHOLD
 from diffcloud.errors import SceneError
-from diffcloud.io.published import RELEASE_UNIT_M
+from diffcloud.io.published import PAPER_THRESHOLD, RELEASE_UNIT_M
 from diffcloud.io.schema import NonNegative
 from diffcloud.mesh.shapes import box_surface, cylinder_surface, loop_cloth
 from diffcloud.mesh.topology import SurfaceMesh

@@ -8,11 +8,10 @@ from typing import Literal, overload
 
 from pydantic import ValidationError
 
-from diffcloud.arcsim.load import load_scene
-from diffcloud.arcsim.release import RELEASE, release_scenario
 from diffcloud.errors import ConfigError, SceneError, unknown_name
 from diffcloud.io.files import read_yaml
 from diffcloud.io.schema import explain
+from diffcloud.scene.registry import EXPERIMENTS, load_experiment, load_scene
 from diffcloud.scene.scenarios.band import BAND_STRETCH, BandScenario, band_scenario
 from diffcloud.scene.scenarios.grid import FOLD, LIFT, SHAKE, GridScenario, grid_scenario
 from diffcloud.scene.scenarios.recorded import RECORDED
@@ -23,7 +22,7 @@ Options = GridScenario | BandScenario | VestScenario
 
 _ALL: tuple[Options, ...] = (LIFT, FOLD, BAND_STRETCH, VEST_HANG, SHAKE, *RECORDED)
 _BUILT_IN: dict[str, Options] = {options.name: options for options in _ALL}
-SCENARIO_NAMES = (*_BUILT_IN, *RELEASE)
+SCENARIO_NAMES = (*_BUILT_IN, *EXPERIMENTS)
 
 
 def load_scenario(name: str | Path | None, scene: Path | None = None) -> Scenario:
@@ -32,7 +31,7 @@ def load_scenario(name: str | Path | None, scene: Path | None = None) -> Scenari
     Args:
         name: a built-in, a `release_*` experiment (then `scene` is needed), the path of a YAML file, or None for a
             scene file as it is written.
-        scene: an ARCSim scene JSON.
+        scene: a scene file, such as an ARCSim scene JSON.
 
     Raises:
         ConfigError, SceneError, MeshError: what is wrong and what is allowed.
@@ -46,10 +45,10 @@ def load_scenario(name: str | Path | None, scene: Path | None = None) -> Scenari
         frames = loaded.default_frames or 25
         return Scenario(Path(scene).stem, loaded, frames, loss_frames=(-1,), every_frame=True)
     text = str(name)
-    if text in RELEASE:
+    if text in EXPERIMENTS:
         if scene is None:
             raise ConfigError(f"Scenario {text} needs --scene with the published scene file (README: published data).")
-        return release_scenario(text, scene)
+        return load_experiment(text, scene)
     if scene is not None:
         raise ConfigError(f"Scenario {text} makes its own scene; --scene goes with release_* scenarios or alone.")
     if text in _BUILT_IN:

@@ -19,6 +19,7 @@ from diffcloud.mesh.topology import ClothMesh
 from diffcloud.scene.scenarios.options import Coordinate, Keyframes, Length, ScenarioOptions, assemble, chosen_material
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.sim.grasp import GRIP_M, Grasp, Grip, inside, turned_up, window
+from diffcloud.sim.integrators import load_integrator
 from diffcloud.sim.surrounding import ContactSettings
 
 Names = tuple[str | int, ...]
@@ -195,7 +196,7 @@ def _sunk(options: GridScenario) -> float:
     weight = -options.gravity[2] * chosen_material(options).density
     if weight <= 0:
         return 0.0
-    return max(contact.resting_height(weight, options.integrator) - options.gap_m, 0.0)
+    return max(load_integrator(options.integrator).resting_height(contact, weight) - options.gap_m, 0.0)
 
 
 def _places(options: GridScenario, names: Sequence[str | int]) -> list[int]:

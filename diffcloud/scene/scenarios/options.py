@@ -11,20 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from diffcloud.arcsim.schema import Friction
 from diffcloud.errors import SceneError, unknown_name
-from diffcloud.io.schema import Checked, NonNegative, Vector
+from diffcloud.io.schema import Checked, Friction, NonNegative, Vector
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.scene.description import Scene
 from diffcloud.scene.scenarios.scenario import Recorder, Scenario
 from diffcloud.scene.scenarios.sheet import Sheet
 from diffcloud.sim.grasp import Grasp
 from diffcloud.sim.handles import Handle, Handles
+from diffcloud.sim.integrators import IntegratorName, load_integrator
 from diffcloud.sim.materials import Material, preset, read_material
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.still_air import AIR_DENSITY, StillAir, still_air
-from diffcloud.sim.surrounding import ContactSettings, Integrator, ReferenceContact, Surrounding
+from diffcloud.sim.surrounding import ContactSettings, Surrounding
 
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 """[m] Whatever lies farther off is a mistake."""
@@ -56,8 +56,8 @@ class ScenarioOptions(Checked):
     frames: Annotated[int, Field(ge=1, le=100_000)] = 25
     rate_hz: Annotated[float, Field(gt=0, le=1e5)] = 10.0
     steps_per_frame: Annotated[int, Field(ge=1, le=10_000)] = 8
-    integrator: Integrator = Scene.integrator
-    """"implicit" has steps of second order and smooth contact; "linearised" are ARCSim's steps, a quarter to a tenth as
+    integrator: IntegratorName = Scene.integrator
+    """"implicit" has steps of second order and smooth contact; "arcsim" are ARCSim's steps, a quarter to a tenth as
     long to compute and less exact (docs/results/discretisation.md)."""
     shaped: bool = Scene.shaped
     """Whether the cloth is at rest in bending as it starts, not flat."""
@@ -80,7 +80,7 @@ class ScenarioOptions(Checked):
     friction_obstacle: Friction = Surrounding.friction_obstacle
     friction_cloth: Friction = Surrounding.friction_cloth
     mesh_contact: bool = True
-    """For the linearised integrator: whether contact is with all meshes and the cloth itself, or with planes only."""
+    """For the arcsim integrator: whether contact is with all meshes and the cloth itself, or with planes only."""
     self_contact: bool = Surrounding.self_contact
     """Whether the cloth meets itself; without, layers pass through each other, and steps are several times quicker."""
     contact_stiffness: NonNegative = ContactSettings.stiffness
@@ -159,24 +159,26 @@ def assemble(
     ]
     thickness = options.contact_thickness_m
     moving = still_air(mesh, options.air_density) if options.air == "still" else StillAir(0.0, 0.0)
+    surrounding = Surrounding(
+        gravity=options.gravity,
+        air_density=0.0 if options.air == "none" else options.air_density,
+        added_mass=moving.added_mass,
+        linear_drag=moving.linear_drag,
+        friction_obstacle=options.friction_obstacle,
+        friction_cloth=options.friction_cloth,
+        self_contact=options.self_contact,
+        contact=ContactSettings(options.contact_stiffness, thickness, 0.1 * thickness),
+        obstacles=obstacles,
+    )
+    if options.mesh_contact:
+        surrounding = load_integrator(options.integrator).with_contact(surrounding)
     scene = Scene(
         mesh=mesh,
         material=replace(chosen_material(options), compression=options.compression),
         handles=Handles(tuple(handles), hard=not options.soft_handles, grasp=grasp),
         frame_time=1 / options.rate_hz,
         frame_steps=options.steps_per_frame,
-        surrounding=Surrounding(
-            gravity=options.gravity,
-            air_density=0.0 if options.air == "none" else options.air_density,
-            added_mass=moving.added_mass,
-            linear_drag=moving.linear_drag,
-            friction_obstacle=options.friction_obstacle,
-            friction_cloth=options.friction_cloth,
-            self_contact=options.self_contact,
-            reference_contact=ReferenceContact() if options.integrator == "linearised" and options.mesh_contact else None,
-            contact=ContactSettings(options.contact_stiffness, thickness, 0.1 * thickness),
-            obstacles=obstacles,
-        ),
+        surrounding=surrounding,
         integrator=options.integrator,
         shaped=options.shaped,
     )

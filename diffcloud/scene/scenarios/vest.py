@@ -8,9 +8,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from diffcloud.arcsim.release import PAPER_THRESHOLD
 from diffcloud.errors import SceneError
-from diffcloud.io.published import RELEASE_UNIT_M
+from diffcloud.io.published import PAPER_THRESHOLD, RELEASE_UNIT_M
 from diffcloud.io.schema import NonNegative
 from diffcloud.mesh.shapes import cylinder_surface, vest_cloth, vest_shoulder
 from diffcloud.scene.scenarios.options import Coordinate, Length, ScenarioOptions, assemble

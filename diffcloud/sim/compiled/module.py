@@ -1,17 +1,18 @@
-"""From the list of terms to a module of kernels.
+"""From lists of terms to modules of kernels.
 
 For each term five functions over its elements: `<name>_force` adds its forces, `<name>_assemble` also gives its part of
 the symmetric step matrix, `<name>_jacobian` its exact derivatives for the implicit step, `<name>_reverse` adds the
 gradients of y · f, `<name>_tangent` how f changes along some directions. `<name>_energy` adds what its elements store.
-Matrices come as 3 x 3 blocks, row by row, for each pair of an element's nodes. The module is written into the cache
-folder, where it can be read.
+Matrices come as 3 x 3 blocks, row by row, for each pair of an element's nodes. One module has the terms that all
+integrators share, so that their kernels are compiled once; each integrator's module adds its own. They are written into the
+cache folder, where they can be read.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from types import ModuleType
 
@@ -47,19 +48,37 @@ _ARGUMENTS = {
 
 
 @cache
-def terms_module(terms: tuple[Term, ...], contacts: tuple[Term, ...], functions: tuple[Function, ...]) -> ModuleType:
-    """The kernels of terms, contacts and functions, written once for each state of the sources.
+def shared_kernels(terms: tuple[Term, ...]) -> ModuleType:
+    """The kernels of each of some terms, written once for each state of the sources."""
+    return _module("shared", lambda: shared_source(terms))
+
+
+@cache
+def integrator_kernels(
+    integrator: str,
+    shared: tuple[Term, ...],
+    own: tuple[Term, ...],
+    contacts: tuple[Term, ...],
+    functions: tuple[Function, ...],
+) -> ModuleType:
+    """The kernels of an integrator's terms, contacts and functions, written once for each state of the sources.
 
     Args:
-        terms: whose elements are known before the motion; `force`, `assemble` and so on go through all of them.
+        shared: terms that other integrators have too.
+        own: further terms whose elements are known before the motion; `force`, `assemble` and so on go through both.
         contacts: whose elements each step finds.
         functions: of a few numbers, that have derivatives too.
     """
+    module = shared_kernels(shared)
+    return _module(integrator, lambda: integrator_source(module, shared, own, contacts, functions))
+
+
+def _module(name: str, source: Callable[[], str]) -> ModuleType:
     folder = cache_folder()
-    name = f"diffcloud_terms_{folder.name}"
+    name = f"diffcloud_terms_{name}_{folder.name}"
     path = folder / f"{name}.py"
     if not path.is_file():
-        write_shared(path, source_of(terms, contacts, functions))
+        write_shared(path, source())
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
@@ -69,24 +88,43 @@ def terms_module(terms: tuple[Term, ...], contacts: tuple[Term, ...], functions:
     return module
 
 
-def source_of(terms: Sequence[Term], contacts: Sequence[Term], functions: Sequence[Function]) -> str:
-    """The module's text."""
-    parts = [_HEAD]
-    stiff: dict[str, set[str]] = {"assemble": set(), "jacobian": set()}
-    for term in (*terms, *contacts):
+def shared_source(terms: Sequence[Term]) -> str:
+    """The text of the module of shared terms."""
+    parts, stiff = _terms(terms)
+    return "\n\n".join([_HEAD, *parts, f"STIFF = {stiff!r}"]) + "\n"
+
+
+def integrator_source(
+    module: ModuleType,
+    shared: Sequence[Term],
+    own: Sequence[Term],
+    contacts: Sequence[Term],
+    functions: Sequence[Function],
+) -> str:
+    """The text of an integrator's module, on top of that of the shared terms."""
+    parts, stiff = _terms([*own, *contacts])
+    terms = [*shared, *own]
+    parts.append(f"Terms = namedtuple('Terms', {[term.name for term in terms]!r})")
+    parts += [_all(kind, terms, {*module.STIFF.get(kind, ()), *stiff.get(kind, ())}) for kind in _ARGUMENTS]
+    parts += [source for function in functions for source in function.sources()]
+    return "\n\n".join([_HEAD, f"from {module.__name__} import *", *parts]) + "\n"
+
+
+def _terms(terms: Sequence[Term]) -> tuple[list[str], dict[str, list[str]]]:
+    """Each term's kernels, and the names of those that add to matrices of each kind."""
+    parts: list[str] = []
+    stiff: dict[str, list[str]] = {"assemble": [], "jacobian": []}
+    for term in terms:
         fields = ["nodes", "slots", *term.constants, *term.tables]
         parts.append(f"{term.class_name} = namedtuple({term.class_name!r}, {fields!r})")
         own = {"assemble": _assemble(term), "jacobian": _jacobian(term)}
         for kind, text in own.items():
             if "blocks[" in text:
-                stiff[kind].add(term.name)
+                stiff[kind].append(term.name)
         parts += [_force(term), *own.values(), _reverse(term), _tangent(term)]
         if term.energy is not None:
             parts.append(_energy(term))
-    parts.append(f"Terms = namedtuple('Terms', {[term.name for term in terms]!r})")
-    parts += [_all(kind, terms, stiff.get(kind, set())) for kind in _ARGUMENTS]
-    parts += [source for function in functions for source in function.sources()]
-    return "\n\n".join(parts) + "\n"
+    return parts, stiff
 
 
 def _all(kind: str, terms: Sequence[Term], stiff: set[str]) -> str:

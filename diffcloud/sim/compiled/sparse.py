@@ -5,7 +5,7 @@ lower half is stored column by column; an element finds its blocks by *slots* th
 between parts of the cloth that share no element adds blocks in single steps. The pattern of the factor is then found
 again, and, where the order no longer suits it, another order (`ordering`).
 
-Cholesky for the linearised step. For the exact Jacobian of the implicit step, which is not symmetric but has a symmetric
+Cholesky for ARCSim's step. For the exact Jacobian of the implicit step, which is not symmetric but has a symmetric
 pattern, LU by blocks: the upper half is stored transposed, in the pattern of the lower. It does not exchange rows
 beyond the blocks; `solve_general` looks at what is left over and turns to a dense factor where that has gone wrong.
 """

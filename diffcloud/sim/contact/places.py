@@ -16,7 +16,7 @@ from diffcloud.sim.compiled.box import Box, BoxType, define
 from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.contact.distance import closest, on_segment
 from diffcloud.sim.contact.surface import SurfaceBox
-from diffcloud.sim.terms import kernels
+from diffcloud.sim.implicit.terms import kernels
 
 POINT_POINT, POINT_EDGE, POINT_FACE, EDGE_EDGE, PLANE = range(5)
 _VANISHING = 1e-12

@@ -21,12 +21,6 @@ parts of different lengths (`step._weights`).
 
     reverse:  Jᵀ y = ∂L/∂w,   ∂L/∂p = -(∂r/∂p)ᵀ y          forward:  J ẇ = -(∂r/∂p) ṗ
 
-`step` has the episode, `newton` the solve, `adjoint` and `tangent` the derivatives.
+`integrator` is what the simulation calls; `step` has the episode, `newton` the solve, `adjoint` and `tangent` the
+derivatives.
 """
-
-from diffcloud.sim.implicit.adjoint import reverse
-from diffcloud.sim.implicit.build import build_scene
-from diffcloud.sim.implicit.step import simulate
-from diffcloud.sim.implicit.tangent import tangents
-
-__all__ = ["build_scene", "reverse", "simulate", "tangents"]

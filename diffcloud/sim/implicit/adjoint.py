@@ -11,7 +11,7 @@ from diffcloud.sim.held import Held, aim, aim_reverse, first_anchors_reverse, ho
 from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
 from diffcloud.sim.implicit.parts import Solved, solved_part
 from diffcloud.sim.implicit.scene import BODY, Kept, Scene, Work, new_work
-from diffcloud.sim.terms import kernels
+from diffcloud.sim.implicit.terms import kernels
 
 _reverse, _spin_reverse = kernels.reverse, kernels.spin_reverse
 _point_point, _point_edge = kernels.barrier_point_point_reverse, kernels.barrier_point_edge_reverse

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloud.sim.contact.half_spaces import half_spaces
 from diffcloud.sim.contact.places import Planes
 from diffcloud.sim.contact.rest import CREASE, NEAR_PART
 from diffcloud.sim.contact.surface import contact_surface
 from diffcloud.sim.implicit.scene import Rigid, Scene
+from diffcloud.sim.implicit.terms import kernels
+from diffcloud.sim.terms import TERMS
 from diffcloud.sim.terms.elements import elements
-from diffcloud.sim.terms.planes import half_spaces
 from diffcloud.sim.terms.term import Setup
 
 
@@ -32,7 +34,7 @@ def build_scene(setup: Setup, time_step: float) -> Scene:
         meets[:] = False
     settings = surrounding.contact
     thicknesses = (settings.repulsion_thickness, min(settings.repulsion_thickness, NEAR_PART * mesh.smallest_height))
-    terms, of = elements(setup, len(bodies))
+    terms, of = elements(setup, TERMS, kernels, len(bodies))
     return Scene(
         terms=terms,
         pattern=of,

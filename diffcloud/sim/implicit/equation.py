@@ -8,7 +8,7 @@ from diffcloud.compiled import kernel
 from diffcloud.sim.compiled.data import Floats, Timing
 from diffcloud.sim.contact.places import Touching
 from diffcloud.sim.implicit.scene import BODY, Rigid, Work
-from diffcloud.sim.terms import kernels
+from diffcloud.sim.implicit.terms import kernels
 
 _force, _spin = kernels.force, kernels.spin_value
 _point_point, _point_edge = kernels.barrier_point_point_force, kernels.barrier_point_edge_force

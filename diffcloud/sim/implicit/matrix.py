@@ -12,7 +12,7 @@ from diffcloud.sim.contact.places import Touching, corners
 from diffcloud.sim.contact.resistance import resistance
 from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
 from diffcloud.sim.implicit.scene import Work
-from diffcloud.sim.terms import kernels
+from diffcloud.sim.implicit.terms import kernels
 
 _assemble, _jacobian, _spin_tangent = kernels.assemble, kernels.jacobian, kernels.spin_tangent
 _pp_jacobian, _pe_jacobian = kernels.barrier_point_point_jacobian, kernels.barrier_point_edge_jacobian

@@ -14,11 +14,14 @@ from diffcloud.sim.compiled.lu import General
 from diffcloud.sim.compiled.sparse import Pattern
 from diffcloud.sim.contact.places import Planes
 from diffcloud.sim.contact.surface import Surface, boxed
+from diffcloud.sim.status import FIRST_OWN
 
 PARTS = 32
 """A step may be halved into so many parts."""
 BODY = 18
 """Numbers of a body's state: centre [m], orientation row by row, velocity [m/s], angular velocity [rad/s]."""
+STUCK = FIRST_OWN
+"""A status: a step did not converge."""
 
 
 class Rigid(NamedTuple):

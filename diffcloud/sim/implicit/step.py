@@ -13,8 +13,20 @@ from diffcloud.sim.held import Held, aim, first_anchors, holders, take_anchors
 from diffcloud.sim.implicit.equation import body_points, finish
 from diffcloud.sim.implicit.newton import converge
 from diffcloud.sim.implicit.room import distance_of
-from diffcloud.sim.implicit.scene import BODY, PARTS, Kept, Past, Scene, Work, follow, new_work, no_past, nothing_kept
-from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE, STUCK
+from diffcloud.sim.implicit.scene import (
+    BODY,
+    PARTS,
+    STUCK,
+    Kept,
+    Past,
+    Scene,
+    Work,
+    follow,
+    new_work,
+    no_past,
+    nothing_kept,
+)
+from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE
 
 _GROWTH = 2.0
 """A part may be so many times as long as the one before it; BDF2 is stable up to 1 + √2."""

@@ -13,7 +13,7 @@ from diffcloud.sim.held import Held, aim, aim_tangent, first_anchors, holders, t
 from diffcloud.sim.implicit.equation import arm_of, contact_force, spin_inputs
 from diffcloud.sim.implicit.parts import Solved, solved_part
 from diffcloud.sim.implicit.scene import BODY, Kept, Scene, Work, new_work
-from diffcloud.sim.terms import kernels
+from diffcloud.sim.implicit.terms import kernels
 
 _tangent, _spin_tangent = kernels.tangent, kernels.spin_tangent
 _point_point, _point_edge = kernels.barrier_point_point_tangent, kernels.barrier_point_edge_tangent

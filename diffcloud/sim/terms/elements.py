@@ -2,33 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from diffcloud.errors import SceneError, unknown_name
 from diffcloud.sim.compiled.sparse import Pattern, pattern, slots
-from diffcloud.sim.terms import TERMS, kernels
 from diffcloud.sim.terms.term import Elements, Setup, Term
 
 
-def elements(setup: Setup, bodies: int = 0) -> tuple[Any, Pattern]:
+def elements(setup: Setup, terms: Sequence[Term], kernels: Any, bodies: int = 0) -> tuple[Any, Pattern]:
     """(`kernels.Terms`, the pattern of the step matrix: cloth nodes, then the centre and the rotation of each body).
+
+    Args:
+        terms, kernels: of an integrator.
 
     Raises:
         SceneError: the surrounding has settings of a force that there is not.
     """
-    names = [term.name for term in TERMS]
+    names = [term.name for term in terms]
     for name in setup.surrounding.forces:
         if name not in names:
             raise SceneError(unknown_name("force", name, names))
-    found = [term.build(setup) or _none(term) for term in TERMS]
+    found = [term.build(setup) or _none(term) for term in terms]
     groups = [np.ascontiguousarray(one.nodes, dtype=np.int64) for one in found]
     count = len(setup.mesh.nodes)
     of_bodies = count + np.arange(2 * bodies, dtype=np.int64).reshape(-1, 2)
     of = pattern(count + 2 * bodies, [*groups, of_bodies])
     parts = []
-    for term, one, group in zip(TERMS, found, groups, strict=True):
+    for term, one, group in zip(terms, found, groups, strict=True):
         numbers = [*(one.constants[name] for name in term.constants), *(one.tables[name] for name in term.tables)]
         arrays = [np.ascontiguousarray(array, dtype=np.float64) for array in numbers]
         parts.append(getattr(kernels, term.class_name)(group, slots(of, group), *arrays))

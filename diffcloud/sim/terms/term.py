@@ -18,7 +18,7 @@ from diffcloud.sim.compiled.trace import Graph, Scalar, Vector
 from diffcloud.sim.handles import Handles
 from diffcloud.sim.materials import Material
 from diffcloud.sim.rigid.bodies import Bodies
-from diffcloud.sim.surrounding import Integrator, Order, Surrounding
+from diffcloud.sim.surrounding import Order, Surrounding
 
 Place = Literal["element", "corner", "episode", "vector"]
 """Whether a parameter has a value for each element, for each node, one for the whole motion, or three for each element."""
@@ -33,7 +33,8 @@ class Setup:
     surrounding: Surrounding
     handles: Handles
     bodies: Bodies
-    integrator: Integrator
+    integrator: str
+    """A key of `integrators.INTEGRATORS`."""
     order: Order
     shaped: bool
     """Whether the cloth's hinges are at rest as the mesh stands, not flat."""
@@ -99,7 +100,7 @@ class Element:
             return tuple(graph.vector(*(f"{array}[i{corner}, {axis}]" for axis in range(3))) for corner in corners)
 
         self.positions = each("motion.positions")
-        """[n] where the nodes are [m]: at the start of a linearised step, at the end of an implicit one."""
+        """[n] where the nodes are [m]: at the start of a step of ARCSim's, at the end of an implicit one."""
         self.before = each("motion.before")
         """[n] velocities at the start of the step [m/s]."""
         self.after = each("motion.after")

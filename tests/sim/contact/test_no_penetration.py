@@ -62,7 +62,7 @@ def dropped(
         handles=Handles(handles, hard=True),
         frame_time=STEP,
         surrounding=Surrounding(air_density=1.2, obstacles=obstacles, reference_contact=ReferenceContact()),
-        integrator="linearised",
+        integrator="arcsim",
     )
     return Scenario("dropped", scene, frames=round(seconds / STEP), loss_frames=(-1,))
 

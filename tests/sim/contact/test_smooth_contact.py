@@ -18,13 +18,13 @@ from diffcloud.sim.contact.additive_ccd import safe_fraction
 from diffcloud.sim.contact.distance import closest
 from diffcloud.sim.contact.surface import contact_surface
 from diffcloud.sim.handles import Handle, Handles
+from diffcloud.sim.implicit.terms import kernels
 from diffcloud.sim.materials import isotropic
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.scenery import MovingObstacle
 from diffcloud.sim.simulate import init
 from diffcloud.sim.surrounding import ContactSettings, Surrounding
 from diffcloud.sim.system import System
-from diffcloud.sim.terms import kernels
 from tests.sim.twins import barrier
 from tests.sim.twins.rigid import angular_momentum, rotation
 

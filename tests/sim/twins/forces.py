@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from diffcloud.arcsim.terms import TERMS, kernels
 from diffcloud.mesh.topology import ClothMesh
 from diffcloud.sim.build import build_system
 from diffcloud.sim.compiled.data import Motion, Parameters, Timing
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.materials import Material
 from diffcloud.sim.surrounding import Surrounding
-from diffcloud.sim.terms import TERMS, kernels
 from diffcloud.sim.terms.term import Term
 
 STEP = 0.01
@@ -37,7 +37,7 @@ class Forces:
         handles = Handles((Handle(0), Handle(1)))
         self.mesh = mesh
         self.system = build_system(
-            mesh, material, time_step=STEP, handles=handles, surrounding=surrounding, shaped=shaped, integrator="linearised"
+            mesh, material, time_step=STEP, handles=handles, surrounding=surrounding, shaped=shaped, integrator="arcsim"
         )
         self.terms = self.system.scene.terms
         given = self.system.properties

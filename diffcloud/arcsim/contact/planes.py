@@ -1,4 +1,4 @@
-"""Contact of the linearised step with half-spaces n · x >= offset: repulsion and lagged Coulomb friction.
+"""Contact of ARCSim's step with half-spaces n · x >= offset: repulsion and lagged Coulomb friction.
 
 Repulsion (ARCSim, thickness τ): violation c = max(τ + offset - n · x, 0), energy K c³/(6 τ) with K = k_c times the node's
 material area; force K c²/(2 τ) along n, stiffness K c/τ.
@@ -7,9 +7,8 @@ Friction (lagged: normal force and sliding direction of the start of the step): 
 -γ P v with P = I - n nᵀ, implicit in v. The second branch is sticking: it halves the sliding velocity in each
 step, so a node on an incline of angle α creeps at g sin(α) Δt, which vanishes with the step.
 
-Projection (`project`): a node whose candidate position is behind the plane is put at the projection thickness above
-it. For a
-single static plane this is the exact solution of the impact-zone problem (nodes do not couple), and inelastic.
+Projection (`step.project`): a node whose candidate position is behind the plane is put at the projection thickness above
+it. For a single static plane this is the exact solution of the impact-zone problem (nodes do not couple), and inelastic.
 
 Not reproduced from ARCSim: the doubled constraint of the node nearest to each obstacle face, contacts of cloth edges
 with the obstacle's edges, and the plane's finite extent.
@@ -18,12 +17,14 @@ with the obstacle's edges, and the plane's finite extent.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.mesh.topology import ClothMesh
 from diffcloud.sim.compiled.trace import Vector, dot, larger, maximum, norm
+from diffcloud.sim.contact.half_spaces import half_spaces
 from diffcloud.sim.surrounding import Surrounding
 from diffcloud.sim.terms.term import Element, Elements, Setup, Term
 
@@ -47,9 +48,9 @@ def force(node: Element) -> Sequence[Vector]:
 
 def build(setup: Setup) -> Elements | None:
     """Every node with every plane."""
-    if setup.integrator != "linearised" or not setup.surrounding.proximity:
+    if not setup.surrounding.proximity:
         return None
-    normals, offsets = half_spaces(setup.mesh, setup.surrounding)
+    normals, offsets = stopping_planes(setup.mesh, setup.surrounding)
     nodes = np.tile(np.arange(len(setup.mesh.nodes)), len(normals))
     contact = setup.surrounding.contact
     return Elements(
@@ -63,7 +64,7 @@ def build(setup: Setup) -> Elements | None:
     )
 
 
-TERM = Term(
+PLANES = Term(
     "planes",
     corners=1,
     force=force,
@@ -74,12 +75,8 @@ TERM = Term(
 """Constants: unit normal towards the cloth; offset [m]; k_c times the node's area [N/m]; τ [m]."""
 
 
-def half_spaces(mesh: ClothMesh, surrounding: Surrounding) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Planar obstacles as (normals [P, 3], offsets [P]), on the side where most of the cloth starts; none where
-    contact with meshes covers them."""
-    found = [obstacle.plane() for obstacle in surrounding.obstacles if surrounding.reference_contact is None]
-    planes = [plane for plane in found if plane is not None]
-    normals = np.array([normal for normal, _ in planes]).reshape(-1, 3)
-    offsets = np.array([offset for _, offset in planes]).reshape(-1)
-    side = np.where(np.median(mesh.nodes @ normals.T - offsets, axis=0) < 0, -1.0, 1.0)
-    return normals * side[:, None], offsets * side
+def stopping_planes(mesh: ClothMesh, surrounding: Surrounding) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The half-spaces that stop nodes (`half_spaces`); none where contact with meshes covers them."""
+    if surrounding.reference_contact is not None:
+        surrounding = replace(surrounding, obstacles=())
+    return half_spaces(mesh, surrounding)

@@ -1,0 +1,25 @@
+"""The forces of the implicit step, and the kernels that are generated from them (`sim.compiled.module`)."""
+
+from diffcloud.sim.compiled.module import integrator_kernels
+from diffcloud.sim.contact.barrier import (
+    BARRIER_EDGE_EDGE,
+    BARRIER_PLANE,
+    BARRIER_POINT_EDGE,
+    BARRIER_POINT_FACE,
+    BARRIER_POINT_POINT,
+)
+from diffcloud.sim.rigid.spin import SPIN
+from diffcloud.sim.terms import TERMS
+from diffcloud.sim.terms.term import Term
+
+CONTACTS: tuple[Term, ...] = (
+    BARRIER_POINT_POINT,
+    BARRIER_POINT_EDGE,
+    BARRIER_POINT_FACE,
+    BARRIER_EDGE_EDGE,
+    BARRIER_PLANE,
+)
+"""Forces between points that each step finds."""
+
+kernels = integrator_kernels("implicit", TERMS, (), CONTACTS, (SPIN,))
+"""`kernels.jacobian`, `kernels.Terms`, `kernels.bending_force`, ..."""
