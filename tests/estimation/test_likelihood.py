@@ -268,6 +268,14 @@ class TestFits:
         assert abs(float(told.mean[0]) - math.log(TRUTH["stretch"])) < 1.645 * deviation
         assert deviation < 0.05
 
+    def test_a_descent_over_all_frames_that_does_not_arrive_counts_too(self):
+        """Two places of each descent, and the horizon's two motions."""
+        one = Objective(SCENARIO, clouds_of(SCENARIO, points=2000, **TRUTH), nuisance=POSE)
+        settings = LikelihoodSettings(iterations=2, starts=1, model_error=False)
+        told = fit_likelihood(one, SPACE, settings).estimate
+        assert len(told.members[0].frames) < len(one.frames)
+        assert told.simulations == 6
+
     def test_bodies_stand_still_for_every_clock(self):
         """A scene with a body beside the cloth, seen by a clock that is free."""
         scenario = load_scenario("vest_hang")

@@ -102,6 +102,7 @@ def estimate(
     """
     likelihood = up_to_horizon(objective.members, space, settings)
     answers, failures, descent = list[Answer](), list[DivergedError](), None
+    simulated = [likelihood]
 
     def follow(number: int, place: Tensor, likelihood: Likelihood, to_beat: float = math.inf) -> Answer | None:
         nonlocal descent
@@ -118,7 +119,7 @@ def estimate(
             failures.append(error)
             return None
 
-    interrupted, simulations = False, 0
+    interrupted = False
     try:
         for number in range(settings.starts):
             away = _START * ((number + 1) // 2) * (1 if number % 2 else -1)
@@ -128,9 +129,9 @@ def estimate(
             if number == 0 and found is not None and not likelihood.knows_grip:
                 off = that_fits(objective.members, float(found.place[-1]))
             if found is not None and abs(off) > _REGRIP:
-                simulations += likelihood.simulations
                 place = torch.cat([found.place[:-1], torch.zeros(1, dtype=torch.float64)])
                 likelihood = up_to_horizon(objective.members, space, settings, off, place)
+                simulated.append(likelihood)
                 found = follow(number, place, likelihood)
             if found is not None:
                 answers.append(found)
@@ -138,9 +139,10 @@ def estimate(
         if answers and not settings.model_error and likelihood.frames < every:
             best = min(answers, key=lambda one: one.energy)
             whole = Likelihood(objective.members, space, settings)
+            simulated.append(whole)
             found = follow(settings.starts, best.place, whole)
             if found is not None and found.converged:
-                simulations, likelihood, answers = simulations + likelihood.simulations, whole, [found]
+                likelihood, answers = whole, [found]
     except KeyboardInterrupt:
         interrupted = True
         if not answers:
@@ -151,7 +153,6 @@ def estimate(
     if not answers:
         raise failures[0]
     answers.sort(key=lambda one: one.energy)
-    simulations += likelihood.simulations
     if likelihood.knows_grip:
         members, grip = [one.objective for one in likelihood.recordings], None
     else:
@@ -159,4 +160,5 @@ def estimate(
         counts = [len(one.objective.frames) for one in likelihood.recordings]
         found_so = [known(one) for one in gripped(objective.members, grip)]
         members = [one.earliest([count]) for one, count in zip(found_so, counts, strict=True)]
+    simulations = sum(one.simulations for one in simulated)
     return Estimate(space, tuple(answers), tuple(members), grip, simulations, interrupted)
