@@ -54,6 +54,38 @@ class TestCloths:
             assert (end[:2] < 0).all()
 
 
+class TestNewton:
+    def told(self, tmp_path, monkeypatch, longer):
+        """Of a strip that hangs so many times as far as a linear one, with a motion that is strained by 5 %."""
+        hung = []
+
+        def simulate(problem, settings):
+            hung.append(problem)
+            return problem
+
+        def hang(sheet):
+            known = real(sheet)
+            return replace(known, measures=lambda track: {"elongation": 0.05 * longer})
+
+        real = study.strip
+        monkeypatch.setattr(study, "strip", hang)
+        monkeypatch.setattr(study.newton, "simulate", simulate)
+        cloth = study.Cloth(4)
+        problem, held = study._problem(cloth)
+        nodes = 1.05 * problem.mesh.nodes[None].repeat(2, 0)
+        motion = study.Moved(nodes, problem.mesh.faces, nodes[:, held].mean(1))
+        assert study._strain(cloth, motion) == pytest.approx(0.05)
+        found = [study.in_a_strip(cloth, motion, tmp_path) for _ in range(2)]
+        assert found[0] == found[1]
+        assert len(hung) == 1  # once
+        return found[0] / cloth.sheet.stretching
+
+    def test_a_strip_that_hangs_farther_is_softer(self, tmp_path, monkeypatch):
+        """Saint Venant and Kirchhoff's law stiffens: this strip would hang less far than a linear one."""
+        assert self.told(tmp_path / "far", monkeypatch, 1.02) == pytest.approx(0.89, abs=0.01)  # as Newton's did
+        assert self.told(tmp_path / "less", monkeypatch, 0.92) == pytest.approx(1.0, abs=0.01)  # as this simulator's did
+
+
 class TestClouds:
     def test_points_lie_on_the_cloth_but_for_noise(self):
         cloth = study.Cloth(2)
