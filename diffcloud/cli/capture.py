@@ -8,15 +8,14 @@ from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
 
-from diffcloud.cli.console import JsonFlag, errors, finish, named_serials, show_checks, warn, whole_numbers
-from diffcloud.errors import ConfigError, DiffCloudError, LimitError, unknown_name
+from diffcloud.cli.console import JsonFlag, errors, finish, show_checks, warn
+from diffcloud.errors import ConfigError, DiffCloudError, LimitError
 from diffcloud.hardware import (
-    ArmLimits,
     ArmProcess,
     CaptureSettings,
     Limits,
@@ -28,18 +27,19 @@ from diffcloud.hardware import (
     read_trajectory,
 )
 from diffcloud.hardware.arm_limits import ArmChecker
-from diffcloud.hardware.camera_settings import CameraSettings, Pace
+from diffcloud.hardware.camera_settings import CameraSettings
 from diffcloud.hardware.devices import Camera
 from diffcloud.hardware.installed import Check
 from diffcloud.hardware.kinova import KinovaArm
 from diffcloud.hardware.motion import plan_motion
 from diffcloud.hardware.realsense import RealSenseCamera
+from diffcloud.hardware.rig import RigSettings, read_rig
 from diffcloud.hardware.trajectory import check_control_rate
 from diffcloud.io.calibrations import read_calibration
+from diffcloud.io.labels import read_labels
 from diffcloud.io.raw_episodes import exists_already
 from diffcloud.sensing.robot import Robot, gen3
 
-_BOX = ",".join(f"{value:g}" for value in (*Limits.box_low_m, *Limits.box_high_m))
 _CLEAR = "Is the workspace clear, and a hand on the emergency stop? The arm will move"
 
 
@@ -76,65 +76,28 @@ def record(
     out: Annotated[
         Path | None, typer.Option(help="Folder of the episode, such as raw/episodes/lift/tan1; must not exist.")
     ] = None,
-    camera: Annotated[list[str] | None, typer.Option(help="NAME=SERIAL; one or more.")] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(help="YAML file of the set-up: cameras, arm, limits (docs/capture.md), such as rig.yaml."),
+    ] = None,
     trajectory: Annotated[
-        Path | None, typer.Option(help="CSV (t_s, x, y, z[, gripper]) or NPY [T, 3]: tool in the base frame, metres.")
+        Path | None,
+        typer.Option(help="CSV (t_s, x, y, z[, gripper]) or NPY [T, 3]: path of the tool in the base frame, metres."),
     ] = None,
-    arm: Annotated[str | None, typer.Option(help="Address of the arm.")] = None,
-    arm_driver: Annotated[
-        str | None, typer.Option(help="module:Class of the driver, if the arm is not a Gen3 (docs/drivers.md).")
+    seconds: Annotated[float | None, typer.Option(help="How long to record cameras without the arm, s.")] = None,
+    check: Annotated[
+        Literal["arm", "cameras", "all"] | None,
+        typer.Option(help="Record nothing; check what a capture relies on. The arm moves a little, if it is checked."),
     ] = None,
-    camera_driver: Annotated[
-        str | None, typer.Option(help="module:Class of the driver, if the cameras are not RealSense (docs/drivers.md).")
+    dry_run: Annotated[bool, typer.Option(help="Check the plan; open nothing. With --check arm: move nothing.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves, nor for a pulled cable.")] = False,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(help="KEY=VALUE, kept in episode.json, such as scenario=lift or fabric=tan; repeated."),
     ] = None,
-    check_arm: Annotated[
-        bool, typer.Option("--check-arm", help="Record nothing; move the arm a little, check what a capture relies on.")
-    ] = False,
-    check_cameras: Annotated[
-        bool, typer.Option("--check-cameras", help="Record nothing; check what the cameras deliver.")
-    ] = False,
-    seconds: Annotated[float | None, typer.Option(help="How long to record without an arm, s.")] = None,
-    rate_hz: Annotated[float, typer.Option("--rate", help="Hz, of control, frames, and keyframes without times.")] = 10.0,
-    fps: Annotated[int, typer.Option(help="Frame rate of the cameras; frames beyond --rate are not written.")] = 30,
-    size: Annotated[str, typer.Option(help="Size of the images, WIDTHxHEIGHT.")] = "640x480",
-    preset: Annotated[
-        str | None, typer.Option(help="Visual preset of RealSense depth sensors, such as high_accuracy.")
-    ] = None,
-    laser: Annotated[float | None, typer.Option(help="Power of RealSense projectors, mW; 0 is off.")] = None,
-    master: Annotated[
-        str | None, typer.Option(help="Name of the RealSense camera whose trigger the others follow (sync cable).")
-    ] = None,
-    auto_exposure: Annotated[
-        bool, typer.Option("--auto-exposure", help="Do not hold exposure, gain and white balance while recording.")
-    ] = False,
-    calibration: Annotated[Path | None, typer.Option(help="Calibration file; its poses go into camera.json.")] = None,
-    box: Annotated[
-        str | None, typer.Option(help=f"Workspace: x0,y0,z0,x1,y1,z1 in metres, in the base frame; {_BOX} if not given.")
-    ] = None,
-    speed: Annotated[float, typer.Option(help="Limit of the tool's speed, m/s.")] = Limits.speed_m_s,
-    acceleration: Annotated[float, typer.Option(help="Limit of its acceleration, m/s².")] = Limits.acceleration_m_s2,
-    force: Annotated[float, typer.Option(help="Limit of the change of the force at the tool, N.")] = Limits.force_N,
-    torque: Annotated[float, typer.Option(help="Limit of the change of the torque, N·m.")] = Limits.torque_Nm,
-    preload: Annotated[
-        float, typer.Option(help="Limit of the force at rest, N; the torque's, N·m, is a third of it.")
-    ] = Limits.preload_N,
-    table: Annotated[float, typer.Option(help="Height of the table in the base frame, m; no link may be lower.")] = (
-        ArmLimits.table_m
-    ),
-    arm_margin: Annotated[
-        float, typer.Option(help="How far links may reach beyond the workspace box and the base, m.")
-    ] = ArmLimits.margin_m,
-    urdf: Annotated[
-        Path | None, typer.Option(help="Description of the arm with its tool; without it, a Gen3 with a 2F-85.")
-    ] = None,
-    stretch_time: Annotated[float, typer.Option(help="Factor on the trajectory's times; 2 is half as fast.")] = 1.0,
     home: Annotated[bool, typer.Option(help="Move to the arm's home position first.")] = False,
     clear_faults: Annotated[bool, typer.Option(help="Clear the arm's faults first.")] = False,
     keep_recording: Annotated[bool, typer.Option(help="Also keep the SDK's own .db3 beside the episode.")] = False,
-    scenario: Annotated[str | None, typer.Option(help="Name that is kept in episode.json.")] = None,
-    fabric: Annotated[str | None, typer.Option(help="Name that is kept in episode.json.")] = None,
-    dry_run: Annotated[bool, typer.Option(help="Check the plan; open nothing. With --check-arm: move nothing.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves, nor for a pulled cable.")] = False,
     json: JsonFlag = False,
 ) -> None:
     """Drive the arm along a trajectory and record cameras and arm, writing to disk while it runs.
@@ -142,67 +105,59 @@ def record(
     The arm is stopped whatever ends the capture: the trajectory's end, a limit, a fault, a lost camera, Ctrl-C or Ctrl-Z,
     even if this process is killed. What was recorded so far stays.
     """
-    limits = _limits(
-        box,
-        speed_m_s=speed,
-        acceleration_m_s2=acceleration,
-        force_N=force,
-        torque_Nm=torque,
-        preload_N=preload,
-        preload_Nm=preload * Limits.preload_Nm / Limits.preload_N,
-    )
-    arm_limits = ArmLimits(table_m=table, margin_m=arm_margin)
-    robot = None if urdf is None else Robot.from_urdf(urdf)
-    path = None if trajectory is None else read_trajectory(trajectory, rate_hz=rate_hz, stretch_time=stretch_time)
-    serials = named_serials(camera or [], "--camera")
-    width, height = whole_numbers(size, "--size")
-    if not rate_hz > 0:
-        raise ConfigError(f"--rate is in Hz, above 0, got {rate_hz:g}.")
-    options: dict[str, Any] = {"width": width, "height": height, "fps": fps}
-    of_realsense = any(option is not None for option in (preset, laser, master)) or auto_exposure or keep_recording
-    if camera_driver is not None and of_realsense:
+    setup = RigSettings() if rig is None else read_rig(rig)
+    limits, arm_limits = setup.limits(), setup.arm_limits()
+    labels = read_labels(label or [])
+    robot = None if setup.urdf is None else Robot.from_urdf(setup.urdf)
+    path = None
+    if trajectory is not None:
+        path = read_trajectory(trajectory, rate_hz=setup.control_rate_hz, stretch_time=setup.time_scale)
+    if setup.camera_driver is not None and keep_recording:
         raise ConfigError(
-            "--preset, --laser, --master, --auto-exposure and --keep-recording are for RealSense cameras, without "
-            "--camera-driver."
+            f"--keep-recording is for RealSense cameras, and {rig} names a camera_driver. Leave --keep-recording out."
         )
-    if master is not None and master not in serials:
-        raise ConfigError(unknown_name("--master", master, serials))
 
     def camera_of(name: str, record_to: Path | None = None) -> Camera:
-        asked = CameraSettings(not auto_exposure, preset, laser, None if master is None else _pace(name, master))
-        return make_camera(name, serials[name], camera_driver, record_to=record_to, settings=asked, **options)
+        width, height = setup.image_size
+        options = {"width": width, "height": height, "fps": setup.camera_rate_hz}
+        asked = setup.camera_settings(name)
+        return make_camera(name, setup.cameras[name], setup.camera_driver, record_to=record_to, settings=asked, **options)
 
-    if check_arm or check_cameras:
-        if check_arm and arm is None:
-            raise ConfigError("--check-arm needs the arm's address: --arm.")
-        if check_cameras and not serials:
-            raise ConfigError("--check-cameras needs cameras: --camera NAME=SERIAL.")
-        cameras = [camera_of(name) for name in serials] if check_cameras else []
-        checker = ArmChecker(robot or gen3(), limits, arm_limits) if check_arm else None
-        connect = partial(open_arm, arm or "", arm_driver)
+    if check is not None:
+        with_arm, with_cameras = check in ("arm", "all"), check in ("cameras", "all")
+        if with_arm and setup.arm is None:
+            raise ConfigError(f"--check {check} needs the arm's address: `arm` in the file that --rig names.")
+        if with_cameras and not setup.cameras:
+            raise ConfigError(f"--check {check} needs cameras: `cameras` in the file that --rig names.")
+        cameras = [camera_of(name) for name in setup.cameras] if with_cameras else []
+        checker = ArmChecker(robot or gen3(), limits, arm_limits) if with_arm else None
+        connect = partial(open_arm, setup.arm or "", setup.arm_driver)
         _check(cameras, checker, connect, path, move=not dry_run, ask=not yes, json=json)
         return
-    if out is None or not serials:
-        raise ConfigError("A capture needs --out, the folder of the episode, and at least one --camera NAME=SERIAL.")
+    if out is None or not setup.cameras:
+        raise ConfigError(
+            "A capture needs --out, the folder of the episode, and --rig, a file whose `cameras` names at least one camera."
+        )
     if out.exists():
         raise exists_already(out)
-    calibrated = {} if calibration is None else read_calibration(calibration).cameras
-    for name, serial in serials.items():
-        if calibration is not None and serial not in calibrated:
-            warn(f"{calibration} has no camera {name} ({serial}); its pose is left open.")
-    plan = _plan(path, serials, arm, limits)
+    arm = _moved_arm(setup, path, seconds, rig, readied=home or clear_faults)
+    calibrated = {} if setup.calibration is None else read_calibration(setup.calibration).cameras
+    for name, serial in setup.cameras.items():
+        if setup.calibration is not None and serial not in calibrated:
+            warn(f"{setup.calibration} has no camera {name} ({serial}); its pose is left open.")
+    plan = _plan(path, setup.cameras, arm, limits)
     if path is not None:
         check_trajectory(path, limits)
-        check_control_rate(rate_hz)
+        check_control_rate(setup.control_rate_hz)
     if dry_run:
         errors.print("Dry run: nothing was opened, nothing moved.")
         finish({"dry_run": True, "plan": plan}, json)
         return
     if arm is not None and not yes:
         typer.confirm(_CLEAR, abort=True, err=True)
-    cameras = [camera_of(name, out.parent / f"{out.name}_{name}.db3" if keep_recording else None) for name in serials]
-    settings = CaptureSettings(rate_hz=rate_hz, frames_hz=rate_hz, go_home=home)
-    opened = None if arm is None else open_arm(arm, arm_driver)
+    cameras = [camera_of(name, out.parent / f"{out.name}_{name}.db3" if keep_recording else None) for name in setup.cameras]
+    settings = CaptureSettings(rate_hz=setup.control_rate_hz, frames_hz=setup.control_rate_hz, go_home=home)
+    opened = None if arm is None else open_arm(arm, setup.arm_driver)
     try:
         if opened is not None and clear_faults:
             opened.clear_faults()
@@ -216,8 +171,7 @@ def record(
             robot=robot,
             settings=settings,
             seconds=seconds,
-            meta={key: value for key, value in (("scenario", scenario), ("fabric", fabric)) if value is not None}
-            | ({"trajectory": trajectory.name} if trajectory is not None else {}),
+            meta=labels | ({"trajectory": trajectory.name} if trajectory is not None else {}),
             T_world_camera={serial: entry.T_world_camera for serial, entry in calibrated.items()},
             tell=errors.print,
         )
@@ -230,10 +184,40 @@ def record(
             opened.close()
     dropped = {camera.name: getattr(camera, "dropped", 0) for camera in cameras}  # not all drivers count them
     if any(dropped.values()):
-        warn(f"Frames that the cameras lost: {dropped}. Use USB 3, a controller for each camera, or a lower --fps.")
+        warn(
+            f"Frames that the cameras lost: {dropped}. Use USB 3, a controller for each camera, or a lower camera_rate_hz "
+            f"in {rig}."
+        )
     errors.print(f"{report.frames} frames and {report.robot_rows} robot rows in {report.seconds:.1f} s to {out!s}.")
     result = {"out": str(out), "frames": report.frames, "robot_rows": report.robot_rows, "seconds": report.seconds}
     finish(result | {"largest_error_m": report.largest_error_m, "dropped": dropped}, json)
+
+
+def _moved_arm(
+    setup: RigSettings, path: ToolTrajectory | None, seconds: float | None, rig: Path | None, *, readied: bool
+) -> str | None:
+    """Return the address of the arm that a capture moves, or None if it records cameras alone.
+
+    Args:
+        readied: whether --home or --clear-faults is given.
+
+    Raises:
+        ConfigError: neither a trajectory nor a time, both, or options of an arm that does not move.
+    """
+    if path is None:
+        if not (seconds is not None and seconds > 0):
+            raise ConfigError(
+                "A capture ends with its trajectory or after a time, and neither was given. Give --trajectory to move the "
+                "arm, or --seconds, above 0, to record cameras alone."
+            )
+        if readied:
+            raise ConfigError("Without --trajectory the arm is not opened. Leave --home and --clear-faults out.")
+        return None
+    if seconds is not None:
+        raise ConfigError("A trajectory has a duration of its own. Give --trajectory or --seconds, not both.")
+    if setup.arm is None:
+        raise ConfigError(f"A trajectory needs an arm, and {rig} names none. Add its address: `arm: 192.168.1.10`.")
+    return setup.arm
 
 
 def _check(
@@ -284,21 +268,6 @@ def _planned(arm: ArmProcess, checker: ArmChecker, path: ToolTrajectory) -> Chec
     except LimitError as error:
         return Check("arm: trajectory", "wrong", str(error))
     return Check("arm: trajectory", "ok", f"{len(path.times)} keyframes within joints, reach and box, above the table")
-
-
-def _pace(name: str, master: str) -> Pace:
-    return "master" if name == master else "slave"
-
-
-def _limits(box: str | None, **values: float) -> Limits:
-    limits = Limits(**values)  # type: ignore[arg-type]  # the box, the only field that is no number, comes below
-    if box is None:
-        return limits
-    try:
-        x0, y0, z0, x1, y1, z1 = map(float, box.split(","))
-    except ValueError as error:
-        raise ConfigError(f"--box takes x0,y0,z0,x1,y1,z1 in metres, got {box!r}.") from error
-    return replace(limits, box_low_m=(x0, y0, z0), box_high_m=(x1, y1, z1))
 
 
 def _plan(path: ToolTrajectory | None, serials: dict[str, str], arm: str | None, limits: Limits) -> dict[str, Any]:

@@ -114,7 +114,7 @@ class ArmChecker:
         if not self._moving:
             raise LimitError(
                 f"The description {robot.description.name} has no surfaces of links that move, so that nothing can be held "
-                "against table and box. Give a URDF whose links have visual or collision meshes, with --urdf."
+                "against table and box. Name a description whose links have meshes: urdf in rig.yaml."
             )
         joints = [robot.moving[index] for index in robot.arm]
         unlimited = [joint.name for joint in joints if joint.kind != "continuous" and not math.isfinite(joint.lower)]
@@ -142,7 +142,7 @@ class ArmChecker:
         if len(reading.joints_rad) != len(self._ends):
             raise LimitError(
                 f"The arm has {len(reading.joints_rad)} joints, the description {self.robot.description.name} has "
-                f"{len(self._ends)}: give the description of this arm with --urdf."
+                f"{len(self._ends)}: name the description of this arm, urdf in rig.yaml."
             )
         reported, expected = _rotation(reading), self.robot.tool_pose(reading.joints_rad)
         offset = reported.inv().apply(expected[:3, 3] - reading.tool_position_m)
@@ -155,7 +155,7 @@ class ArmChecker:
                 f"{(1000 * offset).round().tolist()} mm in the reported tool's frame; up to "
                 f"{1000 * limits.tool_offset_m:g} mm and {np.rad2deg(limits.tool_turn_rad):g}° are accepted. A trajectory "
                 "is for the described tool: set the arm's tool frame (web page: Configurations, Tool), or give the "
-                "description of this arm with --urdf."
+                "description of this arm (urdf in rig.yaml)."
             )
 
     def predict(self, reading: ArmReading, positions: Floats) -> tuple[Floats, str | None]:
@@ -209,8 +209,8 @@ class ArmChecker:
         if speed[worst] > self.arm_limits.joint_speed_rad_s:
             raise LimitError(
                 f"At t = {times[worst[0]]:.2f} s of the {name} joint {worst[1] + 1} would have to turn with "
-                f"{speed[worst]:.2f} rad/s; the limit is {self.arm_limits.joint_speed_rad_s:g} rad/s. Slow down with "
-                f"--stretch-time {1.05 * speed[worst] / self.arm_limits.joint_speed_rad_s:.2f}."
+                f"{speed[worst]:.2f} rad/s; the limit is {self.arm_limits.joint_speed_rad_s:g} rad/s. Multiply "
+                f"time_scale in rig.yaml by {1.05 * speed[worst] / self.arm_limits.joint_speed_rad_s:.2f}."
             )
         return ArmReading(joints[-1], positions[-1], reading.tool_quaternion, float(closed[-1]), reading.wrench)
 
@@ -321,8 +321,9 @@ class ArmChecker:
             what = self.describe(criterion, joints[first], float(gripper[first]), positions[first])
             moment = f"{times[first]:.0%}" if returning else f"t = {times[first]:.2f} s"
             raise LimitError(
-                f"The {name} would break a limit at {moment}: {what}. Start from another pose (by hand), "
-                "move the trajectory, or change the limits (--table, --arm-margin, --box) if the arm is free to go there."
+                f"The {name} would break a limit at {moment}: {what}. Start from another pose (by hand) "
+                "or move the trajectory. If the arm is free to go there, change table_height_m, link_margin_m or "
+                "workspace_m in rig.yaml."
             )
         if returning:  # in joint space a singularity is a place like others
             return
@@ -425,8 +426,8 @@ class ArmWatch:
         if not speed.max() <= limit:
             joint = int(speed.argmax())
             raise LimitError(
-                f"{when} joint {joint + 1} turns with {speed[joint]:.2f} rad/s; the limit is {limit:g} rad/s. Slow down "
-                "with --stretch-time, or look for what turns it."
+                f"{when} joint {joint + 1} turns with {speed[joint]:.2f} rad/s; the limit is {limit:g} rad/s. Raise "
+                "time_scale in rig.yaml, or look for what turns it."
             )
 
     def _excess(self, reading: ArmReading) -> Floats:

@@ -176,7 +176,7 @@ def check_arm(
         if checker.limits.outside(top):
             raise LimitError(
                 f"The tool needs {100 * needed:.0f} cm above it within the workspace box, and {top.round(3).tolist()} m is "
-                "outside. Move the tool down, or widen --box."
+                "outside. Move the tool down, or widen workspace_m in rig.yaml."
             )
         say("moving up at 2 cm/s")
         yield from _motion(guarded)
@@ -264,7 +264,7 @@ def _readings(arm: ArmProcess, checker: ArmChecker) -> Iterator[Check]:
     yield _check(
         "wrench", finite and len(last.wrench) == 6 and force <= limits.preload_N and torque <= limits.preload_Nm,
         f"{force:.1f} N and {torque:.1f} N·m at rest; must be six finite numbers, at most {limits.preload_N:g} N and "
-        f"{limits.preload_Nm:g} N·m (--preload)",
+        f"{limits.preload_Nm:g} N·m (static_force_n in rig.yaml)",
     )  # fmt: skip
     grip = last.gripper
     yield _check("gripper", grip is None or -0.05 <= grip <= 1.05, f"{grip}; must be 0 (open) to 1 (closed), or None")

@@ -39,8 +39,8 @@ class Contact:
             raise LimitError(
                 f"At rest the tool feels {force:.1f} N and {torque:.1f} N·m; up to {limits.preload_N:g} N and "
                 f"{limits.preload_Nm:g} N·m are taken for the estimate's offset (not within it: {beyond}). Free the tool, "
-                "check the payload that is configured on the arm (web page: Configurations, Tool), or raise --preload, "
-                "which scales both."
+                "check the payload that is configured on the arm (web page: Configurations, Tool), or raise "
+                "static_force_n in rig.yaml, which scales both."
             )
         self._zero, self._limits = zero, limits
 

@@ -204,7 +204,7 @@ def plan_motion(
     if limits.outside(position, limits.box_slack_m):
         raise LimitError(
             f"The tool is at {position.round(3).tolist()} m, outside the workspace box {limits.box_low_m} to "
-            f"{limits.box_high_m}. Bring it inside first (--home, or by hand), or widen --box."
+            f"{limits.box_high_m}. Bring it inside first (--home, or by hand), or widen workspace_m in rig.yaml."
         )
     # a box is convex: between a start and a goal inside it the straight line is inside too
     way = approach(position, trajectory.positions[0], speed_m_s=min(speed_m_s, limits.speed_m_s))

@@ -84,7 +84,7 @@ def capture(
     """
     limits, settings = limits or Limits(), settings or CaptureSettings()
     if not cameras:
-        raise HardwareError("A capture needs at least one camera; give --camera NAME=SERIAL.")
+        raise HardwareError("A capture needs at least one camera: cameras in rig.yaml.")
     if (arm is None) != (trajectory is None):
         raise HardwareError("An arm needs a trajectory, and a trajectory an arm.")
     if arm is not None and not isinstance(arm, GuardedArm):

@@ -130,15 +130,15 @@ def check_trajectory(trajectory: ToolTrajectory, limits: Limits) -> None:
         raise LimitError(
             f"Keyframe {first} (t = {trajectory.times[first]:.2f} s) at {_triple(position)} m lies outside the workspace "
             f"box {_triple(limits.box_low_m)} to {_triple(limits.box_high_m)}; {len(outside)} keyframes do.{scale} Move "
-            "the trajectory, or widen the box with --box if the arm is free to go there."
+            "the trajectory, or widen workspace_m in rig.yaml if the arm is free to go there."
         )
     speed = np.linalg.norm(trajectory.velocities, axis=1)
     if speed.max() > limits.speed_m_s:
         segment = int(speed.argmax())
         raise LimitError(
             f"Between keyframes {segment} and {segment + 1} (t = {trajectory.times[segment]:.2f} s) the tool moves at "
-            f"{speed[segment]:.3f} m/s; the limit is {limits.speed_m_s:g} m/s. Slow down with --stretch-time "
-            f"{1.05 * speed[segment] / limits.speed_m_s:.2f}, or raise --speed."
+            f"{speed[segment]:.3f} m/s; the limit is {limits.speed_m_s:g} m/s. Multiply time_scale in "
+            f"rig.yaml by {1.05 * speed[segment] / limits.speed_m_s:.2f}, or raise speed_m_s there."
         )
     acceleration = np.linalg.norm(trajectory.accelerations, axis=1)
     if acceleration.max() > limits.acceleration_m_s2:
@@ -146,8 +146,8 @@ def check_trajectory(trajectory: ToolTrajectory, limits: Limits) -> None:
         slower = 1.05 * np.sqrt(acceleration[keyframe] / limits.acceleration_m_s2)
         raise LimitError(
             f"At keyframe {keyframe} (t = {trajectory.times[keyframe]:.2f} s) the tool accelerates with "
-            f"{acceleration[keyframe]:.2f} m/s²; the limit is {limits.acceleration_m_s2:g} m/s². Slow down with "
-            f"--stretch-time {slower:.2f}, or raise --acceleration."
+            f"{acceleration[keyframe]:.2f} m/s²; the limit is {limits.acceleration_m_s2:g} m/s². Multiply "
+            f"time_scale in rig.yaml by {slower:.2f}, or raise acceleration_m_s2 there."
         )
 
 
@@ -159,8 +159,8 @@ def check_control_rate(rate_hz: float, gain: float = DEFAULT_GAIN) -> None:
     """
     if not gain < 2 * rate_hz:
         raise LimitError(
-            f"A gain of {gain:g} 1/s at {rate_hz:g} Hz overshoots for ever: the arm needs a --rate above {gain / 2:g} Hz, "
-            f"or a gain below {2 * rate_hz:g} 1/s."
+            f"A gain of {gain:g} 1/s at {rate_hz:g} Hz overshoots for ever: the arm needs control_rate_hz (rig.yaml) "
+            f"above {gain / 2:g} Hz, or a gain below {2 * rate_hz:g} 1/s."
         )
 
 

@@ -1,4 +1,5 @@
-"""Generated pages: one for each command, from the commands themselves, and one for the settings of params.yaml.
+"""Generated pages: one for each command, from the commands themselves, and one for the settings in params.yaml and
+rig.yaml.
 
 They are made when the site is built and not kept, so they cannot be out of date.
 """
@@ -20,6 +21,7 @@ import typer
 
 from diffcloud.cli import config as settings
 from diffcloud.cli.app import app
+from diffcloud.hardware.rig import RigSettings
 from diffcloud.sensing.fusion import FusionSettings
 
 ROOT = Path(__file__).parents[2]
@@ -173,7 +175,7 @@ def _plain(text: str) -> str:
 
 
 def settings_page() -> str:
-    """Markdown of all settings of params.yaml."""
+    """Markdown of all settings of params.yaml and rig.yaml."""
     parts = [
         "# Settings",
         "What `params.yaml`, and any file for `--params`, can hold. Unknown keys and bad values are errors. What is not "
@@ -188,6 +190,9 @@ def settings_page() -> str:
                 inner = getattr(section, key)
                 if isinstance(inner, settings.Section):
                     parts += [f"## {name}.{key}", _escaped(_flat(type(inner).__doc__ or "")), _settings_table(inner)]
+    rig = RigSettings()
+    parts += ["## rig.yaml", _escaped(_flat(RigSettings.__doc__ or "")), _settings_table(rig)]
+    parts += ["## rig.yaml: board", _escaped(_flat(type(rig.board).__doc__ or "")), _settings_table(rig.board)]
     return "\n\n".join(parts) + "\n"
 
 

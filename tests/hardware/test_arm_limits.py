@@ -153,7 +153,7 @@ class TestPlan:
     def test_joints_that_would_have_to_be_too_fast(self):
         path = line(HOME_M, np.add(HOME_M, [0.0, 0.2, 0.0]), speed=0.2)
         checker().check_trajectory("trajectory", path, reading())
-        with pytest.raises(LimitError, match=r"joint \d would have to turn with .*--stretch-time"):
+        with pytest.raises(LimitError, match=r"joint \d would have to turn with .*Multiply time_scale"):
             checker(joint_speed_rad_s=0.8).check_trajectory("trajectory", path, reading())
 
     def test_published_trajectories_pass_from_home(self, release):
@@ -177,7 +177,7 @@ def test_a_joint_without_limits_is_refused(tmp_path):
 
 def test_a_description_without_surfaces_is_refused():
     bare = replace(robot().description, meshes={})
-    with pytest.raises(LimitError, match=r"has no surfaces of links that move.*--urdf"):
+    with pytest.raises(LimitError, match=r"has no surfaces of links that move.*urdf in rig"):
         ArmChecker(Robot(bare), Limits(), ArmLimits())
 
 
@@ -374,7 +374,7 @@ class TestContact:
         [
             ([0, 0, 80, 0, 0, 0], r"At rest the tool feels 80\.0 N and 0\.0 N·m; up to 15 N and 5 N·m"),
             ([0, 0, 80, 0, 0, 0], r"not within it: force\)"),
-            ([0, 0, 0, 0, 6, 0], r"6\.0 N·m.*not within it: torque\).*--preload, which scales both"),
+            ([0, 0, 0, 0, 6, 0], r"6\.0 N·m.*not within it: torque\).*static_force_n in rig.yaml, which scales both"),
             ([0, 0, 80, 0, 6, 0], r"not within it: force, torque\)"),
             ([0, 0, np.nan, 0, 0, 0], "nan N"),
         ],

@@ -23,6 +23,7 @@ from tests.cli.invoke import invoke
 from tests.hardware.drivers import Dated, Metres, Silent, Undead, write_images
 from tests.hardware.kortex.opening import in_process
 from tests.hardware.kortex.server import FakeArm
+from tests.hardware.rig_files import write_rig
 
 EXAMPLE = "diffcloud.hardware.examples.simulated_ur5e:SimulatedUR5e"
 FOLDER = "diffcloud.hardware.examples.folder_camera:FolderCamera"
@@ -255,13 +256,14 @@ def trajectory(tmp_path):
 
 
 class TestCommand:
+    def rig(self, tmp_path, urdf, controller, folder=None):
+        cameras = {} if folder is None else {"cameras": {"side": str(folder)}, "camera_driver": FOLDER}
+        return write_rig(tmp_path, arm_driver=EXAMPLE, arm=controller.address, urdf=str(urdf), **cameras)
+
     def test_a_capture_with_both(self, tmp_path, controller, folder):
         with description() as urdf:
-            done = invoke(
-                "capture", "--out", tmp_path / "e", "--trajectory", trajectory(tmp_path), "--urdf", urdf, "--yes",
-                "--arm-driver", EXAMPLE, "--arm", controller.address,
-                "--camera-driver", FOLDER, "--camera", f"side={folder}",
-            )  # fmt: skip
+            rig = self.rig(tmp_path, urdf, controller, folder)
+            done = invoke("capture", "--rig", rig, "--out", tmp_path / "e", "--trajectory", trajectory(tmp_path), "--yes")
             faults = {one.code for one in validate_raw_episode(tmp_path / "e") if one.severity == "fault"}
             invoke("episode", "validate", tmp_path / "e", "--urdf", urdf, code=1 if faults else 0)
         assert done.result["frames"]["side"] > 3
@@ -272,21 +274,22 @@ class TestCommand:
 
     def test_checks_of_both(self, tmp_path, controller, folder):
         with description() as urdf:
-            done = invoke(
-                "capture", "--check-arm", "--check-cameras", "--trajectory", trajectory(tmp_path), "--urdf", urdf, "--yes",
-                "--arm-driver", EXAMPLE, "--arm", controller.address,
-                "--camera-driver", FOLDER, "--camera", f"side={folder}",
-            )  # fmt: skip
+            rig = self.rig(tmp_path, urdf, controller, folder)
+            done = invoke("capture", "--rig", rig, "--check", "all", "--trajectory", trajectory(tmp_path), "--yes")
         names = {one["name"] for one in done.result["checks"]}
         assert {"arm: trajectory", "arm: velocity", "camera side: depth"} <= names
         assert done.result["wrong"] == []
 
-    def test_a_dry_check_reads_the_arm_and_does_not_move_it(self, controller):
+    def test_a_check_of_cameras_does_not_open_the_arm(self, tmp_path, folder):
+        cameras = {"cameras": {"side": str(folder)}, "camera_driver": FOLDER}
+        rig = write_rig(tmp_path, arm_driver="no_such:Arm", arm="nowhere", **cameras)
+        done = invoke("capture", "--rig", rig, "--check", "cameras")
+        assert {one["name"].split(":")[0] for one in done.result["checks"]} == {"camera side"}
+
+    def test_a_dry_check_reads_the_arm_and_does_not_move_it(self, tmp_path, controller):
         before = controller.tool_position
         with description() as urdf:
-            done = invoke(
-                "capture", "--check-arm", "--dry-run", "--urdf", urdf, "--arm-driver", EXAMPLE, "--arm", controller.address
-            )
+            done = invoke("capture", "--rig", self.rig(tmp_path, urdf, controller), "--check", "arm", "--dry-run")
         assert {"arm: joints", "arm: tool frame"} <= {one["name"] for one in done.result["checks"]}
         np.testing.assert_array_equal(controller.tool_position, before)
 
@@ -296,20 +299,21 @@ class TestCommand:
         rows = "t_s,x,y,z\n0,0.49,0.13,0.36\n9,0.94,0.35,0.9\n"
         (tmp_path / "far.csv").write_text(rows)
         with description() as urdf:
-            done = invoke(
-                "capture", "--check-arm", "--trajectory", tmp_path / "far.csv", "--urdf", urdf, "--yes",
-                "--arm-driver", EXAMPLE, "--arm", controller.address, code=1,
-            )  # fmt: skip
+            rig = self.rig(tmp_path, urdf, controller)
+            done = invoke("capture", "--rig", rig, "--check", "arm", "--trajectory", tmp_path / "far.csv", "--yes", code=1)
         assert done.result["wrong"] == ["arm: trajectory"]
 
     @pytest.mark.parametrize(
-        ("arguments", "message"),
+        ("settings", "arguments", "message"),
         [
-            (("--check-arm",), "--check-arm needs the arm's address"),
-            (("--check-cameras",), "--check-cameras needs cameras"),
-            (("--camera", "a=1"), "A capture needs --out"),
-            (("--out", "e"), "at least one --camera"),
+            ({}, ("--check", "arm"), "--check arm needs the arm's address"),
+            ({}, ("--check", "cameras"), "--check cameras needs cameras"),
+            ({"arm": "a"}, ("--check", "all"), "--check all needs cameras"),
+            ({"cameras": {"a": "1"}}, (), "A capture needs --out"),
+            ({}, ("--out", "e"), "a file whose `cameras` names at least one camera"),
         ],
     )
-    def test_what_is_missing_is_said(self, arguments, message):
-        assert message in invoke("capture", *arguments, code=1).errors
+    def test_what_is_missing_is_said(self, tmp_path, settings, arguments, message):
+        assert message in invoke("capture", "--rig", write_rig(tmp_path, **settings), *arguments, code=1).errors
+        if not settings:
+            assert message in invoke("capture", *arguments, code=1).errors

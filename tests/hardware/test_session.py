@@ -118,7 +118,10 @@ def test_a_gripper_that_says_nothing_is_given_its_time(tmp_path, monkeypatch):
     [
         ({"path": short_path(distance=0.9)}, "outside the workspace box"),
         ({"path": short_path(distance=0.2)}, "moves at 0.500 m/s; the limit is 0.1"),
-        ({"settings": replace(QUICK, rate_hz=2.0)}, "at 2 Hz overshoots for ever: the arm needs a --rate above 2 Hz"),
+        (
+            {"settings": replace(QUICK, rate_hz=2.0)},
+            r"at 2 Hz overshoots for ever: the arm needs control_rate_hz \(rig\.yaml\) above 2 Hz",
+        ),
     ],
 )
 def test_refused_before_anything_opens_or_moves(tmp_path, changes, message):

@@ -80,10 +80,10 @@ def test_a_gain_that_overshoots_for_ever_is_refused():
 @pytest.mark.parametrize(
     ("path", "limits", "message"),
     [
-        (line(start=np.array([0.9, 0.0, 0.3])), {}, r"Keyframe \d+ .*outside the workspace box .*--box"),
+        (line(start=np.array([0.9, 0.0, 0.3])), {}, r"Keyframe \d+ .*outside the workspace box .*widen workspace_m"),
         (line(start=np.array([0.5, 0.0, 0.05])), {}, "Keyframe 0 .* 21 keyframes do"),
         (ToolTrajectory(line().times, 1000 * line().positions), {}, "millimetres"),
-        (line(), {}, r"moves at 0\.18\d m/s; the limit is 0\.1 m/s\. .*--stretch-time 1\.9"),
+        (line(), {}, r"moves at 0\.18\d m/s; the limit is 0\.1 m/s\. .*Multiply time_scale in rig\.yaml by 1\.9"),
         (line(), {"speed_m_s": 0.5, "acceleration_m_s2": 0.2}, r"accelerates with 0\.2\d m/s²; the limit is 0\.2"),
     ],
 )
@@ -149,5 +149,5 @@ def test_published_trajectories_keep_the_limits_at_their_own_speed(release):
     for name in ("lift", "fold", "stretch"):
         path = read_trajectory(folder / f"{name}_traj.npy")
         check_trajectory(path, FAST)
-        with pytest.raises(LimitError, match="--stretch-time"):
+        with pytest.raises(LimitError, match="time_scale"):
             check_trajectory(path, Limits())

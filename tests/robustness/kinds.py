@@ -20,6 +20,7 @@ from diffcloud.cli.identify import find_scene
 from diffcloud.cli.report import table_rows
 from diffcloud.estimation import Objective, read_fit
 from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, check_file
+from diffcloud.hardware.rig import RigSettings, read_rig
 from diffcloud.io.calibrations import Calibration, CameraCalibration, read_calibration, write_calibration
 from diffcloud.io.clouds import import_open3d
 from diffcloud.io.files import read_json
@@ -116,6 +117,9 @@ def make_project(folder: Path) -> None:
     shutil.copy(folder / _CAMERA, folder / "images" / "camera.json")
     rows = [f"{0.5 * index},{0.4 + 0.05 * index},0.0,{0.3 + 0.02 * index},0.9" for index in range(6)]
     (folder / "path.csv").write_text("\n".join(["t_s,x,y,z,gripper", *rows]) + "\n")
+    setup = {"arm": "a", "preset": "high_accuracy", "laser_power_mw": 240, "master": "side", "time_scale": 2}
+    rig = RigSettings.model_validate({"cameras": {"side": "a1"}, **setup})
+    (folder / "rig.yaml").write_text(yaml.safe_dump(rig.model_dump(mode="json")))
 
 
 def _run_pipeline(folder: Path) -> None:
@@ -183,7 +187,7 @@ def _left(model: object, path: str) -> Callable[[], None]:
 
 
 _IMPORT = "import clouds {} --gripper gripper.csv --out imported.npz"
-_CAPTURE = command("capture --dry-run --trajectory path.csv --stretch-time 2 --camera a=1 --arm 0 --out e")
+_CAPTURE = command("capture --dry-run --trajectory path.csv --rig rig.yaml --out e")
 _REPORT = command(REPORT)
 _IMAGES = command("import recording a=images --rate-hz 10 --out imported")
 _LOSS = command(f"evaluate loss {_EPISODE} --scenario small --set stretch=1.0 --threads 1")
@@ -235,6 +239,7 @@ KINDS = (
     Kind("ROS bag", "bytes", "recording.bag", command("import recording recording.bag --out imported")),
     Kind("MCAP", "bytes", "recording/recording.mcap", command("import recording recording --out imported")),
     Kind("trajectory", "table", "path.csv", _CAPTURE),
+    Kind("rig", "document", "rig.yaml", lambda: read_rig(Path("rig.yaml"))),
 )  # fmt: skip
 
 

@@ -4,7 +4,7 @@
 <folder>/depth/*.png     16-bit, numbered; written under another name and renamed, or written at once
 <folder>/color/*.png     optional, of the same names, and there before the depth image
 
-diffcloud capture --camera-driver diffcloud.hardware.examples.folder_camera:FolderCamera --camera side=/data/side ...
+In rig.yaml: `camera_driver: diffcloud.hardware.examples.folder_camera:FolderCamera` and `cameras: {side: /data/side}`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
 """A simulated UR5e behind a socket, and the driver for it: what a driver for an arm of your own looks like.
 
     python -m diffcloud.hardware.examples.simulated_ur5e --port 5005
-    diffcloud capture --arm-driver diffcloud.hardware.examples.simulated_ur5e:SimulatedUR5e --arm 127.0.0.1:5005 ...
+    diffcloud capture --rig rig.yaml ...
+
+rig.yaml holds `arm_driver: diffcloud.hardware.examples.simulated_ur5e:SimulatedUR5e` and `arm: 127.0.0.1:5005`.
 
 The controller stands for the arm's own computer. It moves the joints 125 times a second, and stops them by itself when it
 has heard nothing for half a second: the last resort where a process or a cable is lost, which any real arm needs too.

@@ -1,0 +1,45 @@
+"""Labels of a recording, `KEY=VALUE`: they are kept in episode.json, and in the meta of an imported episode."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from pydantic import ValidationError
+
+from diffcloud.errors import ConfigError
+from diffcloud.io.raw_episodes import EpisodeFile
+from diffcloud.io.schema import explain
+
+_KNOWN = frozenset({"scenario", "fabric", "category"})
+"""Fields of episode.json that are labels: the tables of an evaluation and the stages of the pipeline read them."""
+_TAKEN = (frozenset(EpisodeFile.model_fields) - _KNOWN) | {
+    "trajectory", "viewpoints", "pinholes", "cut_planes", "clocks", "scale_sigma", "pose_sigmas", "quality", "agreement",
+    "set_up", "predictions", "noise_free", "category_assumed",
+}  # fmt: skip
+"""Names of facts that commands write and fits read: a label would be taken for the fact."""
+
+
+def read_labels(items: Iterable[str]) -> dict[str, str]:
+    """Return ["scenario=lift", ...] as {"scenario": "lift"}.
+
+    Raises:
+        ConfigError: no KEY=VALUE, a key that is given twice, a key of a fact, or a value that the key does not take.
+    """
+    labels: dict[str, str] = {}
+    for item in items:
+        key, _, value = (part.strip() for part in item.partition("="))
+        if not (key and value) or key in labels:
+            raise ConfigError(
+                f"--label takes KEY=VALUE, each key once, got {item!r}. Try --label scenario=lift --label fabric=tan."
+            )
+        if key in _TAKEN:
+            raise ConfigError(
+                f"--label {item}: episodes keep a fact under the name {key!r}. Allowed are {', '.join(sorted(_KNOWN))} and "
+                "names of your own. Try another name."
+            )
+        labels[key] = value
+    try:
+        EpisodeFile.model_validate({"schema_version": 1, "cameras": ["any"], **labels})
+    except ValidationError as error:
+        raise explain("--label", error, ConfigError) from error
+    return labels
