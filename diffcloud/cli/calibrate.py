@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,7 +12,8 @@ import typer
 from rich.table import Table
 
 from diffcloud.cli.console import JsonFlag, errors, finish, named_serials, show, warn, whole_numbers, writes
-from diffcloud.errors import CalibrationError, EpisodeError, unknown_name
+from diffcloud.errors import CalibrationError, ConfigError, EpisodeError, unknown_name
+from diffcloud.hardware.rig import RigSettings, read_rig
 from diffcloud.io.calibrations import Calibration, CameraCalibration, write_calibration
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.images import write_color
@@ -55,26 +57,37 @@ def calibrate(
         ),
     ],
     out: Annotated[Path, typer.Option(help="Calibration file, such as raw/calibration/lab.json.")],
-    method: Annotated[Literal["charuco", "checkerboard"], typer.Option()] = "charuco",
-    squares: Annotated[str, typer.Option(help="Squares of the board, COLUMNSxROWS.")] = "5x7",
-    square_mm: Annotated[float, typer.Option(help="Side of a square, measured.")] = 30.0,
-    marker_mm: Annotated[float, typer.Option(help="Side of a marker, measured.")] = 22.0,
-    dictionary: Annotated[str, typer.Option(help="Of the markers.")] = "DICT_5X5_100",
-    picture: Annotated[Path | None, typer.Option(help="PNG of detected and reprojected corners.")] = None,
-    serial: Annotated[list[str] | None, typer.Option(help="checkerboard: NAME=SERIAL; the name if not given.")] = None,
-    size: Annotated[str, typer.Option(help="checkerboard: size of the images.")] = "640x480",
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            help="YAML file of the set-up (docs/capture.md). charuco: its `board`. checkerboard: serial numbers of its "
+            "`cameras`, and `image_size`. Default: the default board, and images of 640x480."
+        ),
+    ] = None,
+    method: Annotated[
+        Literal["charuco", "checkerboard"], typer.Option(help="Board in the gripper, or the paper's method.")
+    ] = "charuco",
+    picture: Annotated[Path | None, typer.Option(help="charuco: PNG of detected and reprojected corners.")] = None,
+    serial: Annotated[
+        list[str] | None,
+        typer.Option(help="checkerboard: NAME=SERIAL, in place of the serial number in --rig. Without both, the name."),
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(help="checkerboard: size of the images, WIDTHxHEIGHT, in place of that in --rig.")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Write the file despite objections; it will list them.")] = False,
     json: JsonFlag = False,
 ) -> None:
     """Calibrate all cameras of a set-up into one file."""
+    setup = RigSettings() if rig is None else read_rig(rig)
+    _refuse_others(method, {"--picture": picture, "--serial": serial, "--size": size})
     if method == "checkerboard":
-        found = _checkerboard(source, serial or [], whole_numbers(size, "--size"))
+        image_size = setup.image_size if size is None else whole_numbers(size, "--size")
+        found = _checkerboard(source, setup.cameras, serial or [], image_size)
     else:
         if len(source) != 1:
             raise CalibrationError(f"--method charuco takes one raw episode, got {len(source)} sources.")
-        columns, rows = whole_numbers(squares, "--squares")
-        board = CharucoBoard(columns, rows, square_mm / 1000, marker_mm / 1000, dictionary)
-        found = _charuco(read_raw_episode(source[0]), board, picture)
+        found = _charuco(read_raw_episode(source[0]), setup.board.charuco(), picture)
     summary, objections = found.summary, list(found.calibration.objections)
     columns_shown = _SHOWN[method]
     table = Table("camera", *("position [m]", *columns_shown.values()))
@@ -104,6 +117,18 @@ def calibrate(
         },
         json,
     )
+
+
+def _refuse_others(method: str, given: Mapping[str, object]) -> None:
+    """
+    Raises:
+        ConfigError: an option of the other method is given.
+    """
+    own = {"charuco": ("--picture",), "checkerboard": ("--serial", "--size")}
+    for option, value in given.items():
+        if value and option not in own[method]:
+            other = next(name for name, options in own.items() if option in options)
+            raise ConfigError(f"{option} belongs to --method {other}, and this is --method {method}. Leave {option} out.")
 
 
 @dataclass(frozen=True)
@@ -152,11 +177,12 @@ def _charuco(episode: RawEpisode, board: CharucoBoard, picture: Path | None) -> 
     return _Found(calibration, summary, list(found.warnings), by_arm)
 
 
-def _checkerboard(folders: list[Path], serials: list[str], size: tuple[int, int]) -> _Found:
-    known = named_serials(serials, "--serial")
+def _checkerboard(folders: list[Path], of_rig: Mapping[str, str], serials: list[str], size: tuple[int, int]) -> _Found:
+    given = named_serials(serials, "--serial")
     names = [folder.name.removeprefix("calib_") for folder in folders]
-    if others := sorted(known.keys() - set(names)):
+    if others := sorted(given.keys() - set(names)):
         raise CalibrationError(unknown_name("camera in --serial", others[0], names))
+    known = {**of_rig, **given}
     cameras: dict[str, CameraCalibration] = {}
     summary: dict[str, dict[str, Any]] = {}
     evidence: dict[str, CheckerboardEvidence] = {}

@@ -18,6 +18,7 @@ from diffcloud.sensing.calibration.checkerboard import onto_plane, register_chec
 from diffcloud.sensing.calibration.hand_eye import calibrate_hand_eye, find_views, still_pose
 from diffcloud.sensing.cameras import depth_points, inverse, project, rays, transform
 from tests.cli.invoke import invoke
+from tests.hardware.rig_files import write_rig
 from tests.sensing.charuco_scene import BOARD, CAMERAS, GRIPPER_BOARD, INTRINSICS, board_depth, gripper_poses, render
 
 LENS = (0.12, -0.25, 0.001, -0.0007, 0.08)
@@ -265,10 +266,8 @@ def test_charuco_images_give_the_cameras_within_a_millimetre(tmp_path, rng):
         tmp_path / "c.json",
         "--picture",
         tmp_path / "p.png",
-        "--square-mm",
-        40,
-        "--marker-mm",
-        30,
+        "--rig",
+        write_rig(tmp_path, board={"square_m": 0.04, "marker_m": 0.03}),
     )
     written = read_calibration(tmp_path / "c.json")
     for name, true in CAMERAS.items():

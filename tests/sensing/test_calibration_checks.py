@@ -19,6 +19,7 @@ from diffcloud.sensing.calibration.checks import CameraEvidence, judge_hand_eye
 from diffcloud.sensing.calibration.hand_eye import calibrate_hand_eye
 from diffcloud.sensing.cameras import inverse, project, transform
 from tests.cli.invoke import invoke
+from tests.hardware.rig_files import write_rig
 from tests.sensing.charuco_scene import BOARD, CAMERAS, GRIPPER_BOARD, INTRINSICS, gripper_poses
 from tests.sensing.test_calibration import write_board_episode
 
@@ -38,10 +39,8 @@ def episode(recorded, tmp_path):
 
 
 def calibrated(tmp_path, *options, code=0, square=40):
-    return invoke(
-        "calibrate", tmp_path / "e", "--out", tmp_path / "c.json", "--square-mm", square, "--marker-mm", 0.75 * square,
-        *options, code=code,
-    )  # fmt: skip
+    rig = write_rig(tmp_path, board={"square_m": square / 1000, "marker_m": 0.75 * square / 1000})
+    return invoke("calibrate", tmp_path / "e", "--rig", rig, "--out", tmp_path / "c.json", *options, code=code)
 
 
 def edit_camera(episode, name, change):
@@ -374,6 +373,25 @@ class TestCheckerboard:
         assert not written.exists()
         self.registered(tmp_path, folders, "--serial", f"{name}=0123")
         assert read_calibration(written).camera("0123").name == name
+
+    def test_serials_and_size_of_the_rig_count_unless_given(self, tmp_path, rng):
+        """A camera of the rig that has no folder is none of this calibration."""
+        folders, written = self.folders(tmp_path, rng), tmp_path / "c.json"
+        first, second = CAMERAS
+        rig = write_rig(tmp_path, cameras={first: "11", second: "22", "top": "33"}, image_size=[848, 480])
+        self.registered(tmp_path, folders, "--rig", rig)
+        assert set(read_calibration(written).cameras) == {"11", "22"}
+        assert read_calibration(written).camera("22").intrinsics.width == 848
+        self.registered(tmp_path, folders, "--rig", rig, "--serial", f"{second}=44", "--size", "640x480")
+        assert set(read_calibration(written).cameras) == {"11", "44"}
+        assert read_calibration(written).camera("44").intrinsics.width == 640
+
+    def test_options_of_the_other_method_are_refused(self, tmp_path, rng):
+        said = self.registered(tmp_path, self.folders(tmp_path, rng), "--picture", "p.png", code=1).errors
+        assert "--picture belongs to --method charuco, and this is --method checkerboard. Leave --picture out" in said
+        for option, value in (("--serial", "a=1"), ("--size", "640x480")):
+            said = calibrated(tmp_path, option, value, code=1).errors
+            assert f"{option} belongs to --method checkerboard" in said
 
     def test_a_held_out_error_above_ten_millimetres_is_refused_unless_forced(self, tmp_path, rng):
         folders = self.folders(tmp_path, rng, noise_m=0.05)
