@@ -213,7 +213,7 @@ def load_recording(
         if not (path / "gripper.csv").is_file():
             raise EpisodeError(
                 f"{path} holds no gripper.csv with the columns t_s, x, y, z [m], one row a frame. Name other files with "
-                "`grippers`, or make an episode of a bag by `diffcloud import recording`."
+                "`grippers`, or make an episode of a bag by `diffcloud import`."
             )
         grippers = {"gripper": path / "gripper.csv"}
     return cloud_folder(path, grippers={name: Path(file) for name, file in grippers.items()}, rate_hz=rate_hz)

@@ -2,7 +2,7 @@
 
     python -m studies recorded EPISODES [--fits build/recorded]
 
-EPISODES is what `diffcloud import release --trajectories` writes. Finished fits are kept.
+EPISODES is what `diffcloud import --trajectories` writes. Finished fits are kept.
 """
 
 from __future__ import annotations
@@ -43,9 +43,7 @@ def main(
     for scenario in SCENARIOS:
         files = sorted((episodes / scenario).glob("*.npz"))
         if not files:
-            raise ConfigError(
-                f"{episodes / scenario} holds no episodes: `diffcloud import release --trajectories` writes them."
-            )
+            raise ConfigError(f"{episodes / scenario} holds no episodes: `diffcloud import --trajectories` writes them.")
         command = [sys.executable, "-m", "diffcloud", "fit", "--scenario", scenario, "--out", str(fits / scenario)]
         subprocess.run([*command, "--workers", str(workers), *map(str, files)], check=True)
         found |= {file.stem: read_fit(fits / scenario / f"{file.stem}.json") for file in files}

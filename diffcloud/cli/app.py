@@ -27,7 +27,7 @@ from diffcloud.io.files import refuse_undecoded
 _MOST_TOLD = 300
 """Characters of an unforeseen error's message."""
 COMMANDS = {
-    "import": "diffcloud.cli.importing:app",
+    "import": "diffcloud.cli.importing:import_",
     "evaluate": "diffcloud.cli.evaluate:app",
     "episode": "diffcloud.cli.raw_episode:app",
     "episodes": "diffcloud.cli.episodes:episodes",

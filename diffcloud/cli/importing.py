@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -18,15 +19,17 @@ from numpy.typing import NDArray
 from diffcloud.cli.console import JsonFlag, Topics, errors, finish, warn, writes
 from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.hardware.realsense import play_recordings
+from diffcloud.io.clouds import FORMATS
 from diffcloud.io.depth_folders import depth_folders
 from diffcloud.io.episodes import Episode, write_episode
-from diffcloud.io.files import together
+from diffcloud.io.files import files_in, together
 from diffcloud.io.grippers import named_files
 from diffcloud.io.imports import RELEASE_FOLDERS, cloud_folder, release_episodes
 from diffcloud.io.inputs import open_input
+from diffcloud.io.labels import read_labels
+from diffcloud.io.numbers import number
 from diffcloud.io.published import RECORDED_START_M, read_trajectories, recorded_episode
 from diffcloud.io.recordings import Recording, read_joint_log, write_recording
-from diffcloud.io.ros.joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
 from diffcloud.io.ros.recording import ros_recording
 from diffcloud.io.urdf import RobotDescription, read_urdf
 from diffcloud.sensing.agreement import agreement, corrected
@@ -36,24 +39,215 @@ from diffcloud.sensing.visible_region import with_cut_planes
 
 _FARTHEST_M = 50.0
 """From the robot's base: no cloth hangs there."""
-app = typer.Typer(no_args_is_help=True, help="Turn existing recordings into episodes.")
+_KINDS = {
+    "clouds": "a folder of clouds",
+    "release": "the published data",
+    "ros": "a ROS recording",
+    "realsense": "a RealSense recording",
+    "folder": "a depth folder",
+}
+"""Kind of source -> how messages call it."""
+_RECORDINGS = ("ros", "realsense", "folder")
+_OF = {
+    "--gripper": ("clouds",),
+    "--camera": ("clouds",),
+    "--rate-hz": ("clouds", "folder"),
+    "--label": ("clouds", *_RECORDINGS),
+    "--joint-log": _RECORDINGS,
+    "--clock-offset": _RECORDINGS,
+    "--world-frame": ("ros",),
+    "--tool-frame": ("ros",),
+    "--joints": ("ros",),
+    "--gripper-joint": ("ros",),
+    "--topic": ("ros",),
+    "--urdf": ("ros",),
+    "--trajectories": ("release",),
+}
+"""Option -> the kinds of source that it belongs to."""
+_IMAGE_SIGNS = ("depth", "camera.json", "intrinsics.json", "camera_intrinsic.json", "intrinsic.json")
+"""What a depth folder holds."""
 
 
-@app.command()
-@writes()
-def release(
-    folder: Annotated[Path, typer.Argument(help="Holds lift_real_pcls/, fold_real_pcls/, band_sim_pcls/, hang_sim_pcls/.")],
-    out: Annotated[Path, typer.Option(help="Folder; episodes go to OUT/release_<lift|fold|band|hang>/.")],
+def import_(
+    source: Annotated[
+        list[Path],
+        typer.Argument(
+            help="A folder of clouds (npy, ply, xyz, pcd) that are numbered or named by time, one a frame, in metres. Or a "
+            "ROS recording (.bag, .mcap, .db3, rosbag2 folder), or all parts of a split one. Or, for each camera and as "
+            "NAME=PATH, a RealSense recording (.db3, .bag), or a folder with depth/*.png and camera.json. Or the folder of "
+            "the published data."
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Clouds: episode file (.npz). Recordings: folder of the raw episode; must not exist. Published data: "
+            "folder; episodes go to OUT/release_<lift|fold|band|hang>/."
+        ),
+    ],
+    kind: Annotated[
+        Literal["clouds", "recording", "release"] | None, typer.Option(help="What the source is. Default: it is detected.")
+    ] = None,
+    gripper: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Clouds: CSV with x, y, z in metres and optionally t_s, one row a frame. Of several grippers: one with a "
+            "column gripper that names them, or NAME=PATH, repeated."
+        ),
+    ] = None,
+    rate_hz: Annotated[
+        float | None,
+        typer.Option(
+            help="Clouds, depth folders: frame rate, if neither a CSV nor the file names have times. Names that are times "
+            "must agree."
+        ),
+    ] = None,
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Clouds: NAME=X,Y,Z in metres, in the frame of the clouds, for every camera. Fits leave out what none of "
+            "them could see."
+        ),
+    ] = None,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(help="KEY=VALUE, kept in the episode, such as scenario=lift or fabric=tan; repeated."),
+    ] = None,
+    joint_log: Annotated[
+        Path | None, typer.Option(help="Recordings: CSV of the joints, with the columns of robot.csv.")
+    ] = None,
+    clock_offset: Annotated[
+        float | None, typer.Option(help="Recordings: seconds to add to the times of --joint-log.")
+    ] = None,
+    world_frame: Annotated[str | None, typer.Option(help="ROS: the robot's base in tf. Default: base_link.")] = None,
+    tool_frame: Annotated[str | None, typer.Option(help="ROS: the tool in tf. Default: tool_frame.")] = None,
+    joints: Annotated[
+        list[str] | None,
+        typer.Option(help="ROS: the arm's joints in order, NAME,NAME,... or repeated. Default: joint_1, joint_2, ..."),
+    ] = None,
+    gripper_joint: Annotated[
+        str | None,
+        typer.Option(
+            help="ROS: NAME[,OPEN,CLOSED]: the gripper's joint in joint_states, and its positions when open and closed, in "
+            "rad or m. Default: finger_joint,0,0.8. none: an arm without gripper."
+        ),
+    ] = None,
+    topic: Topics = None,
+    urdf: Annotated[
+        Path | None,
+        typer.Option(
+            help="ROS without joint_states: the robot, whose link frames are in tf. Default: a Kinova Gen3 with a 2F-85."
+        ),
+    ] = None,
     trajectories: Annotated[
         Path | None,
         typer.Option(
-            help="Holds lift_traj.npy and fold_traj.npy, the gripper's tracks. Adds OUT/recorded_<lift|fold>/: the same "
-            "recordings in metres, with the gripper."
+            help="Published data: folder of lift_traj.npy and fold_traj.npy, the gripper's tracks. Adds "
+            "OUT/recorded_<lift|fold>/: the same recordings in metres, with the gripper."
         ),
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Import the data published with the paper."""
+    """Import clouds, recordings or the published data. The kind of the source is detected.
+
+    Clouds become an episode, which fits take. Depth recordings become a raw episode: check it with `diffcloud episode
+    validate`. An option that does not belong to the source's kind is refused.
+    """
+    found = source_kind(source, kind)
+    given = {
+        "--gripper": gripper, "--rate-hz": rate_hz, "--camera": camera, "--label": label, "--joint-log": joint_log,
+        "--clock-offset": clock_offset, "--world-frame": world_frame, "--tool-frame": tool_frame, "--joints": joints,
+        "--gripper-joint": gripper_joint, "--topic": topic, "--urdf": urdf, "--trajectories": trajectories,
+    }  # fmt: skip
+    _refuse_others(source, found, [option for option, value in given.items() if value not in (None, [])])
+    labels = read_labels(label or [])
+    if found == "release":
+        result = _import_release(source[0], out, trajectories)
+    elif found == "clouds":
+        result = _import_clouds(source[0], out, gripper, rate_hz, labels, _viewpoints(camera))
+    else:
+        if clock_offset is not None and joint_log is None:
+            raise ConfigError("--clock-offset shifts the times of a joint log, and none is given. Give --joint-log too.")
+        choices = partial(_ros_choices, world_frame, tool_frame, joints, gripper_joint, topic, urdf)
+        result = _import_recording(_named(source), out, found, choices, rate_hz, joint_log, clock_offset or 0.0, labels)
+    finish({"out": str(out), "kind": found, **result}, json)
+
+
+def source_kind(sources: list[Path], stated: str | None = None) -> str:
+    """Return what the sources are: clouds, release, ros, realsense or folder (of depth images).
+
+    Args:
+        stated: clouds, recording or release, in place of what the files show; None to look.
+
+    Raises:
+        ConfigError: nothing that can be imported, files of several kinds, or a kind that takes one folder with several.
+    """
+    named = _named(sources)
+    kinds = {stated or _general_kind(path) for path in named.values()}
+    if kinds == {"recording"}:
+        kinds = {recording_kind(path) for path in named.values()}
+    if len(kinds) > 1:
+        raise ConfigError(
+            "The sources are of several kinds. Give one folder of clouds, one ROS recording, or one RealSense recording or "
+            "folder per camera, not a mixture."
+        )
+    (kind,) = kinds
+    if kind in ("clouds", "release"):
+        if len(sources) > 1:
+            raise ConfigError(
+                f"{len(sources)} sources are given. Of {_KINDS[kind]}, an import takes one. Import them one by one."
+            )
+        if not sources[0].exists():  # NAME=PATH
+            raise ConfigError(f"{sources[0]}: only recordings of several cameras have names. Give the folder alone.")
+    return kind
+
+
+def _general_kind(path: Path) -> str:
+    """clouds, recording or release, by what lies there.
+
+    Raises:
+        ConfigError: a folder with signs of none of them, or of several.
+    """
+    if not path.is_dir():
+        if path.suffix.lower() in FORMATS:
+            raise ConfigError(f"{path} is a single cloud. Give the folder with one cloud per frame: {path.parent}.")
+        return "recording"
+    if (path / "episode.json").is_file():
+        raise ConfigError(f"{path} is a raw episode already. Make clouds of it: diffcloud preprocess {path}.")
+    signs = {
+        "release": any((path / name).is_dir() for name, _ in RELEASE_FOLDERS.values()),
+        "recording": any((path / name).exists() for name in ("metadata.yaml", "meta/info.json", *_IMAGE_SIGNS)),
+        "clouds": bool(files_in(path, *FORMATS)),
+    }
+    kinds = [kind for kind, found in signs.items() if found]
+    if len(kinds) == 1:
+        return kinds[0]
+    if kinds:
+        raise ConfigError(f"{path} looks like several kinds: {', '.join(kinds)}. Say which one it is with --kind.")
+    raise ConfigError(
+        f"{path} holds nothing that can be imported. A folder holds clouds ({', '.join(FORMATS)}), or depth/*.png with "
+        "camera.json, or metadata.yaml of a rosbag2, or lift_real_pcls/ and others of the published data. Give such a "
+        "folder, or the files of a recording."
+    )
+
+
+def _refuse_others(source: list[Path], found: str, given: list[str]) -> None:
+    """
+    Raises:
+        ConfigError: an option belongs to other kinds of source.
+    """
+    for option in given:
+        if found not in _OF[option]:
+            own = " or ".join(_KINDS[kind] for kind in _OF[option])
+            raise ConfigError(
+                f"{option} belongs to {own}, and {source[0]} is {_KINDS[found]}. Leave {option} out. If the kind is wrong, "
+                "name the right one with --kind."
+            )
+
+
+@writes()
+def _import_release(folder: Path, out: Path, trajectories: Path | None) -> dict[str, Any]:
+    """Write the published data as episodes; the names by folder, for the result."""
     tracks = {} if trajectories is None else _tracks(folder, trajectories)
     written: dict[str, list[str]] = {}
     recorded: dict[Path, Episode] = {}
@@ -69,43 +263,20 @@ def release(
             write_episode(path, episode)
     for scenario, names in written.items():
         errors.print(f"{scenario}: {len(names)} episodes in {out / scenario}")
-    finish({"out": str(out), "episodes": written}, json)
+    return {"episodes": written}
 
 
-@app.command()
 @writes(".npz")
-def clouds(
-    folder: Annotated[
-        Path, typer.Argument(help="Clouds (npy, ply, xyz, pcd) numbered or named by time, one a frame, in metres.")
-    ],
-    out: Annotated[Path, typer.Option(help="Episode file (.npz).")],
-    gripper: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="CSV with x, y, z in metres and optionally t_s, one row a frame. Of several grippers: one with a column "
-            "gripper that names them, or NAME=PATH, repeated."
-        ),
-    ] = None,
-    rate_hz: Annotated[
-        float | None,
-        typer.Option(
-            help="Frame rate, if neither the CSV has t_s nor the file names are times. Names that are times must agree."
-        ),
-    ] = None,
-    camera: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="NAME=X,Y,Z in metres, in the frame of the clouds, for every camera: fits leave out what none of them "
-            "could see."
-        ),
-    ] = None,
-    scenario: Annotated[str | None, typer.Option(help="Name kept in the episode's metadata.")] = None,
-    fabric: Annotated[str | None, typer.Option(help="Fabric kept in the episode's metadata.")] = None,
-    json: JsonFlag = False,
-) -> None:
-    """Import a folder of clouds and the tracks of grippers."""
-    labels = (("scenario", scenario), ("fabric", fabric), ("viewpoints", _viewpoints(camera)))
-    meta = {name: value for name, value in labels if value}
+def _import_clouds(
+    folder: Path,
+    out: Path,
+    gripper: list[str] | None,
+    rate_hz: float | None,
+    labels: dict[str, str],
+    viewpoints: dict[str, list[float]],
+) -> dict[str, Any]:
+    """Write a folder of clouds and the tracks of grippers as an episode; file and counts, for the result."""
+    meta: dict[str, Any] = {**labels, **({"viewpoints": viewpoints} if viewpoints else {})}
     episode = cloud_folder(folder, grippers=named_files(gripper) if gripper else None, rate_hz=rate_hz, meta=meta)
     far = float(np.abs(episode.points).max())
     if far > _FARTHEST_M:
@@ -115,84 +286,82 @@ def clouds(
         )
     write_episode(out, episode)
     errors.print(f"Wrote {episode.frame_count} frames, {len(episode.points)} points to {out}.")
-    finish({"out": str(out), "frames": episode.frame_count, "points": len(episode.points)}, json)
+    return {"out": str(out), "frames": episode.frame_count, "points": len(episode.points)}
 
 
-@app.command()
 @writes()
-def recording(
-    source: Annotated[
-        list[Path],
-        typer.Argument(
-            help="A ROS recording (.bag, .mcap, .db3, rosbag2 folder), or all parts of a split one; or, one per camera and "
-            "as NAME=PATH, recordings of the RealSense SDK (.db3, .bag) or folders with depth/*.png and camera.json."
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="Folder of the raw episode; must not exist.")],
-    joint_log: Annotated[Path | None, typer.Option(help="CSV with the columns of robot.csv.")] = None,
-    log_offset: Annotated[float, typer.Option(help="Seconds to add to the joint log's times.")] = 0.0,
-    rate_hz: Annotated[
-        float | None,
-        typer.Option(help="Frame rate, where the source has no times. File names that are times must agree with it."),
-    ] = None,
-    world_frame: Annotated[str, typer.Option(help="ROS: the robot's base in tf.")] = "base_link",
-    tool_frame: Annotated[str, typer.Option(help="ROS: the tool in tf.")] = "tool_frame",
-    topic: Topics = None,
-    joint: Annotated[
-        list[str] | None, typer.Option(help="ROS: the arm's joints in order; joint_1, ... if not given.")
-    ] = None,
-    gripper_joint: Annotated[
-        str, typer.Option(help="ROS: in joint_states; none for an arm without gripper.")
-    ] = GRIPPER_JOINT,
-    gripper_open: Annotated[float, typer.Option(help="ROS: its position when open, rad or m.")] = 0.0,
-    gripper_closed: Annotated[
-        float | None, typer.Option(help=f"ROS: its position when closed, rad or m; {GRIPPER_CLOSED_RAD} if not given.")
-    ] = None,
-    urdf: Annotated[
-        Path | None,
-        typer.Option(
-            help="ROS without joint_states: the robot, whose link frames are in tf. Default: a Kinova Gen3 with a 2F-85."
-        ),
-    ] = None,
-    scenario: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
-    fabric: Annotated[str | None, typer.Option(help="Kept in episode.json.")] = None,
-    json: JsonFlag = False,
-) -> None:
-    """Import existing depth recordings as a raw episode. Check it with `diffcloud episode validate`."""
-    named = _named(source)
-    kinds = {recording_kind(path) for path in named.values()}
-    if len(kinds) > 1:
-        raise ConfigError("Give one ROS recording, or one RealSense recording or folder per camera, not a mixture.")
+def _import_recording(
+    named: dict[str, Path],
+    out: Path,
+    kind: str,
+    ros_choices: Callable[[], dict[str, Any]],
+    rate_hz: float | None,
+    joint_log: Path | None,
+    clock_offset_s: float,
+    labels: dict[str, str],
+) -> dict[str, Any]:
+    """Write depth recordings as a raw episode; counts and warnings, for the result."""
     with ExitStack() as stack:
-        if kinds == {"ros"}:
-            found = ros_recording(
-                *named.values(),
-                world_frame=world_frame,
-                tool_frame=tool_frame,
-                joint_names=joint or None,
-                gripper_joint=None if gripper_joint == "none" else gripper_joint,
-                gripper_open=gripper_open,
-                gripper_closed=gripper_closed,
-                description=partial(robot_description, urdf),
-                topics=topic or (),
-            )
-        elif kinds == {"realsense"}:
+        if kind == "ros":
+            found = ros_recording(*named.values(), **ros_choices())
+        elif kind == "realsense":
             found = stack.enter_context(play_recordings(named))
         else:
             found = depth_folders(named, rate_hz=rate_hz)
         if joint_log is not None:
-            found = _with_log(found, joint_log, log_offset)
+            found = _with_log(found, joint_log, clock_offset_s)
         warnings = list(found.warnings)
         if found.robot is None:
             warnings.append("No joint log: the robot cannot be masked later. Give --joint-log if there is one.")
         for message in warnings:
             warn(message)
-        meta = {key: value for key, value in (("scenario", scenario), ("fabric", fabric)) if value is not None}
-        frames = write_recording(out, found, rate_hz=rate_hz, meta=meta)
+        frames = write_recording(out, found, rate_hz=rate_hz, meta=labels)
     errors.print(f"Wrote {frames} frames to {out}.")
     rows = 0 if found.robot is None else len(found.robot.times)
-    result = {"out": str(out), "frames": frames, "robot_rows": rows, "source": found.source, "warnings": warnings}
-    finish(result, json)
+    return {"frames": frames, "robot_rows": rows, "source": found.source, "warnings": warnings}
+
+
+def _ros_choices(
+    world_frame: str | None,
+    tool_frame: str | None,
+    joints: list[str] | None,
+    gripper_joint: str | None,
+    topics: list[str] | None,
+    urdf: Path | None,
+) -> dict[str, Any]:
+    """What options choose in a ROS recording, as `ros_recording` takes it."""
+    frames = {"world_frame": world_frame, "tool_frame": tool_frame}
+    names = [name.strip() for item in joints or [] for name in item.split(",")]
+    if not all(names):
+        raise ConfigError(f"--joints takes NAME,NAME,..., got {','.join(joints or [])!r}. Try --joints joint_1,joint_2.")
+    return {
+        **{key: frame for key, frame in frames.items() if frame is not None},
+        **({} if gripper_joint is None else _gripper(gripper_joint)),
+        "joint_names": names or None,
+        "description": partial(robot_description, urdf),
+        "topics": topics or (),
+    }
+
+
+def _gripper(text: str) -> dict[str, Any]:
+    """NAME[,OPEN,CLOSED], or none, as `ros_recording` takes it.
+
+    Raises:
+        ConfigError: something else.
+    """
+    name, *positions = (part.strip() for part in text.split(","))
+    if text.strip() == "none":
+        return {"gripper_joint": None}
+    try:
+        open_, closed = map(number, positions) if positions else (0.0, None)
+    except ValueError:
+        name = ""
+    if name in ("", "none"):
+        raise ConfigError(
+            "--gripper-joint takes NAME, or NAME,OPEN,CLOSED with the joint's positions in rad or m, or none; got "
+            f"{text!r}. Try --gripper-joint finger_joint,0,0.8."
+        )
+    return {"gripper_joint": name, "gripper_open": open_, "gripper_closed": closed}
 
 
 def _tracks(folder: Path, trajectories: Path) -> dict[str, NDArray[np.float64]]:

@@ -210,7 +210,7 @@ def _sources(recorded: list[Path], scenarios: list[str]) -> list[tuple[str, Path
     if not found:
         raise ConfigError(
             f"{' and '.join(map(str, recorded))}: no recordings of {', '.join(scenarios)}. Raw episodes are folders with "
-            "an episode.json, made by `diffcloud capture` or `diffcloud import recording`; clouds lie in <scenario>/*.npz, "
+            "an episode.json, made by `diffcloud capture` or `diffcloud import`; clouds lie in <scenario>/*.npz, "
             "made by `diffcloud import`. Try one of these, or list the scenario in the parameters file (--params)."
         )
     return found

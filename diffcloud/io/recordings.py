@@ -174,7 +174,7 @@ def read_joint_log(path: Path, *, offset_s: float = 0.0, recording_start_s: floa
     if recording_start_s > times[-1] or (times[0] >= EPOCH_S > recording_start_s):
         raise EpisodeError(
             f"{path} covers {times[0]:.2f} to {times[-1]:.2f} s and the recording starts at "
-            f"{recording_start_s:.2f} s: they are on different clocks. Give the difference with --log-offset."
+            f"{recording_start_s:.2f} s: they are on different clocks. Give the difference with --clock-offset."
         )
     return replace(log, times=times)
 

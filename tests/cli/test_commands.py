@@ -330,7 +330,7 @@ def test_ctrl_c_stops_fits_in_processes_and_keeps_their_best(work):
 
 @pytest.mark.parametrize("told", ["side=1,2", "side", "=1,2,3", "side=1,2,nan", "side=a,b,c"])
 def test_a_camera_that_stands_nowhere(work, told):
-    refused = run("import", "clouds", "clouds", "--rate-hz", 10, "--camera", told, "--out", "nowhere.npz", cwd=work, code=1)
+    refused = run("import", "clouds", "--rate-hz", 10, "--camera", told, "--out", "nowhere.npz", cwd=work, code=1)
     assert "--camera takes NAME=X,Y,Z in metres" in refused.errors
     assert not (work / "nowhere.npz").exists()
 
@@ -343,7 +343,7 @@ def test_import_own_clouds_end_to_end(work):
     rows = np.column_stack([episode.times, episode.gripper[:, 0]])
     np.savetxt(work / "gripper.csv", rows, delimiter=",", header="t_s,x,y,z", comments="")
     where = ("--camera", "side=1.2,0,0.5", "--camera", "top=0,0,2")
-    run("import", "clouds", "clouds", "--gripper", "gripper.csv", *where, "--out", "own.npz", cwd=work)
+    run("import", "clouds", "--gripper", "gripper.csv", *where, "--out", "own.npz", cwd=work)
     assert read_episode(work / "own.npz").meta["viewpoints"] == {"side": [1.2, 0.0, 0.5], "top": [0.0, 0.0, 2.0]}
     again = read_episode(work / "own.npz")
     np.testing.assert_allclose(again.points, episode.points, atol=1e-6)
@@ -402,7 +402,7 @@ def test_two_grippers_from_csv_to_report(work):
             rows.append(",".join([name, *(f"{number:.9f}" for number in (time_s, *cloth[node]))]))
     (work / "tracks.csv").write_text("\n".join(rows))
     episode = "data/episodes/still/own.npz"
-    run("import", "clouds", "clouds", "--gripper", "tracks.csv", "--out", episode, cwd=work)
+    run("import", "clouds", "--gripper", "tracks.csv", "--out", episode, cwd=work)
     run("rollout", "--scenario", "still", "--episode", episode, "--set", "stretch=0.6", "--out", "again.npz", cwd=work)
     with np.load(work / "again.npz") as again:
         np.testing.assert_allclose(again["nodes"][:, [20, 24]], nodes[:, [20, 24]], atol=1e-6)
@@ -426,7 +426,7 @@ def test_two_grippers_from_csv_to_report(work):
     # one gripper's file alone is refused by the names
     (work / "one.csv").write_text("\n".join(row[5:] for row in rows if row.startswith("left,")))
     (work / "one.csv").write_text("t_s,x,y,z\n" + (work / "one.csv").read_text())
-    run("import", "clouds", "clouds", "--gripper", "left=one.csv", "--out", "one.npz", cwd=work)
+    run("import", "clouds", "--gripper", "left=one.csv", "--out", "one.npz", cwd=work)
     done = run("rollout", "--scenario", "still", "--episode", "one.npz", "--out", "x.npz", cwd=work, code=1)
     assert "The scene's grippers are left, right, the episode's left" in done.errors
     assert not (work / "x.npz").exists()

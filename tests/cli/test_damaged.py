@@ -135,7 +135,7 @@ def test_clouds_in_millimetres_are_refused(work, rng):
     (work / "clouds").mkdir()
     for index in range(3):
         np.save(work / "clouds" / f"{index:03d}.npy", rng.uniform(100, 900, (50, 3)))
-    said = invoke("import", "clouds", "clouds", "--rate-hz", 10, "--out", "e.npz", code=1).errors
+    said = invoke("import", "clouds", "--rate-hz", 10, "--out", "e.npz", code=1).errors
     assert "divide millimetres by 1000" in said
     assert not (work / "e.npz").exists()
 
@@ -183,12 +183,12 @@ def test_files_numbered_by_large_numbers_are_refused_and_take_no_memory(work, ki
         (work / "clouds").mkdir()
         for stamp in stamps:
             np.save(work / "clouds" / f"{stamp}.npy", np.zeros((5, 3)))
-        command = ("import", "clouds", "clouds", "--rate-hz", 10, "--out", "e.npz")
+        command = ("import", "clouds", "--rate-hz", 10, "--out", "e.npz")
     else:
         folder = write_table_episode(work / "raw", frames=2) / "cameras" / "side"
         for path, stamp in zip(sorted((folder / "depth").iterdir()), stamps, strict=True):
             path.rename(path.with_name(f"{stamp}.png"))
-        command = ("import", "recording", f"side={folder}", "--rate-hz", 10, "--out", "e")
+        command = ("import", f"side={folder}", "--rate-hz", 10, "--out", "e")
     tracemalloc.start()
     assert "are neither frame numbers nor times of a recording" in invoke(*command, code=1).errors
     assert tracemalloc.get_traced_memory()[1] < 100e6

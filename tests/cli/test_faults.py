@@ -108,7 +108,7 @@ class TestKilledWhileWriting:
         ("train-000000.npz", (*SET, "--workers", 0, "--out", "out")),
         ("test_nodes.npy", (*SET, "--workers", 0, "--out", "out")),
         ("set.json", (*SET, "--workers", 0, "--out", "out")),
-        ("out.npz", ("import", "clouds", "clouds", "--rate-hz", 10, "--out", "out/out.npz")),
+        ("out.npz", ("import", "clouds", "--rate-hz", 10, "--out", "out/out.npz")),
         ("out.npz", ("rollout", "--scenario", "small", "--obj", "out/frames", "--out", "out/out.npz")),
         ("000.obj", ("rollout", "--scenario", "small", "--obj", "out/frames", "--out", "out/out.npz")),
     )
@@ -284,7 +284,7 @@ class TestOnlyOwnFilesAreRemoved:
 class TestOutputFiles:
     def test_a_missing_suffix_is_added_and_said(self, work):
         (work / "towel").write_text("an older file")
-        done = invoke("import", "clouds", "clouds", "--rate-hz", 10, "--out", "towel")
+        done = invoke("import", "clouds", "--rate-hz", 10, "--out", "towel")
         assert "writing to towel.npz" in done.errors
         assert "to towel.npz." in done.errors
         assert done.result["out"] == "towel.npz"
@@ -293,7 +293,7 @@ class TestOutputFiles:
 
     @pytest.mark.parametrize("out", ["towel.ply", "towel.tar.gz", "clouds"])
     def test_another_suffix_and_folders_are_refused(self, work, out):
-        done = invoke("import", "clouds", "clouds", "--rate-hz", 10, "--out", out, code=1)
+        done = invoke("import", "clouds", "--rate-hz", 10, "--out", out, code=1)
         assert "--out takes a .npz file" in done.errors
         done = invoke("rollout", "--scenario", "small", "--out", out, code=1)
         assert "--out takes a .npz file" in done.errors

@@ -49,7 +49,7 @@ LEFT = {
     "diffcloud capture --rig rig.yaml --trajectory path.csv": "a lab's own hardware",
     "diffcloud capture --rig rig.yaml --check": "a lab's own hardware",
     "python -m diffcloud.hardware.examples": "runs until it is ended",
-    "diffcloud import recording overhead=a.db3": "recordings of two cameras, made by the SDK of their maker",
+    "diffcloud import overhead=a.db3": "recordings of two cameras, made by the SDK of their maker",
     "diffcloud episode watch": "runs until it is ended",
     ".venv/bin/python -m pytest": "a test of its own",
 }

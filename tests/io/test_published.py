@@ -1,4 +1,4 @@
-"""The published recordings as recordings: `import release --trajectories`, and what the scenarios make of them."""
+"""The published recordings as recordings: `import --trajectories`, and what the scenarios make of them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def published(tmp_path):
 
 def import_release(folder, *, code=0):
     options = ("--trajectories", folder / "trajs", "--out", folder / "episodes")
-    return invoke("import", "release", folder / "pysim", *options, code=code)
+    return invoke("import", folder / "pysim", *options, code=code)
 
 
 def written(folder):
@@ -67,7 +67,7 @@ class TestImport:
 
     def test_without_trajectories_all_is_as_it_was(self, published):
         import_release(published)
-        plain = invoke("import", "release", published / "pysim", "--out", published / "plain").result["episodes"]
+        plain = invoke("import", published / "pysim", "--out", published / "plain").result["episodes"]
         assert set(plain) == {"release_lift", "release_fold", "release_band"}
         for kind, (name,) in plain.items():
             path = f"{kind}/{name}.npz"

@@ -25,7 +25,7 @@ KINDS = pytest.mark.parametrize("kind", ["rosbag1", "rosbag2"])
 
 
 def imported(tmp_path, *sources, options=(), code=0):
-    return invoke("import", "recording", *sources, "--out", tmp_path / "e", *options, code=code)
+    return invoke("import", *sources, "--out", tmp_path / "e", *options, code=code)
 
 
 def depth_m(tmp_path, name, index):
@@ -430,20 +430,19 @@ class TestGripper:
 
     def test_where_it_is_closed_may_be_given(self, tmp_path):
         path = bag(tmp_path, "rosbag2", joints={"claw": 0.03})
-        done = imported(tmp_path, path, options=("--gripper-joint", "claw", "--gripper-closed", 0.04))
+        done = imported(tmp_path, path, options=("--gripper-joint", "claw,0,0.04"))
         np.testing.assert_allclose(self.gripper(tmp_path), 0.75)
         assert done.result["warnings"] == []
 
     def test_one_that_is_closed_at_zero(self, tmp_path):
         path = bag(tmp_path, "rosbag2", joints={"finger": 0.03})
-        where = ("--gripper-joint", "finger", "--gripper-open", 0.04, "--gripper-closed", 0)
-        imported(tmp_path, path, options=where)
+        imported(tmp_path, path, options=("--gripper-joint", "finger,0.04,0"))
         np.testing.assert_allclose(self.gripper(tmp_path), 0.25)
 
     @pytest.mark.parametrize(("open_", "closed"), [(0, 0), (0.8, 0.8), (0, "nan"), ("inf", 0)])
     def test_positions_that_tell_nothing_are_refused(self, tmp_path, open_, closed):
         path = bag(tmp_path, "rosbag2")
-        done = imported(tmp_path, path, options=("--gripper-open", open_, "--gripper-closed", closed), code=1)
+        done = imported(tmp_path, path, options=("--gripper-joint", f"finger_joint,{open_},{closed}"), code=1)
         assert "two different positions" in done.errors
         assert not (tmp_path / "e").exists()
 

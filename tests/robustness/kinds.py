@@ -186,10 +186,10 @@ def _left(model: object, path: str) -> Callable[[], None]:
     return lambda: check_file(model, Path(path), read(Path(path)))
 
 
-_IMPORT = "import clouds {} --gripper gripper.csv --out imported.npz"
+_IMPORT = "import {} --gripper gripper.csv --out imported.npz"
 _CAPTURE = command("capture --dry-run --trajectory path.csv --rig rig.yaml --out e")
 _REPORT = command(REPORT)
-_IMAGES = command("import recording a=images --rate-hz 10 --out imported")
+_IMAGES = command("import a=images --rate-hz 10 --out imported")
 _LOSS = command(f"evaluate loss {_EPISODE} --scenario small --set stretch=1.0 --threads 1")
 _OF_FIT = command(f"evaluate loss {_EPISODE} --fit {_FIT}.json --scenario small --threads 1")
 _PREDICT = command(f"predict {_EPISODE} --checkpoint {_NETWORK}.safetensors")
@@ -236,8 +236,8 @@ KINDS = (
     Kind("depth folder, camera", "document", "images/camera.json", _IMAGES),
     Kind("depth folder, image", "bytes", "images/depth/000001.png", _IMAGES),
     Kind("mesh", "bytes", "cloth.obj", lambda: read_cloth(Path("cloth.obj")), flips=80),
-    Kind("ROS bag", "bytes", "recording.bag", command("import recording recording.bag --out imported")),
-    Kind("MCAP", "bytes", "recording/recording.mcap", command("import recording recording --out imported")),
+    Kind("ROS bag", "bytes", "recording.bag", command("import recording.bag --out imported")),
+    Kind("MCAP", "bytes", "recording/recording.mcap", command("import recording --out imported")),
     Kind("trajectory", "table", "path.csv", _CAPTURE),
     Kind("rig", "document", "rig.yaml", lambda: read_rig(Path("rig.yaml"))),
 )  # fmt: skip

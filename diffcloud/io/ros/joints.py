@@ -50,9 +50,9 @@ class Grip:
         at = GRIPPER_CLOSED_RAD if closed is None else closed
         if not (math.isfinite(open_) and math.isfinite(at) and open_ != at):
             raise ConfigError(
-                f"A gripper that is open at {open_:g} and closed at {at:g} tells nothing: --gripper-open and "
-                "--gripper-closed are two different positions of its joint. A Franka Hand's finger is open at 0.04 and "
-                "closed at 0."
+                f"A gripper that is open at {open_:g} and closed at {at:g} tells nothing: a gripper's joint has two "
+                "different positions, --gripper-joint NAME,OPEN,CLOSED. A Franka Hand's finger is open at 0.04 and closed "
+                "at 0."
             )
         return Grip(joint, open_, at, guessed=closed is None)
 
@@ -63,7 +63,7 @@ class Grip:
             return []
         return [
             f"The gripper is taken to be open where {self.joint} is {self.open:g} and closed where it is {self.closed:g}, "
-            "as a Robotiq 2F-85 is; say where it is with --gripper-open and --gripper-closed."
+            f"as a Robotiq 2F-85 is; say where it is with --gripper-joint {self.joint},OPEN,CLOSED."
         ]
 
     def state(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -101,7 +101,7 @@ def joint_log(
     if not joint_names or missing:
         raise EpisodeError(
             f"{where}: joint_states has {', '.join(sorted(seen))}; {missing or 'joint_1, ...'} not among them. Name the "
-            "arm's joints in order with --joint."
+            "arm's joints in order with --joints."
         )
     needed = {*joint_names, *([] if grip.joint is None else [grip.joint])}
     kept, warnings = of_one_driver(where, sent, needed, named)
@@ -120,8 +120,8 @@ def joint_log(
     elif gripper_joint is not None and (others or gripper_joint != GRIPPER_JOINT):
         raise EpisodeError(
             f"{where}: joint_states has no {gripper_joint!r}, so how far the gripper is open is not known; besides the "
-            f"arm's joints there are {', '.join(others) or 'none'}. Name the gripper's joint with --gripper-joint (and its "
-            "positions with --gripper-open and --gripper-closed), or give --gripper-joint none."
+            f"arm's joints there are {', '.join(others) or 'none'}. Name the gripper's joint and its "
+            "positions with --gripper-joint NAME,OPEN,CLOSED, or give --gripper-joint none."
         )
     elif gripper_joint is not None:
         warnings.append(

@@ -1,7 +1,7 @@
 """The published recordings as recordings: the paper's cloth in SI under the gripper's recorded track.
 
 The `release_*` scenes move their handle along a path of their own and look at one frame. `recorded_lift` and
-`recorded_fold` are simulated under the track that an episode carries (`diffcloud import release --trajectories`), and look
+`recorded_fold` are simulated under the track that an episode carries (`diffcloud import --trajectories`), and look
 at three frames in which about half of the cloth or more is above the plane where the published clouds are cut off.
 """
 
