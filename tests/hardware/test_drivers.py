@@ -293,6 +293,14 @@ class TestCommand:
         assert {"arm: joints", "arm: tool frame"} <= {one["name"] for one in done.result["checks"]}
         np.testing.assert_array_equal(controller.tool_position, before)
 
+    def test_a_check_asks_before_the_arm_moves(self, tmp_path, controller):
+        before = controller.tool_position
+        with description() as urdf:
+            rig = self.rig(tmp_path, urdf, controller)
+            done = invoke("capture", "--rig", rig, "--check", "arm", answer="n\n", code=1)
+        assert "The arm will move" in done.errors
+        np.testing.assert_array_equal(controller.tool_position, before)
+
     @pytest.mark.slow
     @pytest.mark.realtime
     def test_a_trajectory_beyond_the_arms_reach_is_wrong(self, tmp_path, controller):
