@@ -15,7 +15,7 @@ venv: $(STAMP)
 # needs one would compile for itself. --no-compile: of 23,000 files the stages import 5,000, and importing them once compiles
 # these, in a third of the time; open3d by our own import, which also finds libusb on a machine that has none
 IMPORTED := cma, diffcloud.regressors.training, dvc.commands.repro, dvc.repo, dvclive, matplotlib.backends.backend_agg, \
-	diffcloud.cli.evaluate, diffcloud.cli.preprocess, diffcloud.cli.report, diffcloud.cli.train, trimesh
+	diffcloud.jobs.evaluation, diffcloud.jobs.preprocess, diffcloud.jobs.report, diffcloud.jobs.train, trimesh
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -81,13 +81,13 @@ comparison: venv
 SIMULATED := build/simulated
 SIMULATED_PARAMS := pipeline/profiles/simulated.yaml
 simulated: venv
-	diffcloud episodes --params $(SIMULATED_PARAMS) --out $(SIMULATED)/episodes
-	diffcloud fit --params $(SIMULATED_PARAMS) --out $(SIMULATED)/fits $(SIMULATED)/episodes
+	python -m pipeline.episodes --params $(SIMULATED_PARAMS) --out $(SIMULATED)/episodes
+	python -m pipeline.fit --params $(SIMULATED_PARAMS) --out $(SIMULATED)/fits $(SIMULATED)/episodes
 	set -e; for scenario in band_stretch vest_hang; do \
-	    diffcloud simulate --params $(SIMULATED_PARAMS) --scenario $$scenario --out $(SIMULATED)/sets/$$scenario; \
+	    diffcloud network generate --params $(SIMULATED_PARAMS) --scene $$scenario --out $(SIMULATED)/sets/$$scenario; \
 	done
-	diffcloud train --params $(SIMULATED_PARAMS) --data $(SIMULATED)/sets --out $(SIMULATED)/regressors
-	diffcloud evaluate --params $(SIMULATED_PARAMS) --fits $(SIMULATED)/fits --episodes $(SIMULATED)/episodes \
+	python -m pipeline.train --params $(SIMULATED_PARAMS) --data $(SIMULATED)/sets --out $(SIMULATED)/regressors
+	python -m pipeline.evaluate --params $(SIMULATED_PARAMS) --fits $(SIMULATED)/fits --episodes $(SIMULATED)/episodes \
 	    --regressors $(SIMULATED)/regressors --simulated $(SIMULATED)/sets --out $(SIMULATED)/reports \
 	    --markdown docs/results/simulated-experiment.md
 
@@ -95,8 +95,8 @@ simulated: venv
 RECORDINGS := build/recordings
 RECORDINGS_PARAMS := docs/results/raw-recordings.yaml
 recordings: venv
-	diffcloud episodes --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/raw
-	diffcloud preprocess --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/clouds $(RECORDINGS)/raw
+	python -m pipeline.episodes --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/raw
+	python -m pipeline.preprocess --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/clouds $(RECORDINGS)/raw
 	python -m studies recordings --params $(RECORDINGS_PARAMS) --recorded $(RECORDINGS)/raw --episodes $(RECORDINGS)/clouds \
 	    --out docs/results/raw-recordings.md
 
@@ -106,8 +106,8 @@ NUISANCE := --nuisance none --nuisance x=10cm,y=10cm,z=2mm,tilt_x=5e-3rad,tilt_y
 moved: venv
 	set -e; for kind in together apart; do \
 	    params=docs/results/moved-$$kind.yaml; \
-	    diffcloud episodes --params $$params --out $(MOVED)/$$kind/raw; \
-	    diffcloud preprocess --params $$params --out $(MOVED)/$$kind/clouds $(MOVED)/$$kind/raw; \
+	    python -m pipeline.episodes --params $$params --out $(MOVED)/$$kind/raw; \
+	    python -m pipeline.preprocess --params $$params --out $(MOVED)/$$kind/clouds $(MOVED)/$$kind/raw; \
 	    python -m studies recordings --params $$params --recorded $(MOVED)/$$kind/raw --episodes $(MOVED)/$$kind/clouds \
 	        --out docs/results/moved-$$kind.md $(NUISANCE); \
 	done
@@ -138,9 +138,9 @@ coverage-own: venv
 	$(COVERAGE) --seed 5448382 --recordings 3 --refits 20 --fix mass
 	$(COVERAGE) --seed 5448382 --recordings 3 --refits 20 --markdown docs/results/coverage.md
 	$(BESIDE)
-	diffcloud simulate --scenario lift --draws logarithmic --train 1500 --test 375 --seed 75498966 --out $(POSTERIOR)/lift \
-	    --doubts bending=1.5x,drag=1.3x,damping=1.5x,friction_obstacle=1.3x,friction_cloth=1.3x
-	diffcloud train --scenario lift --model posterior --profile quick --target logarithmic --data $(POSTERIOR)/lift \
+	diffcloud network generate --scene lift --distribution logarithmic --train 1500 --test 375 --seed 75498966 --out $(POSTERIOR)/lift \
+	    --uncertain bending=1.5x,drag=1.3x,damping=1.5x,friction_obstacle=1.3x,friction_cloth=1.3x
+	diffcloud network train --params docs/results/posterior.yaml --scene lift --model posterior --data $(POSTERIOR)/lift \
 	    --like $(POSTERIOR)/coverage/lift/episodes/0000.npz --out $(POSTERIOR)/regressors
 	$(BESIDE) --checkpoint $(POSTERIOR)/regressors/posterior.safetensors --markdown docs/results/coverage-posterior.md
 

@@ -1,6 +1,6 @@
 """The library, which `import diffcloud as dc` offers: from recordings to a fitted cloth, in SI units.
 
-Commands do the same with files: `identify` runs the same fit, from the same settings, as `fit` here.
+Commands do the same with files: `diffcloud fit` runs the same fit, from the same settings, as `fit` here.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from diffcloud.estimation.result import FitResult, FittedMotion, physical_values
 from diffcloud.estimation.settings import FitSettings
 from diffcloud.estimation.solvers import Progress
 from diffcloud.estimation.task import FitTask, Recording
-from diffcloud.evaluation.intervals import LEVEL, WITHIN, Intervals, draws, intervals_of
+from diffcloud.evaluation.intervals import Intervals, draws, intervals_of
 from diffcloud.evaluation.methods import space_of
 from diffcloud.identification import fit_settings, found_cloth, known_grip, with_density
 from diffcloud.io.episodes import Episode, read_episode
@@ -175,7 +175,7 @@ class Fit:
         return (drawn * units).rename(columns=_NAMES)
 
     def save(self, folder: str | Path) -> Path:
-        """Write fit.json, fit.npz, intervals.json and scenarios/, which `diffcloud export`, `view` and `rollout` read.
+        """Write fit.json, fit.npz, intervals.json and scenarios/, which `diffcloud export`, `view` and `simulate` read.
 
         Returns:
             The path of fit.json.
@@ -213,7 +213,7 @@ def load_recording(
         if not (path / "gripper.csv").is_file():
             raise EpisodeError(
                 f"{path} holds no gripper.csv with the columns t_s, x, y, z [m], one row a frame. Name other files with "
-                "`grippers`, or make an episode of a bag by `diffcloud import`."
+                "`grippers`, or make an episode of a bag by `diffcloud data import`."
             )
         grippers = {"gripper": path / "gripper.csv"}
     return cloud_folder(path, grippers={name: Path(file) for name, file in grippers.items()}, rate_hz=rate_hz)
@@ -259,8 +259,6 @@ def fit(
     scenes: Scene | Sequence[Scene],
     settings: FitSettings | None = None,
     *,
-    level: float = LEVEL,
-    within: float = WITHIN,
     progress: Callable[[Progress], None] | None = None,
 ) -> Fit:
     """Estimate the parameters of one cloth from one or several recordings. Ctrl-C returns the best so far.
@@ -268,8 +266,6 @@ def fit(
     Args:
         scenes: one for each recording.
         settings: by default those of the first scene.
-        level: probability of the intervals.
-        within: factor to each side within which a parameter counts as identified.
         progress: told after each step.
 
     Raises:
@@ -286,7 +282,8 @@ def fit(
         raise ConfigError(f"Two scenes are named {max(names, key=names.count)}; give each a name of its own.")
     pairs = zip(chosen, episodes, strict=True)
     members = [Recording(scene.scenario, scene.name, episode) for scene, episode in pairs]
-    result = FitTask(members, settings or chosen[0].settings).fitted(
+    settings = settings or chosen[0].settings
+    result = FitTask(members, settings).fitted(
         progress, None if progress is None else lambda done, doing, told: progress(told)
     )
     record = result.record
@@ -294,7 +291,8 @@ def fit(
     if told is not None and told.grip_m is not None:
         chosen = [replace(scene, options={**scene.options, **known_grip(told.grip_m)}) for scene in chosen]
     scenario = chosen[0].scenario
-    intervals = None if told is None else intervals_of(record, space_of(record), scenario, level=level, within=within)
+    level, factor = settings.level, settings.identified_factor
+    intervals = None if told is None else intervals_of(record, space_of(record), scenario, level=level, within=factor)
     return Fit(
         parameters=_estimates(record, intervals, scenario, level),
         status=_status(record, intervals),

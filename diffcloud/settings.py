@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, TypeVar
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from diffcloud.errors import ConfigError
 from diffcloud.io.schema import Checked, Component, Vector, explain
@@ -16,6 +16,8 @@ Count = Annotated[int, Field(ge=1, le=_MOST)]
 CountOrNone = Annotated[int, Field(ge=0, le=_MOST)]
 """Zero: there is none, or it is left out."""
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Level = Annotated[float, Field(ge=0.01, le=0.999)]
+"""A probability of intervals."""
 Factor = Annotated[float, Field(gt=1, le=_FACTOR)]
 """Within which something is known."""
 Name = Annotated[str, Field(max_length=1000)]
@@ -32,7 +34,9 @@ def check_bounds(name: str, bounds: Bounds) -> None:
 
 
 class Section(Checked):
-    """One section of params.yaml."""
+    """One section of params.yaml. The text below a field is its help."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
     @model_validator(mode="before")
     @classmethod

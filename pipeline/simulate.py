@@ -1,6 +1,7 @@
-"""The stage `simulate`."""
+"""The stage `simulate`: the sets that networks are trained on."""
 
 from diffcloud.cli.app import stage
+from diffcloud.cli.generate import generate
 
 if __name__ == "__main__":
-    stage("simulate")
+    stage(generate)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from diffcloud.cli.app import run
-from diffcloud.cli.lazy import lazy_group
+from diffcloud.cli.group import command_group
 
 COMMANDS = {
     "acceptance": "studies.acceptance:acceptance",
@@ -22,11 +22,9 @@ COMMANDS = {
     "towels": "studies.towels:towels",
 }
 """Name -> where it lies; it is imported when it is run."""
-_PARALLEL = ("coverage", "published", "recordings")
-"""Studies that run their jobs through `diffcloud.cli.workers`."""
 
 app = typer.Typer(
-    cls=lazy_group(COMMANDS),
+    cls=command_group(COMMANDS),
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Measure how well and how fast fits, simulator and recordings are.",
@@ -39,4 +37,4 @@ def studies() -> None:
 
 
 if __name__ == "__main__":
-    run(app, COMMANDS, _PARALLEL)
+    run(app)

@@ -12,17 +12,19 @@ import numpy as np
 import torch
 import typer
 
-from diffcloud.cli.console import errors, output, progress_bar, warn, writes
-from diffcloud.cli.scenario_options import choose_scenario
 from diffcloud.clouds.losses import one_sided_chamfer
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
+from diffcloud.console import errors, output, progress_bar, warn, writes
 from diffcloud.errors import ConfigError
-from diffcloud.estimation import AdamSettings, FitSpace, Objective, fit_adam
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.settings import SMOOTHING
+from diffcloud.estimation.solvers import AdamSettings, fit_adam
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.io.files import files_in, write_bytes, write_text
 from diffcloud.io.imports import release_episodes
+from diffcloud.jobs.scenarios import choose_scenario
 from diffcloud.scene.scenarios import PAPER_THRESHOLD, load_scenario
 from diffcloud.sim.properties import one_set
 from diffcloud.sim.simulate import rollout
@@ -160,7 +162,7 @@ def _fit_report(fits: list[_Fit], starts: int) -> str:
         "",
         "One-sided Chamfer loss in squared release units, 3,500 points, paper's frames and settings (50 Adam iterations, "
         "learning rate 0.2, bounds [0.1, 10], start at the middle). The first start averages its gradient over eight "
-        f"perturbed copies (`--smoothing {SMOOTHING}`, its default). The last columns are the losses of the "
+        f"perturbed copies (`smoothing: {SMOOTHING}`, its default). The last columns are the losses of the "
         "published predictions, clipped to the bounds, under the same simulator, metric and points.",
         "",
         *markdown_table(head, rows),

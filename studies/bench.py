@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Mapping
@@ -15,10 +17,11 @@ import torch
 import typer
 from rich.table import Table
 
-from diffcloud.cli.console import JsonFlag, Threads, finish, output, progress_bar, show
-from diffcloud.cli.scenario_options import SceneFile, choose_scenario
+from diffcloud.cli.options import JsonFlag, Threads
 from diffcloud.clouds import SurfaceSampler
+from diffcloud.console import finish, output, progress_bar, show
 from diffcloud.io.clouds import write_ply
+from diffcloud.jobs.scenarios import choose_scenario
 from diffcloud.scene.scenarios import GridScenario, Scenario, built_in, grid_scenario, make_scenario
 from diffcloud.sim.threads import thread_count, use_threads
 from studies.timings import time_contact, time_episode, time_matching
@@ -39,11 +42,11 @@ CONTACT_HEAD = ("nodes", "contacts", "free ms per step", "on a sphere ms per ste
 
 
 def bench(
-    scene: SceneFile = None,
+    scene: Annotated[Path | None, typer.Option(help="Scene file of the published lift.")] = None,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="Runs of each; the fastest one counts.")] = 3,
     contact: Annotated[bool, typer.Option(help="What contacts cost instead: finer and finer cloths on a sphere.")] = False,
-    identify: Annotated[
-        bool, typer.Option("--identify", help="Instead, how long `diffcloud identify` takes for the tutorial's towel.")
+    fit: Annotated[
+        bool, typer.Option("--fit", help="Instead, how long `diffcloud fit` takes for the tutorial's towel.")
     ] = False,
     threads: Threads = None,
     json: JsonFlag = False,
@@ -55,11 +58,11 @@ def bench(
         show(contact_table(costs), json)
         finish({"threads": thread_count(), "timings": costs}, json)
         return
-    if identify:
-        seconds = time_identify()
+    if fit:
+        seconds = time_fit()
         if not json:
-            output.print(f"identify, one lift of the towel, {thread_count()} threads: {seconds:.0f} s")
-        finish({"threads": thread_count(), "identify_seconds": seconds}, json)
+            output.print(f"fit, one lift of the towel, {thread_count()} threads: {seconds:.0f} s")
+        finish({"threads": thread_count(), "fit_seconds": seconds}, json)
         return
     published = {} if scene is None else {"release_lift": scene}
     timings, matchings = run_benchmarks(published, repeats=repeats), matching_benchmarks(repeats=repeats)
@@ -97,11 +100,10 @@ def run_benchmarks(published: Mapping[str, Path], *, repeats: int) -> list[dict[
     return timings
 
 
-def time_identify() -> float:
-    """Seconds from a folder of clouds to the report of `identify`: one lift of the towel of docs/own-clouds.md, of half the
+def time_fit() -> float:
+    """Seconds from clouds to the report of `diffcloud fit`: one lift of the towel of docs/own-clouds.md, of half the
     basis's stiffness and one and a half times its mass, with 2 mm of noise."""
-    from diffcloud.cli.episodes import simulated_frames  # not above: only this needs them
-    from diffcloud.cli.identify import identify
+    from diffcloud.jobs.episodes import simulated_frames  # not above: only this needs them
 
     towel = built_in("lift").model_copy(update=_TOWEL)
     scenario = make_scenario(towel)
@@ -118,7 +120,9 @@ def time_identify() -> float:
         track = np.column_stack([np.arange(len(nodes)) / towel.rate_hz, nodes[:, scenario.grasped[0]]])
         np.savetxt(recording / "gripper.csv", track, delimiter=",", header="t_s,x,y,z", comments="")
         begin = time.perf_counter()
-        identify([recording], Path(folder) / "found", size="0.40x0.30", mass="0.24", threads=thread_count())
+        command = [sys.executable, "-m", "diffcloud", "fit", str(recording), "--out", str(Path(folder) / "found")]
+        known = ["--size", "0.40x0.30", "--density", "0.24", "--threads", str(thread_count())]
+        subprocess.run([*command, *known], check=True, capture_output=True)
         return time.perf_counter() - begin
 
 

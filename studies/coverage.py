@@ -14,23 +14,25 @@ import torch
 import typer
 from rich.table import Table
 
-from diffcloud.cli.config import Config, EpisodesConfig, load_config
-from diffcloud.cli.console import JsonFlag, ParamsFile, Workers, errors, finish, show, warn, writes
-from diffcloud.cli.episodes import hidden_parameters, record_motion, simulated_frames
-from diffcloud.cli.fit_jobs import FitJob
-from diffcloud.cli.preprocess import PreprocessJob
-from diffcloud.cli.scenario_options import choose_scenario
-from diffcloud.cli.workers import Tell, run_all
+from diffcloud.cli.options import JsonFlag, ParamsFile, Workers
+from diffcloud.console import errors, finish, show, warn, writes
 from diffcloud.errors import ConfigError, DiffCloudError, OutputError
 from diffcloud.estimation.pose import SET_UP, PoseSpace
 from diffcloud.estimation.result import describe_fit
 from diffcloud.estimation.task import Recording
-from diffcloud.evaluation.intervals import LEVEL, intervals_of
+from diffcloud.evaluation.intervals import intervals_of
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import files_in, read_json, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint, kept_record
+from diffcloud.jobs.episodes import hidden_parameters, record_motion, simulated_frames
+from diffcloud.jobs.fits import FitJob
+from diffcloud.jobs.pool import Tell, run_all
+from diffcloud.jobs.preprocess import PreprocessJob
+from diffcloud.jobs.scenarios import choose_scenario
+from diffcloud.jobs.settings import Config, EpisodesConfig, load_config
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.depth_camera import DepthNoise
+from diffcloud.settings import updated
 from diffcloud.sim.properties import PARAMETERS
 from studies.coverage_page import (
     HEAD,
@@ -89,7 +91,7 @@ def coverage(
     ] = "same",
     checkpoint: Annotated[
         list[Path] | None,
-        typer.Option(help="Written by `diffcloud train`, repeatable: what it predicts of the same recordings."),
+        typer.Option(help="Written by `diffcloud network train`, repeatable: what it predicts of the same recordings."),
     ] = None,
     markdown: Annotated[Path | None, typer.Option(help="Write all that the folder holds to this page.")] = None,
     workers: Workers = None,
@@ -98,9 +100,9 @@ def coverage(
 ) -> None:
     """Draw cloths, record and fit them, and count how often the stated intervals hold the truth.
 
-    Stretch and mass are drawn as `diffcloud episodes` draws them; material that is not fitted is off by the factors of
-    `fit.doubts`, cameras and clock by what fits assume of a calibrated set-up (2 mm, 0.3°, 2 ms), and the cloth lies about
-    a centimetre beside its place. A recording whose fit fails or gets no interval counts as a miss.
+    Stretch and mass are drawn as `python -m pipeline.episodes` draws them; material that is not fitted is off by the
+    factors of `fit.uncertain`, cameras and clock by what fits assume of a calibrated set-up (2 mm, 0.3°, 2 ms), and the
+    cloth lies about a centimetre beside its place. A recording whose fit fails or gets no interval counts as a miss.
     """
     config = load_config(params)
     known = tuple(fix or ())
@@ -112,9 +114,7 @@ def coverage(
     if refits and checkpoint:
         raise ConfigError("--checkpoint takes one recording of each cloth; leave out --checkpoint or --refits.")
     jobs = [
-        CoverageJob(
-            choose_scenario(name), index, seed, known, level or config.evaluate.level or LEVEL, truth, config, out, refit
-        )
+        CoverageJob(choose_scenario(name), index, seed, known, level or config.fit.level, truth, config, out, refit)
         for name in scenario or config.scenarios
         for index in range(recordings)
         for refit in (range(refits) if refits else (None,))
@@ -198,7 +198,7 @@ class CoverageJob:
         path = self.path
         truth, set_up = self.truth(), self.set_up()
         plan = [self.scenario, self.index, self.refit, self.seed, self.known, self.level, self.kind]
-        plan += [self.config.evaluate.within]
+        plan += [self.config.fit.identified_factor]
         plan += [truth, set_up, self._noise]
         sections = [self.config.episodes, self.config.preprocess, self.config.fit]
         mark = fingerprint([*plan, [str(section) for section in sections]], packages=_CODE)
@@ -249,7 +249,7 @@ class CoverageJob:
         return found
 
     def set_up(self) -> dict[str, float]:
-        """Errors of the set-up, drawn as fits doubt it, name of `estimation.pose` -> value [m, rad, s]; and how far
+        """Errors of the set-up, drawn as fits assume it, name of `estimation.pose` -> value [m, rad, s]; and how far
         beside its place the cloth is laid with its gripper, `laid_x` and `laid_y` [m]."""
         rng = self._random(2)
         deviations = {**SET_UP, "laid_x": _LAID_M, "laid_y": _LAID_M}
@@ -264,12 +264,15 @@ class CoverageJob:
         tell(0.5, "fit")
         fit = self.config.fit
         fixed = {**fit.fixed, **{name: truth[name] for name in self.known}}
-        fit = fit.model_copy(update={"fixed": fixed, "model_error": self.kind != "same"})
+        solver = {**fit.solver.model_dump(), "model_error": self.kind != "same"}
+        fit = updated(fit, fixed=fixed, solver=solver)
         job = FitJob(self.label, [Recording(self.scenario, self.label, episode)], fit, self.folder)
         objective, outcome = job.task.solved()
         outcome = outcome.uninterrupted()
         fitted = describe_fit(objective, job.task.space, job.task.solver_settings, outcome, episodes=[self.label]).record
-        found = intervals_of(fitted, job.task.space, self.scenario, level=self.level, within=self.config.evaluate.within)
+        found = intervals_of(
+            fitted, job.task.space, self.scenario, level=self.level, within=self.config.fit.identified_factor
+        )
         told: dict[str, Any] = {
             "loss": outcome.loss,
             "values": outcome.values,
@@ -387,7 +390,7 @@ def _predict(regressor: Regressor, jobs: Sequence[CoverageJob]) -> None:
         else:
             ends = zip(found.values[0].tolist(), found.first_intervals(job.level).items(), strict=True)
             parameters = {name: {"value": value, "low": low, "high": high} for value, (name, (low, high)) in ends}
-            stated = {"parameters": parameters, "within": job.config.evaluate.within, "level": job.level}
+            stated = {"parameters": parameters, "within": job.config.fit.identified_factor, "level": job.level}
             record = {"intervals": stated}
             if found.samples is not None and {"stretch", "mass"} <= set(told.names):
                 stretch, mass = (found.samples[0, :, told.names.index(name)] for name in ("stretch", "mass"))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from diffcloud.errors import ConfigError
-from diffcloud.evaluation.intervals import LEVEL
+from diffcloud.estimation.settings import LEVEL
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.io.files import files_in, read_json
@@ -250,8 +250,8 @@ def coverage_page(counts: Counts) -> str:
         "",
         "Cloths of drawn parameters are simulated, recorded (`lift` and `fold` by two depth cameras through "
         f"`preprocess`, the others by their whole surface), fitted, and the {level} interval is held against the truth. "
-        "Material that is not asked for is off by the factors that fits state (`estimation.doubts`); cameras and clock are "
-        "off by what they assume of a calibrated set-up (2 mm and 0.3° along and about each axis, and 2 ms, as "
+        "Material that is not asked for is off by the factors that fits state (`estimation.uncertain`); cameras and clock "
+        "are off by what they assume of a calibrated set-up (2 mm and 0.3° along and about each axis, and 2 ms, as "
         "standard deviations; `preprocess` measures the clock anew), and the cloth is displaced by about a centimetre. "
         "Errors and half-widths are of the natural logarithm: 0.1 is about 10 %. A fit that fails or states no "
         "interval is a miss. *Identified*: of the recordings with that verdict, how many are within its factor of the "

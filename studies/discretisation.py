@@ -9,10 +9,11 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from diffcloud.cli.console import JsonFlag, errors, finish, progress_bar, writes
-from diffcloud.cli.scenario_options import choose_scenario
+from diffcloud.cli.options import JsonFlag
+from diffcloud.console import errors, finish, progress_bar, writes
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.io.files import write_text
+from diffcloud.jobs.scenarios import choose_scenario
 from diffcloud.scene.description import Scene
 from diffcloud.sim.surrounding import Order
 from studies.convergence import FINER, NUDGE, PUSH, MeshRow, StepRow, mesh_study, step_study

@@ -2,7 +2,7 @@
 
     python -m studies foreign --seed SEED [--sets towels,folds] [--count 30] [--out build/foreign]
 
-Every other cloth is drawn from a wide range. `diffcloud identify` fits each recording as a user would; the study writes
+Every other cloth is drawn from a wide range. `diffcloud fit` fits each recording as a user would; the study writes
 what is told into cloth.yaml and recordings.yaml. Motions are kept by seed and every fit is a line of OUT/log.jsonl, so a
 study that was interrupted goes on where it ended.
 
@@ -32,11 +32,11 @@ import yaml
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from diffcloud.cli.identify import find_scene
 from diffcloud.errors import ConfigError
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.files import write_npz, write_text
+from diffcloud.jobs.scene_files import find_scene
 from diffcloud.mesh.shapes import grid_cloth
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios.grid import GridScenario
@@ -359,8 +359,8 @@ def fitted(one: Set, seed: int, out: Path, revision: str) -> Case:
     for path, cloth in zip(paths, cloths, strict=True):
         write_episode(path, seen(moved(cloth, one.simulator, out / "motions"), cloth, one.cameras, cut=one.cut))
     _tell(one, folder / "found", names, paths)
-    command = [sys.executable, "-m", "diffcloud", "identify", *map(str, paths), "--out", str(folder / "found")]
-    command += ["--mass", f"{cloths[0].sheet.density:.4f}", "--json"]
+    command = [sys.executable, "-m", "diffcloud", "fit", *map(str, paths), "--out", str(folder / "found")]
+    command += ["--density", f"{cloths[0].sheet.density:.4f}", "--json"]
     with (folder / "messages.txt").open("wb") as messages, (folder / "result.json").open("wb") as result:
         process = subprocess.Popen(command, stdout=result, stderr=messages)
         _, status, used = os.wait4(process.pid, 0)
@@ -525,7 +525,7 @@ def _page(cases: Sequence[Case], seed: int, count: int, revision: str) -> str:
             "# Cloths that other simulators move",
             "",
             f"Random cloths are moved by MuJoCo or Newton, with {COLUMNS} × {ROWS} nodes, and seen by depth "
-            f"cameras with {1e3 * _NOISE:.0f} mm of noise. `diffcloud identify` fits each recording; the density is known. "
+            f"cameras with {1e3 * _NOISE:.0f} mm of noise. `diffcloud fit` fits each recording; the density is known. "
             "Odd seeds have wide ranges of material. *Held* counts 90 % intervals of the stretching stiffness that contain "
             "the truth; a fit without an interval counts as not held. Half-widths are factors.",
             "",

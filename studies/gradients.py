@@ -13,11 +13,12 @@ import typer
 from numpy.typing import NDArray
 from rich.table import Table
 
-from diffcloud.cli.console import JsonFlag, Threads, finish, progress_bar, show, writes
-from diffcloud.cli.scenario_options import ScenarioName, SceneFile, choose_scenario
+from diffcloud.cli.options import JsonFlag, SceneName, Threads
+from diffcloud.console import finish, progress_bar, show, writes
 from diffcloud.errors import ConfigError
 from diffcloud.io.files import write_text
 from diffcloud.io.fingerprints import fingerprint
+from diffcloud.jobs.scenarios import scene_named
 from diffcloud.sim.threads import use_threads
 from studies.gradient_agreement import NAMES, Agreement, gradient_agreement, random_parameters
 
@@ -28,8 +29,7 @@ _OF = ["scenario", "integrator", "simulator"]
 
 @writes(".csv")
 def gradients(
-    scenario: ScenarioName = None,
-    scene: SceneFile = None,
+    scene: SceneName = "lift",
     integrator: Annotated[Literal["implicit", "arcsim"] | None, typer.Option(help="Instead of the scenario's own.")] = None,
     pairs: Annotated[int, typer.Option(min=1, max=100_000, help="Random (stretch, mass), uniform over their bounds.")] = 50,
     seed: Annotated[int, typer.Option(min=0, help="Of the pairs.")] = 0,
@@ -40,7 +40,7 @@ def gradients(
     """Sign and size of d loss/d parameter against the central difference of ±1 %; the loss is the mean squared node
     distance at the loss frame to the run at (1, 1)."""
     use_threads(threads)
-    chosen = choose_scenario(scenario, scene)
+    chosen = scene_named(scene or "lift")
     if integrator is not None:
         chosen = replace(chosen, scene=chosen.scene.stepped(integrator))
     drawn = random_parameters(chosen, pairs, seed=seed)

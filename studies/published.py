@@ -8,21 +8,23 @@ from typing import Annotated, Any
 
 import typer
 
-from diffcloud.cli.comparison import compare, comparison_jobs
-from diffcloud.cli.config import Config, load_config
-from diffcloud.cli.console import JsonFlag, Threads, Workers, errors, finish, writes
-from diffcloud.cli.evaluate import AllowMissing, MarkdownFile, stop_if_missing, write_evaluation
-from diffcloud.cli.fit_jobs import FitJob
-from diffcloud.cli.report import report
-from diffcloud.cli.scenario_options import choose_scenario
-from diffcloud.cli.workers import run_all
+from diffcloud.cli.options import JsonFlag, Threads, Workers
+from diffcloud.console import errors, finish, writes
 from diffcloud.errors import ConfigError
 from diffcloud.estimation.task import Recording
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.files import read_json
 from diffcloud.io.imports import release_episodes
+from diffcloud.jobs.comparison import compare, comparison_jobs
+from diffcloud.jobs.evaluation import write_evaluation
+from diffcloud.jobs.fits import FitJob
+from diffcloud.jobs.pool import run_all
+from diffcloud.jobs.report import write_report
+from diffcloud.jobs.scenarios import choose_scenario
+from diffcloud.jobs.settings import Config, load_config
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.threads import use_threads
+from pipeline.evaluate import AllowMissing, MarkdownFile, stop_if_missing
 from studies.acceptance import SCENES
 
 _PROFILE = Path("pipeline/profiles/release.yaml")
@@ -85,13 +87,14 @@ def published(
         references=references,
     )
     if comparison.records:
-        report(
-            out=out / "index.html",
+        write_report(
+            out / "index.html",
+            config,
+            params,
             fits=data / "fits",
             episodes=data / "episodes",
             regressors=data / "regressors",
             tables=out / "tables",
-            params=params,
         )
     finish({"metrics": metrics, "missing": comparison.missing}, json)
     stop_if_missing(comparison, allow_missing)

@@ -2,14 +2,12 @@
 
     python -m studies recorded EPISODES [--fits build/recorded]
 
-EPISODES is what `diffcloud import --trajectories` writes. Finished fits are kept.
+EPISODES is what `diffcloud data import --kind release --trajectories` writes. Finished fits are kept.
 """
 
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -18,10 +16,16 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from diffcloud.errors import ConfigError
-from diffcloud.estimation.record import FitRecord, read_fit
+from diffcloud.errors import ConfigError, DiffCloudError
+from diffcloud.estimation.record import FitRecord
+from diffcloud.estimation.settings import FitSettings
+from diffcloud.estimation.task import Recording
 from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import write_text
+from diffcloud.jobs.fits import FitJob
+from diffcloud.jobs.pool import run_all
+from diffcloud.scene.scenarios import load_scenario
 
 SCENARIOS = ("recorded_lift", "recorded_fold")
 PAGE = Path("docs/results/recorded.md")
@@ -43,10 +47,22 @@ def main(
     for scenario in SCENARIOS:
         files = sorted((episodes / scenario).glob("*.npz"))
         if not files:
-            raise ConfigError(f"{episodes / scenario} holds no episodes: `diffcloud import --trajectories` writes them.")
-        command = [sys.executable, "-m", "diffcloud", "fit", "--scenario", scenario, "--out", str(fits / scenario)]
-        subprocess.run([*command, "--workers", str(workers), *map(str, files)], check=True)
-        found |= {file.stem: read_fit(fits / scenario / f"{file.stem}.json") for file in files}
+            raise ConfigError(
+                f"{episodes / scenario} holds no episodes: `diffcloud data import --trajectories` writes them."
+            )
+        jobs = [
+            FitJob(
+                file.stem,
+                [Recording(load_scenario(scenario), file.stem, read_episode(file))],
+                FitSettings(),
+                fits / scenario,
+            )
+            for file in files
+        ]
+        for job, record, error in run_all("fit", jobs, workers, patient=True):
+            if record is None:
+                raise DiffCloudError(f"{job.label}: {error}")
+            found[job.name] = record
     write_text(markdown, page(found))
 
 

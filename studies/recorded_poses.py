@@ -13,10 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from diffcloud.cli.config import EpisodesConfig
-from diffcloud.cli.fit_jobs import FitJob
-from diffcloud.cli.scenario_options import scenario_options
-from diffcloud.cli.workers import Tell
 from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.estimation.result import describe_fit
 from diffcloud.estimation.settings import FitSettings
@@ -25,11 +21,16 @@ from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.evaluation.summary import percent
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
+from diffcloud.jobs.fits import FitJob
+from diffcloud.jobs.pool import Tell
+from diffcloud.jobs.scenarios import scenario_options
+from diffcloud.jobs.settings import EpisodesConfig
 from diffcloud.scene.scenarios import GridScenario, Scenario, make_scenario
 from diffcloud.scene.scenarios.layout import find_layout
 from diffcloud.sensing.calibration.checkerboard import rigid_motion
 from diffcloud.sensing.cameras import inverse, transform
 from diffcloud.sensing.recorder import Truth, read_truth
+from diffcloud.settings import updated
 
 POSE_HEAD = (
     "cloth at the start",
@@ -74,8 +75,8 @@ class PoseJob:
             tell(place / len(every), f"{start}, {nuisance}")
             scenario = laid(self.scenario, episode) if start == STARTS[2] else self.scenario
             turned = _TURN if start == STARTS[1] else "none"
-            told = {"parameters": ["stretch"], "fixed": {"mass": hidden["mass"]}, "nuisance": nuisance, "laid": turned}
-            config = self.config.model_copy(update=told)
+            known = {"mass": hidden["mass"]}
+            config = updated(self.config, parameters=["stretch"], fixed=known, alignment=nuisance, initial_state=turned)
             job = FitJob(self.label, [Recording(scenario, self.label, episode)], config, self.folder)
             objective, outcome = job.task.solved()
             outcome = outcome.uninterrupted()
@@ -97,7 +98,7 @@ class PoseJob:
 
 
 def laid(scenario: Scenario, episode: Episode) -> Scenario:
-    """A grid scenario whose cloth lies where the recording's first frame shows it, as `diffcloud identify` lays it.
+    """A grid scenario whose cloth lies where the recording's first frame shows it, as `diffcloud fit` lays it.
 
     Raises:
         ConfigError: not a grid scenario.
@@ -181,11 +182,11 @@ def pose_page(rows: Sequence[Sequence[str]], recordings: Sequence[dict[str, Any]
         "",
         f"Synthetic raw recordings (`make moved`). The cameras' stated places are off by {together:g} mm and {turned:g}° "
         f"together, the second camera's by {apart:g} mm and {twisted:g}° more; cloth and gripper are shifted by {beside:g} "
-        f"mm and turned by {yaw:g}° from the stated place; the joint log is {1e3 * recorded.lag_s:g} ms late. `diffcloud "
-        "preprocess` finds the cameras' places and the lag again. Then the stretch is fitted, with the mass known. The "
-        "cloth starts in one of three ways: exactly as the scenario says (`--laid none`); there, but with its turn fitted "
-        f"too (`--laid {_TURN}`, the default); or where the first frame of the recording shows it, as `diffcloud identify` "
-        "lays it.",
+        f"mm and turned by {yaw:g}° from the stated place; the joint log is {1e3 * recorded.lag_s:g} ms late. "
+        "`diffcloud data preprocess` finds the cameras' places and the lag again. Then the stretch is fitted, with the "
+        "mass known. The cloth starts in one of three ways: exactly as the scenario says (`--initial-state none`); there, "
+        f"but with its turn fitted too (`--initial-state {_TURN}`, the default); or where the first frame of the recording "
+        "shows it, as `diffcloud fit` lays it.",
         "",
         f"Preprocessing had the worse camera {np.median(shifts):.1f} mm from its place in the median and "
         f"{max(shifts):.1f} mm at most, and the log's lag within {np.median(late):.1f} ms in the median and "

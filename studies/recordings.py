@@ -10,17 +10,20 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from diffcloud.cli.config import EpisodesConfig, load_config
-from diffcloud.cli.console import JsonFlag, ParamsFile, Workers, finish, output, progress_bar, writes
-from diffcloud.cli.scenario_options import choose_scenario
-from diffcloud.cli.workers import run_all
+from diffcloud.cli.options import JsonFlag, ParamsFile, Workers
+from diffcloud.console import finish, output, progress_bar, writes
 from diffcloud.errors import ConfigError, DiffCloudError
-from diffcloud.estimation import FitSpace, Objective, solve
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.pose import parse_priors
 from diffcloud.estimation.settings import FitSettings
+from diffcloud.estimation.solvers import solve
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import folders_in, write_text
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
+from diffcloud.jobs.pool import run_all
+from diffcloud.jobs.scenarios import choose_scenario
+from diffcloud.jobs.settings import EpisodesConfig, load_config
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.evaluation import CloudFigures, evaluate_clouds, visible_clouds
 from diffcloud.sensing.recorder import Truth, read_truth
@@ -29,8 +32,8 @@ from studies.recorded_poses import PoseJob, pose_page, pose_rows
 
 @writes(".md")
 def recordings(
-    recorded: Annotated[Path, typer.Option(help="Folder with raw <scenario>/<episode>/ of `diffcloud episodes`.")],
-    episodes: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.npz of `diffcloud preprocess`.")],
+    recorded: Annotated[Path, typer.Option(help="Folder with raw <scenario>/<episode>/ of `python -m pipeline.episodes`.")],
+    episodes: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.npz of `diffcloud data preprocess`.")],
     out: Annotated[Path, typer.Option(help="Markdown file.")],
     fits: Annotated[bool, typer.Option(help="Also fit each: raw clouds, noise-free clouds, one camera.")] = True,
     nuisance: Annotated[
@@ -142,10 +145,11 @@ def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: l
     lines = [
         "# Raw recordings against their truth",
         "",
-        "Synthetic raw episodes (`diffcloud episodes`), made into clouds by `diffcloud preprocess`, compared with the "
-        "truth that only the recorder knows. Robot and table: part of the merged clouds' points that show them. Lost: part "
-        "of the visible cloth's measurements that is not in the cloud, over frames in which the cloth moves, and in which "
-        "it lies flat. Distances are RMS over a frame: mean and greatest over the frames. Command: `make recordings`.",
+        "Synthetic raw episodes (`python -m pipeline.episodes`), made into clouds by `diffcloud data preprocess`, compared "
+        "with the truth that only the recorder knows. Robot and table: part of the merged clouds' points that show them. "
+        "Lost: part of the visible cloth's measurements that is not in the cloud, over frames in which the cloth "
+        "moves, and in which it lies flat. Distances are RMS over a frame: mean and greatest over the frames. Command: "
+        "`make recordings`.",
         "",
         "| episode | points | robot % | table % | lost % | lost flat % | cloud to cloth mm | cloth to cloud mm | "
         "camera moved mm | arm thicker mm | log late ms |",

@@ -8,7 +8,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from diffcloud.cli.console import JsonFlag, errors, finish, progress_bar, writes
+from diffcloud.cli.options import JsonFlag
+from diffcloud.console import errors, finish, progress_bar, writes
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.io.files import write_text
 from diffcloud.simulators.problem import installed

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffcloud.estimation import Objective
+from diffcloud.estimation.objective import Objective
 from diffcloud.io.simulated import SimulatedSet
 from diffcloud.mesh import grid_cloth
 from diffcloud.scene.scenarios import Scenario, built_in, grid_scenario
@@ -40,7 +40,7 @@ def pytest_xdist_auto_num_workers() -> int:
 def _one_worker() -> Iterator[None]:
     """Commands that a test runs in its own process run their jobs there too, unless it gives --workers."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("diffcloud.cli.workers.cores", lambda: 1)
+        patch.setattr("diffcloud.jobs.pool.cores", lambda: 1)
         yield
 
 

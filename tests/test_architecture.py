@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import typer
 import yaml
 from pydantic import BaseModel
 
 ROOT = Path(__file__).parents[1]
-CLI = ROOT / "diffcloud" / "cli"
 ALLOWED = {
     "mesh": set(),
     "io": {"mesh"},
@@ -30,6 +31,20 @@ ALLOWED = {
     "hardware": {"mesh", "io", "clouds", "sensing"},
     "live": {"mesh", "io", "clouds", "sensing"},
     "report": {"mesh", "io", "sim", "scene", "clouds", "estimation", "regressors", "sensing", "evaluation"},
+    "jobs": {
+        "mesh",
+        "io",
+        "sim",
+        "scene",
+        "arcsim",
+        "clouds",
+        "estimation",
+        "evaluation",
+        "identification",
+        "regressors",
+        "sensing",
+        "report",
+    },
 }
 """Sub-package -> the sub-packages it may import; all may import errors."""
 REGISTERED = {"sim": {"arcsim"}, "scene": {"arcsim"}}
@@ -75,26 +90,48 @@ def test_meshes_and_kernels_know_no_torch():
             assert not any(name.split(".")[0] == "torch" for name in imported(path)), path
 
 
-SAME_RESULTS = {"console", "ctrl_c", "lazy", "predict", "scenario_options"}
-"""Modules of `cli` that decide nothing of what a stage of the default parameters writes."""
+SAME_RESULTS = {
+    "cli.app",
+    "cli.options",
+    "jobs.cluster",
+    "jobs.ctrl_c",
+    "jobs.fork_server",
+    "jobs.memory",
+    "jobs.scenarios",
+}
+"""Modules that decide nothing of what a stage writes."""
+LEAVES = {*SAME_RESULTS, "jobs.settings", "jobs.pool"}
+"""Modules whose own imports decide nothing either: values that a stage reads are its parameters."""
 
 
-def pipeline_modules(stage: str) -> set[str]:
-    """What a stage's command imports, itself or by the comparison."""
-    own = imported(CLI / f"{stage}.py")
-    return own | imported(CLI / "comparison.py") if "diffcloud.cli.comparison" in own else own
+def stage_modules(stage: str) -> dict[str, Path]:
+    """The command of a stage, and what it imports of `cli` and `jobs`, by name."""
+    found: dict[str, Path] = {}
+    todo = {f"pipeline.{stage}": ROOT / "pipeline" / f"{stage}.py"}
+    while todo:
+        name, path = todo.popitem()
+        found[name] = path
+        if name in LEAVES:
+            continue
+        for module in imported(path):
+            parts = module.split(".")
+            inner = ROOT.joinpath(*parts[:3]).with_suffix(".py")
+            if parts[0] == "diffcloud" and parts[1:2] in (["cli"], ["jobs"]) and inner.is_file():
+                todo |= {".".join(parts[1:3]): inner} if ".".join(parts[1:3]) not in found else {}
+    return found
 
 
 def needed_packages(stage: str) -> set[str]:
-    """Sub-packages a stage's command reaches, through whatever those import."""
+    """Rooms that a stage's command reaches, through whatever those import."""
+    modules = stage_modules(stage)
     seen: set[str] = set()
-    todo = packages(CLI / f"{stage}.py") & ALLOWED.keys()
-    if "diffcloud.cli.comparison" in pipeline_modules(stage):
-        todo |= packages(CLI / "comparison.py") & ALLOWED.keys()
-    if "scenario_options" in (CLI / f"{stage}.py").read_text(encoding="utf-8"):
-        todo |= {"scene"}
-    while todo:
+    todo = {"scene"} if "jobs.scenarios" in modules else set[str]()
+    for name, path in modules.items():
+        todo |= packages(path) & ALLOWED.keys() if name not in LEAVES else set()
+    while todo - {"jobs"}:
         package = todo.pop()
+        if package == "jobs":
+            continue
         seen.add(package)
         todo |= REGISTERED.get(package, set()) - seen
         for path in (ROOT / "diffcloud" / package).rglob("*.py"):
@@ -110,13 +147,15 @@ def stages() -> dict:
 def test_stage_dependencies_are_the_imports(stage):
     listed = {Path(dep).name for dep in stages()[stage]["deps"] if dep.startswith("diffcloud/") and not dep.endswith(".py")}
     assert listed == needed_packages(stage)
-    imports = {name.split(".")[2] for name in pipeline_modules(stage) if name.startswith("diffcloud.cli.")}
-    modules = {stage, *imports} - SAME_RESULTS
-    assert {f"diffcloud/cli/{name}.py" for name in modules} <= set(stages()[stage]["deps"])
+    decide = {f"diffcloud/{name.replace('.', '/')}.py" for name in stage_modules(stage) if name not in SAME_RESULTS}
+    decide = {name for name in decide if not name.startswith("diffcloud/pipeline/")}
+    files = {dep for dep in stages()[stage]["deps"] if dep.startswith(("diffcloud/cli/", "diffcloud/jobs/"))}
+    assert files == decide
 
 
 def test_stage_parameters_are_sections_of_the_configuration():
-    from diffcloud.cli.config import Config
+    from diffcloud.estimation.settings import FitSettings, LikelihoodSolver
+    from diffcloud.jobs.settings import Config
     from diffcloud.sim.properties import PARAMETERS
 
     written = yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8"))
@@ -130,6 +169,8 @@ def test_stage_parameters_are_sections_of_the_configuration():
         for key, field in section.model_fields.items():
             if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
                 compare(field.annotation, values[key], f"{name}{key}.")
+        if section is FitSettings:
+            assert list(values["solver"]) == list(LikelihoodSolver.model_fields)
 
     compare(Config, written, "")
     for mapping in ("bounds", "fixed"):
@@ -148,18 +189,18 @@ def test_every_setting_can_be_set_in_an_experiment(tmp_path):
     """By `dvc exp run -S`, which takes keys that the file states; and what is set is what a stage reads."""
     from dvc.utils.hydra import apply_overrides
 
-    from diffcloud.cli.config import load_config
+    from diffcloud.jobs.settings import load_config
 
     path = tmp_path / "params.yaml"
     for name in leaves(yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8"))):
         shutil.copy(ROOT / "params.yaml", path)
         apply_overrides(path, [f"{name}=null"])
-    changes = ["fit.seed=3", "fit.fixed.mass=1.2", "fit.bounds.stretch=[0.5,2]", "fit.solver=cma_es"]
+    changes = ["fit.seed=3", "fit.fixed.mass=1.2", "fit.bounds.stretch=[0.5,2]", "fit.solver.starts=2"]
     shutil.copy(ROOT / "params.yaml", path)
-    apply_overrides(path, [*changes, "fit.simulations=50", "preprocess.raw.origin_m=[1,2,3]"])
+    apply_overrides(path, [*changes, "preprocess.raw.origin_m=[1,2,3]"])
     config = load_config(path)
     assert (config.fit.seed, config.fit.fixed, config.fit.bounds) == (3, {"mass": 1.2}, {"stretch": (0.5, 2.0)})
-    assert (config.fit.solver, config.fit.simulations, config.preprocess.raw.origin_m) == ("cma_es", 50, (1.0, 2.0, 3.0))
+    assert (config.fit.solver.starts, config.preprocess.raw.origin_m) == (2, (1.0, 2.0, 3.0))
 
 
 def test_every_stage_command_exists():
@@ -169,7 +210,7 @@ def test_every_stage_command_exists():
 def test_stages_run_the_code_of_the_checkout():
     for name, stage in stages().items():
         assert stage["cmd"].startswith(f"python -m pipeline.{name} ")
-        assert f'stage("{name}")' in (ROOT / "pipeline" / f"{name}.py").read_text(encoding="utf-8")
+        assert "    stage(" in (ROOT / "pipeline" / f"{name}.py").read_text(encoding="utf-8")
 
 
 def check_commands(stages: dict) -> None:
@@ -178,17 +219,22 @@ def check_commands(stages: dict) -> None:
 
     from diffcloud.cli.app import app
 
-    commands = get_command(app).commands
     for stage in stages.values():
-        words = stage["cmd"].removeprefix("python -m pipeline.").removeprefix("diffcloud ").split()
-        assert words[0] in commands
-        options = {option for parameter in commands[words[0]].params for option in parameter.opts}
+        words = stage["cmd"].split()
+        if words[:2] == ["python", "-m"]:
+            module = importlib.import_module(words[2])
+            alone = typer.Typer()
+            name = words[2].removeprefix("pipeline.")
+            alone.command()(getattr(module, name, None) or module.generate)
+            command = get_command(alone)
+        else:
+            assert words[0] == "diffcloud"
+            command = get_command(app).get_command(None, words[1])
+        options = {option for parameter in command.params for option in parameter.opts}
         assert {word for word in words if word.startswith("--")} <= options
 
 
 def test_public_lists_name_what_exists():
-    import importlib
-
     for package in ALLOWED:
         module = importlib.import_module(f"diffcloud.{package}")
         for name in getattr(module, "__all__", []):
@@ -199,3 +245,19 @@ def test_dvc_does_not_phone_home():
     config = (ROOT / ".dvc" / "config").read_text(encoding="utf-8")
     assert "analytics = false" in config
     assert "check_update = false" in config
+
+
+def test_seven_commands_with_few_options():
+    from typer.main import get_command
+
+    from diffcloud.cli.app import app
+
+    def options(command) -> int:
+        own = sum(one.param_type_name == "option" for one in command.params)
+        return own + sum(
+            options(command.get_command(None, name)) for name in getattr(command, "list_commands", lambda _: [])(None)
+        )
+
+    top = get_command(app)
+    assert len(top.list_commands(None)) == 7
+    assert options(top) <= 135

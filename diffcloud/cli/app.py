@@ -9,51 +9,41 @@ import stat
 import sys
 import tempfile
 import traceback
-from collections.abc import Collection, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from diffcloud import __version__
-from diffcloud.cli import ctrl_c
-from diffcloud.cli.console import errors, say
-from diffcloud.cli.fork_server import begin_importing
-from diffcloud.cli.lazy import lazy_group
-from diffcloud.cli.memory import keep_freed_memory
+from diffcloud.cli.group import command_group
+from diffcloud.console import errors, say
 from diffcloud.errors import DiffCloudError
 from diffcloud.io.files import refuse_undecoded
+from diffcloud.jobs import ctrl_c
+from diffcloud.jobs.fork_server import begin_importing
+from diffcloud.jobs.memory import keep_freed_memory
 
+_PARALLEL = {
+    "data preprocess": "diffcloud.jobs.preprocess",
+    "network train": "diffcloud.jobs.train",
+}
+"""Commands that run their jobs in several processes, and what those import."""
 _MOST_TOLD = 300
 """Characters of an unforeseen error's message."""
 COMMANDS = {
-    "import": "diffcloud.cli.importing:import_",
-    "evaluate": "diffcloud.cli.evaluate:app",
-    "episode": "diffcloud.cli.raw_episode:app",
-    "episodes": "diffcloud.cli.episodes:episodes",
-    "preprocess": "diffcloud.cli.preprocess:preprocess",
-    "simulate": "diffcloud.cli.simulate:simulate",
     "fit": "diffcloud.cli.fit:fit",
-    "train": "diffcloud.cli.train:train",
-    "predict": "diffcloud.cli.predict:predict",
-    "report": "diffcloud.cli.report:report",
-    "identify": "diffcloud.cli.identify:identify",
-    "init": "diffcloud.cli.init:init",
-    "export": "diffcloud.cli.export:export",
+    "simulate": "diffcloud.cli.simulate:simulate",
     "view": "diffcloud.cli.view:view",
-    "rollout": "diffcloud.cli.rollout:rollout",
-    "visibility": "diffcloud.cli.visibility:visibility",
-    "materials": "diffcloud.cli.materials:materials",
-    "capture": "diffcloud.cli.capture:record",
-    "calibrate": "diffcloud.cli.calibrate:calibrate",
+    "export": "diffcloud.cli.export:export",
+    "data": "diffcloud.cli.data:app",
+    "network": "diffcloud.cli.network:app",
     "doctor": "diffcloud.cli.doctor:doctor",
 }
-"""Name -> where it lies; it is imported when it is run."""
-_PARALLEL = ("episodes", "preprocess", "fit", "train", "evaluate")
-"""Commands that run their jobs through `diffcloud.cli.workers`."""
+"""Name -> where it lies; it is imported when it is run or asked for help."""
 
 app = typer.Typer(
-    cls=lazy_group(COMMANDS),
+    cls=command_group(COMMANDS),
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Find the simulator parameters of a real cloth from the point clouds of its motion.",
@@ -70,21 +60,25 @@ def diffcloud(
 
 def main() -> None:
     """`diffcloud`."""
-    run(app, COMMANDS, _PARALLEL)
+    run(app, _PARALLEL.get(" ".join(sys.argv[1:3])))
 
 
-def stage(name: str) -> None:
-    """A stage of the pipeline as a program: the command of this name, with the options of the command line."""
-    sys.argv[1:1] = [name]
-    main()
+def stage(command: Callable[..., None], preload: str | None = None) -> None:
+    """A stage of the pipeline as a program.
+
+    Args:
+        preload: module that worker processes need; see `run`.
+    """
+    alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    alone.command()(command)
+    run(alone, preload)
 
 
-def run(app: typer.Typer, places: Mapping[str, str], parallel: Collection[str]) -> None:
+def run(app: typer.Typer, preload: str | None = None) -> None:
     """Run, and turn the project's own errors into a message and exit status 1; any other, into where its traceback is.
 
     Args:
-        places: of its commands.
-        parallel: commands that run their jobs through `diffcloud.cli.workers`.
+        preload: module that worker processes import while the command still reads its arguments.
     """
     _have_a_home()
     keep_freed_memory()
@@ -94,8 +88,8 @@ def run(app: typer.Typer, places: Mapping[str, str], parallel: Collection[str]) 
             stream.reconfigure(errors="backslashreplace")
     try:
         refuse_undecoded(sys.argv[1:])
-        if sys.argv[1:2] and sys.argv[1] in parallel:
-            begin_importing(places[sys.argv[1]].partition(":")[0], sys.argv[1:])
+        if preload is not None:
+            begin_importing(preload, sys.argv[1:])
         with ctrl_c.none_lost():
             app()
     except DiffCloudError as error:

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from diffcloud.cli.console import JsonFlag, finish, progress_bar, show, show_checks
-from diffcloud.hardware.installed import check_installation
+from diffcloud.cli.options import JsonFlag
+from diffcloud.console import finish, progress_bar, show, show_checks
 
 
 def doctor(
@@ -22,6 +22,8 @@ def doctor(
     json: JsonFlag = False,
 ) -> None:
     """Print what a capture needs and whether it is here. Nothing moves. Exit status 0 whatever is missing."""
+    from diffcloud.hardware.installed import check_installation
+
     if compile_:
         _compile()
     checks = check_installation(arm=arm, folder=folder)

@@ -10,14 +10,14 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from diffcloud.cli.console import JsonFlag, errors, finish, progress_bar, show, warn, writes
-from diffcloud.cli.scenario_options import ScenarioName, choose_scenario, fitted_scenario
+from diffcloud.cli.options import JsonFlag
+from diffcloud.console import errors, finish, progress_bar, show, warn, writes
 from diffcloud.errors import ConfigError
-from diffcloud.estimation.record import FitRecord, read_fit
 from diffcloud.io.files import together
 from diffcloud.io.manifests import remove_files
 
 if TYPE_CHECKING:
+    from diffcloud.estimation.record import FitRecord
     from diffcloud.simulators.export.check import Checked, Runnable
 
 TargetName = Literal["mujoco", "newton", "isaac", "arcsim", "obj"]
@@ -35,7 +35,6 @@ def export(
     recording: Annotated[
         str | None, typer.Option(help="For a joint fit: the recording whose motion is exported. Default: the first.")
     ] = None,
-    scenario: ScenarioName = None,
     samples: Annotated[
         int,
         typer.Option(
@@ -44,12 +43,6 @@ def export(
             help="Further exports, with parameters drawn from the fit's uncertainty, for domain randomisation.",
         ),
     ] = 0,
-    intervals: Annotated[
-        Path | None,
-        typer.Option(
-            help="For --samples: the JSON that `evaluate intervals --out` writes. Default: intervals.json beside the fit."
-        ),
-    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of --samples.")] = 0,
     check: Annotated[
         bool,
@@ -58,7 +51,9 @@ def export(
     json: JsonFlag = False,
 ) -> None:
     """Write a fitted cloth for another simulator: mesh, material in SI units, and the recorded motion of what is held."""
+    from diffcloud.estimation.record import read_fit
     from diffcloud.estimation.result import read_motion
+    from diffcloud.jobs.scenarios import choose_scenario, fitted_scenario
     from diffcloud.simulators.export.cloth import fitted_cloth
     from diffcloud.simulators.export.write import described, exported_files, write_export, write_samples
 
@@ -67,10 +62,10 @@ def export(
     if check and importlib.util.find_spec(to) is None:
         raise ConfigError(f"--check needs {to}. Try: pip install 'diffcloud[simulators]', or leave --check out.")
     record = read_fit(fit)
-    index = _index(record, recording, scenario)
+    index = _index(record, recording)
     one = record.episodes[index]
-    drawn = _draws(record, intervals or fit.parent / "intervals.json", samples, seed) if samples else []
-    chosen = choose_scenario(scenario or fitted_scenario(fit, one.scenario))
+    drawn = _draws(record, fit.parent / "intervals.json", samples, seed) if samples else []
+    chosen = choose_scenario(fitted_scenario(fit, one.scenario))
     motion = read_motion(fit.with_suffix(".npz"), index)
     cloth = fitted_cloth(one, motion, chosen, record.values)
     former, about = exported_files(out), {"fit": fit.name}
@@ -113,13 +108,13 @@ def _draws(record: FitRecord, path: Path, count: int, seed: int) -> list[dict[st
     return [{**record.values, **values} for values in draws(read_intervals(path, space), space, count, seed)]
 
 
-def _index(record: FitRecord, name: str | None, scenario: str | None) -> int:
+def _index(record: FitRecord, name: str | None) -> int:
     names = [one.name for one in record.episodes]
     if name is None:
         if len(names) > 1:
             errors.print(f"The motion is that of {names[0]}, the first of {len(names)} recordings.")
         return 0
-    return record.place_of(name, scenario)
+    return record.place_of(name, None)
 
 
 def _show(found: Checked, target: str, json: bool) -> None:

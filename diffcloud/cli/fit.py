@@ -1,300 +1,234 @@
-"""`diffcloud fit`: find the parameters that make the simulator move as the recording does."""
+"""`diffcloud fit`: from recordings of a cloth to its parameters."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
-from diffcloud.cli.config import Config, load_config
-from diffcloud.cli.console import (
-    JsonFlag,
-    ParamsFile,
-    Threads,
-    Workers,
-    assignments,
-    episode_files,
-    errors,
-    finish,
-    known,
-    refuse_many,
-    say,
-    show,
-    told_progress,
-    warn,
-    writes,
+from diffcloud.cli.options import ADVANCED, JsonFlag, ParamsFile, SceneName, Threads, Topics, merged, settings_options
+from diffcloud.console import duration_s, errors, finish
+from diffcloud.errors import ConfigError
+from diffcloud.estimation.settings import AdamSolver, FitSettings
+
+if TYPE_CHECKING:
+    from diffcloud.estimation.task import Recording
+    from diffcloud.jobs.cloth_fit import ClothFit
+
+_FITTING = 0.9
+"""Part of the time of --budget after which fits end: the report needs some, too."""
+
+
+@settings_options(
+    FitSettings,
+    everyday=("parameters", "fixed", "level"),
+    advanced=(
+        "bounds",
+        "prior",
+        "solver",
+        "solver.max_steps",
+        "solver.starts",
+        "loss",
+        "alignment",
+        "initial_state",
+        "uncertain",
+        "frames",
+        "seed",
+    ),
 )
-from diffcloud.cli.ctrl_c import none_lost
-from diffcloud.cli.fit_jobs import JOINT, FitJob, first_start, read_recordings, remove_stale, stated_recordings
-from diffcloud.cli.scenario_options import ScenarioName, SceneFile, choose_scenario
-from diffcloud.cli.workers import run_all
-from diffcloud.errors import ConfigError, DiffCloudError
-from diffcloud.estimation import FitRecord, FitSpace
-from diffcloud.estimation.task import Recording
-from diffcloud.io.episodes import read_episode
-from diffcloud.io.files import files_in, folders_in
-from diffcloud.io.manifests import read_manifest, write_manifest
-from diffcloud.settings import updated
-from diffcloud.sim.threads import use_threads
-
-_MOST_JOINT = 100
-"""Recordings of a joint fit, each of whose steps simulates all of them."""
-_INTERRUPTED = 130
-_SHOWN = {
-    "loss",
-    "loss_start",
-    "loss_resampled",
-    "rms_mm",
-    "iterations",
-    "simulations",
-    "seconds",
-    "stop_reason",
-    "parameters",
-    "nuisance",
-    "solver",
-}
-
-
-@writes()
 def fit(
-    episodes: Annotated[
+    recordings: Annotated[
         list[Path],
         typer.Argument(
-            help="Episode files, or folders of them; without --scenario, a folder with <scenario>/<episode>.npz, "
-            "SCENARIO=EPISODE for each (or SCENARIO=FOLDER), or a YAML file that lists episodes or folders by scenario."
+            help="Recordings of one cloth: folders of numbered clouds with a gripper.csv, raw episodes, ROS bags, episode "
+            "files. SCENE=FILE names the scene of each."
         ),
     ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="Folder; one JSON and one NPZ per fit: <episode>, joint, or without --scenario <scenario>/<episode>."
-        ),
-    ],
-    scenario: ScenarioName = None,
-    scene: SceneFile = None,
-    params: ParamsFile = None,
-    parameters: Annotated[str | None, typer.Option(help="Comma-separated, e.g. stretch,mass,bending.")] = None,
-    fix: Annotated[list[str] | None, typer.Option(help="PARAMETER=VALUE that is known, e.g. mass=1.2.")] = None,
-    bound: Annotated[list[str] | None, typer.Option(help="PARAMETER=LOW:HIGH, repeatable.")] = None,
-    solver: Annotated[
-        str | None,
-        typer.Option(
-            help="likelihood (default), with intervals; adam, the paper's; cma_es or random_search, without derivatives."
-        ),
+    out: Annotated[Path, typer.Option(help="Folder: fit.json, intervals.json, report.html, and what was found.")],
+    settings: Mapping[str, Any],
+    size: Annotated[str | None, typer.Option(help="Sides in metres, such as 0.40x0.30. Default: as seen.")] = None,
+    density: Annotated[
+        str | None, typer.Option(help="Weighed mass over area, in kg per square metre, such as 0.24 or 0.24+-0.01.")
     ] = None,
-    iterations: Annotated[int | None, typer.Option(help="Steps at most. Default: 12 of likelihood, 50 of adam.")] = None,
-    simulations: Annotated[
-        int | None, typer.Option(help="Of cma_es and random_search: as many at most. Default: 200.")
-    ] = None,
-    starts: Annotated[int | None, typer.Option(help="Places to descend from. Default: 3 of likelihood, 1 of adam.")] = None,
-    learning_rate: Annotated[float | None, typer.Option(help="Of adam. Default: the scenario's.")] = None,
+    scene: SceneName = None,
+    budget: Annotated[
+        str,
+        typer.Option(help="Time for reading, fits and report (90, 60s, 3min, 1h, none). Then the best so far is reported."),
+    ] = "5min",
+    topic: Topics = None,
     init: Annotated[
         str,
         typer.Option(
-            help="First start: middle, PARAMETER=VALUE,..., or a regressor's prediction: mlp, ... or its checkpoint."
+            help="First start: middle, PARAMETER=VALUE,..., or a regressor's prediction: mlp, ... or its checkpoint.",
+            rich_help_panel=ADVANCED,
         ),
     ] = "middle",
-    smoothing: Annotated[
-        float | None, typer.Option(help="Of adam: perturbation whose gradients are averaged; 0: none.")
-    ] = None,
-    threshold: Annotated[
-        float | None, typer.Option(help="Stop below this loss; default: never, with --paper the scenario's.")
-    ] = None,
-    points: Annotated[int | None, typer.Option(help="Sampled per frame.")] = None,
-    frame: Annotated[list[int] | None, typer.Option(help="Frame to compare, repeatable; default: all usable ones.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of all random numbers.")] = None,
-    resample: Annotated[bool | None, typer.Option(help="Of adam: new points in each iteration.")] = None,
-    paper: Annotated[
-        bool | None,
-        typer.Option(
-            "--paper",
-            help="The published measure: from cloth to recording only, at the loss frames, no pose; by adam unless "
-            "--solver names another.",
-        ),
-    ] = None,
-    nuisance: Annotated[
-        str | None,
-        typer.Option(
-            help="What of the recording's pose is found too, each with how far it may be off (a weak prior, no bound), "
-            "such as x=2cm,yaw=5deg,lag=50ms. Of x, y, z, tilt_x, tilt_y, yaw, lag, scale; none keeps the scene's pose. "
-            "Default: x and y 0.1m, yaw 30deg, z 2mm, tilt_x and tilt_y 0.29deg, lag 2ms or what preprocess says; "
-            "scale (of the cameras' depths, such as 2%) where the episode says how far it may be off."
-        ),
-    ] = None,
-    laid: Annotated[
-        str | None,
-        typer.Option(
-            help="Also find how the cloth lay before the motion, and how far off that may be: turn=5deg (askew under the "
-            "gripper), shape=5mm (not flat; of each of nine waves), size=2% (larger or smaller than stated), track=2% (the "
-            "gripper's path longer or shorter than recorded). Only if the cloth starts level. Replaces the default, which "
-            "is what the scenario says (turn=10deg for a cloth on a table, and shape=1cm too in the recorded_ ones; none "
-            "for bands and vests, other solvers and --paper)."
-        ),
-    ] = None,
-    doubts: Annotated[
-        str | None,
-        typer.Option(
-            help="Fit roughly known material too, unreported: bending=1.5x,drag=1.3x (the rest is exact), or none. Default "
-            "of likelihood with the implicit integrator: 1.5x of bending and damping, 1.3x of drag and frictions, 3x of "
-            "compression, unless the scenario's doubts say otherwise."
-        ),
-    ] = None,
-    prior: Annotated[
-        str | None,
-        typer.Option(
-            help="The factor of the basis material within which each multiplier probably lies, such as "
-            "bending=3x,mass=2x; none for no prior. Default: 10x, which decides only what the recording does not show."
-        ),
-    ] = None,
-    joint: Annotated[
-        bool | None, typer.Option("--joint", help="One parameter set for all episodes, of any scenario: one cloth.")
-    ] = None,
-    workers: Workers = None,
+    separate: Annotated[
+        bool, typer.Option("--separate", help="Fit each recording alone, in OUT/<recording>, instead of all together.")
+    ] = False,
+    dvc: Annotated[bool, typer.Option("--dvc", help="Make a DVC project of OUT: dvc.yaml and params.yaml.")] = False,
     threads: Threads = None,
+    params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
-    """Fit episodes. Ctrl-C writes the best so far and stops; the same command keeps what is finished and goes on."""
+    """Find the parameters of a cloth from recordings of it: layout, joint fit, intervals, and a report.
+
+    Ctrl-C writes the best so far. The same command keeps what is finished and goes on.
+    """
+    began = time.monotonic()
+    from diffcloud.io.files import claimed
+    from diffcloud.jobs.dvc_project import make_project
+    from diffcloud.jobs.fit_report import Status, result_of
+    from diffcloud.jobs.settings import load_config
+    from diffcloud.sim.threads import use_threads
+
     use_threads(threads)
-    config = load_config(params)
-    if paper and solver is None and config.fit.solver == "likelihood":  # which that measure has not
-        solver = "adam"
-    settings = updated(
-        config.fit,
-        parameters=None if parameters is None else [name.strip() for name in parameters.split(",")],
-        fixed=config.fit.fixed | assignments(fix, "--fix"),
-        bounds=config.fit.bounds | _bounds(bound),
-        solver=solver,
-        iterations=iterations,
-        simulations=simulations,
-        learning_rate=learning_rate,
-        starts=starts,
-        smoothing=smoothing,
-        threshold=threshold,
-        points=points,
-        frames=frame,
-        seed=seed,
-        resample=resample,
-        paper=paper,
-        nuisance=nuisance,
-        laid=laid,
-        prior=prior,
-        doubts=doubts,
-        joint=joint,
-    )
-    every, recordings = _recordings(episodes, scenario, scene, config)
-    if settings.joint:
-        refuse_many(recordings, _MOST_JOINT, "A joint fit takes", "Choose a part of them, or leave out --joint")
-    groups: dict[tuple[Path, str], list[Recording]] = {}
-    for folder, recording in recordings:
-        key = (out, JOINT) if settings.joint else (out / folder, recording.name)
-        groups.setdefault(key, []).append(recording)
-    jobs = [FitJob(name, members, settings, folder) for (folder, name), members in groups.items()]
-    jobs = [replace(job, init=first_start(init, job)) for job in jobs]
-    # everything is read before anything is fitted: a damaged last file must not cost the first ones' time
-    for job in told_progress("checking", jobs):
-        job.task.objective()
-    space = jobs[0].task.space.asked
-    table = Table("episode", "start", "final", "rms mm", *space.names, "iterations", "seconds", "stopped by")
-    results: dict[str, Any] = {}
-    failures: list[str] = []
-
-    def told_as(job: FitJob) -> str:
-        return job.label if every and job.name != JOINT else job.name
-
-    def add(job: FitJob, record: FitRecord) -> None:
-        name = told_as(job)
-        plain = record.plain() | {"seconds": record.seconds}
-        results[name] = {key: value for key, value in plain.items() if key in _SHOWN}
-        table.add_row(name, *_row(record, space))
-        for recording in record.episodes if job.name == JOINT else ():
-            left = recording.left_out
-            told = "" if left is None else f", {left.rms_mm:.1f} with the parameters of the others"
-            errors.print(f"{recording.scenario}/{recording.name}: RMS {recording.rms_mm:.1f} mm{told}")
-        for failure in record.failures:
-            say(f"{name}:", failure, style="yellow")
-
-    if every:  # stated before, so that what an interrupted call leaves is known too
-        write_manifest(out, read_manifest(out) | {path.relative_to(out).as_posix() for job in jobs for path in job.files})
-    try:
-        with none_lost():
-            for job, record, error in run_all("fit", jobs, workers, patient=True):
-                if error is None:
-                    errors.print(f"{job.label}: loss {record.loss_start:.3e} -> {record.loss:.3e}")
-                    add(job, record)
-                else:
-                    failures.append(f"{told_as(job)}: {error}")
-    except KeyboardInterrupt:
-        for job in jobs:
-            if told_as(job) not in results and (best := job.known()) is not None:
-                add(job, best)
-        show(table, json)
-        errors.print(f"Interrupted: {out} has the best so far of each. The same command keeps finished fits and goes on.")
-        raise typer.Exit(_INTERRUPTED) from None
-    show(table, json)
-    finish({"out": str(out), "fits": results}, json)
-    if failures:
-        raise DiffCloudError("\n".join(failures))
-    if every:
-        remove_stale(out, jobs)
+    seconds = None if budget == "none" else duration_s(budget, "--budget")
+    weighed, sides = None if density is None else _weighed(density), None if size is None else _sides(size)
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"--out takes a folder, and {out} is a file.")
+    stored = None if params is None else load_config(params).fit
+    scenes = _scenes(recordings, scene)
+    known = None not in scenes.values()
+    if known and (size or density):
+        raise ConfigError("--size and --density are for a scene that is found; leave them out beside a known one.")
+    if known and dvc:
+        raise ConfigError("--dvc makes a project of a scene that is found; leave it out beside a known one.")
+    results = {}
+    interrupted = False
+    with claimed(out):
+        groups = {out / path.stem: {path: named} for path, named in scenes.items()} if separate else {out: scenes}
+        for folder, members in groups.items():
+            if known:
+                task = _known(members, folder, topic or (), settings, stored or FitSettings(), init)
+            else:
+                task = _found(list(members), folder, sides, weighed, topic or (), settings, stored, init)
+            left = None if seconds is None else max(_FITTING * seconds - (time.monotonic() - began), 1.0)
+            told, findings = task.run(left)
+            for line in findings:
+                errors.print(line, soft_wrap=True)
+            errors.print(f"Wrote {folder / 'report.html'}, {folder / 'fit.json'}.")
+            results[folder.name] = result_of(told, findings)
+            if told.status == Status.interrupted:
+                interrupted = True
+                break
+            if dvc:
+                make_project(folder)
+    finish(results if separate else next(iter(results.values())), json)
+    if interrupted:
+        raise KeyboardInterrupt
 
 
-def _by_scenario(episodes: list[Path], scenarios: list[str]) -> list[str]:
-    """Those scenarios that have episodes in the only folder that is given; none if there is another argument."""
-    if len(episodes) != 1:
-        return []
-    there = [name for name in scenarios if files_in(episodes[0] / name, ".npz")]
-    if there and (missing := [name for name in scenarios if name not in there]):
-        errors.print(f"{episodes[0]} has no episodes of {', '.join(missing)}.", soft_wrap=True)
-    more = [folder.name for folder in folders_in(episodes[0]) if folder.name not in scenarios and files_in(folder, ".npz")]
-    if there and more:
-        warn(f"{episodes[0]} also has episodes of {', '.join(more)}. They are not fitted: list them under `scenarios`.")
-    return there
-
-
-def _recordings(
-    arguments: list[Path], scenario: str | None, scene: Path | None, config: Config
-) -> tuple[bool, list[tuple[str, Recording]]]:
-    """Whether the arguments stand for a folder of all scenarios, and each recording with the folder of its fit.
+def _scenes(recordings: Sequence[Path], scene: str | None) -> dict[Path, str | None]:
+    """Each recording -> its scene; None: it is found.
 
     Raises:
-        ConfigError, EpisodeError: what is stated cannot be read.
+        ConfigError: some name theirs and others do not, or two recordings have one name.
     """
-    stated = stated_recordings(arguments)
-    if stated is not None:
-        if scenario is not None or scene is not None:
-            raise ConfigError("Each episode names its scenario; leave out --scenario and --scene.")
-        return False, [(one.scenario.name, one) for one in read_recordings(stated)]
-    if scenario is None and scene is None and (there := _by_scenario(arguments, config.scenarios)):
-        tree = [(name, path) for name in there for path in episode_files([arguments[0] / name])]
-        found = read_recordings(tree)
-        return True, [(name, one) for (name, _), one in zip(tree, found, strict=True)]
-    chosen = choose_scenario(scenario, scene)
-    files = told_progress("reading", episode_files(arguments))
-    return False, [("", Recording(chosen, path.stem, read_episode(path))) for path in files]
+    from diffcloud.jobs.scene_files import named_recordings
+
+    parts = [(scene, path) for path in recordings]
+    # an equals sign may be a part of a name
+    if scene is None and not all(path.exists() for path in recordings) and any("=" in str(path) for path in recordings):
+        pairs = [str(path).partition("=") for path in recordings]
+        if not all(name and path for name, _, path in pairs):
+            raise ConfigError("Give each recording its scene, as in lift=a.npz fold=b.npz, or none.")
+        parts = [(name, Path(path)) for name, _, path in pairs]
+    named_recordings([path for _, path in parts])  # refuses two of one name
+    return {path: name for name, given in parts for path in named_recordings([given]).values()}
 
 
-def _row(record: FitRecord, space: FitSpace) -> list[str]:
-    return [
-        f"{record.loss_start:.3e}",
-        f"{record.loss:.3e}",
-        f"{record.rms_mm:.1f}",
-        *(f"{record.parameters[name].value:.3f}" for name in space.names),
-        str(record.iterations),
-        known(record.seconds, ".1f"),
-        record.stop_reason,
+def _found(
+    recordings: Sequence[Path],
+    out: Path,
+    size: tuple[float, float] | None,
+    weighed: tuple[float, float] | None,
+    topics: Sequence[str],
+    typed: Mapping[str, Any],
+    stored: FitSettings | None,
+    init: str,
+) -> ClothFit:
+    """The fit of recordings whose scenes are found, or read from what an earlier run found."""
+    from diffcloud.estimation.task import Recording
+    from diffcloud.identification import fit_settings, with_density
+    from diffcloud.jobs.cloth_fit import ClothFit
+    from diffcloud.jobs.scene_files import find_scene
+    from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
+
+    episodes, cloth, layouts = find_scene(recordings, out, size, None if weighed is None else weighed[0], topics)
+    if weighed is not None and weighed[1]:
+        cloth = with_density(cloth, *weighed)
+    chosen = merged(fit_settings(typed.get("parameters"), cloth, weighed, stored), typed)
+    scenes = {name: {**cloth, **fields} for name, fields in layouts.items()}
+    members = [
+        Recording(make_scenario(own_options(scenes[name], name, f"scene of {name}", folder=out)), name, episode)
+        for name, episode in episodes.items()
     ]
+    return ClothFit(members, chosen, out, scenes, _start(init, members, chosen))
 
 
-def _bounds(items: list[str] | None) -> dict[str, tuple[float, float]]:
-    bounds: dict[str, tuple[float, float]] = {}
-    for item in items or []:
-        name, _, text = item.partition("=")
-        low, _, high = text.partition(":")
-        try:
-            bounds[name.strip()] = (float(low), float(high))
-        except ValueError as error:
-            raise ConfigError(f"--bound takes NAME=LOW:HIGH, got {item!r}.") from error
-    return bounds
+def _known(
+    scenes: Mapping[Path, str | None],
+    out: Path,
+    topics: Sequence[str],
+    typed: Mapping[str, Any],
+    stored: FitSettings,
+    init: str,
+) -> ClothFit:
+    """The fit of recordings in known scenes."""
+    from diffcloud.estimation.task import Recording
+    from diffcloud.jobs.cloth_fit import ClothFit
+    from diffcloud.jobs.scenarios import scene_named
+    from diffcloud.jobs.scene_files import named_recordings, read_all, scene_fields
+
+    named = named_recordings(list(scenes))
+    sources = {name: str(scenes[path]) for name, path in named.items()}
+    chosen = stored
+    if typed.get("loss") == "paper" and "solver" not in typed and chosen.solver.name == "likelihood":
+        chosen = chosen.model_copy(update={"solver": AdamSolver()})  # that loss has no likelihood
+    chosen = merged(chosen, typed)
+    episodes = read_all(named, out, topics, keep=False)
+    scenarios = {source: scene_named(source) for source in dict.fromkeys(sources.values())}
+    members = [Recording(scenarios[sources[name]], name, episode) for name, episode in episodes.items()]
+    found = {scenarios[source].name: fields for source in scenarios if (fields := scene_fields(source)) is not None}
+    return ClothFit(members, chosen, out, found, _start(init, members, chosen))
+
+
+def _start(init: str, members: Sequence[Recording], settings: FitSettings) -> dict[str, float]:
+    """Values of the first start by name; none where it is the middle of the range."""
+    if init == "middle":
+        return {}
+    from diffcloud.estimation.task import FitTask
+    from diffcloud.jobs.starts import first_start
+
+    return first_start(init, FitTask(members, settings))
+
+
+def _sides(text: str) -> tuple[float, float]:
+    parts = text.lower().split("x")
+    try:
+        sides = tuple(float(part) for part in parts)
+    except ValueError:
+        sides = ()
+    if len(sides) != 2 or not all(0 < side < 10 for side in sides):
+        raise ConfigError(f"--size takes two sides in metres, such as 0.40x0.30, got {text!r}.")
+    return sides
+
+
+def _weighed(text: str) -> tuple[float, float]:
+    """Density and its standard deviation [kg/m²], of 0.24 or 0.24+-0.01."""
+    value, _, error = text.replace("±", "+-").partition("+-")
+    try:
+        density, deviation = float(value), float(error or 0.0)
+    except ValueError:
+        density = deviation = math.nan
+    if not (0 < density < math.inf and 0 <= deviation < density / 2):
+        raise ConfigError(
+            f"--density is in kg per square metre, above 0, and may have a standard deviation below half of it, as in "
+            f"0.24+-0.01; got {text!r}."
+        )
+    return density, deviation

@@ -1,4 +1,4 @@
-"""`diffcloud predict`: parameters of recorded episodes by a trained network, in milliseconds."""
+"""`diffcloud network predict`: parameters of recorded episodes by a trained network, in milliseconds."""
 
 from __future__ import annotations
 
@@ -6,23 +6,15 @@ import time
 from pathlib import Path
 from typing import Annotated, Any
 
-import pandas as pd
 import typer
-from rich.table import Table
 
-from diffcloud.cli.console import JsonFlag, episode_files, errors, finish, show, with_suffix
-from diffcloud.errors import ConfigError, EpisodeError
-from diffcloud.io.episodes import Episode, read_episode
-from diffcloud.io.files import write_text
-from diffcloud.regressors import MODEL_NAMES, Regressor, predict_episode
-
-REGRESSORS = Path("data/regressors")
-"""Where the pipeline keeps checkpoints: <scenario>/<model>.safetensors."""
+from diffcloud.cli.options import JsonFlag
+from diffcloud.console import episode_files, errors, finish, show, with_suffix
 
 
 def predict(
     episodes: Annotated[list[Path], typer.Argument(help="Episode files, or folders of them.")],
-    checkpoint: Annotated[Path, typer.Option(help="Written by `diffcloud train`.")],
+    checkpoint: Annotated[Path, typer.Option(help="Written by `diffcloud network train`.")],
     level: Annotated[float, typer.Option(min=0.01, max=0.99, help="Probability of the intervals shown.")] = 0.9,
     seed: Annotated[int, typer.Option(min=0, help="Of the choice of points.")] = 0,
     samples: Annotated[
@@ -31,6 +23,14 @@ def predict(
     json: JsonFlag = False,
 ) -> None:
     """Predict the parameters of episodes. Values outside the bounds are shown as they are, and said to be outside."""
+    import pandas as pd
+    from rich.table import Table
+
+    from diffcloud.errors import ConfigError, EpisodeError
+    from diffcloud.io.episodes import read_episode
+    from diffcloud.io.files import write_text
+    from diffcloud.regressors import Regressor, predict_episode
+
     regressor = Regressor.read(checkpoint)
     if samples is not None and regressor.description.model != "posterior":
         raise ConfigError(f"--samples needs a posterior; {checkpoint} is a {regressor.description.model}, which has none.")
@@ -70,25 +70,3 @@ def predict(
     if not json:
         errors.print(f"{1e3 * sorted(seconds)[len(seconds) // 2]:.0f} ms an episode.")
     finish(found, json)
-
-
-def predicted_start(name: str, scenario: str, episode: Episode) -> dict[str, float]:
-    """Parameter -> value within the bounds, for a fit to start from.
-
-    Args:
-        name: a model, for the pipeline's own checkpoint of the scenario, or the path of a checkpoint.
-
-    Raises:
-        ConfigError, CheckpointError, EpisodeError: no such checkpoint, one of another scenario, or an episode that lacks
-            the frames that it sees.
-    """
-    path = REGRESSORS / scenario / f"{name}.safetensors" if name in MODEL_NAMES else Path(name)
-    if name not in MODEL_NAMES and not path.is_file():
-        raise ConfigError(
-            f"A start is middle, PARAMETER=VALUE,..., {', '.join(MODEL_NAMES)} or a checkpoint, got {name!r}."
-        )
-    regressor = Regressor.read(path)
-    if regressor.description.scenario != scenario:
-        raise ConfigError(f"{path} was trained for {regressor.description.scenario}, not for {scenario}.")
-    prediction = predict_episode(regressor, episode)
-    return dict(zip(prediction.names, prediction.clipped[0].tolist(), strict=True))

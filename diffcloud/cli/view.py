@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 import webbrowser
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,10 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from diffcloud.cli.config import load_config
-from diffcloud.cli.console import (
-    JsonFlag,
-    ParamsFile,
+from diffcloud.cli.options import JsonFlag, ParamsFile, SceneName
+from diffcloud.console import (
     episode_files,
     errors,
     finish,
@@ -23,30 +23,45 @@ from diffcloud.cli.console import (
     told_progress,
     writes,
 )
-from diffcloud.cli.scenario_options import ScenarioName, SceneFile, choose_scenario, fitted_scenario
-from diffcloud.estimation.record import FitRecord, read_fit
+from diffcloud.errors import ConfigError
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import write_text
 
 if TYPE_CHECKING:
+    from diffcloud.estimation.record import FitRecord
     from diffcloud.report.overlay import Layer, Overlay
     from diffcloud.sensing.fusion import Seen
 
 _MOST_EPISODES = 50
 """On a page, where each takes about a second and a megabyte."""
+_POLL_S = 0.1
+"""Between looks at the folder of a raw episode."""
 _PHOTOGRAPH_PX = 900
 """Widest row of the cameras' images."""
 
 
 @writes(".html")
 def view(
-    episodes: Annotated[list[Path], typer.Argument(help="Episode files (.npz), folders of them, or raw episodes.")],
+    episodes: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Episode files (.npz), folders of them, or raw episodes; --live takes one that is recorded now."
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="HTML file.")] = Path("view.html"),
-    scenario: ScenarioName = None,
-    scene: SceneFile = None,
+    scene: SceneName = None,
     fit: Annotated[Path | None, typer.Option(help="JSON of a fit to these episodes: its motion and pose.")] = None,
     frames: Annotated[int, typer.Option(min=1, max=1000, help="Of an episode that are shown, evenly spread.")] = 60,
     points: Annotated[int, typer.Option(min=1, max=100_000, help="Of a cloud that are shown.")] = 2000,
+    live: Annotated[
+        bool, typer.Option("--live", help="Follow a raw episode in a browser while it is recorded. Ctrl-C stops watching.")
+    ] = False,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Of --live: calibration file. Default: what camera.json says.")
+    ] = None,
+    port: Annotated[
+        int, typer.Option(min=1024, max=65535, help="Of --live; if it is taken, the next free one is used.")
+    ] = 8080,
     open_: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
     params: ParamsFile = None,
     json: JsonFlag = False,
@@ -57,8 +72,14 @@ def view(
     A fit adds the fitted cloth, before and after its pose was found.
     Raw episodes are made into clouds, and their images show what was masked.
     """
+    from diffcloud.estimation.record import read_fit
     from diffcloud.report.view import build_view
 
+    if live:
+        if len(episodes) != 1:
+            raise ConfigError(f"--live follows one raw episode, got {len(episodes)} paths.")
+        _follow(episodes[0], calibration, points, port, open_=open_)
+        return
     record = None if fit is None else read_fit(fit)
     overlays, facts = [], []
     paths = [path for given in episodes for path in ([given] if _is_raw(given) else episode_files([given]))]
@@ -66,7 +87,7 @@ def view(
     for path in told_progress("drawing", [path.absolute() for path in paths]):  # "." has no name
         seen = _raw(path, params) if _is_raw(path) else _Shown(read_episode(path), {})
         chosen = _spread(seen.episode.frame_count, frames)
-        layers, told = _layers(path, seen.episode, chosen, points, (scenario, scene), fit, record)
+        layers, told = _layers(path, seen.episode, chosen, points, scene, fit, record)
         overlays.append(_overlay(path.stem, seen, chosen, layers))
         facts += [(path.stem, line) for line in (_about(seen.episode), *told)]
     note = "Masked pixels are red, what was kept as cloth is green." if any(one.photographs for one in overlays) else ""
@@ -77,6 +98,28 @@ def view(
     if open_:
         webbrowser.open(out.resolve().as_uri())
     finish({"out": str(out), "episodes": len(overlays), "bytes": len(page.encode())}, json)
+
+
+def _follow(folder: Path, calibration: Path | None, points: int, port: int, *, open_: bool) -> None:
+    """Show clouds, cameras and tool while an episode is recorded. It need not exist yet, or may be finished."""
+    from diffcloud.io.calibrations import read_calibration
+    from diffcloud.live.follower import Follower
+    from diffcloud.live.page import LivePage
+
+    known = None if calibration is None else read_calibration(calibration)
+    follower = Follower(folder, known, points=points)
+    with LivePage(port=port, title=folder.name) as page, suppress(KeyboardInterrupt):  # which is how this ends
+        errors.print(f"Watching {folder} at {page.url} (Ctrl-C stops watching).", soft_wrap=True)
+        if not folder.exists():
+            errors.print(f"{folder} does not exist yet; waiting for it.", soft_wrap=True)
+        if open_:
+            webbrowser.open(page.url)
+        while True:
+            if (frame := follower.newest()) is not None:
+                page.show(frame)
+                if frame.status != "recording":
+                    errors.print(f"Recording {frame.status}. The page keeps its last frame until Ctrl-C.")
+            time.sleep(_POLL_S)
 
 
 @dataclass(frozen=True)
@@ -92,35 +135,35 @@ def _layers(
     episode: Episode,
     frames: list[int],
     points: int,
-    named: tuple[str | None, Path | None],
+    scene: str | None,
     fit: Path | None,
     record: FitRecord | None,
 ) -> tuple[list[Layer], list[str]]:
     """What is drawn of one episode, and what the table says of it."""
+    from diffcloud.jobs.scenarios import choose_scenario, fitted_scenario, scene_named
     from diffcloud.report.overlay import fitted_layers, recorded_layers
     from diffcloud.report.view import scene_layers, table_layers, unposed_layer
     from diffcloud.scene.scenarios import SCENARIO_NAMES
 
     times = episode.times[frames]
-    name, scene = named
     meant = episode.meta.get("scenario")
-    if fit is None and name is None and scene is None and meant in SCENARIO_NAMES:
-        name = str(meant)
-    alone = fit is None and name is None and scene is None
+    if fit is None and scene is None and meant in SCENARIO_NAMES:
+        scene = str(meant)
+    alone = fit is None and scene is None
     layers = recorded_layers(episode, frames, points=points, rng=np.random.default_rng(0), gripper=alone)
     if fit is not None and record is not None:
         from diffcloud.estimation.result import read_motion
 
-        place = record.place_of(path.stem, name)
+        place = record.place_of(path.stem, None)
         recording, motion = record.episodes[place], read_motion(fit.with_suffix(".npz"), place)
-        found = choose_scenario(name or (None if scene else fitted_scenario(fit, recording.scenario)), scene)
+        found = scene_named(scene) if scene else choose_scenario(fitted_scenario(fit, recording.scenario))
         layers += fitted_layers(motion, times)
         layers += [unposed_layer(found, recording, motion, times), *table_layers(found, motion.nodes.reshape(-1, 3))]
         values = ", ".join(f"{key} {value:.3g}" for key, value in record.values.items())
         return layers, [f"fitted in {recording.scenario}: {values}; RMS {recording.rms_mm:.1f} mm"]
-    if alone:
+    if scene is None:
         return layers, ["no scenario: the recording alone"]
-    chosen = choose_scenario(name, scene)
+    chosen = scene_named(scene)
     return layers + scene_layers(chosen, episode, times), [f"scenario {chosen.name}, basis material"]
 
 
@@ -146,10 +189,11 @@ def _is_raw(path: Path) -> bool:
 
 
 def _raw(path: Path, params: Path | None) -> _Shown:
-    """A raw episode as `diffcloud preprocess` makes clouds of it."""
-    from diffcloud.cli.preprocess import aligned, robot_mask
+    """A raw episode as `diffcloud data preprocess` makes clouds of it."""
     from diffcloud.io.images import encode_jpeg
     from diffcloud.io.raw_episodes import read_raw_episode
+    from diffcloud.jobs.preprocess import aligned, robot_mask
+    from diffcloud.jobs.settings import load_config
     from diffcloud.sensing.fusion import fuse
     from diffcloud.sensing.pictures import mask_picture
 

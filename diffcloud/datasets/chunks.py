@@ -77,8 +77,8 @@ def simulate_chunk(scenario: Scenario, draws: ParameterDraws, chunk: Chunk) -> S
         try:
             values = dict(zip(draws.box.names, parameters[missing].T, strict=True))
             runs = [chunk.start + int(entry) for entry in missing]
-            factors = [draws.doubtful(chunk.split, run, attempt) for run in runs]
-            for name in draws.doubts:
+            factors = [draws.uncertain_factors(chunk.split, run, attempt) for run in runs]
+            for name in draws.uncertain:
                 if value := scenario.value(name):
                     values[name] = np.minimum(value * np.array([one[name] for one in factors]), PARAMETERS[name].most)
             nodes[missing], diverged = _nodes(scenario, values)

@@ -134,25 +134,25 @@ class ParameterDraws:
     """Which parameters the runs of a set get.
 
     Raises:
-        ConfigError: modes for a scenario or for parameters that the published code has none for; doubts of what is drawn.
+        ConfigError: modes for what the published code has none for; uncertain material that is drawn.
     """
 
     box: ParameterBox
     kind: Draws
     scenario: str
     seed: int
-    doubts: Mapping[str, float] = field(default_factory=dict)
-    """Other material that differs from run to run, known within a factor of one deviation (`estimation.doubts`)."""
+    uncertain: Mapping[str, float] = field(default_factory=dict)
+    """Other material that differs from run to run, known within a factor of one deviation (`estimation.uncertain`)."""
 
     def __post_init__(self) -> None:
         if self.kind == "modes" and self.scenario not in MODES:
             raise ConfigError(
                 f"The published modes are for {', '.join(MODES)}, not for {self.scenario!r}; "
-                "use --draws uniform, sobol or logarithmic."
+                "use --distribution uniform, sobol or logarithmic."
             )
         if self.kind == "modes" and set(self.box.names) != set(_MIXED):
             raise ConfigError(f"The published modes draw {' and '.join(_MIXED)}, not {', '.join(self.box.names)}.")
-        if twice := [name for name in self.doubts if name in self.box.names]:
+        if twice := [name for name in self.uncertain if name in self.box.names]:
             raise ConfigError(f"Doubts are of other material than what is drawn; leave out {', '.join(twice)}.")
 
     def first(self, split: Split, count: int) -> NDArray[np.float64]:
@@ -164,10 +164,10 @@ class ParameterDraws:
         kind: Draws = "uniform" if self.kind == "sobol" else self.kind
         return self._draw(np.random.default_rng([self.seed, SPLITS.index(split), run, attempt]), 1, kind)[0]
 
-    def doubtful(self, split: Split, run: int, attempt: int) -> dict[str, float]:
+    def uncertain_factors(self, split: Split, run: int, attempt: int) -> dict[str, float]:
         """Factors of a run's other material, log-normal about one."""
         rng = np.random.default_rng([self.seed, SPLITS.index(split), run, attempt, 1])
-        return {name: rng.lognormal(0.0, math.log(factor)) for name, factor in self.doubts.items()}
+        return {name: rng.lognormal(0.0, math.log(factor)) for name, factor in self.uncertain.items()}
 
     def _draw(self, rng: np.random.Generator, count: int, kind: Draws) -> NDArray[np.float64]:
         match kind:

@@ -32,8 +32,6 @@ _WORKER_MEMORY = {
 }
 """Dask's settings, by which its processes keep memory that they freed. By default they give it back after 64 KiB, and a
 quarter of the time goes into getting it again."""
-_ANSWER_S = 10
-"""A scheduler that has not answered by then is not there [s]."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ def simulate_set(
     out: Path,
     *,
     workers: int = 0,
-    scheduler: str | None = None,
+    client: Any = None,
     clouds: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> SimulationOutcome:
@@ -81,33 +79,17 @@ def simulate_set(
 
     Args:
         workers: local processes with a thread each; 0: the threads of this one.
-        scheduler: address of a Dask scheduler, whose workers have this version of the package; instead of `workers`.
+        client: of a Dask scheduler, whose workers have this version of the package; instead of `workers`.
         clouds: points of each exported cloud; None: none are exported.
         progress: called with the number of finished runs.
 
     Raises:
-        ConfigError: no scheduler answers, or the folder holds something else.
+        ConfigError: the folder holds something else.
         DatasetError: a run diverges with every draw, or workers die.
         DiffCloudError: the folder cannot be written.
     """
     began = time.perf_counter()
     chunks = [chunk for split, count in plan.counts.items() for chunk in chunks_of(plan.draws, split, count)]
-    with ExitStack() as stack:
-        # before anything is written
-        client = None if scheduler is None else stack.enter_context(_scheduler_client(scheduler))
-        return _simulate_set(plan, out, chunks, workers, client, clouds, progress, began)
-
-
-def _simulate_set(
-    plan: SimulationPlan,
-    out: Path,
-    chunks: Sequence[Chunk],
-    workers: int,
-    client: Any,
-    clouds: int | None,
-    progress: Callable[[int], None] | None,
-    began: float,
-) -> SimulationOutcome:
     work = WorkFolder(out, [plan.scenario, plan.draws, dict(plan.counts)], chunks)
     missing = [chunk for chunk in chunks if work.read(chunk) is None]
     finished = resumed = sum(len(chunk.parameters) for chunk in chunks) - sum(len(c.parameters) for c in missing)
@@ -168,23 +150,6 @@ def _simulated(
 
 
 @contextmanager
-def _scheduler_client(address: str) -> Iterator[Any]:
-    """A Dask client of a scheduler.
-
-    Raises:
-        ConfigError: none answers.
-    """
-    from distributed import Client
-
-    try:
-        client = Client(address, timeout=_ANSWER_S)
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"No Dask scheduler answers at {address}: {error}. Start one with `dask scheduler`.") from error
-    with client:
-        yield client
-
-
-@contextmanager
 def _local_client(workers: int) -> Iterator[Any]:
     """A Dask client of processes on this machine."""
     import dask  # takes a second
@@ -227,7 +192,7 @@ def _write(
     about = {
         "draws": plan.draws.kind,
         "seed": plan.draws.seed,
-        "doubts": {name: factor for name, factor in plan.draws.doubts.items() if plan.scenario.value(name)},
+        "uncertain": {name: factor for name, factor in plan.draws.uncertain.items() if plan.scenario.value(name)},
         "integrator": plan.scenario.scene.integrator,
         "replaced": sum(len(part.replaced) for parts in results.values() for part in parts),
         "clouds": clouds or 0,

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloud.estimation.laid import check_resizable, is_laid, laid_nodes, sizes_of
+from diffcloud.estimation.initial_state import check_resizable, is_initial_state, laid_nodes, sizes_of
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.simulate import Rollout, init, rollout, rollout_tangents, still
@@ -50,7 +50,7 @@ class Inputs:
 
         Args:
             system: of the scenario's scene.
-            values: name -> [B], of parameters and of how the cloth lies (`estimation.laid`).
+            values: name -> [B], of parameters and of how the cloth lies (`estimation.initial_state`).
             track: [1, S or more, G, 3] recorded displacement of the grippers [m]; None: the scene's own motion.
 
         Raises:
@@ -60,7 +60,9 @@ class Inputs:
         size, reach = sizes_of(values)
         count = len(next(iter(values.values()))) if values else 1
         nodes = laid_nodes(system.mesh, values)
-        properties = scenario.properties(system, {name: value for name, value in values.items() if not is_laid(name)})
+        properties = scenario.properties(
+            system, {name: value for name, value in values.items() if not is_initial_state(name)}
+        )
         properties = properties.repeated(count) if properties.batch < count else properties
         if size is not None:
             check_resizable(scenario)

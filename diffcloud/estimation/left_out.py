@@ -11,8 +11,8 @@ from functools import partial
 
 import torch
 
+from diffcloud.estimation.initial_state import is_initial_state
 from diffcloud.estimation.joint import AnyObjective, JointObjective
-from diffcloud.estimation.laid import is_laid
 from diffcloud.estimation.names import of_recording, plain_name, without_recording
 from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.record import LeftOut
@@ -58,7 +58,7 @@ def leave_each_out(
             motion = member.match(run)
             loss = float(member.losses(motion).mean())  # without the prior of the pose, as the joint fit's is told
             rms_mm = 1e3 * member.scenario.length_unit_m * float(member.squares(motion).mean()) ** 0.5
-        parameters = {name: value for name, value in lying.fixed.items() if not is_laid(name)}
+        parameters = {name: value for name, value in lying.fixed.items() if not is_initial_state(name)}
         told.append(LeftOut(loss=loss, rms_mm=rms_mm, parameters=parameters))
     return told
 

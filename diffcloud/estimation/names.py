@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 SHARED = ("size",)
-"""Of how the cloth lies (`estimation.laid`), what is the same in all recordings."""
+"""Of how the cloth lies (`estimation.initial_state`), what is the same in all recordings."""
 _OWN = "@"
 T = TypeVar("T")
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -27,6 +28,10 @@ from diffcloud.sim.properties import PARAMETERS, check_values
 _EDGE = 1e-6
 
 
+Role = Literal["requested", "material", "initial_state"]
+"""Of a variable; the last two are of `estimation.uncertain` and `estimation.initial_state`."""
+
+
 @dataclass(frozen=True)
 class Variable:
     """One fitted number."""
@@ -38,8 +43,8 @@ class Variable:
     """Factor of one deviation of its log-normal prior; None: none."""
     centre: float = 1.0
     """Of the prior; by default the basis material."""
-    doubtful: bool = False
-    """Nobody asked for it: it is fitted too because it is not known exactly (`estimation.doubts`, `estimation.laid`)."""
+    role: Role = "requested"
+    """`material` and `initial_state` are nuisance variables: fitted because they are not known exactly, and no results."""
     deviation: float | None = None
     """One standard deviation of a normal prior about zero, instead of the log-normal one, of what may be negative."""
 
@@ -49,10 +54,15 @@ class Variable:
                 f"Bounds of {self.name!r} must be finite and in order (low < high), got [{self.low}, {self.high}]."
             )
 
+    @property
+    def nuisance(self) -> bool:
+        """Whether nobody asked for it."""
+        return self.role != "requested"
+
     def spread(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[n] values that parts [n] of 1, evenly spread, stand for: as the prior of doubtful material has them, of another
+        """[n] values that parts [n] of 1, evenly spread, stand for: as the prior of uncertain material has them, of another
         variable log-uniform over its range, or uniform where that begins at zero."""
-        if self.doubtful and self.prior is not None:
+        if self.role == "material" and self.prior is not None:
             from scipy.special import ndtri  # slow to import, and needed by few
 
             return np.clip(self.centre * self.prior ** ndtri(parts), self.low, self.high)
@@ -109,9 +119,9 @@ class FitSpace:
 
     @property
     def asked(self) -> FitSpace:
-        """What was asked for; doubtful material is where its prior has it."""
-        known = {variable.name: variable.centre for variable in self.variables if variable.doubtful}
-        return FitSpace(tuple(v for v in self.variables if not v.doubtful), {**self.fixed, **known})
+        """What was asked for; nuisance variables are at the centres of their priors."""
+        known = {variable.name: variable.centre for variable in self.variables if variable.nuisance}
+        return FitSpace(tuple(v for v in self.variables if not v.nuisance), {**self.fixed, **known})
 
     def of_recording(self, recording: int) -> tuple[FitSpace, Tensor]:
         """Of one recording of a joint fit (`estimation.names`), and where its k variables are among all."""
@@ -169,13 +179,13 @@ class FitSpace:
     def starts(self, count: int, *, seed: int, first: Mapping[str, float] | None = None) -> tuple[Tensor, Tensor]:
         """Initial values [count, k] and which scale each start uses, bool [count].
 
-        The first start is the middle of the range on the paper's linear scale, doubtful material where its prior has it, or
-        `first` where given. The others are spread by a scrambled Sobol sequence: over the box log-uniformly, doubtful
-        material as its prior says. How a cloth lies begins as in the first one.
+        The first start is the middle of the range on the paper's linear scale, for nuisance variables the centre of the
+        prior, or `first` where given. The others are spread by a scrambled Sobol sequence: over the box log-uniformly,
+        uncertain material as its prior says. How a cloth lies begins as in the first one.
         """
         values = np.empty((count, len(self.variables)))
         for column, variable in zip(values.T, self.variables, strict=True):
-            middle = variable.centre if variable.doubtful else 0.5 * (variable.low + variable.high)
+            middle = variable.centre if variable.nuisance else 0.5 * (variable.low + variable.high)
             column[:] = (first or {}).get(variable.name, middle)
         spread = [index for index, variable in enumerate(self.variables) if variable.deviation is None]
         if count > 1 and spread:

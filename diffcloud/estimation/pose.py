@@ -121,7 +121,7 @@ def default_priors(episode: Episode) -> dict[str, float]:
 
 
 def parse_priors(text: str) -> dict[str, float]:
-    """What `--nuisance` says -> name -> standard deviation of its prior [m, rad, s, 1], as of `parse_deviations`.
+    """What `--alignment` says -> name -> standard deviation of its prior [m, rad, s, 1], as of `parse_deviations`.
 
     Raises:
         ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.

@@ -9,11 +9,12 @@ from pydantic import ConfigDict, Field, ValidationError, field_validator, model_
 
 from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.estimation.names import SHARED, of_all
+from diffcloud.estimation.parameters import Role
 from diffcloud.io.files import read_json
 from diffcloud.io.schema import Plain
 from diffcloud.io.timings import read_seconds
 
-SCHEMA = 11
+SCHEMA = 12
 """Of the file. Another one is refused, by name."""
 
 LARGEST = 1e12
@@ -41,7 +42,7 @@ class NuisanceValue(_Model):
     """Of both."""
     of: Literal["pose", "cloth"] = "pose"
     """Of the scene against the recording (`estimation.pose`), or of the cloth when its motion begins
-    (`estimation.laid`)."""
+    (`estimation.initial_state`)."""
 
 
 class LeftOut(_Model):
@@ -113,8 +114,8 @@ class FittedParameter(_Model):
     """Factor of one deviation of its log-normal prior; None: none."""
     centre: Positive = 1.0
     """Of the prior; by default the basis material."""
-    doubtful: bool = False
-    """Not asked for, and fitted too because it is not known exactly."""
+    role: Role = "requested"
+    """Other than requested: a nuisance, fitted because it is not known exactly."""
     at_bound: bool = False
 
 
@@ -261,9 +262,9 @@ class FitRecord(_Model):
     fingerprint: Text = ""
     """Of inputs and code, by which a later call knows a finished fit."""
 
-    def laid_in(self, recording: RecordingFit | None) -> dict[str, float]:
-        """Name -> value, of how the cloth lies when a recording's motion begins (`estimation.laid`), as the simulator
-        takes it.
+    def initial_state_in(self, recording: RecordingFit | None) -> dict[str, float]:
+        """Name -> value, of how the cloth lies when a recording's motion begins, as the simulator takes it
+        (`estimation.initial_state`).
 
         Args:
             recording: one of `episodes`; None: one that is new to the fit, of which is known what all share.
@@ -290,7 +291,9 @@ class FitRecord(_Model):
         if scenario in found:
             return found[scenario]
         if len(found) > 1:
-            raise ConfigError(f"The fit knows {name} in {' and '.join(sorted(found))}; choose one by --scenario.")
+            raise ConfigError(
+                f"The fit knows {name} in {' and '.join(sorted(found))}; rename one of these recordings and fit again."
+            )
         return next(iter(found.values()))
 
     def known_place(self, name: str, scenario: str | None = None) -> int | None:
@@ -324,11 +327,11 @@ class FitRecord(_Model):
     @property
     def fitted(self) -> dict[str, float]:
         """Parameter -> value, of those that were asked for."""
-        return {name: one.value for name, one in self.parameters.items() if not (one.fixed or one.doubtful)}
+        return {name: one.value for name, one in self.parameters.items() if not (one.fixed or one.role != "requested")}
 
     @property
     def free(self) -> dict[str, float]:
-        """Name -> value, of all that was fitted: asked for, doubtful, or of how the cloth lies (`estimation.names`)."""
+        """Name -> value, of all that was fitted: requested, uncertain material, and of how the cloth lies."""
         material = {name: parameter.value for name, parameter in self.parameters.items() if not parameter.fixed}
         return {**material, **self._laid}
 
@@ -339,11 +342,24 @@ class FitRecord(_Model):
 
     @property
     def _laid(self) -> dict[str, float]:
-        return of_all([self.laid_in(one) for one in self.episodes])
+        return of_all([self.initial_state_in(one) for one in self.episodes])
 
     def plain(self) -> dict[str, Any]:
         """As the file has it."""
         return self.model_dump(mode="json", by_alias=True)
+
+
+def _is_record(told: Any) -> bool:
+    return isinstance(told, dict) and "parameters" in told and "loss" in told
+
+
+def is_fit(path: Path) -> bool:
+    """Whether a JSON file holds a fit, of whatever version.
+
+    Raises:
+        ConfigError: missing, or no JSON.
+    """
+    return _is_record(read_json(path, error=ConfigError))
 
 
 def read_fit(path: Path) -> FitRecord:
@@ -352,7 +368,7 @@ def read_fit(path: Path) -> FitRecord:
         ConfigError: missing, damaged, not a fit, or one of another version.
     """
     told = read_json(path, error=ConfigError)
-    if not isinstance(told, dict) or "parameters" not in told or "loss" not in told:
+    if not _is_record(told):
         raise ConfigError(f"{path} is not a fit written by `diffcloud fit`: it lacks `parameters` or `loss`.")
     if told.get("schema") != SCHEMA:
         raise ConfigError(

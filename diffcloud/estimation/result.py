@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloud.errors import ConfigError, DivergedError
+from diffcloud.estimation.initial_state import described_initial_state, is_initial_state
 from diffcloud.estimation.joint import AnyObjective, mean_loss
-from diffcloud.estimation.laid import described_laid, is_laid
 from diffcloud.estimation.likelihood import Estimate
 from diffcloud.estimation.names import of_recording
 from diffcloud.estimation.objective import Objective
@@ -142,7 +142,7 @@ def describe_fit(
     members, paper = objective.members, objective.paper
     first = members[0]
     values = {**outcome.values, **space.fixed}
-    material = {name: value for name, value in values.items() if not is_laid(name)}
+    material = {name: value for name, value in values.items() if not is_initial_state(name)}
     start_values = outcome.start | dict(space.fixed)
     unit = first.scenario.length_unit_m
     with torch.no_grad():
@@ -153,7 +153,7 @@ def describe_fit(
             describe_recording(member, run, name) for member, run, name in zip(members, runs, episodes, strict=True)
         ]
         for index, recording in enumerate(recordings):
-            recording.nuisance |= described_laid(space.of_recording(index)[0], own[index][0], length_unit_m=unit)
+            recording.nuisance |= described_initial_state(space.of_recording(index)[0], own[index][0], length_unit_m=unit)
         poses = [recorded_pose(recording, length_unit_m=unit)[1] for recording in recordings]
         motions = [
             _fitted_motion(member, run, start, pose)
@@ -399,14 +399,14 @@ def _parameters(scenario: Scenario, space: FitSpace, values: Mapping[str, float]
     for variable in (one for one in space.variables if one.name in values):
         entry, bounds = found[variable.name], (variable.low, variable.high)
         entry.bounds, entry.prior, entry.centre = bounds, variable.prior, variable.centre
-        entry.doubtful = variable.doubtful
+        entry.role = variable.role
         low, high, here = (math.log(one) if variable.low > 0 else one for one in (*bounds, entry.value))
         entry.at_bound = min(here - low, high - here) < _AT_BOUND * (high - low)
     return found
 
 
 def _estimate(found: Estimate, members: Sequence[Objective]) -> EstimateRecord:
-    asked = [index for index, one in enumerate(found.space.variables) if not one.doubtful]
+    asked = [index for index, one in enumerate(found.space.variables) if not one.nuisance]
     axis, names = Axis.of(found.space), [found.space.names[index] for index in asked]
 
     def told(place: Tensor) -> dict[str, float]:

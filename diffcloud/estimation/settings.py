@@ -1,80 +1,137 @@
-"""Settings of a fit: one field for each, from which options, params.yaml, records and the page of settings are made."""
+"""Settings of a fit: one field for each, from which options, params.yaml, records and the page of settings are made.
+
+Nothing here imports torch, so that help is quick.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
-from diffcloud.estimation.doubts import MATERIAL_DOUBTS, parse_doubts
-from diffcloud.estimation.laid import parse_laid
-from diffcloud.estimation.pose import parse_priors
-from diffcloud.estimation.solvers import SOLVERS, Settings
 from diffcloud.io.schema import Component, NonNegative, Positive
-from diffcloud.scene.scenarios import Scenario
-from diffcloud.settings import MOST_STARTS, Bounds, Count, Name, Names, Section, Seed, check_bounds
+from diffcloud.settings import MOST_STARTS, Bounds, Count, Factor, Level, Name, Names, Section, Seed, check_bounds
 
+if TYPE_CHECKING:
+    from diffcloud.estimation.solvers import Settings
+    from diffcloud.scene.scenarios import Scenario
+
+LEVEL = 0.9
+"""Of intervals."""
+IDENTIFIED_FACTOR = 2.0
 SMOOTHING = 0.5
 """Default of adam's."""
-_OF_SOLVERS = ("iterations", "starts", "learning_rate", "smoothing", "resample", "simulations")
-"""Options that not every solver has: one does if its settings have a field of that name."""
+SolverName = Literal["likelihood", "adam", "cma_es", "random_search"]
+_Starts = Annotated[int, Field(ge=1, le=MOST_STARTS)] | None
+
+
+class LikelihoodSolver(Section):
+    """Likeliest parameters and their uncertainty: a variance for each frame, a horizon, a correction by a finer mesh."""
+
+    name: Literal["likelihood"] = "likelihood"
+    max_steps: Count | None = None
+    """Steps of a start at most. Default: 12."""
+    starts: _Starts = None
+    """Descents from different places. Default: 3."""
+    model_error: bool = True
+    """Whether cloth and simulator may differ. False for recordings that this simulator made on this mesh."""
+
+
+class AdamSolver(Section):
+    """The paper's: descent along the gradient of the loss. It gives no intervals."""
+
+    name: Literal["adam"] = "adam"
+    max_steps: Count | None = None
+    """Steps at most. Default: 50."""
+    starts: _Starts = None
+    """Descents from different places. Default: 1."""
+    learning_rate: Positive | None = None
+    """Default: the scenario's."""
+    smoothing: NonNegative | None = None
+    """Standard deviation, on the sigmoid's axis, of perturbed copies of the first start, whose gradients are averaged.
+    Default: 0.5; 0: the plain gradient, as in the paper."""
+    resample: bool | None = None
+    """New points in each step, as in the published scripts. Default: the same points."""
+    threshold: NonNegative | None = None
+    """Loss below which the descent stops. Default: never; of `loss: paper`, the scenario's."""
+
+
+class SearchSolver(Section):
+    """A search without derivatives: CMA-ES, or uniform draws. It gives no intervals."""
+
+    name: Literal["cma_es", "random_search"] = "cma_es"
+    max_simulations: Count | None = None
+    """Simulations at most. Default: 200."""
+    threshold: NonNegative | None = None
+    """Loss below which the search stops. Default: never; of `loss: paper`, the scenario's."""
+
+
+def _kind(solver: Any) -> str:
+    name = solver.get("name") if isinstance(solver, dict) else getattr(solver, "name", None)
+    return "search" if name in ("cma_es", "random_search") else "adam" if name == "adam" else "likelihood"
+
+
+Solver = Annotated[
+    Annotated[LikelihoodSolver, Tag("likelihood")]
+    | Annotated[AdamSolver, Tag("adam")]
+    | Annotated[SearchSolver, Tag("search")],
+    Discriminator(_kind),
+]
+SOLVER_KINDS: dict[str, type[Section]] = {
+    "likelihood": LikelihoodSolver,
+    "adam": AdamSolver,
+    "cma_es": SearchSolver,
+    "random_search": SearchSolver,
+}
+"""Name -> its settings."""
 
 
 class FitSettings(Section):
     """Of a fit."""
 
     parameters: Names = ["stretch", "mass"]
-    bounds: dict[str, Bounds] = {}
-    fixed: dict[str, Component] = {}
-    solver: Literal["likelihood", "adam", "cma_es", "random_search"] = "likelihood"
-    """`likelihood` gives each frame a variance, and knows what the model cannot predict; `adam` is the paper's; `cma_es`
-    and `random_search` need no derivatives. Only the first gives intervals."""
-    iterations: Count | None = None
-    """Of likelihood and adam: steps of a start at most; by default 12 and 50."""
-    starts: Annotated[int, Field(ge=1, le=MOST_STARTS)] | None = None
-    """Of likelihood and adam: number of descents, from different places; by default 3 and 1."""
-    learning_rate: Positive | None = None
-    """Of adam; the scenario's own if not given."""
-    smoothing: NonNegative | None = None
-    """Of adam: standard deviation, on the sigmoid's axis, of the first start's perturbed copies, whose gradients are
-    averaged; 0: the plain gradient, as the paper has it; by default 0.5."""
-    resample: bool | None = None
-    """Of adam: new points in each iteration; by default the same ones."""
-    simulations: Count | None = None
-    """Of cma_es and random_search: as many at most; by default 200."""
-    threshold: NonNegative | None = None
+    """Parameters to find, comma-separated, such as stretch,bending,mass."""
+    bounds: dict[str, Bounds] = Field(default={}, json_schema_extra={"flag": "--bound"})
+    """Range of a parameter, NAME=LOW:HIGH, repeatable. Default: the scene's."""
+    fixed: dict[str, Component] = Field(default={}, json_schema_extra={"flag": "--fix"})
+    """A parameter that is known, NAME=VALUE, repeatable."""
+    solver: Solver = LikelihoodSolver()
+    """likelihood, with intervals; adam, the paper's; cma_es or random_search, without derivatives."""
     points: Count | None = None
+    """Points that are sampled on the cloth in each frame. Default: the scene's."""
     frames: Annotated[list[Annotated[int, Field(ge=-100_000, le=100_000)]], Field(min_length=1)] | None = None
+    """Frames to compare, such as 0,5,10. Default: all usable ones."""
     seed: Seed = 0
-    paper: bool = False
-    """The published measure: one-sided, squared, at the scenario's loss frames, without a pose, down to its threshold."""
-    nuisance: Name | None = None
-    """Which parts of the pose are fitted too, and how far off each may well be: "x=0.1m,y=0.1m,yaw=30deg", or "none". If
-    not given, all of them, as `estimation.pose.default_priors` says."""
-    laid: Name | None = None
-    """How the cloth may lie other than as its scenario has it, and how far off: "turn=5deg,shape=5mm,size=2%", or "none"
-    (`estimation.laid`). Default: what the scenario says, of likelihood with the implicit integrator; else none."""
+    """Of all random numbers."""
+    loss: Literal["surface", "paper"] = "surface"
+    """surface: both directions, all frames. paper: from cloth to recording only, squared, at the scene's loss frames."""
+    alignment: Name | None = None
+    """Parts of the recording's pose and clock to find, with their standard deviation: x=2cm,yaw=5deg,lag=50ms. Of x, y, z,
+    tilt_x, tilt_y, yaw, lag, scale; or none. Default: all but scale."""
+    initial_state: Name | None = None
+    """How the cloth may lie at first: turn=5deg, shape=5mm, size=2%, track=2%; or none. Default: what the scene says, for
+    likelihood with the implicit integrator."""
     prior: Name | None = None
-    """Within which factor of the basis each multiplier probably lies: "bending=3x", others 10x; or "none"."""
-    doubts: Name | None = None
-    """The factor within which material that is not asked for is known: "bending=1.5x,drag=1.3x", or "none". It is fitted
-    too, and is not a result (`estimation.doubts`). Default: `MATERIAL_DOUBTS` and what the scenario says, of likelihood
-    with the implicit integrator; else none."""
-    model_error: bool = True
-    """Of likelihood: whether cloth and simulator may differ. False for recordings that this simulator made on this mesh."""
+    """The factor within which each multiplier probably lies, such as bending=3x; or none. Default: 10x."""
+    uncertain: Name | None = None
+    """Other material that is fitted too, each within a factor: bending=1.5x,drag=1.3x; or none. Default: the scene's, for
+    likelihood with the implicit integrator."""
     joint: bool = False
-    """One parameter set for all episodes, whatever their scenario: they must be of one cloth."""
+    """One parameter set for all recordings, of one cloth."""
+    level: Level = LEVEL
+    """Probability of the intervals."""
+    identified_factor: Factor = IDENTIFIED_FACTOR
+    """A parameter counts as identified if its interval ends within this factor to each side."""
 
-    @model_validator(mode="before")
+    @field_validator("solver", mode="before")
     @classmethod
-    def _is_of_now(cls, data: Any) -> Any:
-        if isinstance(data, dict) and "optimizer" in data:
-            raise ValueError(f"optimizer: now `solver`, one of {', '.join(SOLVERS)}")
-        if isinstance(data, dict) and "offset" in data:
-            raise ValueError("offset: now `nuisance`, such as x=0.1m,y=0.1m,yaw=30deg, or none")
-        return data
+    def _named(cls, solver: Any) -> Any:
+        """A name alone stands for that solver with its defaults."""
+        told = {"name": solver} if isinstance(solver, str) else solver
+        if isinstance(told, dict) and told.get("name", "likelihood") not in SOLVER_KINDS:
+            raise ValueError(f"unknown solver {told['name']!r}; allowed are {', '.join(SOLVER_KINDS)}")
+        return told
 
     @field_validator("bounds", "fixed", mode="before")
     @classmethod
@@ -84,69 +141,74 @@ class FitSettings(Section):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
+        from diffcloud.estimation.initial_state import parse_initial_state
+        from diffcloud.estimation.pose import parse_priors
+        from diffcloud.estimation.uncertain import parse_uncertain
+
         for name, pair in self.bounds.items():
             check_bounds(f"bounds.{name}", pair)
-        parse_priors(self.nuisance or "none")
-        if parse_laid(self.laid or "none") and self.paper:
-            raise ValueError("laid: the published measure takes the cloth to lie as the scene has it; leave it out")
-        if self.paper and parse_doubts(self.doubts or "none"):
-            raise ValueError("doubts: the published measure takes the rest of the material for known; leave them out")
-        if self.paper and self.solver == "likelihood":
-            raise ValueError("paper: the published measure has no likelihood; choose another solver, such as adam")
-        if foreign := [name for name in self._solver_options() if self.solver not in _solvers_with(name)]:
-            told = "; ".join(f"{name}: of solver {' or '.join(_solvers_with(name))}" for name in foreign)
-            raise ValueError(f"{told}; not of {self.solver}: leave out, or choose that solver")
+        parse_priors(self.alignment or "none")
+        laid, uncertain = parse_initial_state(self.initial_state or "none"), parse_uncertain(self.uncertain or "none")
+        if self.loss != "paper":
+            return self
+        if laid:
+            raise ValueError("initial_state: with the paper's loss, the cloth lies as the scene has it; leave it out")
+        if uncertain:
+            raise ValueError("uncertain: with the paper's loss, the rest of the material is known; leave it out")
+        if self.solver.name == "likelihood":
+            raise ValueError("loss: the paper's loss has no likelihood; choose another solver, such as adam")
         return self
+
+    @property
+    def paper(self) -> bool:
+        """Whether the loss is the paper's."""
+        return self.loss == "paper"
 
     def measure(self) -> dict[str, Any]:
         """Keyword arguments of `Objective`."""
-        priors = None if self.nuisance is None else parse_priors(self.nuisance)
+        from diffcloud.estimation.pose import parse_priors
+
+        priors = None if self.alignment is None else parse_priors(self.alignment)
         return {"paper": self.paper, "nuisance": priors, "frames": self.frames, "points": self.points, "seed": self.seed}
 
     def known_within(self, scenarios: Sequence[Scenario]) -> dict[str, float]:
         """Material that is not known exactly in a fit of recordings in these scenarios -> factor of one deviation."""
-        if self.doubts is not None:
-            return parse_doubts(self.doubts)
+        from diffcloud.estimation.uncertain import MATERIAL_UNCERTAINTY, parse_uncertain
+
+        if self.uncertain is not None:
+            return parse_uncertain(self.uncertain)
         if not self._fits_more(scenarios):
             return {}
         own: dict[str, float] = {}
         for one in scenarios:
-            own |= {name: max(factor, own.get(name, 1.0)) for name, factor in one.doubts.items()}
+            own |= {name: max(factor, own.get(name, 1.0)) for name, factor in one.uncertain.items()}
         return {
             name: factor
-            for name, factor in {**MATERIAL_DOUBTS, **own}.items()
+            for name, factor in {**MATERIAL_UNCERTAINTY, **own}.items()
             if name not in {*self.parameters, *self.fixed}
         }
 
-    def laid_within(self, scenarios: Sequence[Scenario]) -> list[dict[str, float]]:
+    def initial_state_within(self, scenarios: Sequence[Scenario]) -> list[dict[str, float]]:
         """How the cloth may lie otherwise at the start of each recording, in one fit of recordings in these scenarios: name
-        of `estimation.laid` -> standard deviation [rad, m, 1]."""
-        if self.laid is not None:
-            return [parse_laid(self.laid)] * len(scenarios)
+        of `estimation.initial_state` -> standard deviation [rad, m, 1]."""
+        from diffcloud.estimation.initial_state import parse_initial_state
+
+        if self.initial_state is not None:
+            return [parse_initial_state(self.initial_state)] * len(scenarios)
         return [dict(one.laid) if self._fits_more(scenarios) else {} for one in scenarios]
 
     def _fits_more(self, scenarios: Sequence[Scenario]) -> bool:
         """Whether more than what is asked for is fitted by default: where derivatives make that cheap."""
         implicit = all(one.scene.integrator == "implicit" for one in scenarios)
-        return not self.paper and self.solver == "likelihood" and implicit
+        return self.solver.name == "likelihood" and implicit
 
     def solver_settings(self, scenario: Scenario) -> Settings:
         """Of the solver, with what the scenario says where nothing is given."""
-        given: dict[str, Any] = {}
-        if self.solver == "adam":
+        from diffcloud.estimation.solvers import SOLVERS
+
+        given: dict[str, Any] = {"seed": self.seed}
+        if isinstance(self.solver, AdamSolver):
             given |= {"learning_rate": scenario.learning_rate, "smoothing": SMOOTHING}
-        own = scenario.threshold if self.paper else 0.0
-        given["seed"] = self.seed
-        if self.solver == "likelihood":
-            given["model_error"] = self.model_error
-        else:
-            given["threshold"] = own if self.threshold is None else self.threshold
-        return SOLVERS[self.solver](**given | self._solver_options())
-
-    def _solver_options(self) -> dict[str, Any]:
-        """Those that were given."""
-        return {name: value for name in _OF_SOLVERS if (value := getattr(self, name)) is not None}
-
-
-def _solvers_with(option: str) -> list[str]:
-    return [name for name, kind in SOLVERS.items() if option in {field.name for field in fields(kind)}]
+        if not isinstance(self.solver, LikelihoodSolver):
+            given["threshold"] = scenario.threshold if self.paper else 0.0
+        return SOLVERS[self.solver.name](**given | self.solver.model_dump(exclude={"name"}, exclude_none=True))

@@ -278,7 +278,8 @@ def _usable(
         told = "" if cut is None else f", at most {_TOO_LITTLE:.0%} of the cloth lies above the cut, {cut * unit:.3f} m"
         raise EpisodeError(
             f"No frame of the episode can be compared: they lie at {episode.times[0]:.3f} to {episode.times[-1]:.3f} s, "
-            f"scenario {scenario.name} simulates {simulated:.3f} s{told}. Name some with --frame, or check times and crops."
+            f"scenario {scenario.name} simulates {simulated:.3f} s{told}. Name some with --frames, or check "
+            "times and crops."
         )
     return frames
 

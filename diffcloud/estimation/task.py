@@ -9,9 +9,8 @@ from functools import cached_property
 
 from diffcloud.errors import DivergedError
 from diffcloud.estimation.batches import batch_losses
-from diffcloud.estimation.doubts import with_doubts
+from diffcloud.estimation.initial_state import with_initial_state
 from diffcloud.estimation.joint import AnyObjective, JointObjective
-from diffcloud.estimation.laid import with_laid
 from diffcloud.estimation.left_out import Tell, leave_each_out
 from diffcloud.estimation.objective import Objective
 from diffcloud.estimation.parameters import FitSpace
@@ -20,6 +19,7 @@ from diffcloud.estimation.record import FitRecord, LeftOut
 from diffcloud.estimation.result import FitResult, describe_fit
 from diffcloud.estimation.settings import FitSettings
 from diffcloud.estimation.solvers import FitHistory, FitOutcome, LikelihoodSettings, Progress, Settings, solve
+from diffcloud.estimation.uncertain import with_uncertain
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 
@@ -70,8 +70,8 @@ class FitTask:
     def space(self) -> FitSpace:
         """
         Raises:
-            ConfigError: bounds, priors, doubts or fixed values that do not fit the parameters, or a start that the
-                recordings have none of.
+            ConfigError: bounds, priors, uncertain material or fixed values that do not fit the parameters, or an initial
+                state that the recordings have none of.
         """
         settings = self.settings
         for recording in self.recordings:
@@ -82,8 +82,8 @@ class FitTask:
         priors = parameter_priors("none" if settings.paper else settings.prior, space.names, ranges)
         space = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed, priors=priors)
         scenarios = [recording.scenario for recording in self.recordings]
-        space = with_doubts(space, settings.known_within(scenarios), scenarios)
-        return with_laid(space, settings.laid_within(scenarios), scenarios)
+        space = with_uncertain(space, settings.known_within(scenarios), scenarios)
+        return with_initial_state(space, settings.initial_state_within(scenarios), scenarios)
 
     def objective(self) -> AnyObjective:
         """
@@ -92,6 +92,14 @@ class FitTask:
         """
         measure = self.settings.measure()
         return _joined([Objective(one.scenario, one.episode, **measure) for one in self.recordings])
+
+    def check(self) -> None:
+        """
+        Raises:
+            ConfigError, EpisodeError: as of `space` and `objective`.
+        """
+        _ = self.space
+        self.objective()
 
     @property
     def solver_settings(self) -> Settings:

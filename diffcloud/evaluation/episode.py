@@ -7,10 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from diffcloud.errors import DiffCloudError
-from diffcloud.estimation import AdamSettings, CmaEsSettings, FitRecord, FitSpace, Objective, RandomSearchSettings
 from diffcloud.estimation.names import of_recording
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
+from diffcloud.estimation.record import FitRecord
+from diffcloud.estimation.settings import IDENTIFIED_FACTOR, LEVEL
+from diffcloud.estimation.solvers import AdamSettings, CmaEsSettings, RandomSearchSettings
 from diffcloud.evaluation import methods
-from diffcloud.evaluation.intervals import LEVEL, WITHIN, intervals_of
+from diffcloud.evaluation.intervals import intervals_of
 from diffcloud.evaluation.landscape import loss_landscape
 from diffcloud.evaluation.methods import Estimate, Gap, Rival
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
@@ -31,7 +35,7 @@ class ComparisonSettings:
     """Of the first of them; searches use it too."""
     level: float | None = LEVEL
     """Of intervals; None: state none."""
-    within: float = WITHIN
+    within: float = IDENTIFIED_FACTOR
     """Factor within which a parameter counts as identified."""
     landscape_size: int = 0
     """Places along each axis of the loss landscape; 0: none."""
@@ -44,7 +48,7 @@ class EpisodeRecord:
     record: dict[str, Any]
     """Plain values, the same for the same inputs: scenario, episode, its fit, labels, `start` (metrics of the fit's start,
     None if that diverges), `methods` (a row each: values, clipped values, metrics, simulations), `gaps`, `transfers`,
-    `intervals`, `landscape`, and `doubtful`: parameters that were fitted too, and are not results."""
+    `intervals`, `landscape`, and `nuisance`: parameters that were fitted too, and are not results."""
     seconds: dict[str, dict[str, float]]
     """Method -> phase -> wall time."""
 
@@ -74,7 +78,7 @@ def compare_episode(
     space, _ = methods.space_of(fit).of_recording(recording)
     objective = Objective(scenario, episode, **fit.measured_by(recording))
     told: list[Estimate | Gap] = [methods.fitted(fit, recording)]
-    laid = fit.laid_in(fit.episodes[recording])  # as the pose, for all methods
+    laid = fit.initial_state_in(fit.episodes[recording])  # as the pose, for all methods
     lying = FitSpace(space.asked.variables, {**space.asked.fixed, **laid})
     told += [_run(rival, objective, lying, fit, settings.seed) for rival in settings.rivals]
     told += [*predictions, *methods.published(episode.meta)]
@@ -121,7 +125,7 @@ def compare_episode(
         "length_unit_m": scenario.length_unit_m,
         "threshold": success_threshold(scenario),
         "frames": list(objective.frames),
-        "doubtful": [variable.name for variable in space.variables if variable.doubtful],
+        "nuisance": [variable.name for variable in space.variables if variable.nuisance],
         "start": None if len(sets) in measured.diverged else measured.rows[-1],
         "methods": rows,
         "gaps": [{"method": gap.method, "reason": gap.reason, "expected": gap.expected} for gap in gaps],
@@ -145,7 +149,7 @@ def compare_episode(
 def _run(rival: Rival, objective: Objective, space: FitSpace, fit: FitRecord, seed: int) -> Estimate | Gap:
     """One rival with the budget of the fit, or of one start of Adam; a gap if its simulations fail."""
     told, by_adam = fit.settings, fit.solver == "adam"
-    simulations = int(told["iterations"] or 0) + 1 if by_adam else methods.simulations_each(fit)
+    simulations = int(told["max_steps"] or 0) + 1 if by_adam else methods.simulations_each(fit)
     threshold = float(told.get("threshold") or 0.0)
     objective.reseed(fit.measure.seed)
     try:
@@ -160,7 +164,7 @@ def _run(rival: Rival, objective: Objective, space: FitSpace, fit: FitRecord, se
             return known
         adam = AdamSettings(
             learning_rate=float(told.get("learning_rate") or objective.scenario.learning_rate),
-            iterations=simulations - 1,
+            max_steps=simulations - 1,
             threshold=threshold,
             seed=fit.measure.seed,
             resample=bool(told.get("resample", False)),

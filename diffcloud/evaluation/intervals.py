@@ -25,6 +25,7 @@ from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.record import FitRecord
 from diffcloud.estimation.residuals import Axis
 from diffcloud.estimation.result import physical_values
+from diffcloud.estimation.settings import IDENTIFIED_FACTOR, LEVEL
 from diffcloud.io.files import read_json
 from diffcloud.io.schema import Plain
 from diffcloud.scene.scenarios import Scenario
@@ -37,16 +38,13 @@ Verdict = Literal[
     "not identified",
     "the model does not explain the recording",
 ]
-WITHIN = 2.0
-"""A parameter counts as identified if its interval ends within this factor of the fitted value."""
-LEVEL = 0.9
 _PLAIN = 1e6
 """Below it numbers are written out."""
 FOLLOWS = 4.0
 """Mean squared distance over what is accounted for, up to which the model follows a recording."""
 _ENDLESS = 700.0
 """Largest logarithm of a factor."""
-_UNFINISHED = "the descent took all its steps before it arrived: give it more with --iterations"
+_UNFINISHED = "the descent took all its steps before it arrived: give it more with --max-steps"
 _PRIOR = 0.5
 """Part of the variance from which it is the prior that speaks."""
 _SHARE = 1 / 3
@@ -112,7 +110,7 @@ class Intervals(_Model):
     reason: str
     """Why the verdict is not of the parameters; else empty."""
     remark: str = ""
-    """Why intervals are doubtful all the same; else empty."""
+    """Why intervals may be wrong all the same; else empty."""
     note: str = ""
     """Why the ratio is not what a motion identifies where the mass multiplier acts on a part of the cloth; else empty."""
 
@@ -142,7 +140,7 @@ class _Known:
 
 
 def intervals_of(
-    record: FitRecord, space: FitSpace, scenario: Scenario, *, level: float = LEVEL, within: float = WITHIN
+    record: FitRecord, space: FitSpace, scenario: Scenario, *, level: float = LEVEL, within: float = IDENTIFIED_FACTOR
 ) -> Intervals:
     """Of a fit by `likelihood`.
 
@@ -245,8 +243,7 @@ def read_intervals(path: Path, space: FitSpace) -> Intervals:
         found = Intervals.model_validate(read_json(path, error=ConfigError))
     except ValidationError as error:
         raise ConfigError(
-            f"{path} holds no intervals; take intervals.json of `diffcloud identify`, or what `diffcloud evaluate "
-            "intervals --json` prints."
+            f"{path} holds no intervals, as `diffcloud fit` writes them. Run `diffcloud fit` again."
         ) from error
     shape, count = np.shape(np.array(found.covariance, dtype=object)), len(space.names)
     if tuple(found.parameters) != space.names or shape != (count, count) or not np.isfinite(found.covariance).all():

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from diffcloud.estimation import FitSpace, Objective
 from diffcloud.estimation.batches import batch_losses
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.record import History
 
 

@@ -13,20 +13,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from diffcloud.estimation import (
+from diffcloud.estimation.initial_state import variables_of
+from diffcloud.estimation.names import of_recording
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace, Variable
+from diffcloud.estimation.record import FitRecord
+from diffcloud.estimation.solvers import (
+    SOLVER_NAMES,
+    SOLVERS,
     AdamSettings,
     CmaEsSettings,
-    FitRecord,
-    FitSpace,
-    Objective,
+    FitOutcome,
     RandomSearchSettings,
+    SearchSettings,
     fit_adam,
     solve,
 )
-from diffcloud.estimation.laid import variables_of
-from diffcloud.estimation.names import of_recording
-from diffcloud.estimation.parameters import Variable
-from diffcloud.estimation.solvers import SOLVER_NAMES, SOLVERS, FitOutcome, SearchSettings
 
 Rival = Literal["single_start", "middle", "random_search", "cma_es"]
 """What the comparison can run by itself."""
@@ -68,7 +70,7 @@ def space_of(fit: FitRecord) -> FitSpace:
         if entry.bounds is None:
             fixed[name] = entry.value
         else:
-            variables.append(Variable(name, *entry.bounds, entry.prior, entry.centre, entry.doubtful))
+            variables.append(Variable(name, *entry.bounds, entry.prior, entry.centre, entry.role))
     laid = variables_of([one.nuisance for one in fit.episodes], length_unit_m=fit.length_unit_m)
     return FitSpace((*variables, *laid), fixed)
 
@@ -158,7 +160,7 @@ def published(meta: Mapping[str, Any]) -> list[Estimate]:
 
 def clipped(values: Mapping[str, float], space: FitSpace) -> dict[str, float]:
     """Values within the bounds, with the given ones in place; what a method leaves out is the middle, or what is known of
-    doubtful material."""
+    uncertain material."""
     found = {**middle(space).values, **space.asked.fixed}
     for variable in space.variables:
         value = float(values.get(variable.name, found[variable.name]))

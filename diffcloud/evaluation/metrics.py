@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from diffcloud.clouds.losses import chamfer
-from diffcloud.estimation import Objective
 from diffcloud.estimation.batches import without_diverged
+from diffcloud.estimation.objective import Objective
 from diffcloud.scene.scenarios import PAPER_THRESHOLD, RELEASE_UNIT_M, Scenario
 
 

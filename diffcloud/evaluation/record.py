@@ -1,4 +1,4 @@
-"""What `diffcloud evaluate` leaves for the report, as files hold it: checked before anything is drawn from it."""
+"""What `python -m pipeline.evaluate` leaves for the report, as files hold it: checked before anything is drawn from it."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class ComparisonRecord(Checked):
     length_unit_m: Place
     threshold: Value | None
     frames: list[int]
-    doubtful: list[Text]
+    nuisance: list[Text]
     start: _Metrics | None
     methods: list[MethodRecord]
     gaps: list[GapRecord]
@@ -144,10 +144,10 @@ def check_file(model: Any, path: Path, content: Any) -> None:
         model: of the content; of a table, a list of the model of its rows.
 
     Raises:
-        ConfigError: a file is not as this version's `diffcloud evaluate` writes it; names the field.
+        ConfigError: a file is not as this version's `python -m pipeline.evaluate` writes it; names the field.
     """
     try:
         TypeAdapter(model).validate_python(content)
     except ValidationError as error:
-        told = f"{path} was not written by this version's `diffcloud evaluate`; run it. There"
+        told = f"{path} was not written by this version's `python -m pipeline.evaluate`; run it. There"
         raise explain(told, error, ConfigError) from error

@@ -33,7 +33,7 @@ def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         if record["truth"]:
             row["fabric"] = None  # a simulated target has known parameters; its label names no cloth that is met again
         row |= {"loss": fit["loss"]}
-        row |= {name: value for name, value in fit["clipped"].items() if name not in record["doubtful"]}
+        row |= {name: value for name, value in fit["clipped"].items() if name not in record["nuisance"]}
         if {"stretch", "mass"} <= fit["clipped"].keys():
             row["ratio"] = fit["clipped"]["stretch"] / fit["clipped"]["mass"]
         rows.append(row)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from diffcloud.estimation.laid import is_laid
+from diffcloud.estimation.initial_state import is_initial_state
 from diffcloud.evaluation.intervals import Combination, significant
 from diffcloud.evaluation.methods import PHASES
 from diffcloud.evaluation.repeats import consistency, fit_of, parameter_table, repeatability, transfer
@@ -88,7 +88,9 @@ def fit_table(records: Records) -> pd.DataFrame:
         }
         row: dict[str, Any] = {"scenario": scenario, "episode": name, **losses}
         row |= {key.replace("loss", "rms") + "_mm": to_mm * value**0.5 for key, value in losses.items()}
-        row |= {f"fitted_{parameter}": value for parameter, value in fit["values"].items() if not is_laid(parameter)}
+        row |= {
+            f"fitted_{parameter}": value for parameter, value in fit["values"].items() if not is_initial_state(parameter)
+        }
         truth = {parameter: value for parameter, value in record["truth"].items() if parameter in fit["values"]}
         row |= {f"true_{parameter}": value for parameter, value in truth.items()}
         for kind, values in (("fitted", fit["values"]), ("true", truth)):

@@ -164,7 +164,7 @@ class KinovaArm:
         if state == names.ARMSTATE_IN_FAULT:
             raise HardwareError(
                 f"The arm at {self.address} is in fault ({self._faults(self._feedback())}). Release the emergency stop, "
-                "look why, then clear it: diffcloud capture --clear-faults, or the arm's web page."
+                "look why, then clear it: diffcloud data capture --clear-faults, or the arm's web page."
             )
         if state == names.ARMSTATE_SERVOING_MANUALLY_CONTROLLED:
             raise HardwareError(

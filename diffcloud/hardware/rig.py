@@ -40,7 +40,7 @@ def _refuse(message: str) -> PydanticCustomError:
 
 
 class BoardSettings(Section):
-    """The printed ChArUco board, for `diffcloud calibrate`."""
+    """The printed ChArUco board, for `diffcloud data calibrate`."""
 
     squares: tuple[Annotated[int, Field(ge=3, le=100)], Annotated[int, Field(ge=3, le=100)]] = (
         CharucoBoard.columns,
@@ -78,7 +78,7 @@ class BoardSettings(Section):
 
 
 class RigSettings(Section):
-    """The set-up of a lab, for `diffcloud capture` and `diffcloud calibrate`."""
+    """The set-up of a lab, for `diffcloud data capture` and `diffcloud data calibrate`."""
 
     cameras: dict[CameraName, Serial] = Field(default_factory=dict, max_length=64)
     """Name of each camera and its serial number; a driver of your own may read something else than a serial number."""
@@ -103,7 +103,7 @@ class RigSettings(Section):
     camera_driver: Name | None = None
     """Driver of cameras that are not RealSense, as module:Class."""
     calibration: Path | None = None
-    """Calibration file of `diffcloud calibrate`, whose poses go into camera.json."""
+    """Calibration file of `diffcloud data calibrate`, whose poses go into camera.json."""
     workspace_m: tuple[_Corner, _Corner] = (Limits.box_low_m, Limits.box_high_m)
     """Lowest and highest corner of the box in the base frame that the tool must not leave."""
     table_height_m: _Metres = ArmLimits.table_m

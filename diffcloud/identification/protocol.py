@@ -1,4 +1,4 @@
-"""The cloth and the settings of a fit that `identify` and the library begin with, each with its reason."""
+"""The cloth and the settings of a fit that the command `fit` and the library begin with, each with its reason."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from diffcloud.sim.grasp import GRIP_M
 _DENSITY = 0.16
 _MATERIAL = {"stretching_n_m": 60.0, "bending_n_m": 5e-6, "poisson": 0.2, "damping_s": 0.002}
 _AROUND = {"friction_obstacle": 0.4, "compression": 0.5}
-_DOUBTS = {"friction_obstacle": 2.0, "compression": 3.0, "shear": 1.2, "damping": 2.5}
+_UNCERTAIN = {"friction_obstacle": 2.0, "compression": 3.0, "shear": 1.2, "damping": 2.5}
 _BOUNDS = {"stretch": (0.03, 30.0), "bending": (0.03, 30.0), "mass": (0.2, 5.0)}
 _STEPS = 16
 _GRIP_KNOWN = 1.5
@@ -50,8 +50,8 @@ def found_cloth(
         "grip_m": Found(GRIP_M, "side of the pad, or of the square that a pivot stands for; measure your gripper's [m]"),
         "grip_known_within": Found(_GRIP_KNOWN, "factor within which grip_m is known; 1.05 if you have measured it"),
         "material": Found(material, f"nominal material; density {told}"),
-        **{name: Found(value, "usual; fitted too, within `doubts`") for name, value in _AROUND.items()},
-        "doubts": Found(_DOUBTS, "priors of what is fitted too: factors of one standard deviation"),
+        **{name: Found(value, "usual; fitted too, within `uncertain`") for name, value in _AROUND.items()},
+        "uncertain": Found(_UNCERTAIN, "priors of what is fitted too: factors of one standard deviation"),
         "steps_per_frame": Found(_STEPS, "finer steps move a lifted cloth by less than the noise"),
     }
 
@@ -64,18 +64,21 @@ def known_grip(size: float) -> dict[str, float]:
 def with_density(cloth: Mapping[str, Any], density: float, deviation: float) -> dict[str, Any]:
     """The cloth with a weighed mass that is not exact: the fit allows for it."""
     material = {**_material(cloth), "density_kg_m2": density}
-    return {**cloth, "material": material, "doubts": {**cloth.get("doubts", {}), "mass": 1 + deviation / density}}
+    return {**cloth, "material": material, "uncertain": {**cloth.get("uncertain", {}), "mass": 1 + deviation / density}}
 
 
 def _material(cloth: Mapping[str, Any]) -> dict[str, Any]:
     material = cloth.get("material")
     if not isinstance(material, dict) or material.get("density_kg_m2") is None:
-        raise ConfigError("--mass goes with a material of stated density_kg_m2 in cloth.yaml.")
+        raise ConfigError("--density goes with a material of stated density_kg_m2 in cloth.yaml.")
     return material
 
 
 def fit_settings(
-    parameters: Sequence[str] | None, cloth: Mapping[str, Any], weighed: tuple[float, float] | None
+    parameters: Sequence[str] | None,
+    cloth: Mapping[str, Any],
+    weighed: tuple[float, float] | None,
+    base: FitSettings | None = None,
 ) -> FitSettings:
     """Settings of the fit of such a cloth.
 
@@ -83,6 +86,7 @@ def fit_settings(
         parameters: to find; by default stretching, bending, and the mass if it was not weighed.
         cloth: fields of `found_cloth`.
         weighed: density and its standard deviation [kg/m²].
+        base: what else is said; its parameters, bounds and fixed values come first.
 
     Raises:
         ConfigError: a weighed density with a material of none.
@@ -94,4 +98,9 @@ def fit_settings(
     if weighed is not None and not weighed[1]:
         fixed = {"mass": weighed[0] / float(_material(cloth)["density_kg_m2"])}
     bounds = {name: list(pair) for name, pair in _BOUNDS.items() if name in names}
-    return FitSettings.model_validate({"parameters": names, "fixed": fixed, "bounds": bounds})
+    found: dict[str, Any] = {"parameters": names, "fixed": fixed, "bounds": bounds}
+    if base is None:
+        return FitSettings.model_validate(found)
+    stated = base.model_dump(exclude_unset=True)
+    more = {name: {**found[name], **stated.get(name, {})} for name in ("fixed", "bounds")}
+    return FitSettings.model_validate({**found, **stated, **more})

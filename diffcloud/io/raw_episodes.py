@@ -48,7 +48,7 @@ _LATEST_S = 1e6
 MOST_HZ = 1e5
 """Of frames."""
 _FARTHEST_RAD, _LARGEST = 200.0, 1e5
-"""Of joints that turn without end; and of any other number, which `episode validate` may yet find to be in another unit."""
+"""Of joints that turn without end; and of any other number, which `data check` may yet find to be in another unit."""
 _WRENCH = ("wrench_fx", "wrench_fy", "wrench_fz", "wrench_tx", "wrench_ty", "wrench_tz")
 
 

@@ -64,7 +64,7 @@ class SetFile(Plain):
     length_unit_m: Annotated[float, Field(gt=0, le=1e3)]
     draws: Name | None = None
     seed: Annotated[int, Field(ge=0)] | None = None
-    doubts: dict[Name, Component] = Field(default_factory=dict)
+    uncertain: dict[Name, Component] = Field(default_factory=dict)
     """Other material that differs from run to run -> factor of one deviation."""
     integrator: Name | None = None
     replaced: Count = 0
@@ -148,7 +148,7 @@ class SimulatedSet:
             raise DatasetError(unknown_name("split", split, SPLITS))
         if not (folder / "set.json").is_file():
             raise DatasetError(
-                f"{folder} holds no simulated set (set.json). Make one with `diffcloud simulate --out {folder}`."
+                f"{folder} holds no simulated set (set.json). Make one with `diffcloud network generate --out {folder}`."
             )
         about = _about(folder / "set.json")
         if not about[split]:

@@ -304,7 +304,7 @@ class Regressor:
         """
         path = Path(path)
         if not path.exists():
-            raise CheckpointError(f"No such checkpoint: {path}. Make one with `diffcloud train`.")
+            raise CheckpointError(f"No such checkpoint: {path}. Make one with `diffcloud network train`.")
         check_input(path, kind="checkpoint", error=CheckpointError)
         try:
             with safe_open(path, framework="pt") as file:
@@ -313,7 +313,9 @@ class Regressor:
         except (SafetensorError, OSError, ValueError) as error:
             raise CheckpointError(f"{path} is not a readable checkpoint: {error}. Train again.") from error
         if text is None:
-            raise CheckpointError(f"{path} lacks the description of a regressor; it was not written by `diffcloud train`.")
+            raise CheckpointError(
+                f"{path} lacks the description of a regressor; it was not written by `diffcloud network train`."
+            )
         try:
             described = Description.model_validate_json(text)
         except ValidationError as error:

@@ -106,7 +106,7 @@ class ComparisonEntry:
     records: Sequence[Mapping[str, Any]]
     failures: Sequence[str] = ()
     figures: Sequence[Figure] = field(default_factory=tuple)
-    command: str = "diffcloud evaluate"
+    command: str = "python -m pipeline.evaluate"
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from diffcloud.report.tables import Cell, Table, number, table
 from diffcloud.report.uncertainty import intervals_table
 
 _CLEARLY = 1.05
-"""Factor by which doubtful material is off what was known of it."""
+"""Factor by which uncertain material is off what was known of it."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def _summary(entries: Sequence[EpisodeEntry]) -> _Summary:
 def _fits_table(entries: Sequence[EpisodeEntry]) -> Table:
     names: dict[str, None] = {}
     for entry in entries:
-        names |= dict.fromkeys(name for name, one in entry.fit.parameters.items() if not one.doubtful)
+        names |= dict.fromkeys(name for name, one in entry.fit.parameters.items() if one.role == "requested")
     heads = ("episode", "scenario", "fabric", "start mm", "fitted mm", "other frames mm", *names)
     heads = (*heads, "stretch / mass", "also fitted", "iterations", "simulations")
     return table(heads, (_fit_row(index, entry, list(names)) for index, entry in enumerate(entries)))
@@ -187,7 +187,7 @@ def _fit_row(index: int, entry: EpisodeEntry, names: Sequence[str]) -> list[Cell
 
 def _along_cell(fit: FitRecord) -> Cell:
     """Doubtful material, where it is clearly off what was known of it, as a multiple of that."""
-    parts = {name: one.value / one.centre for name, one in fit.parameters.items() if one.doubtful}
+    parts = {name: one.value / one.centre for name, one in fit.parameters.items() if one.role != "requested"}
     off = [f"{name.replace('_', ' ')} × {part:.2f}" for name, part in parts.items() if not 1 / _CLEARLY < part < _CLEARLY]
     return Cell(", ".join(off) or ("as known" if parts else ""))
 

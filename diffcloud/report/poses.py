@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffcloud.estimation.laid import asked_as
+from diffcloud.estimation.initial_state import asked_as
 from diffcloud.estimation.record import FitRecord, RecordingFit
 from diffcloud.report.tables import UNKNOWN, Cell, Table, number, part, table
 

@@ -30,7 +30,9 @@ class TrainingEntry:
         """
         summary = read_json(path, error=ConfigError)
         if not isinstance(summary, dict) or not {"history", "held_out"} <= summary.keys():
-            raise ConfigError(f"{path} is no training written by `diffcloud train`: it lacks `history` or `held_out`.")
+            raise ConfigError(
+                f"{path} is no training written by `diffcloud network train`: it lacks `history` or `held_out`."
+            )
         return TrainingEntry(path.parents[1].name, path.parent.name, summary)
 
 

@@ -327,7 +327,7 @@ def agreement(episodes: Sequence[Episode], cameras: tuple[str, str], *, scale: b
             raise EpisodeError(
                 f"The cameras {' and '.join(cameras)} cannot be compared: the recording's points name the cameras "
                 f"{', '.join(known) or 'none'}. Points must name their camera, and `viewpoints` its place. Give "
-                "a recording that `diffcloud preprocess` made of raw depth images of two cameras."
+                "a recording that `diffcloud data preprocess` made of raw depth images of two cameras."
             )
         done = episode.meta.get("agreement")
         if isinstance(done, Mapping) and cameras[1] in done:

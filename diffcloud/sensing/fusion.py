@@ -534,7 +534,7 @@ def camera_pose(info: CameraInfo, folder: Path, calibration: Calibration | None)
     if info.T_world_camera is None:
         raise EpisodeError(
             f"Camera {info.name} is not calibrated: camera.json has neither T_world_camera nor a calibration file. Run "
-            "diffcloud calibrate, and give its file with --calibration."
+            "diffcloud data calibrate, and give its file with --calibration."
         )
     return info.T_world_camera
 

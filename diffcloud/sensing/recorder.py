@@ -145,7 +145,7 @@ def read_truth(folder: Path) -> Truth:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise EpisodeError(
             f"{place / 'cameras.json'} does not say where the cameras and the scene were; record again with "
-            "`diffcloud episodes`."
+            "`python -m pipeline.episodes`."
         ) from error
     return Truth(cloth["nodes"], cloth["faces"], cameras, placement, place)
 

@@ -10,11 +10,12 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from diffcloud.estimation import FitSpace, Objective
 from diffcloud.estimation.batches import batch_losses
-from diffcloud.estimation.doubts import MATERIAL_DOUBTS
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.priors import DEFAULT_FACTOR
 from diffcloud.estimation.record import read_fit
+from diffcloud.estimation.uncertain import MATERIAL_UNCERTAINTY
 from diffcloud.io.episodes import read_episode
 from diffcloud.report.figures import INK, new_canvas, svg_of
 from diffcloud.scene import load_scenario
@@ -29,7 +30,9 @@ WIDTH = 7.2
 """[inch]"""
 SHOWN = 700
 """Points of a cloud that are drawn."""
-PRIORS = dict.fromkeys(("stretch", "mass"), DEFAULT_FACTOR) | {name: MATERIAL_DOUBTS[name] for name in ("bending", "drag")}
+PRIORS = dict.fromkeys(("stretch", "mass"), DEFAULT_FACTOR) | {
+    name: MATERIAL_UNCERTAINTY[name] for name in ("bending", "drag")
+}
 """Factor of one standard deviation by default, of what is asked for and of what is not."""
 mpl.rcParams.update({"font.size": 9, "text.color": INK})
 

@@ -15,44 +15,61 @@ import textwrap
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import typer
 
-from diffcloud.cli import config as settings
 from diffcloud.cli.app import app
+from diffcloud.estimation.settings import SOLVER_KINDS
 from diffcloud.hardware.rig import RigSettings
+from diffcloud.jobs import settings
+from diffcloud.regressors.settings import TrainingSettings
 from diffcloud.sensing.fusion import FusionSettings
 
 ROOT = Path(__file__).parents[2]
-
+SOLVERS = tuple(dict.fromkeys(SOLVER_KINDS.values()))
+"""Kinds of the block `fit.solver`."""
 STATUS = {
     0: "done",
     1: "an error, said in one line that begins with `Error:`",
     2: "options or arguments that the command does not have, or that do not convert",
     130: "Ctrl-C",
 }
-_SECTIONS = {"episodes", "preprocess", "simulate", "fit", "train", "evaluate", "report"}
+_SECTIONS = {
+    ("fit",): "fit",
+    ("view",): "preprocess",
+    ("data", "preprocess"): "preprocess",
+    ("network", "generate"): "simulate",
+    ("network", "train"): "train",
+}
+"""Command with --params -> the section that it reads."""
 _FACTS = re.compile(r"\s*\[((?:default|required|x|\d)[^\]]*)\]$")
 
 
 @cache
 def commands() -> dict[tuple[str, ...], Any]:
-    """Words of the command line -> its command, groups before their members: ("evaluate",), ("evaluate", "loss"), ..."""
+    """Words of the command line -> its command, groups before their members: ("data",), ("data", "import"), ..."""
     found: dict[tuple[str, ...], Any] = {}
 
     def walk(command: Any, path: tuple[str, ...]) -> None:
         if path:
             found[path] = command
-        for name, member in getattr(command, "commands", {}).items():
+        for name, member in members(command).items():
             walk(member, (*path, name))
 
     walk(typer.main.get_command(app), ())
     return found
 
 
+def members(command: Any) -> dict[str, Any]:
+    """Commands of a group, which imports them when it is asked; none of a command."""
+    if not hasattr(command, "list_commands"):
+        return {}
+    return {name: command.get_command(None, name) for name in command.list_commands(None)}
+
+
 def command_of(text: str) -> tuple[str, ...] | None:
-    """The command that a text such as `diffcloud evaluate loss --set ...` is of."""
+    """The command that a text such as `diffcloud data check FOLDER` is of."""
     words = text.split()
     if words[:1] != ["diffcloud"]:
         return None
@@ -88,7 +105,7 @@ def command_pages(guides: Mapping[str, str]) -> dict[str, str]:
     pages["commands/index.md"] = (
         "# Commands\n\n| | |\n|---|---|\n" + "\n".join(rows) + "\n\n"
         "All take `--help`, and `--json`: the last line of standard output is then one JSON object. Progress, tables and\n"
-        "messages then go to standard error. Stages of the pipeline take `--params`, a file of [settings](settings.md).\n\n"
+        "messages then go to standard error. `--params` names a file of [settings](settings.md).\n\n"
         f"## Exit status\n\n| | |\n|---|---|\n{statuses}\n"
     )
     pages["commands/settings.md"] = settings_page()
@@ -118,10 +135,9 @@ def _command_page(path: tuple[str, ...], command: Any, guides: list[str]) -> str
     parts = [f"# {name}", _escaped(described), f"```text\n{usage}\n```"]
     if guides:
         parts.append(f"Shown in: {', '.join(guides)}.")
-    members = getattr(command, "commands", {})
-    if members:
+    if inside := members(command):
         rows = [
-            f"| [`{name} {member}`]({'-'.join((*path, member))}.md) | {_summary(members[member])} |" for member in members
+            f"| [`{name} {member}`]({'-'.join((*path, member))}.md) | {_summary(one)} |" for member, one in inside.items()
         ]
         parts.append("## Commands\n\n| | |\n|---|---|\n" + "\n".join(rows))
     for kind, heading in (("argument", "Arguments"), ("option", "Options")):
@@ -129,9 +145,9 @@ def _command_page(path: tuple[str, ...], command: Any, guides: list[str]) -> str
         if rows:
             head = "| | | default |\n|---|---|---|"
             parts.append(f"## {heading}\n\n{head}\n" + "\n".join(rows))
-    if any(parameter.name == "params" for parameter in command.params) and path[0] in _SECTIONS:
-        anchor = "evaluate" if path[0] == "evaluate" else path[0]
-        parts.append(f"`--params`: settings are in the section [`{anchor}`](settings.md#{anchor}).")
+    if any(parameter.name == "params" for parameter in command.params):
+        section = _SECTIONS[path]
+        parts.append(f"`--params`: settings are in the section [`{section}`](settings.md#{section}).")
     parts.append("## Exit status\n\n0, or as [for all commands](index.md#exit-status).")
     return "\n\n".join(parts) + "\n"
 
@@ -188,7 +204,9 @@ def settings_page() -> str:
             parts += [f"## {name}", _escaped(_flat(type(section).__doc__ or "")), _settings_table(section)]
             for key in type(section).model_fields:
                 inner = getattr(section, key)
-                if isinstance(inner, settings.Section):
+                if isinstance(inner, SOLVERS):
+                    parts += _solver_tables()
+                elif isinstance(inner, settings.Section):
                     parts += [f"## {name}.{key}", _escaped(_flat(type(inner).__doc__ or "")), _settings_table(inner)]
     rig = RigSettings()
     parts += ["## rig.yaml", _escaped(_flat(RigSettings.__doc__ or "")), _settings_table(rig)]
@@ -196,14 +214,32 @@ def settings_page() -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def _solver_tables() -> list[str]:
+    """`fit.solver` is one of several blocks, by its name."""
+    parts = ["## fit.solver", "One of these blocks. A name alone, such as `solver: adam`, stands for its defaults."]
+    for kind in SOLVERS:
+        names = ", ".join(name for name, one in SOLVER_KINDS.items() if one is kind)
+        parts += [f"### {names}", _escaped(_flat(kind.__doc__ or "")), _settings_table(kind())]
+    return parts
+
+
 def _settings_table(section: settings.Section) -> str:
-    meanings = attribute_docs(FusionSettings) | attribute_docs(type(section))
+    others = TrainingSettings if isinstance(section, settings.TrainConfig) else FusionSettings
+    meanings = attribute_docs(others) | attribute_docs(type(section))
     rows = []
     for key in type(section).model_fields:
         value = getattr(section, key)
         if not isinstance(value, settings.Section):
-            rows.append(f"| `{key}` | {_value(value)} | {_cell(_escaped(_flat(meanings.get(key, ''))))} |")
+            meaning = meanings.get(key) or _choices(type(section).model_fields[key].annotation)
+            rows.append(f"| `{key}` | {_value(value)} | {_cell(_escaped(_flat(meaning)))} |")
     return "| | default | meaning |\n|---|---|---|\n" + "\n".join(rows)
+
+
+def _choices(annotation: Any) -> str:
+    """Names that a setting may have, where its type lists them."""
+    if get_origin(annotation) is Literal:
+        return f"One of {', '.join(f'`{name}`' for name in get_args(annotation))}." if len(get_args(annotation)) > 1 else ""
+    return next(filter(None, map(_choices, get_args(annotation))), "")
 
 
 def _value(value: Any) -> str:

@@ -7,8 +7,10 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from diffcloud.estimation import AdamSettings, FitSpace, Objective, fit_adam
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.settings import SMOOTHING
+from diffcloud.estimation.solvers import AdamSettings, fit_adam
 from diffcloud.io.imports import release_episodes
 from diffcloud.scene import load_scenario
 from diffcloud.sim import Properties, rollout, rollout_tangents
@@ -152,15 +154,15 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
 
     import yaml
 
-    import diffcloud.cli.comparison
     import diffcloud.estimation.task
-    from tests.cli.invoke import invoke
+    import diffcloud.jobs.comparison
+    from tests.cli.invoke import invoke, study
 
     monkeypatch.chdir(tmp_path)
     profile = yaml.safe_load(
         (Path(__file__).parents[2] / "pipeline" / "profiles" / "release.yaml").read_text(encoding="utf-8")
     )
-    profile["fit"] |= {"iterations": 2, "starts": 2, "smoothing": 0.0}
+    profile["fit"]["solver"] |= {"max_steps": 2, "starts": 2, "smoothing": 0.0}
     profile["evaluate"] |= {"draws": 2, "landscapes": []}
     Path("quick.yaml").write_text(yaml.safe_dump(profile))
     command = ("published", release, "--params", "quick.yaml", "--only", "*/fold_tan*", "--markdown", "c.md")
@@ -174,9 +176,9 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
         raise AssertionError("fitted or compared again")
 
     monkeypatch.setattr(diffcloud.estimation.task, "solve", never)
-    monkeypatch.setattr(diffcloud.cli.comparison, "compare_episode", never)
+    monkeypatch.setattr(diffcloud.jobs.comparison, "compare_episode", never)
     assert invoke(*command).result["metrics"]["comparison"] == found
     assert (
         "No published episode matches"
-        in invoke("published", release, "--params", "quick.yaml", "--only", "shirt*", code=1).errors
+        in study("published", release, "--params", "quick.yaml", "--only", "shirt*", code=1).errors
     )

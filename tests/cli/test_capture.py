@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from diffcloud.cli import capture
+from diffcloud.cli import capturing as capture
 from diffcloud.cli.app import _have_a_home
 from diffcloud.hardware import installed
 from diffcloud.io.calibrations import Calibration, CameraCalibration, write_calibration
@@ -55,8 +55,7 @@ def test_a_capture_is_written_and_valid(tmp_path, server, path):
     cameras = {"serial-side": CameraCalibration("serial-side", SMALL, np.eye(4))}
     write_calibration(tmp_path / "c.json", Calibration(cameras, "charuco"))
     rig = write_rig(tmp_path, cameras=BOTH, arm=ARM, calibration="c.json", control_rate_hz=20, camera_rate_hz=60)
-    done = invoke(
-        "capture", "--rig", rig, "--out", tmp_path / "e", "--trajectory", path, "--yes",
+    done = invoke("data", "capture", "--rig", rig, "--out", tmp_path / "e", "--trajectory", path, "--yes",
         "--label", "scenario=lift", "--label", "operator=Ada",
     )  # fmt: skip
     assert server.stopped_after_last_motion()
@@ -71,7 +70,7 @@ def test_a_capture_is_written_and_valid(tmp_path, server, path):
 
 
 def test_a_dry_run_prints_the_plan_and_opens_nothing(tmp_path, server, path, rig):
-    done = invoke("capture", "--rig", rig, "--out", tmp_path / "e", "--trajectory", path, "--dry-run")
+    done = invoke("data", "capture", "--rig", rig, "--out", tmp_path / "e", "--trajectory", path, "--dry-run")
     assert done.result["plan"]["keyframes"] == 6
     assert (done.result["plan"]["arm"], done.result["plan"]["cameras"]) == (ARM, BOTH)
     assert "Dry run: nothing was opened" in done.errors
@@ -81,7 +80,7 @@ def test_a_dry_run_prints_the_plan_and_opens_nothing(tmp_path, server, path, rig
 
 
 def test_it_asks_before_the_arm_moves(tmp_path, server, path, rig):
-    arguments = ("capture", "--rig", rig, "--out", tmp_path / "e", "--trajectory", path)
+    arguments = ("data", "capture", "--rig", rig, "--out", tmp_path / "e", "--trajectory", path)
     assert "The arm will move" in invoke(*arguments, answer="n\n", code=1).errors
     assert server.calls == []
     invoke(*arguments, answer="y\n")
@@ -92,7 +91,7 @@ def test_a_folder_that_is_there_is_refused_before_anything_moves(tmp_path, serve
     (tmp_path / "e").mkdir()
     (tmp_path / "e" / "episode.json").write_text("{}")
     for more in (("--dry-run",), ("--yes",)):
-        said = invoke("capture", "--rig", rig, "--out", tmp_path / "e", "--trajectory", path, *more, code=1).errors
+        said = invoke("data", "capture", "--rig", rig, "--out", tmp_path / "e", "--trajectory", path, *more, code=1).errors
         assert "exists" in said
         assert "recorded so far" not in said
     assert server.calls == []
@@ -101,7 +100,7 @@ def test_a_folder_that_is_there_is_refused_before_anything_moves(tmp_path, serve
 def test_one_camera_without_an_arm(tmp_path, server):
     """An arm that the file names is not opened for it."""
     rig = write_rig(tmp_path, cameras={"side": "2"}, arm=ARM)
-    done = invoke("capture", "--rig", rig, "--out", tmp_path / "e", "--seconds", 0.2)
+    done = invoke("data", "capture", "--rig", rig, "--out", tmp_path / "e", "--seconds", 0.2)
     assert server.calls == []
     assert done.result["robot_rows"] == 0
     assert done.result["frames"]["side"] >= 1
@@ -148,7 +147,7 @@ UP = ("--trajectory", "up.csv")
 def test_bad_options(tmp_path, server, path, changes, arguments, message, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_rig(tmp_path, **{"cameras": {"side": "1"}, "arm": ARM, **changes})
-    assert message in invoke("capture", "--rig", "rig.yaml", "--out", "e", *arguments, code=1).errors
+    assert message in invoke("data", "capture", "--rig", "rig.yaml", "--out", "e", *arguments, code=1).errors
     assert not (tmp_path / "e").exists()
     assert "SendTwistCommand" not in server.names()
 
@@ -172,14 +171,14 @@ def test_limits_of_the_whole_arm(tmp_path, server, path, changes, message):
         own.replace('<origin xyz="0 0 0.12" rpy="0 0 0"/>', '<origin xyz="0 0 0.17" rpy="0 0 0"/>')
     )
     rig = write_rig(tmp_path, cameras=BOTH, arm=ARM, **changes)
-    command = ("capture", "--rig", rig, "--out", tmp_path / "e", "--trajectory", path, "--yes")
+    command = ("data", "capture", "--rig", rig, "--out", tmp_path / "e", "--trajectory", path, "--yes")
     assert message in invoke(*command, code=1).errors
     assert "SendTwistCommand" not in server.names()
 
 
 def test_trouble_names_what_is_kept(tmp_path, server, path):
     server.at_twist[4] = server.fault
-    command = ("capture", "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "e", "--trajectory", path, "--yes")
+    command = ("data", "capture", "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "e", "--trajectory", path, "--yes")
     write_rig(tmp_path, cameras=BOTH, arm="a.invalid")
     assert "No arm answers" in invoke(*command, code=1).errors
     write_rig(tmp_path, cameras=BOTH, arm=ARM)

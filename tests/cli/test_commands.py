@@ -10,22 +10,29 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
-from diffcloud.estimation import Objective, read_fit, task
+from diffcloud.estimation import task
+from diffcloud.estimation.objective import Objective
 from diffcloud.estimation.pose import NUISANCE
+from diffcloud.estimation.record import read_fit
+from diffcloud.estimation.result import describe_recording
+from diffcloud.estimation.settings import FitSettings
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.obj import read_cloth, read_surface
 from diffcloud.io.timings import read_seconds
 from diffcloud.scene.scenarios import load_scenario
+from diffcloud.sim.properties import one_set
 from tests.arcsim.files import MESHES, over_moving_box, write_file, write_files
-from tests.cli.invoke import DIFFCLOUD, ROOT, Invoked, environment, invoke
+from tests.cli.invoke import DIFFCLOUD, ROOT, Invoked, environment, invoke, stage, study
 from tests.conftest import small_lift
 from tests.estimation.test_fit import clouds_of
 
@@ -53,11 +60,21 @@ def work(tmp_path):
     return tmp_path
 
 
-def test_rollout_writes_the_contract_and_exports(work):
-    done = run(
-        "rollout", "--scenario", "small.yaml", "--set", "stretch=0.5", "--set", "mass=5", "--frames", 3, "--out", "run.npz",
-        "--obj", "obj", "--ply", "ply", cwd=work,
-    )  # fmt: skip
+def staged(name: str, *arguments: object, cwd: Path, code: int = 0) -> Invoked:
+    with contextlib.chdir(cwd):
+        return stage(name, *arguments, code=code)
+
+
+def measured(scene: Path, episode: Path, values: dict[str, float]) -> float:
+    """The loss of these parameters, by the measure of a fit with default settings."""
+    objective = Objective(load_scenario(str(scene)), read_episode(episode), **FitSettings().measure())
+    with torch.no_grad():
+        return describe_recording(objective, objective.simulate_to_loss(one_set(values)), episode.stem).loss
+
+
+def test_simulate_writes_the_contract_and_meshes(work):
+    command = ("simulate", "small.yaml", "--set", "stretch=0.5", "--set", "mass=5", "--frames", 3)
+    done = run(*command, "--out", "run.npz", cwd=work)
     with np.load(work / "run.npz") as data:
         assert data["nodes"].shape == (4, 25, 3)
         assert data["nodes"].dtype == np.float64
@@ -65,94 +82,85 @@ def test_rollout_writes_the_contract_and_exports(work):
         assert data["times"].tolist() == pytest.approx([0, 0.1, 0.2, 0.3])
         last = data["nodes"][-1]
     assert done.result["parameters"] == {"stretch": 0.5, "mass": 5.0}
+    for kind in ("obj", "ply"):
+        run(*command, "--out", kind, "--format", kind, cwd=work)
     np.testing.assert_array_equal(read_cloth(work / "obj" / "003.obj").nodes, last)
-    assert len(list((work / "ply").iterdir())) == 4
+    assert len(list((work / "ply").glob("*.ply"))) == 4
+    assert "give --out motion.npz" in run(*command, cwd=work, code=1).errors
+    assert "writes a folder" in run(*command, "--out", "run.npz", "--format", "obj", cwd=work, code=1).errors
 
 
 def test_a_cloth_that_lies_askew_is_replayed_as_it_lay(work):
     write_episode(work / "askew.npz", clouds_of(small_lift(), stretch=0.7, mass=1.0, turn=0.2, shape_1_1=0.01))
-    told = ("--scenario", "small.yaml", "--fix", "mass=1.0", "--laid", "turn=10deg,shape=1cm", "--starts", 1)
+    told = ("--scene", "small.yaml", "--fix", "mass=1.0", "--initial-state", "turn=10deg,shape=1cm", "--starts", 1)
     run("fit", *told, "--out", "fits", "askew.npz", cwd=work)
-    record = read_fit(work / "fits" / "askew.json")
+    record = read_fit(work / "fits" / "fit.json")
     assert sum(record.nuisance[name].value for name in ("turn", "yaw")) == pytest.approx(0.2, abs=0.05)
-    measured = run("evaluate", "loss", "--fit", "fits/askew.json", "--scenario", "small.yaml", "askew.npz", cwd=work).result
-    assert measured["loss"] == pytest.approx(record.loss, rel=1e-6)
-    run(
-        "rollout", "--fit", "fits/askew.json", "--scenario", "small.yaml", "--episode", "askew.npz", "--out", "r.npz",
-        cwd=work,
-    )  # fmt: skip
-    with np.load(work / "r.npz") as found, np.load(work / "fits" / "askew.npz") as fitted:
+    run("simulate", "fits/fit.json", "--track", "askew.npz", "--out", "r.npz", cwd=work)
+    with np.load(work / "r.npz") as found, np.load(work / "fits" / "fit.npz") as fitted:
         np.testing.assert_allclose(found["nodes"][0], fitted["nodes"][0], atol=1e-12)
         assert np.ptp(found["nodes"][0, :, 2]) > 0.003
-    done = run("evaluate", "intervals", "fits/askew.json", "--scenario", "small.yaml", cwd=work)
-    assert {"turn", "shape"} <= set(done.result["sources"])
+    assert {"turn", "shape"} <= set(json.loads((work / "fits" / "intervals.json").read_text())["sources"])
 
 
 def test_options_add_to_what_the_parameters_file_gives(work):
     (work / "params.yaml").write_text(
-        "fit: {fixed: {bending: 2.0, mass: 3.0}, bounds: {stretch: [0.2, 5.0], mass: [0.5, 2]}}"
+        "fit: {fixed: {bending: 2.0, mass: 3.0}, bounds: {stretch: [0.2, 5.0], mass: [0.5, 2]}, "
+        "solver: {starts: 2, model_error: false}}"
     )
-    told = ("--scenario", "small.yaml", "--params", "params.yaml", "--iterations", 1, "--starts", 1)
-    run("fit", *told, "--out", "fits", "--fix", "mass=1.0", "--bound", "mass=0.9:1.1", "e1.npz", cwd=work)
-    record = read_fit(work / "fits" / "e1.json")
+    told = ("--scene", "small.yaml", "--params", "params.yaml", "--max-steps", 1, "--out", "fits", "e1.npz")
+    run("fit", *told, "--fix", "mass=1.0", "--bound", "mass=0.9:1.1", cwd=work)
+    record = read_fit(work / "fits" / "fit.json")
     assert (record.values["bending"], record.values["mass"]) == (2.0, 1.0)
     assert record.parameters["stretch"].bounds == (0.2, 5.0)
+    settings = {"starts": 2, "model_error": False, "max_steps": 1}
+    assert settings.items() <= record.settings.items()
+    other = run("fit", *told, "--solver", "adam", cwd=work).errors
+    assert "adam has no model_error, which --params states for likelihood" in other
+    assert read_fit(work / "fits" / "fit.json").settings["starts"] == 2
 
 
 def test_fit_then_replay_and_measure(work):
     done = run(
-        "fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 3, "--starts", 2, "--fix", "mass=1.0",
-        "--laid", "none", "e1.npz", cwd=work,
+        "fit", "--scene", "small.yaml", "--out", "fits", "--max-steps", 3, "--starts", 2, "--fix", "mass=1.0",
+        "--initial-state", "none", "e1.npz", cwd=work,
     )  # fmt: skip
-    summary = json.loads((work / "fits" / "e1.json").read_text())
-    assert done.result["fits"]["e1"]["loss"] == summary["loss"]
+    summary = json.loads((work / "fits" / "fit.json").read_text())
+    assert done.result["rms_mm"] == summary["rms_mm"]
     assert {"loss", "loss_start", "iterations", "stop_reason", "parameters"} <= set(summary)
     assert not {"seconds", "versions"} & set(summary)  # they differ from run to run and lie beside it
-    assert done.result["fits"]["e1"]["seconds"] == read_seconds(work / "fits" / "e1.json") > 0
     assert {"value", "unit"} <= set(summary["parameters"]["stretch"])
     values = {name: entry["value"] for name, entry in summary["parameters"].items()}
     assert values.keys() > {"stretch", "mass", "bending"}  # what is not known exactly was fitted too
-    measured = run(
-        "evaluate", "loss", "--scenario", "small.yaml", "e1.npz",
-        *(part for name, value in values.items() for part in ("--set", f"{name}={value!r}")), cwd=work,
-    )  # fmt: skip
-    assert measured.result["loss"] == pytest.approx(summary["loss"], rel=1e-9)  # same metric, same points
-    told = run("evaluate", "loss", "--fit", "fits/e1.json", "e1.npz", cwd=work)  # the scenario's file lies here
-    assert told.result["loss"] == measured.result["loss"]
-    assert told.result["parameters"] == values
-    assert told.result["rms_mm"] > 0
-    other = run("evaluate", "loss", "--fit", "fits/e1.json", "--set", "mass=2", "--seed", 3, "e1.npz", cwd=work)
-    assert other.result["parameters"]["mass"] == 2.0
-    assert other.result["loss"] > told.result["loss"]
-    run("rollout", "--scenario", "small.yaml", "--fit", "fits/e1.json", "--episode", "e1.npz", "--out", "r.npz", cwd=work)
-    with np.load(work / "r.npz") as replay, np.load(work / "fits" / "e1.npz") as fitted:
+    again = measured(work / "small.yaml", work / "e1.npz", values)
+    assert again == pytest.approx(summary["loss"], rel=1e-9)  # same metric, same points
+    assert measured(work / "small.yaml", work / "e1.npz", {**values, "mass": 2.0}) > again
+    run("simulate", "fits/fit.json", "--track", "e1.npz", "--out", "r.npz", cwd=work)
+    with np.load(work / "r.npz") as replay, np.load(work / "fits" / "fit.npz") as fitted:
         np.testing.assert_allclose(replay["nodes"], fitted["nodes"], atol=1e-12)
 
 
 @pytest.mark.parametrize("solver", ["cma_es", "random_search"])
 def test_a_fit_by_a_search(work, solver):
-    command = ("fit", "--scenario", "small.yaml", "--out", "fits", "--solver", solver, "--simulations", 12)
+    (work / "params.yaml").write_text(yaml.safe_dump({"fit": {"solver": {"name": solver, "max_simulations": 12}}}))
+    command = ("fit", "--scene", "small.yaml", "--out", "fits", "--params", "params.yaml")
     done = run(*command, "--init", "stretch=2,mass=1", "e1.npz", cwd=work)
-    summary = json.loads((work / "fits" / "e1.json").read_text())
+    summary = json.loads((work / "fits" / "fit.json").read_text())
     assert (summary["solver"], summary["simulations"], summary["stop_reason"]) == (solver, 12, "simulations")
     assert summary["start"] == {"stretch": 2.0, "mass": 1.0}
-    assert done.result["fits"]["e1"]["loss"] == summary["loss"] <= summary["loss_start"]
-    for options, message in (
-        (
-            ("--starts", 2, "--iterations", 3),
-            "iterations: of solver likelihood or adam; starts: of solver likelihood or adam",
-        ),
-        (("--smoothing", 0.1), f"smoothing: of solver adam; not of {solver}: leave out"),
-        (("--simulations", 0), "simulations"),
-    ):
-        assert message in run(*command, *options, "e1.npz", cwd=work, code=1).errors
+    assert summary["loss"] <= summary["loss_start"]
+    assert f"There are no intervals: the solver {solver} knows no uncertainty" in done.errors
+    assert not (work / "fits" / "intervals.json").exists()
+    for options in (("--starts", 2), ("--max-steps", 3)):
+        assert options[0] in run(*command, *options, "e1.npz", cwd=work, code=1).errors
 
 
-def test_joint_fit_gives_one_result(work):
+def test_each_recording_alone(work):
     write_episode(work / "e2.npz", clouds_of(small_lift(), stretch=1.4, mass=1.0))
-    run("fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 1, "--joint", "e1.npz", "e2.npz", cwd=work)
-    assert json.loads((work / "fits" / "joint.json").read_text())["episodes"][1]["name"] == "e2"
-    assert sorted(path.name for path in (work / "fits").glob("[!.]*")) == ["joint.json", "joint.npz"]
+    command = ("fit", "--scene", "small.yaml", "--out", "fits", "--max-steps", 1, "--starts", 1)
+    done = run(*command, "--separate", "e1.npz", "e2.npz", cwd=work)
+    assert set(done.result) == {"e1", "e2"}
+    assert [len(read_fit(work / "fits" / name / "fit.json").episodes) for name in ("e1", "e2")] == [1, 1]
 
 
 class TestJointFitOverMotions:
@@ -167,46 +175,26 @@ class TestJointFitOverMotions:
 
     def test_each_recording_has_its_own_pose_and_loss(self, motions):
         pairs = ("small.yaml=e1.npz", "side.yaml=s1.npz")
-        done = run("fit", "--joint", *pairs, "--out", "fits", "--iterations", 2, "--fix", "mass=1", cwd=motions)
-        joint = json.loads((motions / "fits" / "joint.json").read_text())
+        done = run("fit", *pairs, "--out", "fits", "--max-steps", 2, "--fix", "mass=1", cwd=motions)
+        joint = json.loads((motions / "fits" / "fit.json").read_text())
         assert [(one["scenario"], one["name"]) for one in joint["episodes"]] == [("small", "e1"), ("side", "s1")]
         losses = [one["loss"] for one in joint["episodes"]]
         assert joint["loss"] == pytest.approx(math.sqrt(losses[0] * losses[1]), rel=1e-9)
         for one in joint["episodes"]:
             assert set(one["nuisance"]) == {*NUISANCE, "turn"} - {"scale"}
             assert one["left_out"]["loss"] >= 0.5 * one["loss"]
-        assert "with the parameters of the others" in done.errors
-        assert done.result["fits"]["joint"]["loss"] == joint["loss"]
-        run(
-            "rollout",
-            "--scenario",
-            "side.yaml",
-            "--fit",
-            "fits/joint.json",
-            "--episode",
-            "s1.npz",
-            "--out",
-            "r.npz",
-            cwd=motions,
-        )
-        with np.load(motions / "r.npz") as replay, np.load(motions / "fits" / "joint.npz") as fitted:
+        assert "when a recording is left out of the fit" in done.errors
+        assert done.result["episodes"].keys() == {"e1", "s1"}
+        run("simulate", "fits/fit.json", "--track", "s1.npz", "--out", "r.npz", cwd=motions)
+        with np.load(motions / "r.npz") as replay, np.load(motions / "fits" / "fit.npz") as fitted:
             np.testing.assert_allclose(replay["nodes"], fitted["nodes_1"], atol=1e-12)
 
-    def test_a_list_says_the_same(self, motions):
-        (motions / "cloth.yaml").write_text("small.yaml: e1.npz\nside.yaml: [s1.npz]\n")
-        run("fit", "--joint", "cloth.yaml", "--out", "fits", "--iterations", 1, cwd=motions)
-        assert len(json.loads((motions / "fits" / "joint.json").read_text())["episodes"]) == 2
-        run("fit", "cloth.yaml", "--out", "single", "--iterations", 1, cwd=motions)
-        assert (motions / "single" / "side" / "s1.json").is_file()
-
-    @pytest.mark.parametrize("arguments", [("small.yaml=lifts", "side.yaml=s1.npz"), ("cloth.yaml",)])
-    def test_a_folder_stands_for_its_episodes(self, motions, arguments):
+    def test_a_folder_stands_for_its_episodes(self, motions):
         (motions / "lifts").mkdir()
         for name in ("e1.npz", "e2.npz"):
             shutil.copy(motions / "e1.npz", motions / "lifts" / name)
-        (motions / "cloth.yaml").write_text("small.yaml: lifts\nside.yaml: [s1.npz]\n")
-        run("fit", "--joint", *arguments, "--out", "fits", "--iterations", 1, cwd=motions)
-        joint = json.loads((motions / "fits" / "joint.json").read_text())
+        run("fit", "small.yaml=lifts", "side.yaml=s1.npz", "--out", "fits", "--max-steps", 1, cwd=motions)
+        joint = json.loads((motions / "fits" / "fit.json").read_text())
         assert [(one["scenario"], one["name"]) for one in joint["episodes"]] == [
             ("small", "e1"),
             ("small", "e2"),
@@ -216,29 +204,22 @@ class TestJointFitOverMotions:
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            (("small.yaml=e1.npz", "e1.npz"), "Give each episode its scenario, as in lift=a.npz fold=b.npz"),
-            (("small.yaml=e1.npz", "--scenario", "small.yaml"), "leave out --scenario"),
-            (("small.yaml=e1.npz", "small.yaml=e1.npz"), "Two episodes have the same name"),
-            (("small.yaml=e1.npz", "small.yaml=."), "Two episodes have the same name"),
-            (("small.yaml=nothing",), "nothing holds no episodes"),
+            (("small.yaml=e1.npz", "e1.npz"), "Give each recording its scene, as in lift=a.npz fold=b.npz"),
+            (("small.yaml=e1.npz", "small.yaml=e1.npz"), "Two recordings are named e1"),
+            (("small.yaml=e1.npz", "small.yaml=."), "Two recordings are named e1"),
+            (("small.yaml=nothing",), "nothing holds no gripper.csv"),
             (("small.yaml=e1.npz", "denim.yaml=s1.npz"), "is of one cloth"),
-            (("empty.yaml",), "lists 0 episodes or folders"),
-            (("number.yaml",), "small takes the path of an episode"),
-            (("nameless.yaml",), "small.yaml takes the path of an episode"),
         ],
     )
     def test_what_is_no_list_of_recordings(self, motions, arguments, message):
         (motions / "denim.yaml").write_text(yaml.safe_dump({**SMALL, "material": "denim"}))
-        (motions / "empty.yaml").write_text("[]")
-        (motions / "number.yaml").write_text("small: 3")
-        (motions / "nameless.yaml").write_text("small.yaml: ''")
         (motions / "nothing").mkdir()
-        assert message in run("fit", "--joint", *arguments, "--out", "fits", cwd=motions, code=1).errors
-        assert not (motions / "fits").exists() or not list((motions / "fits").iterdir())
+        assert message in run("fit", *arguments, "--out", "fits", cwd=motions, code=1).errors
+        assert not (motions / "fits" / "fit.json").exists()
 
 
 def test_a_process_says_what_is_wrong_without_a_traceback(work):
-    command = [*DIFFCLOUD, "fit", "--scenario", "nothing", "--out", "fits", "e1.npz"]
+    command = [*DIFFCLOUD, "fit", "--scene", "nothing", "--out", "fits", "e1.npz"]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=work, env=env, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
@@ -246,7 +227,28 @@ def test_a_process_says_what_is_wrong_without_a_traceback(work):
     assert "Traceback" not in done.stderr
 
 
-def test_interrupted_fit_leaves_the_best_so_far_and_goes_on(work, monkeypatch):
+@pytest.fixture
+def tree(work):
+    """Episodes as the stage `fit` takes them."""
+    (work / "raw" / "scenes").mkdir(parents=True)
+    (work / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump(SMALL))
+    (work / "episodes" / "small").mkdir(parents=True)
+    shutil.move(work / "e1.npz", work / "episodes" / "small" / "e1.npz")
+    return work
+
+
+FIT = ("fit", "--params", "params.yaml", "--out", "fits", "episodes")
+
+
+def told(folder: Path, **fit: object) -> None:
+    (folder / "params.yaml").write_text(yaml.safe_dump({"scenarios": ["small"], "fit": fit}))
+
+
+def fit_of(folder: Path, name: str) -> dict:
+    return json.loads((folder / "small" / f"{name}.json").read_text())
+
+
+def test_interrupted_fit_leaves_the_best_so_far_and_goes_on(tree, monkeypatch):
     calls = []
 
     def evaluate(self, *arguments):
@@ -257,24 +259,28 @@ def test_interrupted_fit_leaves_the_best_so_far_and_goes_on(work, monkeypatch):
 
     evaluated = Objective.__call__
     monkeypatch.setattr(Objective, "__call__", evaluate)
-    write_episode(work / "e2.npz", clouds_of(small_lift(), stretch=1.7, mass=1.0))
-    adam = ("--solver", "adam", "--iterations", 10)  # as many steps whatever the loss does
-    command = ("fit", "--scenario", "small.yaml", "--out", "fits", *adam, "e1.npz", "e2.npz")
-    done = run(*command, cwd=work, code=130)
+    write_episode(tree / "episodes" / "small" / "e2.npz", clouds_of(small_lift(), stretch=1.7, mass=1.0))
+    adam = {"name": "adam", "max_steps": 10}  # as many steps whatever the loss does
+    told(tree, solver=adam)
+    done = staged(*FIT, cwd=tree, code=130)
     assert "best so far" in done.errors
-    first, second = (json.loads((work / "fits" / f"{name}.json").read_text()) for name in ("e1", "e2"))
+    first, second = (fit_of(tree / "fits", name) for name in ("e1", "e2"))
     assert (first["stop_reason"], second["stop_reason"]) == ("iterations", "interrupted")
     assert second["loss"] <= second["loss_start"]
     calls[:] = [0] * 20  # no more interrupts
-    seconds = read_seconds(work / "fits" / "e1.json")
-    assert run(*command, cwd=work).result["fits"]["e1"]["seconds"] == seconds > 0  # kept
-    assert json.loads((work / "fits" / "e2.json").read_text())["iterations"] == 10
+    seconds = read_seconds(tree / "fits" / "small" / "e1.json")
+    assert staged(*FIT, cwd=tree).result["fits"]["small/e1"]["seconds"] == seconds > 0  # kept
+    assert fit_of(tree / "fits", "e2")["iterations"] == 10
     begun = len(calls)
-    run(*command, "--seed", 1, cwd=work)  # another fit
+    told(tree, solver=adam, level=0.8)  # the same fit
+    staged(*FIT, cwd=tree)
+    assert len(calls) == begun
+    told(tree, solver=adam, seed=1)  # another fit
+    staged(*FIT, cwd=tree)
     assert len(calls) > begun
 
 
-def test_a_ctrl_c_after_the_last_step_does_not_cost_the_fit(work, monkeypatch):
+def test_a_ctrl_c_after_the_last_step_does_not_cost_the_fit(tree, monkeypatch):
     real, pressed = task.describe_fit, []
 
     def describe(*arguments, **options):
@@ -284,53 +290,88 @@ def test_a_ctrl_c_after_the_last_step_does_not_cost_the_fit(work, monkeypatch):
         return real(*arguments, **options)
 
     monkeypatch.setattr(task, "describe_fit", describe)
-    command = ("fit", "--scenario", "small.yaml", "--out", "fits", "--solver", "adam", "--iterations", 2, "e1.npz")
-    run(*command, cwd=work, code=130)
-    first = json.loads((work / "fits" / "e1.json").read_text())
-    assert first["stop_reason"] == "iterations"
-    seconds = read_seconds(work / "fits" / "e1.json")
-    assert run(*command, cwd=work).result["fits"]["e1"]["seconds"] == seconds > 0  # kept
+    told(tree, solver={"name": "adam", "max_steps": 2})
+    staged(*FIT, cwd=tree, code=130)
+    assert fit_of(tree / "fits", "e1")["stop_reason"] == "iterations"
+    seconds = read_seconds(tree / "fits" / "small" / "e1.json")
+    assert staged(*FIT, cwd=tree).result["fits"]["small/e1"]["seconds"] == seconds > 0  # kept
 
 
 @pytest.mark.slow
-def test_processes_give_the_same_fits(work):
-    write_episode(work / "e2.npz", clouds_of(small_lift(), stretch=1.7, mass=1.0))
+def test_processes_give_the_same_fits(tree):
+    write_episode(tree / "episodes" / "small" / "e2.npz", clouds_of(small_lift(), stretch=1.7, mass=1.0))
+    told(tree, solver={"max_steps": 2})
     found = {}
     for workers in (1, 2):
-        run(
-            "fit", "--scenario", "small.yaml", "--out", f"by{workers}", "--iterations", 2, "--workers", workers,
-            "e1.npz", "e2.npz", cwd=work,
-        )  # fmt: skip
-        found[workers] = [(work / f"by{workers}" / f"{name}.json").read_bytes() for name in ("e1", "e2")]
+        out = f"by{workers}"
+        staged("fit", "--params", "params.yaml", "--out", out, "--workers", workers, "episodes", cwd=tree)
+        found[workers] = [(tree / out / "small" / f"{name}.json").read_bytes() for name in ("e1", "e2")]
     assert found[1] == found[2]
 
 
 @pytest.mark.slow
-def test_ctrl_c_stops_fits_in_processes_and_keeps_their_best(work):
-    write_episode(work / "easy.npz", clouds_of(small_lift(), stretch=5.05, mass=5.05))  # below the threshold at once
+def test_ctrl_c_stops_fits_in_processes_and_keeps_their_best(tree):
+    folder = tree / "episodes" / "small"
+    (folder / "e1.npz").unlink()
+    write_episode(folder / "easy.npz", clouds_of(small_lift(), stretch=5.05, mass=5.05))  # below the threshold at once
     moved = clouds_of(small_lift(), stretch=1.7, mass=1.0)
-    write_episode(work / "e2.npz", replace(moved, points=moved.points + 0.03))  # out of reach
-    command = [*DIFFCLOUD, "fit", "--scenario", "small.yaml", "--out", "fits", "--solver", "adam"]
-    command += ["--iterations", "1000000", "--workers", "2"]
-    env = environment()
-    process = subprocess.Popen(
-        [*command, "--threshold", "5e-5", "easy.npz", "e2.npz"], cwd=work, env=env, stderr=subprocess.PIPE, text=True
-    )
+    write_episode(folder / "far.npz", replace(moved, points=moved.points + 0.03))  # out of reach
+    told(tree, solver={"name": "adam", "max_steps": 1_000_000, "threshold": 5e-5})
+    command = [sys.executable, "-m", "pipeline.fit", *FIT[1:], "--workers", "2"]
+    process = subprocess.Popen(command, cwd=tree, env=environment(), stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
-    while not (work / "fits" / "easy.json").exists() and time.monotonic() < deadline:
+    while not (tree / "fits" / "small" / "easy.json").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     time.sleep(3)  # the other process began when this one did
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
     assert process.returncode == 130, said
     assert "Traceback" not in said
-    reasons = [json.loads((work / "fits" / f"{name}.json").read_text())["stop_reason"] for name in ("easy", "e2")]
+    reasons = [fit_of(tree / "fits", name)["stop_reason"] for name in ("easy", "far")]
     assert reasons == ["threshold", "interrupted"]
+
+
+CLUSTER = """
+import sys
+from distributed import LocalCluster
+if __name__ == "__main__":
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        print(cluster.scheduler_address, flush=True)
+        sys.stdin.read()
+"""
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_dies_loses_no_finished_fit(tree):
+    for number in range(2, 6):
+        name = tree / "episodes" / "small" / f"e{number}.npz"
+        write_episode(name, clouds_of(small_lift(), stretch=0.5 * number, mass=1.0))
+    told(tree, solver={"name": "adam", "max_steps": 300})
+    (tree / "cluster.py").write_text(CLUSTER)
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "start_new_session": True}
+    with subprocess.Popen([sys.executable, "cluster.py"], cwd=tree, env=environment(), **pipes) as cluster:
+        command = [sys.executable, "-m", "pipeline.fit", *FIT[1:], "--scheduler", cluster.stdout.readline().strip()]
+        process = subprocess.Popen(command, cwd=tree, env=environment(), stderr=subprocess.PIPE, text=True)
+        deadline = time.monotonic() + 60
+        while not (tree / "fits" / "small" / "e1.json").exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        os.killpg(cluster.pid, signal.SIGKILL)
+        _, said = process.communicate(timeout=120)
+    assert process.returncode == 1, said
+    assert "What is finished is kept; run the command again" in " ".join(said.split())
+    finished = {path.stem: path.stat().st_mtime_ns for path in (tree / "fits" / "small").glob("e*.json")}
+    assert 1 <= len(finished) < 5
+    staged(*FIT, cwd=tree)
+    now = {path.stem: path.stat().st_mtime_ns for path in (tree / "fits" / "small").glob("e*.json")}
+    assert finished.items() <= now.items()
+    assert len(now) == 5
 
 
 @pytest.mark.parametrize("told", ["side=1,2", "side", "=1,2,3", "side=1,2,nan", "side=a,b,c"])
 def test_a_camera_that_stands_nowhere(work, told):
-    refused = run("import", "clouds", "--rate-hz", 10, "--camera", told, "--out", "nowhere.npz", cwd=work, code=1)
+    (work / "clouds").mkdir()
+    np.savetxt(work / "clouds" / "0.xyz", np.eye(3))
+    refused = run("data", "import", "clouds", "--rate-hz", 10, "--camera", told, "--out", "nowhere.npz", cwd=work, code=1)
     assert "--camera takes NAME=X,Y,Z in metres" in refused.errors
     assert not (work / "nowhere.npz").exists()
 
@@ -343,25 +384,28 @@ def test_import_own_clouds_end_to_end(work):
     rows = np.column_stack([episode.times, episode.gripper[:, 0]])
     np.savetxt(work / "gripper.csv", rows, delimiter=",", header="t_s,x,y,z", comments="")
     where = ("--camera", "side=1.2,0,0.5", "--camera", "top=0,0,2")
-    run("import", "clouds", "--gripper", "gripper.csv", *where, "--out", "own.npz", cwd=work)
+    run("data", "import", "clouds", "--gripper", "gripper.csv", *where, "--out", "own.npz", cwd=work)
     assert read_episode(work / "own.npz").meta["viewpoints"] == {"side": [1.2, 0.0, 0.5], "top": [0.0, 0.0, 2.0]}
     again = read_episode(work / "own.npz")
     np.testing.assert_allclose(again.points, episode.points, atol=1e-6)
-    run("fit", "--scenario", "small.yaml", "--out", "fits", "--iterations", 1, "own.npz", cwd=work)
+    run("fit", "--scene", "small.yaml", "--out", "fits", "--max-steps", 1, "own.npz", cwd=work)
 
 
 def test_stages_run_in_a_row_and_the_page_is_whole(work):
     (work / "raw" / "scenes").mkdir(parents=True)
     (work / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump(SMALL))
-    params = {"scenarios": ["small"], "episodes": {"per_scenario": 1}, "fit": {"iterations": 2}, "evaluate": {"draws": 1}}
+    params = {
+        "scenarios": ["small"],
+        "episodes": {"per_scenario": 1},
+        "fit": {"solver": {"max_steps": 2}},
+        "evaluate": {"draws": 1},
+    }
     (work / "params.yaml").write_text(yaml.safe_dump(params))
-    run("episodes", "--params", "params.yaml", "--out", "data/recorded", cwd=work)
-    run("preprocess", "--params", "params.yaml", "--out", "data/episodes", "data/recorded", cwd=work)
-    run(
-        "fit", "--params", "params.yaml", "--scenario", "small", "--out", "data/fits/small", "data/episodes/small", cwd=work
-    )
-    run("evaluate", "--params", "params.yaml", cwd=work)
-    run("report", "--params", "params.yaml", cwd=work)
+    staged("episodes", "--params", "params.yaml", "--out", "data/recorded", cwd=work)
+    staged("preprocess", "--params", "params.yaml", "--out", "data/episodes", "data/recorded", cwd=work)
+    staged("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes", cwd=work)
+    staged("evaluate", "--params", "params.yaml", cwd=work)
+    staged("report", "--params", "params.yaml", cwd=work)
     metrics = json.loads((work / "reports" / "metrics.json").read_text())["small"]
     assert set(metrics) == {"rms_mm", "ratio_factor"}  # a fit compares every frame
     page = (work / "reports" / "index.html").read_text()
@@ -371,13 +415,13 @@ def test_stages_run_in_a_row_and_the_page_is_whole(work):
         assert "{{" not in own
         assert "://" not in own
     first = (work / "reports" / "metrics.json").read_bytes()
-    run("evaluate", "--params", "params.yaml", cwd=work)
+    staged("evaluate", "--params", "params.yaml", cwd=work)
     assert (work / "reports" / "metrics.json").read_bytes() == first
 
 
 @pytest.mark.slow
 def test_two_grippers_from_csv_to_report(work):
-    """Their tracks come as one CSV, drive the fit, the rollout, and what the page is made of."""
+    """Their tracks come as one CSV, drive the fit, the simulation, and what the page is made of."""
     (work / "raw" / "scenes").mkdir(parents=True)
     two = {name: value for name, value in SMALL.items() if name != "path"} | {
         "yaw_deg": 0,
@@ -391,7 +435,7 @@ def test_two_grippers_from_csv_to_report(work):
     still = {**two, "path": [[0, 0, 0, 0], [0.5, 0, 0, 0.001]], "grippers": {"left": {"grasped": ["left_top"]}}}
     still["grippers"]["right"] = {"grasped": ["right_top"]}
     (work / "raw" / "scenes" / "still.yaml").write_text(yaml.safe_dump(still))
-    run("rollout", "--scenario", "raw/scenes/two.yaml", "--set", "stretch=0.6", "--out", "true.npz", cwd=work)
+    run("simulate", "raw/scenes/two.yaml", "--set", "stretch=0.6", "--out", "true.npz", cwd=work)
     with np.load(work / "true.npz") as true:
         nodes, faces, times = true["nodes"], true["faces"], true["times"]
     (work / "clouds").mkdir()
@@ -402,32 +446,31 @@ def test_two_grippers_from_csv_to_report(work):
             rows.append(",".join([name, *(f"{number:.9f}" for number in (time_s, *cloth[node]))]))
     (work / "tracks.csv").write_text("\n".join(rows))
     episode = "data/episodes/still/own.npz"
-    run("import", "clouds", "--gripper", "tracks.csv", "--out", episode, cwd=work)
-    run("rollout", "--scenario", "still", "--episode", episode, "--set", "stretch=0.6", "--out", "again.npz", cwd=work)
+    run("data", "import", "clouds", "--gripper", "tracks.csv", "--out", episode, cwd=work)
+    run("simulate", "still", "--track", episode, "--set", "stretch=0.6", "--out", "again.npz", cwd=work)
     with np.load(work / "again.npz") as again:
         np.testing.assert_allclose(again["nodes"][:, [20, 24]], nodes[:, [20, 24]], atol=1e-6)
         np.testing.assert_allclose(again["nodes"], nodes, atol=5e-3)
-    short = ("rollout", "--scenario", "still", "--episode", episode, "--frames", 2, "--out", "short.npz")
+    short = ("simulate", "still", "--track", episode, "--frames", 2, "--out", "short.npz")
     done = run(*short, cwd=work)
     assert f"3 of the recording's {len(times)} frames lie within the" in done.errors
     assert done.result["warnings"]
     assert f"--frames {len(times) - 1} covers all" in done.errors
     assert "of the recording's" not in run(*short, "--frames", len(times) - 1, cwd=work).errors
     (work / "params.yaml").write_text(
-        yaml.safe_dump({"scenarios": ["still"], "fit": {"iterations": 2}, "evaluate": {"draws": 1}})
+        yaml.safe_dump({"scenarios": ["still"], "fit": {"solver": {"max_steps": 2}}, "evaluate": {"draws": 1}})
     )
-    fit = ("fit", "--params", "params.yaml", "--scenario", "still", "--out", "data/fits/still")
-    run(*fit, "data/episodes/still", cwd=work)
-    run("evaluate", "--params", "params.yaml", cwd=work)
-    run("report", "--params", "params.yaml", cwd=work)
+    staged("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes", cwd=work)
+    staged("evaluate", "--params", "params.yaml", cwd=work)
+    staged("report", "--params", "params.yaml", cwd=work)
     metrics = json.loads((work / "reports" / "metrics.json").read_text())
     assert metrics["still"]["rms_mm"]["diffcloud"] < 30  # the scenario's own path would leave it on the table
     assert "own" in (work / "reports" / "index.html").read_text()
     # one gripper's file alone is refused by the names
     (work / "one.csv").write_text("\n".join(row[5:] for row in rows if row.startswith("left,")))
     (work / "one.csv").write_text("t_s,x,y,z\n" + (work / "one.csv").read_text())
-    run("import", "clouds", "--gripper", "left=one.csv", "--out", "one.npz", cwd=work)
-    done = run("rollout", "--scenario", "still", "--episode", "one.npz", "--out", "x.npz", cwd=work, code=1)
+    run("data", "import", "clouds", "--gripper", "left=one.csv", "--out", "one.npz", cwd=work)
+    done = run("simulate", "still", "--track", "one.npz", "--out", "x.npz", cwd=work, code=1)
     assert "The scene's grippers are left, right, the episode's left" in done.errors
     assert not (work / "x.npz").exists()
 
@@ -443,8 +486,8 @@ def test_simulated_targets_are_whole_uniform_and_left_as_they_are(work):
     (work / "raw" / "scenes").mkdir(parents=True)
     (work / "raw" / "scenes" / "v.yaml").write_text("base: vest_hang\nframes: 3\nloss_frames: [2]\npoints: 900\n")
     (work / "p.yaml").write_text(yaml.safe_dump({"scenarios": ["v"], "episodes": {"per_scenario": 3}}))
-    run("episodes", "--params", "p.yaml", "--out", "recorded", cwd=work)
-    run("preprocess", "--params", "p.yaml", "--out", "episodes", "recorded", cwd=work)
+    staged("episodes", "--params", "p.yaml", "--out", "recorded", cwd=work)
+    staged("preprocess", "--params", "p.yaml", "--out", "episodes", "recorded", cwd=work)
     for number in (1, 2, 3):
         recorded, kept = (
             read_episode(work / folder / "v" / f"v_hidden{number}.npz") for folder in ("recorded", "episodes")
@@ -453,16 +496,14 @@ def test_simulated_targets_are_whole_uniform_and_left_as_they_are(work):
         assert np.diff(kept.offsets).tolist() == [900] * 4
         truth = kept.meta["truth"]
         assert all(0.1 <= value <= 10 for value in truth.values())
-    values = [f"{name}={value!r}" for name, value in truth.items()]
-    flags = [word for value in values for word in ("--set", value)]
-    done = run("evaluate", "loss", "--scenario", "v", *flags, "--json", "episodes/v/v_hidden3.npz", cwd=work)
+    loss = measured(work / "raw" / "scenes" / "v.yaml", work / "episodes" / "v" / "v_hidden3.npz", truth)
     area = float(built_in_mesh("vest_hang").face_area.sum())
-    assert done.result["loss"] < 2 * area / (np.pi * 900)  # twice the mean squared distance to the nearest of 900 points
+    assert loss < 2 * area / (np.pi * 900)  # twice the mean squared distance to the nearest of 900 points
 
 
 def test_rollouts_carry_the_bodies_to_draw(work):
-    run("rollout", "--scenario", "vest_hang", "--frames", 1, "--out", "vest.npz", cwd=work)
-    run("rollout", "--scenario", "small.yaml", "--frames", 1, "--out", "lift.npz", cwd=work)
+    run("simulate", "vest_hang", "--frames", 1, "--out", "vest.npz", cwd=work)
+    run("simulate", "small.yaml", "--frames", 1, "--out", "lift.npz", cwd=work)
     with np.load(work / "vest.npz") as vest, np.load(work / "lift.npz") as lift:
         assert vest["nodes"].shape == (2, 80, 3)
         assert vest["obstacle_faces"].max() == len(vest["obstacle_nodes"]) - 1
@@ -475,8 +516,10 @@ def test_rollouts_of_scene_files_carry_what_moves(work):
     data["obstacles"].append({"mesh": "meshes/ball.obj", "transform": {"translate": [0, 0, 0.08]}})
     data |= {"frame_steps": 2, "gravity": [0, 0, -1]}
     path = write_file(write_files(work), data)
-    exports = ("--obj", "obj", "--ply", "ply")
-    run("rollout", "--scene", path, "--frames", 3, "--set", "body_mass=2", "--out", "r.npz", *exports, cwd=work)
+    command = ("simulate", path, "--frames", 3, "--set", "body_mass=2", "--out")
+    run(*command, "r.npz", cwd=work)
+    for kind in ("obj", "ply"):
+        run(*command, kind, "--format", kind, cwd=work)
     box, ball = len(MESHES["box"].nodes), len(MESHES["ball"].nodes)
     with np.load(work / "r.npz") as data:
         assert data["moving_nodes"].shape == (4, box + ball, 3)
@@ -489,7 +532,7 @@ def test_rollouts_of_scene_files_carry_what_moves(work):
     np.testing.assert_array_equal(written.nodes, last)
     np.testing.assert_array_equal(written.faces, faces)
     names = [f"{frame:03d}{what}.ply" for frame in range(4) for what in ("", "_moving")]
-    assert sorted(file.name for file in (work / "ply").iterdir()) == names
+    assert sorted(file.name for file in (work / "ply").glob("*.ply")) == names
 
 
 def test_synthetic_episodes_are_the_same_bytes_for_the_same_seed(work):
@@ -497,7 +540,7 @@ def test_synthetic_episodes_are_the_same_bytes_for_the_same_seed(work):
     (work / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump(SMALL))
     (work / "p.yaml").write_text(yaml.safe_dump({"scenarios": ["small"], "episodes": {"per_scenario": 1}}))
     for out in ("a", "b"):
-        run("episodes", "--params", "p.yaml", "--out", out, cwd=work)
+        staged("episodes", "--params", "p.yaml", "--out", out, cwd=work)
     first, second = (
         {path.relative_to(work / out): path.read_bytes() for path in (work / out).rglob("*") if path.is_file()}
         for out in ("a", "b")
@@ -515,85 +558,82 @@ class TestBadInput:
             ({"episodes": {"hidden_range": [3, 1]}}, "hidden_range must be in order"),
             ({"fits": {}}, "fits: unknown or unsupported field"),
             ({"fit": {"solver": "lbfgs"}}, "fit.solver"),
-            ({"fit": {"optimizer": "adam"}}, "optimizer: now `solver`"),
-            ({"fit": {"smoothing": 0.5}}, "smoothing: of solver adam; not of likelihood"),
-            ({"fit": {"doubts": "bend=2x"}}, "Unknown parameter 'bend'"),
-            ({"fit": {"doubts": "stretch=2x"}}, "doubts: stretch is fitted"),
-            ({"fit": {"doubts": "drag=2x", "paper": True}}, "doubts: the published measure takes the rest of the material"),
-            ({"evaluate": {"doubts": {"drag": 2}}}, "evaluate.doubts: now `fit.doubts`"),
-            ({"fit": {"simulations": 9}}, "simulations: of solver cma_es or random_search; not of likelihood"),
+            ({"fit": {"solver": {"smoothing": 0.5}}}, "smoothing: unknown or unsupported field"),
+            ({"fit": {"solver": {"max_simulations": 9}}}, "max_simulations: unknown or unsupported field"),
+            ({"fit": {"uncertain": "bend=2x"}}, "Unknown parameter 'bend'"),
+            ({"fit": {"uncertain": "stretch=2x"}}, "stretch is fitted"),
+            ({"fit": {"uncertain": "drag=2x", "loss": "paper"}}, "the rest of the material is known"),
+            ({"fit": {"loss": "paper"}}, "the paper's loss has no likelihood"),
+            ({"evaluate": {"level": 0.8}}, "evaluate.level: now `fit.level`"),
         ],
     )
     def test_parameter_files(self, work, params, message):
         (work / "params.yaml").write_text(yaml.safe_dump(params))
-        done = run(
-            "fit", "--params", "params.yaml", "--scenario", "small.yaml", "--out", "fits", "e1.npz", cwd=work, code=1
-        )
+        done = run("fit", "--params", "params.yaml", "--scene", "small.yaml", "--out", "fits", "e1.npz", cwd=work, code=1)
         assert message in done.errors
         assert not (work / "fits").exists()
 
-    def test_a_damaged_last_episode_costs_nothing(self, work):
-        (work / "e2.npz").write_bytes(b"nothing")
-        done = run("fit", "--scenario", "small.yaml", "--out", "fits", "e1.npz", "e2.npz", cwd=work, code=1)
+    def test_a_damaged_last_episode_costs_nothing(self, tree):
+        (tree / "episodes" / "small" / "e2.npz").write_bytes(b"nothing")
+        told(tree)
+        done = staged(*FIT, cwd=tree, code=1)
         assert "e2.npz is not a readable episode" in done.errors
-        assert not (work / "fits").exists()
+        assert not (tree / "fits").exists()
 
     def test_an_episode_that_is_too_short(self, work):
         short = Episode.from_frames([np.zeros((3, 3))] * 2, np.array([0.0, 0.1]))
         write_episode(work / "short.npz", short)
-        done = run("fit", "--scenario", "small.yaml", "--out", "f", "--frame", 5, "short.npz", cwd=work, code=1)
+        done = run("fit", "--scene", "small.yaml", "--out", "f", "--frames", 5, "short.npz", cwd=work, code=1)
         assert "Frame 5 is missing: the episode has 2 frames" in done.errors
 
     def test_unknown_names_and_numbers(self, work):
         for arguments, message in (
-            (("--scenario", "lfit"), "Unknown scenario 'lfit'"),
-            (("--scenario", "small.yaml", "--set", "weight=3"), "Unknown parameter 'weight'"),
-            (("--scenario", "small.yaml", "--set", "mass=heavy"), "takes NAME=NUMBER"),
-            (("--scenario", "small.yaml", "--set", "mass=nan"), "finite"),
-            (("--scenario", "small.yaml", "--set", "stretch=-1e9"), "--set stretch is a multiplier: above 0, got -1e+09"),
-            (("--scenario", "small.yaml", "--set", "body_mass=2"), "body_mass has no effect in small"),
-            (("--scene", "none.json"), "No such file"),
+            (("lfit",), "Unknown scenario 'lfit'"),
+            (("small.yaml", "--set", "weight=3"), "Unknown parameter 'weight'"),
+            (("small.yaml", "--set", "mass=heavy"), "takes NAME=NUMBER"),
+            (("small.yaml", "--set", "mass=nan"), "finite"),
+            (("small.yaml", "--set", "stretch=-1e9"), "--set stretch is a multiplier: above 0, got -1e+09"),
+            (("small.yaml", "--set", "body_mass=2"), "body_mass has no effect in small"),
+            (("none.json",), "No such file"),
         ):
-            done = run("rollout", *arguments, "--out", "r.npz", cwd=work, code=1)
+            done = run("simulate", *arguments, "--out", "r.npz", cwd=work, code=1)
             assert message in done.errors
             assert not (work / "r.npz").exists()
 
     def test_a_diverged_rollout_names_step_and_parameters(self, work):
         explodes = ("--set", "bending=1e6", "--set", "mass=1e-6", "--frames", 2)
-        done = run("rollout", "--scenario", "vest_hang", *explodes, "--out", "r.npz", cwd=work, code=1)
+        done = run("simulate", "vest_hang", *explodes, "--out", "r.npz", cwd=work, code=1)
         assert "diverged at step" in done.errors
         assert "bending=1e+06, mass=1e-06" in done.errors
         assert not (work / "r.npz").exists()
 
     def test_a_disk_that_cannot_be_written(self, work):
         (work / "file").write_text("")
-        done = run("rollout", "--scenario", "small.yaml", "--out", "file/r.npz", cwd=work, code=1)
+        done = run("simulate", "small.yaml", "--out", "file/r.npz", cwd=work, code=1)
         assert "Cannot write" in done.errors
 
 
+def studied(*arguments: object, cwd: Path, code: int = 0) -> Invoked:
+    with contextlib.chdir(cwd):
+        return study(*arguments, code=code)
+
+
 def test_a_study_of_gradients_goes_on_where_it_stopped(work):
-    options = ["gradients", "--scenario", "small.yaml", "--out", "pairs.csv"]
-    run(*options, "--pairs", 2, cwd=work)
+    options = ["gradients", "--scene", "small.yaml", "--out", "pairs.csv"]
+    studied(*options, "--pairs", 2, cwd=work)
     first = (work / "pairs.csv").read_text().splitlines()
-    assert run(*options, "--pairs", 3, cwd=work).result["pairs"] == 3
+    assert studied(*options, "--pairs", 3, cwd=work).result["pairs"] == 3
     assert (work / "pairs.csv").read_text().splitlines()[:3] == first
-    assert "other pairs" in run(*options, "--pairs", 3, "--seed", 1, cwd=work, code=1).errors
-    other = run(*options, "--pairs", 3, "--integrator", "arcsim", cwd=work, code=1).errors
+    assert "other pairs" in studied(*options, "--pairs", 3, "--seed", 1, cwd=work, code=1).errors
+    other = studied(*options, "--pairs", 3, "--integrator", "arcsim", cwd=work, code=1).errors
     assert re.search("holds pairs of small implicit [0-9a-f]{16}, not of small arcsim", " ".join(other.split()))
     (work / "small.yaml").write_text(yaml.safe_dump(SMALL | {"steps_per_frame": SMALL["steps_per_frame"] + 1}))
-    assert "holds pairs of small implicit" in run(*options, "--pairs", 3, cwd=work, code=1).errors
-
-
-def test_materials_are_listed_with_all_their_numbers(work):
-    found = run("materials", cwd=work).result
-    assert found["jersey-knit"]["stretching_n_m"] == pytest.approx(60.0)
-    assert found["jersey-knit"]["shear_n_m"] == pytest.approx(15.0)
-    assert "Kawabata" in found["silk"]["source"]
+    assert "holds pairs of small implicit" in studied(*options, "--pairs", 3, cwd=work, code=1).errors
 
 
 def test_a_study_of_steps_and_meshes_writes_its_page(work):
     (work / "tiny.yaml").write_text(yaml.safe_dump(SMALL | {"nodes": [3, 3], "frames": 1}))
-    run("discretisation", "--scenario", "tiny.yaml", "--cuts", 1, "--out", "page.md", cwd=work)
+    studied("discretisation", "--scenario", "tiny.yaml", "--cuts", 1, "--out", "page.md", cwd=work)
     page = (work / "page.md").read_text()
     assert "| tiny | implicit, BDF2 | 2 (default) |" in page
     assert "| tiny | arcsim | 32 |" in page

@@ -59,7 +59,7 @@ class TestScenarios:
     )
     def test_absurd_values_are_named(self, work, changes, message):
         (work / "bad.yaml").write_text(yaml.safe_dump(SMALL | changes))
-        assert message in invoke("rollout", "--scenario", "bad.yaml", "--out", "r.npz", code=1).errors
+        assert message in invoke("simulate", "bad.yaml", "--out", "r.npz", code=1).errors
         assert not (work / "r.npz").exists()
 
     def test_anchors_that_stand_for_billions_are_refused(self, tmp_path):
@@ -76,7 +76,7 @@ class TestScenarios:
         assert read_yaml(tmp_path / "empty.yaml") is None
 
     def test_names_with_brackets_are_only_names(self, work):
-        assert "Wrote 4 frames" in invoke("rollout", "--scenario", "small.yaml", "--out", "out[/x].npz").errors
+        assert "Wrote 4 frames" in invoke("simulate", "small.yaml", "--out", "out[/x].npz").errors
         assert (work / "out[" / "x].npz").exists()
 
 
@@ -135,7 +135,7 @@ def test_clouds_in_millimetres_are_refused(work, rng):
     (work / "clouds").mkdir()
     for index in range(3):
         np.save(work / "clouds" / f"{index:03d}.npy", rng.uniform(100, 900, (50, 3)))
-    said = invoke("import", "clouds", "--rate-hz", 10, "--out", "e.npz", code=1).errors
+    said = invoke("data", "import", "clouds", "--rate-hz", 10, "--out", "e.npz", code=1).errors
     assert "divide millimetres by 1000" in said
     assert not (work / "e.npz").exists()
 
@@ -143,14 +143,13 @@ def test_clouds_in_millimetres_are_refused(work, rng):
 @pytest.mark.parametrize(
     "command",
     [
-        ("fit", "--seed", "-3", "--scenario", "small.yaml", "--out", "f", "e.npz"),
-        ("coverage", "--seed", "-3", "--scenario", "lift", "--out", "f"),
-        ("train", "--seed", "-3", "--scenario", "lift", "--out", "f", "d"),
-        ("rollout", "--frames", str(10**9), "--scenario", "small.yaml", "--out", "r.npz"),
+        ("network", "generate", "--seed", "-3", "--scene", "small.yaml", "--out", "f"),
+        ("network", "train", "--seed", "-3", "--scene", "lift", "--out", "f", "d"),
+        ("simulate", "small.yaml", "--frames", str(10**9), "--out", "r.npz"),
     ],
 )
 def test_numbers_out_of_range_are_refused_by_name(work, command):
-    assert f"Invalid value for '{command[1]}'" in invoke(*command, code=2).errors
+    assert f"Invalid value for '{command[2]}'" in invoke(*command, code=2).errors
 
 
 @pytest.mark.parametrize(
@@ -165,13 +164,13 @@ def test_numbers_out_of_range_are_refused_by_name(work, command):
     ],
 )
 def test_parameters_that_no_cloth_has_are_refused(work, value, message):
-    assert message in invoke("rollout", "--scenario", "small.yaml", "--set", value, "--out", "r.npz", code=1).errors
+    assert message in invoke("simulate", "small.yaml", "--set", value, "--out", "r.npz", code=1).errors
     assert not (work / "r.npz").exists()
 
 
 def test_no_frames_are_none_to_fit(work):
     (work / "params.yaml").write_text("fit: {frames: []}\n")
-    said = invoke("fit", "--params", "params.yaml", "--scenario", "small.yaml", "--out", "f", "e.npz", code=1).errors
+    said = invoke("fit", "--params", "params.yaml", "--scene", "small.yaml", "--out", "f", "e.npz", code=1).errors
     assert "fit.frames: List should have at least 1 item" in said
 
 
@@ -183,12 +182,12 @@ def test_files_numbered_by_large_numbers_are_refused_and_take_no_memory(work, ki
         (work / "clouds").mkdir()
         for stamp in stamps:
             np.save(work / "clouds" / f"{stamp}.npy", np.zeros((5, 3)))
-        command = ("import", "clouds", "--rate-hz", 10, "--out", "e.npz")
+        command = ("data", "import", "clouds", "--rate-hz", 10, "--out", "e.npz")
     else:
         folder = write_table_episode(work / "raw", frames=2) / "cameras" / "side"
         for path, stamp in zip(sorted((folder / "depth").iterdir()), stamps, strict=True):
             path.rename(path.with_name(f"{stamp}.png"))
-        command = ("import", f"side={folder}", "--rate-hz", 10, "--out", "e")
+        command = ("data", "import", f"side={folder}", "--rate-hz", 10, "--out", "e")
     tracemalloc.start()
     assert "are neither frame numbers nor times of a recording" in invoke(*command, code=1).errors
     assert tracemalloc.get_traced_memory()[1] < 100e6
@@ -214,7 +213,7 @@ def test_what_preprocess_refuses_is_a_fault_of_the_episode(work, change, message
     (folder / "episode.json").write_text(json.dumps({**json.loads((folder / "episode.json").read_text()), **change}))
     faults = [found.message for found in validate_raw_episode(folder) if found.severity == "fault"]
     assert any(message in fault for fault in faults), faults
-    assert message in invoke("preprocess", folder, "--out", "cleaned", code=1).errors
+    assert message in invoke("data", "preprocess", folder, "--out", "cleaned", code=1).errors
 
 
 def test_joints_of_another_arm_are_pointed_out(work):
@@ -224,9 +223,9 @@ def test_joints_of_another_arm_are_pointed_out(work):
     found = {one.code: one for one in validate_raw_episode(folder)}["joint_count"]
     assert (found.severity, found.message[:29]) == ("fault", "It has 3 joints, the Gen3 7: ")
     with as_file(files("diffcloud.sensing") / "gen3_robotiq_2f_85.urdf") as urdf:
-        invoke("episode", "validate", folder, "--urdf", urdf, code=1)
+        invoke("data", "check", folder, "--urdf", urdf, code=1)
     (work / "params.yaml").write_text("scenarios: [lift]\n")
-    assert "joints" in invoke("preprocess", folder, "--params", "params.yaml", "--out", "cleaned", code=1).errors
+    assert "joints" in invoke("data", "preprocess", folder, "--params", "params.yaml", "--out", "cleaned", code=1).errors
 
 
 def test_a_cloth_of_one_face_moves_without_hinges():
@@ -359,5 +358,5 @@ diffcloud.cli.app.main()
         assert (done.stderr.strip() == "Interrupted.") == pressed
 
     def test_debug_stands_before_any_command(self, work):
-        done = subprocess.run([*DIFFCLOUD, "--debug", "materials", "--json"], capture_output=True, text=True, check=True)
-        assert "denim" in json.loads(done.stdout.splitlines()[-1])
+        done = subprocess.run([*DIFFCLOUD, "--debug", "doctor", "--json"], capture_output=True, text=True, check=True)
+        assert "checks" in json.loads(done.stdout.splitlines()[-1])

@@ -116,9 +116,9 @@ def test_a_command_and_its_workers_run_the_code_of_the_current_folder(tmp_path):
     )
     (tmp_path / "pipeline/__main__.py").write_text(
         "import json\n"
-        "from diffcloud.cli.fork_server import begin_importing\n"
+        "from diffcloud.jobs.fork_server import begin_importing\n"
         "from diffcloud.cli.whose import Whose\n"
-        "from diffcloud.cli.workers import run_all\n"
+        "from diffcloud.jobs.pool import run_all\n"
         "if __name__ == '__main__':\n"
         "    begin_importing('diffcloud.cli.whose', ['fit', '--workers', '2'])\n"
         "    jobs = [Whose('here'), *[Whose('there')] * 3]\n"

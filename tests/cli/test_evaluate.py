@@ -15,11 +15,11 @@ import pandas as pd
 import pytest
 import yaml
 
-import diffcloud.cli.comparison
-from diffcloud.estimation import read_fit
+import diffcloud.jobs.comparison
+from diffcloud.estimation.record import read_fit
 from diffcloud.io.episodes import write_episode
 from diffcloud.io.files import claimed
-from tests.cli.invoke import invoke
+from tests.cli.invoke import stage, study
 from tests.cli.test_commands import SMALL
 from tests.conftest import small_lift
 from tests.estimation.test_fit import clouds_of
@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 PARAMS = {
     "scenarios": ["small"],
     "train": {"scenarios": ["other"], "models": ["mlp"]},
-    "fit": {"iterations": 3, "starts": 2},
+    "fit": {"solver": {"max_steps": 3, "starts": 2}},
     "evaluate": {"draws": 2, "landscapes": ["*/tan1"], "landscape_size": 3},
     "report": {"overlay_points": 50},
 }
@@ -51,8 +51,8 @@ def finished(tmp_path_factory):
         (folder / "params.yaml").write_text(yaml.safe_dump(PARAMS))
         for repeat in (1, 2):
             write_episode(folder / "data" / "episodes" / "small" / f"tan{repeat}.npz", recording(repeat))
-        invoke("fit", "--params", "params.yaml", "--scenario", "small", "--out", "data/fits/small", "data/episodes/small")
-        invoke("evaluate", "--params", "params.yaml")
+        stage("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
+        stage("evaluate", "--params", "params.yaml")
     return folder
 
 
@@ -72,7 +72,7 @@ def results(folder):
 def test_twice_gives_the_same_but_for_wall_times(work):
     first = results(work)
     shutil.rmtree(work / "reports")
-    invoke("evaluate", "--params", "params.yaml")
+    stage("evaluate", "--params", "params.yaml")
     second = results(work)
     assert set(first) == set(second)
     differing = {name for name in first if first[name] != second[name]}
@@ -117,12 +117,13 @@ def test_tables_hold_methods_repeats_and_transfer(work):
 
 
 def test_recordings_of_a_joint_fit_are_compared_each_as_it_lay(work):
-    told = ("--joint", "--laid", "turn=5deg", "--starts", 1, "--iterations", 2)
-    invoke(
-        "fit", "--params", "params.yaml", *told, "--scenario", "small", "--out", "data/fits/small", "data/episodes/small"
-    )
-    fit = read_fit(work / "data" / "fits" / "small" / "joint.json")
-    invoke("evaluate", "--params", "params.yaml")
+    joint = {"joint": True, "initial_state": "turn=5deg", "solver": {"starts": 1, "max_steps": 2}}
+    (work / "params.yaml").write_text(yaml.safe_dump(PARAMS | {"fit": joint}))
+    shutil.copytree(work / "data" / "fits" / "small", work / "single")  # of other settings, and removed
+    stage("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
+    shutil.copytree(work / "single", work / "data" / "fits" / "small", dirs_exist_ok=True)
+    fit = read_fit(work / "data" / "fits" / "joint.json")
+    stage("evaluate", "--params", "params.yaml")
     alone = {one.name: read_fit(work / "data" / "fits" / "small" / f"{one.name}.json") for one in fit.episodes}
     for one, other in zip(fit.episodes, fit.episodes[::-1], strict=True):
         own = json.loads((work / "reports" / "episodes" / "small" / f"{one.name}.json").read_text())["record"]
@@ -133,41 +134,41 @@ def test_recordings_of_a_joint_fit_are_compared_each_as_it_lay(work):
         row = next(row for row in record["methods"] if row["method"] == "diffcloud")
         assert record["fit"] == "joint"
         assert record["transfers"] == []
-        assert row["clipped"]["turn"] == fit.laid_in(one)["turn"] != 0
+        assert row["clipped"]["turn"] == fit.initial_state_in(one)["turn"] != 0
 
 
 def test_finished_episodes_are_kept_until_their_inputs_change(work, monkeypatch):
     def never(*arguments, name, **options):
         raise AssertionError(f"{name} was compared again")
 
-    monkeypatch.setattr(diffcloud.cli.comparison, "compare_episode", never)
+    monkeypatch.setattr(diffcloud.jobs.comparison, "compare_episode", never)
     before = results(work)
-    invoke("evaluate", "--params", "params.yaml", "--markdown", "page.md")
+    stage("evaluate", "--params", "params.yaml", "--markdown", "page.md")
     assert results(work) == before
     assert "| small | tan2 |" in (work / "page.md").read_text()
     write_episode(work / "data/episodes/small/tan2.npz", recording(2, stretch=0.9))
     with pytest.raises(AssertionError, match="tan2 was compared again"):
-        invoke("evaluate", "--params", "params.yaml")
+        stage("evaluate", "--params", "params.yaml")
 
 
 @pytest.mark.slow
 def test_two_processes_give_what_one_gives(work):
     one = results(work)
     shutil.rmtree(work / "reports")
-    invoke("evaluate", "--params", "params.yaml", "--workers", 2)
+    stage("evaluate", "--params", "params.yaml", "--workers", 2)
     assert results(work)["reports/metrics.json"] == one["reports/metrics.json"]
 
 
 def test_a_missing_network_is_a_labelled_gap(work):
     (work / "params.yaml").write_text(yaml.safe_dump(PARAMS | {"train": {"scenarios": ["small"], "models": ["mlp"]}}))
-    failed = invoke("evaluate", "--params", "params.yaml", code=1)
+    failed = stage("evaluate", "--params", "params.yaml", code=1)
     assert "small/tan1: mlp: no checkpoint data/regressors/small/mlp.safetensors" in failed.errors
     table = pd.read_csv(work / "reports/tables/methods.csv")
     gap = table[(table["method"] == "mlp")]
     assert gap["status"].tolist() == ["missing", "missing"]
-    allowed = invoke("evaluate", "--params", "params.yaml", "--allow-missing")
+    allowed = stage("evaluate", "--params", "params.yaml", "--allow-missing")
     assert len(allowed.result["missing"]) == 2
-    invoke("report", "--params", "params.yaml")
+    stage("report", "--params", "params.yaml")
     page = (work / "reports" / "index.html").read_text()
     assert "2 things are missing" in page
     assert "small/tan1: MLP: no checkpoint" in page
@@ -178,7 +179,7 @@ def test_a_fit_that_cannot_be_simulated_is_told_and_the_others_go_on(work):
     fit = json.loads(path.read_text())
     fit["parameters"]["mass"] |= {"value": 1e-9, "bounds": [1e-10, 10]}
     path.write_text(json.dumps(fit))
-    failed = invoke("evaluate", "--params", "params.yaml", code=1)
+    failed = stage("evaluate", "--params", "params.yaml", code=1)
     told = failed.errors.rpartition("└")[2]  # after progress and tables
     assert "small/tan1" in told
     assert "diverged" in told
@@ -191,34 +192,34 @@ def test_episodes_may_be_called_by_numbers_and_a_bound_be_zero(tmp_path, monkeyp
     (tmp_path / "small.yaml").write_text(yaml.safe_dump(SMALL))
     changes = {
         "scenarios": ["small.yaml"],
-        "fit": {"parameters": ["stretch", "damping"], "starts": 1, "iterations": 1},
+        "fit": {"parameters": ["stretch", "damping"], "solver": {"starts": 1, "max_steps": 1}},
     }
-    changes["evaluate"] = PARAMS["evaluate"] | {"landscapes": ["small/001"], "rivals": ["middle"], "level": None}
+    changes["evaluate"] = PARAMS["evaluate"] | {"landscapes": ["small/001"], "rivals": ["middle"]}
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(PARAMS | changes | {"scenarios": ["small"]}))
     (tmp_path / "raw" / "scenes").mkdir(parents=True)
     (tmp_path / "small.yaml").rename(tmp_path / "raw" / "scenes" / "small.yaml")
     hidden = clouds_of(small_lift(), seed=1, stretch=0.7, mass=1.0)
     write_episode(tmp_path / "data/episodes/small/001.npz", replace(hidden, meta={"truth": {"stretch": 0.7, "mass": 1.0}}))
-    invoke("fit", "--params", "params.yaml", "--scenario", "small", "--out", "data/fits/small", "data/episodes/small")
-    invoke("evaluate", "--params", "params.yaml")
-    invoke("report", "--params", "params.yaml")
+    stage("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
+    stage("evaluate", "--params", "params.yaml")
+    stage("report", "--params", "params.yaml")
     assert "small / 001" in (tmp_path / "reports/index.html").read_text(encoding="utf-8")
     assert (tmp_path / "reports/figures/landscape_small_001.svg").is_file()
 
 
 def test_one_process_at_a_time_compares_the_published_data(tmp_path):
     with claimed(tmp_path / "reports"):
-        said = invoke("published", tmp_path, "--out", tmp_path / "reports", code=1).errors
+        said = study("published", tmp_path, "--out", tmp_path / "reports", code=1).errors
     assert "is being written by" in said
 
 
 def test_profiles_are_whole_parameter_files():
     from pathlib import Path
 
-    from diffcloud.cli.config import load_config
+    from diffcloud.jobs.settings import load_config
 
     root = Path(__file__).parents[2]
-    assert load_config(root / "pipeline" / "profiles" / "release.yaml").fit.starts == 9
+    assert load_config(root / "pipeline" / "profiles" / "release.yaml").fit.solver.starts == 9
     assert load_config(root / "pipeline" / "profiles" / "simulated.yaml").episodes.per_scenario == 10
     paper = load_config(root / "pipeline" / "profiles" / "paper.yaml")
     assert (paper.simulate.train, paper.simulate.test, paper.episodes.per_scenario) == (1500, 375, 10)
@@ -237,7 +238,7 @@ def test_the_page_runs_in_a_browser_without_errors_and_asks_nobody(work):
         *(work / "data" / "fits").rglob("*.json"),
     ]:
         path.write_text(path.read_text().replace("tan2", nasty))
-    invoke("report", "--params", "params.yaml")
+    stage("report", "--params", "params.yaml")
     page = work / "reports" / "index.html"
     assert page.stat().st_size < 25e6
     assert {path.suffix for path in (work / "reports" / "figures").iterdir()} == {".svg", ".png"}

@@ -22,15 +22,15 @@ MATERIAL = {"density_kg_m2": 0.2, "stretching_n_m": 50.0, "bending_n_m": 1e-5, "
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
-    """A joint fit beside its scenario, as `identify` leaves it, and intervals of it."""
+    """A joint fit beside its scenario, as `fit` leaves it, and intervals of it."""
     root = tmp_path_factory.mktemp("fitted")
     (root / "scenarios").mkdir()
     (root / "scenarios" / "small.yaml").write_text(yaml.safe_dump({**SMALL, "material": MATERIAL}))
     for name, stretch in (("e1", 0.7), ("e2", 0.8)):
         write_episode(root / f"{name}.npz", clouds_of(small_lift(), stretch=stretch, mass=1.0))
     with contextlib.chdir(root):
-        options = ("--scenario", "scenarios/small.yaml", "--parameters", "stretch,bending", "--out", ".")
-        invoke("fit", *options, "--iterations", 1, "--joint", "e1.npz", "e2.npz")
+        options = ("--scene", "scenarios/small.yaml", "--parameters", "stretch,bending", "--out", ".")
+        invoke("fit", *options, "--max-steps", 1, "e1.npz", "e2.npz")
     told = {
         "level": 0.9, "within": 1.5, "ratio": None, "best": None, "worst": None, "sources": {},
         "covariance": [[0.04, 0.0], [0.0, 0.01]], "explains": True, "reason": "",
@@ -54,10 +54,10 @@ def work(fitted, tmp_path):
 
 
 def test_a_fit_finds_its_scenario_and_says_what_it_leaves_out(work):
-    done = invoke("export", "joint.json", "--to", "mujoco", "--recording", "e2", "--out", "out")
+    done = invoke("export", "fit.json", "--to", "mujoco", "--recording", "e2", "--out", "out")
     assert sorted(path.name for path in (work / "out").iterdir()) == sorted(done.result["files"])
     told = json.loads((work / "out" / "cloth.json").read_text())
-    record = json.loads((work / "joint.json").read_text())
+    record = json.loads((work / "fit.json").read_text())
     assert told["recording"] == "e2"
     assert told["material"] == record["material"]
     assert told["isotropic_sheet"]["stretching_n_m"] == pytest.approx(record["parameters"]["stretch"]["physical"])
@@ -68,13 +68,11 @@ def test_a_fit_finds_its_scenario_and_says_what_it_leaves_out(work):
 
 
 def test_the_first_recording_is_the_default_and_said(work):
-    assert (
-        "The motion is that of e1, the first of 2" in invoke("export", "joint.json", "--to", "obj", "--out", "out").errors
-    )
+    assert "The motion is that of e1, the first of 2" in invoke("export", "fit.json", "--to", "obj", "--out", "out").errors
 
 
 def test_samples_spread_as_the_intervals_do(work):
-    done = invoke("export", "joint.json", "--to", "obj", "--samples", 200, "--seed", 3, "--out", "out")
+    done = invoke("export", "fit.json", "--to", "obj", "--samples", 200, "--seed", 3, "--out", "out")
     assert len(list((work / "out").glob("sample_*/cloth.json"))) == 200
     logs = np.log([[drawn["stretch"], drawn["bending"]] for drawn in done.result["samples"]])
     np.testing.assert_allclose(logs.std(axis=0), [0.2, 0.1], rtol=0.2)
@@ -82,15 +80,15 @@ def test_samples_spread_as_the_intervals_do(work):
     last = json.loads((work / "out" / "sample_0199" / "cloth.json").read_text())
     assert last["parameters"]["stretch"] == done.result["samples"][-1]["stretch"]
     assert last["isotropic_sheet"]["stretching_n_m"] == pytest.approx(50 * last["parameters"]["stretch"])
-    again = invoke("export", "joint.json", "--to", "obj", "--samples", 3, "--seed", 3, "--out", "again")
+    again = invoke("export", "fit.json", "--to", "obj", "--samples", 3, "--seed", 3, "--out", "again")
     assert again.result["samples"] == done.result["samples"][:3]
 
 
 def test_a_second_export_takes_the_place_of_the_first_and_of_nothing_else(work):
-    invoke("export", "joint.json", "--to", "mujoco", "--samples", 3, "--out", "out")
+    invoke("export", "fit.json", "--to", "mujoco", "--samples", 3, "--out", "out")
     (work / "out" / "sample_0002" / "nodes.npz").write_bytes(b"mine")
     (work / "out" / "mine.txt").write_text("mine")
-    invoke("export", "joint.json", "--to", "obj", "--samples", 1, "--out", "out")
+    invoke("export", "fit.json", "--to", "obj", "--samples", 1, "--out", "out")
     there = {path.relative_to(work / "out").as_posix() for path in (work / "out").rglob("*") if path.is_file()}
     own = {f"{folder}{name}" for folder in ("", "sample_0000/") for name in ("cloth.obj", "held.csv", "cloth.json")}
     assert there == own | {"mine.txt", "sample_0002/nodes.npz"}
@@ -102,10 +100,8 @@ class TestRefusals:
         [
             (("nothing.json", "--to", "obj"), "nothing.json"),
             (("intervals.json", "--to", "obj"), "is not a fit written by"),
-            (("joint.json", "--to", "obj", "--recording", "e3"), "Unknown recording of the fit 'e3'"),
-            (("joint.json", "--to", "obj", "--check"), "--check runs mujoco and newton; obj cannot be run"),
-            (("joint.json", "--to", "obj", "--scenario", "lift"), "give the fitted one with --scenario"),
-            (("joint.json", "--to", "obj", "--samples", 2, "--intervals", "joint.json"), "holds no intervals"),
+            (("fit.json", "--to", "obj", "--recording", "e3"), "Unknown recording of the fit 'e3'"),
+            (("fit.json", "--to", "obj", "--check"), "--check runs mujoco and newton; obj cannot be run"),
         ],
     )
     def test_say_what_is_wrong_and_write_nothing(self, work, command, message):
@@ -114,26 +110,26 @@ class TestRefusals:
 
     def test_a_scenario_that_is_not_there(self, work):
         shutil.rmtree(work / "scenarios")
-        assert (
-            "give its YAML file by --scenario" in invoke("export", "joint.json", "--to", "obj", "--out", "o", code=1).errors
-        )
+        assert "Put its YAML file into" in invoke("export", "fit.json", "--to", "obj", "--out", "o", code=1).errors
 
     def test_a_missing_motion(self, work):
-        (work / "joint.npz").unlink()
-        assert "No such motion of a fit" in invoke("export", "joint.json", "--to", "obj", "--out", "o", code=1).errors
+        (work / "fit.npz").unlink()
+        assert "No such motion of a fit" in invoke("export", "fit.json", "--to", "obj", "--out", "o", code=1).errors
 
     def test_a_simulator_that_is_not_installed(self, work, monkeypatch):
         import diffcloud.cli.export
 
         monkeypatch.setattr(diffcloud.cli.export.importlib.util, "find_spec", lambda name: None)
-        told = invoke("export", "joint.json", "--to", "newton", "--check", "--out", "o", code=1).errors
+        told = invoke("export", "fit.json", "--to", "newton", "--check", "--out", "o", code=1).errors
         assert "pip install 'diffcloud[simulators]'" in told
 
     def test_intervals_that_say_nothing(self, work):
         told = json.loads((work / "intervals.json").read_text())
         (work / "intervals.json").write_text(json.dumps({**told, "reason": "the cloth is far from the recording"}))
-        command = ("export", "joint.json", "--to", "obj", "--samples", 2, "--out", "o")
+        command = ("export", "fit.json", "--to", "obj", "--samples", 2, "--out", "o")
         assert "Nothing can be drawn" in invoke(*command, code=1).errors
+        (work / "intervals.json").write_text((work / "fit.json").read_text())
+        assert "holds no intervals" in invoke(*command, code=1).errors
         del told["parameters"]["bending"]
         (work / "intervals.json").write_text(json.dumps(told))
         assert "holds intervals of stretch; the fit is of stretch, bending" in invoke(*command, code=1).errors
@@ -148,9 +144,9 @@ def test_the_export_runs_and_moves_as_fitted(target, tmp_path, monkeypatch):
     pytest.importorskip(target)
     monkeypatch.chdir(tmp_path)
     write_episode(tmp_path / "lift.npz", clouds_of(load_scenario("lift"), stretch=1.2, mass=0.45))
-    quick = ("--starts", 1, "--iterations", 1, "--init", "stretch=1.2,mass=0.45")
-    invoke("fit", "--scenario", "lift", "--out", ".", *quick, "lift.npz")
-    done = invoke("export", "lift.json", "--to", target, "--check", "--out", "out")
+    quick = ("--starts", 1, "--max-steps", 1, "--init", "stretch=1.2,mass=0.45")
+    invoke("fit", "--scene", "lift", "--out", ".", *quick, "lift.npz")
+    done = invoke("export", "fit.json", "--to", target, "--check", "--out", "out")
     assert done.result["strip_error"] < 0.05
     assert done.result["cantilever_error"] < 0.05
     times = np.array(done.result["times_s"])

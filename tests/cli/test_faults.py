@@ -16,16 +16,16 @@ import yaml
 
 from diffcloud.io.episodes import write_episode
 from diffcloud.io.simulated import write_simulated
-from tests.cli.invoke import DIFFCLOUD, environment, invoke, run_process
+from tests.cli.invoke import environment, invoke, program, run_process
 from tests.cli.test_commands import SMALL
 from tests.conftest import small_lift
 from tests.estimation.test_fit import clouds_of
 from tests.regressors.simulated import sagging_sheet
 
 ALONE = ("--params", "params.yaml", "--workers", 1)
-FIT = ("fit", *ALONE, "--out", "data/fits", "data/episodes")
-SET = ("simulate", "--scenario", "small", "--train", 40, "--test", 34)
-TRAIN = ("train", *ALONE, "--scenario", "small", "--model", "mlp", "--data", "sim", "--out", "networks")
+FIT = ("pipeline.fit", *ALONE, "--out", "data/fits", "data/episodes")
+SET = ("network", "generate", "--scene", "small", "--train", 40, "--test", 34)
+TRAIN = ("network", "train", *ALONE, "--scene", "small", "--model", "mlp", "--data", "sim", "--out", "networks")
 
 DIES = (
     "import contextlib, os, sys\n"
@@ -41,14 +41,14 @@ DIES = (
     "            os.kill(os.getpid(), 9)\n"
     "        yield stream\n"
     "files._opened_alone = watched\n"
-    "from diffcloud.cli.app import main\n"
+    "from tests.cli.invoke import main\n"
     "main()\n"
 )
 """A command that is killed in the middle of writing a file of this name."""
 FULL = (
     "import resource, signal, sys\n"
     "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-    "from diffcloud.cli.app import main\n"
+    "from tests.cli.invoke import main\n"
     "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)\n"
     "sys.argv[1:] = sys.argv[2:]\n"
     "main()\n"
@@ -66,9 +66,10 @@ def work(tmp_path, monkeypatch):
         "scenarios": ["small"],
         "preprocess": {"outlier_neighbours": 5},
         "train": {"profile": "quick", "epochs": 2, "points": 24},
-        "fit": {"iterations": 1},
+        "fit": {"solver": {"max_steps": 1}},
     }
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(params))
+    (tmp_path / "joint.yaml").write_text(yaml.safe_dump({**params, "fit": {**params["fit"], "joint": True}}))
     for number in (1, 2):
         episode = clouds_of(small_lift(), stretch=0.7 * number, mass=1.0)
         write_episode(tmp_path / "data" / "episodes" / "small" / f"e{number}.npz", episode)
@@ -102,15 +103,15 @@ class TestKilledWhileWriting:
     """By SIGKILL, in the middle of a file."""
 
     COMMANDS = (
-        ("e2.npz", ("preprocess", *ALONE, "--out", "out", "data/episodes")),
-        ("e2.npz", ("fit", *ALONE, "--out", "out", "data/episodes")),
-        ("e2.json", ("fit", *ALONE, "--out", "out", "data/episodes")),
+        ("e2.npz", ("data", "preprocess", *ALONE, "--out", "out", "data/episodes")),
+        ("e2.npz", ("pipeline.fit", *ALONE, "--out", "out", "data/episodes")),
+        ("e2.json", ("pipeline.fit", *ALONE, "--out", "out", "data/episodes")),
         ("train-000000.npz", (*SET, "--workers", 0, "--out", "out")),
         ("test_nodes.npy", (*SET, "--workers", 0, "--out", "out")),
         ("set.json", (*SET, "--workers", 0, "--out", "out")),
-        ("out.npz", ("import", "clouds", "--rate-hz", 10, "--out", "out/out.npz")),
-        ("out.npz", ("rollout", "--scenario", "small", "--obj", "out/frames", "--out", "out/out.npz")),
-        ("000.obj", ("rollout", "--scenario", "small", "--obj", "out/frames", "--out", "out/out.npz")),
+        ("out.npz", ("data", "import", "clouds", "--rate-hz", 10, "--out", "out/out.npz")),
+        ("out.npz", ("simulate", "small", "--out", "out/out.npz")),
+        ("003.obj", ("simulate", "small", "--format", "obj", "--out", "out")),
     )
 
     @pytest.mark.parametrize(("file", "command"), COMMANDS, ids=lambda value: value if isinstance(value, str) else value[0])
@@ -131,11 +132,11 @@ class TestKilledWhileWriting:
 
     def test_what_is_left_is_not_taken_for_an_episode(self, work):
         """A killed `preprocess` leaves half a file, and macOS files of its own, beside the episodes."""
-        run_code(DIES, "e2.npz", "preprocess", *ALONE, "--out", "clean", "data/episodes", cwd=work)
+        run_code(DIES, "e2.npz", "data", "preprocess", *ALONE, "--out", "clean", "data/episodes", cwd=work)
         (work / "clean" / "small" / "._e1.npz").write_bytes(b"macOS")
         assert len(hidden(work / "clean")) == 2
-        done = invoke("fit", "--scenario", "small", "--iterations", 1, "--out", "fits", "clean/small")
-        assert set(done.result["fits"]) == {"e1"}
+        done = invoke("pipeline.fit", *ALONE, "--out", "fits", "clean")
+        assert set(done.result["fits"]) == {"small/e1"}
 
 
 class TestFullDisk:
@@ -171,16 +172,14 @@ class TestFullDisk:
 class TestTwoAtOnce:
     @pytest.mark.parametrize(
         "command",
-        [(*SET, "--workers", 0, "--out", "out"), ("fit", *ALONE, "--out", "out", "data/episodes")],
+        [(*SET, "--workers", 0, "--out", "out"), ("pipeline.fit", *ALONE, "--out", "out", "data/episodes")],
     )
     def test_the_second_is_told_of_the_first_which_ends_as_if_alone(self, work, command):
         invoke(*command)
         undisturbed = contents(work / "out")
         (work / "out").rename(work / "whole")
         env = environment()
-        with subprocess.Popen(
-            [*DIFFCLOUD, *map(str, command)], cwd=work, env=env, stderr=subprocess.PIPE, text=True
-        ) as first:
+        with subprocess.Popen(program(*command), cwd=work, env=env, stderr=subprocess.PIPE, text=True) as first:
             deadline = time.monotonic() + 60
             lock = work / ".out.diffcloud-lock"
             while not (lock.exists() and lock.stat().st_size) and time.monotonic() < deadline:
@@ -192,7 +191,7 @@ class TestTwoAtOnce:
             _, said = first.communicate(timeout=120)
         assert first.returncode == 0, said
         assert f"is being written by process {first.pid} " in done.errors
-        assert command[0] in done.errors
+        assert command[0].removeprefix("pipeline.") in done.errors
         assert contents(work / "out") == undisturbed
         assert hidden(work) == []
 
@@ -203,7 +202,7 @@ class TestLostWorkers:
         invoke(*SET, "--workers", 0, "--out", "out")
         undisturbed = contents(work / "out")
         env = environment()
-        command = [*DIFFCLOUD, *map(str, SET), "--workers", "2", "--out", "killed"]
+        command = program(*SET, "--workers", "2", "--out", "killed")
         process = subprocess.Popen(command, cwd=work, env=env, stderr=subprocess.PIPE, text=True, start_new_session=True)
         deadline = time.monotonic() + 60
         while not (workers := _workers_of(process.pid)) and time.monotonic() < deadline:
@@ -233,7 +232,7 @@ class TestOnlyOwnFilesAreRemoved:
         single = set(invoke(*FIT).result["fits"])
         assert single == {"small/e1", "small/e2"}
         before = contents(work / "data" / "fits" / "small")
-        done = invoke(*FIT, "--joint")
+        done = invoke(*FIT, "--params", "joint.yaml")
         after = contents(work / "data" / "fits" / "small")
         assert before == after
         assert (work / "data/fits/joint.json").exists()
@@ -243,7 +242,7 @@ class TestOnlyOwnFilesAreRemoved:
 
     def test_fits_whose_episode_is_gone_go_and_others_stay(self, work):
         invoke(*FIT)
-        invoke(*FIT, "--joint")
+        invoke(*FIT, "--params", "joint.yaml")
         folder = work / "data" / "fits" / "small"
         (folder / "mine.json").write_text((folder / "e1.json").read_text())  # not from this command
         (folder / "notes.txt").write_text("mine")
@@ -284,17 +283,18 @@ class TestOnlyOwnFilesAreRemoved:
 class TestOutputFiles:
     def test_a_missing_suffix_is_added_and_said(self, work):
         (work / "towel").write_text("an older file")
-        done = invoke("import", "clouds", "--rate-hz", 10, "--out", "towel")
+        done = invoke("data", "import", "clouds", "--rate-hz", 10, "--out", "towel")
         assert "writing to towel.npz" in done.errors
         assert "to towel.npz." in done.errors
         assert done.result["out"] == "towel.npz"
         assert (work / "towel").read_text() == "an older file"
-        assert invoke("fit", "--scenario", "small", "--iterations", 1, "--out", "fits", "towel.npz").result["fits"]
+        known = ("--scene", "small", "--max-steps", 1, "--starts", 1)
+        assert invoke("fit", *known, "--out", "fits", "towel.npz").result["rms_mm"] > 0
 
     @pytest.mark.parametrize("out", ["towel.ply", "towel.tar.gz", "clouds"])
     def test_another_suffix_and_folders_are_refused(self, work, out):
-        done = invoke("import", "clouds", "--rate-hz", 10, "--out", out, code=1)
+        done = invoke("data", "import", "clouds", "--rate-hz", 10, "--out", out, code=1)
         assert "--out takes a .npz file" in done.errors
-        done = invoke("rollout", "--scenario", "small", "--out", out, code=1)
+        done = invoke("simulate", "small", "--out", out, code=1)
         assert "--out takes a .npz file" in done.errors
-        assert sorted(path.name for path in work.iterdir()) == ["clouds", "data", "params.yaml", "raw"]
+        assert sorted(path.name for path in work.iterdir()) == ["clouds", "data", "joint.yaml", "params.yaml", "raw"]

@@ -7,12 +7,12 @@ import shutil
 import numpy as np
 import pytest
 
-from diffcloud.cli.importing import _KINDS, _OF, source_kind
 from diffcloud.errors import ConfigError
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import write_json
 from diffcloud.io.raw_episodes import read_raw_episode
 from diffcloud.io.ros.joints import GRIPPER_CLOSED_RAD, GRIPPER_JOINT
+from diffcloud.jobs.imports import _KINDS, _OF, source_kind
 from tests.cli.invoke import invoke
 from tests.docs.site import reference
 from tests.io.ros_bag import bag
@@ -64,26 +64,26 @@ def test_the_kind_that_is_stated_counts(tmp_path, stated, found):
 def test_options_of_other_kinds_are_refused(tmp_path, kind, option):
     if kind in _OF[option]:
         return
-    said = invoke("import", make(kind, tmp_path), option, VALUES[option], "--out", tmp_path / "out", code=1).errors
+    said = invoke("data", "import", make(kind, tmp_path), option, VALUES[option], "--out", tmp_path / "out", code=1).errors
     assert f"{option} belongs to {_KINDS[_OF[option][0]]}" in said
     assert f"is {_KINDS[kind]}. Leave {option} out. If the kind is wrong, name the right one with --kind" in said
     assert not (tmp_path / "out").exists()
 
 
 def test_every_option_has_its_kinds():
-    options = {option for parameter in reference.commands()["import",].params for option in parameter.opts}
+    options = {option for parameter in reference.commands()["data", "import"].params for option in parameter.opts}
     assert options - {"source", "--out", "--kind", "--json"} == set(_OF) == set(VALUES)
     assert len(options - {"source"}) == 16
 
 
 def test_the_gripper_that_the_help_states_is_the_default():
-    (option,) = (one for one in reference.commands()["import",].params if one.name == "gripper_joint")
+    (option,) = (one for one in reference.commands()["data", "import"].params if one.name == "gripper_joint")
     assert f"Default: {GRIPPER_JOINT},0,{GRIPPER_CLOSED_RAD}." in option.help
 
 
 @pytest.mark.parametrize("text", ["", "a,0", "a,0,1,2", "a,open,closed", "none,0,1", ",0,1"])
 def test_a_gripper_joint_that_is_none(tmp_path, text):
-    said = invoke("import", make("ros", tmp_path), "--gripper-joint", text, "--out", tmp_path / "e", code=1).errors
+    said = invoke("data", "import", make("ros", tmp_path), "--gripper-joint", text, "--out", tmp_path / "e", code=1).errors
     assert "--gripper-joint takes NAME, or NAME,OPEN,CLOSED" in said
 
 
@@ -91,15 +91,15 @@ def test_a_gripper_joint_that_is_none(tmp_path, text):
 def test_joints_are_named_with_commas_or_one_by_one(tmp_path, given):
     options = [word for names in given for word in ("--joints", names)]
     source = make("ros", tmp_path)
-    invoke("import", source, *options, "--out", tmp_path / "e")
+    invoke("data", "import", source, *options, "--out", tmp_path / "e")
     assert read_raw_episode(tmp_path / "e").robot.joints_rad.shape[1] == 3
-    said = invoke("import", source, "--joints", "a,,b", "--out", tmp_path / "f", code=1).errors
+    said = invoke("data", "import", source, "--joints", "a,,b", "--out", tmp_path / "f", code=1).errors
     assert "--joints takes NAME,NAME,..., got 'a,,b'" in said
 
 
 class TestRefused:
     def refused(self, *arguments):
-        return invoke("import", *arguments, "--out", "nowhere", code=1).errors
+        return invoke("data", "import", *arguments, "--out", "nowhere", code=1).errors
 
     def test_what_is_nothing_of_these(self, tmp_path):
         (tmp_path / "empty").mkdir()
@@ -136,12 +136,14 @@ class TestRefused:
 
 def test_labels_go_into_the_episode(tmp_path):
     labels = ("--label", "fabric=tan", "--label", "operator=Ada Lovelace")
-    done = invoke("import", make("clouds", tmp_path), "--rate-hz", 10, *labels, "--out", tmp_path / "e.npz")
+    done = invoke("data", "import", make("clouds", tmp_path), "--rate-hz", 10, *labels, "--out", tmp_path / "e.npz")
     assert done.result["kind"] == "clouds"
     meta = read_episode(tmp_path / "e.npz").meta
     assert (meta["fabric"], meta["operator"]) == ("tan", "Ada Lovelace")
     np.testing.assert_allclose(read_episode(tmp_path / "e.npz").times, np.arange(4) / 10)
-    done = invoke("import", make("folder", tmp_path), *labels, "--label", "scenario=lift", "--out", tmp_path / "raw")
+    done = invoke(
+        "data", "import", make("folder", tmp_path), *labels, "--label", "scenario=lift", "--out", tmp_path / "raw"
+    )
     assert done.result["kind"] == "folder"
     told = read_raw_episode(tmp_path / "raw").description
     assert (told["scenario"], told["fabric"], told["operator"]) == ("lift", "tan", "Ada Lovelace")

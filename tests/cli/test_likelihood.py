@@ -1,4 +1,4 @@
-"""`--solver likelihood` through the commands: other commands take what the fit knows of its uncertainty from its record."""
+"""`likelihood` through the commands: other commands take what the fit knows of its uncertainty from its record."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import pytest
 import yaml
 
 from diffcloud.errors import ConfigError
-from diffcloud.estimation import read_fit
+from diffcloud.estimation.record import read_fit
+from diffcloud.evaluation.intervals import intervals_of
+from diffcloud.evaluation.methods import space_of
 from diffcloud.io.episodes import write_episode
 from diffcloud.scene.scenarios import load_scenario
 from tests.cli.invoke import invoke
@@ -27,7 +29,7 @@ SCENARIO = {
     "path": [[0, 0, 0, 0], [0.8, 0, -0.1, 0.25]],
 }
 OPTIONS = (
-    "--scenario", "small.yaml", "--parameters", "stretch", "--fix", "mass=1.7", "--doubts", "bending=1.5x",
+    "--scene", "small.yaml", "--parameters", "stretch", "--fix", "mass=1.7", "--uncertain", "bending=1.5x",
 )  # fmt: skip
 
 
@@ -40,7 +42,7 @@ def work(tmp_path_factory):
         write_episode(folder / f"{name}.npz", clouds_of(finer, points=2000, seed=seed, **TRUTH))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        invoke("fit", "one.npz", "two.npz", *OPTIONS, "--joint", "--out", "fits")
+        invoke("fit", "one.npz", "two.npz", *OPTIONS, "--out", "fits")
     return folder
 
 
@@ -50,7 +52,7 @@ def here(work, monkeypatch):
 
 
 def test_the_record_has_what_the_fit_knows():
-    record = read_fit(Path("fits/joint.json"))
+    record = read_fit(Path("fits/fit.json"))
     told = record.estimate
     assert record.solver == "likelihood"
     assert set(told.mean) == {"stretch"}
@@ -61,8 +63,8 @@ def test_the_record_has_what_the_fit_knows():
 
 
 def test_intervals_are_those_of_the_record():
-    told = invoke("evaluate", "intervals", "fits/joint.json").result
-    record = read_fit(Path("fits/joint.json"))
+    told = json.loads(Path("fits/intervals.json").read_text())
+    record = read_fit(Path("fits/fit.json"))
     entry, variance = told["parameters"]["stretch"], sum(part[0][0] for part in record.estimate.sources.values())
     assert entry["value"] == pytest.approx(record.estimate.mean["stretch"])
     assert entry["high"] / entry["value"] == pytest.approx(entry["value"] / entry["low"])
@@ -72,15 +74,16 @@ def test_intervals_are_those_of_the_record():
 
 
 def test_a_recording_that_the_model_does_not_follow_is_told(tmp_path):
-    data = json.loads(Path("fits/joint.json").read_text())
+    data = json.loads(Path("fits/fit.json").read_text())
     for one in data["estimate"]["recordings"]:
         one["misfits"] = [25.0] * len(one["misfits"])
-    path = tmp_path / "joint.json"
+    path = tmp_path / "fit.json"
     path.write_text(json.dumps(data))
-    told = invoke("evaluate", "intervals", path, "--scenario", "small.yaml").result
-    assert not told["explains"]
-    assert "in one the cloth is 5.0 times as far from the recording" in told["reason"]
-    assert told["parameters"]["stretch"]["verdict"] == "the model does not explain the recording"
+    record = read_fit(path)
+    told = intervals_of(record, space_of(record), load_scenario("small.yaml"))
+    assert not told.explains
+    assert "in one the cloth is 5.0 times as far from the recording" in told.reason
+    assert told.parameters["stretch"].verdict == "the model does not explain the recording"
 
 
 @pytest.mark.parametrize(
@@ -91,15 +94,15 @@ def test_a_recording_that_the_model_does_not_follow_is_told(tmp_path):
     ],
 )
 def test_a_damaged_estimate_is_refused(tmp_path, change, message):
-    data = json.loads(Path("fits/joint.json").read_text())
+    data = json.loads(Path("fits/fit.json").read_text())
     data["estimate"] |= change
-    (tmp_path / "joint.json").write_text(json.dumps(data))
+    (tmp_path / "fit.json").write_text(json.dumps(data))
     with pytest.raises(ConfigError, match=message):
-        read_fit(tmp_path / "joint.json")
+        read_fit(tmp_path / "fit.json")
 
 
 def test_the_published_measure_has_none():
-    known = ("fit", "one.npz", *OPTIONS[:-2], "--paper", "--out", "papers")
-    assert "the published measure has no likelihood" in invoke(*known, "--solver", "likelihood", code=1).errors
-    invoke(*known, "--iterations", 1)
-    assert read_fit(Path("papers/one.json")).solver == "adam"
+    known = ("fit", "one.npz", *OPTIONS[:-2], "--loss", "paper", "--out", "papers")
+    assert "the paper's loss has no likelihood" in invoke(*known, "--solver", "likelihood", code=1).errors
+    invoke(*known, "--max-steps", 1)
+    assert read_fit(Path("papers/fit.json")).solver == "adam"

@@ -13,7 +13,7 @@ from tests.cli.invoke import ROOT
 _FAULTS = """
 import ctypes, resource, sys
 if sys.argv[1] == "kept":
-    from diffcloud.cli.memory import keep_freed_memory
+    from diffcloud.jobs.memory import keep_freed_memory
     assert keep_freed_memory()
 libc = ctypes.CDLL(None)
 libc.malloc.restype = ctypes.c_void_p

@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 import yaml
 
-from diffcloud.cli.preprocess import PreprocessJob
 from diffcloud.io.episodes import Clock, Episode, read_episode, write_episode
+from diffcloud.jobs.preprocess import PreprocessJob
 from diffcloud.sensing.validation.episode import validate_raw_episode
 from tests.cli.invoke import invoke
 from tests.sensing.cloth_scene import SETTINGS, write_cloth_episode
@@ -29,7 +29,7 @@ def params(tmp_path) -> Path:
 
 def test_raw_episode_to_episode(tmp_path, params):
     raw = write_cloth_episode(tmp_path / "raw" / "lift" / "blue1", frames=2).folder
-    done = invoke("preprocess", tmp_path / "raw", "--out", tmp_path / "episodes", "--params", params)
+    done = invoke("data", "preprocess", tmp_path / "raw", "--out", tmp_path / "episodes", "--params", params)
     assert done.result["points"].keys() == {"lift/blue1"}
     episode = read_episode(tmp_path / "episodes" / "lift" / "blue1.npz")
     assert episode.frame_count == 2
@@ -43,7 +43,7 @@ def test_raw_episode_to_episode(tmp_path, params):
         "kept",
     }
     assert len(np.unique(episode.points[: episode.offsets[1]], axis=0)) == episode.offsets[1]
-    single = invoke("preprocess", raw, "--out", tmp_path / "single", "--params", params)  # by itself: the same
+    single = invoke("data", "preprocess", raw, "--out", tmp_path / "single", "--params", params)  # by itself: the same
     assert single.result["points"] == done.result["points"]
     same = (tmp_path / "single" / "lift" / "blue1.npz").read_bytes()
     assert same == (tmp_path / "episodes" / "lift" / "blue1.npz").read_bytes()
@@ -58,7 +58,7 @@ def test_a_raw_episode_from_within_and_a_tool_that_turns(tmp_path, params, monke
     table["tool_x"], table["tool_y"], table["tool_z"] = 0.5, 0.0, 0.3
     table.to_csv(raw / "robot.csv", index=False)
     monkeypatch.chdir(raw)
-    done = invoke("preprocess", ".", "--out", tmp_path / "out", "--params", params)
+    done = invoke("data", "preprocess", ".", "--out", tmp_path / "out", "--params", params)
     assert done.result["points"].keys() == {"lift/blue1"}
     assert read_episode(tmp_path / "out" / "lift" / "blue1.npz").frame_count == 2
     assert "The tool turns by 60 degrees" in done.errors
@@ -73,7 +73,9 @@ def test_workers_change_nothing_and_a_damaged_episode_stops_no_other(tmp_path, p
     (tmp_path / "raw" / "lift" / "blue2" / "robot.csv").unlink()
     for workers in (1, 2):
         out = tmp_path / str(workers)
-        done = invoke("preprocess", tmp_path / "raw", "--out", out, "--params", params, "--workers", workers, code=1)
+        done = invoke(
+            "data", "preprocess", tmp_path / "raw", "--out", out, "--params", params, "--workers", workers, code=1
+        )
         assert done.result["points"].keys() == {"lift/blue1", "lift/blue3"}
         assert "blue2: " in done.errors
         assert {path.name for path in (out / "lift").glob("*.npz")} == {"blue1.npz", "blue3.npz"}
@@ -84,16 +86,19 @@ def test_workers_change_nothing_and_a_damaged_episode_stops_no_other(tmp_path, p
 def test_bad_robots_and_places(tmp_path, params):
     raw = write_cloth_episode(tmp_path / "raw" / "blue1", frames=1).folder
     common = (raw, "--out", tmp_path / "episodes", "--params", params)
-    assert "No such robot description" in invoke("preprocess", *common, "--urdf", tmp_path / "gone.urdf", code=1).errors
+    assert (
+        "No such robot description"
+        in invoke("data", "preprocess", *common, "--urdf", tmp_path / "gone.urdf", code=1).errors
+    )
     urdf = tmp_path / "robot.urdf"
     urdf.write_text(
         '<robot name="r"><link name="b"><visual><geometry><mesh filename="gone.stl"/></geometry></visual></link></robot>',
         encoding="utf-8",
     )
-    assert "gone.stl' is missing" in invoke("preprocess", *common, "--urdf", urdf, code=1).errors
+    assert "gone.stl' is missing" in invoke("data", "preprocess", *common, "--urdf", urdf, code=1).errors
     description = raw / "episode.json"
     description.write_text(description.read_text().replace('"lift"', '"../lift"'), encoding="utf-8")
-    assert "must be a plain folder name" in invoke("preprocess", *common, code=1).errors
+    assert "must be a plain folder name" in invoke("data", "preprocess", *common, code=1).errors
     assert not (tmp_path / "episodes").exists()
 
 
@@ -115,12 +120,14 @@ def clouds(path: Path, seed: int = 0) -> Path:
 def test_scenarios_without_recordings_are_passed_over(tmp_path, params, several):
     """A folder of lifts alone; of nothing at all, an error that says where recordings lie."""
     clouds(tmp_path / "raw/lift/blue.npz")
-    done = invoke("preprocess", tmp_path / "raw", "--out", tmp_path / "out", "--params", several)
+    done = invoke("data", "preprocess", tmp_path / "raw", "--out", tmp_path / "out", "--params", several)
     assert list(done.result["points"]) == ["lift/blue"]
     (tmp_path / "empty").mkdir()
-    errors = invoke("preprocess", tmp_path / "empty", "--out", tmp_path / "out2", "--params", several, code=1).errors
+    errors = invoke(
+        "data", "preprocess", tmp_path / "empty", "--out", tmp_path / "out2", "--params", several, code=1
+    ).errors
     assert "no recordings of lift, fold" in errors
-    errors = invoke("preprocess", tmp_path / "gone", "--out", tmp_path / "out2", "--params", several, code=1).errors
+    errors = invoke("data", "preprocess", tmp_path / "gone", "--out", tmp_path / "out2", "--params", several, code=1).errors
     assert "No such folder" in errors
     assert not (tmp_path / "out2").exists()
 
@@ -138,13 +145,13 @@ def test_recordings_are_found_where_raw_says(tmp_path, several, params):
     edit_json(board / "episode.json", scenario=None)
     settings = {**yaml.safe_load(params.read_text()), "scenarios": ["lift", "fold"]}
     params.write_text(yaml.safe_dump(settings))
-    done = invoke("preprocess", tmp_path / "recorded", raw, "--out", tmp_path / "out", "--params", params)
+    done = invoke("data", "preprocess", tmp_path / "recorded", raw, "--out", tmp_path / "out", "--params", params)
     assert set(done.result["points"]) == {"lift/hidden1", "lift/tan1", "lift/tan2", "fold/tan3"}
     assert "Left out: " in done.errors
     assert "raw/drape. Its name is none of the scenarios lift, fold" in done.errors
     assert "board/episode.json names no scenario" in done.errors
     clouds(tmp_path / "recorded/fold/tan3.npz")
-    again = invoke("preprocess", tmp_path / "recorded", raw, "--out", tmp_path / "out", "--params", params, code=1)
+    again = invoke("data", "preprocess", tmp_path / "recorded", raw, "--out", tmp_path / "out", "--params", params, code=1)
     assert "Two recordings are called fold/tan3" in again.errors
 
 
@@ -152,7 +159,7 @@ def test_only_what_has_changed_is_done_again(tmp_path, several, monkeypatch):
     """A new recording, another setting, a recording that is gone: what is there is what a first run would leave."""
     for name in ("a", "b"):
         clouds(tmp_path / f"raw/lift/{name}.npz", seed=ord(name))
-    command = ("preprocess", tmp_path / "raw", "--params", several, "--out")
+    command = ("data", "preprocess", tmp_path / "raw", "--params", several, "--out")
     first = invoke(*command, tmp_path / "out")
     done = list[str]()
     run = PreprocessJob.run
@@ -198,7 +205,7 @@ def test_two_cameras_are_aligned_and_the_meta_says_so(two_views):
     """The second camera's points end where they belong, and its clock offset of 50 ms is stated."""
     before = recording(noise_m=0.0005, frames=12)
     out = two_views / "out"
-    invoke("preprocess", two_views / "raw", "--params", two_views / "params.yaml", "--out", out)
+    invoke("data", "preprocess", two_views / "raw", "--params", two_views / "params.yaml", "--out", out)
     episode = read_episode(out / "lift" / "one.npz")
     assert episode.meta["agreement"]["side"]["from"] == ["one"]
     assert episode.clocks["side"].offset_s == pytest.approx(LAG_S, abs=0.005)
@@ -207,14 +214,14 @@ def test_two_cameras_are_aligned_and_the_meta_says_so(two_views):
     assert found["rms_after_m"] < 0.5 * found["rms_before_m"]
     place = TURN.inv().apply(before.viewpoints["side"] - SHIFT_M)
     assert np.linalg.norm(episode.viewpoints["side"] - place) < 0.005
-    again = invoke("preprocess", out, "--params", two_views / "params.yaml", "--out", two_views / "again", code=1)
+    again = invoke("data", "preprocess", out, "--params", two_views / "params.yaml", "--out", two_views / "again", code=1)
     assert "has been corrected already" in again.errors
     assert not list((two_views / "again").rglob("*.npz"))
 
 
 def test_without_the_setting_points_stay(two_views, tmp_path):
     (tmp_path / "params.yaml").write_text("scenarios: [lift]\npreprocess: {points: null, outlier_neighbours: 0}\n")
-    invoke("preprocess", two_views / "raw", "--params", tmp_path / "params.yaml", "--out", tmp_path / "out")
+    invoke("data", "preprocess", two_views / "raw", "--params", tmp_path / "params.yaml", "--out", tmp_path / "out")
     episode, before = read_episode(tmp_path / "out" / "lift" / "one.npz"), recording(noise_m=0.0005, frames=12)
     np.testing.assert_array_equal(episode.points, before.points)
     assert not {"agreement", "clocks"} & episode.meta.keys()
@@ -233,7 +240,7 @@ def test_without_the_setting_points_stay(two_views, tmp_path):
 )
 def test_cameras_that_cannot_be_aligned(two_views, tmp_path, cameras, message):
     found = invoke(
-        "preprocess", two_views / "raw", "--params", _align(tmp_path, cameras), "--out", tmp_path / "out", code=1
+        "data", "preprocess", two_views / "raw", "--params", _align(tmp_path, cameras), "--out", tmp_path / "out", code=1
     )
     assert message in found.errors
     assert not list((tmp_path / "out").rglob("*.npz"))
@@ -245,5 +252,5 @@ def test_clouds_in_other_units_are_not_aligned(tmp_path, params):
     settings["preprocess"]["raw"] |= {"origin_m": [0.0, 0.0, 0.0], "length_unit_m": 0.35}
     params.write_text(yaml.safe_dump(settings))
     write_cloth_episode(tmp_path / "raw" / "lift" / "blue1", frames=1)
-    found = invoke("preprocess", tmp_path / "raw", "--params", params, "--out", tmp_path / "out", code=1)
+    found = invoke("data", "preprocess", tmp_path / "raw", "--params", params, "--out", tmp_path / "out", code=1)
     assert "The scene's length unit is 0.35 m. align_cameras takes clouds in metres." in found.errors

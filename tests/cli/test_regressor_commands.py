@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import shutil
 import signal
 import subprocess
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pandas as pd
 import pytest
 import torch
+import typer
 import yaml
 from click.testing import Result
 from typer.testing import CliRunner
@@ -32,15 +35,41 @@ from tests.regressors.test_checkpoints import regressor
 
 NETWORKS = "data/regressors/small"
 CHECKPOINT = f"{NETWORKS}/mlp.safetensors"
-TRAIN = ("train", "--params", "params.yaml", "--scenario", "small", "--model", "mlp", "--data", "sim", "--out", NETWORKS)
+TRAIN = (
+    "network",
+    "train",
+    "--params",
+    "params.yaml",
+    "--scene",
+    "small",
+    "--model",
+    "mlp",
+    "--data",
+    "sim",
+    "--out",
+    NETWORKS,
+)
 
 
 def run(*arguments: object, code: int = 0) -> Result:
     """A command in this process: what it imports takes seconds."""
-    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    words = [str(argument) for argument in arguments]
+    stage = words[0].removeprefix("pipeline.")
+    chosen = app
+    if stage != words[0]:
+        chosen = typer.Typer()
+        chosen.command()(getattr(importlib.import_module(words.pop(0)), stage))
+    done = CliRunner().invoke(chosen, words)
     raised = isinstance(done.exception, DiffCloudError)  # `main` makes a message and status 1 of it
     assert (1 if raised else done.exit_code) == code, f"{done.output}\n{done.exception!r}"
     return done
+
+
+def trained(folder: Path, **settings: object) -> None:
+    """Other settings of the training in the parameters file."""
+    params = yaml.safe_load((folder / "params.yaml").read_text())
+    params["train"] = {"profile": "quick", "epochs": 2, "points": 24} | settings
+    (folder / "params.yaml").write_text(yaml.safe_dump(params))
 
 
 def result(done: Result) -> dict:
@@ -56,7 +85,7 @@ def work(tmp_path, monkeypatch):
     params = {
         "scenarios": ["small"],
         "train": {"profile": "quick", "epochs": 2, "points": 24},
-        "fit": {"iterations": 1},
+        "fit": {"solver": {"max_steps": 1}},
         "evaluate": {"draws": 1},
     }
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(params))
@@ -70,14 +99,15 @@ def work(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [(("--draws", 1), "A batch needs at least 2 draws"), (("--device", "gpu"), "Torch finds no GPU on this machine")],
+    ("settings", "message"),
+    [({"draws": 1}, "A batch needs at least 2 draws"), ({"device": "gpu"}, "Torch finds no GPU on this machine")],
 )
-def test_trainings_that_cannot_be(work, monkeypatch, options, message):
+def test_trainings_that_cannot_be(work, monkeypatch, settings, message):
+    trained(work, **settings)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
     before = (work / CHECKPOINT).read_bytes()
-    assert message in str(run(*TRAIN, *options, code=1).exception)
+    assert message in str(run(*TRAIN, code=1).exception)
     assert (work / CHECKPOINT).read_bytes() == before
 
 
@@ -88,7 +118,7 @@ def test_train_then_predict(work):
     summary = json.loads((work / "data/regressors/small/mlp/training.json").read_text())
     assert summary["history"] == trained["history"]
     assert Regressor.read(work / CHECKPOINT).description.training["settings"]["seed"] == 5
-    done = run("predict", "--checkpoint", CHECKPOINT, "--json", "data/episodes/small")
+    done = run("network", "predict", "--checkpoint", CHECKPOINT, "--json", "data/episodes/small")
     found = result(done)
     assert set(found) == {"e1", "e2"}
     for values in found.values():
@@ -105,11 +135,13 @@ def test_clouds_show_what_the_cameras_of_a_recording_see(work, monkeypatch):
     )
     viewpoints = {"side": [0.5, -1.0, 0.7], "top": [0.0, 0.0, 2.0]}
     write_episode(work / "other.npz", replace(plain, meta={"scenario": "lift", "viewpoints": viewpoints}))
-    assert "a recording of lift, not of small; add --scenario lift" in str(
+    assert "a recording of lift, not of small; add --scene lift" in str(
         run(*TRAIN, "--like", "other.npz", code=1).exception
     )
     write_episode(work / "seen.npz", replace(plain, meta={"scenario": "small", "viewpoints": viewpoints}))
-    assert "leave out either" in str(run(*TRAIN, "--like", "seen.npz", "--no-augment", code=1).exception)
+    trained(work, augment=False)
+    assert "leave out either" in str(run(*TRAIN, "--like", "seen.npz", code=1).exception)
+    trained(work)
     shown = []
     monkeypatch.setattr(CloudMaker, "seen", lambda maker, nodes: shown.append(maker.augmentation.viewpoints))
     run(*TRAIN, "--like", "seen.npz")
@@ -122,7 +154,7 @@ def test_values_outside_the_bounds_are_shown_and_told(work):
     beyond = regressor(scenario="small")
     beyond.network.head[-1].bias.data += 3
     beyond.write(work / CHECKPOINT)
-    done = run("predict", "--checkpoint", CHECKPOINT, "--json", "data/episodes/small/e1.npz")
+    done = run("network", "predict", "--checkpoint", CHECKPOINT, "--json", "data/episodes/small/e1.npz")
     values = result(done)["e1"]
     assert values["stretch"] > 10
     assert values["clipped"] == {"stretch": 10, "mass": 10}
@@ -133,15 +165,29 @@ def test_values_outside_the_bounds_are_shown_and_told(work):
 @pytest.mark.slow
 def test_a_fit_starts_from_a_prediction_and_the_report_shows_both(work):
     episodes = "data/episodes/small"
-    predicted = result(run("predict", "--checkpoint", CHECKPOINT, "--json", episodes))
-    fit = ("fit", "--params", "params.yaml", "--scenario", "small", "--out", "data/fits/small", episodes)
-    run(
-        *fit, "--init", "mlp", "--laid", "none", "--starts", "1"
-    )  # else evaluate has all methods lay the cloth as the fit ends
+    predicted = result(run("network", "predict", "--checkpoint", CHECKPOINT, "--json", episodes))
+    # else evaluate has all methods lay the cloth as the fit ends
+    fit = (
+        "fit",
+        "--params",
+        "params.yaml",
+        "--scene",
+        "small",
+        "--init",
+        "mlp",
+        "--initial-state",
+        "none",
+        "--starts",
+        "1",
+    )
+    run(*fit, "--separate", "--out", "fits", episodes)
     for name, values in predicted.items():
+        for suffix in (".json", ".npz"):
+            (work / "data/fits/small").mkdir(parents=True, exist_ok=True)
+            shutil.copy(work / "fits" / name / f"fit{suffix}", work / "data/fits/small" / f"{name}{suffix}")
         start = json.loads((work / "data/fits/small" / f"{name}.json").read_text())["start"]
         assert {name: start[name] for name in values["clipped"]} == pytest.approx(values["clipped"], rel=1e-5)
-    done = run("evaluate", "--params", "params.yaml", "--json")
+    done = run("pipeline.evaluate", "--params", "params.yaml", "--json")
     table = pd.read_csv(work / "reports/tables/predictions.csv")
     assert table[["episode", "model"]].to_numpy().tolist() == [["e1", "mlp"], ["e2", "mlp"]]
     assert table["predicted_mass"].tolist() == pytest.approx([values["mass"] for values in predicted.values()], rel=1e-5)
@@ -149,7 +195,7 @@ def test_a_fit_starts_from_a_prediction_and_the_report_shows_both(work):
     assert table["loss"].tolist() == pytest.approx(fits["loss_start"].tolist(), rel=1e-4)  # the same simulation
     assert result(done)["metrics"]["regressors"]["small"]["mlp"]["loss"] == pytest.approx(table["loss"].mean())
     run(*TRAIN)  # for the curves
-    run("report", "--params", "params.yaml")
+    run("pipeline.report", "--params", "params.yaml")
     page = (work / "reports/index.html").read_text()
     head, *scripts = page.split("<script>")
     assert "Predictions of the regressors" in head
@@ -158,10 +204,10 @@ def test_a_fit_starts_from_a_prediction_and_the_report_shows_both(work):
 
 
 def test_an_interrupted_training_goes_on(work):
-    options = ("--epochs", "4000", "--patience", "4000")
+    trained(work, epochs=4000, patience=4000)
     env = environment()
     (work / CHECKPOINT).unlink()
-    process = subprocess.Popen([*DIFFCLOUD, *TRAIN, *options], cwd=work, env=env, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen([*DIFFCLOUD, *TRAIN], cwd=work, env=env, stderr=subprocess.PIPE, text=True)
     metrics = work / "data/regressors/small/mlp/metrics.json"
     assert "Training small/mlp" in process.stderr.readline()
     while process.poll() is None and not metrics.exists():  # until an epoch is done
@@ -198,7 +244,7 @@ def test_without_a_scenario_those_of_the_parameters_are_trained(work):
     params = yaml.safe_load((work / "params.yaml").read_text())
     params["train"] |= {"scenarios": ["small", "other"], "models": ["mlp"], "epochs": 1}
     (work / "params.yaml").write_text(yaml.safe_dump(params))
-    train = ("train", "--params", "params.yaml", "--data", "sims", "--out", "data/regressors", "--json")
+    train = ("network", "train", "--params", "params.yaml", "--data", "sims", "--out", "data/regressors", "--json")
     assert list(result(run(*train))["models"]) == ["small/mlp", "other/mlp"]
     assert Regressor.read(work / "data/regressors/other/mlp.safetensors").description.scenario == "other"
     (work / "data/regressors/other/notes.txt").write_text("mine")
@@ -214,7 +260,7 @@ def test_without_a_scenario_those_of_the_parameters_are_fitted(work):
     (work / "raw/scenes/other.yaml").write_text(yaml.safe_dump(options))
     params = yaml.safe_load((work / "params.yaml").read_text()) | {"scenarios": ["small", "other"]}
     (work / "params.yaml").write_text(yaml.safe_dump(params))
-    fit = ("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
+    fit = ("pipeline.fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
     done = run(*fit, "--json")
     assert "data/episodes has no episodes of other." in done.stderr
     assert list(result(done)["fits"]) == ["small/e1", "small/e2"]
@@ -265,16 +311,19 @@ class TestBadInput:
         episode = "data/episodes/small/e1.npz"
         (work / "bad.safetensors").write_bytes(b"nothing")
         regressor(scenario="fold").write(work / "fold.safetensors")
-        fit = ("fit", "--scenario", "small", "--out", "fits", episode, "--init")
+        fit = ("fit", "--scene", "small", "--out", "fits", episode, "--init")
         for arguments, message in (
-            (("predict", "--checkpoint", "bad.safetensors", episode), "bad.safetensors is not a readable checkpoint"),
+            (
+                ("network", "predict", "--checkpoint", "bad.safetensors", episode),
+                "bad.safetensors is not a readable checkpoint",
+            ),
             ((*fit, "meteornet"), "No such checkpoint: data/regressors/small/meteornet.safetensors"),
             (
                 (*fit, "best"),
                 "A start is middle, PARAMETER=VALUE,..., mlp, pointnet2, meteornet, posterior or a checkpoint, got 'best'",
             ),
             ((*fit, "fold.safetensors"), "fold.safetensors was trained for fold, not for small"),
-            ((*TRAIN, "--scenario", "lift"), "sim holds draws of small, not of lift"),
+            ((*TRAIN, "--scene", "lift"), "sim holds draws of small, not of lift"),
             ((*TRAIN, "--profile", "fast"), "profile: Input should be 'quick', 'reduced' or 'paper'"),
             ((*TRAIN, "--model", "transformer"), "Unknown model 'transformer'"),
         ):

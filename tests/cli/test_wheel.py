@@ -67,7 +67,7 @@ def test_it_checks_itself_and_fits(installed, tmp_path):
         tmp_path / "e1.npz", clouds_of(load_scenario(tmp_path / "small.yaml"), points=2000, stretch=0.7, mass=1.0)
     )
     assert json.loads(run(installed, tmp_path, "-m", "diffcloud", "doctor", "--json").splitlines()[-1])
-    options = ["--scenario", "small.yaml", "--parameters", "stretch", "--fix", "mass=1", "--starts", "1", "--out", "fits"]
+    options = ["--scene", "small.yaml", "--parameters", "stretch", "--fix", "mass=1", "--starts", "1", "--out", "fits"]
     told = json.loads(run(installed, tmp_path, "-m", "diffcloud", "fit", *options, "e1.npz", "--json").splitlines()[-1])
     assert 0.3 < told["fits"]["e1"]["parameters"]["stretch"]["value"] < 1.5
     assert (tmp_path / "fits" / "e1.json").is_file()

@@ -81,17 +81,17 @@ def test_a_replacement_depends_on_run_and_attempt(kind):
 
 
 def test_other_material_is_off_by_its_factor_whatever_else_is_drawn():
-    plain, doubting = draws("uniform"), replace(draws("uniform"), doubts={"bending": 1.5, "drag": 1.1})
-    np.testing.assert_array_equal(plain.first("train", 50), doubting.first("train", 50))
-    assert plain.doubtful("train", 0, 0) == {}
-    found = np.log([list(doubting.doubtful("train", run, 0).values()) for run in range(800)])
+    plain, varied = draws("uniform"), replace(draws("uniform"), uncertain={"bending": 1.5, "drag": 1.1})
+    np.testing.assert_array_equal(plain.first("train", 50), varied.first("train", 50))
+    assert plain.uncertain_factors("train", 0, 0) == {}
+    found = np.log([list(varied.uncertain_factors("train", run, 0).values()) for run in range(800)])
     np.testing.assert_allclose(found.std(axis=0), np.log([1.5, 1.1]), rtol=0.08)
     np.testing.assert_allclose(found.mean(axis=0), 0, atol=0.05)
     assert abs(np.corrcoef(found.T)[0, 1]) < 0.1
-    first = doubting.doubtful("train", 3, 0)
-    assert first == doubting.doubtful("train", 3, 0)
+    first = varied.uncertain_factors("train", 3, 0)
+    assert first == varied.uncertain_factors("train", 3, 0)
     for other in (("test", 3, 0), ("train", 4, 0), ("train", 3, 1)):
-        assert doubting.doubtful(*other) != first
+        assert varied.uncertain_factors(*other) != first
 
 
 def test_bounds_of_a_scenario_count():
@@ -106,7 +106,7 @@ def test_bounds_of_a_scenario_count():
         (lambda: ParameterBox.build(["weight"]), "Unknown parameter 'weight'"),
         (lambda: ParameterBox.build([]), "at least one"),
         (lambda: ParameterBox.build(["mass", "mass"]), "listed twice"),
-        (lambda: draws("modes", "towel"), "not for 'towel'; use --draws"),
+        (lambda: draws("modes", "towel"), "not for 'towel'; use --distribution"),
         (lambda: draws("modes", box=ParameterBox.build(["mass", "bending"])), "draw stretch and mass, not mass, bending"),
         (lambda: ParameterDraws(BOX, "uniform", "lift", 0, {"mass": 1.5}), "leave out mass"),
         (lambda: draws("modes", box=ParameterBox.build(BOX.names, {"stretch": (0.01, 0.02)})).first("train", 3), "hardly"),

@@ -66,17 +66,17 @@ def test_runs_are_those_of_a_plain_rollout(whole):
     assert read.obstacle is None  # the table is not rendered
 
 
-def test_doubtful_material_of_a_run_is_simulated():
-    doubts = {"bending": 2.0, "friction_obstacle": 1.5, "body_mass": 1.5}
+def test_uncertain_material_of_a_run_is_simulated():
+    uncertain = {"bending": 2.0, "friction_obstacle": 1.5, "body_mass": 1.5}
     scenario = small_lift()
     assert scenario.value("bending") == 1.0
     assert scenario.value("friction_obstacle") > 0
     assert scenario.value("body_mass") == 0.0  # there are none, and nothing is drawn
-    draws = ParameterDraws(ParameterBox.build(["stretch", "mass"]), "uniform", scenario.name, 0, doubts)
+    draws = ParameterDraws(ParameterBox.build(["stretch", "mass"]), "uniform", scenario.name, 0, uncertain)
     (chunk,) = chunks.chunks_of(draws, "test", 3)
     found = chunks.simulate_chunk(scenario, draws, chunk)
     system, _ = scenario.scene.build()
-    factors = [draws.doubtful("test", run, 0) for run in range(3)]
+    factors = [draws.uncertain_factors("test", run, 0) for run in range(3)]
     values = dict(zip(("stretch", "mass"), torch.as_tensor(found.parameters.T), strict=True))
     for name in ("bending", "friction_obstacle"):
         values[name] = torch.tensor([scenario.value(name) * one[name] for one in factors], dtype=torch.float64)
@@ -85,7 +85,7 @@ def test_doubtful_material_of_a_run_is_simulated():
     np.testing.assert_array_equal(found.nodes, expected.numpy())
 
 
-def test_doubtful_material_stays_possible(monkeypatch):
+def test_uncertain_material_stays_possible(monkeypatch):
     """Of a compression a little below one, which is the most there is."""
     plain, drawn = small_lift(), []
     scenario = replace(plain, scene=replace(plain.scene, material=replace(plain.scene.material, compression=0.9)))

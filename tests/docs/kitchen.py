@@ -15,7 +15,7 @@ from diffcloud.io.clouds import write_ply
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.sensing.cameras import inverse
-from tests.cli.invoke import invoke
+from tests.cli.invoke import invoke, stage
 from tests.docs.examples import Example, examples, read
 from tests.estimation.test_fit import clouds_of
 from tests.io.test_recordings import bag
@@ -28,9 +28,9 @@ PARAMS = {
     "scenarios": ["lift"],
     "episodes": {"per_scenario": 1, "image_size": [106, 60]},
     "preprocess": {"raw": {"refine": False, "flying_m": 0.1}, "points": 300},
-    "fit": {"iterations": 1, "points": 200},
+    "fit": {"solver": {"max_steps": 1, "starts": 1}, "points": 200},
     "train": {"scenarios": ["fold"]},
-    "evaluate": {"draws": 1, "rivals": ["middle"], "level": None},
+    "evaluate": {"draws": 1, "rivals": ["middle"]},
 }
 """In place of params.yaml and the profiles."""
 QUICK = {"base": "lift", "nodes": [5, 5], "frames": 5, "steps_per_frame": 1, "recorder": "whole_surface", "points": 200}
@@ -45,7 +45,7 @@ def own_clouds(folder: Path) -> None:
     """my_clouds/ with gripper.csv of the tutorial's towel: its nodes, where a run puts them."""
     towel = next(example for example in examples(read("docs/own-clouds.md")) if example.words == ("towel.yaml",))
     write(towel, folder)
-    invoke("rollout", "--scenario", "towel.yaml", "--out", "true.npz")
+    invoke("simulate", "towel.yaml", "--out", "true.npz")
     with np.load("true.npz") as run:
         nodes, times = run["nodes"], run["times"]
     for index, frame in enumerate(nodes):
@@ -57,7 +57,7 @@ def own_clouds(folder: Path) -> None:
 def lift_episode(folder: Path) -> None:
     """my_episode.npz of a lift that takes a moment, before a camera."""
     quick(folder)
-    invoke("rollout", "--scenario", "quick", "--out", "run.npz")
+    invoke("simulate", "quick", "--out", "run.npz")
     meta = {"viewpoints": {"side": [0.8, 0.2, 0.5]}}
     with np.load("run.npz") as run:
         write_episode(folder / "my_episode.npz", Episode.from_frames(list(run["nodes"]), run["times"], meta=meta))
@@ -110,9 +110,9 @@ def lab(folder: Path) -> None:
 def fitted(folder: Path) -> None:
     """Episodes and fits of the pipeline, of a lift that takes a moment."""
     quick(folder)
-    invoke("episodes", "--params", "params.yaml", "--out", "data/recorded")
-    invoke("preprocess", "--params", "params.yaml", "--out", "data/episodes", "data/recorded")
-    invoke("fit", "--params", "params.yaml", "--scenario", "quick", "--out", "data/fits/quick", "data/episodes/quick")
+    stage("episodes", "--params", "params.yaml", "--out", "data/recorded")
+    invoke("data", "preprocess", "--params", "params.yaml", "--out", "data/episodes", "data/recorded")
+    stage("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
     params(folder, "pipeline/profiles/release.yaml")
 
 
@@ -120,7 +120,7 @@ def towel(folder: Path) -> None:
     """towel.npz and its fit, of a lift that takes a moment."""
     (folder / "towel.yaml").write_text(yaml.safe_dump(QUICK))
     write_episode(folder / "towel.npz", clouds_of(load_scenario(folder / "towel.yaml"), stretch=0.7))
-    invoke("fit", "--scenario", "towel.yaml", "--parameters", "stretch", "--out", "fits", "towel.npz")
+    invoke("fit", "--scene", "towel.yaml", "--parameters", "stretch", "--out", "fits", "towel.npz")
 
 
 def write(example: Example, folder: Path) -> None:

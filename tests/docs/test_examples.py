@@ -20,7 +20,7 @@ from typer.main import get_command
 
 from studies import bench
 from studies.__main__ import app as studies
-from tests.cli.invoke import invoke
+from tests.cli.invoke import invoke, stage_command, study
 from tests.docs.examples import PAGES, ROOT, Example, examples, mentions, read
 from tests.docs.kitchen import PREPARED, STAND_INS, write
 from tests.docs.site import reference
@@ -30,15 +30,13 @@ DATA = "PATH/pysim"
 """Stands for the folder of the published data."""
 
 SMALLER = {
-    "visibility": "--size 2",
-    "simulate": "--train 4 --test 5",
-    "train": "--epochs 1 --points 32",
-    "fit": "--starts 1 --iterations 1 --points 200",
-    "identify": "--parameters stretch",
-    "evaluate loss": "--points 200",
+    "network generate": "--train 4 --test 5",
+    "network train": "--epochs 1",
+    "fit": "--starts 1 --max-steps 1 --parameters stretch",
+    "fit my_clouds": "--max-steps 2",
     "published": "--only release_lift/lift_tan --allow-missing --workers 1",
     "bench": "--repeats 1",
-    "export fits/towel.json --to mujoco --samples": "--samples 2",
+    "export fits/fit.json --to mujoco --samples": "--samples 2",
 }
 """Command -> options that are added to it; the last of two counts."""
 
@@ -46,11 +44,11 @@ LEFT = {
     "pip install": "installs",
     "source .venv/bin/activate": "changes the shell",
     "diffcloud doctor --arm": "an arm",
-    "diffcloud capture --rig rig.yaml --trajectory path.csv": "a lab's own hardware",
-    "diffcloud capture --rig rig.yaml --check": "a lab's own hardware",
+    "diffcloud data capture --rig rig.yaml --trajectory path.csv": "a lab's own hardware",
+    "diffcloud data capture --rig rig.yaml --check": "a lab's own hardware",
     "python -m diffcloud.hardware.examples": "runs until it is ended",
-    "diffcloud import overhead=a.db3": "recordings of two cameras, made by the SDK of their maker",
-    "diffcloud episode watch": "runs until it is ended",
+    "diffcloud data import overhead=a.db3": "recordings of two cameras, made by the SDK of their maker",
+    "diffcloud view raw/episodes/lift/tan1 --live": "runs until it is ended",
     ".venv/bin/python -m pytest": "a test of its own",
 }
 """Beginnings of commands that are not run -> what they need, or why."""
@@ -64,8 +62,9 @@ WITH_EXAMPLES = [page for page in PAGES if examples(read(page))]
 def parse(words: tuple[str, ...]) -> None:
     """Read a command line as the command itself does, to its last option; run nothing."""
     if words[0] == "python":
-        study = get_command(studies).commands[words[3]]
-        study.make_context(words[3], list(words[4:]))
+        alone = words[2].startswith("pipeline.")
+        command = stage_command(words[2]) if alone else reference.members(get_command(studies))[words[3]]
+        command.make_context(words[2], list(words[3 if alone else 4 :]))
         return
     path = reference.command_of(" ".join(words))
     assert path is not None, f"no such command: {shlex.join(words)}"
@@ -73,6 +72,10 @@ def parse(words: tuple[str, ...]) -> None:
     command = reference.commands()[path]
     context = command.make_context(" ".join(path), rest)
     assert not getattr(context, "_protected_args", None), f"no such command: {shlex.join(words)}"
+
+
+def is_stage(words: tuple[str, ...]) -> bool:
+    return words[:2] == ("python", "-m") and words[2].startswith("pipeline.")
 
 
 def run(example: Example, *, slow: bool) -> None:
@@ -84,15 +87,16 @@ def run(example: Example, *, slow: bool) -> None:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*fewer than 100 points")  # the kitchen's clouds are small
             exec(compile(example.text, "example", "exec"), {})
-    elif words[0] == "diffcloud" or words[:3] == ("python", "-m", "studies"):
+    elif words[0] == "diffcloud" or words[:3] == ("python", "-m", "studies") or is_stage(words):
         parse(words)
-        own = words[3:] if words[0] == "python" else words[1:]
+        own = words[2:] if is_stage(words) else words[3:] if words[0] == "python" else words[1:]
         later = not slow and example.text.startswith(SLOW)
         absent = RELEASE is None and any(DATA in word or "release" in word for word in words)
         if not (later or absent or example.text.startswith(tuple(LEFT))):
             more = [option for name, option in SMALLER.items() if shlex.join(own).startswith(name)]
+            called = study if words[0] == "python" and not is_stage(words) else invoke
             with not_yet_captured(words):
-                invoke(*own, *shlex.split(" ".join(more)))
+                called(*own, *shlex.split(" ".join(more)))
     elif words[0] == "python" and words[1] != "-m":
         runpy.run_path(words[1])
     elif words[0] == "make":
@@ -107,7 +111,7 @@ def run(example: Example, *, slow: bool) -> None:
 @contextmanager
 def not_yet_captured(words: tuple[str, ...]) -> Iterator[None]:
     """What a capture would record lies there for the commands after it; a capture, also a dry one, takes a new folder."""
-    if words[1] != "capture" or "--out" not in words:
+    if words[1:3] != ("data", "capture") or "--out" not in words:
         yield
         return
     out = Path(words[words.index("--out") + 1])
@@ -165,9 +169,10 @@ def test_nothing_is_left_out_in_vain():
 
 @pytest.mark.parametrize("page", PAGES)
 def test_commands_and_options_that_the_prose_names_exist(page):
+    stages = [stage_command(f"pipeline.{path.stem}") for path in (ROOT / "pipeline").glob("[a-z]*.py")]
     options = {
         option
-        for command in [*reference.commands().values(), *get_command(studies).commands.values()]
+        for command in [*reference.commands().values(), *reference.members(get_command(studies)).values(), *stages]
         for p in command.params
         for option in (*p.opts, *p.secondary_opts)
     }
@@ -180,14 +185,14 @@ def test_commands_and_options_that_the_prose_names_exist(page):
             assert path is not None, f"{page}: no such command: {code}"
             words = code.split()[1 + len(path) :]
             own = {option for p in reference.commands()[path].params for option in (*p.opts, *p.secondary_opts)}
-            group = getattr(reference.commands()[path], "commands", None)
+            group = reference.members(reference.commands()[path])
             assert not (group and words and not words[0].startswith("-")), f"{page}: no such command: {code}"
             assert {word for word in words if word.startswith("--")} <= own, f"{page}: {code}"
 
 
 @pytest.mark.parametrize(
     "line",
-    ["diffcloud fit --scenario lift --out fits --twice e.npz", "diffcloud evaluate los e.npz", "diffcloud fly --high"],
+    ["diffcloud fit --scene lift --out fits --twice e.npz", "diffcloud data chek e.npz", "diffcloud fly --high"],
 )
 def test_what_does_not_exist_is_found(line, folder):
     (example,) = examples(f"```bash\n{line}\n```\n")
@@ -196,6 +201,6 @@ def test_what_does_not_exist_is_found(line, folder):
 
 
 def test_a_value_that_does_not_convert_is_found(folder):
-    (example,) = examples("Try `diffcloud fit --scenario lift --out fits --starts few e.npz`.")
+    (example,) = examples("Try `diffcloud fit --scene lift --out fits --starts few e.npz`.")
     with pytest.raises(Exception, match=r"(?i)integer"):
         run(example, slow=False)

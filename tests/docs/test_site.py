@@ -111,8 +111,8 @@ def test_every_command_has_a_page_with_its_options(site):
 
 def test_pages_and_commands_link_both_ways(site):
     assert "../commands/" not in read("docs/regressors.md")  # GitHub has no such pages
-    assert 'href="commands/train.html"' in (site / "regressors.html").read_text(encoding="utf-8")
-    assert 'href="../regressors.html"' in (site / "commands" / "train.html").read_text(encoding="utf-8")
+    assert 'href="commands/network-train.html"' in (site / "regressors.html").read_text(encoding="utf-8")
+    assert 'href="../regressors.html"' in (site / "commands" / "network-train.html").read_text(encoding="utf-8")
 
 
 def test_placeholders_of_help_texts_are_shown(site):
@@ -121,7 +121,7 @@ def test_placeholders_of_help_texts_are_shown(site):
     for path, command in reference.commands().items():
         texts = [command.help or "", *(getattr(parameter, "help", None) or "" for parameter in command.params)]
         told[path] = [placeholder for text in texts for placeholder in re.findall(r"<[\w|]+>[\w./]*", text)]
-    assert sum(map(bool, told.values())) >= 8
+    assert sum(map(bool, told.values())) >= 5
     for path, placeholders in told.items():
         shown = Fetched(site / reference.address(path).replace(".md", ".html")).text
         for placeholder in placeholders:

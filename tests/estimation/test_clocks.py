@@ -12,12 +12,14 @@ import torch
 from diffcloud.clouds import SurfaceSampler
 from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.errors import ConfigError, EpisodeError
-from diffcloud.estimation import FitSpace, LikelihoodSettings, Objective, fit_likelihood
 from diffcloud.estimation.inputs import Inputs
 from diffcloud.estimation.matching import pairs_forth
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.pose import SET_UP, PoseSpace, default_priors, priors_by_clock
 from diffcloud.estimation.residuals import Axis
 from diffcloud.estimation.result import describe_recording, recorded_pose
+from diffcloud.estimation.solvers import LikelihoodSettings, fit_likelihood
 from diffcloud.io.episodes import Clock, Episode
 from diffcloud.sim.properties import one_set
 from tests.estimation.rates import check_rates

@@ -10,10 +10,13 @@ import pytest
 import torch
 
 from diffcloud.errors import ConfigError, DivergedError, EpisodeError
-from diffcloud.estimation import AdamSettings, FitSpace, JointObjective, Objective, fit_adam
 from diffcloud.estimation.inputs import Inputs
+from diffcloud.estimation.joint import JointObjective
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.record import FittedParameter, read_fit
 from diffcloud.estimation.result import describe_fit, read_motion, write_fit
+from diffcloud.estimation.solvers import AdamSettings, fit_adam
 from diffcloud.estimation.targets import track_displacement
 from diffcloud.estimation.visibility import visibility_map
 from diffcloud.io.episodes import Episode
@@ -117,7 +120,7 @@ class TestRecovery:
         scenario = small_lift(**GENTLE)
         episode = clouds_of(scenario, stretch=0.8, mass=1.5)
         space = FitSpace.build(["stretch"], fixed={"mass": 1.5})
-        outcome = fit_adam(paper_objective(scenario, episode), space, AdamSettings(iterations=40))
+        outcome = fit_adam(paper_objective(scenario, episode), space, AdamSettings(max_steps=40))
         assert outcome.loss < 0.25 * outcome.loss_start
         assert outcome.values["stretch"] == pytest.approx(0.8, rel=0.1)
 
@@ -128,7 +131,7 @@ class TestRecovery:
         found = []
         for mass in (1.5, 0.75):
             space = FitSpace.build(["stretch"], fixed={"mass": mass})
-            settings = AdamSettings(iterations=25, init={"stretch": mass})
+            settings = AdamSettings(max_steps=25, init={"stretch": mass})
             found.append(fit_adam(paper_objective(scenario, episode), space, settings).values["stretch"])
         assert found[0] / found[1] == pytest.approx(2.0, rel=0.15)
 
@@ -150,7 +153,7 @@ class TestRun:
 
     def test_same_seed_same_result_and_best_iterate_kept(self, scenario, objective):
         space = FitSpace.build(["stretch", "mass"])
-        settings = AdamSettings(iterations=6, smoothing=0.3, starts=2)
+        settings = AdamSettings(max_steps=6, smoothing=0.3, starts=2)
         first, second = (fit_adam(objective, space, settings) for _ in range(2))
         assert first.values == second.values
         assert first.loss == second.loss
@@ -159,7 +162,7 @@ class TestRun:
 
     def test_losses_and_gradients_that_grow_beyond_a_record_are_none_in_it(self, objective):
         """A rough loss may well have a gradient that no file need hold."""
-        space, settings = FitSpace.build(["stretch"]), AdamSettings(iterations=1)
+        space, settings = FitSpace.build(["stretch"]), AdamSettings(max_steps=1)
         outcome = fit_adam(objective, space, settings)
         outcome.history.gradients[0][...] = 1e20
         outcome.history.losses[-1][...] = math.inf
@@ -193,7 +196,7 @@ class TestRun:
             return real(self, parameters)
 
         monkeypatch.setattr(Objective, "__call__", fragile)
-        space, settings = FitSpace.build(["stretch"]), AdamSettings(starts=4, iterations=3, smoothing=0.3)
+        space, settings = FitSpace.build(["stretch"]), AdamSettings(starts=4, max_steps=3, smoothing=0.3)
         outcome = fit_adam(objective, space, settings)
         assert outcome.values["stretch"] <= 5.0
         assert outcome.start["stretch"] <= 5.0
@@ -206,7 +209,7 @@ class TestRun:
     def test_a_motion_that_diverges_after_the_compared_frames_is_recorded_as_far_as_it_goes(self, monkeypatch, tmp_path):
         scenario = small_lift(**GENTLE)
         objective = Objective(scenario, clouds_of(scenario, stretch=2.0), frames=range(5), nuisance={})
-        space, settings = FitSpace.build(["stretch"]), AdamSettings(iterations=2)
+        space, settings = FitSpace.build(["stretch"]), AdamSettings(max_steps=2)
         outcome = fit_adam(objective, space, settings)
         whole = describe_fit(objective, space, settings, outcome, episodes=["e"])
         assert not whole.record.failures
@@ -247,7 +250,7 @@ class TestRun:
             return real(self, parameters)
 
         monkeypatch.setattr(Objective, "__call__", fragile)
-        outcome = fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings(iterations=1, smoothing=0.5))
+        outcome = fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings(max_steps=1, smoothing=0.5))
         assert outcome.start["stretch"] == pytest.approx(5.05)
         assert not outcome.failures
 
@@ -262,7 +265,7 @@ class TestRun:
         episodes = [clouds_of(scenario, stretch=stretch, mass=1.0, shift=(0.0, 0.0, 0.002)) for stretch in (0.7, 1.4)]
         objective = JointObjective([Objective(scenario, episode) for episode in episodes])
         space = FitSpace.build(["stretch"])
-        settings = AdamSettings(iterations=2, seed=3)
+        settings = AdamSettings(max_steps=2, seed=3)
         outcome = fit_adam(objective, space, settings)
         told = describe_fit(objective, space, settings, outcome, episodes=["a", "b"], resampled_seeds=2).record
         parameters = space.parameters(torch.tensor([list(outcome.values.values())], dtype=torch.float64))
@@ -281,7 +284,7 @@ class TestRun:
 
     def test_result_files(self, scenario, objective, tmp_path):
         space = FitSpace.build(["stretch"], fixed={"mass": 1.2})
-        settings = AdamSettings(iterations=2)
+        settings = AdamSettings(max_steps=2)
         outcome = fit_adam(objective, space, settings)
         path = write_fit(tmp_path, "e", describe_fit(objective, space, settings, outcome, episodes=["e"]))
         found = read_fit(path)
@@ -375,8 +378,8 @@ class Rough:
 def test_smoothed_gradients_find_the_valley_of_a_rough_loss():
     """Where ripples are as steep as ten valleys, the exact gradient goes nowhere."""
     space = FitSpace.build(["stretch", "mass"])
-    exact = fit_adam(Rough(), space, AdamSettings(iterations=60))
-    found = [fit_adam(Rough(), space, AdamSettings(iterations=60, smoothing=0.5, seed=seed)) for seed in range(4)]
+    exact = fit_adam(Rough(), space, AdamSettings(max_steps=60))
+    found = [fit_adam(Rough(), space, AdamSettings(max_steps=60, smoothing=0.5, seed=seed)) for seed in range(4)]
     assert max(one.loss for one in found) < 0.1 * exact.loss
 
 

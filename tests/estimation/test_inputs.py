@@ -10,9 +10,11 @@ import pytest
 import torch
 
 from diffcloud.errors import ConfigError, SceneError
-from diffcloud.estimation import FitSpace, LikelihoodSettings, Objective, fit_likelihood
+from diffcloud.estimation.initial_state import with_initial_state
 from diffcloud.estimation.inputs import Inputs
-from diffcloud.estimation.laid import with_laid
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
+from diffcloud.estimation.solvers import LikelihoodSettings, fit_likelihood
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.scene.scenarios.sheet import Sheet
 from diffcloud.sim.handles import Handle, Handles
@@ -77,7 +79,7 @@ class TestSize:
 
     def test_a_cloth_that_hangs_has_no_size(self):
         with pytest.raises(ConfigError, match="level"):
-            with_laid(ASKED, [{"size": 0.02}], [load_scenario("vest_hang")])
+            with_initial_state(ASKED, [{"size": 0.02}], [load_scenario("vest_hang")])
 
     @pytest.mark.parametrize(
         ("change", "more"),
@@ -90,7 +92,7 @@ class TestSize:
         scene = SCENARIO.scene
         scenario = replace(SCENARIO, scene=replace(scene, surrounding=replace(scene.surrounding, **change)))
         with pytest.raises(ConfigError, match=more):
-            with_laid(ASKED, [{"size": 0.02}], [scenario])
+            with_initial_state(ASKED, [{"size": 0.02}], [scenario])
         with pytest.raises(ConfigError, match=more):
             motion(scenario, size=0.02)
 
@@ -137,7 +139,7 @@ class TestTrack:
 
 
 def test_rates_are_those_of_the_motion():
-    space = with_laid(ASKED, [{"turn": 0.1, "shape": 0.01, "size": 0.05, "track": 0.05}], [SCENARIO])
+    space = with_initial_state(ASKED, [{"turn": 0.1, "shape": 0.01, "size": 0.05, "track": 0.05}], [SCENARIO])
     objective = Objective(SCENARIO, clouds_of(SCENARIO, points=2000, stretch=0.6, mass=1.7, size=0.05), nuisance={})
     places = torch.randn(1, len(space.names), generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 0.3
     check_rates(objective, space, places, rtol=1e-6, atol=1e-12)
@@ -150,7 +152,7 @@ def test_the_size_of_a_cloth_is_found():
     short = recorded.gripper[:1] + (recorded.gripper - recorded.gripper[:1]) / 1.05
     objective = Objective(SCENARIO, replace(recorded, gripper=short), nuisance={})
     settings = LikelihoodSettings(starts=1, model_error=False, init={"stretch": 1.0})
-    space = with_laid(ASKED, [{"size": 0.1, "track": 0.1}], [SCENARIO])
+    space = with_initial_state(ASKED, [{"size": 0.1, "track": 0.1}], [SCENARIO])
     plain, sized = (fit_likelihood(objective, one, settings) for one in (ASKED, space))
     assert sized.values["size"] == pytest.approx(math.log(1 + LARGER), abs=0.005)
     assert sized.values["track"] == pytest.approx(math.log(1.05), abs=0.01)

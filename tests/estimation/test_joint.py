@@ -13,21 +13,15 @@ import pytest
 import torch
 
 from diffcloud.errors import ConfigError, DivergedError
-from diffcloud.estimation import (
-    FitSpace,
-    JointObjective,
-    LikelihoodSettings,
-    Objective,
-    fit_likelihood,
-    read_fit,
-    solve,
-    write_fit,
-)
-from diffcloud.estimation.joint import mean_loss
-from diffcloud.estimation.laid import laid_nodes, with_laid
+from diffcloud.estimation.initial_state import laid_nodes, with_initial_state
+from diffcloud.estimation.joint import JointObjective, mean_loss
 from diffcloud.estimation.left_out import leave_each_out
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
+from diffcloud.estimation.record import read_fit
 from diffcloud.estimation.residuals import Axis
-from diffcloud.estimation.result import describe_fit, describe_recording
+from diffcloud.estimation.result import describe_fit, describe_recording, write_fit
+from diffcloud.estimation.solvers import LikelihoodSettings, fit_likelihood, solve
 from diffcloud.evaluation.methods import space_of
 from diffcloud.sim.properties import one_set
 from diffcloud.sim.simulate import rollout
@@ -56,7 +50,7 @@ def askew():
     told = [clouds_of(s, points=4000, **TRUTH, **own) for s, own in zip(motions(), lies, strict=True)]
     members = [Objective(scenario, one, nuisance={}) for scenario, one in zip(motions(), told, strict=True)]
     joint, settings = JointObjective(members), LikelihoodSettings(starts=1, model_error=False, init=TRUTH)
-    space = with_laid(SPACE, [{"turn": 0.1}] * 2, motions())
+    space = with_initial_state(SPACE, [{"turn": 0.1}] * 2, motions())
     return joint, settings, space, [(one, fit_likelihood(joint, one, settings)) for one in (SPACE, space)]
 
 
@@ -87,7 +81,7 @@ class TestLaid:
         with torch.no_grad():
             assert float(joint(one_set(record.simulated))) == pytest.approx(record.loss, rel=1e-9)
         for number, (scenario, motion) in enumerate(zip(motions(), result.motions, strict=True)):
-            (lies,) = laid_nodes(scenario.scene.mesh, one_set(record.laid_in(record.episodes[number])))
+            (lies,) = laid_nodes(scenario.scene.mesh, one_set(record.initial_state_in(record.episodes[number])))
             np.testing.assert_allclose(motion.nodes[0], lies, atol=1e-15)
 
     def test_the_uncertainty_does_not_depend_on_the_order(self, askew):
@@ -186,7 +180,7 @@ class TestFit:
         ]
         space, settings = (
             FitSpace.build(["stretch"], fixed={"mass": 1.0}),
-            LikelihoodSettings(starts=1, model_error=False, iterations=2),
+            LikelihoodSettings(starts=1, model_error=False, max_steps=2),
         )
         joint = JointObjective(members)
         record = describe_fit(joint, space, settings, solve(joint, space, settings), episodes=["a", "b"]).record
@@ -199,7 +193,7 @@ class TestFit:
     def test_variables_move_the_motions_of_their_recording(self, generator):
         """Of the material those of both, of how a cloth lies one alone."""
         members = [Objective(s, clouds_of(s, points=4000, **TRUTH), nuisance={}) for s in motions()]
-        space = with_laid(SPACE, [{"turn": 0.1, "shape": 0.01, "size": 0.05}, {"turn": 0.1}], motions())
+        space = with_initial_state(SPACE, [{"turn": 0.1, "shape": 0.01, "size": 0.05}, {"turn": 0.1}], motions())
         places = 0.3 * torch.randn(1, len(space.names), generator=generator).double()
         moving = torch.zeros(2, len(space.names), dtype=torch.long)
         for number, member in enumerate(members):
@@ -224,7 +218,7 @@ class TestFit:
                 slope = torch.autograd.grad(loss.sum(), wanted["stretch"])[0]
                 with torch.no_grad():
                     assert not joint(wanted).requires_grad
-                fit = fit_likelihood(joint, SPACE, LikelihoodSettings(starts=1, iterations=2, model_error=False))
+                fit = fit_likelihood(joint, SPACE, LikelihoodSettings(starts=1, max_steps=2, model_error=False))
                 found[threads] = [loss.detach(), slope, fit.estimate.best.place, fit.estimate.covariance]
         finally:
             use_threads(None)

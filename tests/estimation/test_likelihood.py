@@ -11,13 +11,14 @@ import pytest
 import torch
 
 from diffcloud.errors import DivergedError
-from diffcloud.estimation import FitSpace, JointObjective, Objective
+from diffcloud.estimation.joint import JointObjective
 from diffcloud.estimation.likelihood import Answer, Estimate, LikelihoodSettings, energy
 from diffcloud.estimation.likelihood.energy import Likelihood
 from diffcloud.estimation.likelihood.frames import Frames
 from diffcloud.estimation.likelihood.grasp import in_powers, regripped, that_fits
 from diffcloud.estimation.likelihood.recording import Changes, Linear
-from diffcloud.estimation.parameters import Variable
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace, Variable
 from diffcloud.estimation.solvers import fit_likelihood
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.scene.scenarios.grid import LIFT, GridScenario, grid_scenario
@@ -28,7 +29,7 @@ TRUTH = {"stretch": 0.6, "mass": 1.7}
 SCENARIO = small_lift(**{**GENTLE, "integrator": "implicit", "points": 2000})
 POSE = {"x": 0.01, "yaw": 0.05}
 SPACE = FitSpace(
-    (Variable("stretch", 0.03, 30.0, 10.0), Variable("bending", 0.1, 10.0, 1.5, doubtful=True)), {"mass": TRUTH["mass"]}
+    (Variable("stretch", 0.03, 30.0, 10.0), Variable("bending", 0.1, 10.0, 1.5, role="material")), {"mass": TRUTH["mass"]}
 )
 
 
@@ -271,7 +272,7 @@ class TestFits:
     def test_a_descent_over_all_frames_that_does_not_arrive_counts_too(self):
         """Two places of each descent, and the horizon's two motions."""
         one = Objective(SCENARIO, clouds_of(SCENARIO, points=2000, **TRUTH), nuisance=POSE)
-        settings = LikelihoodSettings(iterations=2, starts=1, model_error=False)
+        settings = LikelihoodSettings(max_steps=2, starts=1, model_error=False)
         told = fit_likelihood(one, SPACE, settings).estimate
         assert len(told.members[0].frames) < len(one.frames)
         assert told.simulations == 6
@@ -284,5 +285,5 @@ class TestFits:
         episode = clouds_of(scenario, points=300)
         one = Objective(scenario, episode, nuisance={"lag": 0.01}, points=100)
         space = FitSpace((Variable("stretch", 0.1, 10.0, 3.0),), {})
-        told = fit_likelihood(one, space, LikelihoodSettings(starts=1, iterations=1))
+        told = fit_likelihood(one, space, LikelihoodSettings(starts=1, max_steps=1))
         assert np.isfinite(told.loss)

@@ -13,11 +13,14 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfacePoints
 from diffcloud.clouds.visibility import seen_places
 from diffcloud.errors import ConfigError, DivergedError, EpisodeError
-from diffcloud.estimation import FitSpace, JointObjective, LikelihoodSettings, Objective, fit_likelihood
+from diffcloud.estimation.joint import JointObjective
 from diffcloud.estimation.matching import Pairs, pairs_forth
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.pose import SET_UP
 from diffcloud.estimation.residuals import Axis
 from diffcloud.estimation.result import describe_recording
+from diffcloud.estimation.solvers import LikelihoodSettings, fit_likelihood
 from diffcloud.io.episodes import Episode
 from diffcloud.scene import load_scenario
 from diffcloud.sensing.whole_surface import sample_surface

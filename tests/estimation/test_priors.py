@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from diffcloud.errors import ConfigError
-from diffcloud.estimation import FitSpace, LikelihoodSettings, Objective, fit_likelihood
 from diffcloud.estimation.batches import posterior_losses
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.priors import DEFAULT_FACTOR, parameter_priors
+from diffcloud.estimation.solvers import LikelihoodSettings, fit_likelihood
 from tests.conftest import small_lift
 from tests.estimation.test_fit import GENTLE, clouds_of
 

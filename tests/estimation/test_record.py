@@ -16,7 +16,7 @@ def test_two_recordings_of_one_name_are_told_apart_by_their_scenario():
     assert record.place_of("b", "other.yaml") == 1
     assert [record.place_of("a", name) for name in ("lift", "fold")] == [0, 2]
     for scenario in (None, "other.yaml"):
-        with pytest.raises(ConfigError, match="The fit knows a in fold and lift; choose one by --scenario"):
+        with pytest.raises(ConfigError, match="The fit knows a in fold and lift; rename one of these recordings"):
             record.place_of("a", scenario)
     with pytest.raises(ConfigError, match="Unknown recording of the fit 'c'"):
         record.place_of("c")

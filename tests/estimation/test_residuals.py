@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from diffcloud.errors import DivergedError
-from diffcloud.estimation import FitSpace, Objective, residuals
+from diffcloud.estimation import residuals
 from diffcloud.estimation.bounded import lowest_within
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.residuals import Axis, moved_by
 from tests.conftest import small_lift
 from tests.estimation.rates import check_rates

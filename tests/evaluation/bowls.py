@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import torch
 
 from diffcloud.errors import DivergedError
-from diffcloud.estimation import FitSpace
+from diffcloud.estimation.parameters import FitSpace
 
 SPACE = FitSpace.build(["stretch", "mass"])
 

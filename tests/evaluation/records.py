@@ -36,7 +36,7 @@ def record(
         "length_unit_m": 1.0,
         "threshold": 6e-5,
         "frames": [-1],
-        "doubtful": [],
+        "nuisance": [],
         "start": None if start is None else _measured(start),
         "methods": [_row(method, loss, stretch, truth) for method, loss in losses.items()],
         "gaps": gaps or [],

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import norm
 
 from diffcloud.errors import ConfigError
-from diffcloud.estimation import FitSpace
+from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.record import EstimateRecord, Followed
 from diffcloud.evaluation.intervals import intervals_of, significant
 from diffcloud.evaluation.summary import largest_sources
@@ -107,9 +107,9 @@ class TestVerdicts:
         assert told(sources, within=1.2).parameters["stretch"].verdict == "not identified"
         assert told(sources, within=1.5).parameters["stretch"].verdict == "identified"
 
-    def test_of_doubtful_material_there_is_none(self):
-        doubtful = replace(FitSpace.build(["bending"], priors={"bending": 1.5}).variables[0], doubtful=True)
-        space = FitSpace((*SPACE.variables, doubtful), {})
+    def test_of_uncertain_material_there_is_none(self):
+        uncertain = replace(FitSpace.build(["bending"], priors={"bending": 1.5}).variables[0], role="material")
+        space = FitSpace((*SPACE.variables, uncertain), {})
         assert set(told({"recording": np.diag([0.01, 0.01])}, space=space).parameters) == {"stretch", "mass"}
 
     def test_a_cloth_that_is_far_from_the_recording_most_of_the_time_says_nothing(self):
@@ -122,7 +122,7 @@ class TestVerdicts:
     def test_a_descent_that_took_all_its_steps_is_remarked_on(self):
         right, cut = (told({"recording": np.diag([0.01, 0.01])}, stop=stop) for stop in ("converged", "iterations"))
         assert right.sentences == []
-        assert "--iterations" in cut.remark
+        assert "--max-steps" in cut.remark
         assert cut.parameters == right.parameters
 
 

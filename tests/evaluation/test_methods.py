@@ -8,11 +8,10 @@ import pytest
 import torch
 
 from diffcloud.errors import DivergedError
-from diffcloud.estimation import AdamSettings, CmaEsSettings, RandomSearchSettings, fit_adam, solve
 from diffcloud.estimation.batches import batch_losses, without_diverged
 from diffcloud.estimation.parameters import Variable
 from diffcloud.estimation.record import History
-from diffcloud.estimation.solvers import SOLVER_NAMES
+from diffcloud.estimation.solvers import SOLVER_NAMES, AdamSettings, CmaEsSettings, RandomSearchSettings, fit_adam, solve
 from diffcloud.evaluation.methods import (
     clipped,
     first_start,
@@ -54,7 +53,7 @@ def test_searches_are_the_solvers_of_fits(settings):
 
 def test_one_start_is_the_first_of_many():
     """Starts do not touch one another, so the paper's setting is what the first of nine starts does."""
-    settings = AdamSettings(iterations=12, starts=4)
+    settings = AdamSettings(max_steps=12, starts=4)
     alone = single_start(Bowl(), SPACE, settings)
     many = fit_adam(Bowl(), SPACE, settings)
     assert alone.simulations == 13
@@ -66,14 +65,14 @@ def test_one_start_is_the_first_of_many():
     for change in ({"smoothing": 0.5}, {"resample": True}):
         assert first_start(summary.model_copy(update={"settings": summary.settings | change}), SPACE) is None
     assert first_start(summary.model_copy(update={"stop_reason": "threshold"}), SPACE) is None
-    elsewhere = fit_adam(Bowl(), SPACE, AdamSettings(iterations=2, init={"mass": 1.0}))
+    elsewhere = fit_adam(Bowl(), SPACE, AdamSettings(max_steps=2, init={"mass": 1.0}))
     assert first_start(summary_of(elsewhere), SPACE) is None
 
 
 @pytest.mark.parametrize(
     "rival",
     [
-        lambda bowl: single_start(bowl, SPACE, AdamSettings(iterations=10)),
+        lambda bowl: single_start(bowl, SPACE, AdamSettings(max_steps=10)),
         lambda bowl: searched(bowl, SPACE, RandomSearchSettings()),
         lambda bowl: searched(bowl, SPACE, CmaEsSettings()),
     ],

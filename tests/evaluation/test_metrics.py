@@ -11,9 +11,11 @@ import torch
 
 from diffcloud.clouds import NeighbourIndex, chamfer
 from diffcloud.errors import DivergedError
-from diffcloud.estimation import AdamSettings, FitSpace, Objective, RandomSearchSettings, fit_adam, solve
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.record import History
 from diffcloud.estimation.result import describe_fit
+from diffcloud.estimation.solvers import AdamSettings, RandomSearchSettings, fit_adam, solve
 from diffcloud.evaluation import ComparisonSettings, EpisodeMeter, Estimate, Gap, compare_episode, loss_landscape
 from diffcloud.evaluation.metrics import success_threshold
 from diffcloud.io.episodes import Episode
@@ -125,7 +127,7 @@ def test_landscape_is_the_loss_on_a_grid(scenario, episode):
 @pytest.fixture(scope="module")
 def summary(scenario, episode):
     objective, space = paper_objective(scenario, episode), FitSpace.build(["stretch", "mass"])
-    settings = AdamSettings(iterations=3, starts=2)
+    settings = AdamSettings(max_steps=3, starts=2)
     outcome = fit_adam(objective, space, settings)
     return describe_fit(objective, space, settings, outcome, episodes=["e"]).record
 
@@ -176,7 +178,7 @@ class TestEpisode:
 
     def test_a_fit_by_a_search_is_compared_as_others_are(self, scenario, episode):
         objective, space = Objective(scenario, episode, seed=1000), FitSpace.build(["stretch", "mass"])
-        settings = RandomSearchSettings(simulations=6, seed=1000)
+        settings = RandomSearchSettings(max_simulations=6, seed=1000)
         summary = describe_fit(objective, space, settings, solve(objective, space, settings), episodes=["e"]).record
         chosen = ComparisonSettings(draws=1, seed=1000, level=None, landscape_size=2)
         record = compare_episode(scenario, episode, summary, name="e", settings=chosen).record

@@ -263,9 +263,11 @@ class TestCommand:
     def test_a_capture_with_both(self, tmp_path, controller, folder):
         with description() as urdf:
             rig = self.rig(tmp_path, urdf, controller, folder)
-            done = invoke("capture", "--rig", rig, "--out", tmp_path / "e", "--trajectory", trajectory(tmp_path), "--yes")
+            done = invoke(
+                "data", "capture", "--rig", rig, "--out", tmp_path / "e", "--trajectory", trajectory(tmp_path), "--yes"
+            )
             faults = {one.code for one in validate_raw_episode(tmp_path / "e") if one.severity == "fault"}
-            invoke("episode", "validate", tmp_path / "e", "--urdf", urdf, code=1 if faults else 0)
+            invoke("data", "check", tmp_path / "e", "--urdf", urdf, code=1 if faults else 0)
         assert done.result["frames"]["side"] > 3
         episode = read_raw_episode(tmp_path / "e")
         assert episode.description["robot"]["model"] == "simulated UR5e"
@@ -275,7 +277,7 @@ class TestCommand:
     def test_checks_of_both(self, tmp_path, controller, folder):
         with description() as urdf:
             rig = self.rig(tmp_path, urdf, controller, folder)
-            done = invoke("capture", "--rig", rig, "--check", "all", "--trajectory", trajectory(tmp_path), "--yes")
+            done = invoke("data", "capture", "--rig", rig, "--check", "all", "--trajectory", trajectory(tmp_path), "--yes")
         names = {one["name"] for one in done.result["checks"]}
         assert {"arm: trajectory", "arm: velocity", "camera side: depth"} <= names
         assert done.result["wrong"] == []
@@ -283,13 +285,13 @@ class TestCommand:
     def test_a_check_of_cameras_does_not_open_the_arm(self, tmp_path, folder):
         cameras = {"cameras": {"side": str(folder)}, "camera_driver": FOLDER}
         rig = write_rig(tmp_path, arm_driver="no_such:Arm", arm="nowhere", **cameras)
-        done = invoke("capture", "--rig", rig, "--check", "cameras")
+        done = invoke("data", "capture", "--rig", rig, "--check", "cameras")
         assert {one["name"].split(":")[0] for one in done.result["checks"]} == {"camera side"}
 
     def test_a_dry_check_reads_the_arm_and_does_not_move_it(self, tmp_path, controller):
         before = controller.tool_position
         with description() as urdf:
-            done = invoke("capture", "--rig", self.rig(tmp_path, urdf, controller), "--check", "arm", "--dry-run")
+            done = invoke("data", "capture", "--rig", self.rig(tmp_path, urdf, controller), "--check", "arm", "--dry-run")
         assert {"arm: joints", "arm: tool frame"} <= {one["name"] for one in done.result["checks"]}
         np.testing.assert_array_equal(controller.tool_position, before)
 
@@ -297,7 +299,7 @@ class TestCommand:
         before = controller.tool_position
         with description() as urdf:
             rig = self.rig(tmp_path, urdf, controller)
-            done = invoke("capture", "--rig", rig, "--check", "arm", answer="n\n", code=1)
+            done = invoke("data", "capture", "--rig", rig, "--check", "arm", answer="n\n", code=1)
         assert "The arm will move" in done.errors
         np.testing.assert_array_equal(controller.tool_position, before)
 
@@ -308,7 +310,9 @@ class TestCommand:
         (tmp_path / "far.csv").write_text(rows)
         with description() as urdf:
             rig = self.rig(tmp_path, urdf, controller)
-            done = invoke("capture", "--rig", rig, "--check", "arm", "--trajectory", tmp_path / "far.csv", "--yes", code=1)
+            done = invoke(
+                "data", "capture", "--rig", rig, "--check", "arm", "--trajectory", tmp_path / "far.csv", "--yes", code=1
+            )
         assert done.result["wrong"] == ["arm: trajectory"]
 
     @pytest.mark.parametrize(
@@ -322,6 +326,6 @@ class TestCommand:
         ],
     )
     def test_what_is_missing_is_said(self, tmp_path, settings, arguments, message):
-        assert message in invoke("capture", "--rig", write_rig(tmp_path, **settings), *arguments, code=1).errors
+        assert message in invoke("data", "capture", "--rig", write_rig(tmp_path, **settings), *arguments, code=1).errors
         if not settings:
-            assert message in invoke("capture", *arguments, code=1).errors
+            assert message in invoke("data", "capture", *arguments, code=1).errors

@@ -112,7 +112,7 @@ class TestClouds:
 
     def test_a_rate_that_disagrees_is_refused(self, tmp_path):
         folder = self.clouds(tmp_path)
-        done = invoke("import", folder, "--rate-hz", 30, "--out", tmp_path / "e.npz", code=1)
+        done = invoke("data", "import", folder, "--rate-hz", 30, "--out", tmp_path / "e.npz", code=1)
         assert "the file names are times, 0.5.xyz to 1.4.xyz, at 10 frames a second, but --rate-hz says 30" in done.errors
 
     def test_times_of_the_gripper_that_disagree_are_refused(self, tmp_path):
@@ -149,28 +149,28 @@ class TestDepthImages:
 
     @pytest.mark.parametrize("options", [(), ("--rate-hz", 30)])
     def test_have_the_times_of_their_names(self, tmp_path, options):
-        invoke("import", f"cam={self.folder(tmp_path)}", "--out", tmp_path / "e", *options)
+        invoke("data", "import", f"cam={self.folder(tmp_path)}", "--out", tmp_path / "e", *options)
         camera = read_raw_episode(tmp_path / "e").cameras["cam"]
         np.testing.assert_allclose(camera.times, 0.0333 * np.arange(4), atol=1e-6)
         np.testing.assert_array_equal(camera.depth(3), table_depth(poses()["side"]))
 
     def test_a_rate_or_a_table_that_disagrees_is_refused(self, tmp_path):
         folder = self.folder(tmp_path)
-        command = ("import", f"cam={folder}", "--out", tmp_path / "e")
+        command = ("data", "import", f"cam={folder}", "--out", tmp_path / "e")
         assert "at 30.03 frames a second, but --rate-hz says 10" in invoke(*command, "--rate-hz", 10, code=1).errors
         (folder / "timestamps.csv").write_text("frame,t_s\n0,0\n1,0.1\n2,0.2\n3,0.3\n")
         assert "are times (1305031102.160407.png), and there is a timestamps.csv" in invoke(*command, code=1).errors
 
     def test_have_the_nearest_colour(self, tmp_path):
         folder = self.folder(tmp_path, color=("1305031102.175304", "1305031102.211214", "1305031102.243211", "1305031103"))
-        invoke("import", f"cam={folder}", "--out", tmp_path / "e")
+        invoke("data", "import", f"cam={folder}", "--out", tmp_path / "e")
         camera = read_raw_episode(tmp_path / "e").cameras["cam"]
         red = [None if camera.color(frame) is None else int(camera.color(frame)[0, 0, 0]) for frame in range(4)]
         assert red == [0, 1, 1, 2]  # 15, 17.5 (before: 18.4), 15.8 and 17.1 ms away
         (folder / "color" / "1305031103.png").unlink()
         for index, path in enumerate(sorted((folder / "color").iterdir())):
             path.rename(path.with_name(f"{index}.png"))
-        said = invoke("import", f"cam={folder}", "--out", tmp_path / "f", code=1).errors
+        said = invoke("data", "import", f"cam={folder}", "--out", tmp_path / "f", code=1).errors
         assert "are not named alike: one by times, the other by frame numbers" in said
 
     def test_epoch_in_nanoseconds(self, tmp_path):
@@ -181,7 +181,7 @@ class TestDepthImages:
         names = [f"joint_{index}" for index in range(1, 8)]
         rows = [f"{t},{','.join(['0.1'] * 7)},0" for t in ("1305031102.1", "1305031102.3")]
         log.write_text("\n".join([",".join(["t_s", *names, "gripper"]), *rows]) + "\n")
-        done = invoke("import", f"cam={folder}", "--out", tmp_path / "e", "--joint-log", log)
+        done = invoke("data", "import", f"cam={folder}", "--out", tmp_path / "e", "--joint-log", log)
         assert done.result["robot_rows"] == 2
         episode = read_raw_episode(tmp_path / "e")
         np.testing.assert_allclose(episode.robot.times, [-0.060407, 0.139593], atol=1e-5)

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from diffcloud.cli.config import load_config
 from diffcloud.errors import DiffCloudError, EpisodeError
 from diffcloud.io.arrays import read_npy, read_npz
 from diffcloud.io.clouds import read_cloud
@@ -30,6 +29,7 @@ from diffcloud.io.pickles import load_npy
 from diffcloud.io.schema import Checked, Vector
 from diffcloud.io.tables import numbers, read_csv
 from diffcloud.io.urdf import read_urdf
+from diffcloud.jobs.settings import load_config
 from diffcloud.regressors import Regressor
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.settings import updated
@@ -249,7 +249,7 @@ def test_a_name_that_is_not_in_the_systems_encoding(tmp_path):
 @pytest.mark.parametrize("locale", [{"LC_ALL": "C"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}])
 def test_commands_in_any_locale(tmp_path, name, locale):
     (tmp_path / os.fsdecode(name)).write_text("base: lift\nframes: 0\n")
-    command = [sys.executable, "-m", "diffcloud.cli.app", "rollout", "--scenario", name, "--out", "m.npz", "--json"]
+    command = [sys.executable, "-m", "diffcloud.cli.app", "simulate", name, "--out", "m.npz", "--json"]
     told = subprocess.run(command, cwd=tmp_path, env=environment() | locale, capture_output=True, timeout=120, check=False)
     assert told.returncode == 1
     text = told.stderr.decode("ascii", errors="replace").strip()
@@ -259,5 +259,5 @@ def test_commands_in_any_locale(tmp_path, name, locale):
 
 
 def test_counts_that_would_take_days_are_refused():
-    with pytest.raises(DiffCloudError, match="starts: Input should be less than or equal to 100 "):
-        updated(load_config(None).fit, starts=100_000)
+    with pytest.raises(DiffCloudError, match=r"solver\.likelihood\.starts: Input should be less than or equal to 100 "):
+        updated(load_config(None).fit, solver={"starts": 100_000})

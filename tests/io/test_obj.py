@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from diffcloud.cli.scenario_options import limits
 from diffcloud.errors import MeshError
 from diffcloud.io.obj import STRETCHED, other_lengths, read_cloth, read_surface, write_cloth, write_surface
+from diffcloud.jobs.scenarios import limits
 from diffcloud.mesh import grid_cloth
 from diffcloud.scene.scenarios import load_scenario
 

@@ -190,5 +190,5 @@ class TestPly:
         ply(folder / "0.ply", elements, form)
         opened = []
         monkeypatch.setattr("PIL.Image.open", lambda *given, **_: opened.append(given))
-        done = invoke("import", folder, "--rate-hz", 10, "--out", tmp_path / "c.npz")
+        done = invoke("data", "import", folder, "--rate-hz", 10, "--out", tmp_path / "c.npz")
         assert (done.result["points"], opened) == (4, [])

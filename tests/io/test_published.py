@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffcloud.estimation import Objective
+from diffcloud.estimation.objective import Objective
 from diffcloud.estimation.pose import default_priors
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.imports import release_episodes
@@ -46,7 +46,7 @@ def published(tmp_path):
 
 def import_release(folder, *, code=0):
     options = ("--trajectories", folder / "trajs", "--out", folder / "episodes")
-    return invoke("import", folder / "pysim", *options, code=code)
+    return invoke("data", "import", folder / "pysim", *options, code=code)
 
 
 def written(folder):
@@ -67,7 +67,7 @@ class TestImport:
 
     def test_without_trajectories_all_is_as_it_was(self, published):
         import_release(published)
-        plain = invoke("import", published / "pysim", "--out", published / "plain").result["episodes"]
+        plain = invoke("data", "import", published / "pysim", "--out", published / "plain").result["episodes"]
         assert set(plain) == {"release_lift", "release_fold", "release_band"}
         for kind, (name,) in plain.items():
             path = f"{kind}/{name}.npz"
@@ -268,7 +268,7 @@ class TestScenarios:
         monkeypatch.chdir(published)
         import_release(published)
         name, episode = f"recorded_{kind}", f"episodes/recorded_{kind}/{NAMES[kind]}.npz"
-        invoke("rollout", "--scenario", name, "--episode", episode, "--out", "run.npz")
+        invoke("simulate", name, "--track", episode, "--out", "run.npz")
         node = load_scenario(name).grasped[0]
         with np.load("run.npz") as run:
             corner = run["nodes"][:FRAMES, node]

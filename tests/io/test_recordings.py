@@ -27,8 +27,8 @@ def test_a_log_of_the_time_of_day_is_shifted_to_a_recording_from_zero(tmp_path):
     log.write_text("\n".join([rows[0], *late]) + "\n")
     options = ("--out", tmp_path / "e", "--rate-hz", 10, "--joint-log", log)
     (folders[0] / "timestamps.csv").unlink()
-    assert "different clocks" in invoke("import", folders[0], *options, code=1).errors
-    invoke("import", folders[0], *options, f"--clock-offset={-START}")
+    assert "different clocks" in invoke("data", "import", folders[0], *options, code=1).errors
+    invoke("data", "import", folders[0], *options, f"--clock-offset={-START}")
     times = read_raw_episode(tmp_path / "e").robot.times
     np.testing.assert_allclose(times, [float(row.split(",")[0]) for row in rows[1:]], atol=1e-6)
 
@@ -45,7 +45,7 @@ def test_colour_of_another_size_is_left_out(tmp_path):
     folders, _ = as_folders(tmp_path)
     for path in (folders[0] / "color").iterdir():
         write_color(path, np.zeros((200, 300, 3), np.uint8))
-    done = invoke("import", folders[0], "--out", tmp_path / "e")
+    done = invoke("data", "import", folders[0], "--out", tmp_path / "e")
     assert "not aligned to depth: it has 300 x 200 pixels, depth 160 x 120" in done.errors
     assert read_raw_episode(tmp_path / "e").cameras["overhead"].color(0) is None
 
@@ -64,12 +64,12 @@ def test_images_that_cannot_be_read_are_no_fault_of_the_output(tmp_path):
 def test_two_imports_to_one_place_do_not_mix(tmp_path):
     folders, _ = as_folders(tmp_path)
     with claimed(tmp_path / "e"):
-        assert "is being written by process" in invoke("import", folders[0], "--out", tmp_path / "e", code=1).errors
+        assert "is being written by process" in invoke("data", "import", folders[0], "--out", tmp_path / "e", code=1).errors
 
 
 @pytest.mark.parametrize("kind", ["rosbag1", "rosbag2", "mcap"])
 def test_ros_recordings(tmp_path, kind):
-    done = invoke("import", bag(tmp_path, kind), "--out", tmp_path / "e", "--label", "fabric=tan")
+    done = invoke("data", "import", bag(tmp_path, kind), "--out", tmp_path / "e", "--label", "fabric=tan")
     assert done.result["frames"] == {"overhead": FRAMES, "side": FRAMES}
     episode = read_raw_episode(tmp_path / "e")
     assert episode.description["rate_hz"] == pytest.approx(10, abs=0.01)
@@ -92,7 +92,7 @@ def test_ros_recordings(tmp_path, kind):
 
 
 def test_depth_in_metres(tmp_path):
-    invoke("import", bag(tmp_path, "rosbag2", encoding="32FC1"), "--out", tmp_path / "e")
+    invoke("data", "import", bag(tmp_path, "rosbag2", encoding="32FC1"), "--out", tmp_path / "e")
     camera = read_raw_episode(tmp_path / "e").cameras["side"]
     metres = camera.depth(2) * camera.info.depth_scale_m
     expected = table_depth(poses()["side"]) / 1000
@@ -101,17 +101,22 @@ def test_depth_in_metres(tmp_path):
 
 def test_ros_recordings_that_lack_something(tmp_path):
     path = bag(tmp_path, "rosbag2")
-    bad = invoke("import", path, "--out", tmp_path / "e", "--joints", "elbow", code=1)
+    bad = invoke("data", "import", path, "--out", tmp_path / "e", "--joints", "elbow", code=1)
     assert "['elbow'] not among them. Name the arm's joints" in bad.errors
-    done = invoke("import", path, "--out", tmp_path / "f", "--tool-frame", "nowhere", "--world-frame", "map")
+    done = invoke("data", "import", path, "--out", tmp_path / "f", "--tool-frame", "nowhere", "--world-frame", "map")
     assert done.result["robot_rows"] > 0
     episode = read_raw_episode(tmp_path / "f")
     assert np.isnan(episode.robot.tool_position_m).all()
     assert episode.cameras["side"].info.T_world_camera is None
     (tmp_path / "x.mcap").write_bytes(b"\x89MCAP0\r\nrest")
-    assert "not a readable ROS recording" in invoke("import", tmp_path / "x.mcap", "--out", tmp_path / "g", code=1).errors
+    assert (
+        "not a readable ROS recording"
+        in invoke("data", "import", tmp_path / "x.mcap", "--out", tmp_path / "g", code=1).errors
+    )
     (tmp_path / "x.txt").write_text("")
-    assert "unknown kind of recording" in invoke("import", tmp_path / "x.txt", "--out", tmp_path / "g", code=1).errors
+    assert (
+        "unknown kind of recording" in invoke("data", "import", tmp_path / "x.txt", "--out", tmp_path / "g", code=1).errors
+    )
 
 
 def as_folders(tmp_path):
@@ -128,9 +133,9 @@ def as_folders(tmp_path):
 def test_folders_of_png(tmp_path):
     folders, log = as_folders(tmp_path)
     (folders[1] / "timestamps.csv").unlink()
-    missing = invoke("import", *folders, "--out", tmp_path / "e", code=1)
+    missing = invoke("data", "import", *folders, "--out", tmp_path / "e", code=1)
     assert "give the frame rate with --rate-hz" in missing.errors
-    done = invoke("import", *folders, "--out", tmp_path / "e", "--rate-hz", 10, "--joint-log", log)
+    done = invoke("data", "import", *folders, "--out", tmp_path / "e", "--rate-hz", 10, "--joint-log", log)
     assert done.result["frames"] == {"overhead": 4, "side": 4}
     episode = read_raw_episode(tmp_path / "e")
     assert episode.cameras["side"].info.serial == "77"
@@ -152,12 +157,12 @@ def test_cameras_of_folders_that_no_camera_is(tmp_path, changes, message):
     folder = as_folders(tmp_path)[0][1]
     told = json.loads((folder / "camera.json").read_text())
     (folder / "camera.json").write_text(json.dumps({**told, **changes}))
-    assert message in invoke("import", folder, "--out", tmp_path / "e", code=1).errors
+    assert message in invoke("data", "import", folder, "--out", tmp_path / "e", code=1).errors
 
 
 def test_data_sets_of_lerobot_are_refused_by_name(tmp_path):
     write_json(tmp_path / "set" / "meta" / "info.json", {"codebase_version": "v2.1"})
-    done = invoke("import", tmp_path / "set", "--out", tmp_path / "e", code=1)
+    done = invoke("data", "import", tmp_path / "set", "--out", tmp_path / "e", code=1)
     assert "is a LeRobot data set: its videos hold no depth in metres" in done.errors
 
 
@@ -166,30 +171,30 @@ def test_an_import_that_fails_leaves_nothing(tmp_path):
     image = folders[0] / "depth" / "000002.png"
     image.write_bytes(image.read_bytes()[:-20])
     before = set(tmp_path.iterdir())
-    assert "is truncated" in invoke("import", folders[0], "--out", tmp_path / "e", code=1).errors
+    assert "is truncated" in invoke("data", "import", folders[0], "--out", tmp_path / "e", code=1).errors
     assert set(tmp_path.iterdir()) == before
 
 
 def test_folders_that_are_damaged(tmp_path):
     folders, log = as_folders(tmp_path)
     (folders[0] / "depth" / "000001.png").unlink()
-    assert "frames [1] are missing" in invoke("import", folders[0], "--out", tmp_path / "e", code=1).errors
+    assert "frames [1] are missing" in invoke("data", "import", folders[0], "--out", tmp_path / "e", code=1).errors
     (folders[1] / "depth" / "000001.png").write_bytes(b"\xff\xd8\xff\xe0")
-    assert "is a JPEG" in invoke("import", folders[1], "--out", tmp_path / "f", code=1).errors
+    assert "is a JPEG" in invoke("data", "import", folders[1], "--out", tmp_path / "f", code=1).errors
     (folders[1] / "camera.json").unlink()
-    assert "intrinsics must be stated" in invoke("import", folders[1], "--out", tmp_path / "g", code=1).errors
+    assert "intrinsics must be stated" in invoke("data", "import", folders[1], "--out", tmp_path / "g", code=1).errors
     shifted = log.read_text().splitlines()
     rows = [shifted[0], *(f"{START + index},{line.split(',', 1)[1]}" for index, line in enumerate(shifted[1:]))]
     (tmp_path / "epoch.csv").write_text("\n".join(rows) + "\n")
     (folders[0] / "depth" / "000001.png").write_bytes((folders[0] / "depth" / "000002.png").read_bytes())
-    bad = invoke("import", folders[0], "--out", tmp_path / "h", "--joint-log", tmp_path / "epoch.csv", code=1)
+    bad = invoke("data", "import", folders[0], "--out", tmp_path / "h", "--joint-log", tmp_path / "epoch.csv", code=1)
     assert "different clocks" in bad.errors
 
 
 def test_times_of_a_folder_that_run_backwards_are_refused_with_the_frame(tmp_path):
     folders, _ = as_folders(tmp_path)
     (folders[0] / "timestamps.csv").write_text("frame,t_s\n0,0.0\n1,0.2\n2,0.1\n3,0.3\n")
-    bad = invoke("import", folders[0], "--out", tmp_path / "e", code=1)
+    bad = invoke("data", "import", folders[0], "--out", tmp_path / "e", code=1)
     assert "frame 2 is of 0.100000 s, frame 1 of 0.200000 s" in bad.errors
     assert not (tmp_path / "e").exists()
 
@@ -198,7 +203,7 @@ def test_a_joint_log_that_runs_backwards_is_refused_with_the_row(tmp_path):
     folders, log = as_folders(tmp_path)
     rows = log.read_text().splitlines()
     log.write_text("\n".join([*rows[:4], rows[5], rows[4], *rows[6:]]) + "\n")
-    bad = invoke("import", folders[0], "--out", tmp_path / "e", "--joint-log", log, code=1)
+    bad = invoke("data", "import", folders[0], "--out", tmp_path / "e", "--joint-log", log, code=1)
     assert "row 5: the time runs backwards (0.100000 s after 0.150000 s)" in bad.errors
     assert not (tmp_path / "e").exists()
 
@@ -207,13 +212,13 @@ def test_colour_that_a_folder_lacks_is_counted(tmp_path):
     folders, log = as_folders(tmp_path)
     for number in (1, 3):
         (folders[0] / "color" / f"{number:06d}.png").unlink()
-    done = invoke("import", folders[0], "--out", tmp_path / "e", "--joint-log", log)
+    done = invoke("data", "import", folders[0], "--out", tmp_path / "e", "--joint-log", log)
     (message,) = done.result["warnings"]
     assert "Camera overhead: 2 of 4 frames have no colour image of their number, such as frame 1" in message
     assert [camera_color(tmp_path, number) is not None for number in range(4)] == [True, False, True, False]
     for path in (folders[0] / "color").iterdir():
         path.unlink()
-    assert invoke("import", folders[0], "--out", tmp_path / "f", "--joint-log", log).result["warnings"] == []
+    assert invoke("data", "import", folders[0], "--out", tmp_path / "f", "--joint-log", log).result["warnings"] == []
 
 
 def camera_color(tmp_path, number):
@@ -226,7 +231,7 @@ def test_a_rate_that_is_none_is_refused(tmp_path, rate):
     for untimed in (False, True):
         if untimed:
             (folders[1] / "timestamps.csv").unlink()
-        bad = invoke("import", folders[1], "--out", tmp_path / "e", "--rate-hz", rate, code=1)
+        bad = invoke("data", "import", folders[1], "--out", tmp_path / "e", "--rate-hz", rate, code=1)
         assert f"A frame rate is in Hz, above 0 and at most 100000, got {rate}" in bad.errors
         assert not (tmp_path / "e").exists()
 
@@ -246,7 +251,7 @@ def test_files_of_others_need_no_end_of_line(tmp_path):
         path.write_text(path.read_text().rstrip("\n"))
     count = len(log.read_text().splitlines()) - 1
     assert len(read_joint_log(log).times) == count
-    done = invoke("import", folders[0], "--out", tmp_path / "e", "--joint-log", log)
+    done = invoke("data", "import", folders[0], "--out", tmp_path / "e", "--joint-log", log)
     assert done.result["frames"] == {"overhead": 4}
 
 
@@ -288,8 +293,7 @@ def test_realsense_recordings_of_two_cameras_with_a_joint_log(tmp_path):
     (tmp_path / "log.csv").write_text(
         "\n".join(["t_s," + ",".join(f"joint_{index}" for index in range(1, 8)), *rows]) + "\n"
     )
-    done = invoke(
-        "import", tmp_path / "overhead.db3", f"side={tmp_path / 'side.db3'}", "--out", tmp_path / "e",
+    done = invoke("data", "import", tmp_path / "overhead.db3", f"side={tmp_path / 'side.db3'}", "--out", tmp_path / "e",
         "--joint-log", tmp_path / "log.csv",
     )  # fmt: skip
     assert done.result["frames"] == {"overhead": 8, "side": 8}

@@ -67,7 +67,7 @@ def desired(t, driven):
 def imported(tmp_path, *options, code=0):
     shutil.rmtree(tmp_path / "e", ignore_errors=True)
     path = next(path for path in (tmp_path / "bag.bag", tmp_path / "bag") if path.exists())
-    return invoke("import", path, "--out", tmp_path / "e", *options, code=code)
+    return invoke("data", "import", path, "--out", tmp_path / "e", *options, code=code)
 
 
 def written(tmp_path, kind="rosbag2", **habits):

@@ -25,7 +25,7 @@ KINDS = pytest.mark.parametrize("kind", ["rosbag1", "rosbag2"])
 
 
 def imported(tmp_path, *sources, options=(), code=0):
-    return invoke("import", *sources, "--out", tmp_path / "e", *options, code=code)
+    return invoke("data", "import", *sources, "--out", tmp_path / "e", *options, code=code)
 
 
 def depth_m(tmp_path, name, index):

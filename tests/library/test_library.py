@@ -14,7 +14,7 @@ import torch
 import yaml
 
 import diffcloud as dc
-from diffcloud.estimation import read_fit
+from diffcloud.estimation.record import read_fit
 from diffcloud.io.episodes import write_episode
 from diffcloud.mesh import grid_cloth
 from diffcloud.scene.scenarios import load_scenario
@@ -23,7 +23,7 @@ from tests.cli.test_likelihood import SCENARIO
 from tests.estimation.test_fit import clouds_of
 
 TRUTH = {"stretch": 0.6, "mass": 1.7}
-SETTINGS = dc.FitSettings(parameters=["stretch"], fixed={"mass": 1.7}, starts=1)
+SETTINGS = dc.FitSettings(parameters=["stretch"], fixed={"mass": 1.7}, solver={"starts": 1})
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +71,9 @@ class TestFit:
         monkeypatch.chdir(tmp_path)
         Path("small.yaml").write_text(yaml.safe_dump(dict(scene.options)))
         write_episode(Path("small.npz"), recording)
-        options = ("--scenario", "small.yaml", "--parameters", "stretch", "--fix", "mass=1.7", "--starts", 1)
+        options = ("--scene", "small.yaml", "--parameters", "stretch", "--fix", "mass=1.7", "--starts", 1)
         invoke("fit", *options, "--out", "fits", "small.npz")
-        record = read_fit(Path("fits/small.json"))
+        record = read_fit(Path("fits/fit.json"))
         assert record.values == found.record.values
         assert record.estimate == found.record.estimate
 
@@ -95,7 +95,9 @@ class TestFit:
         assert (folder / "cloth.json").is_file()
 
     def test_other_solvers_know_no_uncertainty(self, scene, recording):
-        settings = dc.FitSettings(parameters=["stretch"], fixed={"mass": 1.7}, solver="random_search", simulations=3)
+        settings = dc.FitSettings(
+            parameters=["stretch"], fixed={"mass": 1.7}, solver={"name": "random_search", "max_simulations": 3}
+        )
         told = dc.fit([recording], [scene], settings)
         assert told.parameters["stretching"].interval is None
         assert told.status == "not_converged"

@@ -121,7 +121,8 @@ class TestCommand:
 
     def test_draws_are_written(self, files):
         told = invoke(
-            "predict", files / "e.npz", "--checkpoint", files / "posterior.safetensors", "--samples", files / "s.csv"
+            "network", "predict", files / "e.npz", "--checkpoint", files / "posterior.safetensors",
+            "--samples", files / "s.csv",
         )  # fmt: skip
         rows = np.genfromtxt(files / "s.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
         assert set(rows["episode"]) == {"e"}
@@ -132,7 +133,8 @@ class TestCommand:
 
     def test_other_models_have_none(self, files):
         told = invoke(
-            "predict", files / "e.npz", "--checkpoint", files / "meteornet.safetensors", "--samples", files / "s.csv",
+            "network", "predict", files / "e.npz", "--checkpoint", files / "meteornet.safetensors",
+            "--samples", files / "s.csv",
             code=1,
         )  # fmt: skip
         assert "--samples needs a posterior" in told.errors

@@ -45,7 +45,7 @@ def test_the_scripts_data_are_what_was_put_in():
 
 def test_material_that_was_fitted_along_is_no_column_but_is_told_where_it_is_off():
     one = entry()
-    along = {"unit": "x basis", "physical": 1.0, "physical_unit": "N·m", "meaning": "", "doubtful": True}
+    along = {"unit": "x basis", "physical": 1.0, "physical_unit": "N·m", "meaning": "", "role": "material"}
     one.fit.parameters["bending"] = FittedParameter(value=1.95, centre=2.0, **along)
     one.fit.parameters["friction_cloth"] = FittedParameter(value=0.9, centre=0.6, **along)
     assert "<td>friction cloth × 1.50</td>" in main_of(page_of(one))

@@ -23,7 +23,7 @@ from typing import Any, Literal, get_args
 
 import psutil
 
-from tests.cli.invoke import DIFFCLOUD, environment
+from tests.cli.invoke import environment, program
 from tests.robustness.inputs import SEED
 from tests.robustness.kinds import REPORT, STAGES
 
@@ -46,26 +46,24 @@ class Command:
 
     @staticmethod
     def of(arguments: str, *made: str, **options: Any) -> Command:
-        return Command((*DIFFCLOUD, *arguments.split()), made, **options)
+        return Command(tuple(program(*arguments.split())), made, **options)
 
 
 COMMANDS = {
     **{name: Command.of(*stage) for name, stage in STAGES.items()},
     "report": Command.of(REPORT, "page"),
-    "rollout": Command.of("rollout --scenario small --out motion/m.npz --obj motion/obj", "motion"),
-    "export": Command.of(
-        "export data/fits/small/small_hidden1.json --to mujoco --out exported --scenario small", "exported"
-    ),
-    "identify": Command.of(
-        "identify data/episodes/small/small_hidden1.npz --out known --parameters stretch --mass 0.2 --threads 1", "known"
+    "simulate a motion": Command.of("simulate small --format obj --out motion", "motion"),
+    "export": Command.of("export data/fits/small/small_hidden1.json --to mujoco --out exported", "exported"),
+    "fit one cloth": Command.of(
+        "fit data/episodes/small/small_hidden1.npz --out known --parameters stretch --density 0.2 --threads 1", "known"
     ),
     "preprocess, two workers": Command.of(
-        "preprocess --params params.yaml --workers 2 --out twice/episodes twice/recorded",
+        "data preprocess --params params.yaml --workers 2 --out twice/episodes twice/recorded",
         "twice/episodes",
         counts=_OF_WORKERS,
     ),
     "fit, two workers": Command.of(
-        "fit --params params.yaml --workers 2 --out twice/fits twice/given", "twice/fits", counts=_OF_WORKERS
+        "pipeline.fit --params params.yaml --workers 2 --out twice/fits twice/given", "twice/fits", counts=_OF_WORKERS
     ),
     "dvc repro": Command((sys.executable, "-m", "dvc", "repro"), ("data/fits", "reports"), counts=_OF_DVC),
 }

@@ -15,10 +15,8 @@ import numpy as np
 import torch
 import yaml
 
-from diffcloud.cli.config import load_config
-from diffcloud.cli.identify import find_scene
-from diffcloud.cli.report import table_rows
-from diffcloud.estimation import Objective, read_fit
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.record import read_fit
 from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, check_file
 from diffcloud.hardware.rig import RigSettings, read_rig
 from diffcloud.io.calibrations import Calibration, CameraCalibration, read_calibration, write_calibration
@@ -28,6 +26,9 @@ from diffcloud.io.manifests import read_manifest
 from diffcloud.io.obj import read_cloth, write_cloth
 from diffcloud.io.raw_episodes import read_raw_episode
 from diffcloud.io.simulated import SimulatedSet
+from diffcloud.jobs.report import table_rows
+from diffcloud.jobs.scene_files import find_scene
+from diffcloud.jobs.settings import load_config
 from diffcloud.scene.scenarios.catalogue import built_in
 from diffcloud.sensing.robot import Robot
 from diffcloud.sensing.validation.episode import validate_raw_episode
@@ -47,22 +48,22 @@ PARAMS = {
     "episodes": {"per_scenario": 1, "image_size": [106, 60]},
     "preprocess": {"outlier_neighbours": 5, "points": 200},
     "simulate": {"scenarios": ["small"], "train": 8, "test": 4},
-    "fit": {"iterations": 2},
+    "fit": {"solver": {"max_steps": 2}},
     "train": {"scenarios": ["small"], "models": ["mlp"], "profile": "quick", "epochs": 2, "points": 24},
     "evaluate": {"draws": 1, "rivals": ["middle"], "landscapes": ["small/small_hidden1"], "landscape_size": 3},
     "report": {},
 }
 _FITTED = "--params params.yaml --fits data/fits --episodes data/episodes --regressors data/regressors"
 STAGES = {
-    "episodes": ("episodes --params params.yaml --out data/recorded", "data/recorded"),
-    "preprocess": ("preprocess --params params.yaml --out data/episodes data/recorded", "data/episodes"),
-    "simulate": ("simulate --params params.yaml --scenario small --out data/simulated/small", "data/simulated/small"),
-    "fit": ("fit --params params.yaml --out data/fits data/episodes", "data/fits"),
-    "train": ("train --params params.yaml --data data/simulated --out data/regressors", "data/regressors"),
-    "evaluate": (f"evaluate {_FITTED} --simulated data/simulated --out reports", "reports"),
+    "episodes": ("pipeline.episodes --params params.yaml --out data/recorded", "data/recorded"),
+    "preprocess": ("data preprocess --params params.yaml --out data/episodes data/recorded", "data/episodes"),
+    "simulate": ("network generate --params params.yaml --scene small --out data/simulated/small", "data/simulated/small"),
+    "fit": ("pipeline.fit --params params.yaml --out data/fits data/episodes", "data/fits"),
+    "train": ("network train --params params.yaml --data data/simulated --out data/regressors", "data/regressors"),
+    "evaluate": (f"pipeline.evaluate {_FITTED} --simulated data/simulated --out reports", "reports"),
 }
 """Command -> arguments and the folder that it fills: the stages of dvc.yaml, one scenario of those that have several."""
-REPORT = f"report {_FITTED} --tables reports/tables --out page/index.html"
+REPORT = f"pipeline.report {_FITTED} --tables reports/tables --out page/index.html"
 _RAW, _EPISODE = "data/recorded/small/small_hidden1", "data/episodes/small/small_hidden1.npz"
 _CAMERA, _TIMES = f"{_RAW}/cameras/side/camera.json", f"{_RAW}/cameras/side/timestamps.csv"
 _FITS, _PREDICTED, _COMPARED = (f"reports/tables/{name}" for name in ("fits.csv", "predictions.csv", "comparison.json"))
@@ -155,7 +156,7 @@ def command(arguments: str) -> Callable[[], None]:
     """`diffcloud` with these arguments, in this process."""
 
     def run() -> None:
-        from diffcloud.cli.app import main
+        from tests.cli.invoke import main
 
         sys.argv = ["diffcloud", *arguments.split()]
         main()
@@ -164,18 +165,18 @@ def command(arguments: str) -> Callable[[], None]:
 
 
 def _cleaned() -> None:
-    """`preprocess`, with which `episode validate` must agree."""
+    """`data preprocess`, with which `data check` must agree."""
     faults = [one.message for one in validate_raw_episode(Path(_RAW)) if one.severity == "fault"]
     try:
-        command("preprocess --params params.yaml --out cleaned data/recorded")()
+        command("data preprocess --params params.yaml --out cleaned data/recorded")()
     except SystemExit as end:
         if end.code and not faults:
-            print("Traceback: episode validate finds nothing wrong in what preprocess refuses")
+            print("Traceback: data check finds nothing wrong in what preprocess refuses")
         raise
 
 
 def _scene_of_recording() -> None:
-    """`identify`, up to its fit."""
+    """`fit`, up to its fit."""
     _, cloth, layouts = find_scene([Path(_EPISODE)], Path("found"), None, None)
     print(sorted(cloth), sorted(layouts))
 
@@ -186,19 +187,19 @@ def _left(model: object, path: str) -> Callable[[], None]:
     return lambda: check_file(model, Path(path), read(Path(path)))
 
 
-_IMPORT = "import {} --gripper gripper.csv --out imported.npz"
-_CAPTURE = command("capture --dry-run --trajectory path.csv --rig rig.yaml --out e")
+_IMPORT = "data import {} --gripper gripper.csv --out imported.npz"
+_CAPTURE = command("data capture --dry-run --trajectory path.csv --rig rig.yaml --out e")
 _REPORT = command(REPORT)
-_IMAGES = command("import a=images --rate-hz 10 --out imported")
-_LOSS = command(f"evaluate loss {_EPISODE} --scenario small --set stretch=1.0 --threads 1")
-_OF_FIT = command(f"evaluate loss {_EPISODE} --fit {_FIT}.json --scenario small --threads 1")
-_PREDICT = command(f"predict {_EPISODE} --checkpoint {_NETWORK}.safetensors")
+_IMAGES = command("data import a=images --rate-hz 10 --out imported")
+_LOSS = command(f"fit {_EPISODE} --scene small --parameters stretch --solver random_search --out fitted --threads 1")
+_OF_FIT = command(f"simulate {_FIT}.json --track {_EPISODE} --frames 1 --out m.npz")
+_PREDICT = command(f"network predict {_EPISODE} --checkpoint {_NETWORK}.safetensors")
 KINDS = (
     Kind(
-        "scenario", "document", "raw/scenes/small.yaml", command("rollout --scenario raw/scenes/small.yaml --out m.npz")
+        "scenario", "document", "raw/scenes/small.yaml", command("simulate raw/scenes/small.yaml --out m.npz")
     ),
     Kind("params", "document", "full.yaml", lambda: load_config(Path("full.yaml"))),
-    Kind("ARCSim scene", "document", "conf/scene.json", command("rollout --scene conf/scene.json --frames 2 --out m.npz")),
+    Kind("ARCSim scene", "document", "conf/scene.json", command("simulate conf/scene.json --frames 2 --out m.npz")),
     Kind("episode", "arrays", _EPISODE, _LOSS),
     Kind("gripper track", "table", "gripper.csv", command(_IMPORT.format("ply"))),
     *(Kind(f"cloud, {form}", "bytes", f"{form}/1.{form}", command(_IMPORT.format(form)), flips=60)
@@ -217,7 +218,7 @@ KINDS = (
     Kind("fit, record", "document", f"{_FIT}.json", lambda: read_fit(Path(f"{_FIT}.json"))),
     Kind("fit, record, evaluated", "document", f"{_FIT}.json", _OF_FIT, most=40, as_of="fit, record"),
     Kind("fit, record, reported", "document", f"{_FIT}.json", _REPORT, most=12, flips=4, as_of="fit, record"),
-    Kind("fit, motion", "arrays", f"{_FIT}.npz", command(f"export {_FIT}.json --to obj --out exported --scenario small")),
+    Kind("fit, motion", "arrays", f"{_FIT}.npz", command(f"export {_FIT}.json --to obj --out exported")),
     Kind("manifest", "document", "data/fits/manifest.json", lambda: read_manifest(Path("data/fits"))),
     Kind("network", "bytes", f"{_NETWORK}.safetensors", _PREDICT, flips=60),
     Kind("simulated set", "document", f"{_SET}/set.json", lambda: SimulatedSet.read(Path(_SET), "train")),

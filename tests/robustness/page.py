@@ -26,13 +26,13 @@ negative, zero, huge, duplicated, or nested {levels} levels deep; and bytes are 
 is read in its own process, which may take {seconds:.0f} seconds and {gigabytes:.0f} GB. It must either succeed, or
 end with an error of this project that names file and field, and leave nothing behind. Which of the two is right is set
 for every field by `tests/robustness/expected.yaml`: it lists what may be accepted, and the rest must be refused. Flipped
-bytes may happen to give another valid file. `episode validate` must find a fault wherever `preprocess` refuses a raw
+bytes may happen to give another valid file. `data check` must find a fault wherever `preprocess` refuses a raw
 episode.
 """
 _FAULTS = """
 ## Disturbed commands
 
-Every command of the pipeline, `identify`, and `dvc repro` itself are disturbed at a random moment: by a kill, by Ctrl-C,
+Every stage of the pipeline, `fit`, and `dvc repro` itself are disturbed at a random moment: by a kill, by Ctrl-C,
 by a kill of one of their worker processes, by a full disk (no file may grow beyond a random size of a hundred bytes to
 ten kilobytes), by a folder that cannot be written to, or by a second start of the same command. Afterwards, any output
 under its final name must be complete. There must be no traceback and no hang. Running the command again must give the

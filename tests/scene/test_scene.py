@@ -23,9 +23,9 @@ class TestScenarios:
         assert SCENARIO_NAMES[7:] == ("release_lift", "release_fold", "release_hang", "release_band")
         with pytest.raises(ConfigError, match=r"Unknown scenario 'lfit'. Did you mean 'lift'.* Allowed: .*lift"):
             load_scenario("lfit")
-        with pytest.raises(ConfigError, match="needs --scene"):
+        with pytest.raises(ConfigError, match="needs the published scene file"):
             load_scenario("release_lift")
-        with pytest.raises(ConfigError, match="goes with release"):
+        with pytest.raises(ConfigError, match="only release_"):
             load_scenario("lift", "x.json")
 
     @pytest.mark.parametrize("name", ["lift", "fold"])

@@ -153,7 +153,7 @@ class TestRegistration:
         folders = [release.parent / f"calib_{name}" for name in ("overhead", "side")]
         if not all(folder.is_dir() for folder in folders):
             pytest.skip("the published calibration points (calib_overhead/, calib_side/) are not beside DIFFCLOUD_RELEASE")
-        done = invoke("calibrate", "--method", "checkerboard", *folders, "--out", tmp_path / "c.json")
+        done = invoke("data", "calibrate", "--method", "checkerboard", *folders, "--out", tmp_path / "c.json")
         written = read_calibration(tmp_path / "c.json")
         for folder, name in zip(folders, ("overhead", "side"), strict=True):
             published = np.load(folder / "tcr.npy")
@@ -260,6 +260,7 @@ def test_charuco_images_give_the_cameras_within_a_millimetre(tmp_path, rng):
     poses = gripper_poses(20, rng)
     folder = write_board_episode(tmp_path / "e", poses, rng, depth_scale=1.03)
     done = invoke(
+        "data",
         "calibrate",
         folder,
         "--out",
@@ -354,6 +355,7 @@ def test_a_board_that_is_not_there(tmp_path, rng):
             writer.add_robot(RobotSample(t, np.zeros(7), 0.0, np.zeros(3), np.array([1.0, 0, 0, 0])))
         writer.add_frame("side", 0.5, np.ones((480, 640), np.uint16), np.full((480, 640, 3), 90, np.uint8))
     assert (
-        "saw the board at 0 still poses" in invoke("calibrate", tmp_path / "e", "--out", tmp_path / "c.json", code=1).errors
+        "saw the board at 0 still poses"
+        in invoke("data", "calibrate", tmp_path / "e", "--out", tmp_path / "c.json", code=1).errors
     )
     assert not (tmp_path / "c.json").exists()

@@ -40,7 +40,7 @@ def episode(recorded, tmp_path):
 
 def calibrated(tmp_path, *options, code=0, square=40):
     rig = write_rig(tmp_path, board={"square_m": square / 1000, "marker_m": 0.75 * square / 1000})
-    return invoke("calibrate", tmp_path / "e", "--rig", rig, "--out", tmp_path / "c.json", *options, code=code)
+    return invoke("data", "calibrate", tmp_path / "e", "--rig", rig, "--out", tmp_path / "c.json", *options, code=code)
 
 
 def edit_camera(episode, name, change):
@@ -356,7 +356,9 @@ class TestCheckerboard:
         return found
 
     def registered(self, tmp_path, folders, *options, code=0):
-        return invoke("calibrate", "--method", "checkerboard", *folders, "--out", tmp_path / "c.json", *options, code=code)
+        return invoke(
+            "data", "calibrate", "--method", "checkerboard", *folders, "--out", tmp_path / "c.json", *options, code=code
+        )
 
     def test_corners_are_held_out_in_strips(self, tmp_path, rng):
         done = self.registered(tmp_path, self.folders(tmp_path, rng))
@@ -365,16 +367,7 @@ class TestCheckerboard:
             assert entry["rms_mm"] < entry["held_out_mm"] < 3
         assert done.result["warnings"] == done.result["objections"] == []
 
-    def test_serials_name_cameras_that_are_there(self, tmp_path, rng):
-        folders, written = self.folders(tmp_path, rng), tmp_path / "c.json"
-        name = next(iter(CAMERAS))
-        assert "Unknown camera in --serial 'top'" in self.registered(tmp_path, folders, "--serial", "top=1", code=1).errors
-        assert "--serial takes NAME=SERIAL" in self.registered(tmp_path, folders, "--serial", "12", code=1).errors
-        assert not written.exists()
-        self.registered(tmp_path, folders, "--serial", f"{name}=0123")
-        assert read_calibration(written).camera("0123").name == name
-
-    def test_serials_and_size_of_the_rig_count_unless_given(self, tmp_path, rng):
+    def test_serials_and_size_are_those_of_the_rig(self, tmp_path, rng):
         """A camera of the rig that has no folder is none of this calibration."""
         folders, written = self.folders(tmp_path, rng), tmp_path / "c.json"
         first, second = CAMERAS
@@ -382,16 +375,10 @@ class TestCheckerboard:
         self.registered(tmp_path, folders, "--rig", rig)
         assert set(read_calibration(written).cameras) == {"11", "22"}
         assert read_calibration(written).camera("22").intrinsics.width == 848
-        self.registered(tmp_path, folders, "--rig", rig, "--serial", f"{second}=44", "--size", "640x480")
-        assert set(read_calibration(written).cameras) == {"11", "44"}
-        assert read_calibration(written).camera("44").intrinsics.width == 640
 
     def test_options_of_the_other_method_are_refused(self, tmp_path, rng):
         said = self.registered(tmp_path, self.folders(tmp_path, rng), "--picture", "p.png", code=1).errors
-        assert "--picture belongs to --method charuco, and this is --method checkerboard. Leave --picture out" in said
-        for option, value in (("--serial", "a=1"), ("--size", "640x480")):
-            said = calibrated(tmp_path, option, value, code=1).errors
-            assert f"{option} belongs to --method checkerboard" in said
+        assert "--picture belongs to --method charuco, and this is --method checkerboard. Leave it out" in said
 
     def test_a_held_out_error_above_ten_millimetres_is_refused_unless_forced(self, tmp_path, rng):
         folders = self.folders(tmp_path, rng, noise_m=0.05)

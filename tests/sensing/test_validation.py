@@ -234,12 +234,12 @@ def test_cameras_that_are_not_set_alike(episode, settings, code):
 
 
 def test_the_command_explains_and_fails(episode, tmp_path):
-    assert invoke("episode", "validate", episode).result == {"episode": str(episode), "valid": True, "findings": []}
+    assert invoke("data", "check", episode).result == {"episode": str(episode), "valid": True, "findings": []}
     (episode / "cameras/side/depth/000002.png").write_bytes(b"")
     (episode / "robot.csv").write_text("t_s,joint_1\n0,0\n")
-    done = invoke("episode", "validate", episode, code=1)
+    done = invoke("data", "check", episode, code=1)
     assert {finding["code"] for finding in done.result["findings"]} == {"image", "joint_count", "short_robot_log"}
-    assert "No such folder" in invoke("episode", "validate", tmp_path / "none", code=1).errors
+    assert "No such folder" in invoke("data", "check", tmp_path / "none", code=1).errors
 
 
 def exchange(first, second):
@@ -283,7 +283,7 @@ def faults(folder):
 def test_a_camera_without_a_place_is_a_fault(episode):
     edit_json(episode / "cameras" / "side" / "camera.json", T_world_camera=None)
     assert faults(episode) == {"uncalibrated"}
-    assert "Run diffcloud calibrate" in message(episode, "uncalibrated")
+    assert "Run diffcloud data calibrate" in message(episode, "uncalibrated")
 
 
 def test_a_gap_in_the_joint_log_is_a_fault(episode):

@@ -9,20 +9,18 @@ import math
 import pytest
 import yaml
 
-from diffcloud.cli.config import load_config
-from diffcloud.cli.scenario_options import choose_scenario
 from diffcloud.errors import ConfigError, DivergedError, OutputError
-from diffcloud.io.episodes import read_episode, write_episode
+from diffcloud.io.episodes import read_episode
+from diffcloud.jobs.scenarios import choose_scenario
+from diffcloud.jobs.settings import load_config
 from studies import coverage
 from studies.coverage_page import counted, counts_of, coverage_page
-from tests.cli.invoke import invoke
+from tests.cli.invoke import study
 from tests.cli.test_commands import SMALL as LIFT
-from tests.conftest import small_lift
-from tests.estimation.test_fit import clouds_of
 from tests.regressors.test_checkpoints import regressor
 
 SMALL = {**LIFT, "recorder": "whole_surface"}
-PARAMS = {"fit": {"starts": 1, "iterations": 4, "doubts": "bending=1.5x"}}
+PARAMS = {"fit": {"solver": {"starts": 1, "max_steps": 4}, "uncertain": "bending=1.5x"}}
 
 
 @pytest.fixture
@@ -38,7 +36,7 @@ COVERAGE = ("coverage", "--scenario", "small.yaml", "--recordings", 2, "--params
 
 class TestCoverage:
     def test_counts_and_records(self, work):
-        done = invoke(*COVERAGE, "--fix", "mass", "--seed", 3, "--markdown", "page.md")
+        done = study(*COVERAGE, "--fix", "mass", "--seed", 3, "--markdown", "page.md")
         told = done.result["parameters"]["stretch"]
         assert told["n"] == 2
         assert 0 <= told["covered"] <= told["stated"] <= 2
@@ -50,22 +48,22 @@ class TestCoverage:
 
     @pytest.mark.slow
     def test_a_later_call_keeps_what_is_finished(self, work):
-        invoke(*COVERAGE, "--fix", "mass")
+        study(*COVERAGE, "--fix", "mass")
         before = {path: path.stat().st_mtime_ns for path in (work / "out").rglob("*.*")}
-        invoke(*COVERAGE, "--fix", "mass", "--recordings", 3)
+        study(*COVERAGE, "--fix", "mass", "--recordings", 3)
         after = {path: path.stat().st_mtime_ns for path in (work / "out").rglob("*.*")}
         assert before.items() <= after.items()
-        free = invoke(*COVERAGE)
+        free = study(*COVERAGE)
         assert set(free.result["parameters"]) == {"stretch", "mass"}
         assert free.result["ratio"]["n"] == 2
         assert (work / "out/small/free/0000.json").is_file()
 
     def test_other_recordings_are_made_anew(self, work):
-        invoke(*COVERAGE, "--recordings", 1)
+        study(*COVERAGE, "--recordings", 1)
         episode = work / "out/small/episodes/0000.npz"
         first, written = read_episode(episode), episode.stat().st_mtime_ns
         (work / "params.yaml").write_text(yaml.safe_dump({**PARAMS, "preprocess": {"points": 40}}))
-        invoke(*COVERAGE, "--recordings", 1)
+        study(*COVERAGE, "--recordings", 1)
         second = read_episode(episode)
         assert first.meta["truth"] == second.meta["truth"]
         assert first.meta["made"] != second.meta["made"]
@@ -74,11 +72,11 @@ class TestCoverage:
     def test_fits_with_other_known_parameters_share_a_raw_recording(self, work):
         (work / "small.yaml").write_text(yaml.safe_dump(LIFT))
         (work / "params.yaml").write_text(yaml.safe_dump({**PARAMS, "episodes": {"image_size": [212, 120]}}))
-        invoke(*COVERAGE, "--recordings", 1, "--fix", "mass")
+        study(*COVERAGE, "--recordings", 1, "--fix", "mass")
         episode = work / "out/small/episodes/0000.npz"
         written = episode.stat().st_mtime_ns
         assert read_episode(episode).meta["source"] == "raw episode"
-        invoke(*COVERAGE, "--recordings", 1)
+        study(*COVERAGE, "--recordings", 1)
         assert episode.stat().st_mtime_ns == written
 
     @pytest.mark.parametrize("truth", ["refined", "finer"])
@@ -89,8 +87,8 @@ class TestCoverage:
         monkeypatch.setattr(
             coverage, "simulated_frames", lambda scenario, sets: scenes.append(scenario.scene) or frames(scenario, sets)
         )
-        invoke(*COVERAGE, "--recordings", 1)
-        invoke(*COVERAGE, "--recordings", 1, "--truth", truth)
+        study(*COVERAGE, "--recordings", 1)
+        study(*COVERAGE, "--recordings", 1, "--truth", truth)
         record, same = (
             json.loads((work / f"out/small/{name}/0000.json").read_text()) for name in (f"free_{truth}", "free")
         )
@@ -102,12 +100,12 @@ class TestCoverage:
     def test_another_truth_is_recorded_with_noise(self, work):
         """1 mm along each axis; a frame that shows the start alone, which other steps leave where it was."""
         for truth in ("same", "refined"):
-            invoke(*COVERAGE, "--recordings", 1, "--truth", truth)
+            study(*COVERAGE, "--recordings", 1, "--truth", truth)
         clouds = [read_episode(work / f"out/small/{name}/0000.npz").frame(0) for name in ("episodes", "episodes_refined")]
         assert abs(clouds[0] - clouds[1]).mean() == pytest.approx(1e-3 * math.sqrt(2 / math.pi), rel=0.15)
 
     def test_refits_share_what_is_fitted_and_nothing_else(self, work):
-        done = invoke(*COVERAGE, "--recordings", 1, "--refits", 2, "--markdown", "page.md")
+        done = study(*COVERAGE, "--recordings", 1, "--refits", 2, "--markdown", "page.md")
         first, second = (json.loads((work / f"out/small/free_refits/0000_0{n}.json").read_text()) for n in (0, 1))
         assert [first["truth"][name] == second["truth"][name] for name in ("stretch", "mass", "bending")] == [
             True,
@@ -124,7 +122,7 @@ class TestCoverage:
     def test_a_network_predicts_the_same_recordings(self, work):
         """The ratio's interval is that of the ratio of what is drawn together."""
         regressor("posterior", scenario="small").write(work / "posterior.safetensors")
-        done = invoke(*COVERAGE, "--checkpoint", "posterior.safetensors", "--markdown", "page.md")
+        done = study(*COVERAGE, "--checkpoint", "posterior.safetensors", "--markdown", "page.md")
         record = json.loads((work / "out/small/posterior/0001.json").read_text())
         fitted = json.loads((work / "out/small/free/0001.json").read_text())
         assert record["truth"] == fitted["truth"]
@@ -143,18 +141,18 @@ class TestCoverage:
 
         path = work / "out/small/mass_known/0000.json"
         monkeypatch.setattr(coverage, "intervals_of", full)
-        assert "Cannot write there" in invoke(*COVERAGE, "--recordings", 1, "--fix", "mass").errors
+        assert "Cannot write there" in study(*COVERAGE, "--recordings", 1, "--fix", "mass").errors
         assert not path.exists()
         monkeypatch.setattr(coverage, "intervals_of", diverging)
         for _ in range(2):
-            done = invoke(*COVERAGE, "--recordings", 1, "--fix", "mass")
+            done = study(*COVERAGE, "--recordings", 1, "--fix", "mass")
             assert "diverged" in done.errors
             assert done.result["failures"]
         assert "error" in json.loads(path.read_text())
 
     def test_records_of_other_calls_are_told(self, work):
-        invoke(*COVERAGE, "--fix", "mass")
-        said = invoke(*COVERAGE, "--fix", "mass", "--recordings", 1, "--seed", 5).errors
+        study(*COVERAGE, "--fix", "mass")
+        said = study(*COVERAGE, "--fix", "mass", "--recordings", 1, "--seed", 5).errors
         assert "mass_known holds 1 records of earlier calls" in said
 
     @pytest.mark.parametrize(
@@ -174,41 +172,41 @@ class TestCoverage:
         regressor("posterior", scenario="small").write(work / "one.safetensors")
         regressor("posterior", scenario="small").write(work / "other.safetensors")
         regressor("mlp", scenario="lift").write(work / "of_lift.safetensors")
-        assert message in invoke(*COVERAGE, *options, code=1).errors
+        assert message in study(*COVERAGE, *options, code=1).errors
         assert not list((work / "out").rglob("*.json"))
 
     @pytest.mark.parametrize("name", ["friction_cloth", "shear"])
     def test_what_is_not_drawn_or_may_be_zero_is_refused_before_anything_is_fitted(self, work, name):
-        told = {"fit": {**PARAMS["fit"], "doubts": None, "parameters": ["stretch", name]}}
+        told = {"fit": {**PARAMS["fit"], "uncertain": None, "parameters": ["stretch", name]}}
         (work / "params.yaml").write_text(yaml.safe_dump(told))
-        assert f"not {name}" in invoke(*COVERAGE, code=1).errors
+        assert f"not {name}" in study(*COVERAGE, code=1).errors
         assert not list((work / "out").rglob("*.json"))
 
     def test_further_material_is_drawn_as_it_is_doubted(self, work):
         before = coverage_truth(work)
-        told = {"fit": {**PARAMS["fit"], "doubts": None, "parameters": ["stretch", "mass", "bending"]}}
+        told = {"fit": {**PARAMS["fit"], "uncertain": None, "parameters": ["stretch", "mass", "bending"]}}
         (work / "params.yaml").write_text(yaml.safe_dump(told))
         after = coverage_truth(work)
         assert after == before
-        done = invoke(*COVERAGE, "--recordings", 1)
+        done = study(*COVERAGE, "--recordings", 1)
         assert set(done.result["parameters"]) == {"stretch", "mass", "bending"}
 
     def test_another_level_or_factor_does_not_mix(self, work):
-        invoke(*COVERAGE, "--recordings", 1)
-        assert "level 0.9" in invoke(*COVERAGE, "--recordings", 1, "--level", 0.8, code=1).errors
+        study(*COVERAGE, "--recordings", 1)
+        assert "level 0.9" in study(*COVERAGE, "--recordings", 1, "--level", 0.8, code=1).errors
         (work / "out/small/free/0000.json").rename(work / "out/small/free/0007.json")  # whichever cloths they are of
-        assert "level 0.9" in invoke(*COVERAGE, "--recordings", 1, "--level", 0.8, code=1).errors
+        assert "level 0.9" in study(*COVERAGE, "--recordings", 1, "--level", 0.8, code=1).errors
         (work / "out/small/free/0007.json").rename(work / "out/small/free/0000.json")
         path = work / "out/small/free/0000.json"
         assert json.loads(path.read_text())["intervals"]["within"] == 2.0
-        (work / "params.yaml").write_text(yaml.safe_dump({**PARAMS, "evaluate": {"within": 1.2}}))
-        invoke(*COVERAGE, "--recordings", 1)
+        (work / "params.yaml").write_text(yaml.safe_dump({"fit": {**PARAMS["fit"], "identified_factor": 1.2}}))
+        study(*COVERAGE, "--recordings", 1)
         assert json.loads(path.read_text())["intervals"]["within"] == 1.2
 
 
 def coverage_truth(folder):
     config = load_config(folder / "params.yaml")
-    config = config.model_copy(update={"fit": config.fit.model_copy(update={"doubts": None})})
+    config = config.model_copy(update={"fit": config.fit.model_copy(update={"uncertain": None})})
     return coverage.CoverageJob(choose_scenario("lift"), 3, 5, (), 0.9, "same", config, folder / "out").truth()
 
 
@@ -312,39 +310,3 @@ def test_a_page_is_of_one_level(tmp_path):
     page = coverage_page(counts_of(tmp_path))
     assert "the 50 % interval is held against the truth" in page
     assert "exactly 50 %" in page
-
-
-class TestIntervals:
-    @pytest.fixture
-    def fitted(self, work):
-        for name, seed in (("e1", 1), ("e2", 2)):
-            write_episode(work / f"{name}.npz", clouds_of(small_lift(), seed=seed, stretch=0.7, mass=1.0))
-        fit = ("fit", "--scenario", "small.yaml", "--out", "fits", "--fix", "mass=1", "--starts", 1)
-        invoke(*fit, "e1.npz")
-        invoke(*fit, "--joint", "e1.npz", "e2.npz")
-        return work
-
-    def test_they_are_stated_with_a_verdict(self, fitted):
-        done = invoke("evaluate", "intervals", "fits/e1.json", "--scenario", "small.yaml", "--level", 0.8)
-        entry = done.result["parameters"]["stretch"]
-        assert done.result["level"] == 0.8
-        assert entry["low"] < entry["value"] < entry["high"]
-        assert entry["verdict"]
-        wide = invoke("evaluate", "intervals", "fits/e1.json", "--scenario", "small.yaml", "--level", 0.99)
-        assert wide.result["parameters"]["stretch"]["high"] > entry["high"]
-
-    def test_of_a_joint_fit_too(self, fitted):
-        command = ("evaluate", "intervals", "fits/joint.json", "--scenario", "small.yaml")
-        joint = invoke(*command)
-        assert joint.result["parameters"].keys() == {"stretch"}
-        assert {"bending", "damping"} <= joint.result["sources"].keys()
-
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
-            (("fits/e1.json", "--within", 1), "--within takes a factor above 1"),
-            (("e1.npz",), "e1.npz"),
-        ],
-    )
-    def test_bad_input_is_refused(self, fitted, arguments, message):
-        assert message in invoke("evaluate", "intervals", *arguments, "--scenario", "small.yaml", code=1).errors

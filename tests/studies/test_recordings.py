@@ -14,7 +14,7 @@ import yaml
 from diffcloud.io.episodes import read_episode, write_episode
 from diffcloud.io.images import png_size, write_depth
 from diffcloud.sensing.recorder import read_truth
-from tests.cli.invoke import invoke
+from tests.cli.invoke import invoke, stage, study
 
 SMALL = {
     "base": "lift",
@@ -28,7 +28,7 @@ PARAMS = {
     "scenarios": ["small"],
     "episodes": {"per_scenario": 1},
     "preprocess": {"raw": {"flying_m": 0.03}, "outlier_deviations": 5},
-    "fit": {"iterations": 1},
+    "fit": {"solver": {"max_steps": 1}},
     "evaluate": {"draws": 1},
 }
 
@@ -41,8 +41,8 @@ def place(tmp_path_factory) -> Path:
     (folder / "params.yaml").write_text(yaml.safe_dump(PARAMS), encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        invoke("episodes", "--params", "params.yaml", "--out", "recorded")
-        invoke("preprocess", "--params", "params.yaml", "--out", "episodes", "recorded")
+        stage("episodes", "--params", "params.yaml", "--out", "recorded")
+        invoke("data", "preprocess", "--params", "params.yaml", "--out", "episodes", "recorded")
     return folder
 
 
@@ -67,16 +67,16 @@ def test_recordings_are_raw_and_become_clouds_with_pictures(work):
 
 
 def test_measured_against_the_truth_and_reported(work):
-    done = invoke(
-        "recordings", "--recorded", "recorded", "--episodes", "episodes", "--out", "table.md", "--params", "params.yaml"
+    done = study(
+        "recordings", "--recorded", "recorded", "--episodes", "episodes", "--out", "table.md", "--params", "params.yaml",
     )  # fmt: skip
     figures = done.result["clouds"]["small_hidden1"]
     assert figures["robot"] <= 0.002
     assert len(done.result["fits"]) == 3
     assert "| small_hidden1 |" in (work / "table.md").read_text(encoding="utf-8")
-    invoke("fit", "--params", "params.yaml", "--scenario", "small", "--out", "fits/small", "episodes/small")
-    invoke("evaluate", "--params", "params.yaml", "--fits", "fits", "--episodes", "episodes", "--out", "reports")
-    invoke(
+    stage("fit", "--params", "params.yaml", "--out", "fits", "episodes")
+    stage("evaluate", "--params", "params.yaml", "--fits", "fits", "--episodes", "episodes", "--out", "reports")
+    stage(
         "report", "--params", "params.yaml", "--fits", "fits", "--episodes", "episodes", "--tables", "reports/tables",
         "--out", "reports/index.html",
     )  # fmt: skip
@@ -87,13 +87,13 @@ def test_measured_against_the_truth_and_reported(work):
 
 def test_a_look_at_the_raw_recording_its_clouds_and_a_fit(work):
     raw, episode = "recorded/small/small_hidden1", "episodes/small/small_hidden1.npz"
-    done = invoke("view", raw, "--params", "params.yaml", "--out", "raw.html", "--scenario", "small")
+    done = invoke("view", raw, "--params", "params.yaml", "--out", "raw.html", "--scene", "small")
     assert done.result["episodes"] == 1
     page = (work / "raw.html").read_text(encoding="utf-8")
     assert page.count('"name":"recorded, overhead"') == page.count('"name":"cloth, basis material"') == 1
     assert len(re.findall(r'"/9j/[A-Za-z0-9+/=]{1000,}"', page)) == 4  # a JPEG a frame
-    invoke("fit", episode, "--scenario", "small", "--params", "params.yaml", "--out", "seen")
-    invoke("view", episode, "--fit", "seen/small_hidden1.json", "--out", "fitted")
+    invoke("fit", episode, "--scene", "small", "--params", "params.yaml", "--out", "seen")
+    invoke("view", episode, "--fit", "seen/fit.json", "--out", "fitted")
     page = (work / "fitted.html").read_text(encoding="utf-8")
     for name in ("fitted", "start of the fit", "fitted, where the scene has it", "table", "cameras", "held nodes"):
         assert f'"name":"{name}"' in page
@@ -103,9 +103,9 @@ def test_a_look_at_the_raw_recording_its_clouds_and_a_fit(work):
 
 def test_a_look_with_what_does_not_belong_to_it(work):
     raw, episode = work / "recorded" / "small" / "small_hidden1", work / "episodes" / "small" / "small_hidden1.npz"
-    invoke("fit", episode, "--scenario", "small", "--params", "params.yaml", "--out", "seen")
+    invoke("fit", episode, "--scene", "small", "--params", "params.yaml", "--out", "seen")
     shutil.copy(episode, work / "other.npz")
-    told = invoke("view", "other.npz", "--fit", "seen/small_hidden1.json", "--out", "o.html", code=1).errors
+    told = invoke("view", "other.npz", "--fit", "seen/fit.json", "--out", "o.html", code=1).errors
     assert "Unknown recording of the fit 'other'" in told
     assert "small_hidden1" in told
     assert "No such episode" in invoke("view", "nothing.npz", "--out", "o.html", code=1).errors
@@ -136,26 +136,26 @@ def test_a_look_at_an_episode_whose_meta_is_damaged(work, meta, says):
 
 
 def test_again_replaces_only_what_is_synthetic(work):
-    invoke("episodes", "--params", "params.yaml", "--out", "recorded")
+    stage("episodes", "--params", "params.yaml", "--out", "recorded")
     own = work / "own" / "small" / "small_hidden1"
     own.mkdir(parents=True)
     (own / "notes.txt").write_text("mine", encoding="utf-8")
-    assert "no synthetic recording" in invoke("episodes", "--params", "params.yaml", "--out", "own", code=1).errors
+    assert "no synthetic recording" in stage("episodes", "--params", "params.yaml", "--out", "own", code=1).errors
     assert (own / "notes.txt").is_file()
 
 
 def test_none_are_made_where_only_own_ones_are_wanted(work):
     (work / "own.yaml").write_text(yaml.safe_dump({**PARAMS, "episodes": {"per_scenario": 0}}), encoding="utf-8")
-    assert invoke("episodes", "--params", "own.yaml", "--out", "no_others").result["episodes"] == {}
+    assert stage("episodes", "--params", "own.yaml", "--out", "no_others").result["episodes"] == {}
     assert [path.name for path in (work / "no_others").iterdir()] == ["manifest.json"]
     (work / "own.yaml").write_text(yaml.safe_dump({**PARAMS, "episodes": {"source": "raw/episodes"}}), encoding="utf-8")
-    assert "recordings in raw/ are always used" in invoke("episodes", "--params", "own.yaml", "--out", "o", code=1).errors
+    assert "recordings in raw/ are always used" in stage("episodes", "--params", "own.yaml", "--out", "o", code=1).errors
 
 
 def test_a_truncated_image_and_one_without_depth_are_named(work):
     raw = work / "copied_for_damage" / "small" / "small_hidden1"
     shutil.copytree(work / "recorded" / "small" / "small_hidden1", raw)
-    common = ("preprocess", raw, "--params", "params.yaml", "--out", "damaged")
+    common = ("data", "preprocess", raw, "--params", "params.yaml", "--out", "damaged")
     image = raw / "cameras" / "side" / "depth" / "000002.png"
     whole = image.read_bytes()
     image.write_bytes(whole[: len(whole) // 2])
@@ -167,8 +167,7 @@ def test_a_truncated_image_and_one_without_depth_are_named(work):
 
 
 def test_poses_found_are_held_against_the_true_ones(work, tmp_path):
-    told = invoke(
-        "recordings", "--recorded", "recorded", "--episodes", "episodes", "--params", "params.yaml",
+    told = study("recordings", "--recorded", "recorded", "--episodes", "episodes", "--params", "params.yaml",
         "--out", tmp_path / "poses.md", "--nuisance", "none", "--nuisance", "x=1cm,yaw=2deg,lag=5ms",
     )  # fmt: skip
     (fits,) = told.result["recordings"]
@@ -184,7 +183,7 @@ def test_poses_found_are_held_against_the_true_ones(work, tmp_path):
     page = (tmp_path / "poses.md").read_text()
     assert "off by 0 mm and 0° together" in page
     assert page.count("| as the first frame shows it") == page.count("| as the scenario says, its turn fitted") == 2
-    broken = invoke("recordings", "--recorded", "recorded", "--episodes", "episodes", "--params", "params.yaml",
+    broken = study("recordings", "--recorded", "recorded", "--episodes", "episodes", "--params", "params.yaml",
                     "--out", tmp_path / "poses2.md", "--nuisance", "sideways=2", code=1)  # fmt: skip
     assert "sideways" in broken.errors
     assert not (tmp_path / "poses2.md").exists()
@@ -199,14 +198,14 @@ def test_the_pose_of_a_heavy_displaced_cloth_is_the_true_one(tmp_path, monkeypat
         "scenarios": ["small"],
         "episodes": heavy,
         "preprocess": PARAMS["preprocess"],
-        "fit": {"model_error": False},
+        "fit": {"solver": {"model_error": False}},
     }
     Path("raw/scenes").mkdir(parents=True)
     Path("raw/scenes/small.yaml").write_text(yaml.safe_dump(scene), encoding="utf-8")
     Path("params.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
-    invoke("episodes", "--params", "params.yaml", "--out", "recorded")
-    invoke("preprocess", "--params", "params.yaml", "--out", "episodes", "recorded")
-    told = invoke(
+    stage("episodes", "--params", "params.yaml", "--out", "recorded")
+    invoke("data", "preprocess", "--params", "params.yaml", "--out", "episodes", "recorded")
+    told = study(
         "recordings", "--recorded", "recorded", "--episodes", "episodes", "--params", "params.yaml", "--out", "poses.md",
         "--nuisance", "x=10cm,y=10cm",
     )  # fmt: skip

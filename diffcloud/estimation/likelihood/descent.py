@@ -11,7 +11,7 @@ from torch import Tensor
 
 from diffcloud.errors import DivergedError
 from diffcloud.estimation.bounded import lowest_within
-from diffcloud.estimation.laid import asked_as
+from diffcloud.estimation.initial_state import asked_as
 from diffcloud.estimation.likelihood.energy import Likelihood, Terms
 from diffcloud.estimation.likelihood.frames import squared
 from diffcloud.estimation.likelihood.grasp import in_powers
@@ -182,7 +182,7 @@ class Descent:
         precision = torch.diag(of.precision)
         sources = {"recording": covariance @ (terms.matrix - precision) @ covariance}
         for index, variable in enumerate(of.space.variables):
-            name = asked_as(variable.name) if variable.doubtful else "prior"
+            name = asked_as(variable.name) if variable.nuisance else "prior"
             part = of.precision[index] * torch.outer(covariance[index], covariance[index])
             sources[name] = sources[name] + part if name in sources else part
         poses = covariance[len(of.space.names) : len(of.space.names) + of.poses]

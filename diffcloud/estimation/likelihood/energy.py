@@ -40,7 +40,7 @@ class Likelihood:
         Args:
             grip: of the scenarios, in deviations from the size that was given.
         """
-        self.space, self.axis, self.iterations = space, Axis.of(space), settings.iterations
+        self.space, self.axis, self.iterations = space, Axis.of(space), settings.max_steps
         self.recordings, self.simulations, self.grip = list[Recording](), 0, grip
         variables = count = len(space.names)
         last = variables + sum(len(one.pose_space.names) for one in objectives)
@@ -48,7 +48,7 @@ class Likelihood:
             own, columns = space.of_recording(index)
             self.recordings.append(Recording(objective, own, columns, count, last, model_error=settings.model_error))
             count += len(objective.pose_space.names)
-        asked = [index for index, one in enumerate(space.variables) if not one.doubtful]
+        asked = [index for index, one in enumerate(space.variables) if not one.nuisance]
         self.asked = torch.tensor(asked, dtype=torch.long)
         self.changes = [Changes() for _ in self.recordings]
         self.looked: Tensor | None = None

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 class LikelihoodSettings:
     """Of one fit."""
 
-    iterations: int = 12
+    max_steps: int = 12
     """Places that each start compares at most, the first one included."""
     starts: int = 3
     """Descents: from the centres of the priors, then with the first variable, the stretching, above and below."""

@@ -25,7 +25,7 @@ class AdamSettings:
     """Of one fit."""
 
     learning_rate: float = 0.2
-    iterations: int = 50
+    max_steps: int = 50
     threshold: float = 0.0
     """Stop below this loss; 0: never."""
     starts: int = 1
@@ -72,7 +72,7 @@ def fit_adam(
     best = _Best(math.inf, 0, start_values[0])
     reason: StopReason = "iterations"
     try:
-        for iteration in range(settings.iterations + 1):
+        for iteration in range(settings.max_steps + 1):
             if settings.resample and iteration:
                 objective.reseed(settings.seed + iteration)
             owner, noise = _trials(settings, unbounded, generator)
@@ -115,7 +115,7 @@ def fit_adam(
             if best.loss < settings.threshold:
                 reason = "threshold"
                 break
-            if iteration < settings.iterations:
+            if iteration < settings.max_steps:
                 optimiser.step()
     except KeyboardInterrupt:
         if not history.losses:

@@ -33,7 +33,7 @@ class SearchSettings:
         ConfigError: fewer than one simulation.
     """
 
-    simulations: int = 200
+    max_simulations: int = 200
     """Runs at most; a parameter set takes one for each recording."""
     threshold: float = 0.0
     """Stop below this loss; 0: never."""
@@ -43,8 +43,8 @@ class SearchSettings:
     """Values of the first parameter set; the middle of the range where not given."""
 
     def __post_init__(self) -> None:
-        if self.simulations < 1:
-            raise ConfigError(f"A search needs simulations: one or more, got {self.simulations}.")
+        if self.max_simulations < 1:
+            raise ConfigError(f"A search needs simulations: one or more, got {self.max_simulations}.")
 
 
 class Proposals(Protocol):
@@ -108,12 +108,12 @@ def search(
     reason: StopReason = "simulations"
     try:
         simulate(values)
-        while simulated + each <= settings.simulations and not best.loss < settings.threshold:
+        while simulated + each <= settings.max_simulations and not best.loss < settings.threshold:
             if proposals.converged:
                 reason = "converged"
                 break
             asked = proposals.ask()
-            places = torch.as_tensor(asked[: (settings.simulations - simulated) // each])
+            places = torch.as_tensor(asked[: (settings.max_simulations - simulated) // each])
             losses = simulate(axis.bounded(low + (high - low) * places))
             if len(losses) == len(asked):  # else the budget has ended within the batch
                 proposals.tell(losses)

@@ -1,7 +1,7 @@
 """A simulated UR5e behind a socket, and the driver for it: what a driver for an arm of your own looks like.
 
     python -m diffcloud.hardware.examples.simulated_ur5e --port 5005
-    diffcloud capture --rig rig.yaml ...
+    diffcloud data capture --rig rig.yaml ...
 
 rig.yaml holds `arm_driver: diffcloud.hardware.examples.simulated_ur5e:SimulatedUR5e` and `arm: 127.0.0.1:5005`.
 

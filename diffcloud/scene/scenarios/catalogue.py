@@ -38,19 +38,21 @@ def load_scenario(name: str | Path | None, scene: Path | None = None) -> Scenari
     """
     if name is None:
         if scene is None:
-            raise ConfigError(
-                f"Give --scenario (one of {', '.join(SCENARIO_NAMES)}, or a YAML file), or --scene FILE.json."
-            )
+            raise ConfigError(f"Give --scene: one of {', '.join(SCENARIO_NAMES)}, a YAML file, or an ARCSim scene JSON.")
         loaded = load_scene(scene)
         frames = loaded.default_frames or 25
         return Scenario(Path(scene).stem, loaded, frames, loss_frames=(-1,), every_frame=True)
     text = str(name)
     if text in EXPERIMENTS:
         if scene is None:
-            raise ConfigError(f"Scenario {text} needs --scene with the published scene file (README: published data).")
+            raise ConfigError(
+                f"Scenario {text} needs the published scene file, as in {text}=FILE.json (docs/published-data.md)."
+            )
         return load_experiment(text, scene)
     if scene is not None:
-        raise ConfigError(f"Scenario {text} makes its own scene; --scene goes with release_* scenarios or alone.")
+        raise ConfigError(
+            f"Scenario {text} makes its own scene; only release_* take a scene file, as in release_lift=FILE.json."
+        )
     if text in _BUILT_IN:
         return make_scenario(_BUILT_IN[text])
     if Path(text).suffix in (".yaml", ".yml"):

@@ -30,7 +30,7 @@ Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 """[m] Whatever lies farther off is a mistake."""
 Length = Annotated[float, Field(gt=0, le=100)]
 """[m] Of a cloth, or of what it meets."""
-MOST_DOUBT = 100.0
+MOST_UNCERTAINTY = 100.0
 """A larger factor is no knowledge of a material."""
 _Time = Annotated[float, Field(ge=-1e6, le=1e6)]
 Keyframes = Annotated[list[tuple[_Time, Coordinate, Coordinate, Coordinate]], Field(min_length=2)]
@@ -41,16 +41,16 @@ class ScenarioOptions(Checked):
     """The fields that all built-in scenarios share (SI units)."""
 
     name: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^./\\\s][^/\\]*$")]
-    """Folders and files are named after it. A recording may have any name that one of these can have, and `identify` names
+    """Folders and files are named after it. A recording may have any name that one of these can have, and `fit` names
     its scenario so."""
     material: str | Sheet = "basis-knit"
     """A preset, the path of an ARCSim material JSON, or an isotropic sheet in SI units."""
     compression: Annotated[float, Field(ge=0, le=1)] = 1.0
     """The part of its stretching stiffness with which the cloth resists compression in its plane. Fabric wrinkles instead,
     finer than most meshes (docs/physics.md, wrinkles)."""
-    doubts: dict[str, Annotated[float, Field(gt=1, le=MOST_DOUBT)]] = Field(default_factory=dict)
+    uncertain: dict[str, Annotated[float, Field(gt=1, le=MOST_UNCERTAINTY)]] = Field(default_factory=dict)
     """Material that is known less well, or better, than usual: parameter -> factor of one deviation
-    (`estimation.doubts`)."""
+    (`estimation.uncertain`)."""
     path: Keyframes
     """The gripper's displacement."""
     frames: Annotated[int, Field(ge=1, le=100_000)] = 25
@@ -86,13 +86,13 @@ class ScenarioOptions(Checked):
     contact_stiffness: NonNegative = ContactSettings.stiffness
     contact_thickness_m: Annotated[float, Field(gt=0, le=1)] = ContactSettings.repulsion_thickness
 
-    @field_validator("doubts")
+    @field_validator("uncertain")
     @classmethod
-    def _of_parameters(cls, doubts: dict[str, float]) -> dict[str, float]:
-        for name in doubts:
+    def _of_parameters(cls, uncertain: dict[str, float]) -> dict[str, float]:
+        for name in uncertain:
             if name not in PARAMETERS:
                 raise ValueError(unknown_name("parameter", name, PARAMETERS))
-        return doubts
+        return uncertain
 
     @property
     def reach(self) -> float:
@@ -193,5 +193,5 @@ def assemble(
         learning_rate=options.learning_rate,
         threshold=options.threshold_m2,
         recorder=options.recorder,
-        doubts=options.doubts,
+        uncertain=options.uncertain,
     )

@@ -1,7 +1,7 @@
 """The published recordings as recordings: the paper's cloth in SI under the gripper's recorded track.
 
 The `release_*` scenes move their handle along a path of their own and look at one frame. `recorded_lift` and
-`recorded_fold` are simulated under the track that an episode carries (`diffcloud import --trajectories`), and look
+`recorded_fold` are simulated under the track that an episode carries (`diffcloud data import --trajectories`), and look
 at three frames in which about half of the cloth or more is above the plane where the published clouds are cut off.
 """
 
@@ -11,7 +11,7 @@ from diffcloud.scene.scenarios.grid import FOLD, LIFT, GridScenario
 
 _COMPRESSION = 0.1
 """Fabric has wrinkles shorter than edges of 22 to 33 mm. Where fits start; they find it for each recording."""
-_DOUBTS = {"shear": 3.0, "bending": 3.0}
+_UNCERTAIN = {"shear": 3.0, "bending": 3.0}
 """One standard deviation, as a factor. The five fabrics have not been measured; woven ones shear at least ten times as
 easily as they stretch, and in bending fabrics differ as much."""
 _SHAPE_M = 0.01
@@ -31,7 +31,7 @@ RECORDED_LIFT = LIFT.model_copy(
     update={
         "name": "recorded_lift",
         "compression": _COMPRESSION,
-        "doubts": _DOUBTS,
+        "uncertain": _UNCERTAIN,
         "nodes": (13, 13),
         **_NODE,
         "grip_m": 0.0065,
@@ -50,7 +50,7 @@ RECORDED_FOLD = FOLD.model_copy(
     update={
         "name": "recorded_fold",
         "compression": _COMPRESSION,
-        "doubts": _DOUBTS,
+        "uncertain": _UNCERTAIN,
         **_NODE,
         "grip_m": 0.0097,
         "nodes": (9, 9),  # finer ones diverge with the light, stiff cloth that some folds lead to

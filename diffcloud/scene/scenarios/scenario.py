@@ -52,11 +52,11 @@ class Scenario:
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Overrides of the parameters' own bounds."""
     recorder: Recorder = "depth_cameras"
-    doubts: Mapping[str, float] = field(default_factory=dict)
-    """Material -> factor of one deviation, where it is known less well, or better, than usual (`estimation.doubts`)."""
+    uncertain: Mapping[str, float] = field(default_factory=dict)
+    """Material -> factor of one deviation, where it is known less well, or better, than usual (`estimation.uncertain`)."""
     laid: Mapping[str, float] = field(default_factory=dict)
     """How far the cloth's start, its size and the gripper's path may be off, which fits find: `turn` [rad], `shape` [m],
-    `size` and `track` [1] (`estimation.laid`) -> standard deviation."""
+    `size` and `track` [1] (`estimation.initial_state`) -> standard deviation."""
     regrip: Callable[[float], Scenario] | None = None
     """The same with a grasp so many standard deviations larger; None: its size is known."""
 

@@ -49,7 +49,7 @@ def calibration_findings(camera: RecordedCamera, folder: Path, calibration: Path
             if camera.info.T_world_camera is None:
                 message = (
                     "Not calibrated: neither T_world_camera nor a calibration file says where the camera stands, without "
-                    "which there are no clouds. Run diffcloud calibrate."
+                    "which there are no clouds. Run diffcloud data calibrate."
                 )
                 yield Finding("fault", "uncalibrated", place, message)
             return

@@ -85,7 +85,7 @@ def fitted_cloth(
     if motion.nodes.shape[1] != len(scene.mesh.nodes) or not np.array_equal(motion.faces, scene.mesh.faces):
         raise ConfigError(
             f"The fit's mesh ({motion.nodes.shape[1]} nodes) is not that of the scenario {scenario.name} "
-            f"({len(scene.mesh.nodes)} nodes); give the fitted one with --scenario."
+            f"({len(scene.mesh.nodes)} nodes). Put the fitted scene's YAML file into scenarios/ beside the fit."
         )
     size = recording.nuisance.get("size")
     if size is not None:
@@ -241,7 +241,7 @@ def _held(scene: Scene, motion: FittedMotion, paths: NDArray[np.float64]) -> tup
     if absent:
         raise ConfigError(
             f"The fit's motion holds the nodes {sorted(rows)}, its scenario's handles are at {sorted(absent)}, too: they "
-            "do not belong together. Give the --scenario that was fitted, or fit again."
+            "do not belong together. Put the fitted scene's YAML file into scenarios/ beside the fit, or fit again."
         )
     held: dict[int, Motion | None] = {}
     loose = set()

@@ -1,4 +1,4 @@
-"""`diffcloud identify` as a new user runs it: folders of clouds in, parameters and a report out."""
+"""`diffcloud fit` as a new user runs it: folders of clouds in, parameters and a report out."""
 
 from __future__ import annotations
 
@@ -19,20 +19,23 @@ import torch
 import yaml
 
 import diffcloud as dc
-from diffcloud.cli import identify
-from diffcloud.cli.fit_jobs import FitJob
-from diffcloud.cli.preprocess import Cleaned, PreprocessJob
 from diffcloud.clouds import SurfaceSampler
-from diffcloud.errors import EpisodeError
-from diffcloud.estimation import read_fit, task
+from diffcloud.errors import ConfigError, EpisodeError
+from diffcloud.estimation import task
 from diffcloud.estimation.likelihood.descent import Descent
+from diffcloud.estimation.record import read_fit
 from diffcloud.estimation.result import read_motion
 from diffcloud.io.clouds import read_cloud, write_ply
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.raw_episodes import read_raw_episode
+from diffcloud.jobs import scene_files
+from diffcloud.jobs.dvc_project import make_project
+from diffcloud.jobs.fits import FitJob
+from diffcloud.jobs.preprocess import Cleaned, PreprocessJob
+from diffcloud.jobs.scene_files import find_scene
 from diffcloud.scene.scenarios import built_in, make_scenario
 from diffcloud.sim.simulate import rollout
-from tests.cli.invoke import DIFFCLOUD, environment, invoke
+from tests.cli.invoke import DIFFCLOUD, environment, invoke, study
 from tests.io.ros_bag import bag
 from tests.io.test_ros_choices import desired
 from tests.io.test_ros_choices import written as rivals
@@ -75,7 +78,7 @@ def work(towel, tmp_path):
         yield tmp_path
 
 
-COMMAND = ("identify", "recorded/first", "recorded/second", "--size", "0.16x0.12", "--mass", 0.25, "--out", "found")
+COMMAND = ("fit", "recorded/first", "recorded/second", "--size", "0.16x0.12", "--density", 0.25, "--out", "found")
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +135,7 @@ class TestNewUser:
         """A tenth of the mass is a tenth of the stiffness: a motion tells their ratio."""
         folder, done = found
         with contextlib.chdir(folder):
-            words = [*COMMAND[:-1], "weighed", "--mass", "0.25+-0.05", "--parameters", "stretch"]
+            words = [*COMMAND[:-1], "weighed", "--density", "0.25+-0.05", "--parameters", "stretch"]
             told = invoke(*words).result["parameters"]["stretch"]
             sources = json.loads(Path("weighed/intervals.json").read_text())["sources"]
         assert sources["mass"]["stretch"] == pytest.approx(0.18, abs=0.06)
@@ -152,8 +155,7 @@ class TestNewUser:
         with contextlib.chdir(folder):
             record = read_fit(folder / "found" / "fit.json")
             assert [one.name for one in record.episodes] == ["first", "second"]
-            options = ("--fit", "found/fit.json", "--episode", "found/episodes/second.npz", "--out", "run.npz")
-            done = invoke("rollout", *options)
+            done = invoke("simulate", "found/fit.json", "--track", "found/episodes/second.npz", "--out", "run.npz")
             assert done.result["parameters"] == record.values
             assert "not among the fit's recordings" not in done.errors
             moved = np.load("run.npz")["nodes"]
@@ -171,10 +173,7 @@ class TestNewUser:
             path.write_text(path.read_text().replace("steps_per_frame: 8", "steps_per_frame: 16"))
             before = {one: one.read_bytes() for one in [*Path("found/scenarios").iterdir(), Path("found/fit.json")]}
             monkeypatch.setattr(FitJob, "run", stopped)
-            with pytest.raises(KeyboardInterrupt):
-                identify.identify(
-                    [Path("recorded/first"), Path("recorded/second")], Path("found"), parameters="stretch", mass="0.25"
-                )
+            invoke(*COMMAND, "--parameters", "stretch", code=130)
             assert before == {one: one.read_bytes() for one in before}
 
     def test_a_link_to_a_raw_episode_keeps_its_name(self, tmp_path, monkeypatch):
@@ -188,28 +187,28 @@ class TestNewUser:
             return Cleaned({}, [])
 
         monkeypatch.setattr(PreprocessJob, "run", cleaned)
-        assert identify._read(tmp_path / "tan1", "tan1", tmp_path / "found").frame_count == 1
+        assert scene_files.read_recording(tmp_path / "tan1", "tan1", tmp_path / "found", (), keep=True).frame_count == 1
 
     def test_another_recording_of_that_name_is_told(self, found, tmp_path):
         folder = shutil.copytree(found[0], tmp_path, dirs_exist_ok=True)
         out, recordings = folder / "found", [folder / "recorded" / name for name in ("first", "second")]
         told = []
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(identify, "warn", told.append)
-            identify.find_scene(recordings, out, None, None)
+            patch.setattr(scene_files, "warn", told.append)
+            find_scene(recordings, out, None, None)
             assert told == []
             track = folder / "recorded" / "first" / "gripper.csv"
             rows = np.loadtxt(track, delimiter=",", skiprows=1)
             rows[-1, 3] += 0.01
             np.savetxt(track, rows, delimiter=",", header="t_s,x,y,z", comments="")
-            identify.find_scene(recordings, out, None, None)
+            find_scene(recordings, out, None, None)
             assert len(told) == 1
             assert told[0].startswith("first is another recording than that")
             notes = out / "recordings.yaml"
             text = notes.read_text()
             notes.write_text(text[: text.index("first:")] + text[text.index("second:") :])
-            identify.find_scene(recordings, out, None, None)
-            identify.find_scene(recordings, out, None, None)
+            find_scene(recordings, out, None, None)
+            find_scene(recordings, out, None, None)
         assert len(told) == 1
 
     @pytest.mark.slow
@@ -236,10 +235,11 @@ class TestRefusals:
         [
             (("--size", "0.40x0.30"), "was stated. Check --size"),
             (("--size", "big"), "--size takes two sides in metres"),
-            (("--mass", -1), "--mass is in kg per square metre"),
-            (("--mass", "0.25+-0.2"), "below half of it, as in 0.24+-0.01"),
-            (("--mass", "light"), "got 'light'"),
-            (("--within", 0.5), "--within takes a factor above 1"),
+            (("--density", -1), "--density is in kg per square metre"),
+            (("--density", "0.25+-0.2"), "below half of it, as in 0.24+-0.01"),
+            (("--density", "light"), "got 'light'"),
+            (("--level", 1.5), "--level"),
+            (("--scene", "lift"), "leave them out beside a known one"),
             (("--out", "recorded/first/gripper.csv"), "--out takes a folder"),
         ],
     )
@@ -248,42 +248,42 @@ class TestRefusals:
         assert not (work / "found" / "fit.json").exists()
 
     def test_of_what_is_not_there(self, work):
-        assert "No such recording: nothing" in invoke("identify", "nothing", "--out", "found", code=1).errors
+        assert "No such recording: nothing" in invoke("fit", "nothing", "--out", "found", code=1).errors
         (work / "recorded/first/gripper.csv").unlink()
-        assert "holds no gripper.csv" in invoke("identify", "recorded/first", "--out", "found", code=1).errors
+        assert "holds no gripper.csv" in invoke("fit", "recorded/first", "--out", "found", code=1).errors
 
     def test_of_a_bag_comes_after_it_was_read(self, work):
         """It shows a table without a cloth, which is what is refused."""
         for kind in ("mcap", "rosbag2"):
             (work / kind).mkdir()
             path = bag(work / kind, kind)
-            said = invoke("identify", path, "--size", "0.16x0.12", "--out", "found", code=1).errors
+            said = invoke("fit", path, "--size", "0.16x0.12", "--out", "found", code=1).errors
             name = path.stem if path.is_file() else path.name
             assert said.startswith(f"{path}: ")
             assert read_raw_episode(work / "found" / "recordings" / name).robot is not None
             file = path if path.is_file() else next(iter(path.glob("*.db3")))
             os.utime(file, ns=(0, 0))
-            said = invoke("identify", path, "--size", "0.16x0.12", "--out", "found", code=1).errors
+            said = invoke("fit", path, "--size", "0.16x0.12", "--out", "found", code=1).errors
             assert f"was made of another {path.name}" in said
             shutil.rmtree(work / "found")
         (work / "d435.bag").write_bytes(b"#ROSBAG V2.0 /device_0/sensor_0/info")
-        said = invoke("identify", "d435.bag", "--out", "found", code=1).errors
+        said = invoke("fit", "d435.bag", "--out", "found", code=1).errors
         assert "is a recording of the RealSense SDK" in said
 
     def test_of_a_bag_with_several_topics_names_them(self, work):
-        """As `import recording` does; the topic that is named is the one that is read."""
+        """As `data import` does; the topic that is named is the one that is read."""
         rivals(work, other=desired)
-        said = invoke("identify", "bag", "--out", "found", code=1).errors
+        said = invoke("fit", "bag", "--out", "found", code=1).errors
         assert "Several publishers send the same joints at the same time: /joint_states#1" in said
         assert "such as `--topic '/joint_states#1'`" in said
         assert not (work / "found" / "recordings").exists()
         for number, offset in ((1, 0.0), (2, 0.15)):
             named = ("--topic", f"/joint_states#{number}")
-            invoke("identify", "bag", *named, "--size", "0.16x0.12", "--out", "found", code=1)  # it shows no cloth
+            invoke("fit", "bag", *named, "--size", "0.16x0.12", "--out", "found", code=1)  # it shows no cloth
             log = read_raw_episode(work / "found" / "recordings" / "bag").robot
             late = 0.004 * (number - 1)
             np.testing.assert_allclose(log.joints_rad[:, 3], HOME_RAD[3] + 0.2 * (log.times - late) + offset, atol=1e-5)
-            said = invoke("identify", "bag", "--topic", "/tf", "--out", "found", code=1).errors
+            said = invoke("fit", "bag", "--topic", "/tf", "--out", "found", code=1).errors
             assert "or with other topics. Remove" in said
             shutil.rmtree(work / "found")
         said = invoke(*COMMAND, "--topic", "/tf", code=1).errors
@@ -310,7 +310,7 @@ class TestRefusals:
         assert "recordings.yaml: first lacks center_m, laid_turn_deg, table_height_m" in invoke(*COMMAND, code=1).errors
 
     def test_two_of_one_name(self, work):
-        twice = invoke("identify", "recorded/first", "recorded/first", "--out", "found", code=1)
+        twice = invoke("fit", "recorded/first", "recorded/first", "--out", "found", code=1)
         assert "Two recordings are named first" in twice.errors
 
 
@@ -384,7 +384,7 @@ class TestStopped:
         """Within 15 seconds. Without a budget, this takes about a minute with nothing beside it."""
         lifted_by_mujoco(tmp_path, "one", stretching=40.0)
         lifted_by_mujoco(tmp_path, "two", stretching=40.0, **OTHER)
-        words = ["identify", "one", "two", "--size", "0.40x0.30", "--mass", "0.25", "--out", "found", "--json"]
+        words = ["fit", "one", "two", "--size", "0.40x0.30", "--density", "0.25", "--out", "found", "--json"]
         words += ["--budget", "25s"] if by == "budget" else []
         began = time.monotonic()
         deaf = ["env", "--ignore-signal=INT"] if by == "budget" else []  # as a script starts it in the background
@@ -408,7 +408,7 @@ class TestScene:
         assert "0.400 x 0.300 m was stated" in invoke(*wrong, code=1).errors
         assert not Path("found/cloth.yaml").exists()
         assert not Path("found/recordings.yaml").exists()
-        _, cloth, _ = identify.find_scene([Path("recorded/first")], Path("found"), None, None)
+        _, cloth, _ = find_scene([Path("recorded/first")], Path("found"), None, None)
         assert cloth["size_m"] == pytest.approx(SIZE, abs=0.005)
 
     @pytest.mark.parametrize("sides", [(1.0, 1.0), (0.22, 0.18)])
@@ -420,7 +420,7 @@ class TestScene:
             table = np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)) * sides + (0.5, 0.0), np.full(count, 0.02)])
             write_ply(path, np.concatenate([read_cloud(path), table + 0.002 * rng.standard_normal(table.shape)]))
         with pytest.raises(EpisodeError, match=r"seem to hold the table.*Only points of the cloth.*Remove the table"):
-            identify.find_scene([folder], Path("found"), None if stated is None else sides, None)
+            find_scene([folder], Path("found"), None if stated is None else sides, None)
         assert not Path("found/cloth.yaml").exists()
 
 
@@ -458,7 +458,7 @@ OTHER = {"yaw": 0.44, "centre": (0.57, -0.05)}
 
 def towel_identified(folder, *recordings):
     with contextlib.chdir(folder):
-        return invoke("identify", *recordings, "--size", "0.40x0.30", "--mass", 0.25, "--out", "found").result
+        return invoke("fit", *recordings, "--size", "0.40x0.30", "--density", 0.25, "--out", "found").result
 
 
 @pytest.fixture(scope="module")
@@ -505,15 +505,15 @@ class TestTowelOfAnotherSimulator:
     def test_cut_above_all_that_lies_on_the_table(self, tmp_path):
         lifted_by_mujoco(tmp_path, "one", stretching=40.0, cut_m=0.015)
         with contextlib.chdir(tmp_path):
-            told = invoke("identify", "one", "--size", "0.40x0.30", "--out", "found", code=1).errors
+            told = invoke("fit", "one", "--size", "0.40x0.30", "--out", "found", code=1).errors
         assert "4 of 31 clouds are empty (frames 0, 1, 2, 3)" in told
 
 
 @pytest.mark.slow
 def test_how_long_it_takes_is_measured():
-    told = invoke("bench", "--identify", "--threads", 1)
+    told = study("bench", "--fit", "--threads", 1)
     assert told.result["threads"] == 1
-    assert told.result["identify_seconds"] > 0
+    assert told.result["fit_seconds"] > 0
 
 
 def test_results_are_plain_json(found):
@@ -524,11 +524,11 @@ def test_results_are_plain_json(found):
 
 @pytest.fixture
 def project(found, tmp_path):
-    """A copy of what was identified, where `diffcloud init` has been."""
+    """A copy of what was found, made a project."""
     shutil.copytree(found[0] / "found", tmp_path / "found")
     for page in ("params.yaml", "dvc.yaml"):
         (tmp_path / "found" / page).unlink(missing_ok=True)
-    invoke("init", tmp_path / "found")
+    make_project(tmp_path / "found")
     return tmp_path / "found"
 
 
@@ -542,50 +542,51 @@ def dvc(folder, *words):
 
 
 class TestProject:
-    """`diffcloud init` where `diffcloud identify` has been."""
+    """`diffcloud fit --dvc`."""
 
     @pytest.mark.slow
     def test_the_pipeline_comes_to_the_same_fit_and_runs_again_only_for_what_changed(self, project):
         before = read_fit(project / "fit.json")
         assert (
-            yaml.safe_load((project / "params.yaml").read_text())["identify"]["options"]
-            == "--parameters stretch --mass 0.25"
+            yaml.safe_load((project / "params.yaml").read_text())["fit"]["options"] == "--parameters stretch --density 0.25"
         )
-        dvc(project, "repro", "identify")
+        dvc(project, "repro", "fit")
         assert read_fit(project / "fit.json").fingerprint == before.fingerprint  # the finished fit was kept
-        assert "up to date" in dvc(project, "status", "identify")
+        assert "up to date" in dvc(project, "status", "fit")
         assert "stretch" in dvc(project, "metrics", "show")
         (project / "episodes" / "second.npz").rename(project / "elsewhere.npz")
-        assert "episodes" in dvc(project, "status", "identify")
-        dvc(project, "repro", "identify")
+        assert "episodes" in dvc(project, "status", "fit")
+        dvc(project, "repro", "fit")
         assert [one.name for one in read_fit(project / "fit.json").episodes] == ["first"]
-        assert "up to date" in dvc(project, "status", "identify")
+        assert "up to date" in dvc(project, "status", "fit")
 
     def test_its_stages_are_commands_that_exist(self, project):
         check_commands(yaml.safe_load((project / "dvc.yaml").read_text())["stages"])
 
     def test_dvc_knows_it_inside_of_a_repository_and_outside(self, project):
         told = dvc(project, "status")
-        assert "identify" in told
+        assert "fit" in told
         inner = project / "inner"
         shutil.copytree(project, inner, ignore=shutil.ignore_patterns(".dvc*", "*.yaml", "inner"))
         for name in ("cloth.yaml", "recordings.yaml"):
             shutil.copy(project / name, inner / name)
-        invoke("init", inner)
+        make_project(inner)
         assert not (inner / ".dvc").exists()  # the outer project's
 
     def test_nothing_is_written_over(self, project):
+        make_project(project)  # the same once more is no change
         (project / "params.yaml").write_text("mine: 1\n")
-        told = invoke("init", project, code=1).errors
-        assert "params.yaml is there already" in told
+        with pytest.raises(ConfigError, match=r"params\.yaml is there already"):
+            make_project(project)
         assert (project / "params.yaml").read_text() == "mine: 1\n"
 
-    def test_a_folder_where_identify_did_not_finish_is_refused(self, project, tmp_path):
-        told = invoke("init", tmp_path, code=1).errors
-        assert "lacks cloth.yaml, recordings.yaml, fit.json" in told
+    def test_a_folder_where_no_fit_has_finished_is_refused(self, project, tmp_path):
+        with pytest.raises(ConfigError, match=r"lacks cloth\.yaml, recordings\.yaml, fit\.json"):
+            make_project(tmp_path)
         for name in ("params.yaml", "dvc.yaml", "episodes/first.npz"):
             (project / name).unlink()
-        assert "lacks first" in invoke("init", project, code=1).errors
+        with pytest.raises(ConfigError, match="lacks first"):
+            make_project(project)
         assert not (project / "dvc.yaml").exists()
 
     @pytest.mark.parametrize(
@@ -601,14 +602,15 @@ class TestProject:
         for page in ("params.yaml", "dvc.yaml"):
             (project / page).unlink()
         (project / name).write_text(text)
-        assert told in invoke("init", project, code=1).errors
+        with pytest.raises(ConfigError, match=told):
+            make_project(project)
         assert not (project / "dvc.yaml").exists()
 
 
 @pytest.mark.parametrize("name", ["towel", "001", "2024-06-01", "on", "null", "a: b", "a # b", "'", "x" * 200])
 def test_a_recording_may_have_any_name(name):
     """Among the keys of recordings.yaml, where a number, a date or a word of YAML would be no name."""
-    assert yaml.safe_load(f"{identify._inline(name)}:\n  a: 1") == {name: {"a": 1}}
+    assert yaml.safe_load(f"{scene_files._inline(name)}:\n  a: 1") == {name: {"a": 1}}
 
 
 @pytest.mark.slow

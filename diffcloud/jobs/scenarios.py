@@ -1,13 +1,11 @@
-"""Options that choose a scenario, shared by several commands."""
+"""Scenarios by name: built-in ones, a person's own in raw/scenes, and those of fits."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from diffcloud.cli.console import warn
+from diffcloud.console import warn
 from diffcloud.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -16,16 +14,6 @@ if TYPE_CHECKING:
 
 OWN_SCENARIOS = Path("raw/scenes")
 """A person's own scenario files, found by name."""
-
-ScenarioName = Annotated[
-    str | None,
-    typer.Option(
-        "--scenario",
-        help="lift, fold, band_stretch, vest_hang, shake, recorded_lift, recorded_fold, release_lift, release_fold, "
-        f"release_hang, release_band, a YAML file, or the name of one in {OWN_SCENARIOS}.",
-    ),
-]
-SceneFile = Annotated[Path | None, typer.Option("--scene", help="ARCSim scene JSON.")]
 
 
 def choose_scenario(name: str | None, scene: Path | None = None) -> Scenario:
@@ -40,6 +28,19 @@ def choose_scenario(name: str | None, scene: Path | None = None) -> Scenario:
     return scenario
 
 
+def scene_named(source: str) -> Scenario:
+    """The scenario that the option --scene names: a built-in, a YAML file, one of raw/scenes, an ARCSim scene JSON, or
+    NAME=FILE.json for a published scenario with its scene file.
+
+    Raises:
+        ConfigError, SceneError: none of these, or a damaged file.
+    """
+    name, equals, file = source.partition("=")
+    if equals and file.endswith(".json") and not Path(source).exists():
+        return choose_scenario(name, Path(file))
+    return choose_scenario(None, Path(source)) if source.endswith(".json") else choose_scenario(source)
+
+
 def scenario_options(name: str) -> Options:
     """The fields of a built-in scenario, or of a person's own one, to vary.
 
@@ -52,7 +53,7 @@ def scenario_options(name: str) -> Options:
 
 
 def fitted_scenario(fit: Path, name: str) -> str:
-    """The scenario of a fit, by the name that the fit gives: the file that `diffcloud identify` wrote beside the fit, a
+    """The scenario of a fit, by the name that the fit gives: the file that `diffcloud fit` wrote beside the fit, a
     built-in or the person's own one of that name, or a file in the current folder.
 
     Args:
@@ -70,7 +71,18 @@ def fitted_scenario(fit: Path, name: str) -> str:
         return name
     if here.is_file():
         return str(here)
-    raise ConfigError(f"{fit} is a fit in the scenario {name}, which is not known here; give its YAML file by --scenario.")
+    raise ConfigError(
+        f"{fit} is a fit in the scenario {name}, which is not known here. Put its YAML file into {fit.parent}/scenarios/."
+    )
+
+
+def own_scene(source: str) -> Path | None:
+    """The YAML file that --scene names, by its path or as one of raw/scenes; None of a built-in or a scene JSON."""
+    from diffcloud.scene.scenarios import SCENARIO_NAMES
+
+    if source.endswith((".yaml", ".yml")):
+        return Path(source)
+    return _own(source) if source not in SCENARIO_NAMES and _own(source).is_file() else None
 
 
 def _own(name: str) -> Path:
@@ -81,14 +93,14 @@ def limits(scenario: Scenario) -> list[str]:
     """What the scene asks for and the contact model lacks, and whether its cloth is drawn to another scale."""
     from diffcloud.io.obj import STRETCHED, other_lengths
 
-    factor, told = other_lengths(scenario.scene.mesh)
-    doubts = [f"In the mesh of {scenario.name}, {told}"] if factor > STRETCHED else []
+    factor, lengths = other_lengths(scenario.scene.mesh)
+    told = [f"In the mesh of {scenario.name}, {lengths}"] if factor > STRETCHED else []
     surrounding = scenario.scene.surrounding
     meshes = [index for index, obstacle in enumerate(surrounding.obstacles) if obstacle.plane() is None]
     if not meshes or surrounding.reference_contact is not None or scenario.scene.integrator == "implicit":
-        return doubts
+        return told
     return [
-        *doubts,
+        *told,
         f"Obstacles {meshes} of {scenario.name} are not planar. Contact of this scene is simulated with planes only: the "
         "cloth passes through these, and results are valid until the first such contact.",
     ]

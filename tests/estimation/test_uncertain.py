@@ -10,11 +10,12 @@ import torch
 import yaml
 
 from diffcloud.errors import ConfigError, SceneError
-from diffcloud.estimation import FitSpace, LikelihoodSettings, Objective, fit_likelihood
-from diffcloud.estimation.doubts import MATERIAL_DOUBTS, parse_doubts, with_doubts
-from diffcloud.estimation.parameters import Variable
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace, Variable
 from diffcloud.estimation.residuals import Axis
 from diffcloud.estimation.settings import FitSettings
+from diffcloud.estimation.solvers import LikelihoodSettings, fit_likelihood
+from diffcloud.estimation.uncertain import MATERIAL_UNCERTAINTY, parse_uncertain, with_uncertain
 from diffcloud.scene.scenarios import load_scenario
 from tests.conftest import small_lift
 from tests.estimation.rates import check_rates
@@ -22,12 +23,12 @@ from tests.estimation.test_fit import GENTLE, clouds_of
 
 SCENARIO = small_lift(**{**GENTLE, "integrator": "implicit", "points": 800})
 ASKED = FitSpace.build(["stretch"], fixed={"mass": 1.7})
-BENT = with_doubts(ASKED, {"bending": 1.5}, [SCENARIO])
+BENT = with_uncertain(ASKED, {"bending": 1.5}, [SCENARIO])
 
 
 def test_option():
-    assert parse_doubts("none") == {}
-    assert parse_doubts("bending=1.5x, drag=2x") == {"bending": 1.5, "drag": 2.0}
+    assert parse_uncertain("none") == {}
+    assert parse_uncertain("bending=1.5x, drag=2x") == {"bending": 1.5, "drag": 2.0}
 
 
 @pytest.mark.parametrize(
@@ -45,7 +46,7 @@ def test_option():
 )
 def test_what_is_no_doubt_is_refused(text, message):
     with pytest.raises(ConfigError, match=message):
-        parse_doubts(text)
+        parse_uncertain(text)
 
 
 class TestSpace:
@@ -53,11 +54,11 @@ class TestSpace:
         assert BENT.names == ("stretch", "bending")
         assert BENT.asked.names == ("stretch",)
         assert BENT.asked.fixed == {"mass": 1.7, "bending": 1.0}
-        assert BENT.variables[1] == Variable("bending", 1.5**-4, 1.5**4, 1.5, 1.0, doubtful=True)
+        assert BENT.variables[1] == Variable("bending", 1.5**-4, 1.5**4, 1.5, 1.0, role="material")
 
     def test_it_is_about_what_is_given_or_else_the_scenarios(self):
         system, _ = SCENARIO.scene.build()
-        space = with_doubts(
+        space = with_uncertain(
             FitSpace.build(["stretch"], fixed={"bending": 2.0}), {"bending": 1.2, "friction_obstacle": 1.3}, [SCENARIO]
         )
         assert [variable.centre for variable in space.variables] == [
@@ -69,40 +70,40 @@ class TestSpace:
 
     def test_what_no_scene_has_is_no_doubt(self):
         dry = small_lift(**{**GENTLE, "friction_obstacle": 0.0})
-        assert with_doubts(ASKED, {"friction_obstacle": 1.3, "body_mass": 2.0}, [dry]) == ASKED
+        assert with_uncertain(ASKED, {"friction_obstacle": 1.3, "body_mass": 2.0}, [dry]) == ASKED
 
-    def test_compression_is_doubtful_only_where_the_cloth_gives_way_to_it(self):
+    def test_compression_is_uncertain_only_where_the_cloth_gives_way_to_it(self):
         wrinkling = small_lift(**{**GENTLE, "compression": 0.1})
-        assert with_doubts(ASKED, {"compression": 3.0}, [SCENARIO]) == ASKED
-        added = with_doubts(ASKED, {"compression": 3.0}, [wrinkling]).variables[1]
-        assert added == Variable("compression", 0.1 / 3.0**4, 1.0, 3.0, 0.1, doubtful=True)
+        assert with_uncertain(ASKED, {"compression": 3.0}, [SCENARIO]) == ASKED
+        added = with_uncertain(ASKED, {"compression": 3.0}, [wrinkling]).variables[1]
+        assert added == Variable("compression", 0.1 / 3.0**4, 1.0, 3.0, 0.1, role="material")
 
     def test_a_scenario_says_what_is_known_less_well(self):
         own, usual = (FitSettings().known_within([load_scenario(name)]) for name in ("recorded_lift", "lift"))
-        assert usual == MATERIAL_DOUBTS
-        assert own == {**MATERIAL_DOUBTS, "shear": 3.0, "bending": 3.0}
+        assert usual == MATERIAL_UNCERTAINTY
+        assert own == {**MATERIAL_UNCERTAINTY, "shear": 3.0, "bending": 3.0}
         assert "shear" not in FitSettings(parameters=["stretch", "shear"]).known_within([load_scenario("recorded_lift")])
-        assert FitSettings(doubts="none").known_within([load_scenario("recorded_lift")]) == {}
+        assert FitSettings(uncertain="none").known_within([load_scenario("recorded_lift")]) == {}
 
     @pytest.mark.parametrize(
-        ("doubts", "message"), [({"sheer": 3.0}, "parameter 'sheer'"), ({"shear": 0.5}, "greater than 1")]
+        ("uncertain", "message"), [({"sheer": 3.0}, "parameter 'sheer'"), ({"shear": 0.5}, "greater than 1")]
     )
-    def test_a_scenario_that_doubts_what_it_cannot(self, doubts, message, tmp_path):
+    def test_a_scenario_that_doubts_what_it_cannot(self, uncertain, message, tmp_path):
         path = tmp_path / "own.yaml"
-        path.write_text(yaml.safe_dump({"base": "lift", "doubts": doubts}))
+        path.write_text(yaml.safe_dump({"base": "lift", "uncertain": uncertain}))
         with pytest.raises(SceneError, match=message):
             load_scenario(path)
 
     def test_what_scenes_state_differently_is_left_to_each(self):
         other = small_lift(**{**GENTLE, "integrator": "implicit", "friction_obstacle": 0.9})
-        assert with_doubts(ASKED, {"friction_obstacle": 1.3}, [SCENARIO, other]) == ASKED
+        assert with_uncertain(ASKED, {"friction_obstacle": 1.3}, [SCENARIO, other]) == ASKED
 
     def test_what_is_fitted_is_no_doubt(self):
         with pytest.raises(ConfigError, match="stretch is fitted"):
-            with_doubts(ASKED, {"stretch": 1.3}, [SCENARIO])
+            with_uncertain(ASKED, {"stretch": 1.3}, [SCENARIO])
 
     def test_starts_spread_over_what_is_asked_for_and_over_what_is_known_of_the_rest(self):
-        laid = Variable("turn", -1.0, 1.0, deviation=0.2, centre=0.0, doubtful=True)
+        laid = Variable("turn", -1.0, 1.0, deviation=0.2, centre=0.0, role="initial_state")
         values = replace(BENT, variables=(*BENT.variables, laid)).starts(257, seed=3)[0]
         assert values[0, 1] == 1.0
         bending = values[1:, 1].log() / math.log(1.5)
@@ -126,7 +127,7 @@ def objective():
 
 
 def test_the_prior_is_about_what_is_known():
-    space = with_doubts(FitSpace.build(["stretch"], fixed={"bending": 2.0}), {"bending": 1.5}, [SCENARIO])
+    space = with_uncertain(FitSpace.build(["stretch"], fixed={"bending": 2.0}), {"bending": 1.5}, [SCENARIO])
     factor = space.prior_factor(torch.tensor([[7.0, 2.0], [1.0, 3.0], [1.0, 2 / 1.5**2]]).double(), 1)
     assert factor.log().tolist() == pytest.approx([0.0, 0.01, 0.04])
 
@@ -141,15 +142,18 @@ def test_a_stiffer_hinge_than_stated_does_not_bend_the_fit():
     objective = Objective(band, clouds_of(band, points=2000, stretch=3.0, mass=2.0, bending=1.8), nuisance={})
     asked = FitSpace.build(["stretch"], fixed={"mass": 2.0})
     settings = LikelihoodSettings(starts=1, model_error=False, init={"stretch": 2.5})
-    exact, doubted = (
-        fit_likelihood(objective, space, settings) for space in (asked, with_doubts(asked, {"bending": 1.5}, [band]))
+    exact, uncertain = (
+        fit_likelihood(objective, space, settings) for space in (asked, with_uncertain(asked, {"bending": 1.5}, [band]))
     )
-    off = [abs(math.log(found.values["stretch"] / 3.0)) for found in (exact, doubted)]
+    off = [abs(math.log(found.values["stretch"] / 3.0)) for found in (exact, uncertain)]
     assert off[0] > 0.1
     assert off[1] < 0.01
-    assert doubted.loss < 0.1 * exact.loss
-    assert doubted.values["bending"] == pytest.approx(1.8, rel=0.02)
+    assert uncertain.loss < 0.1 * exact.loss
+    assert uncertain.values["bending"] == pytest.approx(1.8, rel=0.02)
 
 
 def test_the_defaults_are_parameters():
-    assert parse_doubts(",".join(f"{name}={factor}x" for name, factor in MATERIAL_DOUBTS.items())) == MATERIAL_DOUBTS
+    assert (
+        parse_uncertain(",".join(f"{name}={factor}x" for name, factor in MATERIAL_UNCERTAINTY.items()))
+        == MATERIAL_UNCERTAINTY
+    )

@@ -1,4 +1,4 @@
-"""What every command shares: progress on standard error, one JSON object at the end of standard output."""
+"""The terminal: progress and messages on standard error, results on standard output, and the parts of options."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-import typer
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -53,31 +52,6 @@ output = _console(stderr=False)
 
 Item = TypeVar("Item")
 Command = TypeVar("Command", bound=Callable[..., Any])
-
-Topics = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--topic",
-        help="ROS: which topic to take where several could be: of depth, colour, camera_info, joint states or tf; "
-        "repeated. TOPIC#NUMBER takes one of several publishers of joint states on it.",
-    ),
-]
-JsonFlag = Annotated[bool, typer.Option("--json", help="End standard output with one JSON object.")]
-Threads = Annotated[
-    int | None,
-    typer.Option(min=1, max=1024, help="Threads that simulate; results are the same for any number. Default: all cores."),
-]
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        max=1024,
-        help="Processes, each with one thread; results are the same for any number. Default: one per core.",
-    ),
-]
-ParamsFile = Annotated[
-    Path | None, typer.Option("--params", help="YAML with a section for this stage; options given here win.")
-]
 
 
 def finish(result: dict[str, Any], as_json: bool) -> None:
@@ -233,25 +207,6 @@ def duration_s(text: str, option: str) -> float:
             f"Try {option} 10min."
         )
     return seconds
-
-
-def named_serials(items: list[str], option: str) -> dict[str, str]:
-    """["overhead=012345", ...] -> {"overhead": "012345"}."""
-    serials: dict[str, str] = {}
-    for item in items:
-        name, equals, serial = item.partition("=")
-        if not (name and equals and serial) or name in serials or serial in serials.values():
-            raise ConfigError(f"{option} takes NAME=SERIAL, each name and serial once, got {item!r}.")
-        serials[name] = serial
-    return serials
-
-
-def whole_numbers(text: str, option: str) -> tuple[int, int]:
-    """ "640x480" -> (640, 480)."""
-    first, _, second = text.partition("x")
-    if not (first.isdigit() and second.isdigit()):
-        raise ConfigError(f"{option} takes two whole numbers such as 640x480 or 5x7, got {text!r}.")
-    return int(first), int(second)
 
 
 def episode_files(paths: list[Path]) -> list[Path]:

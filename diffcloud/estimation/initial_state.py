@@ -2,7 +2,7 @@
 
 The pose (`estimation.pose`) moves cloth, gripper and bodies together, which is the same motion seen from elsewhere. A
 cloth that a hand has laid down 5° askew, or with a rim that stands up, moves in another way, and so does a larger one.
-So these are variables of the motion, like doubtful material (`estimation.doubts`): fitted under priors, and no property
+So these are variables of the motion, like uncertain material (`estimation.uncertain`): fitted under priors, and no property
 of the material. In a joint fit, each recording has its own, except for the size, which belongs to the cloth.
 
 The turn is about the cloth's middle. Its height over where the scene lays it is a sum of nine waves over the cloth,
@@ -42,8 +42,8 @@ _FARTHEST = 4.0
 """Bounds, in standard deviations."""
 
 
-def parse_laid(text: str) -> dict[str, float]:
-    """What `--laid` says -> name -> standard deviation of its prior [m, rad, 1], as of `parse_deviations`.
+def parse_initial_state(text: str) -> dict[str, float]:
+    """What `--initial-state` says -> name -> standard deviation of its prior [m, rad, 1], as of `parse_deviations`.
 
     Raises:
         ConfigError: an unknown name or unit, a unit of something else, what is no positive number, or a share that is too
@@ -58,7 +58,7 @@ def parse_laid(text: str) -> dict[str, float]:
     return found
 
 
-def with_laid(space: FitSpace, laid: Sequence[Mapping[str, float]], scenarios: Sequence[Scenario]) -> FitSpace:
+def with_initial_state(space: FitSpace, laid: Sequence[Mapping[str, float]], scenarios: Sequence[Scenario]) -> FitSpace:
     """The space with the variables appended.
 
     Args:
@@ -86,7 +86,7 @@ def with_laid(space: FitSpace, laid: Sequence[Mapping[str, float]], scenarios: S
 
 
 def variables_of(described: Sequence[Mapping[str, NuisanceValue]], *, length_unit_m: float) -> list[Variable]:
-    """Those that `described_laid` tells of.
+    """Those that `described_initial_state` tells of.
 
     Args:
         described: of each recording; other nuisance is passed over.
@@ -96,8 +96,10 @@ def variables_of(described: Sequence[Mapping[str, NuisanceValue]], *, length_uni
     """
     every = [{name: entry.prior for name, entry in one.items() if entry.of == "cloth"} for one in described]
     for name in (name for one in every for name in one):
-        if not is_laid(name):
-            raise ConfigError(unknown_name("variable of how a cloth lies", name, [*filter(is_laid, LAID), *_SHAPES]))
+        if not is_initial_state(name):
+            raise ConfigError(
+                unknown_name("variable of how a cloth lies", name, [*filter(is_initial_state, LAID), *_SHAPES])
+            )
     return _variables(every, length_unit_m=length_unit_m)
 
 
@@ -136,10 +138,12 @@ def _variable(name: str, deviation: float, length_unit_m: float) -> Variable:
         deviation: [m, rad, 1].
     """
     deviation /= length_unit_m if LAID[asked_as(name)] == "m" else 1.0
-    return Variable(name, -_FARTHEST * deviation, _FARTHEST * deviation, centre=0.0, doubtful=True, deviation=deviation)
+    return Variable(
+        name, -_FARTHEST * deviation, _FARTHEST * deviation, centre=0.0, role="initial_state", deviation=deviation
+    )
 
 
-def is_laid(name: str) -> bool:
+def is_initial_state(name: str) -> bool:
     """Whether a variable tells how a cloth lies."""
     plain = plain_name(name)
     return plain in _SHAPES or (plain in LAID and plain != "shape")
@@ -170,7 +174,7 @@ def laid_nodes(mesh: ClothMesh, values: Mapping[str, Tensor]) -> Tensor | None:
     Args:
         values: name -> [B], those of the material too.
     """
-    own = {name: value for name, value in values.items() if is_laid(name)}
+    own = {name: value for name, value in values.items() if is_initial_state(name)}
     if not own:
         return None
     nodes = torch.as_tensor(mesh.nodes, dtype=torch.float64)
@@ -196,7 +200,9 @@ def laid_nodes(mesh: ClothMesh, values: Mapping[str, Tensor]) -> Tensor | None:
     )
 
 
-def described_laid(space: FitSpace, values: Mapping[str, float], *, length_unit_m: float) -> dict[str, NuisanceValue]:
+def described_initial_state(
+    space: FitSpace, values: Mapping[str, float], *, length_unit_m: float
+) -> dict[str, NuisanceValue]:
     """Values as records keep them: name -> value and its prior, in SI."""
     found = {}
     for variable in space.variables:

@@ -11,12 +11,15 @@ import pytest
 import torch
 
 from diffcloud.errors import ConfigError
-from diffcloud.estimation import FitSpace, LikelihoodSettings, Objective, fit_likelihood, read_fit, write_fit
-from diffcloud.estimation.laid import laid_nodes, parse_laid, with_laid
+from diffcloud.estimation.initial_state import laid_nodes, parse_initial_state, with_initial_state
 from diffcloud.estimation.names import of_all, of_recording, without_recording
+from diffcloud.estimation.objective import Objective
+from diffcloud.estimation.parameters import FitSpace
+from diffcloud.estimation.record import read_fit
 from diffcloud.estimation.residuals import Axis
-from diffcloud.estimation.result import describe_fit
+from diffcloud.estimation.result import describe_fit, write_fit
 from diffcloud.estimation.settings import FitSettings
+from diffcloud.estimation.solvers import LikelihoodSettings, fit_likelihood
 from diffcloud.evaluation.methods import space_of
 from diffcloud.scene.scenarios import load_scenario, make_scenario
 from diffcloud.scene.scenarios.grid import LIFT
@@ -72,8 +75,8 @@ class TestNodes:
 
 class TestSpace:
     def test_option(self):
-        assert parse_laid("none") == {}
-        assert parse_laid("turn=5deg, shape=5mm") == {"turn": pytest.approx(math.radians(5)), "shape": 0.005}
+        assert parse_initial_state("none") == {}
+        assert parse_initial_state("turn=5deg, shape=5mm") == {"turn": pytest.approx(math.radians(5)), "shape": 0.005}
 
     @pytest.mark.parametrize(
         ("text", "message"),
@@ -91,14 +94,14 @@ class TestSpace:
     )
     def test_what_it_does_not_take(self, text, message):
         with pytest.raises(ConfigError, match=message):
-            parse_laid(text)
+            parse_initial_state(text)
 
     def test_a_cloth_that_hangs_does_not_lie(self):
         with pytest.raises(ConfigError, match="lies level at the start; that of vest_hang does not"):
-            with_laid(ASKED, [{"turn": 0.1}], [load_scenario("vest_hang")])
+            with_initial_state(ASKED, [{"turn": 0.1}], [load_scenario("vest_hang")])
 
     def test_each_recording_has_its_own_but_the_cloth_has_one_size(self):
-        space = with_laid(ASKED, [{"turn": 0.1, "size": 0.02}, {"turn": 0.2, "track": 0.01}], [SCENARIO, SCENARIO])
+        space = with_initial_state(ASKED, [{"turn": 0.1, "size": 0.02}, {"turn": 0.2, "track": 0.01}], [SCENARIO, SCENARIO])
         assert space.names == ("stretch", "size", "turn@0", "turn@1", "track@1")
         assert [one.deviation for one in space.variables[1:]] == [0.02, 0.1, 0.2, 0.01]
         second, places = space.of_recording(1)
@@ -121,17 +124,20 @@ class TestSpace:
         turn = {"turn": pytest.approx(math.radians(10))}
         said = {**turn, "shape": 0.01}
         assert recorded.laid == said
-        assert FitSettings().laid_within([recorded]) == [said]
-        assert FitSettings().laid_within([recorded, load_scenario("lift")]) == [said, turn]
-        assert FitSettings().laid_within([make_scenario(LIFT.model_copy(update={"laid_turn_deg": 0.0}))]) == [{}]
-        assert FitSettings().laid_within([load_scenario("vest_hang")]) == [{}]
-        assert FitSettings(paper=True, solver="adam").laid_within([recorded]) == [{}]
-        assert FitSettings(solver="cma_es").laid_within([recorded]) == [{}]
-        assert FitSettings(laid="none").laid_within([recorded]) == [{}]
-        assert FitSettings(laid="turn=5deg").laid_within([recorded] * 2) == [{"turn": pytest.approx(math.radians(5))}] * 2
+        assert FitSettings().initial_state_within([recorded]) == [said]
+        assert FitSettings().initial_state_within([recorded, load_scenario("lift")]) == [said, turn]
+        assert FitSettings().initial_state_within([make_scenario(LIFT.model_copy(update={"laid_turn_deg": 0.0}))]) == [{}]
+        assert FitSettings().initial_state_within([load_scenario("vest_hang")]) == [{}]
+        assert FitSettings(loss="paper", solver="adam").initial_state_within([recorded]) == [{}]
+        assert FitSettings(solver="cma_es").initial_state_within([recorded]) == [{}]
+        assert FitSettings(initial_state="none").initial_state_within([recorded]) == [{}]
+        assert (
+            FitSettings(initial_state="turn=5deg").initial_state_within([recorded] * 2)
+            == [{"turn": pytest.approx(math.radians(5))}] * 2
+        )
 
     def test_it_stands_behind_what_is_asked_for_in_the_scenes_unit(self):
-        space = with_laid(ASKED, [{"shape": 0.007, "turn": 0.1}], [replace(SCENARIO, length_unit_m=0.35)])
+        space = with_initial_state(ASKED, [{"shape": 0.007, "turn": 0.1}], [replace(SCENARIO, length_unit_m=0.35)])
         assert space.names[:2] == ("stretch", "turn")
         assert set(space.names[2:]) == WAVES
         assert space.asked.fixed == {"mass": 1.7, "turn": 0.0, **dict.fromkeys(WAVES, 0.0)}
@@ -139,7 +145,7 @@ class TestSpace:
         assert space.variables[1].low == pytest.approx(-0.4)
 
     def test_its_axis_counts_deviations_and_its_prior_is_normal(self):
-        space = with_laid(ASKED, [{"turn": 0.1}], [SCENARIO])
+        space = with_initial_state(ASKED, [{"turn": 0.1}], [SCENARIO])
         places = torch.tensor([[0.3, -2.0]], dtype=torch.float64)
         values = Axis.of(space).values(places)
         assert values.tolist() == [pytest.approx([math.exp(0.3), -0.2])]
@@ -152,7 +158,7 @@ def objective():
     return Objective(SCENARIO, clouds_of(SCENARIO, points=3000, stretch=0.6, mass=1.7, **LAID), nuisance={})
 
 
-SPACE = with_laid(ASKED, [{"turn": 0.1, "shape": 0.01}], [SCENARIO])
+SPACE = with_initial_state(ASKED, [{"turn": 0.1, "shape": 0.01}], [SCENARIO])
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +195,7 @@ def test_it_is_told_as_nuisance_and_read_back(objective, fits, tmp_path):
         flat = float(objective(column(**record.values)))
     assert again == pytest.approx(record.loss, rel=1e-9)
     assert flat > 5 * again
-    (lies,) = laid_nodes(SCENARIO.scene.mesh, column(**record.laid_in(record.episodes[0])))
+    (lies,) = laid_nodes(SCENARIO.scene.mesh, column(**record.initial_state_in(record.episodes[0])))
     np.testing.assert_allclose(result.motions[0].nodes[0], lies, atol=1e-15)
     for change, message in (({"unit": "s"}, "how a cloth lies is in m, rad or 1"), ({"of": "table"}, "cloth")):
         told = json.loads((tmp_path / "e.json").read_text())
@@ -204,7 +210,7 @@ def test_it_is_told_as_nuisance_and_read_back(objective, fits, tmp_path):
 
 
 def test_a_fit_may_begin_with_a_turn_to_the_other_side(objective):
-    settings = LikelihoodSettings(iterations=3, starts=1, model_error=False, init={"stretch": 1.0, "turn": -0.1})
+    settings = LikelihoodSettings(max_steps=3, starts=1, model_error=False, init={"stretch": 1.0, "turn": -0.1})
     outcome = fit_likelihood(objective, SPACE, settings)
     record = describe_fit(objective, SPACE, settings, outcome, episodes=["e"]).record
     assert record.start["turn"] == pytest.approx(-0.1)

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import psutil
 import pytest
 
-import diffcloud.cli.fork_server
-import diffcloud.cli.workers
-from diffcloud.cli.config import load_config
-from diffcloud.cli.fork_server import asked_workers
-from diffcloud.cli.workers import Tell, run_all
+import diffcloud.jobs.fork_server
+import diffcloud.jobs.pool
 from diffcloud.errors import ConfigError, DiffCloudError
+from diffcloud.jobs.fork_server import asked_workers
+from diffcloud.jobs.pool import Tell, run_all
+from diffcloud.jobs.settings import load_config
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def test_workers_end_with_a_process_that_is_killed(tmp_path):
     script.write_text(
         "import os, time\n"
         "from dataclasses import dataclass\n"
-        "from diffcloud.cli.workers import run_all\n"
+        "from diffcloud.jobs.pool import run_all\n"
         "@dataclass(frozen=True)\n"
         "class Endless:\n"
         "    label = 'endless'\n"
@@ -96,7 +96,7 @@ def test_workers_end_with_a_process_that_is_killed(tmp_path):
     ],
 )
 def test_the_server_of_workers_begins_where_the_command_line_asks_for_several(monkeypatch, arguments, count):
-    monkeypatch.setattr(diffcloud.cli.fork_server, "cores", lambda: 4)
+    monkeypatch.setattr(diffcloud.jobs.fork_server, "cores", lambda: 4)
     assert asked_workers(arguments) == count
 
 
@@ -107,11 +107,11 @@ def test_workers_have_imported_what_their_command_needs_and_no_interrupt_reaches
     script.write_text(
         "import sys, signal\n"
         "from concurrent.futures import ProcessPoolExecutor\n"
-        "from diffcloud.cli.fork_server import begin_importing, worker_context\n"
+        "from diffcloud.jobs.fork_server import begin_importing, worker_context\n"
         "def told():\n"
-        "    return 'diffcloud.cli.fit' in sys.modules, signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])\n"
+        "    return 'diffcloud.jobs.fits' in sys.modules, signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])\n"
         "if __name__ == '__main__':\n"
-        "    begin_importing('diffcloud.cli.fit', ['fit', '--workers', '2'])\n"
+        "    begin_importing('diffcloud.jobs.fits', ['fit', '--workers', '2'])\n"
         "    with ProcessPoolExecutor(1, mp_context=worker_context()) as pool:\n"
         "        print(*pool.submit(told).result(), signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))\n"
     )
@@ -122,7 +122,7 @@ def test_workers_have_imported_what_their_command_needs_and_no_interrupt_reaches
 def test_by_default_there_is_a_worker_for_each_core(monkeypatch):
     """A process of its own each, as the machine has cores; with one core, this process."""
     for count in (1, 3):
-        monkeypatch.setattr(diffcloud.cli.workers, "cores", lambda count=count: count)
+        monkeypatch.setattr(diffcloud.jobs.pool, "cores", lambda count=count: count)
         found = {pid for _, pid, _ in run_all("processes", [Process(seconds=0.3) for _ in range(6)], None)}
         assert (found == {os.getpid()}) == (count == 1)
         assert len(found) <= count

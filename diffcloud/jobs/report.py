@@ -1,27 +1,25 @@
-"""`diffcloud report`: one self-contained page about all fits."""
+"""The pipeline's page about all fits, in one file."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 
 import diffcloud
 from diffcloud.arcsim.release import RELEASE
-from diffcloud.cli.config import load_config
-from diffcloud.cli.console import JsonFlag, ParamsFile, errors, finish, writes
-from diffcloud.cli.fit_jobs import fit_file
-from diffcloud.cli.scenario_options import choose_scenario, fitted_scenario
 from diffcloud.errors import ConfigError
-from diffcloud.estimation import read_fit
+from diffcloud.estimation.record import read_fit
 from diffcloud.estimation.result import read_motion
 from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, check_file
 from diffcloud.evaluation.summary import tables as comparison_tables
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import read_json, together, write_bytes, write_text
 from diffcloud.io.tables import read_csv
+from diffcloud.jobs.fits import fit_file
+from diffcloud.jobs.scenarios import choose_scenario, fitted_scenario
+from diffcloud.jobs.settings import Config
 from diffcloud.report import (
     ComparisonEntry,
     EpisodeEntry,
@@ -32,23 +30,27 @@ from diffcloud.report import (
 )
 
 
-@writes(".html")
-def report(
-    out: Annotated[Path, typer.Option(help="HTML file.")] = Path("reports/index.html"),
-    fits: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.json and .npz.")] = Path("data/fits"),
-    episodes: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.npz.")] = Path("data/episodes"),
-    regressors: Annotated[Path, typer.Option(help="Folder with <scenario>/<model>/training.json; may lack any.")] = Path(
-        "data/regressors"
-    ),
-    tables: Annotated[Path, typer.Option(help="Folder written by `diffcloud evaluate`.")] = Path("reports/tables"),
-    params: ParamsFile = None,
-    json: JsonFlag = False,
-) -> None:
-    """Write the report page."""
-    config = load_config(params)
+def write_report(
+    out: Path, config: Config, params: Path | None, *, fits: Path, episodes: Path, regressors: Path, tables: Path
+) -> tuple[int, int]:
+    """Write the page, and its figures beside it.
+
+    Args:
+        params: the file of the settings, which the page names.
+        fits: folder with <scenario>/<episode>.json and .npz.
+        episodes: folder with <scenario>/<episode>.npz.
+        regressors: folder with <scenario>/<model>/training.json; may lack any.
+        tables: what the stage `evaluate` has written.
+
+    Returns:
+        Numbers of episodes and of bytes.
+
+    Raises:
+        ConfigError, EpisodeError: a table, a fit or an episode that is missing or damaged.
+    """
     table = tables / "fits.csv"
     if not table.is_file():
-        raise ConfigError(f"No such table: {table}; run `diffcloud evaluate` first.")
+        raise ConfigError(f"No such table: {table}; run `python -m pipeline.evaluate` first.")
     entries: list[EpisodeEntry] = []
     loss_frames: dict[str, tuple[int, ...]] = {}
     rows = table_rows(table)
@@ -81,7 +83,7 @@ def report(
         for path in sorted((regressors / name).glob("*/training.json"))
     ]
     environment = {
-        "commands": "diffcloud episodes, preprocess, simulate, fit, train, evaluate, report (dvc.yaml)",
+        "commands": "dvc repro: episodes, preprocess, simulate, fit, train, evaluate, report (dvc.yaml)",
         "parameters": "params.yaml" if params is None else str(params),
         "seed of the fits": str(config.fit.seed),
         "seed of the comparison": str(config.evaluate.seed),
@@ -104,8 +106,7 @@ def report(
             write_text(out.parent / "figures" / f"{figure.name}.svg", figure.svg)
             write_bytes(out.parent / "figures" / f"{figure.name}.png", figure.png)
         write_text(out, page)
-    errors.print(f"Wrote {out} ({len(page) / 1e6:.1f} MB).")
-    finish({"out": str(out), "episodes": len(entries), "bytes": len(page.encode())}, json)
+    return len(entries), len(page.encode())
 
 
 def _loss_frames(fit: Path, scenario: str) -> tuple[int, ...]:
@@ -116,7 +117,7 @@ def _loss_frames(fit: Path, scenario: str) -> tuple[int, ...]:
 
 
 def _comparison(folder: Path, entries: list[EpisodeEntry]) -> ComparisonEntry:
-    """What `diffcloud evaluate` has left, with its figures.
+    """What the stage `evaluate` has left, with its figures.
 
     Raises:
         ConfigError: it has left nothing, or something else.
@@ -133,7 +134,7 @@ def _comparison(folder: Path, entries: list[EpisodeEntry]) -> ComparisonEntry:
 
 
 def _pictures(folder: Path, name: str) -> dict[str, bytes]:
-    """Of a raw episode, as `diffcloud preprocess` left them; none of other episodes."""
+    """Of a raw episode, as the stage `preprocess` left them; none of other episodes."""
     kinds = {"mask": "masked (red) and kept as cloth (green)", "cloud": "merged cloud from above, along y and along x"}
     files = {caption: folder / f"{name}.{kind}.png" for kind, caption in kinds.items()}
     return {caption: path.read_bytes() for caption, path in files.items() if path.is_file()}

@@ -16,15 +16,16 @@ import yaml
 from typer.testing import CliRunner
 
 from diffcloud.cli.app import app
-from diffcloud.datasets import CHUNK, simulation
+from diffcloud.datasets import CHUNK
 from diffcloud.errors import DiffCloudError
 from diffcloud.io.simulated import SimulatedSet
+from diffcloud.jobs import cluster
 from diffcloud.regressors.dataset import Augmentation, CloudDataset
 from tests.cli.invoke import DIFFCLOUD, ROOT, environment, run_process
 from tests.cli.test_commands import SMALL
 from tests.datasets.test_simulation import contents
 
-SET = ("simulate", "--scenario", "small.yaml", "--train", 2 * CHUNK + 8, "--test", 18)
+SET = ("network", "generate", "--scene", "small.yaml", "--train", 2 * CHUNK + 8, "--test", 18)
 """Four chunks."""
 
 
@@ -90,13 +91,19 @@ def test_ctrl_c_says_how_to_go_on(work):
 
 
 def test_settings_come_from_the_parameter_file_and_options_win(work):
-    section = {"train": 2, "test": 5, "draws": "sobol", "parameters": ["mass", "bending"], "scenarios": ["small.yaml"]}
+    section = {
+        "train": 2,
+        "test": 5,
+        "distribution": "sobol",
+        "parameters": ["mass", "bending"],
+        "scenarios": ["small.yaml"],
+    }
     (work / "params.yaml").write_text(yaml.safe_dump({"simulate": section}))
     done = run_process(
-        "simulate", "--params", "params.yaml", "--scenario", "small.yaml", "--test", 0, "--export-clouds",
-        "--doubts", "drag=1.3x", "--out", "few", cwd=work,
+        "network", "generate", "--params", "params.yaml", "--scene", "small.yaml", "--test", 0, "--export-clouds",
+        "--uncertain", "drag=1.3x", "--out", "few", cwd=work,
     )  # fmt: skip
-    assert json.loads((work / "few" / "set.json").read_text())["doubts"] == {"drag": 1.3}
+    assert json.loads((work / "few" / "set.json").read_text())["uncertain"] == {"drag": 1.3}
     assert {key: done[key] for key in ("train", "test", "draws", "parameters")} == {
         "train": 2, "test": 0, "draws": "sobol", "parameters": ["mass", "bending"],
     }  # fmt: skip
@@ -108,10 +115,10 @@ def test_settings_come_from_the_parameter_file_and_options_win(work):
     ("arguments", "message"),
     [
         (("--parameters", "weight"), "Unknown parameter 'weight'"),
-        (("--draws", "gauss"), "draws: Input should be 'uniform', 'sobol', 'logarithmic' or 'modes'"),
-        (("--draws", "modes"), "not for 'small'"),
-        (("--doubts", "stretch=1.5x"), "leave out stretch"),
-        (("--doubts", "drag=0.5x"), "drag takes the factor within which it is known"),
+        (("--distribution", "gauss"), "distribution: Input should be 'uniform', 'sobol', 'logarithmic' or 'modes'"),
+        (("--distribution", "modes"), "not for 'small'"),
+        (("--uncertain", "stretch=1.5x"), "leave out stretch"),
+        (("--uncertain", "drag=0.5x"), "drag takes the factor within which it is known"),
         (("--train", "-1"), "train: "),
         (("--train", "0", "--test", "0"), "at least one run"),
         (("--out", "."), "holds something else than a simulated set"),
@@ -120,8 +127,8 @@ def test_settings_come_from_the_parameter_file_and_options_win(work):
 )
 def test_bad_input(work, monkeypatch, arguments, message):
     monkeypatch.chdir(work)
-    monkeypatch.setattr(simulation, "_ANSWER_S", 0.5)
-    started = ["simulate", "--scenario", "small.yaml", "--train", "2", "--out", "bad", *arguments]
+    monkeypatch.setattr(cluster, "_ANSWER_S", 0.5)
+    started = ["network", "generate", "--scene", "small.yaml", "--train", "2", "--out", "bad", *arguments]
     done = CliRunner().invoke(app, started)
     assert isinstance(done.exception, DiffCloudError)
     assert message in str(done.exception)

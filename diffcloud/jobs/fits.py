@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
 
-from diffcloud.cli.console import assignments, episode_files, errors, told_progress
-from diffcloud.cli.scenario_options import choose_scenario
-from diffcloud.cli.workers import Tell, check_interrupt
+from diffcloud.console import episode_files, errors, told_progress, warn
 from diffcloud.errors import ConfigError
-from diffcloud.estimation import Progress, read_fit, write_fit
-from diffcloud.estimation.record import FitRecord
-from diffcloud.estimation.result import FitResult
+from diffcloud.estimation.record import FitRecord, read_fit
+from diffcloud.estimation.result import FitResult, write_fit
 from diffcloud.estimation.settings import FitSettings
+from diffcloud.estimation.solvers import Progress
 from diffcloud.estimation.task import FitTask, Recording
 from diffcloud.io.episodes import read_episode
-from diffcloud.io.files import read_yaml
+from diffcloud.io.files import files_in, folders_in
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
 from diffcloud.io.timings import timings_path
+from diffcloud.jobs.ctrl_c import none_lost
+from diffcloud.jobs.pool import Tell, check_interrupt, run_all
+from diffcloud.jobs.scenarios import choose_scenario
 from diffcloud.scene.scenarios import Scenario
 
 JOINT = "joint"
 """Name of the fit of one parameter set to all recordings."""
 _CODE = ("mesh", "io", "sim", "scene", "clouds", "estimation")
 """Packages whose source decides the numbers of a fit."""
-_MOST_RECORDINGS = 1000
+_MOST_JOINT = 100
+"""Recordings of a joint fit, each of whose steps simulates all of them."""
 
 
 def fit_file(fits: Path, scenario: str, name: str) -> Path:
@@ -40,59 +42,6 @@ def joint_fit(fits: Path) -> list[Path]:
     """The JSON of a joint fit over all scenarios, if there is one."""
     path = fits / f"{JOINT}.json"
     return [path] if path.is_file() else []
-
-
-def stated_recordings(arguments: Sequence[Path]) -> list[tuple[str, Path]] | None:
-    """(scenario, episode file or folder) of arguments SCENARIO=PATH, or of a YAML file that maps scenarios to such paths;
-    None if they are neither.
-
-    Raises:
-        ConfigError: some are and others are not, or the file is no such list.
-    """
-    if len(arguments) == 1 and arguments[0].suffix in (".yaml", ".yml"):
-        return _listed(arguments[0])
-    if all(argument.exists() for argument in arguments):  # an equals sign may be a part of a name
-        return None
-    pairs = [str(argument).partition("=") for argument in arguments]
-    if not any(equals for _, equals, _ in pairs):
-        return None
-    if not all(scenario and equals and path for scenario, equals, path in pairs):
-        raise ConfigError("Give each episode its scenario, as in lift=a.npz fold=b.npz, or none and --scenario.")
-    return [(scenario, Path(path)) for scenario, _, path in pairs]
-
-
-def _listed(path: Path) -> list[tuple[str, Path]]:
-    told, found = read_yaml(path, error=ConfigError), []
-    for scenario, files in told.items() if isinstance(told, dict) else ():
-        for file in files if isinstance(files, list) else [files]:
-            if not (isinstance(file, str) and file):
-                raise ConfigError(
-                    f"{path}: {scenario} takes the path of an episode or of a folder of them, or a list of such paths, "
-                    f"got {files!r}."
-                )
-            found.append((str(scenario), path.parent / file))
-    if not 0 < len(found) <= _MOST_RECORDINGS:
-        raise ConfigError(
-            f"{path} lists {len(found)} episodes or folders; it takes 1 to {_MOST_RECORDINGS}, by scenario: "
-            "`lift: [a.npz, b.npz]`."
-        )
-    return found
-
-
-def read_recordings(pairs: Sequence[tuple[str, Path]]) -> list[Recording]:
-    """
-    Args:
-        pairs: scenario, and an episode file, or a folder that stands for every episode in it.
-
-    Raises:
-        ConfigError, EpisodeError: an unknown scenario, a folder without episodes, a damaged episode, or two of one name in
-            a scenario.
-    """
-    scenarios = {name: choose_scenario(name) for name in dict.fromkeys(name for name, _ in pairs)}
-    files = [(name, file) for name, path in pairs for file in episode_files([path])]
-    for name in scenarios:
-        episode_files([file for one, file in files if one == name])
-    return [Recording(scenarios[name], file.stem, read_episode(file)) for name, file in told_progress("reading", files)]
 
 
 @dataclass(frozen=True)
@@ -177,7 +126,8 @@ class FitJob:
 
     @cached_property
     def _fingerprint(self) -> str:
-        settings = self.settings.model_dump(exclude={"joint"})  # which the name and the recordings tell
+        # the name and the recordings tell whether it is joint; level and factor are of what is said of it
+        settings = self.settings.model_dump(exclude={"joint", "level", "identified_factor"})
         resolved = [
             self.task.space,
             self.task.solver_settings,
@@ -185,23 +135,70 @@ class FitJob:
         return fingerprint([self.name, self.recordings, settings, resolved], packages=_CODE)
 
 
-def first_start(init: str, job: FitJob) -> dict[str, float]:
-    """Values of the first start by name; recordings of a joint fit give the mean of their predictions.
+def fit_all(
+    episodes: Path,
+    out: Path,
+    scenarios: Sequence[str],
+    settings: FitSettings,
+    workers: int | None,
+    scheduler: str | None = None,
+) -> Iterator[tuple[FitJob, FitRecord | None, str | None]]:
+    """Fit every episode, or all together if the settings say so. Finished fits are kept; fits of episodes that are gone are
+    removed.
+
+    Args:
+        episodes: folder of <scenario>/<episode>.npz.
+        out: folder for <scenario>/<episode>.json and .npz, or joint.json and joint.npz.
+
+    Yields:
+        Fit, its record, and the message of its error; after Ctrl-C, what is known of the rest.
 
     Raises:
-        ConfigError: a value of what is not fitted, or outside of its bounds.
+        ConfigError, EpisodeError: no episodes, or a damaged one; before anything is fitted.
+        KeyboardInterrupt: Ctrl-C; the best so far of each is written.
     """
-    if init == "middle":
-        return {}
-    if "=" in init:
-        stated = assignments(init.split(","), "--init")
-        job.task.space.check_start(stated)
-        return stated
-    # imported here: the fits of the pipeline start elsewhere, and must not be stale when a regressor changes
-    from diffcloud.cli.predict import predicted_start
+    jobs = _jobs(episodes, out, scenarios, settings)
+    # stated before, so that what an interrupted call leaves is known too
+    write_manifest(out, read_manifest(out) | {path.relative_to(out).as_posix() for job in jobs for path in job.files})
+    done, failed = set[str](), False
+    try:
+        with none_lost():
+            for job, record, error in run_all("fit", jobs, workers, patient=True, scheduler=scheduler):
+                done.add(job.label)
+                failed = failed or error is not None
+                yield job, record, error
+    except KeyboardInterrupt:
+        for job in jobs:
+            if job.label not in done and (best := job.known()) is not None:
+                yield job, best, None
+        raise
+    if not failed:
+        remove_stale(out, jobs)
 
-    found = [predicted_start(init, one.scenario.name, one.episode) for one in job.recordings]
-    return job.task.space.nearest({name: sum(values[name] for values in found) / len(found) for name in found[0]})
+
+def _jobs(episodes: Path, out: Path, scenarios: Sequence[str], settings: FitSettings) -> list[FitJob]:
+    there = [name for name in scenarios if files_in(episodes / name, ".npz")]
+    if not there:
+        raise ConfigError(
+            f"{episodes} holds no episodes of {', '.join(scenarios)}. They lie in <scenario>/<episode>.npz; run "
+            "`python -m pipeline.preprocess` first."
+        )
+    if missing := [name for name in scenarios if name not in there]:
+        errors.print(f"{episodes} has no episodes of {', '.join(missing)}.", soft_wrap=True)
+    if more := [one.name for one in folders_in(episodes) if one.name not in scenarios and files_in(one, ".npz")]:
+        warn(f"{episodes} also has episodes of {', '.join(more)}. They are not fitted: list them under `scenarios`.")
+    chosen = {name: choose_scenario(name) for name in there}
+    files = [(name, file) for name in there for file in episode_files([episodes / name])]
+    members = [Recording(chosen[name], file.stem, read_episode(file)) for name, file in told_progress("reading", files)]
+    if settings.joint and len(members) > _MOST_JOINT:
+        raise ConfigError(f"A joint fit takes {_MOST_JOINT} episodes at most, got {len(members)}. Choose a part of them.")
+    jobs = [FitJob(JOINT, members, settings, out)] if settings.joint else []
+    if not settings.joint:
+        jobs = [FitJob(one.name, [one], settings, out / name) for (name, _), one in zip(files, members, strict=True)]
+    # everything is read before anything is fitted: a damaged last file must not cost the first ones' time
+    for job in told_progress("checking", jobs):
+        job.task.check()
+    return jobs
 
 
 def remove_stale(out: Path, jobs: Sequence[FitJob]) -> None:

@@ -1,4 +1,4 @@
-"""`diffcloud init`: what `diffcloud identify` wrote becomes a project of DVC, in place."""
+"""What `diffcloud fit` wrote becomes a project of DVC, in place."""
 
 from __future__ import annotations
 
@@ -6,22 +6,20 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from diffcloud.cli.console import JsonFlag, errors, finish
+from diffcloud.console import errors
 from diffcloud.errors import ConfigError
-from diffcloud.estimation import FitRecord, read_fit
-from diffcloud.evaluation.intervals import LEVEL, WITHIN, read_intervals
+from diffcloud.estimation.record import FitRecord, read_fit
+from diffcloud.estimation.settings import LEVEL
+from diffcloud.evaluation.intervals import read_intervals
 from diffcloud.evaluation.methods import space_of
 from diffcloud.io.files import files_in, read_yaml, together, write_text
 from diffcloud.io.timings import NAME
 
 _PARAMS = """\
 # Settings for the stages of dvc.yaml. A stage runs again when its section or a file that it reads has changed.
-identify:
-  options: {options}  # all of `diffcloud identify --help` but --out
+fit:
+  options: {options}  # all of `diffcloud fit --help` but --out
 export:
   to: mujoco  # newton, isaac, arcsim or obj
 """
@@ -29,9 +27,9 @@ _DVC = """\
 # episodes/ -> fit.json, intervals.json, report.html -> exported/
 # A new recording of the cloth is one more file in episodes/.
 stages:
-  identify:
-    cmd: diffcloud identify ${identify.options} --out . episodes/*.npz
-    params: [identify]
+  fit:
+    cmd: diffcloud fit ${fit.options} --out . episodes/*.npz
+    params: [fit]
     deps: [episodes, cloth.yaml, recordings.yaml]
     metrics:
       - intervals.json:
@@ -55,18 +53,18 @@ stages:
 """
 
 
-def init(
-    folder: Annotated[Path, typer.Argument(help="What `diffcloud identify` wrote (its --out).")],
-    json: JsonFlag = False,
-) -> None:
-    """Make a DVC project of what `diffcloud identify` wrote: dvc.yaml and params.yaml beside its files, which stay."""
+def make_project(folder: Path) -> None:
+    """Write dvc.yaml and params.yaml beside the files of a fit, which stay.
+
+    Raises:
+        ConfigError: the folder is a project, the fit did not finish there, or DVC refuses.
+    """
     record = _identified(folder)
     pages = {"params.yaml": _PARAMS.format(options=_options(folder, record)), "dvc.yaml": _DVC}
-    for name in pages:
-        if (folder / name).exists():
-            raise ConfigError(
-                f"{folder / name} is there already: this folder is a project. Remove it to have it written anew."
-            )
+    for name, text in pages.items():
+        path = folder / name
+        if path.exists() and path.read_text(encoding="utf-8") != text:
+            raise ConfigError(f"{path} is there already: this folder is a project. Remove it to have it written anew.")
     if _above(folder, ".dvc") is None:
         _start_dvc(folder)
     ignored = folder / ".dvcignore"
@@ -77,7 +75,6 @@ def init(
         for name, text in pages.items():
             write_text(folder / name, text)
     errors.print(f"Wrote {folder / 'dvc.yaml'}, {folder / 'params.yaml'}. Next: cd {shlex.quote(str(folder))} && dvc repro")
-    finish({"files": [str(folder / name) for name in pages]}, json)
 
 
 def _above(folder: Path, name: str) -> Path | None:
@@ -100,7 +97,7 @@ def _start_dvc(folder: Path) -> None:
 
 
 def _identified(folder: Path) -> FitRecord:
-    """The fit that `diffcloud identify` left there.
+    """The fit that `diffcloud fit` left there.
 
     Raises:
         ConfigError: it did not finish there, or a recording is no longer there.
@@ -108,20 +105,20 @@ def _identified(folder: Path) -> FitRecord:
     needed = ["cloth.yaml", "recordings.yaml", "fit.json", "fit.npz", "intervals.json", "report.html"]
     if missing := [name for name in needed if not (folder / name).is_file()]:
         raise ConfigError(
-            f"{folder} lacks {', '.join(missing)}, which `diffcloud identify` writes. Run "
-            f"`diffcloud identify RECORDING --out {shlex.quote(str(folder))}` first."
+            f"{folder} lacks {', '.join(missing)}, which `diffcloud fit` writes. Run "
+            f"`diffcloud fit RECORDING --out {shlex.quote(str(folder))}` first."
         )
     record = read_fit(folder / "fit.json")
     there = {path.stem for path in files_in(folder / "episodes", ".npz")}
     if gone := [one.name for one in record.episodes if one.name not in there]:
         raise ConfigError(
-            f"{folder / 'episodes'} lacks {', '.join(gone)}, recordings of the fit; run `diffcloud identify` again."
+            f"{folder / 'episodes'} lacks {', '.join(gone)}, recordings of the fit; run `diffcloud fit` again."
         )
     return record
 
 
 def _options(folder: Path, record: FitRecord) -> str:
-    """Options with which `diffcloud identify` arrives at the same fit."""
+    """Options with which `diffcloud fit` arrives at the same fit."""
     options = ["--parameters", ",".join(record.fitted)]
     if (mass := record.parameters.get("mass")) is not None and mass.fixed:
         try:
@@ -129,11 +126,10 @@ def _options(folder: Path, record: FitRecord) -> str:
         except (KeyError, TypeError, ValueError) as error:
             raise ConfigError(
                 f"{folder / 'cloth.yaml'} has no material.density_kg_m2, by which the fitted mass was weighed; "
-                "run `diffcloud identify` again."
+                "run `diffcloud fit` again."
             ) from error
-        options += ["--mass", f"{mass.value * density:.12g}"]
+        options += ["--density", f"{mass.value * density:.12g}"]
     told = read_intervals(folder / "intervals.json", space_of(record).asked)
-    for name, value, usual in (("level", told.level, LEVEL), ("within", told.within, WITHIN)):
-        if value != usual:
-            options += [f"--{name}", f"{value:g}"]
+    if told.level != LEVEL:
+        options += ["--level", f"{told.level:g}"]
     return shlex.join(options)

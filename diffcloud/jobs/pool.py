@@ -16,12 +16,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol, TypeVar
 
-from diffcloud.cli import ctrl_c
-from diffcloud.cli.console import progress_bar
-from diffcloud.cli.fork_server import worker_context
-from diffcloud.cli.lazy import imports
-from diffcloud.cli.memory import keep_freed_memory
+from diffcloud.console import progress_bar
 from diffcloud.errors import DiffCloudError
+from diffcloud.jobs import ctrl_c
+from diffcloud.jobs.cluster import results_in_order, scheduler_client
+from diffcloud.jobs.fork_server import worker_context
+from diffcloud.jobs.memory import imports, keep_freed_memory
 from diffcloud.sim.threads import cores, use_threads
 
 Tell = Callable[[float, str], None]
@@ -49,20 +49,30 @@ AnyJob = TypeVar("AnyJob", bound=Job)
 
 
 def run_all(
-    title: str, jobs: Sequence[AnyJob], workers: int | None, *, patient: bool = False
+    title: str, jobs: Sequence[AnyJob], workers: int | None, *, patient: bool = False, scheduler: str | None = None
 ) -> Iterator[tuple[AnyJob, Any, str | None]]:
     """(job, what it gave, message of its error) in the order of the jobs.
 
     Args:
         workers: processes, each with one thread; 1: this one; None: one per core.
+        scheduler: address of a Dask scheduler, whose workers run the jobs instead and see the same folders.
         patient: after Ctrl-C, wait for running jobs, which look at `check_interrupt`; else their processes end at once.
 
     Raises:
-        DiffCloudError: a process died.
+        ConfigError: no scheduler answers.
+        DiffCloudError: a process died, or the scheduler did.
         KeyboardInterrupt: Ctrl-C.
     """
     workers = cores() if workers is None else workers
     with progress_bar(title, len(jobs)) as update:
+        if scheduler is not None and jobs:
+            with scheduler_client(scheduler) as client:
+                for index, (job, found) in enumerate(
+                    zip(jobs, results_in_order(client, _attempt_there, jobs), strict=True)
+                ):
+                    update(index + 1, job.label)
+                    yield (job, *found)
+            return
         if workers == 1 or len(jobs) < 2:
             _one_thread()
             for index, job in enumerate(jobs):
@@ -110,6 +120,13 @@ def _attempt(job: Job, tell: Tell = lambda done, text: None) -> tuple[Any, str |
         return job.run(tell), None
     except DiffCloudError as error:
         return None, str(error)
+
+
+def _attempt_there(job: Job) -> tuple[Any, str | None]:
+    """Of a worker of Dask's."""
+    _one_thread()
+    use_threads(1)
+    return _attempt(job)
 
 
 def _stored(job: Job, path: Path) -> Path:

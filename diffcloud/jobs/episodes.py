@@ -1,4 +1,4 @@
-"""`diffcloud episodes`: the first stage. Makes synthetic recordings; a person's own lie in raw/."""
+"""Synthetic recordings of every scenario; a person's own lie in raw/."""
 
 from __future__ import annotations
 
@@ -6,22 +6,21 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
-import typer
 from numpy.typing import NDArray
 
-from diffcloud.cli.config import EpisodesConfig, load_config
-from diffcloud.cli.console import JsonFlag, ParamsFile, Workers, errors, finish, writes
-from diffcloud.cli.scenario_options import choose_scenario
-from diffcloud.cli.workers import Tell, run_all
+from diffcloud.console import errors
 from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.io.episodes import write_episode
 from diffcloud.io.files import staged
 from diffcloud.io.manifests import remove_files, write_manifest
 from diffcloud.io.raw_episodes import raw_episode_files, read_description
+from diffcloud.jobs.pool import Tell, run_all
+from diffcloud.jobs.scenarios import choose_scenario
+from diffcloud.jobs.settings import Config, EpisodesConfig
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.depth_camera import DepthNoise, published_cameras
 from diffcloud.sensing.recorder import ClothMotion, record
@@ -33,27 +32,24 @@ from diffcloud.sim.system import System
 _HIDDEN = ("stretch", "mass")
 
 
-@writes()
-def episodes(
-    out: Annotated[Path, typer.Option(help="Folder; episodes go to OUT/<scenario>/<episode>, raw or .npz.")],
-    params: ParamsFile = None,
-    workers: Workers = None,
-    json: JsonFlag = False,
-) -> None:
-    """Make synthetic recordings of every scenario."""
-    config = load_config(params)
+def make_episodes(config: Config, out: Path, workers: int | None, scheduler: str | None = None) -> dict[str, list[str]]:
+    """Make the recordings in OUT/<scenario>/<episode>, raw or .npz.
+
+    Returns:
+        Scenario -> names.
+    """
     settings = config.episodes
     jobs = [EpisodesJob(name, index, settings, out / name) for index, name in enumerate(config.scenarios)]
     if not settings.per_scenario:
         jobs = []
         write_manifest(out, [])
     written = {}
-    for job, names, error in run_all("episodes", jobs, workers):
+    for job, names, error in run_all("episodes", jobs, workers, scheduler=scheduler):
         if error is not None:
             raise DiffCloudError(error)
         written[job.scenario] = names
         errors.print(f"{job.scenario}: {', '.join(names)}")
-    finish({"out": str(out), "episodes": written}, json)
+    return written
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.estimation.parameters import FitSpace, Variable
 from diffcloud.estimation.priors import parse_factor
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.scene.scenarios.options import MOST_DOUBT
+from diffcloud.scene.scenarios.options import MOST_UNCERTAINTY
 from diffcloud.sim.properties import PARAMETERS
 
-MATERIAL_DOUBTS = {
+MATERIAL_UNCERTAINTY = {
     "compression": 3.0,
     "bending": 1.5,
     "drag": 1.3,
@@ -32,8 +32,8 @@ _FARTHEST = 4.0
 """Bounds, in standard deviations."""
 
 
-def parse_doubts(text: str) -> dict[str, float]:
-    """What `--doubts` says -> parameter -> factor of one deviation.
+def parse_uncertain(text: str) -> dict[str, float]:
+    """What `--uncertain` says -> parameter -> factor of one deviation.
 
     Args:
         text: "none", or parameters with the factor within which each is known, as in "bending=1.5x,drag=1.3x".
@@ -45,40 +45,40 @@ def parse_doubts(text: str) -> dict[str, float]:
     for item in [] if text.strip() == "none" else text.split(","):
         name, _, value = (part.strip() for part in item.partition("="))
         if name not in PARAMETERS:
-            raise ConfigError(f"doubts: {unknown_name('parameter', name, PARAMETERS)}")
+            raise ConfigError(f"uncertain: {unknown_name('parameter', name, PARAMETERS)}")
         if name in found:
-            raise ConfigError(f"doubts name {name} twice.")
-        told = f"doubts {item.strip()!r}: {name} takes the factor within which it is known"
+            raise ConfigError(f"uncertain name {name} twice.")
+        told = f"uncertain {item.strip()!r}: {name} takes the factor within which it is known"
         found[name] = parse_factor(
             value,
             told,
             f"{name}=1.5x",
-            most=MOST_DOUBT,
+            most=MOST_UNCERTAINTY,
             instead=f"where less is known, fit it: name {name} in --parameters",
         )
     return found
 
 
-def with_doubts(space: FitSpace, doubts: Mapping[str, float], scenarios: Sequence[Scenario]) -> FitSpace:
-    """The space with doubtful material appended. Left as it is: what no scenario has, or what several
+def with_uncertain(space: FitSpace, uncertain: Mapping[str, float], scenarios: Sequence[Scenario]) -> FitSpace:
+    """The space with uncertain material appended. Left as it is: what no scenario has, or what several
     scenarios of a joint fit state differently.
 
     Args:
-        doubts: parameter -> factor of one deviation about its given value, or else the scenario's.
+        uncertain: parameter -> factor of one deviation about its given value, or else the scenario's.
 
     Raises:
         ConfigError: one is asked for.
     """
     variables, fixed = list(space.variables), dict(space.fixed)
-    for name, factor in doubts.items():
+    for name, factor in uncertain.items():
         if name in space.names:
-            raise ConfigError(f"doubts: {name} is fitted; what is known of it is its prior, or its bounds.")
+            raise ConfigError(f"uncertain: {name} is fitted; what is known of it is its prior, or its bounds.")
         known = {_stated(one, name, space.fixed) for one in scenarios}
         value = known.pop()
         if not known and value > 0:
             far = factor**_FARTHEST
             high = min(value * far, PARAMETERS[name].most)
-            variables.append(Variable(name, value / far, high, factor, value, doubtful=True))
+            variables.append(Variable(name, value / far, high, factor, value, role="material"))
             fixed.pop(name, None)
     return FitSpace(tuple(variables), fixed)
 

@@ -9,10 +9,9 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from diffcloud.errors import ConfigError
-from diffcloud.estimation.doubts import parse_doubts
 from diffcloud.estimation.settings import FitSettings
+from diffcloud.estimation.uncertain import parse_uncertain
 from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
-from diffcloud.evaluation.intervals import LEVEL, WITHIN
 from diffcloud.io.files import read_yaml
 from diffcloud.io.raw_episodes import ScenePlacement
 from diffcloud.io.schema import Component, NonNegative, Positive, explain
@@ -21,11 +20,11 @@ from diffcloud.sensing.depth_camera import DepthNoise
 from diffcloud.sensing.filters import Thinning
 from diffcloud.sensing.fusion import FusionSettings
 from diffcloud.sensing.recorder import RecorderSettings
-from diffcloud.settings import Bounds, Count, CountOrNone, Factor, Name, Names, Pixels, Point, Section, Seed, check_bounds
+from diffcloud.settings import Bounds, Count, CountOrNone, Name, Names, Pixels, Point, Section, Seed, check_bounds
 
 
 class EpisodesConfig(Section):
-    """Synthetic recordings. A person's own lie in raw/, where `diffcloud preprocess` finds them."""
+    """Synthetic recordings. A person's own lie in raw/, where `diffcloud data preprocess` finds them."""
 
     per_scenario: CountOrNone = 2
     """Of each scenario; 0: none, only a person's own are used."""
@@ -143,10 +142,10 @@ class SimulateConfig(Section):
     scenarios: Names = ["lift", "fold"]
     """Those that the pipeline makes sets of."""
     parameters: Names = ["stretch", "mass"]
-    draws: Literal["uniform", "sobol", "logarithmic", "modes"] = "uniform"
+    distribution: Literal["uniform", "sobol", "logarithmic", "modes"] = "uniform"
     """Over the bounds: `uniform`, `sobol`, or `logarithmic` (uniform in the logarithms where the lower bound is
     positive); or `modes`: the published code's mixture of soft, medium and stiff cloths."""
-    doubts: Name | None = None
+    uncertain: Name | None = None
     """Material that is not drawn differs from run to run by these factors, as those of fits. Default: not at all."""
     train: CountOrNone = 1500
     test: CountOrNone = 375
@@ -154,7 +153,7 @@ class SimulateConfig(Section):
 
     def known_within(self) -> dict[str, float]:
         """Material that is not drawn -> factor of one deviation."""
-        return parse_doubts(self.doubts or "none")
+        return parse_uncertain(self.uncertain or "none")
 
 
 class TrainConfig(Section):
@@ -193,10 +192,6 @@ class EvaluateConfig(Section):
     seed: Seed = 1000
     rivals: Annotated[list[Rival], Field(max_length=len(RIVALS) + 10)] = list(RIVALS)
     """Methods beside the fits and the networks; searches may simulate as often as the fit."""
-    level: Annotated[float, Field(gt=0, lt=1)] | None = LEVEL
-    """Of the intervals; null: none."""
-    within: Factor = WITHIN
-    """A parameter counts as identified if its interval ends within this factor."""
     landscapes: Annotated[list[Name], Field(max_length=10_000)] = []
     """Patterns of <scenario>/<episode> whose loss landscape is simulated."""
     landscape_size: Annotated[int, Field(ge=2, le=1000)] = 7
@@ -205,11 +200,11 @@ class EvaluateConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _is_of_now(cls, data: Any) -> Any:
-        if isinstance(data, dict) and "doubts" in data:
-            raise ValueError('evaluate.doubts: now `fit.doubts`, such as "bending=1.5x,drag=1.3x", or none')
+        if isinstance(data, dict) and "level" in data:
+            raise ValueError("evaluate.level: now `fit.level`")
         return data
 
-    def comparison(self, episode: str) -> ComparisonSettings:
+    def comparison(self, episode: str, fit: FitSettings) -> ComparisonSettings:
         """For <scenario>/<episode>."""
 
         def chosen(patterns: list[str]) -> bool:
@@ -219,8 +214,8 @@ class EvaluateConfig(Section):
             rivals=tuple(self.rivals),
             draws=self.draws,
             seed=self.seed,
-            level=self.level,
-            within=self.within,
+            level=fit.level,
+            within=fit.identified_factor,
             landscape_size=self.landscape_size if chosen(self.landscapes) else 0,
         )
 

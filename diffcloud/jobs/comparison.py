@@ -10,11 +10,8 @@ from typing import Any
 
 import pandas as pd
 
-from diffcloud.cli.config import Config
-from diffcloud.cli.fit_jobs import joint_fit
-from diffcloud.cli.workers import Tell, run_all
 from diffcloud.errors import CheckpointError, DiffCloudError, EpisodeError
-from diffcloud.estimation import FitRecord, read_fit
+from diffcloud.estimation.record import FitRecord, read_fit
 from diffcloud.evaluation import ComparisonSettings, EpisodeRecord, Estimate, Gap, compare_episode
 from diffcloud.evaluation.methods import predicted
 from diffcloud.evaluation.repeats import other_repeats
@@ -23,6 +20,9 @@ from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import files_in, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint, kept_record
 from diffcloud.io.timings import read_seconds, read_timings
+from diffcloud.jobs.fits import joint_fit
+from diffcloud.jobs.pool import Tell, run_all
+from diffcloud.jobs.settings import Config
 from diffcloud.regressors import Regressor, predict_episode
 from diffcloud.scene.scenarios import Scenario
 
@@ -104,14 +104,14 @@ class Comparison:
         return self.failures + gaps
 
 
-def compare(jobs: Sequence[Job], workers: int | None) -> Comparison:
+def compare(jobs: Sequence[Job], workers: int | None, scheduler: str | None = None) -> Comparison:
     """All episodes.
 
     Raises:
         DiffCloudError: nothing could be compared in any of them.
     """
     comparison = Comparison()
-    for job, found, error in run_all("evaluate", jobs, workers):
+    for job, found, error in run_all("evaluate", jobs, workers, scheduler=scheduler):
         if error is not None:
             comparison.failures.append(f"{job.label}: {error}")
         else:
@@ -171,7 +171,7 @@ def comparison_jobs(
                 predictions=[network.of(recorded[name]) for network in networks],
                 # simulated targets share labels, not parameters
                 transfers=others[name] if real and len(fit.episodes) == 1 else {},
-                settings=config.evaluate.comparison(f"{group}/{label}"),
+                settings=config.evaluate.comparison(f"{group}/{label}", config.fit),
                 kept=kept / group / f"{label}.json",
             )
         )
@@ -207,7 +207,7 @@ class _Network:
 
 
 def _networks(config: Config, scenario: str, regressors: Path, simulated: Path) -> list[_Network]:
-    folder, level = regressors / scenario, config.evaluate.level
+    folder, level = regressors / scenario, config.fit.level
     asked = set(config.train.models) if scenario in config.train.scenarios else set()
     found = []
     for model in (name for name in PREDICTORS if not name.startswith("published_")):
@@ -226,7 +226,7 @@ def _networks(config: Config, scenario: str, regressors: Path, simulated: Path) 
             except CheckpointError as error:
                 found.append(_Network(model, None, str(error), True, {}, level))
         elif model in asked:
-            found.append(_Network(model, None, f"no checkpoint {path}; run `diffcloud train`", True, {}, level))
+            found.append(_Network(model, None, f"no checkpoint {path}; run `diffcloud network train`", True, {}, level))
         elif model != "posterior":  # an extra, which nobody misses
             reason = "not trained for this scenario (train.scenarios, train.models)"
             found.append(_Network(model, None, reason, False, {}, level))

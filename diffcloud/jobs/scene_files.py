@@ -1,0 +1,253 @@
+"""The scene of each recording of one cloth, in files that a person may edit: OUT/cloth.yaml and OUT/recordings.yaml."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from diffcloud.console import warn
+from diffcloud.errors import ConfigError, DiffCloudError, EpisodeError
+from diffcloud.identification import found_cloth
+from diffcloud.io.episodes import Episode, read_episode, write_episode
+from diffcloud.io.files import files_in, read_json, read_yaml, together, write_json, write_text
+from diffcloud.io.fingerprints import fingerprint
+from diffcloud.io.imports import cloud_folder
+from diffcloud.io.recordings import write_recording
+from diffcloud.io.ros.recording import ros_recording
+from diffcloud.jobs.preprocess import PreprocessJob
+from diffcloud.jobs.scenarios import own_scene
+from diffcloud.jobs.settings import Config
+from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
+from diffcloud.scene.scenarios.layout import FIELDS, Found, find_layout
+
+_BAGS = (".bag", ".mcap", ".db3")
+_CLOTH_FIELDS = ("base", "size_m", "nodes", "material", "grip", "grip_m", "steps_per_frame")
+_HEAD = "# Found by diffcloud fit, with the reason beside each value. Edit and run the command again to overrule."
+
+
+def find_scene(
+    recordings: Sequence[Path],
+    out: Path,
+    size: tuple[float, float] | None,
+    mass: float | None,
+    topics: Sequence[str] = (),
+) -> tuple[dict[str, Episode], dict[str, Any], dict[str, dict[str, Any]]]:
+    """Read the recordings, and find or read what cloth.yaml and recordings.yaml say of them.
+
+    Args:
+        topics: of ROS recordings, those to take where several could be (`ros_recording`).
+
+    Returns:
+        Recording -> episode, the cloth's fields of a scenario, and recording -> its own.
+
+    Raises:
+        EpisodeError: a recording that cannot be used.
+        ConfigError, SceneError: one of both files says what cannot be, or topics without a ROS recording.
+    """
+    names = named_recordings(recordings)
+    episodes = read_all(names, out, topics)
+    path = out / "recordings.yaml"
+    with together():  # nothing of a scene that was not found would count in the next run
+        cloth = _cloth(out, episodes, size, mass)
+        stated = read_fields(path).keys() if path.is_file() else set[str]()
+        layouts = _layouts(out, episodes, names, cloth)
+        _warn_of_changes(out, episodes, stated)
+    return episodes, cloth, layouts
+
+
+def read_all(names: Mapping[str, Path], out: Path, topics: Sequence[str] = (), *, keep: bool = True) -> dict[str, Episode]:
+    """
+    Args:
+        keep: whether episode files are copied to OUT/episodes/ too. Other recordings are kept there in any case.
+
+    Raises:
+        EpisodeError: a recording that cannot be used.
+        ConfigError: topics without a ROS recording.
+    """
+    if topics and not any(map(_is_bag, names.values())):
+        raise ConfigError("--topic chooses among the topics of a ROS recording, and none was given. Leave --topic out.")
+    return {name: read_recording(path, name, out, topics, keep=keep) for name, path in names.items()}
+
+
+def named_recordings(recordings: Sequence[Path]) -> dict[str, Path]:
+    """Name of each recording -> where it lies; a folder of episode files stands for all of them.
+
+    Raises:
+        ConfigError: one that is not there, or two of one name.
+    """
+    named: dict[str, Path] = {}
+    for path in [one for given in recordings for one in files_in(given, ".npz") or [given]]:
+        if not path.exists():
+            raise ConfigError(f"No such recording: {path}.")
+        name = path.stem if path.is_file() else path.absolute().name
+        if name in named:
+            raise ConfigError(f"Two recordings are named {name}; rename one.")
+        named[name] = path
+    return named
+
+
+def _is_bag(path: Path) -> bool:
+    return path.suffix in _BAGS or (path / "metadata.yaml").is_file()
+
+
+def read_recording(path: Path, name: str, out: Path, topics: Sequence[str], *, keep: bool) -> Episode:
+    """A recording as an episode; see `read_all`."""
+    kept = out / "episodes" / f"{name}.npz"
+    if _is_bag(path):
+        path = _unpacked(path, out / "recordings" / name, topics)
+    if path.is_file():
+        episode = read_episode(path)
+        if not keep:
+            return episode
+    elif (path / "episode.json").is_file():
+        job = PreprocessJob("episodes", path.absolute(), out, Config().preprocess, None)
+        for message in job.run(lambda done, text: None).warnings:
+            warn(f"{name}: {message}")
+        return read_episode(kept)
+    else:
+        track = path / "gripper.csv"
+        if not track.is_file():
+            raise EpisodeError(f"{path} holds no gripper.csv with the columns t_s, x, y, z [m], one row a frame.")
+        episode = cloud_folder(path, grippers={"gripper": track})
+    write_episode(kept, episode)
+    return episode
+
+
+def _unpacked(bag: Path, folder: Path, topics: Sequence[str]) -> Path:
+    """A ROS recording as a raw episode, kept in OUT/recordings/: what `data import` makes of it by default."""
+    from diffcloud.jobs.imports import recording_kind, robot_description
+
+    if recording_kind(bag) != "ros":
+        raise EpisodeError(
+            f"{bag} is a recording of the RealSense SDK, which does not say where the camera stands: make a raw episode of "
+            "it first, by `diffcloud data import NAME=FILE` and a calibration."
+        )
+    files = sorted(bag.rglob("*")) if bag.is_dir() else [bag]
+    source: dict[str, Any] = {"files": [[one.name, one.stat().st_size, one.stat().st_mtime_ns] for one in files]}
+    if topics:
+        source["topics"] = sorted(topics)
+    told = folder.with_name(f"{folder.name}.source.json")
+    if not folder.is_dir():
+        write_recording(folder, ros_recording(bag, description=partial(robot_description, None), topics=topics))
+        write_json(told, source)
+    elif not told.is_file() or read_json(told) != source:
+        raise EpisodeError(
+            f"{folder} was made of another {bag.name} than {bag} is now, or with other topics. Remove {folder} to have it "
+            "made anew."
+        )
+    return folder
+
+
+def _cloth(
+    out: Path, episodes: Mapping[str, Episode], stated: tuple[float, float] | None, mass: float | None
+) -> dict[str, Any]:
+    """The fields of cloth.yaml: read if it is there, else found and written."""
+    path = out / "cloth.yaml"
+    if path.is_file():
+        fields = read_fields(path)
+        _refuse_missing(fields, _CLOTH_FIELDS, str(path))
+        own_options(fields, "cloth", path, folder=out)
+        if stated is not None and list(stated) != fields["size_m"]:
+            other = f"--size {stated[0]:g}x{stated[1]:g}"
+            warn(f"{path} says size_m {fields['size_m']}, and that counts, not {other}: edit the file.")
+        if isinstance(fields.get("material"), str) and fields["material"].endswith(".json"):
+            fields["material"] = str((out / fields["material"]).resolve())  # scenarios are written to another folder
+        return fields
+    found = found_cloth(list(episodes.values()), stated, mass)
+    write_text(path, _yaml(found))
+    return {name: entry.value for name, entry in found.items()}
+
+
+def _layouts(
+    out: Path, episodes: Mapping[str, Episode], sources: Mapping[str, Path], cloth: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """The fields of each recording in recordings.yaml: read where they are there, else found and written."""
+    path = out / "recordings.yaml"
+    known = read_fields(path) if path.is_file() else {}
+    size = (float(cloth["size_m"][0]), float(cloth["size_m"][1]))
+    blocks, layouts = [path.read_text().rstrip()] if known else [_HEAD], {}
+    for name, episode in episodes.items():
+        if name in known:
+            if not isinstance(known[name], dict):
+                raise ConfigError(f"{path}: {name} must be a mapping of a scenario's fields, got {known[name]!r:.60}.")
+            layouts[name] = dict(known[name])
+            _refuse_missing(layouts[name], FIELDS, f"{path}: {name}")
+            where = f"{out / 'cloth.yaml'} with {name} of {path}"
+            options = own_options({**cloth, **layouts[name]}, name, where, folder=out)
+            try:
+                make_scenario(options)
+            except DiffCloudError as error:
+                raise ConfigError(f"{where}: {error}") from error
+            continue
+        try:
+            layout = find_layout(episode, size, 0.0 if cloth["grip"] == "pivot" else cloth["grip_m"])
+        except EpisodeError as error:
+            raise EpisodeError(f"{sources[name]}: {error}") from error
+        for message in layout.warnings:
+            warn(f"{name}: {message}.")
+        layouts[name] = {key: entry.value for key, entry in layout.fields.items()}
+        lines = _yaml(layout.fields, head=False).splitlines()
+        blocks.append("\n".join([f"{_inline(name)}:", *(f"  {line}" for line in lines)]))
+    write_text(path, "\n".join(blocks) + "\n")
+    return layouts
+
+
+def _warn_of_changes(out: Path, episodes: Mapping[str, Episode], stated: Collection[str]) -> None:
+    """Say which recordings are not those any more that their blocks in recordings.yaml were made for, which count.
+
+    Args:
+        stated: those whose blocks were there before.
+    """
+    path = out / "stages" / "recordings.json"
+    told = read_json(path) if path.is_file() else {}
+    known = {name: mark for name, mark in told.items() if name in stated} if isinstance(told, dict) else {}
+    for name, one in episodes.items():
+        mark = fingerprint([one.points, one.times, one.gripper], packages=())
+        if known.setdefault(name, mark) != mark:
+            warn(
+                f"{name} is another recording than that which its block in {out / 'recordings.yaml'} was made for, and the "
+                "block counts. Remove it to have the layout found anew."
+            )
+    write_json(path, known)
+
+
+def _refuse_missing(fields: Mapping[str, Any], needed: Sequence[str], where: str) -> None:
+    """A built-in's own value would stand in for what is missing, and nobody would know."""
+    missing = [name for name in needed if name not in fields]
+    if missing:
+        raise ConfigError(f"{where} lacks {', '.join(missing)}. Put it back, or remove the whole to have it found anew.")
+
+
+def read_fields(path: Path) -> dict[str, Any]:
+    told = read_yaml(path, error=ConfigError)
+    if not isinstance(told, dict):
+        raise ConfigError(f"{path} must be a mapping, got {type(told).__name__}. Remove it to have it written anew.")
+    return told
+
+
+def _yaml(found: Mapping[str, Found], *, head: bool = True) -> str:
+    lines = [_HEAD] if head else []
+    lines += [f"{name}: {_inline(entry.value)}  # {entry.reason}" for name, entry in found.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _inline(value: Any) -> str:
+    """As YAML in one line; a text that would be read as something else, such as the name 001, in quotes."""
+    text: str = yaml.safe_dump(value, default_flow_style=True, width=1000, sort_keys=False)
+    return text.strip().removesuffix("...").strip()
+
+
+def scene_fields(source: str) -> dict[str, Any] | None:
+    """The fields of a scene's YAML file, with the path of its material; None of a built-in or a scene JSON, which later
+    commands find by name."""
+    path = own_scene(source)
+    if path is None:
+        return None
+    told = read_fields(path)
+    if isinstance(material := told.get("material"), str) and material.endswith(".json"):
+        told["material"] = str((path.parent / material).resolve())
+    return told

@@ -1,0 +1,52 @@
+"""The first start of a fit: stated, or predicted by a network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from diffcloud.console import assignments
+from diffcloud.errors import ConfigError
+from diffcloud.estimation.task import FitTask
+from diffcloud.io.episodes import Episode
+from diffcloud.regressors import MODEL_NAMES, Regressor, predict_episode
+
+REGRESSORS = Path("data/regressors")
+"""Where the pipeline keeps checkpoints: <scenario>/<model>.safetensors."""
+
+
+def first_start(init: str, task: FitTask) -> dict[str, float]:
+    """Values of the first start by name; recordings of a joint fit give the mean of their predictions.
+
+    Raises:
+        ConfigError: a value of what is not fitted, or outside of its bounds.
+    """
+    if init == "middle":
+        return {}
+    if "=" in init:
+        stated = assignments(init.split(","), "--init")
+        task.space.check_start(stated)
+        return stated
+    found = [predicted_start(init, one.scenario.name, one.episode) for one in task.recordings]
+    return task.space.nearest({name: sum(values[name] for values in found) / len(found) for name in found[0]})
+
+
+def predicted_start(name: str, scenario: str, episode: Episode) -> dict[str, float]:
+    """Parameter -> value within the bounds, for a fit to start from.
+
+    Args:
+        name: a model, for the pipeline's own checkpoint of the scenario, or the path of a checkpoint.
+
+    Raises:
+        ConfigError, CheckpointError, EpisodeError: no such checkpoint, one of another scenario, or an episode that lacks
+            the frames that it sees.
+    """
+    path = REGRESSORS / scenario / f"{name}.safetensors" if name in MODEL_NAMES else Path(name)
+    if name not in MODEL_NAMES and not path.is_file():
+        raise ConfigError(
+            f"A start is middle, PARAMETER=VALUE,..., {', '.join(MODEL_NAMES)} or a checkpoint, got {name!r}."
+        )
+    regressor = Regressor.read(path)
+    if regressor.description.scenario != scenario:
+        raise ConfigError(f"{path} was trained for {regressor.description.scenario}, not for {scenario}.")
+    prediction = predict_episode(regressor, episode)
+    return dict(zip(prediction.names, prediction.clipped[0].tolist(), strict=True))
