@@ -130,7 +130,8 @@ def merged(settings: Section, typed: Mapping[str, Any]) -> Any:
         return kind.model_validate(told)
     except ValidationError as error:
         faults = [
-            f"{_flag_of(fault['loc'], typed)}: {fault['msg'].removeprefix('Value error, ')}" for fault in error.errors()
+            f"{_flag_of(kind, fault['loc'], typed)}: {fault['msg'].removeprefix('Value error, ')}"
+            for fault in error.errors()
         ]
         raise ConfigError("; ".join(faults) + ".") from error
 
@@ -209,8 +210,16 @@ def _flag(path: str, field: FieldInfo) -> str:
     return str(extra.get("flag", f"--{path.rpartition('.')[2].replace('_', '-')}"))
 
 
-def _flag_of(place: Sequence[int | str], typed: Mapping[str, Any]) -> str:
-    """The option that a fault is about, or the key in --params."""
-    path = ".".join(str(part) for part in place if part not in ("likelihood", "adam", "search"))
+def _flag_of(kind: type[Section], place: Sequence[int | str], typed: Mapping[str, Any]) -> str:
+    """The option that a fault is about and the part of its value, or else the key in --params.
+
+    Args:
+        place: of the fault; pydantic names the kind of a block in it too, which no path has.
+    """
+    field = kind.model_fields.get(str(place[0])) if place else None
+    skipped = 1 if field is not None and len(_blocks(field)) > 1 and len(place) > 2 else None
+    path = ".".join(str(part) for index, part in enumerate(place) if index != skipped)
     option = next((one for one in typed if path == one or path.startswith(f"{one}.")), None)
-    return path if option is None else f"--{option.rpartition('.')[2].replace('_', '-')} {path}".strip()
+    if option is None:
+        return path
+    return f"{_flag(option, _field(kind, option))} {path.removeprefix(option).removeprefix('.')}".strip()

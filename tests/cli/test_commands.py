@@ -120,6 +120,25 @@ def test_options_add_to_what_the_parameters_file_gives(work):
     assert read_fit(work / "fits" / "fit.json").settings["starts"] == 2
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--fix", "mass=heavy"), "--fix mass: Input should be a number"),
+        (("--fix", "mass"), "--fix takes NAME=VALUE, got 'mass'"),
+        (("--bound", "mass=3:1"), "bounds.mass must be in order"),
+        (("--bound", "mass=low:2"), "--bound mass.0: Input should be a number"),
+        (("--level", 2), "--level: Input should be less than or equal to 0.999"),
+        (("--max-steps", 0), "--max-steps: Input should be greater than or equal to 1"),
+        (("--solver", "lbfgs"), "--solver: unknown solver 'lbfgs'; allowed are likelihood, adam"),
+        (("--frames", "first"), "--frames 0: Input should be a number"),
+    ],
+)
+def test_an_option_that_cannot_be_is_named(work, options, message):
+    done = run("fit", "--scene", "small.yaml", "--out", "fits", *options, "e1.npz", cwd=work, code=1)
+    assert message in done.errors
+    assert not (work / "fits").exists()
+
+
 def test_fit_then_replay_and_measure(work):
     done = run(
         "fit", "--scene", "small.yaml", "--out", "fits", "--max-steps", 3, "--starts", 2, "--fix", "mass=1.0",
