@@ -33,6 +33,7 @@ def preprocess(
     Finished episodes are kept until the recording, a setting or the code changes. Of a folder, clouds whose recording is
     gone are removed.
     """
+    from diffcloud.errors import EpisodeError
     from diffcloud.jobs.preprocess import preprocess as clean
     from diffcloud.jobs.settings import load_config
     from diffcloud.settings import updated
@@ -42,5 +43,7 @@ def preprocess(
     if not mask:
         raw = raw.model_copy(update={"robot": None})
     settings = config.preprocess.model_copy(update={"raw": raw})
-    points, warnings = clean(recorded, out, config, settings, calibration=calibration, workers=workers)
+    points, warnings, failures = clean(recorded, out, config, settings, calibration=calibration, workers=workers)
     finish({"out": str(out), "points": points, "warnings": warnings}, json)
+    if failures:
+        raise EpisodeError("\n".join(failures))

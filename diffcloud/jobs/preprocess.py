@@ -42,7 +42,7 @@ def preprocess(
     *,
     calibration: Path | None = None,
     workers: int | None = None,
-) -> tuple[dict[str, dict[str, list[int]]], list[str]]:
+) -> tuple[dict[str, dict[str, list[int]]], list[str], list[str]]:
     """Clean every recording into OUT/<scenario>/<episode>.npz. Finished episodes are kept until the recording, a setting or
     the code changes. Of a folder, clouds whose recording is gone are removed.
 
@@ -51,10 +51,11 @@ def preprocess(
         calibration: file with the cameras of raw episodes.
 
     Returns:
-        <scenario>/<episode> -> points of each frame, recorded and kept; and warnings.
+        <scenario>/<episode> -> points of each frame, recorded and kept; warnings; and what failed, beside which the others
+        are cleaned all the same.
 
     Raises:
-        ConfigError, EpisodeError: recordings that cannot be used; others are cleaned all the same.
+        ConfigError: no recording, or two of one name.
     """
     sources = _sources([path.absolute() for path in recorded], config.scenarios)  # "." has no name
     calibrated = None if calibration is None else read_calibration(calibration)
@@ -90,9 +91,7 @@ def preprocess(
     for message in warnings:
         warn(message)
     errors.print(f"Cleaned {len(kept) - len(finished)} episodes into {out}; {len(finished)} were finished already.")
-    if failures:
-        raise EpisodeError("\n".join(failures))
-    return kept, warnings
+    return kept, warnings, failures
 
 
 @dataclass(frozen=True)

@@ -166,7 +166,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
     profile["evaluate"] |= {"draws": 2, "landscapes": []}
     Path("quick.yaml").write_text(yaml.safe_dump(profile))
     command = ("published", release, "--params", "quick.yaml", "--only", "*/fold_tan*", "--markdown", "c.md")
-    found = invoke(*command).result["metrics"]["comparison"]
+    found = study(*command).result["metrics"]["comparison"]
     assert set(found["methods"]["release_fold"]) >= {"diffcloud", "cma_es", "published_mlp", "published_meteornet"}
     assert "verdicts" not in found  # Adam knows no intervals
     assert "fold_tan2" in Path("c.md").read_text(encoding="utf-8")

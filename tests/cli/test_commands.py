@@ -365,7 +365,7 @@ def test_a_scheduler_that_dies_loses_no_finished_fit(tree):
     for number in range(2, 6):
         name = tree / "episodes" / "small" / f"e{number}.npz"
         write_episode(name, clouds_of(small_lift(), stretch=0.5 * number, mass=1.0))
-    told(tree, solver={"name": "adam", "max_steps": 300})
+    told(tree, solver={"name": "adam", "max_steps": 20})
     (tree / "cluster.py").write_text(CLUSTER)
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "start_new_session": True}
     with subprocess.Popen([sys.executable, "cluster.py"], cwd=tree, env=environment(), **pipes) as cluster:

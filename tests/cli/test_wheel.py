@@ -69,5 +69,5 @@ def test_it_checks_itself_and_fits(installed, tmp_path):
     assert json.loads(run(installed, tmp_path, "-m", "diffcloud", "doctor", "--json").splitlines()[-1])
     options = ["--scene", "small.yaml", "--parameters", "stretch", "--fix", "mass=1", "--starts", "1", "--out", "fits"]
     told = json.loads(run(installed, tmp_path, "-m", "diffcloud", "fit", *options, "e1.npz", "--json").splitlines()[-1])
-    assert 0.3 < told["fits"]["e1"]["parameters"]["stretch"]["value"] < 1.5
-    assert (tmp_path / "fits" / "e1.json").is_file()
+    assert 0.3 < told["parameters"]["stretch"]["value"] < 1.5
+    assert (tmp_path / "fits" / "fit.json").is_file()

@@ -168,7 +168,7 @@ def test_a_recording_is_watched_while_it_grows(browser, tmp_path):
     """The command in a process of its own, as beside a capture; Ctrl-C ends it."""
     pytest.importorskip("viser")
     folder = tmp_path / "episode"
-    command = [sys.executable, "-m", "diffcloud", "episode", "watch", str(folder), "--port", "8741"]
+    command = [sys.executable, "-m", "diffcloud", "view", str(folder), "--live", "--port", "8741"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             told = process.stderr.readline()
