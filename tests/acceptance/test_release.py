@@ -156,7 +156,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
 
     import diffcloud.estimation.task
     import diffcloud.jobs.comparison
-    from tests.cli.invoke import invoke, study
+    from tests.cli.invoke import study
 
     monkeypatch.chdir(tmp_path)
     profile = yaml.safe_load(
@@ -177,7 +177,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
 
     monkeypatch.setattr(diffcloud.estimation.task, "solve", never)
     monkeypatch.setattr(diffcloud.jobs.comparison, "compare_episode", never)
-    assert invoke(*command).result["metrics"]["comparison"] == found
+    assert study(*command).result["metrics"]["comparison"] == found
     assert (
         "No published episode matches"
         in study("published", release, "--params", "quick.yaml", "--only", "shirt*", code=1).errors

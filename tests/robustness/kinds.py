@@ -237,8 +237,8 @@ KINDS = (
     Kind("depth folder, camera", "document", "images/camera.json", _IMAGES),
     Kind("depth folder, image", "bytes", "images/depth/000001.png", _IMAGES),
     Kind("mesh", "bytes", "cloth.obj", lambda: read_cloth(Path("cloth.obj")), flips=80),
-    Kind("ROS bag", "bytes", "recording.bag", command("import recording.bag --out imported")),
-    Kind("MCAP", "bytes", "recording/recording.mcap", command("import recording --out imported")),
+    Kind("ROS bag", "bytes", "recording.bag", command("data import recording.bag --out imported")),
+    Kind("MCAP", "bytes", "recording/recording.mcap", command("data import recording --out imported")),
     Kind("trajectory", "table", "path.csv", _CAPTURE),
     Kind("rig", "document", "rig.yaml", lambda: read_rig(Path("rig.yaml"))),
 )  # fmt: skip
