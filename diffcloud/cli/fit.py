@@ -92,8 +92,8 @@ def fit(
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out takes a folder, and {out} is a file.")
     stored = None if params is None else load_config(params).fit
-    scenes = _scenes(recordings, scene)
-    known = None not in scenes.values()
+    members = _members(recordings, scene)
+    known = all(named is not None for _, named in members.values())
     if known and (size or density):
         raise ConfigError("--size and --density are for a scene that is found; leave them out beside a known one.")
     if known and dvc:
@@ -101,12 +101,13 @@ def fit(
     results = {}
     interrupted = False
     with claimed(out):
-        groups = {out / path.stem: {path: named} for path, named in scenes.items()} if separate else {out: scenes}
-        for folder, members in groups.items():
+        groups = {out / name: {name: one} for name, one in members.items()} if separate else {out: members}
+        for folder, group in groups.items():
             if known:
-                task = _known(members, folder, topic or (), settings, stored or FitSettings(), init)
+                task = _known(group, folder, topic or (), settings, stored or FitSettings(), init)
             else:
-                task = _found(list(members), folder, sides, weighed, topic or (), settings, stored, init)
+                paths = [path for path, _ in group.values()]
+                task = _found(paths, folder, sides, weighed, topic or (), settings, stored, init)
             left = None if seconds is None else max(_FITTING * seconds - (time.monotonic() - began), 1.0)
             told, findings = task.run(left)
             for line in findings:
@@ -123,8 +124,8 @@ def fit(
         raise KeyboardInterrupt
 
 
-def _scenes(recordings: Sequence[Path], scene: str | None) -> dict[Path, str | None]:
-    """Each recording -> its scene; None: it is found.
+def _members(recordings: Sequence[Path], scene: str | None) -> dict[str, tuple[Path, str | None]]:
+    """Name of each recording -> where it lies, and its scene; None: it is found.
 
     Raises:
         ConfigError: some name theirs and others do not, or two recordings have one name.
@@ -138,8 +139,9 @@ def _scenes(recordings: Sequence[Path], scene: str | None) -> dict[Path, str | N
         if not all(name and path for name, _, path in pairs):
             raise ConfigError("Give each recording its scene, as in lift=a.npz fold=b.npz, or none.")
         parts = [(name, Path(path)) for name, _, path in pairs]
-    named_recordings([path for _, path in parts])  # refuses two of one name
-    return {path: name for name, given in parts for path in named_recordings([given]).values()}
+    named = named_recordings([path for _, path in parts])
+    own = {path: stated for stated, given in parts for path in named_recordings([given]).values()}
+    return {name: (path, own[path]) for name, path in named.items()}
 
 
 def _found(
@@ -172,7 +174,7 @@ def _found(
 
 
 def _known(
-    scenes: Mapping[Path, str | None],
+    group: Mapping[str, tuple[Path, str | None]],
     out: Path,
     topics: Sequence[str],
     typed: Mapping[str, Any],
@@ -183,15 +185,14 @@ def _known(
     from diffcloud.estimation.task import Recording
     from diffcloud.jobs.cloth_fit import ClothFit
     from diffcloud.jobs.scenarios import scene_named
-    from diffcloud.jobs.scene_files import named_recordings, read_all, scene_fields
+    from diffcloud.jobs.scene_files import read_all, scene_fields
 
-    named = named_recordings(list(scenes))
-    sources = {name: str(scenes[path]) for name, path in named.items()}
+    sources = {name: str(stated) for name, (_, stated) in group.items()}
     chosen = stored
     if typed.get("loss") == "paper" and "solver" not in typed and chosen.solver.name == "likelihood":
         chosen = chosen.model_copy(update={"solver": AdamSolver()})  # that loss has no likelihood
     chosen = merged(chosen, typed)
-    episodes = read_all(named, out, topics, keep=False)
+    episodes = read_all({name: path for name, (path, _) in group.items()}, out, topics, keep=False)
     scenarios = {source: scene_named(source) for source in dict.fromkeys(sources.values())}
     members = [Recording(scenarios[sources[name]], name, episode) for name, episode in episodes.items()]
     found = {scenarios[source].name: fields for source in scenarios if (fields := scene_fields(source)) is not None}

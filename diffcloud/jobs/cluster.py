@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -38,7 +39,7 @@ def results_in_order(client: Any, work: Callable[[Item], Found], items: Sequence
         DiffCloudError: the scheduler or its workers are gone; what jobs have written stays.
         KeyboardInterrupt: Ctrl-C; what has not begun is cancelled.
     """
-    futures = [client.submit(work, item, pure=False) for item in items]
+    futures = [client.submit(_from_folder, os.getcwd(), work, item, pure=False) for item in items]
     try:
         for future in futures:
             try:
@@ -54,3 +55,9 @@ def results_in_order(client: Any, work: Callable[[Item], Found], items: Sequence
             future.release()
     finally:
         client.cancel(futures)
+
+
+def _from_folder(folder: str, work: Callable[[Item], Found], item: Item) -> Found:
+    """On a worker: paths of a job are relative to the folder of the command."""
+    os.chdir(folder)
+    return work(item)

@@ -182,6 +182,19 @@ def test_each_recording_alone(work):
     assert [len(read_fit(work / "fits" / name / "fit.json").episodes) for name in ("e1", "e2")] == [1, 1]
 
 
+def test_recordings_alone_may_have_a_dot_in_their_names(work):
+    """Of a folder, all of the name counts."""
+    episode = read_episode(work / "e1.npz")
+    for name in ("run.1", "run.2"):
+        (work / name).mkdir()
+        for index in range(episode.frame_count):
+            np.savetxt(work / name / f"{index:03d}.xyz", episode.frame(index))
+        rows = np.column_stack([episode.times, episode.gripper[:, 0]])
+        np.savetxt(work / name / "gripper.csv", rows, delimiter=",", header="t_s,x,y,z", comments="")
+    command = ("fit", "--scene", "small.yaml", "--out", "fits", "--max-steps", 1, "--starts", 1, "--separate")
+    assert set(run(*command, "run.1", "run.2", cwd=work).result) == {"run.1", "run.2"}
+
+
 class TestJointFitOverMotions:
     """One cloth that is lifted, and pulled to the side."""
 
@@ -361,14 +374,15 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-def test_a_scheduler_that_dies_loses_no_finished_fit(tree):
+def test_a_scheduler_that_dies_loses_no_finished_fit(tree, tmp_path_factory):
     for number in range(2, 6):
         name = tree / "episodes" / "small" / f"e{number}.npz"
         write_episode(name, clouds_of(small_lift(), stretch=0.5 * number, mass=1.0))
     told(tree, solver={"name": "adam", "max_steps": 20})
     (tree / "cluster.py").write_text(CLUSTER)
+    elsewhere = tmp_path_factory.mktemp("elsewhere")  # where workers start; what they write is relative to the command
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "start_new_session": True}
-    with subprocess.Popen([sys.executable, "cluster.py"], cwd=tree, env=environment(), **pipes) as cluster:
+    with subprocess.Popen([sys.executable, tree / "cluster.py"], cwd=elsewhere, env=environment(), **pipes) as cluster:
         command = [sys.executable, "-m", "pipeline.fit", *FIT[1:], "--scheduler", cluster.stdout.readline().strip()]
         process = subprocess.Popen(command, cwd=tree, env=environment(), stderr=subprocess.PIPE, text=True)
         deadline = time.monotonic() + 60
