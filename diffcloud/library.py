@@ -29,7 +29,7 @@ from diffcloud.estimation.solvers import Progress
 from diffcloud.estimation.task import FitTask, Recording
 from diffcloud.evaluation.intervals import Intervals, draws, intervals_of
 from diffcloud.evaluation.methods import space_of
-from diffcloud.identification import fit_settings, found_cloth, known_grip, with_density
+from diffcloud.identification import fit_settings, found_cloth, known_grip, with_density, with_material_path
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import read_yaml, together, write_json, write_text
 from diffcloud.io.imports import cloud_folder
@@ -96,10 +96,7 @@ class Scene:
             return Scene(str(source), {"base": str(source)})
         path = Path(source)
         load_scenario(path)  # raises
-        told = dict(read_yaml(path, error=ConfigError) or {})
-        if isinstance(material := told.get("material"), str) and material.endswith(".json"):
-            told["material"] = str((path.parent / material).resolve())
-        return Scene(path.stem, told)
+        return Scene(path.stem, with_material_path(read_yaml(path, error=ConfigError) or {}, path.parent))
 
     @cached_property
     def scenario(self) -> Scenario:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,18 @@ def found_cloth(
         "uncertain": Found(_UNCERTAIN, "priors of what is fitted too: factors of one standard deviation"),
         "steps_per_frame": Found(_STEPS, "finer steps move a lifted cloth by less than the noise"),
     }
+
+
+def with_material_path(fields: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Fields of a scenario's file for one in another folder: the file of its material, if it names one, by its whole path.
+
+    Args:
+        folder: of the file.
+    """
+    material = fields.get("material")
+    if not (isinstance(material, str) and material.endswith(".json")):
+        return dict(fields)
+    return {**fields, "material": str((folder / material).resolve())}
 
 
 def known_grip(size: float) -> dict[str, float]:

@@ -18,11 +18,10 @@ OWN_SCENARIOS = Path("raw/scenes")
 
 def choose_scenario(name: str | None, scene: Path | None = None) -> Scenario:
     """Load a scenario and say what of its scene is not simulated."""
-    from diffcloud.scene.scenarios import SCENARIO_NAMES, load_scenario  # takes seconds, which help does without
+    from diffcloud.scene.scenarios import load_scenario  # takes seconds, which help does without
 
-    if name is not None and name not in SCENARIO_NAMES and _own(name).is_file():
-        name = str(_own(name))
-    scenario = load_scenario(name, scene)
+    own = None if name is None else _own(name)
+    scenario = load_scenario(name if own is None else own, scene)
     for message in limits(scenario):
         warn(message)
     return scenario
@@ -47,9 +46,10 @@ def scenario_options(name: str) -> Options:
     Raises:
         ConfigError, SceneError: neither, or a damaged file.
     """
-    from diffcloud.scene.scenarios import SCENARIO_NAMES, built_in, read_options
+    from diffcloud.scene.scenarios import built_in, read_options
 
-    return read_options(_own(name)) if name not in SCENARIO_NAMES and _own(name).is_file() else built_in(name)
+    own = _own(name)
+    return built_in(name) if own is None else read_options(own)
 
 
 def fitted_scenario(fit: Path, name: str) -> str:
@@ -67,7 +67,7 @@ def fitted_scenario(fit: Path, name: str) -> str:
     beside, here = fit.parent / "scenarios" / f"{name}.yaml", Path(f"{name}.yaml")
     if beside.is_file():
         return str(beside)
-    if name in SCENARIO_NAMES or _own(name).is_file():
+    if name in SCENARIO_NAMES or _own(name) is not None:
         return name
     if here.is_file():
         return str(here)
@@ -78,15 +78,15 @@ def fitted_scenario(fit: Path, name: str) -> str:
 
 def own_scene(source: str) -> Path | None:
     """The YAML file that --scene names, by its path or as one of raw/scenes; None of a built-in or a scene JSON."""
+    return Path(source) if source.endswith((".yaml", ".yml")) else _own(source)
+
+
+def _own(name: str) -> Path | None:
+    """The file of a person's own scenario of that name; built-in names are no others'."""
     from diffcloud.scene.scenarios import SCENARIO_NAMES
 
-    if source.endswith((".yaml", ".yml")):
-        return Path(source)
-    return _own(source) if source not in SCENARIO_NAMES and _own(source).is_file() else None
-
-
-def _own(name: str) -> Path:
-    return OWN_SCENARIOS / f"{name}.yaml"
+    path = OWN_SCENARIOS / f"{name}.yaml"
+    return path if name not in SCENARIO_NAMES and path.is_file() else None
 
 
 def limits(scenario: Scenario) -> list[str]:

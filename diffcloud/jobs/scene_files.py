@@ -11,7 +11,7 @@ import yaml
 
 from diffcloud.console import warn
 from diffcloud.errors import ConfigError, DiffCloudError, EpisodeError
-from diffcloud.identification import found_cloth
+from diffcloud.identification import found_cloth, with_material_path
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import files_in, read_json, read_yaml, together, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint
@@ -154,9 +154,7 @@ def _cloth(
         if stated is not None and list(stated) != fields["size_m"]:
             other = f"--size {stated[0]:g}x{stated[1]:g}"
             warn(f"{path} says size_m {fields['size_m']}, and that counts, not {other}: edit the file.")
-        if isinstance(fields.get("material"), str) and fields["material"].endswith(".json"):
-            fields["material"] = str((out / fields["material"]).resolve())  # scenarios are written to another folder
-        return fields
+        return with_material_path(fields, out)  # scenarios are written to another folder
     found = found_cloth(list(episodes.values()), stated, mass)
     write_text(path, _yaml(found))
     return {name: entry.value for name, entry in found.items()}
@@ -245,9 +243,4 @@ def scene_fields(source: str) -> dict[str, Any] | None:
     """The fields of a scene's YAML file, with the path of its material; None of a built-in or a scene JSON, which later
     commands find by name."""
     path = own_scene(source)
-    if path is None:
-        return None
-    told = read_fields(path)
-    if isinstance(material := told.get("material"), str) and material.endswith(".json"):
-        told["material"] = str((path.parent / material).resolve())
-    return told
+    return None if path is None else with_material_path(read_fields(path), path.parent)

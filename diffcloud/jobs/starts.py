@@ -15,13 +15,11 @@ REGRESSORS = Path("data/regressors")
 
 
 def first_start(init: str, task: FitTask) -> dict[str, float]:
-    """Values of the first start by name; recordings of a joint fit give the mean of their predictions.
+    """Values of a first start that is stated or predicted, by name; recordings of a joint fit give the mean of theirs.
 
     Raises:
         ConfigError: a value of what is not fitted, or outside of its bounds.
     """
-    if init == "middle":
-        return {}
     if "=" in init:
         stated = assignments(init.split(","), "--init")
         task.space.check_start(stated)
