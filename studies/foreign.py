@@ -411,6 +411,7 @@ def _tell(one: Set, found: Path, names: dict[str, Cloth], paths: Sequence[Path])
     find_scene(paths, found, size, first.sheet.density)
     cloth = yaml.safe_load((found / "cloth.yaml").read_text())
     cloth["grip_m"] = first.pad if one.told else first.stated_pad
+    cloth["air"] = "none"  # neither simulator has any
     if one.told:
         cloth["grip_known_within"] = 1.0
     if one.kind == "fold":
