@@ -81,7 +81,7 @@ comparison: venv
 SIMULATED := build/simulated
 SIMULATED_PARAMS := pipeline/profiles/simulated.yaml
 simulated: venv
-	python -m pipeline.episodes --params $(SIMULATED_PARAMS) --out $(SIMULATED)/episodes
+	python -m pipeline.synthesize --params $(SIMULATED_PARAMS) --out $(SIMULATED)/episodes
 	python -m pipeline.fit --params $(SIMULATED_PARAMS) --out $(SIMULATED)/fits $(SIMULATED)/episodes
 	set -e; for scenario in band_stretch vest_hang; do \
 	    diffcloud network generate --params $(SIMULATED_PARAMS) --scene $$scenario --out $(SIMULATED)/sets/$$scenario; \
@@ -95,7 +95,7 @@ simulated: venv
 RECORDINGS := build/recordings
 RECORDINGS_PARAMS := docs/results/raw-recordings.yaml
 recordings: venv
-	python -m pipeline.episodes --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/raw
+	python -m pipeline.synthesize --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/raw
 	python -m pipeline.preprocess --params $(RECORDINGS_PARAMS) --out $(RECORDINGS)/clouds $(RECORDINGS)/raw
 	python -m studies recordings --params $(RECORDINGS_PARAMS) --recorded $(RECORDINGS)/raw --episodes $(RECORDINGS)/clouds \
 	    --out docs/results/raw-recordings.md
@@ -106,7 +106,7 @@ NUISANCE := --nuisance none --nuisance x=10cm,y=10cm,z=2mm,tilt_x=5e-3rad,tilt_y
 moved: venv
 	set -e; for kind in together apart; do \
 	    params=docs/results/moved-$$kind.yaml; \
-	    python -m pipeline.episodes --params $$params --out $(MOVED)/$$kind/raw; \
+	    python -m pipeline.synthesize --params $$params --out $(MOVED)/$$kind/raw; \
 	    python -m pipeline.preprocess --params $$params --out $(MOVED)/$$kind/clouds $(MOVED)/$$kind/raw; \
 	    python -m studies recordings --params $$params --recorded $(MOVED)/$$kind/raw --episodes $(MOVED)/$$kind/clouds \
 	        --out docs/results/moved-$$kind.md $(NUISANCE); \
@@ -129,17 +129,17 @@ COVERAGE := $(COUNTED) --out build/coverage
 BESIDE := $(COUNTED) --out $(POSTERIOR)/coverage --seed 6985324 --recordings 24 --scenario lift
 DRAWN := --seed 82037895
 coverage-own: venv
-	$(COVERAGE) $(DRAWN) --recordings 200 --fix mass
+	$(COVERAGE) $(DRAWN) --recordings 200 --fix density
 	$(COVERAGE) $(DRAWN) --recordings 200
-	$(COVERAGE) --fix mass --scenario lift --scenario fold --seed 7775397 --recordings 16 --truth refined
-	$(COVERAGE) --fix mass --scenario band_stretch --scenario vest_hang --seed 7775397 --recordings 8 --truth refined
-	$(COVERAGE) --fix mass --scenario lift --seed 7775397 --recordings 12 --truth finer
-	$(COVERAGE) --fix mass --scenario fold --seed 7775397 --recordings 6 --truth finer
-	$(COVERAGE) --seed 5448382 --recordings 3 --refits 20 --fix mass
+	$(COVERAGE) --fix density --scenario lift --scenario fold --seed 7775397 --recordings 16 --truth refined
+	$(COVERAGE) --fix density --scenario band_stretch --scenario vest_hang --seed 7775397 --recordings 8 --truth refined
+	$(COVERAGE) --fix density --scenario lift --seed 7775397 --recordings 12 --truth finer
+	$(COVERAGE) --fix density --scenario fold --seed 7775397 --recordings 6 --truth finer
+	$(COVERAGE) --seed 5448382 --recordings 3 --refits 20 --fix density
 	$(COVERAGE) --seed 5448382 --recordings 3 --refits 20 --markdown docs/results/coverage.md
 	$(BESIDE)
 	diffcloud network generate --scene lift --distribution logarithmic --train 1500 --test 375 --seed 75498966 --out $(POSTERIOR)/lift \
-	    --uncertain bending=1.5x,drag=1.3x,damping=1.5x,friction_obstacle=1.3x,friction_cloth=1.3x
+	    --uncertain bending=1.5x,air_density=1.3x,damping=1.5x,friction=1.3x,self_friction=1.3x
 	diffcloud network train --params docs/results/posterior.yaml --scene lift --model posterior --data $(POSTERIOR)/lift \
 	    --like $(POSTERIOR)/coverage/lift/episodes/0000.npz --out $(POSTERIOR)/regressors
 	$(BESIDE) --checkpoint $(POSTERIOR)/regressors/posterior.safetensors --markdown docs/results/coverage-posterior.md
@@ -153,10 +153,11 @@ hanging: venv
 robustness: venv
 	python -m tests.robustness --out docs/results/robustness.md
 
-# The pictures of README and docs/concepts.md, from what `make repro` leaves in data/.
+# The pictures of README (from examples/) and of docs/concepts.md (from what `make repro` leaves in data/).
 pictures: venv
 	python docs/site/pictures.py
 	python docs/site/physics_figures.py
+	diffcloud fit examples/towel.npz --size 0.395x0.244 --density 0.24 --out build/towel
 	python docs/site/motion.py
 
 # The site of docs/, README and all commands, as files that open from disk: build/site/index.html.

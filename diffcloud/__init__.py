@@ -20,7 +20,7 @@ Imports run one way (a test holds this):
     regressors <- mesh, clouds, io
     sensing    <- mesh, clouds, io
     hardware   <- sensing, io                  (cameras and arm; their packages are imported when one is opened)
-    report, library <- everything above
+    reporting, library <- everything above
     cli        <- everything; nothing imports it but pipeline (the stages of `dvc repro`) and studies
 """
 
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         find_scenes,
         fit,
         load_recording,
+        report,
         sample_surface,
     )
 
@@ -62,6 +63,7 @@ __all__ = [
     "find_scenes",
     "fit",
     "load_recording",
+    "report",
     "sample_surface",
 ]
 

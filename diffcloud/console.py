@@ -182,7 +182,7 @@ def with_suffix(path: Path, suffix: str, option: str = "--out") -> Path:
 
 
 def assignments(items: list[str] | None, option: str) -> dict[str, float]:
-    """["stretch=0.5", ...] -> {"stretch": 0.5}."""
+    """["stretching=40", ...] -> {"stretching": 40.0}."""
     values: dict[str, float] = {}
     for item in items or []:
         name, _, text = item.partition("=")

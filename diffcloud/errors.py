@@ -74,7 +74,7 @@ class DivergedError(DiffCloudError):
         where = f" with {parameters}" if parameters else ""
         super().__init__(
             f"The simulation diverged at step {step}, batch entries {entries}{where}: {reason}. "
-            "Try a smaller time step (more frame_steps), parameters nearer the basis material, "
+            "Try a smaller time step (more frame_steps), parameters nearer the nominal material, "
             "a stiffer material, or a softer contact."
         )
 

@@ -23,34 +23,24 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfaceSampler
 from diffcloud.errors import ConfigError, EpisodeError, unknown_name
 from diffcloud.estimation.record import FitRecord
-from diffcloud.estimation.result import FitResult, FittedMotion, physical_values, write_fit
+from diffcloud.estimation.result import FitResult, FittedMotion, write_fit
 from diffcloud.estimation.settings import FitSettings
 from diffcloud.estimation.solvers import Progress
-from diffcloud.estimation.task import FitTask, Recording
-from diffcloud.evaluation.intervals import Intervals, draws, intervals_of
+from diffcloud.estimation.task import FitTask, Recording, compared
+from diffcloud.evaluation.intervals import Intervals, draws, intervals_of, stated_parameters
 from diffcloud.evaluation.methods import space_of
 from diffcloud.identification import fit_settings, found_cloth, known_grip, with_density, with_material_path
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import read_yaml, together, write_json, write_text
 from diffcloud.io.imports import cloud_folder
+from diffcloud.reporting.fit_page import Status, Told, findings_of, page_of
 from diffcloud.scene.scenarios import Scenario, load_scenario
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
 from diffcloud.scene.scenarios.layout import find_layout
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import Rollout, rollout
 from diffcloud.simulators.export.cloth import fitted_cloth
-from diffcloud.simulators.export.write import Target, described, write_export, write_samples
-
-_NAMES = {
-    "stretch": "stretching",
-    "mass": "density",
-    "drag": "air_density",
-    "friction_obstacle": "friction",
-    "friction_cloth": "self_friction",
-}
-"""Parameter of a fit -> quantity, where their names differ."""
-_PARAMETERS = {_NAMES.get(name, name): name for name in PARAMETERS if name != "mass"}
-"""Quantity -> parameter that sets it."""
+from diffcloud.simulators.export.write import described, write_export, write_samples
 
 
 @dataclass(frozen=True)
@@ -70,7 +60,8 @@ class Estimate:
     the lower bound is zero."""
 
     def __str__(self) -> str:
-        ends = "" if self.interval is None else f" ({self.interval[0]:.3g} to {self.interval[1]:.3g}), {self.status}"
+        ends = "" if self.interval is None else f" ({self.interval[0]:.3g} to {self.interval[1]:.3g})"
+        ends += f", {self.status.replace('_', ' ')}" if self.status else ""
         return f"{self.value:.3g} {self.unit}{ends}"
 
 
@@ -124,11 +115,9 @@ class Scene:
         system, _ = scenario.scene.build()
         values = dict[str, Tensor]()
         for name, value in (quantities or {}).items():
-            if name not in _PARAMETERS:
-                raise ConfigError(unknown_name("quantity", name, _PARAMETERS))
-            parameter = PARAMETERS[_PARAMETERS[name]]
-            unit = 1.0 if parameter.basis is None else scenario.scene.basis(parameter.basis)
-            values[parameter.name] = torch.as_tensor(value, dtype=torch.float64).reshape(-1) / unit
+            if name not in PARAMETERS:
+                raise ConfigError(unknown_name("quantity", name, PARAMETERS))
+            values[name] = torch.as_tensor(value, dtype=torch.float64).reshape(-1) / scenario.nominal(name)
         count = max((len(value) for value in values.values()), default=1)
         values = {name: value.expand(count) if len(value) == 1 else value for name, value in values.items()}
         steps = scenario.steps if seconds is None else max(round(seconds / scenario.scene.time_step), 1)
@@ -156,8 +145,22 @@ class Fit:
     """Of each recording, with the fitted values."""
 
     def __str__(self) -> str:
-        lines = [f"{self.status}, residual {1e3 * self.residual:.1f} mm"]
+        lines = [f"{self.status.replace('_', ' ')}, residual {1e3 * self.residual:.1f} mm"]
         return "\n".join([*lines, *(f"{name}: {told}" for name, told in self.parameters.items())])
+
+    def _repr_html_(self) -> str:
+        """A table of the parameters, for notebooks."""
+        rows = [
+            {
+                "parameter": name,
+                "value": f"{one.value:.3g} {one.unit}",
+                "interval": "" if one.interval is None else f"{one.interval[0]:.3g} to {one.interval[1]:.3g}",
+                "status": one.status.replace("_", " "),
+            }
+            for name, one in self.parameters.items()
+        ]
+        head = f"<p>{self.status.replace('_', ' ')}, residual {1e3 * self.residual:.1f} mm</p>"
+        return head + str(pd.DataFrame(rows).to_html(index=False))
 
     def sample(self, count: int, seed: int = 0) -> pd.DataFrame:
         """Parameter sets drawn from the posterior: a row each, a column for each quantity in SI units.
@@ -168,11 +171,10 @@ class Fit:
         if self.intervals is None:
             raise ConfigError("Only a fit by the solver likelihood knows how uncertain it is; fit again with it.")
         drawn = pd.DataFrame(draws(self.intervals, space_of(self.record).asked, count, seed))
-        units = {name: entry.physical / entry.value for name, entry in self.intervals.parameters.items()}
-        return (drawn * units).rename(columns=_NAMES)
+        return drawn * {name: entry.nominal for name, entry in self.intervals.parameters.items()}
 
     def save(self, folder: str | Path) -> Path:
-        """Write fit.json, fit.npz, intervals.json and scenarios/, which `diffcloud export`, `view` and `simulate` read.
+        """Write fit.json, fit.npz, intervals.json and scenes/, which `diffcloud export`, `view` and `simulate` read.
 
         Returns:
             The path of fit.json.
@@ -182,7 +184,7 @@ class Fit:
             path = write_fit(folder, "fit", FitResult(self.record, list(self.motions)))
             for scene in self.scenes:
                 text = yaml.safe_dump(dict(scene.options), sort_keys=False)
-                write_text(folder / "scenarios" / f"{scene.name}.yaml", text)
+                write_text(folder / "scenes" / f"{scene.name}.yaml", text)
             if self.intervals is not None:
                 write_json(folder / "intervals.json", self.intervals.model_dump(mode="json"))
         return path
@@ -240,15 +242,16 @@ def find_scenes(
         cloth |= known_grip(grip)
     if weighed is not None and weighed[1]:
         cloth = with_density(cloth, *weighed)
-    settings, scenes = fit_settings(None, cloth, weighed), list[Scene]()
+    scenes = list[Scene]()
     sides = (float(cloth["size_m"][0]), float(cloth["size_m"][1]))
     for number, recording in enumerate(recordings, 1):
         layout = find_layout(recording, sides, float(cloth["grip_m"]))
         for message in layout.warnings:
             warnings.warn(f"Recording {number}: {message}.", stacklevel=2)
         options = {**cloth, **{name: found.value for name, found in layout.fields.items()}}
-        scenes.append(Scene(f"recording_{number}", options, settings))
-    return scenes
+        scenes.append(Scene(f"recording_{number}", options))
+    settings = fit_settings(None, scenes[0].scenario, weighed)
+    return [replace(scene, settings=settings) for scene in scenes]
 
 
 def fit(
@@ -303,34 +306,56 @@ def fit(
 
 
 def _estimates(record: FitRecord, intervals: Intervals | None, scenario: Scenario, level: float) -> dict[str, Estimate]:
-    if intervals is None:
-        asked = space_of(record).asked.names
-        told = physical_values(scenario, {name: record.values[name] for name in asked})
-        return {_NAMES.get(n, n): Estimate(p.physical, p.physical_unit, None, level, "") for n, p in told.items()}
+    sources = {} if intervals is None else intervals.sources
     return {
-        _NAMES.get(name, name): Estimate(
-            entry.physical,
-            entry.physical_unit,
-            (entry.physical_low, entry.physical_high),
-            intervals.level,
-            entry.verdict,
-            dict(sorted(((source, row[name]) for source, row in intervals.sources.items()), key=lambda one: -one[1])),
+        name: Estimate(
+            one["value"],
+            one["unit"],
+            None if intervals is None else (one["low"], one["high"]),
+            level,
+            one["status"] or "",
+            dict(sorted(((source, row[name]) for source, row in sources.items()), key=lambda part: -part[1])),
         )
-        for name, entry in intervals.parameters.items()
+        for name, one in stated_parameters(record, intervals, scenario).items()
     }
 
 
 def _status(record: FitRecord, intervals: Intervals | None) -> str:
     if record.stop_reason == "interrupted":
         return "interrupted"
-    if intervals is not None and not intervals.explains:
+    if intervals is not None and not intervals.fits_to_noise:
         return "model_error"
     if record.stop_reason not in ("converged", "threshold"):
         return "not_converged"
     return "fits_to_noise" if intervals is not None else "no_uncertainty"
 
 
-def export(fit: Fit, to: Target, out: str | Path, *, recording: int = 0, samples: int = 0, seed: int = 0) -> Path:
+def report(fit: Fit, recordings: Episode | Sequence[Episode], path: str | Path) -> Path:
+    """Write the page of a fit: findings, intervals, and a player of recorded clouds and fitted cloths.
+
+    Args:
+        recordings: of the fit, in its order.
+        path: of the HTML file.
+
+    Returns:
+        The path.
+
+    Raises:
+        ConfigError, EpisodeError: the recordings are not those of the fit.
+    """
+    episodes = [recordings] if isinstance(recordings, Episode) else list(recordings)
+    if len(episodes) != len(fit.scenes):
+        raise ConfigError(f"The fit is of {len(fit.scenes)} recordings, got {len(episodes)}.")
+    pairs = zip(fit.scenes, episodes, strict=True)
+    members = [Recording(scene.scenario, scene.name, episode) for scene, episode in pairs]
+    status = Status.interrupted if fit.status == "interrupted" else Status.finished
+    told = Told(fit.record, compared(fit.record, members), fit.intervals, status)
+    page = page_of(told, findings_of(told), {one.name: one.episode for one in members}, fit.motions)
+    write_text(Path(path), page)
+    return Path(path)
+
+
+def export(fit: Fit, to: str, out: str | Path, *, recording: int = 0, samples: int = 0, seed: int = 0) -> Path:
     """Write the fitted cloth for another simulator: mesh, material in SI units, and the motion of what is held.
 
     Args:

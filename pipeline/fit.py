@@ -52,7 +52,7 @@ def fit(
     results: dict[str, Any] = {}
     failures: list[str] = []
     try:
-        for job, record, error in fit_all(episodes, out, config.scenarios, config.fit, workers, scheduler):
+        for job, record, error in fit_all(episodes, out, config.scenes, config.fit, workers, scheduler):
             if record is None:
                 failures.append(f"{job.label}: {error}")
                 continue

@@ -111,7 +111,7 @@ def _real_fits(release: Path, starts: int) -> str:
             update(index, label)
             scenario = choose_scenario(name, _scene(release, name))
             objective = Objective(scenario, episode, paper=True)
-            space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
+            space = FitSpace.build(["stretching", "density"], bounds=scenario.bounds)
             settings = AdamSettings(learning_rate=scenario.learning_rate, smoothing=SMOOTHING)
             single = fit_adam(objective, space, settings).uninterrupted()
             many = fit_adam(objective, space, replace(settings, starts=starts)).uninterrupted()
@@ -138,18 +138,29 @@ def _real_fits(release: Path, starts: int) -> str:
 
 def _fit_report(fits: list[_Fit], starts: int) -> str:
     models = list(fits[0].predictions)
-    head = ["episode", "start", "1 start", "stretch", "mass", "s", f"{starts} starts", "stretch", "mass", *models]
+    head = [
+        "episode",
+        "start",
+        "1 start",
+        "stretching",
+        "density",
+        "s",
+        f"{starts} starts",
+        "stretching",
+        "density",
+        *models,
+    ]
     rows = [
         [
             fit.episode,
             f"{fit.start:.5f}",
             f"{fit.single:.5f}",
-            f"{fit.single_values['stretch']:.2f}",
-            f"{fit.single_values['mass']:.2f}",
+            f"{fit.single_values['stretching']:.2f}",
+            f"{fit.single_values['density']:.2f}",
             f"{fit.seconds:.1f}",
             f"{fit.many:.5f}",
-            f"{fit.many_values['stretch']:.2f}",
-            f"{fit.many_values['mass']:.2f}",
+            f"{fit.many_values['stretching']:.2f}",
+            f"{fit.many_values['density']:.2f}",
             *(f"{fit.predictions[model]:.5f}" for model in models),
         ]
         for fit in fits
@@ -211,9 +222,9 @@ def _simulated_clouds(release: Path) -> str:
         at_loss += loss <= PAPER_THRESHOLD
         always += max(losses) <= PAPER_THRESHOLD
         kind = name.removeprefix("release_")
-        pair = [f"{truth[key]:.2f}" for key in ("stretch", "mass")]
+        pair = [f"{truth[key]:.2f}" for key in ("stretching", "density")]
         rows.append([f"{kind} {label}", *pair, f"{losses[0]:.1e}", f"{loss:.1e}", f"{max(losses):.1e}"])
-    head = ["episode", "stretch", "mass", "start", "loss frame", "worst frame"]
+    head = ["episode", "stretching", "density", "start", "loss frame", "worst frame"]
     note = (
         "One-sided Chamfer (squared release units) from the cloth simulated at the true parameters to the published "
         "simulated clouds. At the start both are the same cloth, so that column is what sampling alone costs."
@@ -233,7 +244,7 @@ def _simulated_fits(release: Path) -> str:
         for index, (name, label, episode) in enumerate(episodes):
             update(index, label)
             scenario = load_scenario(name, _scene(release, name))
-            space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
+            space = FitSpace.build(["stretching", "density"], bounds=scenario.bounds)
             settings = AdamSettings(learning_rate=scenario.learning_rate, threshold=scenario.threshold)
             found = fit_adam(Objective(scenario, episode, paper=True), space, settings).uninterrupted()
             truth = episode.meta["truth"]
@@ -244,13 +255,13 @@ def _simulated_fits(release: Path) -> str:
                     f"{found.loss:.1e}",
                     str(found.iterations),
                     f"{found.seconds:.1f}",
-                    *(f"{found.values[key]:.2f} ({truth[key]:.2f})" for key in ("stretch", "mass")),
+                    *(f"{found.values[key]:.2f} ({truth[key]:.2f})" for key in ("stretching", "density")),
                 ]
             )
-    head = ["episode", "start", "loss", "iterations", "s", "stretch (true)", "mass (true)"]
+    head = ["episode", "start", "loss", "iterations", "s", "stretching (true)", "density (true)"]
     note = (
         f"One Adam start from the middle of the bounds with the paper's settings, stopped below {PAPER_THRESHOLD:g}. A "
-        "loss below the threshold is no identification: stretch and mass trade off against each other."
+        "loss below the threshold is no identification: stretching and density trade off against each other."
     )
     return "\n".join(["# Fits of the published simulated clouds", "", note, "", *markdown_table(head, rows), ""])
 
@@ -263,7 +274,7 @@ def _trajectories(release: Path, reference: Path) -> str:
         system, _ = scenario.scene.build()
         with np.load(path, allow_pickle=False) as run:
             nodes = run["verts"]
-            values = {"stretch": float(run["stretch_mult"]), "mass": float(run["mass_mult"])}
+            values = {"stretching": float(run["stretch_mult"]), "density": float(run["mass_mult"])}
         tensors = one_set(values)
         with torch.no_grad():
             found = rollout(system, len(nodes) - 1, properties=scenario.properties(system, tensors))

@@ -102,12 +102,12 @@ def run_benchmarks(published: Mapping[str, Path], *, repeats: int) -> list[dict[
 
 def time_fit() -> float:
     """Seconds from clouds to the report of `diffcloud fit`: one lift of the towel of docs/own-clouds.md, of half the
-    basis's stiffness and one and a half times its mass, with 2 mm of noise."""
-    from diffcloud.jobs.episodes import simulated_frames  # not above: only this needs them
+    nominal stiffness and one and a half times its mass, with 2 mm of noise."""
+    from diffcloud.jobs.synthesize import simulated_frames  # not above: only this needs them
 
     towel = built_in("lift").model_copy(update=_TOWEL)
     scenario = make_scenario(towel)
-    system, (nodes,), _ = simulated_frames(scenario, {"stretch": np.array([0.5]), "mass": np.array([1.5])})
+    system, (nodes,), _ = simulated_frames(scenario, {"stretching": np.array([0.5]), "density": np.array([1.5])})
     generator = torch.Generator().manual_seed(0)
     sampler = SurfaceSampler.build(torch.as_tensor(system.mesh.faces), 2500, generator=generator)
     clouds = sampler.sample(torch.from_numpy(nodes)).numpy()

@@ -26,7 +26,7 @@ _SIDE = 3
 
 @dataclass(frozen=True)
 class Run:
-    """One motion for each of nine pairs (stretch, mass)."""
+    """One motion for each of nine pairs (stretching, density)."""
 
     nodes: NDArray[np.float64]
     """[9, V, 3] at the loss frame [m]; NaN where a motion diverged."""
@@ -65,13 +65,13 @@ class MeshRow:
 
 
 def pairs(scenario: Scenario) -> dict[str, torch.Tensor]:
-    """Nine pairs: the middles of nine equal parts of the bounds of stretch and mass, on their logarithmic scale."""
+    """Nine pairs: the middles of nine equal parts of the bounds of stretching and density, on their logarithmic scale."""
     axes = []
-    for name in ("stretch", "mass"):
+    for name in ("stretching", "density"):
         low, high = scenario.bounds.get(name, PARAMETERS[name].bounds)
         axes.append([low * (high / low) ** ((k + 0.5) / _SIDE) for k in range(_SIDE)])
     stretch, mass = zip(*itertools.product(*axes), strict=True)
-    return {"stretch": torch.tensor(stretch), "mass": torch.tensor(mass)}
+    return {"stretching": torch.tensor(stretch), "density": torch.tensor(mass)}
 
 
 def simulate(scenario: Scenario, scene: Scene, *, nudge: float = 0.0) -> Run:

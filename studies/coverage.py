@@ -24,12 +24,12 @@ from diffcloud.evaluation.intervals import intervals_of
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import files_in, read_json, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint, kept_record
-from diffcloud.jobs.episodes import hidden_parameters, record_motion, simulated_frames
 from diffcloud.jobs.fits import FitJob
 from diffcloud.jobs.pool import Tell, run_all
 from diffcloud.jobs.preprocess import PreprocessJob
 from diffcloud.jobs.scenarios import choose_scenario
-from diffcloud.jobs.settings import Config, EpisodesConfig, load_config
+from diffcloud.jobs.settings import Config, SynthesizeConfig, load_config
+from diffcloud.jobs.synthesize import hidden_parameters, record_motion, simulated_frames
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.depth_camera import DepthNoise
 from diffcloud.settings import updated
@@ -54,8 +54,8 @@ _RECORDS = ("mesh", "io", "sim", "scene", "clouds", "sensing")
 _CODE = (*_RECORDS, "estimation", "evaluation")
 _FINER_STEPS = 4
 """Times as many steps of the truths `refined` and `finer`."""
-_LAID_M = 0.01
-"""Deviation by which a cloth is laid beside its place."""
+_PLACE_M = 0.01
+"""Deviation by which a cloth lies off its place."""
 Truth = Literal["same", "refined", "finer"]
 _OTHER_NOISE = DepthNoise(subpixel_px=0.1, correlation_px=1.5, step_px=1 / 16, edge_dropout=0.5, flying=0.2, holes=0.01)
 """Of cameras that are worse than the noise model says: errors of more pixels go together, disparity has coarser steps, and
@@ -79,7 +79,8 @@ def coverage(
     refits: Annotated[
         int | None,
         typer.Option(
-            min=2, help="Recordings of each cloth, each fitted on its own: stretch and mass stay, all else is drawn anew."
+            min=2,
+            help="Recordings of each cloth, each fitted on its own: stretching and density stay, all else is drawn anew.",
         ),
     ] = None,
     truth: Annotated[
@@ -100,8 +101,8 @@ def coverage(
 ) -> None:
     """Draw cloths, record and fit them, and count how often the stated intervals hold the truth.
 
-    Stretch and mass are drawn as `python -m pipeline.episodes` draws them; material that is not fitted is off by the
-    factors of `fit.uncertain`, cameras and clock by what fits assume of a calibrated set-up (2 mm, 0.3°, 2 ms), and the
+    Stretching and density are drawn as `python -m pipeline.synthesize` draws them. Material that is not fitted is off
+    by the factors of `fit.uncertain`, cameras and clock by what fits assume of a calibrated set-up (2 mm, 0.3°, 2 ms). The
     cloth lies about a centimetre beside its place. A recording whose fit fails or gets no interval counts as a miss.
     """
     config = load_config(params)
@@ -115,7 +116,7 @@ def coverage(
         raise ConfigError("--checkpoint takes one recording of each cloth; leave out --checkpoint or --refits.")
     jobs = [
         CoverageJob(choose_scenario(name), index, seed, known, level or config.fit.level, truth, config, out, refit)
-        for name in scenario or config.scenarios
+        for name in scenario or config.scenes
         for index in range(recordings)
         for refit in (range(refits) if refits else (None,))
     ]
@@ -146,7 +147,7 @@ def coverage(
         f"{job.scenario.name}/{job.folder.name}": counts.get((job.scenario.name, job.folder.name), {"parameters": {}})
         for job in jobs
     }
-    result = next(iter(asked.values())) if len(asked) == 1 else {"scenarios": asked}
+    result = next(iter(asked.values())) if len(asked) == 1 else {"scenes": asked}
     finish({"out": str(out), "level": jobs[0].level, **result, "failures": failures}, json)
 
 
@@ -200,7 +201,7 @@ class CoverageJob:
         plan = [self.scenario, self.index, self.refit, self.seed, self.known, self.level, self.kind]
         plan += [self.config.fit.identified_factor]
         plan += [truth, set_up, self._noise]
-        sections = [self.config.episodes, self.config.preprocess, self.config.fit]
+        sections = [self.config.synthesize, self.config.preprocess, self.config.fit]
         mark = fingerprint([*plan, [str(section) for section in sections]], packages=_CODE)
         record = kept_record(path, mark)
         if record is None:
@@ -236,7 +237,7 @@ class CoverageJob:
     def truth(self) -> dict[str, float]:
         """All that is drawn, name -> value."""
         rng = np.random.default_rng([self.seed, self.index])
-        drawn = hidden_parameters(self.scenario, self.config.episodes.model_copy(update={"per_scenario": 1}), rng)
+        drawn = hidden_parameters(self.scenario, self.config.synthesize.model_copy(update={"per_scenario": 1}), rng)
         if self.refit is not None:
             rng = self._random(3)
         found = {name: float(value[0]) for name, value in drawn.items()}
@@ -250,9 +251,9 @@ class CoverageJob:
 
     def set_up(self) -> dict[str, float]:
         """Errors of the set-up, drawn as fits assume it, name of `estimation.pose` -> value [m, rad, s]; and how far
-        beside its place the cloth is laid with its gripper, `laid_x` and `laid_y` [m]."""
+        beside its place the cloth lies with its gripper, `place_x` and `place_y` [m]."""
         rng = self._random(2)
-        deviations = {**SET_UP, "laid_x": _LAID_M, "laid_y": _LAID_M}
+        deviations = {**SET_UP, "place_x": _PLACE_M, "place_y": _PLACE_M}
         return {name: deviation * float(rng.standard_normal()) for name, deviation in deviations.items()}
 
     def _random(self, *stream: int) -> np.random.Generator:
@@ -263,7 +264,7 @@ class CoverageJob:
         episode = self.episode(truth, tell)
         tell(0.5, "fit")
         fit = self.config.fit
-        fixed = {**fit.fixed, **{name: truth[name] for name in self.known}}
+        fixed = {**fit.fixed, **self.scenario.in_si({name: truth[name] for name in self.known})}
         solver = {**fit.solver.model_dump(), "model_error": self.kind != "same"}
         fit = updated(fit, fixed=fixed, solver=solver)
         job = FitJob(self.label, [Recording(self.scenario, self.label, episode)], fit, self.folder)
@@ -295,7 +296,7 @@ class CoverageJob:
         """Recorded and preprocessed; fits with other known parameters share it."""
         path = self.out / self.scenario.name / "_".join(["episodes", *self.marks]) / f"{self.name}.npz"
         told = [self.scenario, self.index, self.refit, self.seed, self.kind]
-        told += [str(self.config.episodes), str(self.config.preprocess)]
+        told += [str(self.config.synthesize), str(self.config.preprocess)]
         set_up = self.set_up()
         made = fingerprint([*told, dict(truth), set_up, self._noise], packages=_RECORDS)
         if path.is_file() and (kept := read_episode(path)).meta.get("made") == made:
@@ -313,7 +314,7 @@ class CoverageJob:
         seed = int(rng.integers(2**31))
         with TemporaryDirectory(prefix="diffcloud-") as folder:
             work = Path(folder)
-            config = _misplaced(self.config.episodes, set_up)
+            config = _misplaced(self.config.synthesize, set_up)
             noise, _ = self._noise
             record_motion(self.scenario, system, nodes, times, work, path.stem, config, seed=seed, meta=meta, noise=noise)
             source = work / path.stem if (work / path.stem).is_dir() else work / path.name
@@ -332,14 +333,18 @@ class CoverageJob:
         return episode
 
 
-def _misplaced(config: EpisodesConfig, set_up: Mapping[str, float]) -> EpisodesConfig:
+def _misplaced(config: SynthesizeConfig, set_up: Mapping[str, float]) -> SynthesizeConfig:
     """What depth cameras record with these errors, in directions of the recorder's own."""
-    moved, turned, laid = (
+    moved, turned, placed = (
         math.hypot(*(set_up[name] for name in names))
-        for names in (("x", "y", "z"), ("tilt_x", "tilt_y", "yaw"), ("laid_x", "laid_y"))
+        for names in (("x", "y", "z"), ("tilt_x", "tilt_y", "yaw"), ("place_x", "place_y"))
     )
-    lag = max(config.lag_s + set_up["lag"], 0.0)
-    changes = {"cameras_moved": (1e3 * moved, math.degrees(turned)), "beside": (1e3 * laid, 0.0), "lag_s": lag}
+    lag = max(config.clock_offset_s + set_up["lag"], 0.0)
+    changes = {
+        "rig_error": (1e3 * moved, math.degrees(turned)),
+        "placement_error": (1e3 * placed, 0.0),
+        "clock_offset_s": lag,
+    }
     return config.model_copy(update=changes)
 
 
@@ -348,7 +353,7 @@ def _displaced(episode: Episode, set_up: Mapping[str, float]) -> Episode:
     points = torch.from_numpy(episode.points.astype(np.float64))
     names = tuple(name for name in SET_UP if name != "lag")
     space = PoseSpace.build(dict.fromkeys(names, 1.0), points.mean(0), length_unit_m=1.0)
-    values = [set_up[name] + set_up.get(f"laid_{name}", 0.0) for name in names]
+    values = [set_up[name] + set_up.get(f"place_{name}", 0.0) for name in names]
     moved = space.moved(points[None], torch.tensor([values], dtype=torch.float64))[0]
     times = episode.times.copy()
     times[1:] -= set_up["lag"]
@@ -389,12 +394,17 @@ def _predict(regressor: Regressor, jobs: Sequence[CoverageJob]) -> None:
             record: dict[str, Any] = {"error": str(error)}
         else:
             ends = zip(found.values[0].tolist(), found.first_intervals(job.level).items(), strict=True)
-            parameters = {name: {"value": value, "low": low, "high": high} for value, (name, (low, high)) in ends}
+            parameters = {
+                name: {"value": value, "low": low, "high": high, "nominal": 1.0} for value, (name, (low, high)) in ends
+            }
             stated = {"parameters": parameters, "within": job.config.fit.identified_factor, "level": job.level}
             record = {"intervals": stated}
-            if found.samples is not None and {"stretch", "mass"} <= set(told.names):
-                stretch, mass = (found.samples[0, :, told.names.index(name)] for name in ("stretch", "mass"))
-                ends = np.quantile((stretch / mass).numpy(), [0.5, 0.5 - job.level / 2, 0.5 + job.level / 2])
-                record["intervals"]["ratio"] = dict(zip(("value", "low", "high"), ends.tolist(), strict=True))
+            if found.samples is not None and {"stretching", "density"} <= set(told.names):
+                stretching, density = (found.samples[0, :, told.names.index(name)] for name in ("stretching", "density"))
+                ends = np.quantile((stretching / density).numpy(), [0.5, 0.5 - job.level / 2, 0.5 + job.level / 2])
+                record["intervals"]["ratio"] = {
+                    "nominal": 1.0,
+                    **dict(zip(("value", "low", "high"), ends.tolist(), strict=True)),
+                }
         folder = job.out / job.scenario.name / "_".join([told.model, *job.marks])
         write_json(folder / f"{job.index:04d}.json", {"truth": truth, **record})

@@ -18,7 +18,7 @@ from diffcloud.io.files import files_in, read_json
 
 REFITS = "refits"
 """Last part of the name of a folder whose records are of few cloths, each recorded several times."""
-_RATIO = "stretch / mass"
+_RATIO = "stretching / density"
 Counts = dict[tuple[str, str], dict[str, Any]]
 """(scenario, name of a folder of records) -> what these say, as of `counted`."""
 Cell = tuple[tuple[str, str, str], dict[str, Any]]
@@ -54,9 +54,9 @@ def counted(folder: Path) -> dict[str, Any]:
 
     Returns:
         level: of the intervals; parameters: name -> n, stated: with an interval, covered: those that hold the truth,
-        median_factor: of the intervals, rms_error: of the logarithm, verdicts, identified_within: of those called
+        median_factor: of the intervals, rms_error: of the logarithm, statuses, identified_within: of those called
         identified, how many are within the factor, noise_alone: how many intervals of the noise of residuals alone would
-        hold the truth, sources: source -> median deviation; ratio: the same of stretch to mass, if both are fitted; refits:
+        hold the truth, sources: source -> median deviation; ratio: the same of the ratio, if both are fitted; refits:
         as of `_held_by_refits`, where each cloth was recorded several times.
 
     Raises:
@@ -67,7 +67,7 @@ def counted(folder: Path) -> dict[str, Any]:
     fitted = next((list(one["intervals"]["parameters"]) for one in records if "intervals" in one), [])
     parameters = {name: _count(records, name) for name in fitted}
     told: dict[str, Any] = {"parameters": parameters, "level": level_of(folder, records) or LEVEL}
-    if any("ratio" in one.get("intervals", {}) for one in records) and {"stretch", "mass"} <= set(fitted):
+    if any("ratio" in one.get("intervals", {}) for one in records) and {"stretching", "density"} <= set(fitted):
         told["ratio"] = _count(records, "ratio")
     if folder.name.endswith(REFITS):
         told["refits"] = _held_by_refits(named)
@@ -89,22 +89,22 @@ def level_of(folder: Path, records: Sequence[Mapping[str, Any]]) -> float | None
 
 
 def _count(records: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
-    offs, widths, covered, verdicts, right, alone = [], [], 0, dict[str, int](), 0, 0
+    offs, widths, covered, statuses, right, alone = [], [], 0, dict[str, int](), 0, 0
     sources: dict[str, list[float]] = {}
     for record in records:
         if "intervals" not in record:
             continue
         truth, told = record["truth"], record["intervals"]
         entry = told["ratio"] if name == "ratio" else told["parameters"][name]
-        true = truth["stretch"] / truth["mass"] if name == "ratio" else truth[name]
+        true = entry["nominal"] * (truth["stretching"] / truth["density"] if name == "ratio" else truth[name])
         off = abs(math.log(entry["value"] / true))
         offs.append(off)
         if entry["low"] is not None:
             covered += entry["low"] <= true <= entry["high"]
             widths.append(math.log(entry["high"] / entry["low"]) / 2)
-        if (verdict := entry.get("verdict")) is not None:
-            verdicts[verdict] = verdicts.get(verdict, 0) + 1
-            right += verdict == "identified" and off <= math.log(told["within"])
+        if (status := entry.get("status")) is not None:
+            statuses[status] = statuses.get(status, 0) + 1
+            right += status == "identified" and off <= math.log(told["within"])
         if entry["low"] is None or "sources" not in told:
             continue
         for source, deviations in told["sources"].items():
@@ -119,7 +119,7 @@ def _count(records: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
         "median_half_width": float(np.median(widths)) if widths else None,
         "rms_error": float(np.sqrt(np.mean(np.square(offs)))) if offs else None,
         "median_error": float(np.median(offs)) if offs else None,
-        "verdicts": verdicts,
+        "statuses": statuses,
         "identified_within": right,
         "noise_alone": int(alone),
         "sources": {source: float(np.median(deviations)) for source, deviations in sources.items()},
@@ -137,7 +137,7 @@ def summary(cells: Sequence[Cell]) -> list[list[str]]:
             _number(count["rms_error"]),
             _number(count["median_error"]),
             _number(count["median_half_width"]),
-            f"{count['identified_within']} of {count['verdicts'].get('identified', 0)}" if labels[2] != _RATIO else "",
+            f"{count['identified_within']} of {count['statuses'].get('identified', 0)}" if labels[2] != _RATIO else "",
         ]
         for labels, count in cells
     ]
@@ -208,8 +208,8 @@ def _held_by_refits(named: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, 
         named: name of a file, <cloth>_<refit>, -> its record.
 
     Returns:
-        parameter -> cloths, held: of how many at least the share `level` of all refits is within the verdict's factor of
-        the truth, identified: (refits of these with the verdict identified, all refits of these), others: the same of other
+        parameter -> cloths, held: of how many at least the share `level` of all refits is within the status's factor of
+        the truth, identified: (refits of these with the status identified, all refits of these), others: the same of other
         cloths.
     """
     cloths: dict[str, list[dict[str, Any]]] = {}
@@ -220,10 +220,13 @@ def _held_by_refits(named: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, 
     for records in cloths.values() if stated else ():
         fits = [record["intervals"] | {"truth": record["truth"]} for record in records if "intervals" in record]
         for name in stated[0]["parameters"]:
-            entries = [(fit["parameters"][name], fit["truth"][name], fit["within"]) for fit in fits]
+            entries = [
+                (fit["parameters"][name], fit["truth"][name] * fit["parameters"][name]["nominal"], fit["within"])
+                for fit in fits
+            ]
             near = sum(abs(math.log(entry["value"] / true)) <= math.log(within) for entry, true, within in entries)
             held = near >= stated[0]["level"] * len(records)
-            named = sum(entry["verdict"] == "identified" for entry, _, _ in entries)
+            named = sum(entry["status"] == "identified" for entry, _, _ in entries)
             told = found.setdefault(name, {"cloths": 0, "held": 0, "identified": (0, 0), "others": (0, 0)})
             told["cloths"] += 1
             told["held"] += held
@@ -250,11 +253,11 @@ def coverage_page(counts: Counts) -> str:
         "",
         "Cloths of drawn parameters are simulated, recorded (`lift` and `fold` by two depth cameras through "
         f"`preprocess`, the others by their whole surface), fitted, and the {level} interval is held against the truth. "
-        "Material that is not asked for is off by the factors that fits state (`estimation.uncertain`); cameras and clock "
+        "Nuisance material is off by the factors that fits state (`estimation.uncertain`); cameras and clock "
         "are off by what they assume of a calibrated set-up (2 mm and 0.3° along and about each axis, and 2 ms, as "
         "standard deviations; `preprocess` measures the clock anew), and the cloth is displaced by about a centimetre. "
         "Errors and half-widths are of the natural logarithm: 0.1 is about 10 %. A fit that fails or states no "
-        "interval is a miss. *Identified*: of the recordings with that verdict, how many are within its factor of the "
+        "interval is a miss. *Identified*: of the recordings with that status, how many are within its factor of the "
         "truth. *Refined*: the truth has four times the steps that fits take, and was recorded with noise that they do not "
         "expect (`lift` and `fold` by worse cameras, the others with noise of 1 mm along each axis). *Finer*: like that, "
         "and its mesh has half the edge length. "
@@ -289,8 +292,8 @@ def coverage_page(counts: Counts) -> str:
     if refits:
         lines += [
             "Fresh recordings of the same cloths, everything else drawn anew. A parameter is *held* where at least "
-            f"{level} of the recordings (the level of the intervals) find it within the verdict's factor of the truth; the "
-            "last two columns count recordings with the verdict *identified*.",
+            f"{level} of the recordings (the level of the intervals) find it within the status's factor of the truth; the "
+            "last two columns count recordings with the status *identified*.",
             "",
             *markdown_table(REFIT_HEAD, refits),
             "",

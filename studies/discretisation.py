@@ -33,7 +33,7 @@ def discretisation(
     out: Annotated[Path, typer.Option(help="Markdown page.")] = Path("docs/results/discretisation.md"),
     json: JsonFlag = False,
 ) -> None:
-    """Errors of step size and mesh at the loss frame, for nine pairs of stretch and mass; writes a Markdown page."""
+    """Errors of step size and mesh at the loss frame, for nine pairs of stretching and density; writes a Markdown page."""
     chosen = [choose_scenario(name) for name in scenario or NAMES]
     steps: list[StepRow] = []
     meshes: list[MeshRow] = []
@@ -81,7 +81,7 @@ def _page(own: dict[str, Scene], steps: list[StepRow], meshes: list[MeshRow]) ->
         "# Step size and mesh",
         "",
         f"RMS node distance at the loss frame to the same simulation with {FINER} times the steps, over nine pairs of "
-        "stretch and mass: the middles of nine equal parts of their bounds, on the logarithmic scale. The last two "
+        "stretching and density: the middles of nine equal parts of their bounds, on the logarithmic scale. The last two "
         f"distances are to runs whose start was changed by {NUDGE:.0e} m and by {1e3 * PUSH:g} mm at random. Where the "
         "first is large, the motion is chaotic, and no step size makes it repeat; where the second is, as in folds that "
         "may buckle to either side, no recording repeats either. Milliseconds are processor time as far as the loss frame, "

@@ -46,7 +46,7 @@ from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.simulators import mujoco, newton
 from diffcloud.simulators.problem import REST_HEIGHT, Problem, Sheet, installed
 from diffcloud.simulators.problems import strip
-from diffcloud.simulators.towels import COUNTS, one_way
+from studies.mujoco_towels import COUNTS, one_way
 
 Floats = NDArray[np.float64]
 Kind = Literal["lift", "fold"]
@@ -323,7 +323,7 @@ class Case:
     high: float
     at_upper: bool
     """Whether the interval ends at the bound of the search."""
-    verdict: str
+    status: str
     seconds: float
     """Of processor time."""
     message: str
@@ -372,20 +372,20 @@ def fitted(one: Set, seed: int, out: Path, revision: str) -> Case:
         said = (folder / "messages.txt").read_text().strip().splitlines()[-3:]
         return Case(one.name, seed, truth, False, 1.0, 1.0, 1.0, False, "failed", seconds, " ".join(said), revision)
     told = json.loads((folder / "result.json").read_text())
-    found = told["parameters"]["stretch"]
+    found = told["parameters"]["stretching"]
     stated = found["low"] is not None
-    low, high = (found["low"], found["high"]) if stated else (found["physical"], found["physical"])
+    low, high = (found["low"], found["high"]) if stated else (found["value"], found["value"])
     upper = stated and high >= _upper(folder / "found")
     return Case(
         one.name,
         seed,
         truth,
         stated,
-        found["physical"],
+        found["value"],
         low,
         high,
         upper,
-        found["verdict"],
+        found["status"],
         seconds,
         told["reason"],
         revision,
@@ -394,8 +394,8 @@ def fitted(one: Set, seed: int, out: Path, revision: str) -> Case:
 
 def _upper(found: Path) -> float:
     """The largest stretching that the fit tried [N/m]."""
-    told = json.loads((found / "fit.json").read_text())["parameters"]["stretch"]
-    return 0.99 * float(told["physical"] / told["value"] * told["bounds"][1])
+    told = json.loads((found / "fit.json").read_text())["parameters"]["stretching"]
+    return 0.99 * float(told["bounds"][1])
 
 
 def _tell(one: Set, found: Path, names: dict[str, Cloth], paths: Sequence[Path]) -> None:
@@ -428,7 +428,7 @@ def _told(cloth: Cloth) -> dict[str, Any]:
     return {
         "center_m": centre.tolist(),
         "yaw_deg": yaw,
-        "laid_turn_deg": 0.0,
+        "initial_state": "none",
         "table_height_m": table + REST_HEIGHT - _GAP_M,
         "grasped": ["right_top"],
         "rate_hz": _RATE,
@@ -495,7 +495,7 @@ def _read(log: Path) -> dict[tuple[str, int, str], Case]:
 
 def _line(case: Case) -> str:
     if not case.stated:
-        return f"{case.set} {case.seed}: truth {case.truth:.1f}, {case.verdict}: {case.message}, {case.seconds:.0f} s"
+        return f"{case.set} {case.seed}: truth {case.truth:.1f}, {case.status}: {case.message}, {case.seconds:.0f} s"
     told = f"truth {case.truth:.1f}, {case.value:.1f} [{case.low:.1f} {case.high:.1f}]"
     return f"{case.set} {case.seed}: {told} {'held' if case.held else 'MISSED'}, z {case.z:+.1f}, {case.seconds:.0f} s"
 
@@ -517,7 +517,7 @@ def _page(cases: Sequence[Case], seed: int, count: int, revision: str) -> str:
             f"{case.value:.1f}" if case.stated else "",
             f"{case.low:.1f} to {'any' if case.at_upper else f'{case.high:.1f}'}" if case.stated else case.message,
             "yes" if case.held else "no",
-            case.verdict,
+            case.status,
         ]
         for case in cases
     ]
@@ -538,7 +538,7 @@ def _page(cases: Sequence[Case], seed: int, count: int, revision: str) -> str:
             "",
             "## Each fit",
             "",
-            *markdown_table(["set", "seed", "truth, N/m", "found", "interval", "held", "verdict"], each),
+            *markdown_table(["set", "seed", "truth, N/m", "found", "interval", "held", "status"], each),
             "",
         ]
     )

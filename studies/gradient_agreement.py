@@ -14,7 +14,7 @@ from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import rollout
 
-NAMES = ("stretch", "mass")
+NAMES = ("stretching", "density")
 _CHUNK = 10
 """Pairs simulated together."""
 STEP = 0.01
@@ -26,7 +26,7 @@ class Agreement:
     """Derivatives of one loss at n parameter sets."""
 
     parameters: NDArray[np.float64]
-    """[n, 2] stretch and mass multipliers."""
+    """[n, 2] multipliers of stretching and density."""
     gradient: NDArray[np.float64]
     """[n, 2] by reverse mode."""
     difference: NDArray[np.float64]
@@ -46,7 +46,7 @@ class Agreement:
 
 
 def random_parameters(scenario: Scenario, count: int, *, seed: int) -> NDArray[np.float64]:
-    """[count, 2] stretch and mass, uniform over their bounds; a longer list begins with the shorter one."""
+    """[count, 2] stretching and density, uniform over their bounds; a longer list begins with the shorter one."""
     low, high = np.transpose([scenario.bounds.get(name, PARAMETERS[name].bounds) for name in NAMES])
     return np.random.default_rng(seed).uniform(low, high, (count, len(NAMES)))
 
@@ -57,7 +57,7 @@ def gradient_agreement(scenario: Scenario, parameters: NDArray[np.float64]) -> I
     The loss is the mean squared node distance at the first loss frame to the run at (1, 1).
 
     Args:
-        parameters: [n, 2] stretch and mass.
+        parameters: [n, 2] stretching and density.
 
     Raises:
         DivergedError: names step and batch entries.

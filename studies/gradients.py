@@ -31,7 +31,9 @@ _OF = ["scenario", "integrator", "simulator"]
 def gradients(
     scene: SceneName = "lift",
     integrator: Annotated[Literal["implicit", "arcsim"] | None, typer.Option(help="Instead of the scenario's own.")] = None,
-    pairs: Annotated[int, typer.Option(min=1, max=100_000, help="Random (stretch, mass), uniform over their bounds.")] = 50,
+    pairs: Annotated[
+        int, typer.Option(min=1, max=100_000, help="Random (stretching, density), uniform over their bounds.")
+    ] = 50,
     seed: Annotated[int, typer.Option(min=0, help="Of the pairs.")] = 0,
     out: Annotated[Path | None, typer.Option(help="CSV of all pairs; an existing one is continued.")] = None,
     threads: Threads = None,

@@ -61,7 +61,7 @@ _STRETCHING, _BENDING, _DAMPING = 60.0, 1e-5, 0.02
 """[N/m], [N·m], [s] Usual of woven cloth; the motion hardly depends on them."""
 _NOISE = 0.012
 """[m] What is left of a fit, against which the prior of the lag counts."""
-_START = {"added_mass": 0.5, "linear_drag": 0.5, "drag": 0.7}
+_START = {"added_mass": 0.5, "linear_drag": 0.5, "air_density": 0.7}
 
 
 @dataclass(frozen=True)
@@ -406,15 +406,15 @@ def study(recordings: Sequence[Recording]) -> tuple[list[Row], dict[str, tuple[f
     three = [one for one in recordings if one.name in FITTED]
     swings = {one.name: free_swing(one) for one in recordings}
     without = dict(_START) | {"added_mass": 1e-6, "damping": _DAMPING}
-    still = simulated_swing(without | {"linear_drag": 1e-6, "drag": 1e-6})[0]
+    still = simulated_swing(without | {"linear_drag": 1e-6, "air_density": 1e-6})[0]
     ratio = (float(np.median([swings[one.name][0] for one in three])) / still) ** 2 - 1
     nuisance = {"bending": 1.0, "damping": _DAMPING}
-    free = ("linear_drag", "drag", *nuisance)
+    free = ("linear_drag", "air_density", *nuisance)
     rows = []
     for model, start, names in (
-        ("drag alone", without | nuisance, free),
-        ("added mass by the free swing", _START | nuisance | {"added_mass": max(ratio, 1e-3)}, free),
-        ("added mass by the clouds", _START | nuisance, ("added_mass", *free)),
+        ("air_density alone", without | nuisance, free),
+        ("added density by the free swing", _START | nuisance | {"added_mass": max(ratio, 1e-3)}, free),
+        ("added density by the clouds", _START | nuisance, ("added_mass", *free)),
     ):
         rows.append(_row(model, recordings, fit(three, start, names)))
         typer.echo(f"{model}: median {_median(rows[-1]):.1f} mm", err=True)
@@ -436,7 +436,7 @@ def _page(rows: Sequence[Row], swings: Mapping[str, tuple[float, float]], figure
             f"{row.decay:.2f}",
             f"{row.values['added_mass']:.2f}",
             f"{row.values['linear_drag']:.2f}",
-            f"{1.2 * row.values['drag'] / _DENSITY:.2f}",
+            f"{1.2 * row.values['air_density'] / _DENSITY:.2f}",
         ]
         for row in rows
     ]
@@ -446,7 +446,7 @@ def _page(rows: Sequence[Row], swings: Mapping[str, tuple[float, float]], figure
     ]
     quarter, half, three = np.quantile([period for period, _ in swings.values()], [0.25, 0.5, 0.75])
     head = ["air", *(f"{name} mm" for name in FITTED), "others, median mm", "period s", "decay 1/s"]
-    head += ["added mass / mass", "linear drag / mass 1/s", "air density / mass 1/m"]
+    head += ["added density / density", "linear air_density / density 1/s", "air density / density 1/m"]
     heads = ["recording", *(f"{row.model} mm" for row in rows), "recorded period s", "decay 1/s"]
     text = _TEXT.format(
         count=len(swings),
@@ -468,7 +468,7 @@ def _page(rows: Sequence[Row], swings: Mapping[str, tuple[float, float]], figure
 _TEXT = """
 # A cloth that hangs and swings
 
-Air moves with a real cloth. A model without this air swings too fast, and neither stiffness nor drag changes that.
+Air moves with a real cloth. A model without this air swings too fast, and neither stiffness nor air_density changes that.
 
 The recorded free swing has a period of {half:.3f} s (median of {count}; quartiles {quarter:.3f} and {three:.3f}). The
 models were fitted to three recordings. For the other {others}, only the pose was fitted.
@@ -491,9 +491,9 @@ pose of the bar.
   the bar stands still, this prediction decides alone.
 - **Pose.** Each recording has a shift, a rotation and one lag of all frames (prior {late:g} ms).
 - **Fit.** Gauss–Newton with the simulator's own derivatives. Bending and damping are fitted as nuisance parameters.
-  The mass of the cloth is unknown, so only ratios to it are found.
-- **Added mass.** In the second row, the period of the free swing in the three recordings determines the added mass,
-  and their clouds determine the rest. In the third row, the clouds determine the added mass too.
+  The density of the cloth is unknown, so only ratios to it are found.
+- **Added density.** In the second row, the period of the free swing in the three recordings determines the added density,
+  and their clouds determine the rest. In the third row, the clouds determine the added density too.
 
 ## Each recording
 

@@ -52,10 +52,10 @@ def published(
         raise ConfigError(f"{folder} has no conf/; give the folder with lift_real_pcls/ and conf/.")
     config = load_config(params)
     chosen = [item for item in release_episodes(folder) if fnmatch.fnmatch(f"{item[0]}/{item[1]}", only)]
-    config = config.model_copy(update={"scenarios": [name for name in SCENES if any(item[0] == name for item in chosen)]})
+    config = config.model_copy(update={"scenes": [name for name in SCENES if any(item[0] == name for item in chosen)]})
     if not chosen:
         raise ConfigError(f"No published episode matches {only!r}; patterns are such as 'release_lift/*' or '*/lift_tan'.")
-    scenes = {name: folder / "conf" / "rigidcloth" / SCENES[name] for name in config.scenarios}
+    scenes = {name: folder / "conf" / "rigidcloth" / SCENES[name] for name in config.scenes}
     scenarios = {name: choose_scenario(name, scene) for name, scene in scenes.items()}
     _import(chosen, data / "episodes")
     fitted, failures = _fit(config, chosen, scenarios, data / "fits", workers)

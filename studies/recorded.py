@@ -73,7 +73,7 @@ def page(found: Mapping[str, FitRecord]) -> str:
     """
     lifts, folds = ([one for one in found.values() if one.scenario == scenario] for scenario in SCENARIOS)
     agreed, pairs = _repeats(found)
-    head = ["recording", "RMS, mm", "to recording, to cloth", "frames", "stretch / density", "bending", "compression"]
+    head = ["recording", "RMS, mm", "to recording, to cloth", "frames", "stretching / density", "bending", "compression"]
     head += ["shear", "shift, cm", "yaw", "s"]
     return "\n".join(
         [
@@ -101,7 +101,7 @@ def page(found: Mapping[str, FitRecord]) -> str:
             "",
             *markdown_table(["pair", "factor"], [[name, f"{factor:.2f}"] for name, factor in pairs]),
             "",
-            "The misfit is several times the noise of the points, and several values end at bounds. So the values "
+            "The residual is several times the noise of the points, and several values end at bounds. So the values "
             "reproduce these motions, and are no properties of the fabrics: such cloth hardly stretches when it is lifted "
             "or folded.",
             "",
@@ -121,16 +121,16 @@ def _row(name: str, fit: FitRecord) -> list[str]:
 
     def told(parameter: str, digits: int, times: float = 1.0) -> str:
         entry = fit.parameters[parameter]
-        return f"{times * entry.value:.{digits}g}" + ("*" if entry.at_bound else "")
+        return f"{times * entry.multiplier:.{digits}g}" + ("*" if entry.at_bound else "")
 
-    bound = any(fit.parameters[parameter].at_bound for parameter in ("stretch", "mass"))
+    bound = any(fit.parameters[parameter].at_bound for parameter in ("stretching", "density"))
     return [
         name,
         f"{fit.rms_mm:.1f}",
         f"{one.rms_to_recording_mm:.1f}, {one.rms_to_cloth_mm:.1f}",
         str(len(one.frames)),
         f"{_ratio(fit):.3g}" + ("*" if bound else ""),
-        f"{1e6 * fit.parameters['bending'].physical:.3g}",
+        f"{1e6 * fit.parameters['bending'].value:.3g}",
         told("compression", 2),
         told("shear", 2),
         f"{100 * math.hypot(moved.get('x', 0.0), moved.get('y', 0.0)):.1f}",
@@ -141,7 +141,7 @@ def _row(name: str, fit: FitRecord) -> list[str]:
 
 def _ratio(fit: FitRecord) -> float:
     """[(N/m)/(kg/m²)]"""
-    return fit.parameters["stretch"].physical / fit.parameters["mass"].physical
+    return fit.parameters["stretching"].value / fit.parameters["density"].value
 
 
 def _repeats(found: Mapping[str, FitRecord]) -> tuple[int, list[tuple[str, float]]]:

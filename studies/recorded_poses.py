@@ -24,7 +24,7 @@ from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
 from diffcloud.jobs.fits import FitJob
 from diffcloud.jobs.pool import Tell
 from diffcloud.jobs.scenarios import scenario_options
-from diffcloud.jobs.settings import EpisodesConfig
+from diffcloud.jobs.settings import SynthesizeConfig
 from diffcloud.scene.scenarios import GridScenario, Scenario, make_scenario
 from diffcloud.scene.scenarios.layout import find_layout
 from diffcloud.sensing.calibration.checkerboard import rigid_motion
@@ -36,7 +36,7 @@ POSE_HEAD = (
     "cloth at the start",
     "nuisance",
     "recordings",
-    "stretch: median error",
+    "stretching: median error",
     "greatest",
     "start: median mm off",
     "median ° off",
@@ -73,10 +73,10 @@ class PoseJob:
         every = [(start, nuisance) for start in STARTS for nuisance in self.nuisance]
         for place, (start, nuisance) in enumerate(every):
             tell(place / len(every), f"{start}, {nuisance}")
-            scenario = laid(self.scenario, episode) if start == STARTS[2] else self.scenario
+            scenario = placed(self.scenario, episode) if start == STARTS[2] else self.scenario
             turned = _TURN if start == STARTS[1] else "none"
-            known = {"mass": hidden["mass"]}
-            config = updated(self.config, parameters=["stretch"], fixed=known, alignment=nuisance, initial_state=turned)
+            known = self.scenario.in_si({"density": hidden["density"]})
+            config = updated(self.config, parameters=["stretching"], fixed=known, alignment=nuisance, initial_state=turned)
             job = FitJob(self.label, [Recording(scenario, self.label, episode)], config, self.folder)
             objective, outcome = job.task.solved()
             outcome = outcome.uninterrupted()
@@ -87,7 +87,7 @@ class PoseJob:
                 {
                     "start": start,
                     "nuisance": nuisance,
-                    "stretch": abs(math.log(outcome.values["stretch"] / hidden["stretch"])),
+                    "stretching": abs(math.log(outcome.values["stretching"] / hidden["stretching"])),
                     "shift_mm": 1e3 * float(np.sqrt(((moved - true) ** 2).sum(-1).mean())),
                     "turn_deg": math.degrees(Rotation.from_matrix(rigid_motion(moved, true)[:3, :3]).magnitude()),
                     "lag_ms": None if lag is None else 1e3 * lag.value,
@@ -97,8 +97,8 @@ class PoseJob:
         return found
 
 
-def laid(scenario: Scenario, episode: Episode) -> Scenario:
-    """A grid scenario whose cloth lies where the recording's first frame shows it, as `diffcloud fit` lays it.
+def placed(scenario: Scenario, episode: Episode) -> Scenario:
+    """A grid scenario whose cloth lies where the recording's first frame shows it, as `diffcloud fit` finds it.
 
     Raises:
         ConfigError: not a grid scenario.
@@ -135,7 +135,7 @@ def cameras_off(truth: Truth, episode: Episode) -> dict[str, float]:
     shifts = [transform(off, nodes).mean(axis=0) - nodes.mean(axis=0) for off in _displacements(truth, episode)]
     return {
         "camera_mm": 1e3 * max(float(np.linalg.norm(shift)) for shift in shifts),
-        "log_late_ms": 1e3 * episode.meta["quality"]["refinement"]["lag_s"],
+        "log_late_ms": 1e3 * episode.meta["quality"]["refinement"]["clock_offset_s"],
     }
 
 
@@ -153,7 +153,7 @@ def pose_rows(found: Sequence[Sequence[dict[str, Any]]]) -> list[list[str]]:
     """Under `POSE_HEAD`, a row for each nuisance."""
     rows = []
     for fits in zip(*found, strict=True):
-        off, shift, turn = (np.array([fit[key] for fit in fits]) for key in ("stretch", "shift_mm", "turn_deg"))
+        off, shift, turn = (np.array([fit[key] for fit in fits]) for key in ("stretching", "shift_mm", "turn_deg"))
         lags = [abs(fit["lag_ms"]) for fit in fits if fit["lag_ms"] is not None]
         right = int(((shift <= 3) & (turn <= 1)).sum())
         rows.append(
@@ -172,21 +172,25 @@ def pose_rows(found: Sequence[Sequence[dict[str, Any]]]) -> list[list[str]]:
     return rows
 
 
-def pose_page(rows: Sequence[Sequence[str]], recordings: Sequence[dict[str, Any]], recorded: EpisodesConfig) -> str:
+def pose_page(rows: Sequence[Sequence[str]], recordings: Sequence[dict[str, Any]], recorded: SynthesizeConfig) -> str:
     """Markdown: what was recorded, what preprocessing found (`cameras_off` of each recording), and the table."""
     shifts = [one["camera_mm"] for one in recordings]
-    late = [abs(one["log_late_ms"] - 1e3 * recorded.lag_s) for one in recordings]
-    (together, turned), (apart, twisted), (beside, yaw) = recorded.cameras_moved, recorded.extrinsic_error, recorded.beside
+    late = [abs(one["log_late_ms"] - 1e3 * recorded.clock_offset_s) for one in recordings]
+    (together, turned), (apart, twisted), (beside, yaw) = (
+        recorded.rig_error,
+        recorded.extrinsic_error,
+        recorded.placement_error,
+    )
     lines = [
         f"# Cameras moved {'together' if together else 'apart'}, cloth beside its place",
         "",
         f"Synthetic raw recordings (`make moved`). The cameras' stated places are off by {together:g} mm and {turned:g}° "
         f"together, the second camera's by {apart:g} mm and {twisted:g}° more; cloth and gripper are shifted by {beside:g} "
-        f"mm and turned by {yaw:g}° from the stated place; the joint log is {1e3 * recorded.lag_s:g} ms late. "
-        "`diffcloud data preprocess` finds the cameras' places and the lag again. Then the stretch is fitted, with the "
-        "mass known. The cloth starts in one of three ways: exactly as the scenario says (`--initial-state none`); there, "
+        f"mm and turned by {yaw:g}° from the stated place; the joint log is {1e3 * recorded.clock_offset_s:g} ms late. "
+        "`diffcloud data preprocess` finds the cameras' places and the lag again. Then stretching is fitted, with the "
+        "density known. The cloth starts in one of three ways: exactly as the scene says (`--initial-state none`); there, "
         f"but with its turn fitted too (`--initial-state {_TURN}`, the default); or where the first frame of the recording "
-        "shows it, as `diffcloud fit` lays it.",
+        "shows it, as `diffcloud fit` finds it.",
         "",
         f"Preprocessing had the worse camera {np.median(shifts):.1f} mm from its place in the median and "
         f"{max(shifts):.1f} mm at most, and the log's lag within {np.median(late):.1f} ms in the median and "

@@ -23,16 +23,18 @@ from diffcloud.io.files import folders_in, write_text
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
 from diffcloud.jobs.pool import run_all
 from diffcloud.jobs.scenarios import choose_scenario
-from diffcloud.jobs.settings import EpisodesConfig, load_config
+from diffcloud.jobs.settings import SynthesizeConfig, load_config
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.sensing.evaluation import CloudFigures, evaluate_clouds, visible_clouds
 from diffcloud.sensing.recorder import Truth, read_truth
+from studies.cloud_quality import CloudFigures, evaluate_clouds, visible_clouds
 from studies.recorded_poses import PoseJob, pose_page, pose_rows
 
 
 @writes(".md")
 def recordings(
-    recorded: Annotated[Path, typer.Option(help="Folder with raw <scenario>/<episode>/ of `python -m pipeline.episodes`.")],
+    recorded: Annotated[
+        Path, typer.Option(help="Folder with raw <scenario>/<episode>/ of `python -m pipeline.synthesize`.")
+    ],
     episodes: Annotated[Path, typer.Option(help="Folder with <scenario>/<episode>.npz of `diffcloud data preprocess`.")],
     out: Annotated[Path, typer.Option(help="Markdown file.")],
     fits: Annotated[bool, typer.Option(help="Also fit each: raw clouds, noise-free clouds, one camera.")] = True,
@@ -48,12 +50,12 @@ def recordings(
     config = load_config(params)
     found = [
         (name, path)
-        for name in config.scenarios
+        for name in config.scenes
         for path in folders_in(recorded / name)
         if (path / "episode.json").is_file() and (path / "truth").is_dir()
     ]
     if not found:
-        raise ConfigError(f"{recorded} holds no synthetic raw episodes of {', '.join(config.scenarios)}.")
+        raise ConfigError(f"{recorded} holds no synthetic raw episodes of {', '.join(config.scenes)}.")
     if nuisance:
         for one in nuisance:
             parse_priors(one)  # refused before anything is fitted
@@ -61,7 +63,7 @@ def recordings(
             PoseJob(choose_scenario(name), folder, episodes / name / f"{folder.name}.npz", tuple(nuisance), config.fit)
             for name, folder in found
         ]
-        _poses(jobs, workers, out, config.episodes, json)
+        _poses(jobs, workers, out, config.synthesize, json)
         return
     measured: list[tuple[str, CloudFigures, Mapping[str, Any]]] = []
     fitted: list[_Fits] = []
@@ -81,7 +83,7 @@ def recordings(
     finish({"out": str(out), "episodes": len(measured), **_summary(measured, fitted)}, json)
 
 
-def _poses(jobs: list[PoseJob], workers: int | None, out: Path, recorded: EpisodesConfig, json: bool) -> None:
+def _poses(jobs: list[PoseJob], workers: int | None, out: Path, recorded: SynthesizeConfig, json: bool) -> None:
     done, failures = [], []
     for job, told, error in run_all("recordings", jobs, workers):
         if error is None:
@@ -102,7 +104,7 @@ def _poses(jobs: list[PoseJob], workers: int | None, out: Path, recorded: Episod
 
 @dataclass(frozen=True)
 class _Fits:
-    """Ratios of stretch to mass that fits found."""
+    """Ratios of stretching to density that fits found."""
 
     episode: str
     true: float
@@ -117,15 +119,18 @@ def _fit_all(scenario: Scenario, name: str, episode: Episode, raw: RawEpisode, t
     clouds = [raw.placement.to_scene(cloud) for cloud in visible_clouds(raw, truth)]
     seen_from = {"viewpoints": episode.meta["viewpoints"]}
     noise_free = Episode.from_frames(clouds, episode.times, gripper=held, meta=seen_from)
-    ratios = [_ratio(scenario, cloud, hidden["mass"], config) for cloud in (episode, noise_free, _of_first_camera(episode))]
-    return _Fits(name, hidden["stretch"] / hidden["mass"], *ratios)
+    ratios = [
+        _ratio(scenario, cloud, hidden["density"], config) for cloud in (episode, noise_free, _of_first_camera(episode))
+    ]
+    return _Fits(name, hidden["stretching"] / hidden["density"], *ratios)
 
 
 def _ratio(scenario: Scenario, episode: Episode, mass: float, config: FitSettings) -> float:
-    """Fitted stretch over the weighed mass. With both free, bending and air hardly tell them apart (docs/concepts.md)."""
+    """Fitted stretching over the weighed density. With both free, bending and air hardly tell them apart
+    (docs/concepts.md)."""
     objective = Objective(scenario, episode, **config.measure())
-    space = FitSpace.build(["stretch"], bounds={**scenario.bounds, **config.bounds}, fixed={"mass": mass})
-    return solve(objective, space, config.solver_settings(scenario)).uninterrupted().values["stretch"] / mass
+    space = FitSpace.build(["stretching"], bounds=scenario.search_range(config.bounds), fixed={"density": mass})
+    return solve(objective, space, config.solver_settings(scenario)).uninterrupted().values["stretching"] / mass
 
 
 def _of_first_camera(episode: Episode) -> Episode:
@@ -145,8 +150,8 @@ def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: l
     lines = [
         "# Raw recordings against their truth",
         "",
-        "Synthetic raw episodes (`python -m pipeline.episodes`), made into clouds by `diffcloud data preprocess`, compared "
-        "with the truth that only the recorder knows. Robot and table: part of the merged clouds' points that show them. "
+        "Synthetic raw episodes (`python -m pipeline.synthesize`), made into clouds by `diffcloud data preprocess`, "
+        "compared with the truth that only the recorder knows. Robot and table: part of the merged clouds' points on them. "
         "Lost: part of the visible cloth's measurements that is not in the cloud, over frames in which the cloth "
         "moves, and in which it lies flat. Distances are RMS over a frame: mean and greatest over the frames. Command: "
         "`make recordings`.",
@@ -159,7 +164,7 @@ def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: l
         part = _parts(figures)
         refined = quality.get("refinement")
         shifts = "–" if refined is None else ", ".join(f"{1e3 * v:.1f}" for v in list(refined["shift_m"].values())[1:])
-        tail = "– | –" if refined is None else f"{1e3 * refined['skin_m']:.1f} | {1e3 * refined['lag_s']:.0f}"
+        tail = "– | –" if refined is None else f"{1e3 * refined['skin_m']:.1f} | {1e3 * refined['clock_offset_s']:.0f}"
         lines.append(
             f"| {name} | {figures.points.min()}–{figures.points.max()} | {_percent(part['robot'], 2)} | "
             f"{_percent(part['table'], 2)} | {_percent(part['lost'], 1)} | {_percent(part['lost_flat'], 1)} | "
@@ -170,7 +175,7 @@ def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: l
             "",
             "## Fits",
             "",
-            "Stretch-to-mass ratio of a cloth that has been weighed (mass fixed at its truth), fitted by "
+            "Stretching-to-density ratio of a cloth that has been weighed (density fixed at its truth), fitted by "
             f"{config.solver}. "
             "The noise-free cloud is what both cameras see of the cloth, without noise, holes or masks; the gripper is "
             "then where it truly was.",

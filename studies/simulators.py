@@ -15,8 +15,7 @@ from diffcloud.console import errors, finish, progress_bar, writes
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.io.files import write_text
 from diffcloud.simulators.problem import installed
-from diffcloud.simulators.problems import TOWEL
-from diffcloud.simulators.study import (
+from studies.simulator_motions import (
     THIS,
     WHOLE_STIFFNESS,
     Answer,
@@ -28,6 +27,7 @@ from diffcloud.simulators.study import (
     opinions,
     switches,
 )
+from studies.towel_problems import TOWEL
 
 _TIMES = {"lift": (0.5, 1.0, 1.5, 2.0, 2.4), "fold": (0.5, 1.0, 1.5, 2.0, 2.4), "swing": (0.25, 0.5, 0.75, 1.0, 1.5)}
 """Problem -> times [s] that tables show."""

@@ -40,7 +40,7 @@ class Timing:
 
 
 def time_episode(scenario: Scenario, *, batch: int, repeats: int = 3) -> Timing:
-    """Time rollouts of a scenario with gradients of stretch and mass.
+    """Time rollouts of a scenario with gradients of stretching and density.
 
     The loss is the mean square of the last positions: the cost of the simulation alone.
     """
@@ -49,7 +49,7 @@ def time_episode(scenario: Scenario, *, batch: int, repeats: int = 3) -> Timing:
     def once(backward: bool) -> float:
         values = {
             name: torch.linspace(0.5, 2.0, batch, dtype=torch.float64).requires_grad_(backward)
-            for name in ("stretch", "mass")
+            for name in ("stretching", "density")
         }
         begin = time.perf_counter()
         with torch.set_grad_enabled(backward):
@@ -60,7 +60,7 @@ def time_episode(scenario: Scenario, *, batch: int, repeats: int = 3) -> Timing:
         return time.perf_counter() - begin
 
     def along() -> float:
-        values = {name: torch.linspace(0.5, 2.0, batch, dtype=torch.float64) for name in ("stretch", "mass")}
+        values = {name: torch.linspace(0.5, 2.0, batch, dtype=torch.float64) for name in ("stretching", "density")}
         properties = scenario.properties(system, values)
         tangents = properties.repeated(TANGENTS)
         begin = time.perf_counter()
@@ -96,7 +96,7 @@ def time_matching(scenario: Scenario, points: int, *, repeats: int = 5) -> Match
     """Time one comparison of a motion with clouds of 3,500 points a frame, which another cloth made, with 2 mm of noise."""
     system, _ = scenario.scene.build()
     faces, generator = torch.as_tensor(system.mesh.faces), torch.Generator().manual_seed(0)
-    values = {"stretch": torch.tensor([1.0, 1.3], dtype=torch.float64)}
+    values = {"stretching": torch.tensor([1.0, 1.3], dtype=torch.float64)}
     nodes = rollout(system, scenario.steps, properties=scenario.properties(system, values)).positions
     nodes = nodes[:, scenario.scene.frame_steps :: scenario.scene.frame_steps]
     recorded = SurfaceSampler.build(faces, 3500, generator=generator, dtype=torch.float64).sample(nodes[:1])[0]
@@ -149,7 +149,7 @@ def time_contact(side: int, *, steps: int = 25, repeats: int = 3) -> ContactTimi
     def build(surrounding: Surrounding) -> System:
         return build_system(
             mesh,
-            preset("basis-knit"),
+            preset("soft-knit"),
             time_step=0.01,
             handles=Handles(()),
             surrounding=surrounding,
@@ -161,7 +161,7 @@ def time_contact(side: int, *, steps: int = 25, repeats: int = 3) -> ContactTimi
     free = build(Surrounding())
 
     def once(system: System) -> float:
-        values = {name: torch.ones(1, dtype=torch.float64, requires_grad=True) for name in ("stretch", "mass")}
+        values = {name: torch.ones(1, dtype=torch.float64, requires_grad=True) for name in ("stretching", "density")}
         begin = time.perf_counter()
         properties = scaled_properties(system.properties, values, faces=torch.as_tensor(system.mesh.faces))
         rollout(system, steps, properties=properties).positions[:, -1].square().mean().backward()

@@ -13,7 +13,7 @@ from diffcloud.console import errors, finish, progress_bar, writes
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.io.files import write_text
 from diffcloud.simulators.problem import installed
-from diffcloud.simulators.towels import COUNTS, OLD, PAD, Apart, compare
+from studies.mujoco_towels import COUNTS, OLD, PAD, Apart, compare
 
 _TIMES = (0.5, 0.8, 1.0, 1.2, 1.5)
 _MESHES = ((13, 10), (19, 15))

@@ -96,7 +96,7 @@ def flat_set(
     nodes = np.array(mesh.nodes if nodes_of is None else nodes_of, dtype=np.float32)
     return SimulatedSet(
         scenario="flat",
-        names=("stretch", "mass"),
+        names=("stretching", "density"),
         bounds=np.array([[0.1, 10.0], [0.1, 10.0]]),
         parameters=np.random.default_rng(0).uniform(0.1, 10, (runs, 2)),
         nodes=np.tile(nodes, (runs, frames, 1, 1)),

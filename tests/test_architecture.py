@@ -30,7 +30,7 @@ ALLOWED = {
     "sensing": {"mesh", "io", "clouds"},
     "hardware": {"mesh", "io", "clouds", "sensing"},
     "live": {"mesh", "io", "clouds", "sensing"},
-    "report": {"mesh", "io", "sim", "scene", "clouds", "estimation", "regressors", "sensing", "evaluation"},
+    "reporting": {"mesh", "io", "sim", "scene", "clouds", "estimation", "regressors", "sensing", "evaluation"},
     "jobs": {
         "mesh",
         "io",
@@ -43,7 +43,7 @@ ALLOWED = {
         "identification",
         "regressors",
         "sensing",
-        "report",
+        "reporting",
     },
 }
 """Sub-package -> the sub-packages it may import; all may import errors."""
@@ -143,7 +143,7 @@ def stages() -> dict:
     return yaml.safe_load((ROOT / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
 
 
-@pytest.mark.parametrize("stage", ["episodes", "preprocess", "simulate", "fit", "train", "evaluate", "report"])
+@pytest.mark.parametrize("stage", ["synthesize", "preprocess", "generate", "fit", "train", "evaluate", "report"])
 def test_stage_dependencies_are_the_imports(stage):
     listed = {Path(dep).name for dep in stages()[stage]["deps"] if dep.startswith("diffcloud/") and not dep.endswith(".py")}
     assert listed == needed_packages(stage)
@@ -195,11 +195,11 @@ def test_every_setting_can_be_set_in_an_experiment(tmp_path):
     for name in leaves(yaml.safe_load((ROOT / "params.yaml").read_text(encoding="utf-8"))):
         shutil.copy(ROOT / "params.yaml", path)
         apply_overrides(path, [f"{name}=null"])
-    changes = ["fit.seed=3", "fit.fixed.mass=1.2", "fit.bounds.stretch=[0.5,2]", "fit.solver.starts=2"]
+    changes = ["fit.seed=3", "fit.fixed.density=1.2", "fit.bounds.stretching=[0.5,2]", "fit.solver.starts=2"]
     shutil.copy(ROOT / "params.yaml", path)
     apply_overrides(path, [*changes, "preprocess.raw.origin_m=[1,2,3]"])
     config = load_config(path)
-    assert (config.fit.seed, config.fit.fixed, config.fit.bounds) == (3, {"mass": 1.2}, {"stretch": (0.5, 2.0)})
+    assert (config.fit.seed, config.fit.fixed, config.fit.bounds) == (3, {"density": 1.2}, {"stretching": (0.5, 2.0)})
     assert (config.fit.solver.starts, config.preprocess.raw.origin_m) == (2, (1.0, 2.0, 3.0))
 
 

@@ -1,7 +1,8 @@
-"""Gradients of an episode of ARCSim's steps, from its end to its start: one solve per step, with the factor of the step.
+"""Gradients of a loss through a rollout of ARCSim's steps, by the adjoint method from the last step to the first.
 
-For a step's equation r(u, p) = 0 and the gradient g by u, the matrix A y = g gives the gradient -yᵀ ∂r/∂p by all that the
-equation reads.
+Let r(u, p) = 0 be a step's equation, A its matrix, and g the gradient of the loss with respect to u. The adjoint y solves
+A y = g with the matrix factor of the step, which takes one solve. The gradient with respect to any input p of the equation
+is -yᵀ ∂r/∂p.
 """
 
 from __future__ import annotations
@@ -44,9 +45,10 @@ def reverse(
 
     Args:
         anchors, positions, velocities: as `simulate` left them.
-        position_gradients, velocity_gradients: [S + 1, V, 3] of a loss by each; the first rows take those by the start.
-        gradients: zeros; takes the sums over all steps.
-        track_gradients: [S, G, 3] zeros; takes those by the track.
+        position_gradients, velocity_gradients: [S + 1, V, 3] of a loss with respect to positions and velocities. The first
+            rows receive the gradients with respect to the initial state.
+        gradients: zeros on entry; receives the sums over all steps.
+        track_gradients: [S, G, 3] zeros on entry; receives the gradients with respect to the track.
     """
     dt = scene.time_step
     steps, nodes = len(positions) - 1, positions.shape[1]
@@ -134,7 +136,7 @@ def reverse(
 def restore(
     scene: Scene, parameters: Parameters, positions: Floats, velocities: Floats, solved: Floats, motion: Motion
 ) -> None:
-    """The motion at a step's solution."""
+    """Set `motion` to its state at a step's solution."""
     nodes = len(positions)
     copy_to(motion.positions[:nodes], positions)
     copy_to(motion.before[:nodes], velocities)
@@ -158,8 +160,10 @@ def candidates(scene: Scene, motion: Motion):  # type: ignore[no-untyped-def]
 
 @kernel
 def stop_at_planes(scene: Scene, above, places: Floats, backwards: int) -> None:  # type: ignore[no-untyped-def]
-    """What planes stop does not move along their normals. Each of these projections is its own transpose; their product
-    is that of the other order, which is `backwards`."""
+    """Project vectors of nodes onto the planes that stop them: remove the component along each plane's normal.
+
+    Each projection is its own transpose. The transpose of their product is the product in reverse order (`backwards`).
+    """
     count = len(above)
     for q in range(count):
         p = count - 1 - q if backwards > 0 else q
@@ -182,7 +186,7 @@ def factor_of(  # type: ignore[no-untyped-def]
     corners: Ints,
     constants: Floats,
 ):
-    """(pattern, factor) of a step: as it was kept, or made again."""
+    """Return (pattern, factor) of a step's matrix. The factor is the kept one, or else computed again."""
     pattern, moved = pattern_with(scene.pattern, corners)
     begin, end = kept.begins[step, 4], kept.begins[step + 1, 4]
     if end > begin:

@@ -27,6 +27,8 @@ class Arcsim:
     name = "arcsim"
     terms = TERMS
     contacts = CONTACTS
+    smooth = False
+    meshes = False
 
     def check(self, surrounding: Surrounding) -> None:
         if surrounding.moving or surrounding.bodies:

@@ -74,12 +74,12 @@ def load_experiment(name: str, path: Path) -> Scenario:
         frames=settings.frames,
         loss_frames=(settings.loss_frame,),
         loss_faces=None if faces is None else np.array(faces),
-        node_sets={} if nodes is None else {"mass": np.array(nodes)},
+        node_sets={} if nodes is None else {"density": np.array(nodes)},
         points=settings.points,
         learning_rate=settings.learning_rate,
         threshold=settings.threshold,
         length_unit_m=RELEASE_UNIT_M,
         first_frame_time=settings.first_frame * scene.frame_time,
         # the published scripts use 0.05 in places; everything here is compared on one box
-        bounds={"stretch": (0.1, 10.0), "mass": (0.1, 10.0)},
+        bounds={"stretching": (0.1, 10.0), "density": (0.1, 10.0)},
     )

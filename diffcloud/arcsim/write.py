@@ -84,8 +84,8 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
         "obstacles": obstacles,
         "gravity": list(around.gravity),
         "wind": {"density": around.air_density, "velocity": list(around.wind), "drag": around.air_drag},
-        "friction": around.friction_cloth,
-        "obs_friction": around.friction_obstacle,
+        "friction": around.self_friction,
+        "obs_friction": around.friction,
         "disable": ["remeshing"] + ([] if around.proximity else ["proximity"]),
         "magic": {
             "handle_stiffness": scene.handles.stiffness,

@@ -75,7 +75,10 @@ def stage(command: Callable[..., None], preload: str | None = None) -> None:
 
 
 def run(app: typer.Typer, preload: str | None = None) -> None:
-    """Run, and turn the project's own errors into a message and exit status 1; any other, into where its traceback is.
+    """Run a command-line app. Turn an error into a message and exit status 1.
+
+    The message of a `DiffCloudError` is its own text. For any other error, the message names the file with the
+    traceback; with --debug, `run` raises that error instead.
 
     Args:
         preload: module that worker processes import while the command still reads its arguments.

@@ -15,14 +15,13 @@ from diffcloud.console import errors, finish, progress_bar, show, warn, writes
 from diffcloud.errors import ConfigError
 from diffcloud.io.files import together
 from diffcloud.io.manifests import remove_files
+from diffcloud.simulators.export.targets import TARGETS
 
 if TYPE_CHECKING:
     from diffcloud.estimation.record import FitRecord
     from diffcloud.simulators.export.check import Checked, Runnable
 
-TargetName = Literal["mujoco", "newton", "isaac", "arcsim", "obj"]
-_RUNNABLE = ("mujoco", "newton")
-_SIMPLIFIED = ("mujoco", "newton", "isaac")
+TargetName = Literal[*TARGETS]  # type: ignore[valid-type]
 _SHOWN = (0.5, 1.0, 1.5, 2.0, 3.0)
 """[s] At which distances are shown."""
 
@@ -57,8 +56,9 @@ def export(
     from diffcloud.simulators.export.cloth import fitted_cloth
     from diffcloud.simulators.export.write import described, exported_files, write_export, write_samples
 
-    if check and to not in _RUNNABLE:
-        raise ConfigError(f"--check runs {' and '.join(_RUNNABLE)}; {to} cannot be run here.")
+    if check and not TARGETS[to].runs:
+        runnable = " and ".join(name for name, one in TARGETS.items() if one.runs)
+        raise ConfigError(f"--check runs {runnable}; {to} cannot be run here.")
     if check and importlib.util.find_spec(to) is None:
         raise ConfigError(f"--check needs {to}. Try: pip install 'diffcloud[simulators]', or leave --check out.")
     record = read_fit(fit)
@@ -75,7 +75,7 @@ def export(
     remove_files(out, sorted(former - written))
     for sentence in left_out:
         warn(sentence)
-    if to in _SIMPLIFIED:
+    if TARGETS[to].simplified:
         lack = 1e3 * cloth.simplified_m
         told_lack = f"moves the cloth by {lack.mean():.1f} mm on average (RMS over nodes), by {lack.max():.1f} mm at worst"
         if not np.isfinite(lack).all():
@@ -84,10 +84,10 @@ def export(
     several = f", and {samples} more in {out / 'sample_0000'} and so on" if samples else ""
     errors.print(f"Wrote {', '.join(names)} to {out}{several}.", soft_wrap=True)
     told: dict[str, Any] = {"out": str(out), "files": names, "left_out": left_out}
-    if to in _SIMPLIFIED:
+    if TARGETS[to].simplified:
         told["simplified_rms_mm"] = _plain(1e3 * cloth.simplified_m)
     if drawn:
-        told["samples"] = drawn
+        told["samples"] = [chosen.in_si(each) for each in drawn]
     if check:
         from diffcloud.simulators.export.check import check_export
 
@@ -100,7 +100,7 @@ def export(
 
 
 def _draws(record: FitRecord, path: Path, count: int, seed: int) -> list[dict[str, float]]:
-    """Values of all parameters, the given ones too."""
+    """Multipliers of all parameters, the given ones too."""
     from diffcloud.evaluation.intervals import draws, read_intervals
     from diffcloud.evaluation.methods import space_of
 

@@ -82,8 +82,8 @@ def fit(
     began = time.monotonic()
     from diffcloud.io.files import claimed
     from diffcloud.jobs.dvc_project import make_project
-    from diffcloud.jobs.fit_report import Status, result_of
     from diffcloud.jobs.settings import load_config
+    from diffcloud.reporting.fit_page import Status, result_of
     from diffcloud.sim.threads import use_threads
 
     use_threads(threads)
@@ -164,12 +164,12 @@ def _found(
     episodes, cloth, layouts = find_scene(recordings, out, size, None if weighed is None else weighed[0], topics)
     if weighed is not None and weighed[1]:
         cloth = with_density(cloth, *weighed)
-    chosen = merged(fit_settings(typed.get("parameters"), cloth, weighed, stored), typed)
     scenes = {name: {**cloth, **fields} for name, fields in layouts.items()}
     members = [
         Recording(make_scenario(own_options(scenes[name], name, f"scene of {name}", folder=out)), name, episode)
         for name, episode in episodes.items()
     ]
+    chosen = merged(fit_settings(typed.get("parameters"), members[0].scenario, weighed, stored), typed)
     return ClothFit(members, chosen, out, scenes, _start(init, members, chosen))
 
 

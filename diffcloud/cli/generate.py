@@ -1,34 +1,29 @@
-"""`diffcloud network generate`: a set of simulated runs with drawn parameters, to train the regressors on."""
+"""`diffcloud network generate`: a set of simulated runs with random parameters, to train the regressors on."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from diffcloud.cli.options import JsonFlag, ParamsFile, SceneName, Scheduler
+from diffcloud.cli.options import JsonFlag, ParamsFile, SceneName, Scheduler, merged, settings_options
 from diffcloud.console import errors, finish, progress_bar, show, warn, writes
+from diffcloud.jobs.network_settings import GenerateSettings
 
 _INTERRUPTED = 130
 
 
 @writes()
+@settings_options(
+    GenerateSettings, everyday=("train", "test", "distribution", "parameters", "uncertain", "seed"), advanced=()
+)
 def generate(
     out: Annotated[Path, typer.Option(help="Folder of the set; an interrupted run resumes from OUT.partial.")],
+    settings: Mapping[str, Any],
     scene: SceneName = None,
-    train: Annotated[int | None, typer.Option(help="Runs to train on.")] = None,
-    test: Annotated[int | None, typer.Option(help="Runs to test on.")] = None,
-    distribution: Annotated[
-        str | None, typer.Option(help="Of the draws: uniform, sobol, logarithmic, or modes (as published).")
-    ] = None,
-    parameters: Annotated[str | None, typer.Option(help="Comma-separated, e.g. stretch,mass.")] = None,
-    uncertain: Annotated[
-        str | None,
-        typer.Option(help="Vary other material from run to run, by such factors: bending=1.5x,drag=1.3x. Default: none."),
-    ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the draws and of exported clouds.")] = None,
     workers: Annotated[int, typer.Option(min=0, max=1024, help="Processes with one thread each. 0: this one alone.")] = 0,
     scheduler: Scheduler = None,
     export_clouds: Annotated[
@@ -37,7 +32,7 @@ def generate(
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
-    """Simulate runs with drawn parameters. Ctrl-C keeps what is finished; the same call goes on from there."""
+    """Simulate runs with random parameters. Ctrl-C keeps what is finished; the same call goes on from there."""
     from rich.table import Table
 
     from diffcloud.datasets import ParameterBox, ParameterDraws, SimulationPlan, simulate_set
@@ -46,27 +41,19 @@ def generate(
     from diffcloud.jobs.ctrl_c import none_lost
     from diffcloud.jobs.scenarios import scene_named
     from diffcloud.jobs.settings import load_config
-    from diffcloud.settings import updated
+    from diffcloud.scene.scenarios.uncertain import parse_uncertain
 
     if scene is None:
         raise ConfigError("A set needs a scene: give --scene, such as lift.")
-    settings = updated(
-        load_config(params).simulate,
-        parameters=None if parameters is None else [name.strip() for name in parameters.split(",")],
-        distribution=distribution,
-        uncertain=uncertain,
-        train=train,
-        test=test,
-        seed=seed,
-    )
+    stated = merged(load_config(params).generate, settings)
     chosen = scene_named(scene)
-    box = ParameterBox.build(settings.parameters, chosen.bounds)
+    box = ParameterBox.build(stated.parameters, chosen.bounds)
     plan = SimulationPlan(
         chosen,
-        ParameterDraws(box, settings.distribution, chosen.name, settings.seed, settings.known_within()),
-        {"train": settings.train, "test": settings.test},
+        ParameterDraws(box, stated.distribution, chosen.name, stated.seed, parse_uncertain(stated.uncertain or "none")),
+        {"train": stated.train, "test": stated.test},
     )
-    with progress_bar(f"simulating {chosen.name}", settings.train + settings.test) as update:
+    with progress_bar(f"simulating {chosen.name}", stated.train + stated.test) as update:
         try:
             with none_lost(), nullcontext() if scheduler is None else scheduler_client(scheduler) as client:
                 outcome = simulate_set(
@@ -90,9 +77,9 @@ def generate(
     table = Table("scenario", "train", "test", "draws", "parameters", "taken up", "seconds", "MB")
     table.add_row(
         chosen.name,
-        str(settings.train),
-        str(settings.test),
-        settings.distribution,
+        str(stated.train),
+        str(stated.test),
+        stated.distribution,
         ", ".join(box.names),
         str(outcome.resumed),
         f"{outcome.seconds:.1f}",
@@ -103,9 +90,9 @@ def generate(
         {
             "out": str(out),
             "scenario": chosen.name,
-            "train": settings.train,
-            "test": settings.test,
-            "draws": settings.distribution,
+            "train": stated.train,
+            "test": stated.test,
+            "draws": stated.distribution,
             "parameters": list(box.names),
             "resumed": outcome.resumed,
             "replaced": replaced,

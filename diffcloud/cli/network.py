@@ -1,4 +1,4 @@
-"""Networks that tell parameters from clouds: simulate their training sets, train them, predict."""
+"""Networks that estimate parameters from point clouds: simulate training sets, train, and predict."""
 
 from __future__ import annotations
 
@@ -17,4 +17,4 @@ app = typer.Typer(cls=command_group(COMMANDS), no_args_is_help=True, add_complet
 
 @app.callback()
 def network() -> None:
-    """Networks that tell parameters from clouds: simulate their training sets, train them, predict."""
+    """Networks that estimate parameters from point clouds: simulate training sets, train, and predict."""

@@ -183,6 +183,8 @@ def _option(name: str, field: FieldInfo, panel: str | None) -> Any:
         return Annotated[bool | None, typer.Option(flag, help=text, rich_help_panel=panel)]
     if get_origin(plain) is dict:
         return Annotated[list[str] | None, typer.Option(flag, help=text, metavar="NAME=VALUE", rich_help_panel=panel)]
+    if get_origin(plain) is list:
+        return Annotated[list[str] | None, typer.Option(flag, help=text, metavar="LIST", rich_help_panel=panel)]
     if plain in (int, float):
         return Annotated[plain | None, typer.Option(flag, help=text, rich_help_panel=panel)]
     choices = "|".join(get_args(plain)) if get_origin(plain) is Literal else "TEXT"
@@ -193,7 +195,7 @@ def _parsed(field: FieldInfo, value: Any, path: str) -> Any:
     """What was typed as it would stand in YAML."""
     kind = get_origin(_plain(field.annotation))
     if kind is list:
-        return [part.strip() for part in value.split(",")]
+        return [part.strip() for item in value for part in item.split(",")]
     if kind is not dict:
         return value
     found = {}

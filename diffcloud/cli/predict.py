@@ -30,6 +30,7 @@ def predict(
     from diffcloud.io.episodes import read_episode
     from diffcloud.io.files import write_text
     from diffcloud.regressors import Regressor, predict_episode
+    from diffcloud.sim.properties import PARAMETERS
 
     regressor = Regressor.read(checkpoint)
     if samples is not None and regressor.description.model != "posterior":
@@ -39,7 +40,8 @@ def predict(
     found: dict[str, dict[str, Any]] = {}
     outside: list[str] = []
     seconds = []
-    table = Table("episode", *names, f"{100 * level:.0f} % interval")
+    heads = (name if PARAMETERS[name].quantity is None else f"{name}, × nominal" for name in names)
+    table = Table("episode", *heads, f"{100 * level:.0f} % interval")
     for path in episode_files(episodes):
         episode = read_episode(path)
         began = time.perf_counter()

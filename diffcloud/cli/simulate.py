@@ -42,8 +42,8 @@ def simulate(
         bool,
         typer.Option(
             "--sensitivity",
-            help="Instead: how far nodes move [mm] between neighbouring values of stretch and mass, at the loss frame or "
-            "over the track.",
+            help="Instead: how far nodes move [mm] between neighbouring values of stretching and density at the loss frame "
+            "or over the track.",
         ),
     ] = False,
     noise_mm: Annotated[float, typer.Option(help="Of --sensitivity: larger differences count as visible.")] = 4.0,
@@ -101,17 +101,16 @@ def _write_motion(
     from diffcloud.jobs.scenarios import limits
     from diffcloud.mesh.topology import SurfaceMesh
     from diffcloud.sim.moved import moved_surfaces
-    from diffcloud.sim.properties import check_values, one_set
+    from diffcloud.sim.properties import one_set
 
     values = {} if fitted is None else dict(fitted.values)
-    values |= assignments(set_, "--set")
-    check_values(values, "--set")
+    values |= chosen.multipliers(assignments(set_, "--set"), "--set")
     chosen.check_parameters(values)
     frames = frames or chosen.frames
     steps = frames * chosen.scene.frame_steps
     system, _ = chosen.scene.build()
     recording = None if fitted is None else _recording(fitted.episodes, chosen.name, track_file)
-    laid = {} if fitted is None else fitted.initial_state_in(recording)
+    initial_state = {} if fitted is None else fitted.initial_state_in(recording)
     track, warnings = None, limits(chosen)
     if recorded is not None:
         if recorded.gripper is None:
@@ -120,10 +119,10 @@ def _write_motion(
         track = torch.as_tensor(track_displacement(recorded, system.handles.grippers, steps, system.time_step))[None]
     with progress_bar("simulating", steps) as update, torch.no_grad():
         try:
-            given = Inputs.of(chosen, system, steps, one_set({**values, **laid}), track)
+            given = Inputs.of(chosen, system, steps, one_set({**values, **initial_state}), track)
             run = given.rollout(progress=lambda done: update(done, ""))
         except DivergedError as error:
-            shown = ", ".join(f"{name}={value:g}" for name, value in values.items()) or "the basis material"
+            shown = ", ".join(f"{name}={value:g}" for name, value in chosen.in_si(values).items()) or "the scene's material"
             raise DivergedError(error.step, error.entries, error.reason, shown) from error
     per_frame = slice(None, None, chosen.scene.frame_steps)
     nodes, times = run.positions[0, per_frame].numpy(), run.times[per_frame].numpy()
@@ -167,7 +166,7 @@ def _write_motion(
             "out": str(out),
             "frames": frames,
             "nodes": nodes.shape[1],
-            "parameters": values,
+            "parameters": chosen.in_si(values),
             "length_unit_m": chosen.length_unit_m,
             "warnings": warnings,
         },
@@ -183,9 +182,10 @@ def _show_sensitivity(chosen: Scenario, recorded: Episode | None, noise_mm: floa
     from diffcloud.evaluation.summary import percent
 
     found = visibility_map(chosen, episode=recorded, size=_GRID, linear=False)
-    for name, distances in (("stretch", found.along_stretch_mm), ("mass", found.along_mass_mm)):
-        rows, columns = (found.grid[1:], found.grid) if name == "stretch" else (found.grid, found.grid[1:])
-        table = Table(f"step in {name}; stretch \\ mass", *(f"{value:.3g}" for value in columns))
+    for name, distances in (("stretching", found.along_stretching_mm), ("density", found.along_density_mm)):
+        rows, columns = (found.grid[1:], found.grid) if name == "stretching" else (found.grid, found.grid[1:])
+        rows, columns = rows * chosen.nominal("stretching"), columns * chosen.nominal("density")
+        table = Table(f"step in {name}; stretching N/m \\ density kg/m²", *(f"{value:.3g}" for value in columns))
         for value, row in zip(rows, distances, strict=True):
             table.add_row(f"{value:.3g}", *(Text(f"{d:.1f}", "" if d > noise_mm else "dim") for d in row))
         show(table, json)
@@ -194,9 +194,10 @@ def _show_sensitivity(chosen: Scenario, recorded: Episode | None, noise_mm: floa
         output.print(f"{percent(fraction)} of neighbouring pairs differ by more than {noise_mm} mm.")
     told: dict[str, Any] = {
         "visible_fraction": fraction,
-        "grid": found.grid.tolist(),
-        "along_stretch_mm": found.along_stretch_mm.tolist(),
-        "along_mass_mm": found.along_mass_mm.tolist(),
+        "stretching": (found.grid * chosen.nominal("stretching")).tolist(),
+        "density": (found.grid * chosen.nominal("density")).tolist(),
+        "along_stretching_mm": found.along_stretching_mm.tolist(),
+        "along_density_mm": found.along_density_mm.tolist(),
     }
     finish(told, json)
 

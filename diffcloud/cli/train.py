@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from diffcloud.cli.options import JsonFlag, ParamsFile, Workers
+from diffcloud.cli.options import JsonFlag, ParamsFile, Workers, merged, settings_options
 from diffcloud.console import errors, finish, known, show, writes
+from diffcloud.jobs.network_settings import TrainSettings
 
 _INTERRUPTED = 130
 
 
 @writes()
+@settings_options(TrainSettings, everyday=("models", "profile", "epochs", "seed", "device"), advanced=())
 def train(
     data: Annotated[
         Path, typer.Option(help="Folder written by `diffcloud network generate`; without a scene, of <scenario>/.")
@@ -24,19 +27,12 @@ def train(
             help="Folder; <model>.safetensors, and <model>/ of curves and errors, without a scene in <scenario>/."
         ),
     ],
-    scene: Annotated[str | None, typer.Option(help="Scene of the simulated set. Default: all of train.scenarios.")] = None,
-    model: Annotated[
-        list[str] | None,
-        typer.Option(help="mlp, pointnet2, meteornet, or posterior (an extra); repeatable. Default: the first three."),
-    ] = None,
-    profile: Annotated[str | None, typer.Option(help="quick, reduced or paper: all hyper-parameters.")] = None,
+    settings: Mapping[str, Any],
+    scene: Annotated[str | None, typer.Option(help="Scene of the simulated set. Default: all of train.scenes.")] = None,
     like: Annotated[
         Path | None,
         typer.Option(help="A preprocessed episode: clouds show the faces that its cameras see, instead of random ones."),
     ] = None,
-    epochs: Annotated[int | None, typer.Option(help="Passes over the training draws.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of all random numbers.")] = None,
-    device: Annotated[str | None, typer.Option(help="auto, cpu or gpu (mixed precision).")] = None,
     loaders: Annotated[
         int,
         typer.Option(
@@ -60,17 +56,9 @@ def train(
     from diffcloud.jobs.train import viewpoints
     from diffcloud.settings import updated
 
-    section = load_config(params).train
-    scenarios = section.scenarios if scene is None else [scene]
-    config = updated(
-        section,
-        models=None if not model else list(dict.fromkeys(model)),
-        profile=profile,
-        epochs=epochs,
-        viewpoints=None if like is None else viewpoints(like, scenarios),
-        seed=seed,
-        device=device,
-    )
+    config = merged(load_config(params).train, settings)
+    if like is not None:
+        config = updated(config, viewpoints=viewpoints(like, config.scenes if scene is None else [scene]))
     table = Table(
         "network",
         "parameter",

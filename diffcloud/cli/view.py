@@ -29,7 +29,7 @@ from diffcloud.io.files import write_text
 
 if TYPE_CHECKING:
     from diffcloud.estimation.record import FitRecord
-    from diffcloud.report.overlay import Layer, Overlay
+    from diffcloud.reporting.overlay import Layer, Overlay
     from diffcloud.sensing.fusion import Seen
 
 _MOST_EPISODES = 50
@@ -73,7 +73,7 @@ def view(
     Raw episodes are made into clouds, and their images show what was masked.
     """
     from diffcloud.estimation.record import read_fit
-    from diffcloud.report.view import build_view
+    from diffcloud.reporting.view import build_view
 
     if live:
         if len(episodes) != 1:
@@ -141,8 +141,8 @@ def _layers(
 ) -> tuple[list[Layer], list[str]]:
     """What is drawn of one episode, and what the table says of it."""
     from diffcloud.jobs.scenarios import choose_scenario, fitted_scenario, scene_named
-    from diffcloud.report.overlay import fitted_layers, recorded_layers
-    from diffcloud.report.view import scene_layers, table_layers, unposed_layer
+    from diffcloud.reporting.overlay import fitted_layers, recorded_layers
+    from diffcloud.reporting.view import scene_layers, table_layers, unposed_layer
     from diffcloud.scene.scenarios import SCENARIO_NAMES
 
     times = episode.times[frames]
@@ -159,16 +159,16 @@ def _layers(
         found = scene_named(scene) if scene else choose_scenario(fitted_scenario(fit, recording.scenario))
         layers += fitted_layers(motion, times)
         layers += [unposed_layer(found, recording, motion, times), *table_layers(found, motion.nodes.reshape(-1, 3))]
-        values = ", ".join(f"{key} {value:.3g}" for key, value in record.values.items())
+        values = ", ".join(f"{key} {one.value:.3g} {one.unit}" for key, one in record.parameters.items())
         return layers, [f"fitted in {recording.scenario}: {values}; RMS {recording.rms_mm:.1f} mm"]
     if scene is None:
         return layers, ["no scenario: the recording alone"]
     chosen = scene_named(scene)
-    return layers + scene_layers(chosen, episode, times), [f"scenario {chosen.name}, basis material"]
+    return layers + scene_layers(chosen, episode, times), [f"scenario {chosen.name}, nominal material"]
 
 
 def _overlay(name: str, seen: _Shown, frames: list[int], layers: list[Layer]) -> Overlay:
-    from diffcloud.report.overlay import Overlay
+    from diffcloud.reporting.overlay import Overlay
 
     photographs = [seen.photographs[frame] for frame in frames] if seen.photographs else []
     return Overlay(name, frames, seen.episode.times[frames], layers, photographs=photographs)

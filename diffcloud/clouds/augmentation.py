@@ -24,8 +24,8 @@ from diffcloud.mesh.topology import SurfaceMesh
 
 _SETTINGS, _NODES, _FACES, _POINTS, _PLACE = range(5)
 """Streams of a run."""
-_CAMERAS_M, _LAID_M = 0.004, 0.01
-"""Largest standard deviation of depth noise, and that of where a cloth is laid [m]."""
+_CAMERAS_M, _PLACE_M = 0.004, 0.01
+"""Largest standard deviation of depth noise, and that of where a cloth lies [m]."""
 _BEHIND_M = 0.01
 """What is nearer to the middle of a face does not hide it [m]: the face itself, a layer that it lies on."""
 _SPARE = 1.5
@@ -72,8 +72,8 @@ class Augmentation:
 
     @staticmethod
     def recorded(viewpoints: tuple[tuple[float, float, float], ...]) -> Augmentation:
-        """What depth cameras see together of a cloth that was laid by hand."""
-        return Augmentation((1.0, 1.0), jitter_m=_CAMERAS_M, loss_faces_only=False, viewpoints=viewpoints, shift_m=_LAID_M)
+        """What depth cameras see together of a cloth that was put down by hand."""
+        return Augmentation((1.0, 1.0), jitter_m=_CAMERAS_M, loss_faces_only=False, viewpoints=viewpoints, shift_m=_PLACE_M)
 
 
 @dataclass(frozen=True)

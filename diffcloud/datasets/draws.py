@@ -1,6 +1,6 @@
 """Parameters of simulated runs: uniform, uniform in the logarithms, by a Sobol sequence, or as published.
 
-The published code picks one of four modes for each run (soft, medium, stiff, random) and then stretch and mass uniformly in
+The published code picks a mode for each run (soft, medium, stiff, random) and then stretching and density uniformly in
 the mode's ranges. Draws outside of the bounds are rejected.
 """
 
@@ -20,13 +20,13 @@ from diffcloud.sim.properties import PARAMETERS
 
 Draws = Literal["uniform", "sobol", "logarithmic", "modes"]
 
-_MIXED = ("stretch", "mass")
+_MIXED = ("stretching", "density")
 _TRIES = 64
 """Draws from the modes of which the first inside the bounds counts; more than half of the published ones are."""
 
 Range = tuple[float, float]
 Mode = tuple[tuple[Range, ...], tuple[Range, ...]]
-"""Ranges of stretch and of mass; of two, each is as likely."""
+"""Ranges of stretching and of density; of two, each is as likely."""
 
 _SOFT, _MEDIUM, _STIFF = (0.1, 1.0), (1.0, 10.0), (1.0, 10.0)
 _STANDARD: tuple[Mode, ...] = (
@@ -142,7 +142,7 @@ class ParameterDraws:
     scenario: str
     seed: int
     uncertain: Mapping[str, float] = field(default_factory=dict)
-    """Other material that differs from run to run, known within a factor of one deviation (`estimation.uncertain`)."""
+    """Nuisance material parameters that vary between runs -> factor of one standard deviation (`estimation.uncertain`)."""
 
     def __post_init__(self) -> None:
         if self.kind == "modes" and self.scenario not in MODES:
@@ -153,7 +153,9 @@ class ParameterDraws:
         if self.kind == "modes" and set(self.box.names) != set(_MIXED):
             raise ConfigError(f"The published modes draw {' and '.join(_MIXED)}, not {', '.join(self.box.names)}.")
         if twice := [name for name in self.uncertain if name in self.box.names]:
-            raise ConfigError(f"Doubts are of other material than what is drawn; leave out {', '.join(twice)}.")
+            raise ConfigError(
+                f"`uncertain` takes other material than the sampled parameters; leave out {', '.join(twice)}."
+            )
 
     def first(self, split: Split, count: int) -> NDArray[np.float64]:
         """[count, k] parameters of a split's runs."""
@@ -165,7 +167,7 @@ class ParameterDraws:
         return self._draw(np.random.default_rng([self.seed, SPLITS.index(split), run, attempt]), 1, kind)[0]
 
     def uncertain_factors(self, split: Split, run: int, attempt: int) -> dict[str, float]:
-        """Factors of a run's other material, log-normal about one."""
+        """Sample factors of a run's nuisance material parameters, log-normal with median 1: name -> factor."""
         rng = np.random.default_rng([self.seed, SPLITS.index(split), run, attempt, 1])
         return {name: rng.lognormal(0.0, math.log(factor)) for name, factor in self.uncertain.items()}
 

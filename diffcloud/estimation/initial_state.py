@@ -1,22 +1,21 @@
 """How a cloth lies when its motion begins: turned under the gripper, not quite flat, and not quite as large as stated.
 
 The pose (`estimation.pose`) moves cloth, gripper and bodies together, which is the same motion seen from elsewhere. A
-cloth that a hand has laid down 5° askew, or with a rim that stands up, moves in another way, and so does a larger one.
+cloth that a hand has put down 5° askew, or with a rim that stands up, moves in another way, and so does a larger one.
 So these are variables of the motion, like uncertain material (`estimation.uncertain`): fitted under priors, and no property
 of the material. In a joint fit, each recording has its own, except for the size, which belongs to the cloth.
 
-The turn is about the cloth's middle. Its height over where the scene lays it is a sum of nine waves over the cloth,
+The turn is about the cloth's middle. Its height over the scene's is a sum of nine waves over the cloth,
 
     h(u, v) = Σ c_ij cos(π i u) cos(π j v),      u, v in [0, 1],      0 < i + j <= 3,
 
 raised until no node is lower than before. `size` and `track` are logarithms: of how many times as large as the scene's the
-cloth is, and of how many times as far as recorded the gripper goes. What they do to a motion: `fit.inputs`.
+cloth is, and of how many times as far as recorded the gripper goes. What they do to a motion: `estimation.inputs`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 import numpy as np
 import torch
@@ -25,16 +24,11 @@ from torch import Tensor
 from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.estimation.names import of_all, plain_name
 from diffcloud.estimation.parameters import FitSpace, Variable
-from diffcloud.estimation.priors import parse_deviations
 from diffcloud.estimation.record import NuisanceValue
 from diffcloud.mesh.topology import ClothMesh
 from diffcloud.scene.scenarios import Scenario
+from diffcloud.scene.scenarios.initial_state import INITIAL_STATE
 
-LAID: dict[str, Literal["m", "rad", "1"]] = {"size": "1", "turn": "rad", "shape": "m", "track": "1"}
-"""Name -> unit. `shape` stands for the height of each wave. What recordings share comes first (`estimation.names`), so
-that the variables of each are in the same order in a fit and in its record."""
-_LARGEST_SHARE = 0.2
-"""Largest standard deviation of `size` or `track`; scenarios have the same limit."""
 _SHAPES = {f"shape_{i}_{j}": (i, j) for i in range(4) for j in range(4) if 0 < i + j <= 3}
 _FLAT = 1e-6
 """Part of its size by which a level cloth may be off."""
@@ -42,51 +36,35 @@ _FARTHEST = 4.0
 """Bounds, in standard deviations."""
 
 
-def parse_initial_state(text: str) -> dict[str, float]:
-    """What `--initial-state` says -> name -> standard deviation of its prior [m, rad, 1], as of `parse_deviations`.
-
-    Raises:
-        ConfigError: an unknown name or unit, a unit of something else, what is no positive number, or a share that is too
-            large; names it.
-    """
-    found = parse_deviations(text, "laid", LAID)
-    for name, deviation in found.items():
-        if LAID[name] == "1" and deviation > _LARGEST_SHARE:
-            raise ConfigError(
-                f"laid {name}={100 * deviation:g}%: at most {100 * _LARGEST_SHARE:g}%; state what is that far off."
-            )
-    return found
-
-
-def with_initial_state(space: FitSpace, laid: Sequence[Mapping[str, float]], scenarios: Sequence[Scenario]) -> FitSpace:
+def with_initial_state(space: FitSpace, stated: Sequence[Mapping[str, float]], scenarios: Sequence[Scenario]) -> FitSpace:
     """The space with the variables appended.
 
     Args:
-        laid: for each recording, name -> standard deviation [m, rad, 1]. That of `size` of any recording holds for all; of
-            several, the largest.
+        stated: for each recording, name -> standard deviation [m, rad, 1]. `size` belongs to all: its
+            largest holds.
         scenarios: of the recordings.
 
     Raises:
         ConfigError: a cloth that does not lie level, or a size where there is more than a table around the cloth.
     """
-    sizes = [own["size"] for own in laid if "size" in own]
+    sizes = [own["size"] for own in stated if "size" in own]
     deviations: list[dict[str, float]] = []
-    for own, scenario in zip(laid, scenarios, strict=True):
+    for own, scenario in zip(stated, scenarios, strict=True):
         nodes = scenario.scene.mesh.nodes
         known = {**own, "size": max(sizes)} if sizes else own
         if known and np.ptp(nodes[:, 2]) > _FLAT * np.ptp(nodes, axis=0).max():
-            told = f"laid {', '.join(known)}: this needs a cloth that lies level at the start"
+            told = f"initial_state {', '.join(known)}: this needs a cloth that lies level at the start"
             raise ConfigError(f"{told}; that of {scenario.name} does not.")
         if sizes:
             check_resizable(scenario)
-        names = [each for name in LAID if name in known for each in (_SHAPES if name == "shape" else (name,))]
+        names = [each for name in INITIAL_STATE if name in known for each in (_SHAPES if name == "shape" else (name,))]
         deviations.append({name: known[asked_as(name)] for name in names})
     own_variables = _variables(deviations, length_unit_m=scenarios[0].length_unit_m)
     return FitSpace((*space.variables, *own_variables), space.fixed)
 
 
 def variables_of(described: Sequence[Mapping[str, NuisanceValue]], *, length_unit_m: float) -> list[Variable]:
-    """Those that `described_initial_state` tells of.
+    """Return the variables that `described_initial_state` describes.
 
     Args:
         described: of each recording; other nuisance is passed over.
@@ -98,7 +76,7 @@ def variables_of(described: Sequence[Mapping[str, NuisanceValue]], *, length_uni
     for name in (name for one in every for name in one):
         if not is_initial_state(name):
             raise ConfigError(
-                unknown_name("variable of how a cloth lies", name, [*filter(is_initial_state, LAID), *_SHAPES])
+                unknown_name("variable of how a cloth lies", name, [*filter(is_initial_state, INITIAL_STATE), *_SHAPES])
             )
     return _variables(every, length_unit_m=length_unit_m)
 
@@ -112,9 +90,10 @@ def _variables(deviations: Sequence[Mapping[str, float]], *, length_unit_m: floa
 
 
 def check_resizable(scenario: Scenario) -> None:
-    """
+    """Check that the cloth's surroundings are at most one level table. Anything else would not grow with the cloth.
+
     Raises:
-        ConfigError: there is more around the cloth than a level table, which does not grow with it.
+        ConfigError: the scene has wind, moving obstacles, further forces, or obstacles other than one level table.
     """
     around = scenario.scene.surrounding
     planes = [surface.plane() for surface in around.obstacles]
@@ -128,7 +107,7 @@ def check_resizable(scenario: Scenario) -> None:
     if any(found.values()):
         more = ", ".join(name for name, there in found.items() if there)
         raise ConfigError(
-            f"laid size: this needs a scene of cloth and table alone; {scenario.name} also has {more}. Leave size out."
+            f"initial_state size: this needs a scene of cloth and table alone; {scenario.name} has {more}. Omit size."
         )
 
 
@@ -137,7 +116,7 @@ def _variable(name: str, deviation: float, length_unit_m: float) -> Variable:
     Args:
         deviation: [m, rad, 1].
     """
-    deviation /= length_unit_m if LAID[asked_as(name)] == "m" else 1.0
+    deviation /= length_unit_m if INITIAL_STATE[asked_as(name)] == "m" else 1.0
     return Variable(
         name, -_FARTHEST * deviation, _FARTHEST * deviation, centre=0.0, role="initial_state", deviation=deviation
     )
@@ -146,11 +125,11 @@ def _variable(name: str, deviation: float, length_unit_m: float) -> Variable:
 def is_initial_state(name: str) -> bool:
     """Whether a variable tells how a cloth lies."""
     plain = plain_name(name)
-    return plain in _SHAPES or (plain in LAID and plain != "shape")
+    return plain in _SHAPES or (plain in INITIAL_STATE and plain != "shape")
 
 
 def asked_as(name: str) -> str:
-    """The name in `LAID` under which a variable is asked for; of any other, its own."""
+    """The name in `INITIAL_STATE` under which a variable is requested; of any other, its own."""
     plain = plain_name(name)
     return "shape" if plain in _SHAPES else plain
 
@@ -168,7 +147,7 @@ def sizes_of(values: Mapping[str, Tensor]) -> tuple[Tensor | None, Tensor | None
     return size.exp(), (-size if track is None else track - size).exp()
 
 
-def laid_nodes(mesh: ClothMesh, values: Mapping[str, Tensor]) -> Tensor | None:
+def initial_nodes(mesh: ClothMesh, values: Mapping[str, Tensor]) -> Tensor | None:
     """[B, V, 3] where a cloth starts, at the scene's size; differentiable. None: as the scene has it.
 
     Args:
@@ -207,7 +186,7 @@ def described_initial_state(
     found = {}
     for variable in space.variables:
         if variable.deviation is not None:
-            unit = LAID[asked_as(variable.name)]
+            unit = INITIAL_STATE[asked_as(variable.name)]
             factor = length_unit_m if unit == "m" else 1.0
             value, prior = values[variable.name] * factor, variable.deviation * factor
             found[variable.name] = NuisanceValue(value=value, prior=prior, unit=unit, of="cloth")

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloud.estimation.initial_state import check_resizable, is_initial_state, laid_nodes, sizes_of
+from diffcloud.estimation.initial_state import check_resizable, initial_nodes, is_initial_state, sizes_of
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.properties import Properties
 from diffcloud.sim.simulate import Rollout, init, rollout, rollout_tangents, still
@@ -59,7 +59,7 @@ class Inputs:
         """
         size, reach = sizes_of(values)
         count = len(next(iter(values.values()))) if values else 1
-        nodes = laid_nodes(system.mesh, values)
+        nodes = initial_nodes(system.mesh, values)
         properties = scenario.properties(
             system, {name: value for name, value in values.items() if not is_initial_state(name)}
         )

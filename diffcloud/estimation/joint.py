@@ -6,7 +6,7 @@ lowest:
 
     loss = (∏ loss_i)^(1/n)
 
-so that each weighs by its own misfit, and a part gained in one counts as much as in another. The paper's measure takes the
+so that each counts by its own residual, and a part gained in one counts as in another. The measure of the paper takes the
 plain mean.
 """
 
@@ -88,8 +88,8 @@ def check_same_cloth(first: Scenario, other: Scenario) -> None:
         if one != two:
             raise ConfigError(f"A joint fit is of one cloth: {first.name} and {other.name} {told} {one} and {two}.")
     for parameter in PARAMETERS.values():
-        if parameter.basis in ("stretching", "shear", "bending", "density"):
-            values = first.scene.basis(parameter.basis), other.scene.basis(parameter.basis)
+        if parameter.quantity in ("stretching", "shear", "bending", "density"):
+            values = first.scene.nominal(parameter.quantity), other.scene.nominal(parameter.quantity)
             unit = "" if parameter.unit == "–" else f" {parameter.unit}"
             if abs(values[0] - values[1]) > _SAME * max(values):
                 raise ConfigError(

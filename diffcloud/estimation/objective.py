@@ -231,7 +231,8 @@ class Objective:
         return len(self.frames) * torch.stack(found).sum(0)
 
     def way_squares(self, motion: Motion) -> list[float]:
-        """The same of one matched motion over all frames, forth, and in the default measure back."""
+        """Return the capped mean squared distances of one matched motion over all frames, in squared length units. The
+        first is from simulated to recorded points; the default measure adds one from recorded points to the cloth."""
         return [float(pairs.squares(self._moved(motion, pairs), self.cap).mean() / pairs.share) for pairs in motion.pairs]
 
     def points(self, run: Rollout, *, pose: Tensor | None = None) -> Tensor:
@@ -250,11 +251,11 @@ class Objective:
         return self._target.space.moved_motion(run.at, times, pose).numpy()
 
     def posed_bodies(self, pose: Tensor) -> NDArray[np.float64]:
-        """[V, 3] the nodes of the bodies beside the cloth, there too."""
+        """[V, 3] the nodes of the bodies beside the cloth, in the recording's frame."""
         return self._target.space.moved(self._bodies[None], pose)[0].numpy()
 
     def match(self, run: Rollout, *, pose: Tensor | None = None) -> Motion:
-        """A rollout beside an episode, at its pose or at poses [B, d]."""
+        """Match a rollout to the recording, at its pose of lowest loss or at poses [B, d]."""
         velocities = self.still_bodies(self.velocities(run)) if self.pose_space.moves_clocks else None
         return self.matched(self.with_bodies(self.looked_at(run)), velocities, pose)
 
@@ -282,7 +283,8 @@ class Objective:
         return there.unflatten(-2, (clocks, -1))[..., : nodes.shape[-2] // clocks, :].flatten(-3, -2) - nodes
 
     def velocities(self, run: Rollout) -> Tensor:
-        """[B, L, C · V', 3] of the same nodes: differences over a step to both sides, zero before the start."""
+        """[B, L, C · V', 3] velocities of the nodes that `looked_at` returns, by central differences over one step to
+        each side. Velocities before the start of the motion are zero."""
         step, last, found = float(run.times[1]), float(run.times[-1]), []
         for offset in self.pose_space.clocks.values():
             before, after = ((self.times + offset + way * step).clamp(0.0, last) for way in (-1, 1))
@@ -290,7 +292,8 @@ class Objective:
         return torch.cat(found, dim=-2)
 
     def matched(self, nodes: Tensor, velocities: Tensor | None, pose: Tensor | None) -> Motion:
-        """The same of nodes and velocities [B, L, C · V, 3] at the compared frames, those of bodies among them."""
+        """Match nodes and their velocities [B, L, C · V, 3] at the compared frames to the recording, as `match` does. They
+        include the nodes of bodies."""
         with torch.no_grad():
             still = nodes.detach(), None if velocities is None else velocities.detach()
             if pose is None and self.pose_space.names:
@@ -301,8 +304,8 @@ class Objective:
             return replace(matcher(pose), nodes=nodes, velocities=velocities)
 
     def _lowest(self, nodes: Tensor, velocities: Tensor | None) -> tuple[Tensor, Matcher]:
-        """As of `_follow`, from the pose of the basis material. With a scale, poses have several minima: then the lower one
-        of two, reached from the basis material's scale and from none."""
+        """As of `_follow`, from the pose of the nominal material. With a scale, poses have several minima: then the lower
+        one of two, reached from the nominal material's scale and from none."""
         space, first = self.pose_space, self._first_pose().expand(len(nodes), -1)
         pose, matcher = self._follow(nodes, velocities, first, _CAPS)
         if "scale" in space.names:
@@ -315,7 +318,7 @@ class Objective:
         return pose, matcher
 
     def _first_pose(self) -> Tensor:
-        """[1, d] of the basis material, from zero on."""
+        """[1, d] of the nominal material, from zero on."""
         if self._first is None:
             self._first = torch.zeros(1, len(self.pose_space.names), dtype=torch.float64)
             with suppress(DivergedError):  # then steps begin at zero, whatever the parameters

@@ -10,7 +10,7 @@ scale hardly reaches; extra starts therefore use the logarithmic scale where the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -42,7 +42,7 @@ class Variable:
     prior: float | None = None
     """Factor of one deviation of its log-normal prior; None: none."""
     centre: float = 1.0
-    """Of the prior; by default the basis material."""
+    """Of the prior; by default the nominal material."""
     role: Role = "requested"
     """`material` and `initial_state` are nuisance variables: fitted because they are not known exactly, and no results."""
     deviation: float | None = None
@@ -56,7 +56,7 @@ class Variable:
 
     @property
     def nuisance(self) -> bool:
-        """Whether nobody asked for it."""
+        """Whether the variable is fitted only because it is uncertain."""
         return self.role != "requested"
 
     def spread(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -119,7 +119,7 @@ class FitSpace:
 
     @property
     def asked(self) -> FitSpace:
-        """What was asked for; nuisance variables are at the centres of their priors."""
+        """The requested variables; nuisance variables are at the centres of their priors."""
         known = {variable.name: variable.centre for variable in self.variables if variable.nuisance}
         return FitSpace(tuple(v for v in self.variables if not v.nuisance), {**self.fixed, **known})
 
@@ -135,10 +135,11 @@ class FitSpace:
         variables = tuple(replace(variable, name=name) for name, variable in left.items())
         return FitSpace(variables, without_recording(self.fixed, recording))
 
-    def check_start(self, first: Mapping[str, float]) -> None:
+    def check_start(self, first: Mapping[str, float], nominal: Callable[[str], float] = lambda name: 1.0) -> None:
         """
         Args:
             first: values of a first start.
+            nominal: parameter -> value that a multiplier of 1 stands for, for messages.
 
         Raises:
             ConfigError: one of what is not fitted, or outside of its bounds; names the nearest that is allowed.
@@ -149,6 +150,7 @@ class FitSpace:
                 raise ConfigError(f"--init: {unknown_name('fitted parameter', name, bounds)}")
             low, high = bounds[name]
             if not low <= value <= high:
+                low, high, value = (one * nominal(name) for one in (low, high, value))
                 nearest = high if value > high else low
                 raise ConfigError(
                     f"--init {name}={value:g} is outside of its bounds [{low:g}, {high:g}]; the nearest allowed value is "

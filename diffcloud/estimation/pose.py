@@ -28,9 +28,10 @@ import torch
 from torch import Tensor
 
 from diffcloud.errors import ConfigError, EpisodeError, unknown_name
-from diffcloud.estimation.priors import INDEPENDENT, parse_deviations
+from diffcloud.estimation.priors import INDEPENDENT
 from diffcloud.estimation.record import NuisanceValue
 from diffcloud.io.episodes import Episode
+from diffcloud.quantities import parse_deviations
 
 NUISANCE: dict[str, Literal["m", "rad", "s", "1"]] = {
     "x": "m",
@@ -45,7 +46,7 @@ NUISANCE: dict[str, Literal["m", "rad", "s", "1"]] = {
 """Name -> unit."""
 SET_UP = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.005, "yaw": 0.005, "lag": 0.002}
 """Standard deviations of a calibrated set-up [m, rad, s]: of its cameras against the robot, and of its clock."""
-LAID = {"x": 0.1, "y": 0.1, "yaw": math.radians(30)}
+BY_HAND = {"x": 0.1, "y": 0.1, "yaw": math.radians(30)}
 """Of where a hand lays a cloth that the scene places [m, rad]."""
 _RESOLVED = {"m": 3e-4, "rad": 1.5e-3, "s": 3e-4, "1": 1.5e-3}
 """A step as small as this is the last one to a pose; what is left changes little."""
@@ -112,12 +113,12 @@ def _pose_sigmas(episode: Episode) -> dict[str, float]:
 
 
 def default_priors(episode: Episode) -> dict[str, float]:
-    """Name -> standard deviation [m, rad, s, 1], of a cloth laid by hand in front of the episode's set-up.
+    """Name -> standard deviation [m, rad, s, 1], of a cloth put down by hand in front of the episode's set-up.
 
     Raises:
         EpisodeError: the episode's meta is damaged.
     """
-    return set_up_of(episode) | {name: episode.pose_sigmas.get(name, sigma) for name, sigma in LAID.items()}
+    return set_up_of(episode) | {name: episode.pose_sigmas.get(name, sigma) for name, sigma in BY_HAND.items()}
 
 
 def parse_priors(text: str) -> dict[str, float]:
@@ -126,7 +127,7 @@ def parse_priors(text: str) -> dict[str, float]:
     Raises:
         ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.
     """
-    return parse_deviations(text, "nuisance", NUISANCE)
+    return parse_deviations(text, "alignment", NUISANCE)
 
 
 @dataclass(frozen=True)
@@ -208,7 +209,7 @@ class PoseSpace:
         return any(name in self.clocks for name in self.names)
 
     def lags(self, values: Tensor) -> Tensor:
-        """[B, C] of each clock off its offset, of values [B, d]."""
+        """[B, C] difference of each clock from its stated offset [s], at values [B, d]."""
         return self._parts(values, tuple(self.clocks))
 
     def rotation(self, values: Tensor) -> Tensor:
@@ -223,11 +224,12 @@ class PoseSpace:
         return turned + _beside(self.centre + self._parts(values, _SHIFTS), turned)
 
     def moved_motion(self, at: Callable[[Tensor], Tensor], times: Tensor, values: Tensor) -> Tensor:
-        """[T, V, 3] where the recording has the nodes of one motion at times [T] of its own, at values [1, d]; of several
-        clocks, by their mean.
+        """[T, V, 3] nodes of one motion in the recording's frame, at pose values [1, d]. With several clocks, the mean of
+        their offsets applies.
 
         Args:
-            at: times [T] -> nodes [1, T, V, 3].
+            at: times [T] of the motion -> nodes [1, T, V, 3] in the scene.
+            times: [T] timestamps of the recording [s].
         """
         lags = self.lags(values) + torch.tensor(list(self.clocks.values()), dtype=torch.float64)
         return self.moved(at(times + lags.mean()), values)[0]

@@ -14,7 +14,7 @@ from diffcloud.io.files import read_json
 from diffcloud.io.schema import Plain
 from diffcloud.io.timings import read_seconds
 
-SCHEMA = 12
+SCHEMA = 13
 """Of the file. Another one is refused, by name."""
 
 LARGEST = 1e12
@@ -102,18 +102,20 @@ class FittedParameter(_Model):
     """One parameter, fitted or given, and what it means."""
 
     value: NonNegative
+    """In `unit`, which is SI if the scene is."""
     unit: Text
-    """"x basis" of a multiplier."""
-    physical: NonNegative
-    physical_unit: Text
     meaning: Text
+    nominal: NonNegative = 1.0
+    """Value of the scene's own material, on which the simulator's multiplier acts; 1 where there is no multiplier."""
+    multiplier: NonNegative
+    """What the simulator takes: the value over `nominal`."""
     fixed: bool = False
     bounds: tuple[NonNegative, NonNegative] | None = None
     """Of a fitted one."""
     prior: Annotated[float, Field(gt=1, le=1e6)] | None = None
     """Factor of one deviation of its log-normal prior; None: none."""
-    centre: Positive = 1.0
-    """Of the prior; by default the basis material."""
+    centre: Positive | None = None
+    """Of the prior of a fitted one, in `unit`."""
     role: Role = "requested"
     """Other than requested: a nuisance, fitted because it is not known exactly."""
     at_bound: bool = False
@@ -136,8 +138,8 @@ class WholeMaterial(_Model):
     """[N·m] Bending stiffness per width."""
     damping: NonNegative
     """[s] Proportional to the stiffness."""
-    friction_obstacle: Friction
-    friction_cloth: Friction
+    friction: Friction
+    self_friction: Friction
     air_density: NonNegative
     """[kg/m³]"""
     added_mass: NonNegative
@@ -154,9 +156,9 @@ class Measure(_Model):
     nuisance: dict[str, Annotated[float, Field(gt=0, le=1e3)]]
     """Free variables of the pose -> standard deviation of the prior [m, rad, s]; of the first recording."""
     frames: list[int] | None
-    """Asked for; None: the scenario's, or every usable one."""
+    """Requested; None: the scenario's, or every usable one."""
     points: Annotated[int, Field(ge=1, le=10_000_000)] | None
-    """Asked for; None: the scenario's."""
+    """Requested; None: the scenario's."""
     seed: Annotated[int, Field(ge=0)]
 
 
@@ -189,14 +191,14 @@ class Followed(_Model):
 
     horizon_s: float
     """Frames after it did not count [s]."""
-    misfits: list[NonNegative]
+    chi_squares: list[NonNegative]
     """Of each frame that counted, its mean squared distance over what noise, spacing and mesh account for."""
     finer_mm: list[NonNegative]
     """By how much a mesh of half the edge length moves the cloth in each, RMS over the nodes."""
 
 
 class EstimateRecord(_Model):
-    """What the solver `likelihood` says of the parameters that were asked for, on the axis of the fit; k of them."""
+    """What the solver `likelihood` says of the requested parameters, on the axis of the fit; k of them."""
 
     mean: dict[str, Value]
     """Of all answers, by their likelihoods."""
@@ -321,27 +323,27 @@ class FitRecord(_Model):
 
     @property
     def values(self) -> dict[str, float]:
-        """Parameter -> value, the given ones too."""
-        return {name: parameter.value for name, parameter in self.parameters.items()}
+        """Parameter -> multiplier, the given ones too."""
+        return {name: parameter.multiplier for name, parameter in self.parameters.items()}
 
     @property
     def fitted(self) -> dict[str, float]:
-        """Parameter -> value, of those that were asked for."""
-        return {name: one.value for name, one in self.parameters.items() if not (one.fixed or one.role != "requested")}
+        """Requested parameter -> multiplier."""
+        return {name: one.multiplier for name, one in self.parameters.items() if not (one.fixed or one.role != "requested")}
 
     @property
     def free(self) -> dict[str, float]:
         """Name -> value, of all that was fitted: requested, uncertain material, and of how the cloth lies."""
-        material = {name: parameter.value for name, parameter in self.parameters.items() if not parameter.fixed}
-        return {**material, **self._laid}
+        material = {name: parameter.multiplier for name, parameter in self.parameters.items() if not parameter.fixed}
+        return {**material, **self._initial_states}
 
     @property
     def simulated(self) -> dict[str, float]:
         """Name -> value, of all that the fitted motions were simulated with, named as in `free`."""
-        return {**self.values, **self._laid}
+        return {**self.values, **self._initial_states}
 
     @property
-    def _laid(self) -> dict[str, float]:
+    def _initial_states(self) -> dict[str, float]:
         return of_all([self.initial_state_in(one) for one in self.episodes])
 
     def plain(self) -> dict[str, Any]:

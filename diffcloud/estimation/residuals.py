@@ -18,6 +18,7 @@ from diffcloud.errors import DivergedError
 from diffcloud.estimation.inputs import Inputs
 from diffcloud.estimation.objective import Objective
 from diffcloud.estimation.parameters import FitSpace
+from diffcloud.sim.integrators import load_integrator
 from diffcloud.sim.simulate import Rollout
 
 STEP = 0.05
@@ -69,7 +70,7 @@ class Axis:
 
 def by_tangents(objective: Objective) -> bool:
     """Whether the derivatives of its integrator hold over finite distances."""
-    return objective.scenario.scene.integrator == "implicit"
+    return load_integrator(objective.scenario.scene.integrator).smooth
 
 
 @dataclass(frozen=True)

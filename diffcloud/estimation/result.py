@@ -83,23 +83,25 @@ class FitResult:
 
 
 def physical_values(scenario: Scenario, values: Mapping[str, float]) -> dict[str, FittedParameter]:
-    """Each parameter with what it means: multiplier, physical value and unit (SI if the scene is)."""
-    described = {}
-    for name, value in values.items():
-        parameter = PARAMETERS[name]
-        basis = parameter.basis
-        described[name] = FittedParameter(
-            value=value,
-            unit=parameter.unit if basis is None else "x basis",
-            physical=value if basis is None else value * scenario.scene.basis(basis),
-            physical_unit=parameter.unit,
-            meaning=parameter.meaning,
+    """Return each parameter with what it means.
+
+    Args:
+        values: parameter -> multiplier, or the value itself where the simulator takes that.
+    """
+    return {
+        name: FittedParameter(
+            value=value * (nominal := scenario.nominal(name)),
+            unit=PARAMETERS[name].unit,
+            meaning=PARAMETERS[name].meaning,
+            nominal=nominal,
+            multiplier=value,
         )
-    return described
+        for name, value in values.items()
+    }
 
 
 def whole_material(scenario: Scenario, values: Mapping[str, float]) -> WholeMaterial:
-    """The material of the scenario with parameters of these values; what they leave out is the basis material's."""
+    """The material of the scenario with parameters of these values; what they leave out is the nominal material's."""
     material = scenario.scene.material
     system, _ = scenario.scene.build()
     changed = scenario.properties(system, one_set(values))
@@ -114,8 +116,8 @@ def whole_material(scenario: Scenario, values: Mapping[str, float]) -> WholeMate
         compression=float(changed.compression),
         bending=bending * material.resting_bending_stiffness,
         damping=float(changed.damping),
-        friction_obstacle=float(changed.friction_obstacle),
-        friction_cloth=float(changed.friction_cloth),
+        friction=float(changed.friction),
+        self_friction=float(changed.self_friction),
         air_density=float(changed.air_density),
         added_mass=max(float(changed.node_mass.sum()) - weight, 0.0) / area,
         linear_drag=float(changed.linear_drag),
@@ -398,9 +400,10 @@ def _parameters(scenario: Scenario, space: FitSpace, values: Mapping[str, float]
         found[name].fixed = True
     for variable in (one for one in space.variables if one.name in values):
         entry, bounds = found[variable.name], (variable.low, variable.high)
-        entry.bounds, entry.prior, entry.centre = bounds, variable.prior, variable.centre
+        entry.bounds = (variable.low * entry.nominal, variable.high * entry.nominal)
+        entry.prior, entry.centre = variable.prior, variable.centre * entry.nominal
         entry.role = variable.role
-        low, high, here = (math.log(one) if variable.low > 0 else one for one in (*bounds, entry.value))
+        low, high, here = (math.log(one) if variable.low > 0 else one for one in (*bounds, entry.multiplier))
         entry.at_bound = min(here - low, high - here) < _AT_BOUND * (high - low)
     return found
 
@@ -421,8 +424,10 @@ def _estimate(found: Estimate, members: Sequence[Objective]) -> EstimateRecord:
         starts=[told(one.place) for one in found.answers],
         weights=found.weights.tolist(),
         recordings=[
-            Followed(horizon_s=float(member.times.max()), misfits=misfits, finer_mm=[1e3 * apart for apart in apart_m])
-            for member, misfits, apart_m in zip(members, found.best.misfits, found.best.apart_m, strict=True)
+            Followed(
+                horizon_s=float(member.times.max()), chi_squares=chi_squares, finer_mm=[1e3 * apart for apart in apart_m]
+            )
+            for member, chi_squares, apart_m in zip(members, found.best.chi_squares, found.best.apart_m, strict=True)
         ],
     )
 

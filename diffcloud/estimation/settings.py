@@ -6,9 +6,9 @@ Nothing here imports torch, so that help is quick.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
 
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from diffcloud.io.schema import Component, NonNegative, Positive
 from diffcloud.settings import MOST_STARTS, Bounds, Count, Factor, Level, Name, Names, Section, Seed, check_bounds
@@ -22,7 +22,6 @@ LEVEL = 0.9
 IDENTIFIED_FACTOR = 2.0
 SMOOTHING = 0.5
 """Default of adam's."""
-SolverName = Literal["likelihood", "adam", "cma_es", "random_search"]
 _Starts = Annotated[int, Field(ge=1, le=MOST_STARTS)] | None
 
 
@@ -67,22 +66,10 @@ class SearchSolver(Section):
     """Loss below which the search stops. Default: never; of `loss: paper`, the scenario's."""
 
 
-def _kind(solver: Any) -> str:
-    name = solver.get("name") if isinstance(solver, dict) else getattr(solver, "name", None)
-    return "search" if name in ("cma_es", "random_search") else "adam" if name == "adam" else "likelihood"
-
-
-Solver = Annotated[
-    Annotated[LikelihoodSolver, Tag("likelihood")]
-    | Annotated[AdamSolver, Tag("adam")]
-    | Annotated[SearchSolver, Tag("search")],
-    Discriminator(_kind),
-]
+_Block = LikelihoodSolver | AdamSolver | SearchSolver
+Solver = Annotated[_Block, Field(discriminator="name")]
 SOLVER_KINDS: dict[str, type[Section]] = {
-    "likelihood": LikelihoodSolver,
-    "adam": AdamSolver,
-    "cma_es": SearchSolver,
-    "random_search": SearchSolver,
+    name: kind for kind in get_args(_Block) for name in get_args(kind.model_fields["name"].annotation)
 }
 """Name -> its settings."""
 
@@ -90,8 +77,8 @@ SOLVER_KINDS: dict[str, type[Section]] = {
 class FitSettings(Section):
     """Of a fit."""
 
-    parameters: Names = ["stretch", "mass"]
-    """Parameters to find, comma-separated, such as stretch,bending,mass."""
+    parameters: Names = ["stretching", "density"]
+    """Parameters to find, comma-separated, such as stretching,bending,density."""
     bounds: dict[str, Bounds] = Field(default={}, json_schema_extra={"flag": "--bound"})
     """Range of a parameter, NAME=LOW:HIGH, repeatable. Default: the scene's."""
     fixed: dict[str, Component] = Field(default={}, json_schema_extra={"flag": "--fix"})
@@ -111,12 +98,12 @@ class FitSettings(Section):
     tilt_x, tilt_y, yaw, lag, scale; or none. Default: all but scale."""
     initial_state: Name | None = None
     """How the cloth may lie at first: turn=5deg, shape=5mm, size=2%, track=2%; or none. Default: what the scene says, for
-    likelihood with the implicit integrator."""
+    likelihood with a smooth integrator."""
     prior: Name | None = None
     """The factor within which each multiplier probably lies, such as bending=3x; or none. Default: 10x."""
     uncertain: Name | None = None
-    """Other material that is fitted too, each within a factor: bending=1.5x,drag=1.3x; or none. Default: the scene's, for
-    likelihood with the implicit integrator."""
+    """Other material that is fitted too, each within a factor: bending=1.5x,air_density=1.3x; or none. Default: the
+    scene's, for likelihood with a smooth integrator."""
     joint: bool = False
     """One parameter set for all recordings, of one cloth."""
     level: Level = LEVEL
@@ -128,10 +115,14 @@ class FitSettings(Section):
     @classmethod
     def _named(cls, solver: Any) -> Any:
         """A name alone stands for that solver with its defaults."""
-        told = {"name": solver} if isinstance(solver, str) else solver
-        if isinstance(told, dict) and told.get("name", "likelihood") not in SOLVER_KINDS:
-            raise ValueError(f"unknown solver {told['name']!r}; allowed are {', '.join(SOLVER_KINDS)}")
-        return told
+        if isinstance(solver, str):
+            solver = {"name": solver}
+        if not isinstance(solver, dict):
+            return solver
+        solver = {"name": "likelihood", **solver}
+        if solver["name"] not in SOLVER_KINDS:
+            raise ValueError(f"unknown solver {solver['name']!r}; allowed are {', '.join(SOLVER_KINDS)}")
+        return solver
 
     @field_validator("bounds", "fixed", mode="before")
     @classmethod
@@ -141,18 +132,21 @@ class FitSettings(Section):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        from diffcloud.estimation.initial_state import parse_initial_state
         from diffcloud.estimation.pose import parse_priors
-        from diffcloud.estimation.uncertain import parse_uncertain
+        from diffcloud.scene.scenarios.initial_state import parse_initial_state
+        from diffcloud.scene.scenarios.uncertain import parse_uncertain
 
         for name, pair in self.bounds.items():
             check_bounds(f"bounds.{name}", pair)
         parse_priors(self.alignment or "none")
-        laid, uncertain = parse_initial_state(self.initial_state or "none"), parse_uncertain(self.uncertain or "none")
+        initial_state, uncertain = (
+            parse_initial_state(self.initial_state or "none"),
+            parse_uncertain(self.uncertain or "none"),
+        )
         if self.loss != "paper":
             return self
-        if laid:
-            raise ValueError("initial_state: with the paper's loss, the cloth lies as the scene has it; leave it out")
+        if initial_state:
+            raise ValueError("initial_state: with the paper's loss, the initial state is the scene's; leave it out")
         if uncertain:
             raise ValueError("uncertain: with the paper's loss, the rest of the material is known; leave it out")
         if self.solver.name == "likelihood":
@@ -173,7 +167,8 @@ class FitSettings(Section):
 
     def known_within(self, scenarios: Sequence[Scenario]) -> dict[str, float]:
         """Material that is not known exactly in a fit of recordings in these scenarios -> factor of one deviation."""
-        from diffcloud.estimation.uncertain import MATERIAL_UNCERTAINTY, parse_uncertain
+        from diffcloud.estimation.uncertain import MATERIAL_UNCERTAINTY
+        from diffcloud.scene.scenarios.uncertain import parse_uncertain
 
         if self.uncertain is not None:
             return parse_uncertain(self.uncertain)
@@ -191,16 +186,19 @@ class FitSettings(Section):
     def initial_state_within(self, scenarios: Sequence[Scenario]) -> list[dict[str, float]]:
         """How the cloth may lie otherwise at the start of each recording, in one fit of recordings in these scenarios: name
         of `estimation.initial_state` -> standard deviation [rad, m, 1]."""
-        from diffcloud.estimation.initial_state import parse_initial_state
+
+        from diffcloud.scene.scenarios.initial_state import parse_initial_state
 
         if self.initial_state is not None:
             return [parse_initial_state(self.initial_state)] * len(scenarios)
-        return [dict(one.laid) if self._fits_more(scenarios) else {} for one in scenarios]
+        return [dict(one.initial_state) if self._fits_more(scenarios) else {} for one in scenarios]
 
     def _fits_more(self, scenarios: Sequence[Scenario]) -> bool:
-        """Whether more than what is asked for is fitted by default: where derivatives make that cheap."""
-        implicit = all(one.scene.integrator == "implicit" for one in scenarios)
-        return self.solver.name == "likelihood" and implicit
+        """Whether nuisance variables are fitted by default: where derivatives make that cheap."""
+        from diffcloud.sim.integrators import load_integrator
+
+        smooth = all(load_integrator(one.scene.integrator).smooth for one in scenarios)
+        return self.solver.name == "likelihood" and smooth
 
     def solver_settings(self, scenario: Scenario) -> Settings:
         """Of the solver, with what the scenario says where nothing is given."""

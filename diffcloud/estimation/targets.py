@@ -99,7 +99,7 @@ class Target:
         return found
 
     def at(self, chosen: Sequence[int]) -> Target:
-        """The same with some of its frames, by their places among these."""
+        """Return this target with a subset of its frames, chosen by their indices 0..L-1."""
         chosen = list(chosen)
         first = chosen == list(range(len(chosen)))
         index = slice(len(chosen)) if first else chosen  # a slice is a view: lost pixels are many to copy
@@ -259,7 +259,7 @@ def _checked(scenario: Scenario, episode: Episode, frame: int) -> int:
 def _usable(
     scenario: Scenario, system: System, episode: Episode, track: Tensor | None, cut: float | None, late: float
 ) -> list[int]:
-    """Frames after the start, within the simulation, with enough of the cloth of the basis above the cut.
+    """Frames after the start, within the simulation, with enough of the cloth of nominal material above the cut.
 
     Args:
         late: largest offset of a clock [s].

@@ -59,7 +59,7 @@ class FitTask:
     recordings: Sequence[Recording]
     settings: FitSettings = field(default_factory=FitSettings)
     init: Mapping[str, float] = field(default_factory=dict)
-    """Values of the first start; the middle of the range where not given."""
+    """Multipliers of the first start; the middle of the range where not given."""
 
     @property
     def scenario(self) -> Scenario:
@@ -76,11 +76,12 @@ class FitTask:
         settings = self.settings
         for recording in self.recordings:
             recording.scenario.check_parameters([*settings.parameters, *settings.fixed])
-        bounds = {**self.scenario.bounds, **settings.bounds}
-        space = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed)
+        fixed = self.scenario.multipliers(settings.fixed, "fixed")
+        bounds = self.scenario.search_range(settings.bounds)
+        space = FitSpace.build(settings.parameters, bounds=bounds, fixed=fixed)
         ranges = {variable.name: (variable.low, variable.high) for variable in space.variables}
         priors = parameter_priors("none" if settings.paper else settings.prior, space.names, ranges)
-        space = FitSpace.build(settings.parameters, bounds=bounds, fixed=settings.fixed, priors=priors)
+        space = FitSpace.build(settings.parameters, bounds=bounds, fixed=fixed, priors=priors)
         scenarios = [recording.scenario for recording in self.recordings]
         space = with_uncertain(space, settings.known_within(scenarios), scenarios)
         return with_initial_state(space, settings.initial_state_within(scenarios), scenarios)

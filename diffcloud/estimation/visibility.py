@@ -17,18 +17,18 @@ from diffcloud.sim.simulate import rollout
 
 @dataclass(frozen=True)
 class VisibilityMap:
-    """A grid of stretch (rows) x mass (columns) multipliers."""
+    """A grid of stretching (rows) x density (columns) multipliers."""
 
     grid: NDArray[np.float64]
     """[n] multipliers of both axes."""
-    along_stretch_mm: NDArray[np.float64]
+    along_stretching_mm: NDArray[np.float64]
     """[n - 1, n] RMS node distance between neighbours in stretch [mm]."""
-    along_mass_mm: NDArray[np.float64]
+    along_density_mm: NDArray[np.float64]
     """[n, n - 1]"""
 
     def visible_fraction(self, noise_mm: float) -> float:
         """Part of all neighbouring pairs that differ by more than the noise."""
-        pairs = np.concatenate([self.along_stretch_mm.ravel(), self.along_mass_mm.ravel()])
+        pairs = np.concatenate([self.along_stretching_mm.ravel(), self.along_density_mm.ravel()])
         return float((pairs > noise_mm).mean())
 
 
@@ -46,7 +46,7 @@ def visibility_map(
     grid = np.linspace(0.1, 10, size) if linear else np.logspace(-1, 1, size)
     stretch, mass = (torch.as_tensor(axis.ravel()) for axis in np.meshgrid(grid, grid, indexing="ij"))
     system, _ = scenario.scene.build()
-    properties = scenario.properties(system, {"stretch": stretch, "mass": mass})
+    properties = scenario.properties(system, {"stretching": stretch, "density": mass})
     per_frame = scenario.scene.frame_steps
     if episode is None:
         steps, track = scenario.loss_frames[0] % (scenario.frames + 1) * per_frame, None

@@ -16,19 +16,19 @@ from diffcloud.estimation.solvers import AdamSettings, CmaEsSettings, RandomSear
 from diffcloud.evaluation import methods
 from diffcloud.evaluation.intervals import intervals_of
 from diffcloud.evaluation.landscape import loss_landscape
-from diffcloud.evaluation.methods import Estimate, Gap, Rival
+from diffcloud.evaluation.methods import Baseline, Estimate, Gap
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 
-RIVALS: tuple[Rival, ...] = ("single_start", "middle", "random_search", "cma_es")
+BASELINES: tuple[Baseline, ...] = ("single_start", "middle", "random_search", "cma_es")
 
 
 @dataclass(frozen=True)
 class ComparisonSettings:
     """Of `compare_episode`."""
 
-    rivals: Sequence[Rival] = RIVALS
+    baselines: Sequence[Baseline] = BASELINES
     draws: int = 4
     """Fresh point samples that losses are averaged over."""
     seed: int = 1000
@@ -78,16 +78,16 @@ def compare_episode(
     space, _ = methods.space_of(fit).of_recording(recording)
     objective = Objective(scenario, episode, **fit.measured_by(recording))
     told: list[Estimate | Gap] = [methods.fitted(fit, recording)]
-    laid = fit.initial_state_in(fit.episodes[recording])  # as the pose, for all methods
-    lying = FitSpace(space.asked.variables, {**space.asked.fixed, **laid})
-    told += [_run(rival, objective, lying, fit, settings.seed) for rival in settings.rivals]
+    initial_state = fit.initial_state_in(fit.episodes[recording])  # as the pose, for all methods
+    lying = FitSpace(space.asked.variables, {**space.asked.fixed, **initial_state})
+    told += [_run(baseline, objective, lying, fit, settings.seed) for baseline in settings.baselines]
     told += [*predictions, *methods.published(episode.meta)]
     estimates = [entry for entry in told if isinstance(entry, Estimate)]
     gaps = [entry for entry in told if isinstance(entry, Gap)]
     meter = EpisodeMeter(objective, draws=settings.draws, seed=settings.seed)
     sources = dict(transfers or {})
     every = (*(e.values for e in estimates), *sources.values())
-    sets = [methods.clipped({**laid, **values}, space) for values in every]
+    sets = [methods.clipped({**initial_state, **values}, space) for values in every]
     measured = meter.measure([*sets, of_recording(fit.start, recording)])
     rows, transferred = [], []
     for index, estimate in enumerate(estimates):
@@ -146,18 +146,18 @@ def compare_episode(
     return EpisodeRecord(record, seconds)
 
 
-def _run(rival: Rival, objective: Objective, space: FitSpace, fit: FitRecord, seed: int) -> Estimate | Gap:
-    """One rival with the budget of the fit, or of one start of Adam; a gap if its simulations fail."""
+def _run(baseline: Baseline, objective: Objective, space: FitSpace, fit: FitRecord, seed: int) -> Estimate | Gap:
+    """One baseline with the budget of the fit, or of one start of Adam; a gap if its simulations fail."""
     told, by_adam = fit.settings, fit.solver == "adam"
     simulations = int(told["max_steps"] or 0) + 1 if by_adam else methods.simulations_each(fit)
     threshold = float(told.get("threshold") or 0.0)
     objective.reseed(fit.measure.seed)
     try:
-        if rival == "middle":
+        if baseline == "middle":
             return methods.middle(space)
-        if rival == "random_search":
+        if baseline == "random_search":
             return methods.searched(objective, space, RandomSearchSettings(simulations, threshold, seed))
-        if rival == "cma_es":
+        if baseline == "cma_es":
             return methods.searched(objective, space, CmaEsSettings(simulations, threshold, seed))
         known = methods.first_start(fit, space)
         if known is not None:
@@ -171,4 +171,4 @@ def _run(rival: Rival, objective: Objective, space: FitSpace, fit: FitRecord, se
         )
         return methods.single_start(objective, space, adam)
     except DiffCloudError as error:
-        return Gap(rival, str(error))
+        return Gap(baseline, str(error))

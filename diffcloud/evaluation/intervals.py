@@ -1,4 +1,4 @@
-"""What a fit says of the parameters: intervals with a level, a verdict for each, and what to improve first.
+"""What a fit says of the parameters: intervals with a level, a status for each, and what to improve first.
 
 The covariance is the one that `estimation.likelihood` has found. On the axis of the fit (a factor up and down for
 multipliers) an interval reaches to both sides as far as the variance's root times the quantile of the normal distribution.
@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -29,14 +29,15 @@ from diffcloud.estimation.settings import IDENTIFIED_FACTOR, LEVEL
 from diffcloud.io.files import read_json
 from diffcloud.io.schema import Plain
 from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.properties import PARAMETERS
 
-Verdict = Literal[
+ParameterStatus = Literal[
     "identified",
-    "only the ratio",
-    "only a combination",
-    "the prior speaks",
-    "not identified",
-    "the model does not explain the recording",
+    "ratio_only",
+    "combination_only",
+    "prior_dominated",
+    "not_identified",
+    "model_error",
 ]
 _PLAIN = 1e6
 """Below it numbers are written out."""
@@ -46,7 +47,7 @@ _ENDLESS = 700.0
 """Largest logarithm of a factor."""
 _UNFINISHED = "the descent took all its steps before it arrived: give it more with --max-steps"
 _PRIOR = 0.5
-"""Part of the variance from which it is the prior that speaks."""
+"""Part of the variance from which the prior dominates."""
 _SHARE = 1 / 3
 """A parameter has its part in a combination from this component on."""
 
@@ -59,25 +60,27 @@ class Interval(_Model):
     """Of one parameter."""
 
     value: float
+    """In `unit`, as are both ends."""
     low: float
     high: float
-    physical: float
-    physical_low: float
-    physical_high: float
-    physical_unit: str
+    unit: str
+    nominal: float
+    """Value of the scene's own material, on which the fit's multiplier acts; 1 where there is no multiplier."""
     factor: float | None
     """To its farther end."""
     at_bounds: list[float]
     """Bounds at which it ends: it is one-sided there."""
-    verdict: Verdict
+    status: ParameterStatus
 
 
 class RatioInterval(_Model):
-    """Of stretch to mass."""
+    """Of stretching to density [m²/s²]."""
 
     value: float
     low: float
     high: float
+    nominal: float
+    """Of the scene's own material."""
     factor: float
 
 
@@ -105,24 +108,24 @@ class Intervals(_Model):
     """Where the uncertainty comes from, the largest part first -> parameter (or `ratio`) -> standard deviation, of the
     logarithm, or of the part of the range where the lower bound is zero."""
     covariance: list[list[float]]
-    explains: bool
+    fits_to_noise: bool
     """Whether the model follows every recording for most of what counts."""
     reason: str
-    """Why the verdict is not of the parameters; else empty."""
-    remark: str = ""
+    """Why the status is not of the parameters; else empty."""
+    warning: str = ""
     """Why intervals may be wrong all the same; else empty."""
     note: str = ""
-    """Why the ratio is not what a motion identifies where the mass multiplier acts on a part of the cloth; else empty."""
+    """Why the ratio is not what a motion identifies where the density acts on a part of the cloth; else empty."""
 
     @property
     def sentences(self) -> list[str]:
-        """Reason, remark and note, for people."""
-        return [text[0].upper() + text[1:] + "." for text in (self.reason, self.remark, self.note) if text]
+        """Reason, warning and note, for people."""
+        return [text[0].upper() + text[1:] + "." for text in (self.reason, self.warning, self.note) if text]
 
 
 @dataclass(frozen=True)
 class _Known:
-    """Of k parameters that were asked for."""
+    """Of k requested parameters."""
 
     sources: Mapping[str, NDArray[np.float64]]
     """Name -> [k, k] covariance on the axis of the fit."""
@@ -160,40 +163,38 @@ def intervals_of(
     sources = {name: np.array(rows) for name, rows in told.sources.items()}
     found = _Known(sources, float(ndtri(0.5 + level / 2)))
     ratio_row = _ratio_row(space)
-    ratio = None if ratio_row is None else _ratio(values, found.reach(ratio_row))
+    ratio = None if ratio_row is None else _ratio(values, found.reach(ratio_row), scenario)
     combinations = _combinations(found, space)
-    explains, reason = _followed(record)
+    fits_to_noise, reason = _followed(record)
     parameters = {}
     for index, variable in enumerate(space.variables):
         name = variable.name
         low, high, bounded = _ends(space, index, values[name], found.reach(np.eye(len(space.names))[index]))
         factor = _factor(values[name], low, high)
         prior = found.sources.get("prior")
-        verdict: Verdict
-        if not explains:
-            verdict = "the model does not explain the recording"
+        status: ParameterStatus
+        if not fits_to_noise:
+            status = "model_error"
         elif prior is not None and prior[index, index] > _PRIOR * found.covariance[index, index]:
-            verdict = "the prior speaks"
+            status = "prior_dominated"
         elif factor <= within and not bounded:
-            verdict = "identified"
-        elif name in ("stretch", "mass") and ratio is not None and ratio.factor <= within:
-            verdict = "only the ratio"
+            status = "identified"
+        elif name in ("stretching", "density") and ratio is not None and ratio.factor <= within:
+            status = "ratio_only"
         elif any(name in _tied(one, space) for one in combinations if one.factor is not None and one.factor <= within):
-            verdict = "only a combination"
+            status = "combination_only"
         else:
-            verdict = "not identified"
-        one = physical_values(scenario, {name: 1.0})[name]
+            status = "not_identified"
+        nominal = scenario.nominal(name)
         parameters[name] = Interval(
-            value=values[name],
-            low=low,
-            high=high,
-            physical=values[name] * one.physical,
-            physical_low=low * one.physical,
-            physical_high=high * one.physical,
-            physical_unit=one.physical_unit,
+            value=values[name] * nominal,
+            low=low * nominal,
+            high=high * nominal,
+            unit=PARAMETERS[name].unit,
+            nominal=nominal,
             factor=factor if math.isfinite(factor) else None,
-            at_bounds=bounded,
-            verdict=verdict,
+            at_bounds=[bound * nominal for bound in bounded],
+            status=status,
         )
     several = len(space.names) > 1
     return Intervals(
@@ -205,25 +206,42 @@ def intervals_of(
         worst=combinations[-1] if several else None,
         sources=_sources(found, space, ratio_row),
         covariance=found.covariance.tolist(),
-        explains=explains,
+        fits_to_noise=fits_to_noise,
         reason=reason,
-        remark=_UNFINISHED if explains and record.stop_reason == "iterations" else "",
+        warning=_UNFINISHED if fits_to_noise and record.stop_reason == "iterations" else "",
         note="" if ratio is None else _node_set_note(scenario),
     )
 
 
-def _ratio(values: Mapping[str, float], reach: float) -> RatioInterval:
-    value, factor = values["stretch"] / values["mass"], math.exp(min(reach, _ENDLESS))
-    return RatioInterval(value=value, low=value / factor, high=value * factor, factor=factor)
+def stated_parameters(record: FitRecord, found: Intervals | None, scenario: Scenario) -> dict[str, dict[str, Any]]:
+    """Return value, unit, low, high and status of each requested parameter, in SI units.
+
+    Args:
+        found: intervals of the fit; without them, low, high and status are None.
+        scenario: of the first recording.
+    """
+    if found is not None:
+        kept = {"value", "unit", "low", "high", "status"}
+        return {name: one.model_dump(include=kept) for name, one in found.parameters.items()}
+    return {
+        name: {"value": one.value, "unit": one.unit, "low": None, "high": None, "status": None}
+        for name, one in physical_values(scenario, record.fitted).items()
+    }
+
+
+def _ratio(values: Mapping[str, float], reach: float, scenario: Scenario) -> RatioInterval:
+    nominal = scenario.nominal("stretching") / scenario.nominal("density")
+    value, factor = nominal * values["stretching"] / values["density"], math.exp(min(reach, _ENDLESS))
+    return RatioInterval(value=value, low=value / factor, high=value * factor, nominal=nominal, factor=factor)
 
 
 def _followed(record: FitRecord) -> tuple[bool, str]:
     """Whether the model follows every recording for most of what counts, and else why not."""
     assert record.estimate is not None
     for one, told in zip(record.episodes, record.estimate.recordings, strict=True):
-        misfits = np.array(told.misfits)
-        if np.median(misfits) > FOLLOWS:
-            times = math.sqrt(float(np.median(misfits)))
+        chi_squares = np.array(told.chi_squares)
+        if np.median(chi_squares) > FOLLOWS:
+            times = math.sqrt(float(np.median(chi_squares)))
             return False, (
                 f"in {one.name} the cloth is {times:.1f} times as far from the recording as noise, spacing and mesh "
                 "account for: check the size, the grasp, the gripper's track, and whether clouds hold more than the cloth"
@@ -253,7 +271,7 @@ def read_intervals(path: Path, space: FitSpace) -> Intervals:
 
 
 def draws(found: Intervals, space: FitSpace, count: int, seed: int) -> list[dict[str, float]]:
-    """Parameter sets as probable as the data leave them: normal on the axis of the fit, none beyond its bounds.
+    """Return sets of multipliers as probable as the data leave them: normal on the axis of the fit, none beyond its bounds.
 
     Raises:
         ConfigError: the fit does not follow its recording; then its covariance says nothing.
@@ -261,7 +279,7 @@ def draws(found: Intervals, space: FitSpace, count: int, seed: int) -> list[dict
     if found.reason:
         raise ConfigError(f"Nothing can be drawn from these intervals: {found.reason}.")
     axis = Axis.of(space)
-    values = torch.tensor([[entry.value for entry in found.parameters.values()]], dtype=torch.float64)
+    values = torch.tensor([[one.value / one.nominal for one in found.parameters.values()]], dtype=torch.float64)
     spread = np.random.default_rng(seed).multivariate_normal(np.zeros(len(space.names)), found.covariance, count)
     drawn = axis.bounded(axis.places(values) + torch.from_numpy(spread))
     return [dict(zip(space.names, row, strict=True)) for row in drawn.tolist()]
@@ -285,10 +303,10 @@ def significant(low: float | None, high: float | None) -> Callable[[float | None
 
 def _node_set_note(scenario: Scenario) -> str:
     """See `Intervals.note`."""
-    nodes = scenario.node_sets.get("mass")
+    nodes = scenario.node_sets.get("density")
     if nodes is None:
         return ""
-    return f"mass multiplies {len(nodes)} of {len(scenario.scene.mesh.nodes)} nodes, so stretch / mass is no exact scale"
+    return f"density multiplies {len(nodes)} of {len(scenario.scene.mesh.nodes)} nodes, so their ratio is no exact scale"
 
 
 def _ends(space: FitSpace, index: int, value: float, reach: float) -> tuple[float, float, list[float]]:
@@ -308,10 +326,10 @@ def _factor(value: float, low: float, high: float) -> float:
 
 
 def _ratio_row(space: FitSpace) -> NDArray[np.float64] | None:
-    if not {"stretch", "mass"} <= set(space.names):
+    if not {"stretching", "density"} <= set(space.names):
         return None
     row = np.zeros(len(space.names))
-    row[space.names.index("stretch")], row[space.names.index("mass")] = 1.0, -1.0
+    row[space.names.index("stretching")], row[space.names.index("density")] = 1.0, -1.0
     return row
 
 

@@ -17,7 +17,7 @@ from diffcloud.estimation.record import History
 def loss_landscape(
     objective: Objective, space: FitSpace, values: Mapping[str, float], history: History, *, size: int
 ) -> dict[str, Any] | None:
-    """Losses over the first two parameters that were asked for, the others as fitted.
+    """Losses over the first two requested parameters, the others as fitted.
 
     Args:
         values: the fitted ones.
@@ -26,7 +26,7 @@ def loss_landscape(
 
     Returns:
         names; x, y: [n] of the first and the second parameter; loss: [n][n], rows of y, None where a run diverged; paths:
-        for each start that was followed [iterations][2]; fitted: [2]. None if fewer than two were asked for.
+        for each start that was followed [iterations][2]; fitted: [2]. None if fewer than two are requested.
     """
     if len(space.asked.variables) < 2:
         return None

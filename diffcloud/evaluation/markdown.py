@@ -39,7 +39,7 @@ def comparison_page(told: Tables, missing: Sequence[str], title: str) -> str:
         "",
         "## What is identified",
         "",
-        "Intervals at the stated level, verdicts, and the largest sources of uncertainty with their parts of the variance.",
+        "Intervals at the stated level, statuses, and the largest sources of uncertainty with their parts of the variance.",
         "",
         *_identified(told["intervals"]),
         "",
@@ -114,8 +114,8 @@ def _seconds(table: pd.DataFrame) -> list[str]:
 def _identified(table: pd.DataFrame) -> list[str]:
     if table.empty:
         return ["Not asked for."]
-    kept = ["scenario", "episode", "parameter", "value", "low", "high", "ratio_factor", "verdict", "sources"]
-    head = ["scenario", "episode", "parameter", "value", "from", "to", "factor of the ratio", "verdict", "improve first"]
+    kept = ["scenario", "episode", "parameter", "value", "low", "high", "ratio_factor", "status", "sources"]
+    head = ["scenario", "episode", "parameter", "value", "from", "to", "factor of the ratio", "status", "improve first"]
     return _table(head, table[kept])
 
 

@@ -1,7 +1,7 @@
 """Methods that name the parameters of an episode, on equal terms.
 
-Each gives one parameter set: the fit, a network's prediction, or a rival without gradients or learning. Rivals that search
-are the solvers of `estimation.solvers`; they see the objective that the fit sees (frames, points, common random
+Each gives one parameter set: the fit, a network's prediction, or a baseline without gradients or learning. Baselines that
+search are the solvers of `estimation.solvers`; they see the objective that the fit sees (frames, points, common random
 numbers, bounds), may simulate as often as the fit (as one start of it, where that was Adam's), and stop below the same
 threshold.
 """
@@ -30,7 +30,7 @@ from diffcloud.estimation.solvers import (
     solve,
 )
 
-Rival = Literal["single_start", "middle", "random_search", "cma_es"]
+Baseline = Literal["single_start", "middle", "random_search", "cma_es"]
 """What the comparison can run by itself."""
 Phase = Literal["dataset", "training", "inference", "optimisation"]
 PHASES: tuple[Phase, ...] = ("dataset", "training", "inference", "optimisation")
@@ -67,12 +67,13 @@ def space_of(fit: FitRecord) -> FitSpace:
     """The free parameters of a fit with their bounds and priors, and those that were given."""
     variables, fixed = [], {}
     for name, entry in fit.parameters.items():
-        if entry.bounds is None:
-            fixed[name] = entry.value
+        if entry.bounds is None or entry.centre is None:
+            fixed[name] = entry.multiplier
         else:
-            variables.append(Variable(name, *entry.bounds, entry.prior, entry.centre, entry.role))
-    laid = variables_of([one.nuisance for one in fit.episodes], length_unit_m=fit.length_unit_m)
-    return FitSpace((*variables, *laid), fixed)
+            low, high, centre = (one / entry.nominal for one in (*entry.bounds, entry.centre))
+            variables.append(Variable(name, low, high, entry.prior, centre, entry.role))
+    initial_state = variables_of([one.nuisance for one in fit.episodes], length_unit_m=fit.length_unit_m)
+    return FitSpace((*variables, *initial_state), fixed)
 
 
 def fitted(fit: FitRecord, recording: int) -> Estimate:
@@ -124,7 +125,7 @@ def first_start(fit: FitRecord, space: FitSpace) -> Estimate | None:
 
 
 def searched(objective: Objective, space: FitSpace, settings: CmaEsSettings | RandomSearchSettings) -> Estimate:
-    """A rival without gradients: the solver that a fit can have too, under its name.
+    """A baseline without gradients: the solver that a fit can have too, under its name.
 
     Raises:
         DivergedError: every candidate diverged.

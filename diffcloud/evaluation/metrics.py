@@ -68,7 +68,8 @@ class EpisodeMeter:
             loss_other_frames, rms_other_frames_mm: at the frames that the fit did not use, of one draw; absent without any,
                 and where the motion diverges after the fit's frames;
             two_sided: Chamfer in both directions at the fit's frames, of one draw;
-            and of episodes with known parameters: success, error_<parameter> (relative), error_ratio (of stretch to mass).
+            and of episodes with known parameters: success, error_<parameter> (relative), error_ratio
+            (stretching over density).
         """
         with torch.no_grad():
             found, kept, late = without_diverged(len(sets), lambda index: self._distances([sets[i] for i in index]))
@@ -126,6 +127,8 @@ class EpisodeMeter:
             return {}
         row: dict[str, Any] = {"success": bool(loss < success_threshold(self.scenario))}
         row |= {f"error_{name}": abs(values[name] / value - 1) for name, value in truth.items() if value}
-        if {"stretch", "mass"} <= truth.keys():
-            row["error_ratio"] = abs(values["stretch"] * truth["mass"] / (values["mass"] * truth["stretch"]) - 1)
+        if {"stretching", "density"} <= truth.keys():
+            row["error_ratio"] = abs(
+                values["stretching"] * truth["density"] / (values["density"] * truth["stretching"]) - 1
+            )
         return row

@@ -73,7 +73,7 @@ class StatedIntervals(Intervals):
 
     level: Annotated[float, Field(gt=0, lt=1)]
     within: Annotated[float, Field(gt=1, le=1e6)]
-    remark: Text
+    warning: Text
     note: Text
 
 

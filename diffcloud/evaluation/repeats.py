@@ -22,7 +22,7 @@ def fit_of(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """One row per episode with a fit of its own: scenario, episode, fabric, category, repeat, loss, and a column
-    per parameter but those fitted too because they are not known exactly, with `ratio` of stretch to mass where both are
+    per parameter but those fitted too because they are not known exactly, with their `ratio` where both are
     there. Joint fits are left out: their recordings agree because they were made to."""
     rows = []
     for record in records:
@@ -34,8 +34,8 @@ def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
             row["fabric"] = None  # a simulated target has known parameters; its label names no cloth that is met again
         row |= {"loss": fit["loss"]}
         row |= {name: value for name, value in fit["clipped"].items() if name not in record["nuisance"]}
-        if {"stretch", "mass"} <= fit["clipped"].keys():
-            row["ratio"] = fit["clipped"]["stretch"] / fit["clipped"]["mass"]
+        if {"stretching", "density"} <= fit["clipped"].keys():
+            row["ratio"] = fit["clipped"]["stretching"] / fit["clipped"]["density"]
         rows.append(row)
     return pd.DataFrame(rows)
 

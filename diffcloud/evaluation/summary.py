@@ -70,7 +70,7 @@ def method_table(records: Records, references: Mapping[tuple[str, str], float] |
 
 def fit_table(records: Records) -> pd.DataFrame:
     """One row per fit: losses of its start and its end in squared length units and as RMS in millimetres, the means over
-    the episodes of a joint fit; fitted and true parameters; the stretch-to-mass ratio, which a motion identifies best."""
+    the episodes of a joint fit; fitted and true parameters; stretching over density, which a motion identifies best."""
     fits: dict[tuple[str, str], list[tuple[Mapping[str, Any], Mapping[str, Any]]]] = {}
     for record in records:
         fit = fit_of(record)
@@ -94,8 +94,8 @@ def fit_table(records: Records) -> pd.DataFrame:
         truth = {parameter: value for parameter, value in record["truth"].items() if parameter in fit["values"]}
         row |= {f"true_{parameter}": value for parameter, value in truth.items()}
         for kind, values in (("fitted", fit["values"]), ("true", truth)):
-            if {"stretch", "mass"} <= values.keys():
-                row[f"{kind}_ratio"] = values["stretch"] / values["mass"]
+            if {"stretching", "density"} <= values.keys():
+                row[f"{kind}_ratio"] = values["stretching"] / values["density"]
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -152,7 +152,7 @@ def seconds_table(seconds: Mapping[tuple[str, str], Mapping[str, Mapping[str, fl
 
 
 def interval_table(records: Records) -> pd.DataFrame:
-    """One row per episode and parameter: fitted value, interval, verdict, what the ratio is known within, the
+    """One row per episode and parameter: fitted value, interval, status, what the ratio is known within, the
     best-determined combination, and the three largest sources of uncertainty."""
     rows = []
     for record in records:
@@ -162,22 +162,24 @@ def interval_table(records: Records) -> pd.DataFrame:
         ratio = told["ratio"] or {}
         for name, entry in told["parameters"].items():
             row: dict[str, Any] = {"scenario": record["scenario"], "episode": record["episode"], "fabric": record["fabric"]}
-            row |= {"parameter": name, "verdict": entry["verdict"]}
-            row |= {key: entry[key] for key in ("value", "low", "high", "factor")}
-            row |= {key: entry[key] for key in ("physical", "physical_low", "physical_high", "physical_unit")}
+            row |= {"parameter": name, "status": entry["status"]}
+            row |= {key: entry[key] for key in ("value", "low", "high", "unit", "factor")}
             row |= {"ratio": ratio.get("value"), "ratio_factor": ratio.get("factor")}
             row |= {"combination": None if told["best"] is None else str(Combination.model_validate(told["best"]))}
             row |= {"sources": largest_sources(told["sources"], name), "level": told["level"], "reason": told["reason"]}
-            row |= {"remark": told["remark"], "note": told["note"]}
-            row |= dict(zip(("posterior_low", "posterior_high"), _posterior(record, name), strict=True))
+            row |= {"warning": told["warning"], "note": told["note"]}
+            row |= dict(zip(("posterior_low", "posterior_high"), _posterior(record, name, entry["nominal"]), strict=True))
             rows.append(row)
     return pd.DataFrame(rows)
 
 
-def _posterior(record: Mapping[str, Any], name: str) -> tuple[float | None, float | None]:
-    """The interval that a posterior gives a parameter, if one was asked."""
+def _posterior(record: Mapping[str, Any], name: str, nominal: float) -> tuple[float | None, float | None]:
+    """The interval that a posterior gives a parameter, in SI units, if there is one."""
     stated = [row["intervals"] for row in record["methods"] if row.get("intervals")]
-    return tuple(stated[0].get(name, (None, None))) if stated else (None, None)
+    if not stated or name not in stated[0]:
+        return None, None
+    low, high = stated[0][name]
+    return low * nominal, high * nominal
 
 
 def percent(share: float) -> str:
@@ -294,11 +296,11 @@ def metrics(told: Tables) -> dict[str, Any]:
         found["against_reference"] = {"within_5_percent": reference[0], "episodes": reference[1]}
     table = told["intervals"]
     if not table.empty:
-        verdicts: dict[str, Any] = {}
+        statuses: dict[str, Any] = {}
         for (scenario, parameter), group in table.groupby(["scenario", "parameter"], sort=False):
-            counts = group["verdict"].value_counts(sort=False)
-            verdicts.setdefault(str(scenario), {})[str(parameter)] = {str(key): int(n) for key, n in counts.items()}
-        found["verdicts"] = verdicts
+            counts = group["status"].value_counts(sort=False)
+            statuses.setdefault(str(scenario), {})[str(parameter)] = {str(key): int(n) for key, n in counts.items()}
+        found["statuses"] = statuses
     return found
 
 
@@ -310,7 +312,7 @@ def headline(told: Tables) -> dict[str, Any]:
 
     Returns:
         scenario -> `rms_mm` (method -> mean RMS distance at the compared frames [mm]) and, of the fits where known,
-        `rms_other_frames_mm` (mean) and `ratio_factor` (median factor, at least 1, between fitted and true stretch / mass).
+        `rms_other_frames_mm` (mean) and `ratio_factor` (median factor, at least 1, between fitted and true ratios).
     """
     found: dict[str, Any] = {}
     for row in told["means"].to_dict("records"):
@@ -347,9 +349,9 @@ def sentences(told: Tables) -> dict[str, list[str]]:
 
 def overview(told: Tables) -> pd.DataFrame:
     """One row per scenario: the methods with the lowest and the next mean loss, the middle of the range, how far
-    DiffCloud's mean is below the best predictor's, and the verdict that most episodes give on each parameter."""
+    DiffCloud's mean is below the best predictor's, and the status that most episodes give on each parameter."""
     below = {row["scenario"]: row["below"] for row in against_predictors(told["methods"]).to_dict("records")}
-    verdicts = told["intervals"]
+    statuses = told["intervals"]
     rows = []
     for scenario, group in told["means"].groupby("scenario", sort=False):
         ranked = group.sort_values("loss", kind="stable").to_dict("records")
@@ -358,10 +360,10 @@ def overview(told: Tables) -> pd.DataFrame:
             row |= {place: label(one["method"]), f"{place}_mm": one["rms_mm"]}
         row["middle_mm"] = next((one["rms_mm"] for one in ranked if one["method"] == "middle"), None)
         row["below_predictor"] = below.get(scenario)
-        if not verdicts.empty:
-            for name, part in verdicts[verdicts["scenario"] == scenario].groupby("parameter", sort=False):
-                verdict, count = next(iter(part["verdict"].value_counts().items()))
-                row[f"verdict_{name}"] = f"{verdict} ({count}/{len(part)})"
+        if not statuses.empty:
+            for name, part in statuses[statuses["scenario"] == scenario].groupby("parameter", sort=False):
+                status, count = next(iter(part["status"].value_counts().items()))
+                row[f"status_{name}"] = f"{str(status).replace('_', ' ')} ({count}/{len(part)})"
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -409,15 +411,19 @@ def _identified(table: pd.DataFrame) -> list[str]:
         return []
     found = []
     for (scenario, name), group in table.groupby(["scenario", "parameter"], sort=False):
-        counts = ", ".join(f"{verdict} in {count}" for verdict, count in group["verdict"].value_counts().items())
-        text = f"{scenario}: verdict on {name}: {counts} of {_count(len(group))}"
+        counts = ", ".join(
+            f"{str(status).replace('_', ' ')} in {count}" for status, count in group["status"].value_counts().items()
+        )
+        text = f"{scenario}: status of {name}: {counts} of {_count(len(group))}"
         if group["factor"].notna().any():
             text += f"; {group['level'].iloc[0]:.0%} intervals end within {_times(group['factor'].median())} (median)"
         found.append(f"{text}.")
     for scenario, group in table.drop_duplicates(["scenario", "episode"]).groupby("scenario", sort=False):
         if group["ratio_factor"].notna().any():
-            found.append(f"{scenario!s}: stretch / mass is known within {_times(group['ratio_factor'].median())} (median).")
-    for kind in ("reason", "remark"):
+            found.append(
+                f"{scenario!s}: stretching / density is known within {_times(group['ratio_factor'].median())} (median)."
+            )
+    for kind in ("reason", "warning"):
         for row in table[table[kind] != ""].drop_duplicates(["scenario", "episode"]).to_dict("records"):
             found.append(f"{row['scenario']} / {row['episode']}: {row[kind]}.")
     for row in table[table["note"] != ""].drop_duplicates(["scenario", "note"]).to_dict("records"):
@@ -478,7 +484,7 @@ def _credibility(told: Tables) -> list[str]:
         )
         # the worst fabric decides: the next one may be like it
         if max(factors.max() for factors in spreads.values()) > _FAR * own:
-            text += ": the number explains its own recording and is no property of the fabric to that precision"
+            text += ": the number holds for its own recording, and not for the fabric to that precision"
         else:
             text += ": the number holds beyond its own recording"
         found.append(f"{text}.")

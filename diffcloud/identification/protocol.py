@@ -11,14 +11,16 @@ import numpy as np
 from diffcloud.errors import ConfigError
 from diffcloud.estimation.settings import FitSettings
 from diffcloud.io.episodes import Episode
+from diffcloud.scene.scenarios import Scenario
 from diffcloud.scene.scenarios.layout import Found, found_size, node_counts
 from diffcloud.sim.grasp import GRIP_M
 
 _DENSITY = 0.16
 _MATERIAL = {"stretching_n_m": 60.0, "bending_n_m": 5e-6, "poisson": 0.2, "damping_s": 0.002}
-_AROUND = {"friction_obstacle": 0.4, "compression": 0.5}
-_UNCERTAIN = {"friction_obstacle": 2.0, "compression": 3.0, "shear": 1.2, "damping": 2.5}
-_BOUNDS = {"stretch": (0.03, 30.0), "bending": (0.03, 30.0), "mass": (0.2, 5.0)}
+_AROUND = {"friction": 0.4, "compression": 0.5}
+_UNCERTAIN = {"friction": 2.0, "compression": 3.0, "shear": 1.2, "damping": 2.5}
+_BOUNDS = {"stretching": (0.03, 30.0), "bending": (0.03, 30.0), "density": (0.2, 5.0)}
+"""Multiples of the nominal material."""
 _STEPS = 16
 _GRIP_KNOWN = 1.5
 
@@ -77,7 +79,7 @@ def known_grip(size: float) -> dict[str, float]:
 def with_density(cloth: Mapping[str, Any], density: float, deviation: float) -> dict[str, Any]:
     """The cloth with a weighed mass that is not exact: the fit allows for it."""
     material = {**_material(cloth), "density_kg_m2": density}
-    return {**cloth, "material": material, "uncertain": {**cloth.get("uncertain", {}), "mass": 1 + deviation / density}}
+    return {**cloth, "material": material, "uncertain": {**cloth.get("uncertain", {}), "density": 1 + deviation / density}}
 
 
 def _material(cloth: Mapping[str, Any]) -> dict[str, Any]:
@@ -89,7 +91,7 @@ def _material(cloth: Mapping[str, Any]) -> dict[str, Any]:
 
 def fit_settings(
     parameters: Sequence[str] | None,
-    cloth: Mapping[str, Any],
+    scenario: Scenario,
     weighed: tuple[float, float] | None,
     base: FitSettings | None = None,
 ) -> FitSettings:
@@ -97,20 +99,18 @@ def fit_settings(
 
     Args:
         parameters: to find; by default stretching, bending, and the mass if it was not weighed.
-        cloth: fields of `found_cloth`.
+        scenario: of a cloth of `found_cloth`.
         weighed: density and its standard deviation [kg/m²].
         base: what else is said; its parameters, bounds and fixed values come first.
 
-    Raises:
-        ConfigError: a weighed density with a material of none.
     """
-    names = ["stretch", "bending", *(["mass"] if weighed is None else [])]
+    names = ["stretching", "bending", *(["density"] if weighed is None else [])]
     if parameters is not None:
         names = list(parameters)
     fixed = {}
     if weighed is not None and not weighed[1]:
-        fixed = {"mass": weighed[0] / float(_material(cloth)["density_kg_m2"])}
-    bounds = {name: list(pair) for name, pair in _BOUNDS.items() if name in names}
+        fixed = {"density": weighed[0]}
+    bounds = {name: [part * scenario.nominal(name) for part in _BOUNDS[name]] for name in names if name in _BOUNDS}
     found: dict[str, Any] = {"parameters": names, "fixed": fixed, "bounds": bounds}
     if base is None:
         return FitSettings.model_validate(found)

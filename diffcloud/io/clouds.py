@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,6 @@ from diffcloud.io.pcd import read_pcd
 from diffcloud.io.pickles import load_npy
 from diffcloud.io.ply import read_ply
 
-FORMATS = (".npy", ".ply", ".xyz", ".pcd")
-
 
 def read_cloud(path: Path) -> NDArray[np.float32]:
     """[N, 3] points of one file; colours, normals and further columns are left out.
@@ -28,10 +27,9 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
     """
     path = Path(path)
     check_input(path, kind="cloud", error=EpisodeError)
-    readers = {".npy": load_npy, ".ply": read_ply, ".xyz": _read_xyz, ".pcd": read_pcd}
-    if path.suffix.lower() not in readers:
+    if path.suffix.lower() not in FORMATS:
         raise EpisodeError(f"{path}: unknown cloud format; allowed are {', '.join(FORMATS)}.")
-    points = np.asarray(readers[path.suffix.lower()](path))
+    points = np.asarray(FORMATS[path.suffix.lower()](path))
     if points.dtype.kind not in "fiu":
         raise EpisodeError(f"{path} holds {points.dtype} values; a cloud holds numbers.")
     if points.ndim != 2 or points.shape[1] != 3:
@@ -61,6 +59,10 @@ def _read_xyz(path: Path) -> NDArray[Any]:
     except (ValueError, UnicodeDecodeError) as error:
         raise EpisodeError(f"{path} is not a readable XYZ file (three or more numbers a line): {error}.") from error
     return table[:, :3] if table.size else np.zeros((0, 3))
+
+
+FORMATS: dict[str, Callable[[Path], Any]] = {".npy": load_npy, ".ply": read_ply, ".xyz": _read_xyz, ".pcd": read_pcd}
+"""Suffix -> reader. Not .csv: tracks and time stamps lie beside clouds."""
 
 
 def import_open3d() -> Any:

@@ -95,7 +95,7 @@ def cloud_folder(
             places that disagree.
     """
     frames, empty = [], []
-    named = named_frames(Path(folder), FORMATS, kind="clouds")
+    named = named_frames(Path(folder), tuple(FORMATS), kind="clouds")
     named.check_rate(rate_hz, Path(folder))
     for number, path in zip(named.numbers, named.paths, strict=True):
         try:
@@ -150,8 +150,8 @@ def _table(path: Path) -> dict[str, Any]:
 def _pair(value: Any) -> dict[str, float]:
     pair = np.asarray(value, dtype=np.float64).reshape(-1)
     if pair.shape != (2,) or not np.isfinite(pair).all():
-        raise EpisodeError(f"A published parameter pair must be two finite numbers (stretch, mass), got {value!r}.")
-    return {"stretch": float(pair[0]), "mass": float(pair[1])}
+        raise EpisodeError(f"A published parameter pair must be two finite numbers (stretching, density), got {value!r}.")
+    return {"stretching": float(pair[0]), "density": float(pair[1])}
 
 
 def _fabric(name: str, scenario: str) -> dict[str, Any]:

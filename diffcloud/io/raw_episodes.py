@@ -111,7 +111,7 @@ class CameraFile(Checked):
     settings: dict[Name, Annotated[float, Field(ge=-1e9, le=1e9)]] = Field(default_factory=dict)
 
     def camera(self, name: str) -> CameraInfo:
-        """What it says of a camera of this name."""
+        """Return the contents of this file as the `CameraInfo` of the camera with this name."""
         place = None if self.T_world_camera is None else np.array(self.T_world_camera)
         held = self.intrinsics.intrinsics()
         return CameraInfo(name, self.serial, held, self.depth_scale_m, place, self.calibration, self.settings)
@@ -314,10 +314,10 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 
 def read_camera_info(path: Path) -> CameraInfo:
-    """camera.json.
+    """Read a camera.json file.
 
     Raises:
-        EpisodeError: missing, damaged, or a number that no camera has; names the field.
+        EpisodeError: the file is missing or damaged, or a value is out of range. The message names the field.
     """
     try:
         told = CameraFile.model_validate(read_json(Path(path), error=EpisodeError))

@@ -77,15 +77,15 @@ def by_charuco(episode: RawEpisode, board: CharucoBoard, picture: Path | None) -
 
 
 def by_checkerboard(folders: Sequence[Path], serials: Mapping[str, str], size: tuple[int, int]) -> Calibrated:
-    """From points of a checkerboard that the cameras saw and the robot touched (the paper's method).
+    """Calibrate cameras from checkerboard corners that each camera saw and the robot touched (the paper's method).
 
     Args:
-        folders: one for each camera; its name names the camera.
-        serials: camera -> serial number; the name where there is none.
-        size: columns and rows of the images.
+        folders: one for each camera. The folder's name, without a leading `calib_`, is the camera's name.
+        serials: camera name -> serial number. A camera without a serial number is listed under its name.
+        size: columns and rows of the images [px].
 
     Raises:
-        CalibrationError: arrays that are missing or damaged, or two folders of one camera.
+        CalibrationError: arrays are missing or damaged, or two folders belong to one camera.
     """
     cameras: dict[str, CameraCalibration] = {}
     summary: dict[str, dict[str, Any]] = {}

@@ -1,4 +1,4 @@
-"""A fit of one cloth with its files: OUT/fit.json, fit.npz, intervals.json, report.html, and scenarios/."""
+"""A fit of one cloth with its files: OUT/fit.json, fit.npz, intervals.json, report.html, and scenes/."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import yaml
 from diffcloud.console import progress_bar
 from diffcloud.errors import DiffCloudError
 from diffcloud.estimation.record import FitRecord
+from diffcloud.estimation.result import read_motion
 from diffcloud.estimation.settings import FitSettings
 from diffcloud.estimation.task import Recording, compared
 from diffcloud.evaluation.intervals import Intervals, intervals_of
@@ -19,10 +20,10 @@ from diffcloud.evaluation.methods import space_of
 from diffcloud.identification import known_grip
 from diffcloud.io.files import together, write_bytes, write_json, write_text
 from diffcloud.jobs import ctrl_c
-from diffcloud.jobs.fit_report import Status, Told, findings_of, page_of
 from diffcloud.jobs.fits import FitJob
 from diffcloud.jobs.pool import check_interrupt
 from diffcloud.jobs.scene_files import read_fields
+from diffcloud.reporting.fit_page import Status, Told, findings_of, page_of
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.sim import warm
 
@@ -90,7 +91,7 @@ class ClothFit:
 
     def _scene(self, name: str) -> Path:
         """The file of a scenario of an unfinished fit."""
-        return self.out / "stages" / "scenarios" / f"{name}.yaml"
+        return self.out / "stages" / "scenes" / f"{name}.yaml"
 
     def _intervals(self, record: FitRecord) -> Intervals | None:
         if record.estimate is None:
@@ -115,12 +116,13 @@ class ClothFit:
 
     def _write(self, told: Told, findings: Sequence[str]) -> None:
         out, files = self.out, self.job.files
-        page = page_of(told, findings, {one.name: one.episode for one in self.members}, files[1])
+        motions = [read_motion(files[1], index) for index in range(len(self.members))]
+        page = page_of(told, findings, {one.name: one.episode for one in self.members}, motions)
         with together():
             for path in files:
                 _copy(path, out / f"fit{path.suffix}")
             for name in self.scenes:
-                _copy(self._scene(name), out / "scenarios" / f"{name}.yaml")
+                _copy(self._scene(name), out / "scenes" / f"{name}.yaml")
             write_text(out / "report.html", page)
             if told.intervals is not None:
                 write_json(out / "intervals.json", told.intervals.model_dump(mode="json"))

@@ -208,7 +208,7 @@ class _Network:
 
 def _networks(config: Config, scenario: str, regressors: Path, simulated: Path) -> list[_Network]:
     folder, level = regressors / scenario, config.fit.level
-    asked = set(config.train.models) if scenario in config.train.scenarios else set()
+    asked = set(config.train.models) if scenario in config.train.scenes else set()
     found = []
     for model in (name for name in PREDICTORS if not name.startswith("published_")):
         path = folder / f"{model}.safetensors"
@@ -228,7 +228,7 @@ def _networks(config: Config, scenario: str, regressors: Path, simulated: Path) 
         elif model in asked:
             found.append(_Network(model, None, f"no checkpoint {path}; run `diffcloud network train`", True, {}, level))
         elif model != "posterior":  # an extra, which nobody misses
-            reason = "not trained for this scenario (train.scenarios, train.models)"
+            reason = "not trained for this scenario (train.scenes, train.models)"
             found.append(_Network(model, None, reason, False, {}, level))
     return found
 

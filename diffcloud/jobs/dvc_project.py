@@ -13,7 +13,7 @@ from diffcloud.estimation.record import FitRecord, read_fit
 from diffcloud.estimation.settings import LEVEL
 from diffcloud.evaluation.intervals import read_intervals
 from diffcloud.evaluation.methods import space_of
-from diffcloud.io.files import files_in, read_yaml, together, write_text
+from diffcloud.io.files import files_in, together, write_text
 from diffcloud.io.timings import NAME
 
 _PARAMS = """\
@@ -36,7 +36,7 @@ stages:
           cache: false
     outs:
       - report.html
-      - scenarios:
+      - scenes:
           persist: true
       - fit.json:
           persist: true
@@ -48,7 +48,7 @@ stages:
   export:
     cmd: diffcloud export fit.json --to ${export.to} --out exported
     params: [export]
-    deps: [fit.json, fit.npz, scenarios]
+    deps: [fit.json, fit.npz, scenes]
     outs: [exported]
 """
 
@@ -120,15 +120,8 @@ def _identified(folder: Path) -> FitRecord:
 def _options(folder: Path, record: FitRecord) -> str:
     """Options with which `diffcloud fit` arrives at the same fit."""
     options = ["--parameters", ",".join(record.fitted)]
-    if (mass := record.parameters.get("mass")) is not None and mass.fixed:
-        try:
-            density = float(read_yaml(folder / "cloth.yaml", error=ConfigError)["material"]["density_kg_m2"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise ConfigError(
-                f"{folder / 'cloth.yaml'} has no material.density_kg_m2, by which the fitted mass was weighed; "
-                "run `diffcloud fit` again."
-            ) from error
-        options += ["--density", f"{mass.value * density:.12g}"]
+    if (weighed := record.parameters.get("density")) is not None and weighed.fixed:
+        options += ["--density", f"{weighed.value:.12g}"]
     told = read_intervals(folder / "intervals.json", space_of(record).asked)
     if told.level != LEVEL:
         options += ["--level", f"{told.level:g}"]

@@ -47,11 +47,11 @@ def evaluate(
         ConfigError: no fits.
         DiffCloudError: nothing could be compared.
     """
-    if not joint_fit(fits) and not any(files_in(fits / name, ".json") for name in config.scenarios):
-        raise ConfigError(f"{fits} holds no fits of {', '.join(config.scenarios)}; run `python -m pipeline.fit` first.")
+    if not joint_fit(fits) and not any(files_in(fits / name, ".json") for name in config.scenes):
+        raise ConfigError(f"{fits} holds no fits of {', '.join(config.scenes)}; run `python -m pipeline.fit` first.")
     jobs = [
         job
-        for name in config.scenarios
+        for name in config.scenes
         for job in comparison_jobs(
             config,
             name,
@@ -134,7 +134,7 @@ def _curves(config: Config, fits: Path) -> tuple[list[dict[str, Any]], list[dict
     """Of all fits: losses of each iteration, RMS of each frame."""
     curves: list[dict[str, Any]] = []
     residuals: list[dict[str, Any]] = []
-    named = [path for name in config.scenarios for path in files_in(fits / name, ".json")]
+    named = [path for name in config.scenes for path in files_in(fits / name, ".json")]
     for path in [*named, *joint_fit(fits)]:
         fit = read_fit(path)
         curves += [
@@ -182,7 +182,7 @@ def _metrics(fits: pd.DataFrame, predictions: list[dict[str, Any]]) -> dict[str,
         means = pd.DataFrame(predictions).groupby(["scenario", "model"], sort=False)[["loss", "rms_mm"]].mean()
         for row in means.reset_index().to_dict("records"):
             by_model.setdefault(row["scenario"], {})[row["model"]] = {key: float(row[key]) for key in ("loss", "rms_mm")}
-    return {"scenarios": by_scenario, "episodes": episodes, "regressors": by_model}
+    return {"scenes": by_scenario, "episodes": episodes, "regressors": by_model}
 
 
 def _cell(value: float | int | None) -> str:

@@ -92,12 +92,13 @@ class FitJob:
         known = self.known()
         if known is not None and known.stop_reason != "interrupted":
             return known
-        unit_mm, asked = 1e3 * self.scenario.length_unit_m, self.task.space.asked.names
+        unit_mm, scenario = 1e3 * self.scenario.length_unit_m, self.scenario
 
         def show(doing: str, progress: Progress) -> None:
-            """No part that is done: how many starts there will be is not known."""
+            """Report the current step. The fraction done stays 0, because the number of starts is not known in advance."""
             check_interrupt()
-            values = "  ".join(f"{key} {progress.values[key]:.3g}" for key in asked if key in progress.values)
+            shown = {name: progress.values[name] for name in self.settings.parameters if name in progress.values}
+            values = "  ".join(f"{name} {value:.3g}" for name, value in scenario.in_si(shown).items())
             step = progress.iteration if progress.simulations is None else progress.simulations
             tell(0.0, f"{doing}step {step}  best {unit_mm * progress.best**0.5:.2f} mm  {values}")
 

@@ -57,7 +57,7 @@ def preprocess(
     Raises:
         ConfigError: no recording, or two of one name.
     """
-    sources = _sources([path.absolute() for path in recorded], config.scenarios)  # "." has no name
+    sources = _sources([path.absolute() for path in recorded], config.scenes)  # "." has no name
     calibrated = None if calibration is None else read_calibration(calibration)
     if any(path.is_dir() for _, path in sources):
         robot_mask(settings.raw)  # a robot that cannot be read must not cost an episode's time
@@ -250,7 +250,7 @@ def _stem(path: Path) -> str:
 def robot_mask(raw: RawConfig) -> RobotMask | None:
     """Of the robot that the settings name; None where they name none."""
     robot = _robot(raw)
-    return None if robot is None else RobotMask(robot, inflation_m=raw.inflation_m)
+    return None if robot is None else RobotMask(robot, robot_margin_m=raw.robot_margin_m)
 
 
 @cache
@@ -308,11 +308,11 @@ def _clean(episode: Episode, config: PreprocessConfig) -> Episode:
                 episode.frame(frame),
                 crop=config.crop_m,
                 neighbours=config.outlier_neighbours,
-                deviations=config.outlier_deviations,
+                deviations=config.outlier_std,
                 radius_m=config.radius_m,
                 radius_neighbours=config.radius_neighbours,
                 limit=config.points,
-                thinning=config.thinning,
+                downsampling=config.downsampling,
                 rng=rng,
             )
         except EpisodeError as error:

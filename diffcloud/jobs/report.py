@@ -20,7 +20,7 @@ from diffcloud.io.tables import read_csv
 from diffcloud.jobs.fits import fit_file
 from diffcloud.jobs.scenarios import choose_scenario, fitted_scenario
 from diffcloud.jobs.settings import Config
-from diffcloud.report import (
+from diffcloud.reporting import (
     ComparisonEntry,
     EpisodeEntry,
     TrainingEntry,
@@ -78,9 +78,7 @@ def write_report(
             )
         )
     trainings = [
-        TrainingEntry.read(path)
-        for name in config.scenarios
-        for path in sorted((regressors / name).glob("*/training.json"))
+        TrainingEntry.read(path) for name in config.scenes for path in sorted((regressors / name).glob("*/training.json"))
     ]
     environment = {
         "commands": "dvc repro: episodes, preprocess, simulate, fit, train, evaluate, report (dvc.yaml)",
@@ -95,7 +93,7 @@ def write_report(
     page = build_page(
         entries,
         title=config.report.title,
-        overlay_points=config.report.overlay_points,
+        cloud_points=config.report.cloud_points,
         environment=environment,
         predictions=predictions,
         trainings=trainings,

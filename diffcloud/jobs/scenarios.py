@@ -17,7 +17,7 @@ OWN_SCENARIOS = Path("raw/scenes")
 
 
 def choose_scenario(name: str | None, scene: Path | None = None) -> Scenario:
-    """Load a scenario and say what of its scene is not simulated."""
+    """Load a scenario and warn about parts of its scene that are not simulated."""
     from diffcloud.scene.scenarios import load_scenario  # takes seconds, which help does without
 
     own = None if name is None else _own(name)
@@ -64,7 +64,7 @@ def fitted_scenario(fit: Path, name: str) -> str:
     """
     from diffcloud.scene.scenarios import SCENARIO_NAMES
 
-    beside, here = fit.parent / "scenarios" / f"{name}.yaml", Path(f"{name}.yaml")
+    beside, here = fit.parent / "scenes" / f"{name}.yaml", Path(f"{name}.yaml")
     if beside.is_file():
         return str(beside)
     if name in SCENARIO_NAMES or _own(name) is not None:
@@ -72,17 +72,17 @@ def fitted_scenario(fit: Path, name: str) -> str:
     if here.is_file():
         return str(here)
     raise ConfigError(
-        f"{fit} is a fit in the scenario {name}, which is not known here. Put its YAML file into {fit.parent}/scenarios/."
+        f"{fit} is a fit in the scenario {name}, which is not known here. Put its YAML file into {fit.parent}/scenes/."
     )
 
 
 def own_scene(source: str) -> Path | None:
-    """The YAML file that --scene names, by its path or as one of raw/scenes; None of a built-in or a scene JSON."""
+    """Return the YAML file that --scene names, by path or by its name in raw/scenes; None for a built-in or scene JSON."""
     return Path(source) if source.endswith((".yaml", ".yml")) else _own(source)
 
 
 def _own(name: str) -> Path | None:
-    """The file of a person's own scenario of that name; built-in names are no others'."""
+    """Return the file of the user's own scenario with that name, or None. A built-in name always means the built-in."""
     from diffcloud.scene.scenarios import SCENARIO_NAMES
 
     path = OWN_SCENARIOS / f"{name}.yaml"
@@ -92,12 +92,13 @@ def _own(name: str) -> Path | None:
 def limits(scenario: Scenario) -> list[str]:
     """What the scene asks for and the contact model lacks, and whether its cloth is drawn to another scale."""
     from diffcloud.io.obj import STRETCHED, other_lengths
+    from diffcloud.sim.integrators import load_integrator
 
     factor, lengths = other_lengths(scenario.scene.mesh)
     told = [f"In the mesh of {scenario.name}, {lengths}"] if factor > STRETCHED else []
     surrounding = scenario.scene.surrounding
     meshes = [index for index, obstacle in enumerate(surrounding.obstacles) if obstacle.plane() is None]
-    if not meshes or surrounding.reference_contact is not None or scenario.scene.integrator == "implicit":
+    if not meshes or surrounding.reference_contact is not None or load_integrator(scenario.scene.integrator).meshes:
         return told
     return [
         *told,

@@ -4,69 +4,59 @@ from __future__ import annotations
 
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from diffcloud.errors import ConfigError
 from diffcloud.estimation.settings import FitSettings
-from diffcloud.estimation.uncertain import parse_uncertain
-from diffcloud.evaluation import RIVALS, ComparisonSettings, Rival
+from diffcloud.evaluation import BASELINES, Baseline, ComparisonSettings
 from diffcloud.io.files import read_yaml
 from diffcloud.io.raw_episodes import ScenePlacement
 from diffcloud.io.schema import Component, NonNegative, Positive, explain
-from diffcloud.regressors.settings import Loss, Profile, Target
+from diffcloud.jobs.network_settings import GenerateSettings, TrainSettings
 from diffcloud.sensing.depth_camera import DepthNoise
-from diffcloud.sensing.filters import Thinning
+from diffcloud.sensing.filters import Downsampling
 from diffcloud.sensing.fusion import FusionSettings
 from diffcloud.sensing.recorder import RecorderSettings
 from diffcloud.settings import Bounds, Count, CountOrNone, Name, Names, Pixels, Point, Section, Seed, check_bounds
 
 
-class EpisodesConfig(Section):
+class SynthesizeConfig(Section):
     """Synthetic recordings. A person's own lie in raw/, where `diffcloud data preprocess` finds them."""
 
     per_scenario: CountOrNone = 2
     """Of each scenario; 0: none, only a person's own are used."""
     seed: Seed = 0
-    hidden_range: Bounds = (0.3, 3.0)
+    true_range: Bounds = (0.3, 3.0)
     """Hidden multipliers of camera recordings are drawn log-uniformly from it; fully observed scenarios (`recorder:
     whole_surface`) draw uniformly over the bounds of a fit, as the paper does."""
     image_size: tuple[Pixels, Pixels] = (424, 240)
     """Columns and rows of camera recordings; a D435 offers 424 x 240, 640 x 480, 848 x 480 and more."""
     subpixel_px: NonNegative = DepthNoise.subpixel_px
     """Deviation of the cameras' disparity [px of their imagers]."""
-    lag_s: NonNegative = RecorderSettings.lag_s
+    clock_offset_s: NonNegative = RecorderSettings.clock_offset_s
     """How late the joint log is."""
     extrinsic_error: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """(millimetres, degrees) by which the stated place of each camera but the first is off."""
-    cameras_moved: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    rig_error: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """The same of all cameras together."""
-    beside: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    placement_error: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """(millimetres, degrees) by which cloth and gripper are not where the recording says."""
 
     def recorder(self) -> RecorderSettings:
         return RecorderSettings(
-            lag_s=self.lag_s,
+            clock_offset_s=self.clock_offset_s,
             extrinsic_error=self.extrinsic_error,
-            cameras_moved=self.cameras_moved,
-            beside=self.beside,
+            rig_error=self.rig_error,
+            placement_error=self.placement_error,
         )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _is_of_now(cls, data: Any) -> Any:
-        if isinstance(data, dict) and "source" in data:
-            raise ValueError(
-                "source: recordings in raw/ are always used; remove the key, and set per_scenario: 0 for no others"
-            )
-        return data
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        check_bounds("hidden_range", self.hidden_range)
-        if self.hidden_range[0] <= 0:
-            raise ValueError(f"hidden_range must be positive, got {self.hidden_range}")
+        check_bounds("true_range", self.true_range)
+        if self.true_range[0] <= 0:
+            raise ValueError(f"true_range must be positive, got {self.true_range}")
         return self
 
 
@@ -75,19 +65,21 @@ class RawConfig(Section):
 
     robot: Name | None = "gen3"
     """Whose pixels are masked: `gen3`, the package's own description, or the path of a URDF; null: nobody's."""
-    inflation_m: NonNegative = 0.007
+    robot_margin_m: NonNegative = 0.007
     """Margin around the robot."""
     workspace_m: tuple[Point, Point] = FusionSettings.workspace_m
-    eyes_m: Annotated[tuple[Annotated[float, Field(ge=-1, le=1)], ...], Field(max_length=10)] = FusionSettings.eyes_m
-    flying_m: NonNegative = FusionSettings.flying_m
+    imager_offsets_m: Annotated[tuple[Annotated[float, Field(ge=-1, le=1)], ...], Field(max_length=10)] = (
+        FusionSettings.imager_offsets_m
+    )
+    depth_jump_m: NonNegative = FusionSettings.depth_jump_m
     refine: bool = FusionSettings.refine
-    lag_s: Annotated[float, Field(ge=-10, le=10)] = FusionSettings.lag_s
+    clock_offset_s: Annotated[float, Field(ge=-10, le=10)] = FusionSettings.clock_offset_s
     table: bool = FusionSettings.table
     clearance_m: Positive = FusionSettings.clearance_m
     color_difference: Positive = FusionSettings.color_difference
     smoothing_px: CountOrNone = FusionSettings.smoothing_px
     cluster_gap_m: NonNegative = FusionSettings.cluster_gap_m
-    least_cluster: Annotated[float, Field(ge=0, le=1)] = FusionSettings.least_cluster
+    min_cluster_fraction: Annotated[float, Field(ge=0, le=1)] = FusionSettings.min_cluster_fraction
     subpixel_px: Positive = FusionSettings.subpixel_px
     imager_focal_px: Positive = FusionSettings.imager_focal_px
     baseline_m: Positive = FusionSettings.baseline_m
@@ -98,7 +90,7 @@ class RawConfig(Section):
 
     def fusion(self) -> FusionSettings:
         placement = None if self.origin_m is None else ScenePlacement(self.origin_m, self.yaw_rad, self.length_unit_m)
-        own = {"robot", "inflation_m", "origin_m", "yaw_rad", "length_unit_m"}
+        own = {"robot", "robot_margin_m", "origin_m", "yaw_rad", "length_unit_m"}
         return FusionSettings(**self.model_dump(exclude=own), placement=placement)
 
     @model_validator(mode="after")
@@ -119,14 +111,14 @@ class PreprocessConfig(Section):
     crop_m: tuple[Point, Point] | None = None
     """Lowest and highest corner of a box in the scene's frame."""
     outlier_neighbours: CountOrNone = 20
-    outlier_deviations: Positive = 5.0
+    outlier_std: Positive = 5.0
     """A merged cloud is of uneven density: 2.5, the paper's, takes thin parts of the cloth."""
     radius_m: Positive | None = None
     """Points with fewer than `radius_neighbours` others within it are outliers too; in the scene's unit."""
     radius_neighbours: Count = 4
     points: Count | None = 3500
     """Kept per frame at most."""
-    thinning: Thinning = "random"
+    downsampling: Downsampling = "random"
     seed: Seed = 0
 
     @model_validator(mode="after")
@@ -136,73 +128,18 @@ class PreprocessConfig(Section):
         return self
 
 
-class SimulateConfig(Section):
-    """Simulated sets for the regressors."""
-
-    scenarios: Names = ["lift", "fold"]
-    """Those that the pipeline makes sets of."""
-    parameters: Names = ["stretch", "mass"]
-    distribution: Literal["uniform", "sobol", "logarithmic", "modes"] = "uniform"
-    """Over the bounds: `uniform`, `sobol`, or `logarithmic` (uniform in the logarithms where the lower bound is
-    positive); or `modes`: the published code's mixture of soft, medium and stiff cloths."""
-    uncertain: Name | None = None
-    """Material that is not drawn differs from run to run by these factors, as those of fits. Default: not at all."""
-    train: CountOrNone = 1500
-    test: CountOrNone = 375
-    seed: Seed = 0
-
-    def known_within(self) -> dict[str, float]:
-        """Material that is not drawn -> factor of one deviation."""
-        return parse_uncertain(self.uncertain or "none")
-
-
-class TrainConfig(Section):
-    """Regressors. What is not given (null) is the profile's (`diffcloud.regressors.settings`)."""
-
-    scenarios: Names = ["lift", "fold"]
-    """Those that the pipeline trains for."""
-    models: Names = ["mlp", "pointnet2", "meteornet"]
-    profile: Profile = "reduced"
-    epochs: Count | None = None
-    draws: Count | None = None
-    points: Count | None = None
-    batch_size: Count | None = None
-    learning_rate: Positive | None = None
-    loss: Loss | None = None
-    target: Target | None = None
-    augment: bool | None = None
-    viewpoints: tuple[tuple[Component, Component, Component], ...] | None = None
-    """Places in the scene, in its length unit: clouds show what cameras there see."""
-    subtract_background: bool | None = None
-    heteroscedastic: bool | None = None
-    patience: Count | None = None
-    seed: Seed | None = None
-    device: Literal["auto", "cpu", "gpu"] = "auto"
-
-    def changes(self) -> dict[str, object]:
-        """What differs from the profile."""
-        return self.model_dump(exclude={"scenarios", "models", "profile", "device"}, exclude_none=True)
-
-
 class EvaluateConfig(Section):
     """Comparing methods, and what can be known of the parameters."""
 
     draws: Count = 4
     """Fresh point samples that a loss is averaged over."""
     seed: Seed = 1000
-    rivals: Annotated[list[Rival], Field(max_length=len(RIVALS) + 10)] = list(RIVALS)
+    baselines: Annotated[list[Baseline], Field(max_length=len(BASELINES) + 10)] = list(BASELINES)
     """Methods beside the fits and the networks; searches may simulate as often as the fit."""
     landscapes: Annotated[list[Name], Field(max_length=10_000)] = []
     """Patterns of <scenario>/<episode> whose loss landscape is simulated."""
     landscape_size: Annotated[int, Field(ge=2, le=1000)] = 7
     """Places along each of its axes."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _is_of_now(cls, data: Any) -> Any:
-        if isinstance(data, dict) and "level" in data:
-            raise ValueError("evaluate.level: now `fit.level`")
-        return data
 
     def comparison(self, episode: str, fit: FitSettings) -> ComparisonSettings:
         """For <scenario>/<episode>."""
@@ -211,7 +148,7 @@ class EvaluateConfig(Section):
             return any(fnmatch(episode, pattern) for pattern in patterns)
 
         return ComparisonSettings(
-            rivals=tuple(self.rivals),
+            baselines=tuple(self.baselines),
             draws=self.draws,
             seed=self.seed,
             level=fit.level,
@@ -224,19 +161,19 @@ class ReportConfig(Section):
     """The page."""
 
     title: Name = "DiffCloud report"
-    overlay_points: Count = 1200
+    cloud_points: Count = 1200
     """Shown per cloud and frame."""
 
 
 class Config(Section):
     """All of params.yaml."""
 
-    scenarios: Names = ["lift", "fold", "band_stretch", "vest_hang"]
-    episodes: EpisodesConfig = EpisodesConfig()
+    scenes: Names = ["lift", "fold", "band_stretch", "vest_hang"]
+    synthesize: SynthesizeConfig = SynthesizeConfig()
     preprocess: PreprocessConfig = PreprocessConfig()
-    simulate: SimulateConfig = SimulateConfig()
+    generate: GenerateSettings = GenerateSettings()
     fit: FitSettings = FitSettings()
-    train: TrainConfig = TrainConfig()
+    train: TrainSettings = TrainSettings()
     evaluate: EvaluateConfig = EvaluateConfig()
     report: ReportConfig = ReportConfig()
 

@@ -15,14 +15,15 @@ REGRESSORS = Path("data/regressors")
 
 
 def first_start(init: str, task: FitTask) -> dict[str, float]:
-    """Values of a first start that is stated or predicted, by name; recordings of a joint fit give the mean of theirs.
+    """Return the multipliers of a first start, which is stated in SI units or predicted. Recordings of a joint fit give the
+    mean of theirs.
 
     Raises:
         ConfigError: a value of what is not fitted, or outside of its bounds.
     """
     if "=" in init:
-        stated = assignments(init.split(","), "--init")
-        task.space.check_start(stated)
+        stated = task.scenario.multipliers(assignments(init.split(","), "--init"), "--init")
+        task.space.check_start(stated, task.scenario.nominal)
         return stated
     found = [predicted_start(init, one.scenario.name, one.episode) for one in task.recordings]
     return task.space.nearest({name: sum(values[name] for values in found) / len(found) for name in found[0]})

@@ -18,8 +18,8 @@ from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.manifests import read_manifest, remove_files, write_manifest
 from diffcloud.io.timings import read_timings, timings_path
 from diffcloud.jobs.ctrl_c import none_lost
+from diffcloud.jobs.network_settings import TrainSettings
 from diffcloud.jobs.pool import Tell, run_all
-from diffcloud.jobs.settings import TrainConfig
 from diffcloud.regressors import (
     ModelName,
     Regressor,
@@ -33,7 +33,13 @@ _CODE = ("mesh", "io", "clouds", "regressors")
 
 
 def train(
-    data: Path, out: Path, config: TrainConfig, *, scenario: str | None = None, workers: int | None = None, loaders: int = 0
+    data: Path,
+    out: Path,
+    config: TrainSettings,
+    *,
+    scenario: str | None = None,
+    workers: int | None = None,
+    loaders: int = 0,
 ) -> Iterator[tuple[TrainJob, dict[str, Any] | None, str | None]]:
     """Train the networks; finished ones of the same settings and data are kept.
 
@@ -51,7 +57,7 @@ def train(
         KeyboardInterrupt: Ctrl-C; the last saved epoch is kept.
     """
     every = scenario is None
-    scenarios = config.scenarios if scenario is None else [scenario]
+    scenarios = config.scenes if scenario is None else [scenario]
     settings = {name: profile_settings(config.profile, name, **config.changes()) for name in config.models}
     jobs: list[TrainJob] = []
     for name in scenarios:
@@ -100,7 +106,7 @@ class TrainJob:
     train: SimulatedSet
     test: SimulatedSet
     settings: TrainingSettings
-    config: TrainConfig
+    config: TrainSettings
     folder: Path
     loaders: int
     """Processes that sample clouds."""

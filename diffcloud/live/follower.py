@@ -49,12 +49,12 @@ class LiveFrame:
 
 
 class Follower:
-    """Reads what is new in a folder.
+    """Reads the newest frame of a raw recording while it is being recorded.
 
     Args:
-        folder: of a raw episode; it may not be there yet.
-        calibration: of its cameras; by default what camera.json says.
-        points: maximum number per camera.
+        folder: folder of the raw recording, which may not exist yet.
+        calibration: calibration of the cameras; by default the one in each camera.json.
+        points: maximum number of points per camera.
     """
 
     def __init__(self, folder: Path, calibration: Calibration | None = None, *, points: int = 20_000) -> None:
@@ -63,7 +63,7 @@ class Follower:
         self._poses: dict[str, Floats] = {}
 
     def newest(self) -> LiveFrame | None:
-        """The state now; None if it is that of the last call, or if nothing is there yet.
+        """Return the current state, or None if the last call returned the same state or the recording does not exist yet.
 
         Raises:
             EpisodeError: a file is damaged, or a camera is not calibrated.

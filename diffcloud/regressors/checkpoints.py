@@ -80,7 +80,7 @@ class Description(BaseModel):
     """k parameters."""
     bounds: tuple[tuple[float, float], ...]
     target: Target = "linear"
-    heteroscedastic: bool = False
+    predict_variance: bool = False
     times: Annotated[tuple[float, ...], Field(min_length=1, max_length=10**4)]
     """Of the frames that it sees, since the start of the motion [s]."""
     frame_time: Annotated[float, Field(gt=0)]
@@ -96,7 +96,7 @@ class Description(BaseModel):
     order: Order = "cloud"
     density: Annotated[float, Field(gt=0, le=1)] = 1.0
     spread: tuple[float, ...]
-    """Laplace width of each parameter's error, as a fraction on the target's scale; with a heteroscedastic head, the
+    """Laplace width of each parameter's error, as a fraction on the target's scale; with a predict_variance head, the
     factor on the width that it predicts. From the validation draws."""
     training: dict[str, Any] = {}
     """Settings of the training."""
@@ -109,7 +109,7 @@ class Description(BaseModel):
             )
         if self.points * len(self.times) > _MOST_POINTS:
             raise ValueError(f"{self.points} points in {len(self.times)} frames are more than {_MOST_POINTS} together")
-        if self.model == "posterior" and self.heteroscedastic:
+        if self.model == "posterior" and self.predict_variance:
             raise ValueError("a posterior has widths of its own, and no second output for them")
         for name, (low, high) in zip(self.names, self.bounds, strict=True):
             if not low < high or (self.target == "logarithmic" and low <= 0):
@@ -118,7 +118,7 @@ class Description(BaseModel):
 
     @property
     def outputs(self) -> int:
-        return len(self.names) * (2 if self.heteroscedastic else 1)
+        return len(self.names) * (2 if self.predict_variance else 1)
 
     def build(self, *, dropout: float | None = None) -> nn.Module:
         """The network with fresh weights."""
@@ -202,7 +202,7 @@ def laplace_reach(level: float) -> float:
 
 
 def split_outputs(outputs: Tensor, parameters: int) -> tuple[Tensor, Tensor]:
-    """[B, k or 2k] -> fractions [B, k] and logarithms of widths [B, k] (zero without a heteroscedastic head)."""
+    """[B, k or 2k] -> fractions [B, k] and logarithms of widths [B, k] (zero without a predict_variance head)."""
     fractions = outputs[:, :parameters]
     if outputs.shape[1] == parameters:
         return fractions, torch.zeros_like(fractions)

@@ -61,8 +61,8 @@ class MeteorNet(nn.Module):
     ) -> None:
         """
         Args:
-            frames: of the sequences that it is trained with; they set the unit of time.
-            density: fraction of the published numbers of centroids and neighbours; the layers are the same.
+            frames: number of frames in a training sequence, which is one unit of time long.
+            density: fraction of the published numbers of centroids and neighbours. Layer widths stay as published.
         """
         super().__init__()
         self.frames = frames

@@ -32,7 +32,7 @@ class TrainingSettings:
     """"cosine" lowers the learning rate to zero at the end, which short trainings need."""
     loss: Loss = "normalised"
     target: Target = "linear"
-    heteroscedastic: bool = False
+    predict_variance: bool = False
     """A second output per parameter: the width of a Laplace distribution, trained by its likelihood. Without, one width
     per parameter comes from the validation draws."""
     draws: int | None = None

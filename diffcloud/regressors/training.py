@@ -111,11 +111,11 @@ def train_regressor(
             "Torch finds no GPU on this machine. Use --device cpu, or auto, which takes one where there is one."
         )
     _check_sets(train, test, settings)
-    if model == "posterior" and (settings.heteroscedastic or settings.loss != "normalised"):
-        raise ConfigError("A posterior has a loss and widths of its own; leave out heteroscedastic, and loss: raw.")
-    if settings.heteroscedastic and settings.loss == "raw" and settings.target == "logarithmic":
+    if model == "posterior" and (settings.predict_variance or settings.loss != "normalised"):
+        raise ConfigError("A posterior has a loss and widths of its own; leave out predict_variance, and loss: raw.")
+    if settings.predict_variance and settings.loss == "raw" and settings.target == "logarithmic":
         raise ConfigError(
-            "With heteroscedastic and loss: raw, widths are learned in the parameters' units, but those of a logarithmic "
+            "With predict_variance and loss: raw, widths are learned in the parameters' units, but those of a logarithmic "
             "target are on its scale. Use target: linear, or loss: normalised."
         )
     on_gpu = device == "gpu" or (device == "auto" and torch.cuda.is_available())
@@ -128,7 +128,7 @@ def train_regressor(
         names=train.names,
         bounds=tuple((float(low), float(high)) for low, high in train.bounds),
         target=settings.target,
-        heteroscedastic=settings.heteroscedastic,
+        predict_variance=settings.predict_variance,
         times=tuple(clouds.train.times.tolist()),
         frame_time=float(np.diff(train.times).min()),
         points=settings.points,
@@ -256,7 +256,7 @@ class _Batches(Dataset[tuple[Tensor, Tensor]]):
 
 
 class _Order(Sampler[tuple[int, list[int]]]):
-    """Batches of one epoch; shuffled ones leave out what is over, since a small batch would upset the normalisation."""
+    """Batches of one epoch. A shuffled epoch drops its incomplete last batch, which would disturb batch normalisation."""
 
     def __init__(self, indices: Sequence[int], batch_size: int, *, shuffle_seed: int | None) -> None:
         self.indices, self.batch_size, self.seed = list(indices), min(batch_size, len(indices)), shuffle_seed

@@ -11,7 +11,7 @@ from diffcloud.sim.build import build_system
 from diffcloud.sim.handles import Handle, Handles
 from diffcloud.sim.integrators import load_integrator
 from diffcloud.sim.materials import Material
-from diffcloud.sim.properties import Basis
+from diffcloud.sim.properties import Quantity
 from diffcloud.sim.simulate import init
 from diffcloud.sim.surrounding import Order, Surrounding
 from diffcloud.sim.system import State, System
@@ -57,7 +57,7 @@ class Scene:
         """All static obstacles but the planar ones (tables), as one mesh to draw; without any, no nodes and no faces."""
         return SurfaceMesh.joined([obstacle for obstacle in self.surrounding.obstacles if obstacle.plane() is None])
 
-    def basis(self, name: Basis) -> float:
+    def nominal(self, name: Quantity) -> float:
         """What multipliers act on, in the scene's units: stiffness at rest in stretching [N/m], in shear divided by
         that, or in bending [N·m]; density of the cloth or of the air that moves with it [kg/m²], of the air [kg/m³], its
         linear drag [kg/(m²·s)], mass of all rigid bodies [kg]."""

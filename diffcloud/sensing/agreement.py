@@ -119,7 +119,7 @@ class Agreement:
 
     def described(self) -> dict[str, Any]:
         """For metadata, in SI."""
-        names = ("rotation_rad", "translation_m", "log_scale", "lag_s")
+        names = ("rotation_rad", "translation_m", "log_scale", "clock_offset_s")
         parts: tuple[slice | int, ...] = (slice(0, 3), slice(3, 6), 6, 7)
         return {
             "method": "point to surface between two cameras, instrumental variables with Tukey weights",

@@ -66,7 +66,7 @@ class DepthCamera:
     view: View
     """Where it truly stands."""
     noise: DepthNoise = DepthNoise()
-    eyes_m: tuple[float, ...] = (0.015, 0.065)
+    imager_offsets_m: tuple[float, ...] = (0.015, 0.065)
     """The infrared imagers' places along the image's x [m]."""
 
     def info(self, stated: Floats | None = None) -> CameraInfo:

@@ -15,7 +15,7 @@ from diffcloud.errors import EpisodeError
 from diffcloud.io.clouds import import_open3d
 from diffcloud.io.episodes import Episode
 
-Thinning = Literal["random", "voxel", "farthest"]
+Downsampling = Literal["random", "voxel", "farthest"]
 """At `random`, the point nearest the middle of each occupied `voxel`, or each time the one `farthest` from those kept."""
 
 _BISECTIONS = 20
@@ -40,7 +40,7 @@ def clean_frame(
     radius_m: float | None = None,
     radius_neighbours: int = 4,
     limit: int | None = None,
-    thinning: Thinning = "random",
+    downsampling: Downsampling = "random",
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.int64], FilterReport]:
     """Indices of the points of one frame to keep.
@@ -52,7 +52,7 @@ def clean_frame(
             the cloud by this many standard deviations (the rule of PCL's StatisticalOutlierRemoval); 0 neighbours: off.
         radius_m, radius_neighbours: a point is an outlier if fewer than this many others lie within the radius; None: off.
         limit: keep at most this many points, none twice.
-        thinning: how the points to keep are chosen.
+        downsampling: how the points to keep are chosen.
 
     Raises:
         EpisodeError: nothing is left; says after which filter.
@@ -79,15 +79,17 @@ def clean_frame(
             )
     inliers = len(keep)
     if limit is not None and len(keep) > limit:
-        keep = np.sort(keep[thin(points[keep], limit, thinning, rng)])
+        keep = np.sort(keep[thin(points[keep], limit, downsampling, rng)])
     return keep, FilterReport(len(points), cropped, inliers, len(keep))
 
 
-def thin(points: NDArray[np.float32], limit: int, thinning: Thinning, rng: np.random.Generator) -> NDArray[np.int64]:
+def thin(
+    points: NDArray[np.float32], limit: int, downsampling: Downsampling, rng: np.random.Generator
+) -> NDArray[np.int64]:
     """Indices of at most `limit` of more points [N, 3], none twice; `voxel` may keep some fewer."""
-    if thinning == "random":
+    if downsampling == "random":
         return rng.choice(len(points), limit, replace=False)
-    if thinning == "farthest":
+    if downsampling == "farthest":
         open3d = import_open3d()
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
         kept = np.asarray(cloud.farthest_point_down_sample(limit).points)

@@ -60,10 +60,10 @@ class FusionSettings:
 
     workspace_m: Box = ((0.3, -0.5, -0.05), (1.0, 0.5, 0.7))
     """Lowest and highest corner in the base frame; what lies outside is dropped."""
-    eyes_m: tuple[float, ...] = (0.015, 0.065)
+    imager_offsets_m: tuple[float, ...] = (0.015, 0.065)
     """See `masking.spoilt_pixels`."""
-    flying_m: float = 0.02
-    lag_s: float = 0.0
+    depth_jump_m: float = 0.02
+    clock_offset_s: float = 0.0
     """How much later than the truth the joint log's times are."""
     table: bool = True
     """Fit a plane and take it out."""
@@ -76,7 +76,7 @@ class FusionSettings:
     """Radius of the smoothing of depth (`smoothing`); 0: none."""
     cluster_gap_m: float = 0.03
     """Clusters of the merged cloud are this far apart; 0: no cluster is dropped."""
-    least_cluster: float = 0.05
+    min_cluster_fraction: float = 0.05
     """A cluster with a smaller part of the points of the largest one is no cloth: it is dropped."""
     subpixel_px: float = 0.08
     """Deviation of the stereo disparity, in pixels of the camera's infrared imagers."""
@@ -177,16 +177,18 @@ def fuse(
     cameras, quality = _Cameras(raw, views, mask, settings), _Quality(list(raw.cameras))
     if settings.refine and len(raw.cameras) > 1:
         tell(0, "refining the cameras' places")
-        arm = None if mask is None else RobotMask(mask.robot, inflation_m=0.0)
-        found = refine_extrinsics(raw, views, arm, cameras.sight(), sigma_per_m=settings.sigma_per_m, lag_s=settings.lag_s)
+        arm = None if mask is None else RobotMask(mask.robot, robot_margin_m=0.0)
+        found = refine_extrinsics(
+            raw, views, arm, cameras.sight(), sigma_per_m=settings.sigma_per_m, clock_offset_s=settings.clock_offset_s
+        )
         quality.figures["refinement"] = {
             "shift_m": {name: round(shift, 6) for name, shift in found.shift_m.items()},
             "T_world_camera": {name: pose.tolist() for name, pose in found.T_world_camera.items()},
             "skin_m": round(found.skin_m, 6),
-            "lag_s": round(found.lag_s, 6),
+            "clock_offset_s": round(found.clock_offset_s, 6),
             "lag_sigma_s": round(found.lag_sigma_s, 6),
         }
-        settings = replace(settings, lag_s=found.lag_s)
+        settings = replace(settings, clock_offset_s=found.clock_offset_s)
         views = {name: replace(view, T_world_camera=found.T_world_camera[name]) for name, view in views.items()}
         cameras = _Cameras(raw, views, mask, settings)
     frames = []
@@ -221,7 +223,7 @@ class _Cameras:
         if mask is not None and raw.robot is not None:  # of all images of all cameras at once
             self._poses = {
                 name: mask.robot.forward_kinematics(
-                    mask.robot.configuration(*joints_at(raw.robot, camera.times, lag_s=settings.lag_s))
+                    mask.robot.configuration(*joints_at(raw.robot, camera.times, clock_offset_s=settings.clock_offset_s))
                 )
                 for name, camera in raw.cameras.items()
             }
@@ -351,8 +353,8 @@ def _cloud(
         mask,
         poses,
         within=within,
-        eyes_m=settings.eyes_m,
-        flying_m=settings.flying_m,
+        imager_offsets_m=settings.imager_offsets_m,
+        depth_jump_m=settings.depth_jump_m,
         sigma_per_m=settings.sigma_per_m,
     )
     kept, lost = within & ~spoilt.any, (depth_m == 0) | spoilt.any
@@ -398,7 +400,7 @@ def _without_scraps(parts: dict[str, Seen], settings: FusionSettings) -> dict[st
     if settings.cluster_gap_m == 0:
         return parts
     kept = in_large_clusters(
-        np.concatenate([part.points for part in parts.values()]), settings.cluster_gap_m, settings.least_cluster
+        np.concatenate([part.points for part in parts.values()]), settings.cluster_gap_m, settings.min_cluster_fraction
     )
     ends = np.cumsum([len(part.points) for part in parts.values()])
     return {name: part.select(mine) for (name, part), mine in zip(parts.items(), np.split(kept, ends[:-1]), strict=True)}
@@ -511,11 +513,11 @@ def _tool(
     if log is None or not len(log.times):
         return None, None
     if np.isfinite(log.tool_position_m).all():
-        clock = log.times - settings.lag_s
+        clock = log.times - settings.clock_offset_s
         track = np.stack([np.interp(times, clock, column) for column in log.tool_position_m.T], axis=1)
         return track, turning(log.tool_quaternion)
     if mask is not None:
-        poses = mask.robot.tool_pose(joints_at(log, times, lag_s=settings.lag_s)[0])
+        poses = mask.robot.tool_pose(joints_at(log, times, clock_offset_s=settings.clock_offset_s)[0])
         return poses[:, :3, 3], turning(Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True))
     return None, None
 

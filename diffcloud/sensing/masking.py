@@ -78,10 +78,10 @@ class RobotMask:
     """A robot's inflated surface, ready to be cast into cameras.
 
     Args:
-        inflation_m: margin around every link, or by link; others have none [m].
+        robot_margin_m: margin around every link, or by link; others have none [m].
     """
 
-    def __init__(self, robot: Robot, *, inflation_m: float | Mapping[str, float] = 0.01) -> None:
+    def __init__(self, robot: Robot, *, robot_margin_m: float | Mapping[str, float] = 0.01) -> None:
         self.robot = robot
         self._indices: list[int] = []
         """Places among the robot's links of those that have a surface."""
@@ -90,7 +90,7 @@ class RobotMask:
         open3d = import_open3d()
         boxes: list[Floats] = []
         for name, mesh in robot.description.meshes.items():
-            solid = inflate(mesh, inflation_m.get(name, 0.0) if isinstance(inflation_m, Mapping) else inflation_m)
+            solid = inflate(mesh, robot_margin_m.get(name, 0.0) if isinstance(robot_margin_m, Mapping) else robot_margin_m)
             scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # threads cost more than they gain on these few rays
             scene.add_triangles(solid.vertices.astype(np.float32), solid.faces.astype(np.uint32))
             ends = np.stack([solid.vertices.min(axis=0), solid.vertices.max(axis=0)])
@@ -182,8 +182,8 @@ def spoilt_pixels(
     poses: Floats | None = None,
     *,
     within: Mask | None = None,
-    eyes_m: Sequence[float] = (0.05,),
-    flying_m: float = 0.01,
+    imager_offsets_m: Sequence[float] = (0.05,),
+    depth_jump_m: float = 0.01,
     sigma_per_m: float = 0.0,
 ) -> Spoilt:
     """Pixels that show no cloth because of the robot, or of a border.
@@ -192,9 +192,9 @@ def spoilt_pixels(
         depth_m: [H, W] z-depth [m]; 0 is no measurement.
         mask, poses: the robot and its [L, 4, 4] T_world_link; None without a robot.
         within: [H, W] pixels that matter, such as those in the workspace; the others are in no set. None: all.
-        eyes_m: places of the stereo pair's other eyes along the image's x [m]; a D435's second imager is at 0.05 of its
-            depth image.
-        flying_m: see `flying_pixels`; 0 leaves them.
+        imager_offsets_m: places of the stereo pair's other imagers along the image's x [m]; a D435's second one is at 0.05
+            of its depth image.
+        depth_jump_m: see `flying_pixels`; 0 leaves them.
         sigma_per_m: standard deviation of the inverse depth [1/m]. What is measured before the robot by no more than noise
             explains is robot.
     """
@@ -205,10 +205,10 @@ def spoilt_pixels(
         free = valid & ~robot
         points = view.directions[free] * depth_m[free][:, None]
         hidden = np.zeros(len(points), dtype=bool)
-        for x in eyes_m:
+        for x in imager_offsets_m:
             hidden |= mask.hides(points, view.T_world_camera, poses, eye=(x, 0.0, 0.0))
         shadow[free] = hidden
-    flying = flying_pixels(depth_m, flying_m) & valid & ~robot & ~shadow if flying_m > 0 else np.zeros_like(valid)
+    flying = flying_pixels(depth_m, depth_jump_m) & valid & ~robot & ~shadow if depth_jump_m > 0 else np.zeros_like(valid)
     return Spoilt(robot, shadow, flying)
 
 
@@ -254,12 +254,12 @@ def offset(mesh: LinkMesh, margin_m: float) -> LinkMesh:
     return LinkMesh(corner + margin_m * mean / np.maximum(cosine, 1 / _LONGEST_MITRE)[:, None], faces)
 
 
-def joints_at(log: RobotLog, times: Floats, *, lag_s: float = 0.0) -> tuple[Floats, Floats]:
+def joints_at(log: RobotLog, times: Floats, *, clock_offset_s: float = 0.0) -> tuple[Floats, Floats]:
     """The arm when images were taken, between rows linearly: joints [T, J] [rad], gripper [T] 0..1 or NaN.
 
     Args:
         times: [T] of the images, on the log's clock [s].
-        lag_s: how much later than the truth the log's times are.
+        clock_offset_s: how much later than the truth the log's times are.
 
     Raises:
         EpisodeError: the log is empty or does not cover the images.
@@ -268,7 +268,7 @@ def joints_at(log: RobotLog, times: Floats, *, lag_s: float = 0.0) -> tuple[Floa
         raise EpisodeError(
             "The joint log is empty; without it the robot cannot be masked. Record again, or go without a mask."
         )
-    clock = log.times - lag_s
+    clock = log.times - clock_offset_s
     if times[0] < clock[0] - _OUTSIDE_S or times[-1] > clock[-1] + _OUTSIDE_S:
         raise EpisodeError(
             f"The joint log covers {clock[0]:.2f} to {clock[-1]:.2f} s, the images {times[0]:.2f} to {times[-1]:.2f} s: "

@@ -70,7 +70,7 @@ class RecorderSettings:
 
     placement: ScenePlacement = _IN_REACH
     joint_rate_hz: float = 40.0
-    lag_s: float = 0.02
+    clock_offset_s: float = 0.02
     """The joint log's times are late by this much."""
     largest_growth_m: float = 0.003
     """The rendered arm is larger than its description by at most this."""
@@ -78,9 +78,9 @@ class RecorderSettings:
     extrinsic_error: tuple[float, float] = (0.0, 0.0)
     """(millimetres, degrees) by which the stated place of each camera but the first is off, in a direction drawn for the
     episode."""
-    cameras_moved: tuple[float, float] = (0.0, 0.0)
+    rig_error: tuple[float, float] = (0.0, 0.0)
     """The same for all cameras together, which then still agree with one another, but not with the arm."""
-    beside: tuple[float, float] = (0.0, 0.0)
+    placement_error: tuple[float, float] = (0.0, 0.0)
     """(millimetres, degrees about the vertical) by which cloth and gripper are not where the recording says."""
     table_size_m: tuple[float, float] = (1.1, 1.3)
     """Along x and y of the base frame, its middle under the scene's origin."""
@@ -145,7 +145,7 @@ def read_truth(folder: Path) -> Truth:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise EpisodeError(
             f"{place / 'cameras.json'} does not say where the cameras and the scene were; record again with "
-            "`python -m pipeline.episodes`."
+            "`python -m pipeline.synthesize`."
         ) from error
     return Truth(cloth["nodes"], cloth["faces"], cameras, placement, place)
 
@@ -177,13 +177,13 @@ def record(
     settings = settings or RecorderSettings()
     rng, others = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     robot = gen3()
-    placement = _laid_beside(settings, motion.nodes, others)
+    placement = _misplaced(settings, motion.nodes, others)
     nodes = placement.to_world(motion.nodes)
     held = nodes[:, list(motion.grasped)].mean(axis=1)
     joints = _holding(robot, held)
     poses = robot.forward_kinematics(robot.configuration(joints, _GRIPPER_CLOSED))
     scene = _Scene(robot, motion.faces, _table(motion, settings), settings, np.array(cloth_color, dtype=np.float64), rng)
-    moved = _motion(*settings.cameras_moved, nodes, others)
+    moved = _motion(*settings.rig_error, nodes, others)
     stated = {
         camera.name: _motion(*(settings.extrinsic_error if index else (0.0, 0.0)), nodes, rng)
         @ moved
@@ -255,7 +255,7 @@ class _Scene:
         rng: np.random.Generator,
     ) -> None:
         self._robot, self._faces, self._settings = robot, faces, settings
-        self._arm = RobotMask(lookalike(robot, rng, largest_growth_m=settings.largest_growth_m), inflation_m=0.0)
+        self._arm = RobotMask(lookalike(robot, rng, largest_growth_m=settings.largest_growth_m), robot_margin_m=0.0)
         self._table = caster([table])
         self._colors = _COLORS.copy()
         self._colors[CLOTH] = cloth_color
@@ -296,7 +296,7 @@ class _Scene:
         seen = (labels == CLOTH) | (labels == TABLE)  # what the arm hides of itself is left: it is robot either way
         points = view.directions[seen] * depth_m[seen][:, None]
         lost = np.zeros(len(points), dtype=bool)
-        for x in camera.eyes_m:
+        for x in camera.imager_offsets_m:
             eye = np.array([x, 0.0, 0.0])
             between, _, _ = _cast(self._loose, view, eye, points - eye)
             lost |= between < 1 - _SAME
@@ -347,9 +347,9 @@ def _motion(millimetres: float, degrees: float, nodes: Floats, rng: np.random.Ge
     return found
 
 
-def _laid_beside(settings: RecorderSettings, nodes: Floats, rng: np.random.Generator) -> ScenePlacement:
+def _misplaced(settings: RecorderSettings, nodes: Floats, rng: np.random.Generator) -> ScenePlacement:
     """The stated placement, turned about the cloth's middle and shifted on the table, in directions drawn at random."""
-    stated, (millimetres, degrees) = settings.placement, settings.beside
+    stated, (millimetres, degrees) = settings.placement, settings.placement_error
     way, sign = (
         rng.uniform(0.5 * np.pi, 1.5 * np.pi),
         rng.choice([-1.0, 1.0]),
@@ -362,7 +362,7 @@ def _laid_beside(settings: RecorderSettings, nodes: Floats, rng: np.random.Gener
 
 
 def _write_log(writer: RawEpisodeWriter, robot: Robot, times: Floats, joints: Floats, settings: RecorderSettings) -> None:
-    """The joint log at its own rate: what the arm did `lag_s` before each row's time.
+    """The joint log at its own rate: what the arm did `clock_offset_s` before each row's time.
 
     Between the images it moves smoothly, at rest before the first and after the last.
 
@@ -373,7 +373,7 @@ def _write_log(writer: RawEpisodeWriter, robot: Robot, times: Floats, joints: Fl
     start, end = times[0] - _BEFORE_S, times[-1] + _BEFORE_S
     clock = start + np.arange(int(np.ceil((end - start) * settings.joint_rate_hz)) + 1) / settings.joint_rate_hz
     continuous = np.unwrap(joints, axis=0)
-    true_times = np.clip(clock - settings.lag_s, times[0], times[-1])
+    true_times = np.clip(clock - settings.clock_offset_s, times[0], times[-1])
     if len(times) > 1:
         from scipy.interpolate import CubicSpline  # slow to import
 

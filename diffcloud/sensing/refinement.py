@@ -101,7 +101,7 @@ class Refinement:
     """The first camera's is as it was, unless all cameras were found to be elsewhere."""
     skin_m: float
     """By which the arm is thicker than described, as the median over the links that were seen; 0 without an arm."""
-    lag_s: float
+    clock_offset_s: float
     """By which the joint log's times are late."""
     lag_sigma_s: float
     """Standard deviation that it is known with; 0 without an arm."""
@@ -131,7 +131,13 @@ class _Rows:
 
 
 def refine_extrinsics(
-    raw: RawEpisode, views: Mapping[str, View], arm: RobotMask | None, sight: Sight, *, sigma_per_m: float, lag_s: float
+    raw: RawEpisode,
+    views: Mapping[str, View],
+    arm: RobotMask | None,
+    sight: Sight,
+    *,
+    sigma_per_m: float,
+    clock_offset_s: float,
 ) -> Refinement:
     """Refine the cameras' poses.
 
@@ -139,7 +145,7 @@ def refine_extrinsics(
         views: by camera, at the calibration's poses.
         arm: the described surface, without inflation; None without an arm.
         sigma_per_m: standard deviation of the inverse depth [1/m].
-        lag_s: of the joint log, to start from.
+        clock_offset_s: of the joint log, to start from.
     """
     names, log = list(views), raw.robot
     first = names[0]
@@ -151,7 +157,7 @@ def refine_extrinsics(
         if len(points)
     ]
     if not seen:
-        return Refinement(poses, 0.0, lag_s, 0.0, dict.fromkeys(names, 0.0))
+        return Refinement(poses, 0.0, clock_offset_s, 0.0, dict.fromkeys(names, 0.0))
     centre = np.concatenate(seen).mean(axis=0)
     plane, surfaces = _plane(sight.table[first]), [_with_normals(points) for points in sight.cloth[first]]
     images = {} if arm is None else {name: _thinned(raw, name, views[name], sight.frames[name]) for name in names}
@@ -170,14 +176,14 @@ def refine_extrinsics(
     for iteration in range(_ITERATIONS):
         if arm is not None and iteration == _THICKENED_AT:
             thickened = found[poses_end + 1 :].copy()
-            surface = RobotMask(arm.robot, inflation_m=dict(zip(arm.robot.links, thickened.tolist(), strict=True)))
+            surface = RobotMask(arm.robot, robot_margin_m=dict(zip(arm.robot.links, thickened.tolist(), strict=True)))
         information, right = np.diag(prior), -prior * found
         groups, of_arm = [], []
         for index, name in enumerate(names):
             own = 6 * index + np.arange(6)
             if surface is not None and log is not None:
                 view = replace(images[name].view, T_world_camera=poses[name])
-                lag, skin = lag_s + float(found[poses_end]), found[poses_end + 1 :] - thickened
+                lag, skin = clock_offset_s + float(found[poses_end]), found[poses_end + 1 :] - thickened
                 rows = _arm_rows(log, surface, images[name], view, centre, skin, lag, sigma_per_m)
                 rows = rows.among(len(prior), np.concatenate([own, np.arange(poses_end, len(prior))]))
                 rows.J[:, :6] = rows.J[:, own]  # the first camera takes the others along
@@ -221,7 +227,7 @@ def refine_extrinsics(
         for name in names
     }
     sigma = 0.0 if arm is None or log is None else float(np.sqrt(lag_variance))
-    return Refinement(poses, skin_m, lag_s + float(found[poses_end]), sigma, shift)
+    return Refinement(poses, skin_m, clock_offset_s + float(found[poses_end]), sigma, shift)
 
 
 def _within(found: Floats, metres: float, radians: float) -> bool:
@@ -264,7 +270,7 @@ def _arm_rows(
     """
     robot = arm.robot
     earlier, now, later = (
-        robot.forward_kinematics(robot.configuration(*joints_at(log, images.times, lag_s=lag + value)))
+        robot.forward_kinematics(robot.configuration(*joints_at(log, images.times, clock_offset_s=lag + value)))
         for value in (-_LAG_STEP_S, 0.0, _LAG_STEP_S)
     )
     rates = (later - earlier) / (2 * _LAG_STEP_S)

@@ -68,8 +68,8 @@ def build_system(
                 "air_density": surrounding.air_density,
                 "air_drag": surrounding.air_drag,
                 "linear_drag": surrounding.linear_drag,
-                "friction_obstacle": surrounding.friction_obstacle,
-                "friction_cloth": surrounding.friction_cloth,
+                "friction": surrounding.friction,
+                "self_friction": surrounding.self_friction,
             }
         ),
     )

@@ -86,6 +86,11 @@ class Integrator(Protocol):
     """Forces whose elements are known before the motion."""
     contacts: tuple[Term, ...]
     """Forces between points that each step finds."""
+    smooth: bool
+    """Whether derivatives hold over finite changes of the parameters. Fits then step by tangents and fit nuisance
+    variables by default; else they use finite differences."""
+    meshes: bool
+    """Whether its own contact stops the cloth at obstacles that are no planes."""
 
     def check(self, surrounding: Surrounding) -> None:
         """

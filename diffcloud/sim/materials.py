@@ -101,11 +101,6 @@ class Material:
         return TABLE_ENTRY_TO_STRETCHING * 0.5 * (k0 + k2 - coupled)
 
     @property
-    def strained_stretching_stiffness(self) -> float:
-        """Mean of k0 and k2 [N/m] at the tables' reference strain, to which a fabric may have stiffened."""
-        return TABLE_ENTRY_TO_STRETCHING * float(self.stretching[1:, [0, 2]].mean())
-
-    @property
     def resting_shear_stiffness(self) -> float:
         """Shear force per width per shear angle at rest [N/m]."""
         return TABLE_ENTRY_TO_STRETCHING * 0.5 * float(self.stretching[0, 3])
@@ -172,7 +167,7 @@ def isotropic(
     )
 
 
-_BASIS_SOURCE = (
+_NOMINAL_SOURCE = (
     "chosen, not measured: soft enough that the whole box [0.1, 10]² of multipliers moves a hand-sized cloth by more "
     "than a depth camera's noise (docs/scenarios.md); most real fabrics lie at its stiff edge. Its shear is half of "
     "an isotropic sheet's, as a knit's is lower"
@@ -198,17 +193,17 @@ _PRESETS = {
     material.name: material
     for material in (
         isotropic(
-            "basis-knit",
+            "soft-knit",
             density=0.2,
             stretching=4.0,
             shear=1.0,
             bending=4e-6,
             stiffening=3.0,
             damping=FABRIC_DAMPING,
-            source=_BASIS_SOURCE,
+            source=_NOMINAL_SOURCE,
         ),
         isotropic(
-            "basis-foam",
+            "foam",
             density=0.2,
             stretching=2.0,
             shear=0.5,
@@ -218,7 +213,7 @@ _PRESETS = {
             source=_STIFFENING_FOAM_SOURCE,
         ),
         isotropic(
-            "basis-soft-foam",
+            "soft-foam",
             density=0.2,
             stretching=1.0,
             shear=0.25,

@@ -42,9 +42,9 @@ class Properties:
     """[B] of the linear tangential drag [kg/(m²·s)]."""
     linear_drag: Tensor
     """[B] of the linear drag in all directions [kg/(m²·s)]."""
-    friction_obstacle: Tensor
+    friction: Tensor
     """[B] Coulomb coefficient between cloth and obstacles [-]."""
-    friction_cloth: Tensor
+    self_friction: Tensor
     """[B] Coulomb coefficient between cloths [-]."""
     body_mass: Tensor
     """[B, N] of the rigid bodies [kg]; their inertia scales with it."""
@@ -62,8 +62,8 @@ class Properties:
         return Properties(*(tensor.repeat(count, *[1] * (tensor.dim() - 1)) for tensor in self.tensors()))
 
 
-Basis = Literal["stretching", "shear", "bending", "density", "air_density", "added_mass", "linear_drag", "body_mass"]
-"""What of the basis material, the air and the bodies a multiplier acts on."""
+Quantity = Literal["stretching", "shear", "bending", "density", "air_density", "added_mass", "linear_drag", "body_mass"]
+"""What of the nominal material, the air and the bodies a multiplier acts on."""
 
 
 @dataclass(frozen=True)
@@ -73,32 +73,33 @@ class Parameter:
     name: str
     meaning: str
     unit: str
-    """Of the physical value: of the number itself, or of what the multiplier times its basis is."""
+    """SI, of what people state and read. A multiplier times the nominal value of its `quantity` has it."""
     bounds: tuple[float, float]
-    """Of a fit, unless others are given."""
-    basis: Basis | None = None
-    """What it multiplies; None: it is the physical value itself."""
+    """Of a fit, unless others are given: multiples of the scene's own material where there is a `quantity`."""
+    quantity: Quantity | None = None
+    """What the simulator's multiplier acts on; None: the simulator takes the value itself."""
     most: float = math.inf
     """Largest value that means something."""
 
-    def check(self, value: float, what: str) -> None:
+    def check(self, value: float, what: str, nominal: float = 1.0) -> None:
         """
         Args:
-            what: names the value in the message, such as "--set stretch".
+            value: in `unit`, or a multiplier.
+            what: names the value in the message, such as "--set stretching".
+            nominal: the value that a multiplier of 1 stands for; 1 of a multiplier.
 
         Raises:
             ConfigError: not a number that this parameter can have.
         """
+        low, high = (bound * nominal for bound in self.bounds)
         if not math.isfinite(value):
-            raise ConfigError(f"{what} must be a finite number, got {value:g}. The default range is {list(self.bounds)}.")
-        if self.basis is not None and value <= 0:
+            raise ConfigError(f"{what} must be a finite number, got {value:g}. The default range is {low:g} to {high:g}.")
+        if self.quantity is not None and value <= 0:
+            raise ConfigError(f"{what} must be above 0, got {value:g}; the lowest usual value is {low:g}.")
+        if value > _LARGEST * nominal or (self.quantity is not None and value < nominal / _LARGEST):
             raise ConfigError(
-                f"{what} is a multiplier: above 0, got {value:g}; the lowest usual value is {self.bounds[0]:g}."
-            )
-        if value > _LARGEST or (self.basis is not None and value < 1 / _LARGEST):
-            raise ConfigError(
-                f"{what} is {value:g}; values from {1 / _LARGEST:g} to {_LARGEST:g} are simulated, and from "
-                f"{self.bounds[0]:g} to {self.bounds[1]:g} are usual."
+                f"{what} is {value:g}; values from {nominal / _LARGEST:g} to {_LARGEST * nominal:g} are simulated, and "
+                f"from {low:g} to {high:g} are usual."
             )
         if value < 0:
             raise ConfigError(f"{what} must not be negative, got {value:g}; the nearest allowed value is 0.")
@@ -112,29 +113,22 @@ _MULTIPLIED = (0.1, 10.0)
 PARAMETERS: dict[str, Parameter] = {
     parameter.name: parameter
     for parameter in (
-        Parameter("stretch", "multiplier on the stretching table", "N/m", _MULTIPLIED, "stretching"),
-        Parameter(
-            "mass",
-            "multiplier on node masses (of a node set, where the scenario names one)",
-            "kg/m²",
-            _MULTIPLIED,
-            "density",
-        ),
-        Parameter("density", "multiplier on all node masses", "kg/m²", _MULTIPLIED, "density"),
-        Parameter("shear", "multiplier on the ratio of shear to stretching stiffness", "–", _MULTIPLIED, "shear"),
+        Parameter("stretching", "stretching stiffness: force per width per strain", "N/m", _MULTIPLIED, "stretching"),
+        Parameter("density", "mass per area (of a node set, where the scene names one)", "kg/m²", _MULTIPLIED, "density"),
+        Parameter("shear", "shear stiffness over stretching stiffness", "–", _MULTIPLIED, "shear"),
         Parameter("compression", "part of the stretching stiffness that resists compression", "–", (0.001, 1.0), most=1.0),
-        Parameter("bending", "multiplier on the bending table", "N·m", _MULTIPLIED, "bending"),
-        Parameter("drag", "multiplier on the air density and the tangential drag", "kg/m³", _MULTIPLIED, "air_density"),
-        Parameter("added_mass", "multiplier on the air that moves with the cloth", "kg/m²", _MULTIPLIED, "added_mass"),
-        Parameter("linear_drag", "multiplier on drag in proportion to velocity", "kg/(m²·s)", _MULTIPLIED, "linear_drag"),
+        Parameter("bending", "bending stiffness per width", "N·m", _MULTIPLIED, "bending"),
+        Parameter("air_density", "air density, for drag that is quadratic in speed", "kg/m³", _MULTIPLIED, "air_density"),
+        Parameter("added_mass", "mass per area of the air that moves with the cloth", "kg/m²", _MULTIPLIED, "added_mass"),
+        Parameter("linear_drag", "drag per area that is linear in speed", "kg/(m²·s)", _MULTIPLIED, "linear_drag"),
         Parameter("damping", "stiffness-proportional damping", "s", (0.0, 0.1)),
-        Parameter("friction_obstacle", "Coulomb coefficient between cloth and obstacles", "–", (0.0, 1.5)),
-        Parameter("friction_cloth", "Coulomb coefficient of the cloth with itself", "–", (0.0, 1.5)),
-        Parameter("body_mass", "multiplier on the masses of all rigid bodies", "kg", _MULTIPLIED, "body_mass"),
+        Parameter("friction", "Coulomb coefficient between cloth and obstacles", "–", (0.0, 1.5)),
+        Parameter("self_friction", "Coulomb coefficient of the cloth with itself", "–", (0.0, 1.5)),
+        Parameter("body_mass", "mass of all rigid bodies", "kg", _MULTIPLIED, "body_mass"),
     )
 }
 """Every parameter by name: the one table that bounds, units, checks, records and docs/concepts.md are made from. The paper
-fits stretch and mass in [0.1, 10]."""
+fits stretching and density in [0.1, 10]."""
 
 
 def check_values(values: Mapping[str, float], option: str) -> None:
@@ -166,10 +160,10 @@ def scaled_properties(
     """Properties of a batch of parameter sets.
 
     Args:
-        base: the basis material, batch 1.
+        base: the nominal material, batch 1.
         values: name -> [B] values (multipliers or absolute, see `PARAMETERS`); all of one length.
         faces: [F, 3] node indices, to spread a node set's multiplier over faces.
-        node_sets: parameter name -> bool [V]; `mass` and `stretch` act on those nodes only (the published experiments
+        node_sets: parameter name -> bool [V]; `density` and `stretching` act on those nodes only (the published experiments
             multiply the mass of a part of the nodes). A face takes the mean multiplier of its corners.
 
     Raises:
@@ -180,8 +174,8 @@ def scaled_properties(
         if name not in PARAMETERS:
             raise ConfigError(unknown_name("parameter", name, PARAMETERS))
     for name in node_sets:
-        if name not in ("mass", "stretch"):
-            raise ConfigError(f"A node set for {name!r} is not supported; node sets act on mass and stretch.")
+        if name not in ("density", "stretching"):
+            raise ConfigError(f"A node set for {name!r} is not supported; node sets act on density and stretching.")
     lengths = {len(value) for value in values.values()} or {1}
     if len(lengths) > 1:
         raise ConfigError(f"Parameters have different batch lengths: {sorted(lengths)}.")
@@ -196,10 +190,10 @@ def scaled_properties(
         value = get(name)[:, None]
         return value if name not in node_sets else torch.where(node_sets[name], value, 1.0)
 
-    stretch = over_nodes("stretch")
+    stretch = over_nodes("stretching")
     if stretch.shape[1] > 1:
         stretch = stretch[:, faces].mean(-1)
-    weight = base.weight * over_nodes("mass") * get("density")[:, None]
+    weight = base.weight * over_nodes("density")
     return replace(
         base,
         node_mass=weight + (base.node_mass - base.weight) * get("added_mass")[:, None],
@@ -209,10 +203,10 @@ def scaled_properties(
         compression=values.get("compression", base.compression),
         bending=base.bending * get("bending")[:, None],
         damping=values.get("damping", base.damping),
-        air_density=base.air_density * get("drag"),
-        air_drag=base.air_drag * get("drag"),
+        air_density=base.air_density * get("air_density"),
+        air_drag=base.air_drag * get("air_density"),
         linear_drag=base.linear_drag * get("linear_drag"),
         body_mass=base.body_mass * get("body_mass")[:, None],
-        friction_obstacle=values.get("friction_obstacle", base.friction_obstacle),
-        friction_cloth=values.get("friction_cloth", base.friction_cloth),
+        friction=values.get("friction", base.friction),
+        self_friction=values.get("self_friction", base.self_friction),
     )

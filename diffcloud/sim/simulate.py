@@ -82,7 +82,7 @@ def rollout(
     is given.
 
     Args:
-        properties: of a batch of parameter sets; default the basis material, batch 1.
+        properties: of a batch of parameter sets; default the nominal material, batch 1.
         state: where to begin; default rest.
         track: [B or 1, S, G, 3] displacement of each gripper since the start at the end of each step [m], in the order of
             `Handles.grippers`; then the moving handles follow them instead of the scene's own motion.

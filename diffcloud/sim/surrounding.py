@@ -67,8 +67,8 @@ class Surrounding:
     """In all directions [kg/(m²·s)]."""
     lagged_air: bool = False
     """Whether drag is that before the step, as in ARCSim, where light cloth in dense air explodes."""
-    friction_cloth: float = 0.6
-    friction_obstacle: float = 0.3
+    self_friction: float = 0.6
+    friction: float = 0.3
     contact: ContactSettings = field(default_factory=ContactSettings)
     proximity: bool = True
     """Of the arcsim integrator: whether planes, and other meshes, repel and rub (off: only projection and impacts)."""

@@ -24,7 +24,7 @@ class System:
     time_step: float
     """[s]"""
     properties: Properties
-    """Of the basis material, batch 1."""
+    """Of the nominal material, batch 1."""
 
     @property
     def bodies(self) -> Bodies:

@@ -1,9 +1,11 @@
-"""Problems in MuJoCo: a flex of two dimensions, each of its nodes a body that slides along three axes.
+"""Simulate problems in MuJoCo: the cloth is a two-dimensional flex, and each node is a body that slides along three axes.
 
-Its membrane is Saint Venant's and Kirchhoff's, as is this simulator's, and its damping multiplies the rate of the
-strain. It takes both stiffnesses from one Young's modulus E and one thickness h. Its hinges resist by their chord, with
-the same dependence on the mesh as this simulator's, and k_b = 4 E h³/(12 (1 - ν²)); with B = k_b/5 of a strip whose
-sides are free that gives h² = 15 B (1 - ν²)/(E h).
+MuJoCo's membrane is Saint Venant-Kirchhoff, as is that of DiffCloud's simulator, and its damping multiplies the strain
+rate. MuJoCo takes the membrane and the bending stiffness from one Young's modulus E and one thickness h.
+
+The energy of MuJoCo's hinges depends on their chord 2 sin(θ/2) instead of their angle θ. Hinge stiffnesses depend on the
+mesh as in DiffCloud's simulator, with k_b = 4 E h³/(12 (1 - ν²)). A strip with free sides has the bending stiffness
+B = k_b/5. Hence h² = 15 B (1 - ν²)/(E h).
 """
 
 from __future__ import annotations
@@ -81,12 +83,12 @@ def simulate(problem: Problem, settings: Settings | None = None) -> Track:
     return Track(np.array(list(frames)), time.process_time() - began)
 
 
-def model_file(problem: Problem, settings: Settings | None = None, *, remark: str = "") -> str:
+def model_file(problem: Problem, settings: Settings | None = None, *, header: str = "") -> str:
     """The problem in MuJoCo's XML (MJCF). Each node is a body that slides along three axes; a held one is so heavy, and
     does not fall, that it stays where a step puts it.
 
     Args:
-        remark: at the head of the file.
+        header: at the head of the file.
     """
     chosen, sheet = settings or Settings(), problem.sheet
     step = 1 / (problem.rate * problem.steps_of(chosen.step))
@@ -96,8 +98,8 @@ def model_file(problem: Problem, settings: Settings | None = None, *, remark: st
     )
     surface_of: dict[str, Any] = {**contact, "priority": "1"}  # so that the cloth's own friction is that with itself
     root = Element("mujoco", model=problem.name)
-    if remark:
-        root.append(Comment(remark))
+    if header:
+        root.append(Comment(header))
     solver = {"timestep": repr(float(step)), "cone": chosen.cone, "impratio": f"{chosen.impratio:g}"}
     SubElement(root, "option", solver, gravity=f"0 0 {-problem.gravity:.9g}")
     asset, world = SubElement(root, "asset"), SubElement(root, "worldbody")

@@ -77,7 +77,7 @@ def mean_height(problem: Problem, stretching: float = 1.0) -> tuple[float, float
 
 
 def _modules() -> tuple[Any, Any]:
-    """(the script, warp), which say nothing of the kernels that they load."""
+    """Import and return (the script `run_newton`, warp). Warp's log messages about loaded kernels are turned off."""
     import warp
 
     warp.config.log_level = warp.LOG_WARNING

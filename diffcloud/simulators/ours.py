@@ -41,8 +41,8 @@ def scene(problem: Problem, order: Order = 2) -> Scene:
         surrounding=Surrounding(
             gravity=(0.0, 0.0, -problem.gravity),
             air_density=0.0,
-            friction_obstacle=problem.frictions[0],
-            friction_cloth=problem.frictions[1],
+            friction=problem.frictions[0],
+            self_friction=problem.frictions[1],
             self_contact=problem.self_contact,
             obstacles=(*table, *problem.bodies),
         ),

@@ -1,4 +1,4 @@
-"""The moving picture of README, from the first lift and the first fold of `make repro` and their fits: `make pictures`."""
+"""The moving picture of README: the towel of examples/, as recorded and as fitted, from two sides (`make pictures`)."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ from PIL import Image
 
 from diffcloud.estimation.result import FittedMotion, read_motion
 from diffcloud.io.episodes import Episode, read_episode
-from diffcloud.report.overlay import states_at
+from diffcloud.reporting.overlay import states_at
 
 ROOT = Path(__file__).parents[2]
-SHOWN = ("lift/lift_hidden1", "fold/fold_hidden1")
+RECORDING, FIT = ROOT / "examples" / "towel.npz", ROOT / "build" / "towel" / "fit.npz"
+SIDES = (-60, 30)
+"""Azimuth of each view [deg]."""
 RECORDED, CLOTH, EDGE, HELD = "#333333", "#2a9d8f", "#14524b", "#b3261e"
 SIZE = (6.4, 2.9)
 """[inch], at 100 dots per inch."""
-EVERY = 4
+EVERY = 2
 """One of so many recorded points is drawn."""
 FRAME_MS, LAST_MS = 110, 1000
 """How long each frame is shown [ms]; the last one longer, before the motion begins again."""
@@ -27,22 +29,21 @@ COLOURS = 48
 
 
 def main() -> None:
-    data = ROOT / "data"
-    pairs = [(read_episode(data / f"episodes/{name}.npz"), read_motion(data / f"fits/{name}.npz")) for name in SHOWN]
-    frames = [picture(pairs, frame) for frame in range(min(episode.frame_count for episode, _ in pairs))]
+    episode, motion = read_episode(RECORDING), read_motion(FIT)
+    frames = [picture(episode, motion, frame) for frame in range(episode.frame_count)]
     first, *others = (one.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE) for one in frames)
     durations = [FRAME_MS] * len(others) + [LAST_MS]
     file = ROOT / "docs" / "images" / "fit.gif"
     first.save(file, save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
 
 
-def picture(pairs: list[tuple[Episode, FittedMotion]], frame: int) -> Image.Image:
-    """Draw one frame of each recording with its fit, side by side."""
+def picture(episode: Episode, motion: FittedMotion, frame: int) -> Image.Image:
+    """Draw one frame of the recording with its fit, from each side."""
     figure = Figure(figsize=SIZE, dpi=100)
-    for place, (episode, motion) in enumerate(pairs, 1):
-        (state,) = states_at(motion.times, episode.times[[frame]])
-        nodes, cloud = motion.nodes[state], episode.frame(frame)[::EVERY]
-        axes = figure.add_subplot(1, len(pairs), place, projection="3d", computed_zorder=False)
+    (state,) = states_at(motion.times, episode.times[[frame]])
+    nodes, cloud = motion.nodes[state], episode.frame(frame)[::EVERY]
+    for place, side in enumerate(SIDES, 1):
+        axes = figure.add_subplot(1, len(SIDES), place, projection="3d", computed_zorder=False)
         options = {"color": CLOTH, "alpha": 0.7, "linewidth": 0.25, "edgecolor": EDGE}
         axes.plot_trisurf(*nodes.T, triangles=motion.faces, zorder=1, **options)
         axes.scatter(*cloud.T, s=1.2, color=RECORDED, alpha=0.55, zorder=2)
@@ -51,9 +52,9 @@ def picture(pairs: list[tuple[Episode, FittedMotion]], frame: int) -> Image.Imag
         middle, half = (low + high) / 2, (high - low).max() / 2
         axes.set(**{f"{axis}lim": (mid - half, mid + half) for axis, mid in zip("xyz", middle, strict=True)})
         axes.set_axis_off()
-        axes.view_init(18, -60)
-        axes.set_box_aspect((1, 1, 1), zoom=1.25)
-    time = f"{pairs[0][0].times[frame]:.1f} s"
+        axes.view_init(18, side)
+        axes.set_box_aspect((1, 1, 1), zoom=1.7)
+    time = f"{episode.times[frame]:.1f} s"
     legend = ("dots: recorded cloud", "surface: fitted simulation", "red: held nodes")
     figure.text(0.5, 0.03, "   ·   ".join((time, *legend)), ha="center", fontsize=8.5)
     figure.subplots_adjust(0, 0.02, 1, 1, 0, 0)

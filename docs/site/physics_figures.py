@@ -8,7 +8,7 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.axes import Axes
 
-from diffcloud.report.figures import INK, new_canvas, svg_of
+from diffcloud.reporting.figures import INK, new_canvas, svg_of
 
 DOCS = Path(__file__).parents[1]
 OLD, PAD, PIVOT = "#8c96a3", "#d55e00", "#2b8ccb"

@@ -17,7 +17,7 @@ from diffcloud.estimation.priors import DEFAULT_FACTOR
 from diffcloud.estimation.record import read_fit
 from diffcloud.estimation.uncertain import MATERIAL_UNCERTAINTY
 from diffcloud.io.episodes import read_episode
-from diffcloud.report.figures import INK, new_canvas, svg_of
+from diffcloud.reporting.figures import INK, new_canvas, svg_of
 from diffcloud.scene import load_scenario
 from diffcloud.sim.properties import one_set
 
@@ -30,8 +30,8 @@ WIDTH = 7.2
 """[inch]"""
 SHOWN = 700
 """Points of a cloud that are drawn."""
-PRIORS = dict.fromkeys(("stretch", "mass"), DEFAULT_FACTOR) | {
-    name: MATERIAL_UNCERTAINTY[name] for name in ("bending", "drag")
+PRIORS = dict.fromkeys(("stretching", "density"), DEFAULT_FACTOR) | {
+    name: MATERIAL_UNCERTAINTY[name] for name in ("bending", "air_density")
 }
 """Factor of one standard deviation by default, of what is asked for and of what is not."""
 mpl.rcParams.update({"font.size": 9, "text.color": INK})
@@ -102,9 +102,9 @@ def priors(objective: Objective, values: dict[str, float]) -> None:
     bounds = dict.fromkeys(PRIORS, (1e-3, 1e3))
     bare, known = (FitSpace.build(list(PRIORS), bounds=bounds, priors=given) for given in (None, PRIORS))
     for count, space, style, colour, label in (
-        (1, bare, "-", HIDDEN, "stretch alone"),
-        (2, bare, "-", BELOW, "stretch and mass"),
-        (4, bare, "-", CLOTH, "stretch, mass, bending and drag"),
+        (1, bare, "-", HIDDEN, "stretching alone"),
+        (2, bare, "-", BELOW, "stretching and density"),
+        (4, bare, "-", CLOTH, "stretching, density, bending and air_density"),
         (4, known, "--", CLOTH, "the same, with the priors"),
     ):
         moved = (torch.arange(len(PRIORS)) < count).double()

@@ -39,7 +39,7 @@ _SECTIONS = {
     ("fit",): "fit",
     ("view",): "preprocess",
     ("data", "preprocess"): "preprocess",
-    ("network", "generate"): "simulate",
+    ("network", "generate"): "generate",
     ("network", "train"): "train",
 }
 """Command with --params -> the section that it reads."""
@@ -196,7 +196,7 @@ def settings_page() -> str:
         "# Settings",
         "What `params.yaml`, and any file for `--params`, can hold. Unknown keys and bad values are errors. What is not "
         "given has the default here; options of a command win over the file.",
-        "`scenarios` lists those that the pipeline goes through: " + _value(settings.Config().scenarios) + ".",
+        "`scenes` lists those that the pipeline goes through: " + _value(settings.Config().scenes) + ".",
     ]
     for name, field in settings.Config.model_fields.items():
         section = field.default
@@ -224,7 +224,7 @@ def _solver_tables() -> list[str]:
 
 
 def _settings_table(section: settings.Section) -> str:
-    others = TrainingSettings if isinstance(section, settings.TrainConfig) else FusionSettings
+    others = TrainingSettings if isinstance(section, settings.TrainSettings) else FusionSettings
     meanings = attribute_docs(others) | attribute_docs(type(section))
     rows = []
     for key in type(section).model_fields:

@@ -33,7 +33,7 @@ def scenario_of(release, name):
 
 def simulate(scenario, stretch, mass, steps):
     system, _ = scenario.scene.build()
-    values = {name: torch.tensor([v], dtype=torch.float64) for name, v in (("stretch", stretch), ("mass", mass))}
+    values = {name: torch.tensor([v], dtype=torch.float64) for name, v in (("stretching", stretch), ("density", mass))}
     with torch.no_grad():
         return rollout(system, steps, properties=scenario.properties(system, values)).positions[0].numpy()
 
@@ -62,7 +62,7 @@ def test_every_published_episode_is_imported(release):
             assert episode.frame_count == 25
             assert set(episode.meta["predictions"]) == {"mlp", "pointnet2", "meteornet"}
         else:
-            assert set(episode.meta["truth"]) == {"stretch", "mass"}
+            assert set(episode.meta["truth"]) == {"stretching", "density"}
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_derivatives_through_published_contact(release, kind, stretch, mass):
     steps = scenario.loss_frames[0]
 
     def properties(values):
-        return scenario.properties(system, dict(zip(("stretch", "mass"), values.unbind(-1), strict=True)))
+        return scenario.properties(system, dict(zip(("stretching", "density"), values.unbind(-1), strict=True)))
 
     def loss(values):
         return rollout(system, steps, properties=properties(values)).positions[:, -1].square().sum((1, 2))
@@ -123,7 +123,7 @@ def test_derivatives_through_published_contact(release, kind, stretch, mass):
 def test_a_simulated_episode_is_fitted_below_the_papers_threshold(release, kind):
     scenario = scenario_of(release, f"release_{kind}")
     episode = next(e for s, n, e in release_episodes(release) if s == f"release_{kind}" and n == "1")
-    space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
+    space = FitSpace.build(["stretching", "density"], bounds=scenario.bounds)
     settings = AdamSettings(learning_rate=scenario.learning_rate, threshold=scenario.threshold)
     outcome = fit_adam(Objective(scenario, episode, paper=True), space, settings)
     assert outcome.loss < scenario.threshold
@@ -137,7 +137,7 @@ def test_a_single_start_fit_beats_every_published_prediction(release, kind):
     scenario = scenario_of(release, name)
     label, episode = next((n, e) for s, n, e in release_episodes(release) if s == name)
     objective = Objective(scenario, episode, paper=True)
-    space = FitSpace.build(["stretch", "mass"], bounds=scenario.bounds)
+    space = FitSpace.build(["stretching", "density"], bounds=scenario.bounds)
     outcome = fit_adam(objective, space, AdamSettings(learning_rate=scenario.learning_rate, smoothing=SMOOTHING))
     pairs = episode.meta["predictions"].values()
     values = {key: torch.tensor([np.clip(pair[key], 0.1, 10) for pair in pairs]) for key in space.names}
@@ -168,7 +168,7 @@ def test_one_command_compares_the_published_episodes(release, tmp_path, monkeypa
     command = ("published", release, "--params", "quick.yaml", "--only", "*/fold_tan*", "--markdown", "c.md")
     found = study(*command).result["metrics"]["comparison"]
     assert set(found["methods"]["release_fold"]) >= {"diffcloud", "cma_es", "published_mlp", "published_meteornet"}
-    assert "verdicts" not in found  # Adam knows no intervals
+    assert "statuses" not in found  # Adam knows no intervals
     assert "fold_tan2" in Path("c.md").read_text(encoding="utf-8")
     assert Path("reports/release/index.html").is_file()
 

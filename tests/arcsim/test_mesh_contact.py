@@ -30,10 +30,10 @@ def test_derivatives_of_an_episode(variant):
     episode = Episode.build(over_box(contact, proximity=proximity), 6)
     found = compare(episode, directions(episode, per_field=1), steps=(1e-4, 1e-5, 1e-6))
     if not proximity:
-        assert found.pop("friction_obstacle")[0] == 0.0
+        assert found.pop("friction")[0] == 0.0
     for name, (value, forward, central) in found.items():
         if abs(value) < 1e-12:  # friction that sticks does not depend on its coefficient
-            assert name == "friction_obstacle"
+            assert name == "friction"
             continue
         assert forward <= 1e-8, name
         assert central <= 1e-5, name
@@ -43,9 +43,9 @@ def test_a_batch_is_its_entries():
     scenario = over_box(ReferenceContact())
     system, _ = scenario.scene.build()
     stretch = torch.tensor([0.3, 1.0, 4.0], dtype=torch.float64)
-    batch = rollout(system, 8, properties=scenario.properties(system, {"stretch": stretch})).positions
+    batch = rollout(system, 8, properties=scenario.properties(system, {"stretching": stretch})).positions
     for index in range(3):
-        one = {"stretch": stretch[index : index + 1]}
+        one = {"stretching": stretch[index : index + 1]}
         single = rollout(system, 8, properties=scenario.properties(system, one)).positions[0]
         assert torch.equal(batch[index], single)
 

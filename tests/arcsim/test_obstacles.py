@@ -59,7 +59,7 @@ def test_a_body_weighs_as_much_as_its_volume_of_water(folder):
     """However fine its mesh: ARCSim's 0.01 kg per node would be 0.08 kg here."""
     scene = load_scene(write_file(folder, sheet_over_box(transform={"scale": 2})))
     volume = 0.09 * 0.078 * 0.02 * 8
-    assert scene.basis("body_mass") == pytest.approx(1000 * volume)
+    assert scene.nominal("body_mass") == pytest.approx(1000 * volume)
 
 
 def test_a_motion_acts_on_the_transformed_mesh_between_its_times(folder):

@@ -36,7 +36,7 @@ def test_a_node_that_two_slopes_stop_in_one_step(angles):
         surrounding=Surrounding(
             obstacles=tuple(slope(angle) for angle in angles),
             proximity=False,
-            friction_obstacle=0.0,
+            friction=0.0,
         ),
         integrator="arcsim",
     )

@@ -38,7 +38,7 @@ def repulsion(surface: Surface, points: np.ndarray, smallest: float = 0.0, count
 def parameters(inverse_mass: np.ndarray) -> Parameters:
     """Everything that pairs do not ask for is nothing."""
     nothing = dict.fromkeys(Parameters._fields, np.zeros(1)) | {"target": np.zeros((1, 3))}
-    friction = {"friction_obstacle": np.array([MU_OBSTACLE]), "friction_cloth": np.array([MU_CLOTH])}
+    friction = {"friction": np.array([MU_OBSTACLE]), "self_friction": np.array([MU_CLOTH])}
     return Parameters(**(nothing | {"inverse_mass": inverse_mass} | friction))
 
 
@@ -110,7 +110,7 @@ def given(pair: twin.Pair, state: str):
     motion = moving(pair.positions.numpy(), pair.before.numpy(), pair.after.numpy())
     known = parameters(pair.inverse_mass.numpy())
     if state == "no friction":
-        known = known._replace(friction_cloth=np.zeros(1))
+        known = known._replace(self_friction=np.zeros(1))
     return elements(pair.kind, corners, constants, pair.thickness), known, motion, Timing(DT, DT)
 
 
@@ -140,7 +140,7 @@ def test_force_and_step_matrix_of_a_pair(kind, state, rng):
 def test_derivatives_of_a_pair(kind, state, rng):
     """By everything that the force reads, in both modes, against automatic derivatives of the twin."""
     tolerance = 1e-6 if state == "sliver" else 1e-9
-    friction = "friction_obstacle" if state == "obstacle" else "friction_cloth"
+    friction = "friction" if state == "obstacle" else "self_friction"
     for pair in pairs(kind, state, rng, count=8):
         element, known, motion, timing = given(pair, state)
         names = ("positions", "before", "after", "inverse_mass", "friction")
@@ -202,7 +202,7 @@ def test_friction_is_coulombs_and_never_reverses(kind, state, rng):
         element, known, motion, timing = given(pair, state)
         with_friction, without = np.zeros((4, 3)), np.zeros((4, 3))
         kernel(kind, "force")(element, known, motion, timing, with_friction)
-        frictionless = known._replace(friction_obstacle=np.zeros(1), friction_cloth=np.zeros(1))
+        frictionless = known._replace(friction=np.zeros(1), self_friction=np.zeros(1))
         kernel(kind, "force")(element, frictionless, motion, timing, without)
         weights, normal = meeting(kind, pair.positions.numpy())
         height = pair.sign * normal @ (weights @ pair.positions.numpy())
@@ -378,7 +378,7 @@ def test_pairs_add_the_twins_to_the_step_matrix(rng):
     mass = rng.uniform(0.001, 0.002, nodes)
     known = parameters(np.concatenate([1 / mass, np.zeros(len(scene.obstacles))]))
     faces, hinges, handles = len(system.mesh.faces), len(system.mesh.hinges.length), len(system.handles.nodes)
-    known = known._replace(node_mass=mass, stretching=np.ones(faces), bending=np.ones(hinges))
+    known = known._replace(node_mass=mass, weight=mass, stretching=np.ones(faces), bending=np.ones(hinges))
     known = known._replace(hold=np.zeros(handles), target=np.zeros((handles, 3)))
     motion, holder = moving(points, velocities, velocities.copy()), np.full(nodes, -1)
     surface, settings = scene.surface, scene.repulsion._replace(smallest=0.0, thickness=THICKNESS)

@@ -75,8 +75,8 @@ def test_every_field_reaches_the_system(folder):
     assert float(system.properties.damping) == 0.01
     assert float(system.properties.air_density) == 1.2
     assert float(system.properties.air_drag) == 0.1
-    assert float(system.properties.friction_cloth) == 0.5
-    assert float(system.properties.friction_obstacle) == 0.2
+    assert float(system.properties.self_friction) == 0.5
+    assert float(system.properties.friction) == 0.2
     assert (system.scene.terms.air.wind == [1, 0, 0]).all()
     assert (system.scene.terms.gravity.acceleration == [0, 0, -30]).all()
     assert system.handles.nodes == [0, 2, 8]

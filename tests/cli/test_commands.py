@@ -29,6 +29,7 @@ from diffcloud.estimation.settings import FitSettings
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.obj import read_cloth, read_surface
 from diffcloud.io.timings import read_seconds
+from diffcloud.jobs.scenarios import scene_named
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.sim.properties import one_set
 from tests.arcsim.files import MESHES, over_moving_box, write_file, write_files
@@ -56,7 +57,7 @@ def run(*arguments: object, cwd: Path, code: int = 0) -> Invoked:
 @pytest.fixture
 def work(tmp_path):
     (tmp_path / "small.yaml").write_text(yaml.safe_dump(SMALL))
-    write_episode(tmp_path / "e1.npz", clouds_of(small_lift(), stretch=0.7, mass=1.0))
+    write_episode(tmp_path / "e1.npz", clouds_of(small_lift(), stretching=0.7, density=1.0))
     return tmp_path
 
 
@@ -73,7 +74,7 @@ def measured(scene: Path, episode: Path, values: dict[str, float]) -> float:
 
 
 def test_simulate_writes_the_contract_and_meshes(work):
-    command = ("simulate", "small.yaml", "--set", "stretch=0.5", "--set", "mass=5", "--frames", 3)
+    command = ("simulate", "small.yaml", "--set", "stretching=2", "--set", "density=1", "--frames", 3)
     done = run(*command, "--out", "run.npz", cwd=work)
     with np.load(work / "run.npz") as data:
         assert data["nodes"].shape == (4, 25, 3)
@@ -81,7 +82,7 @@ def test_simulate_writes_the_contract_and_meshes(work):
         assert data["faces"].dtype == np.int64
         assert data["times"].tolist() == pytest.approx([0, 0.1, 0.2, 0.3])
         last = data["nodes"][-1]
-    assert done.result["parameters"] == {"stretch": 0.5, "mass": 5.0}
+    assert done.result["parameters"] == {"stretching": 2.0, "density": 1.0}
     for kind in ("obj", "ply"):
         run(*command, "--out", kind, "--format", kind, cwd=work)
     np.testing.assert_array_equal(read_cloth(work / "obj" / "003.obj").nodes, last)
@@ -91,8 +92,8 @@ def test_simulate_writes_the_contract_and_meshes(work):
 
 
 def test_a_cloth_that_lies_askew_is_replayed_as_it_lay(work):
-    write_episode(work / "askew.npz", clouds_of(small_lift(), stretch=0.7, mass=1.0, turn=0.2, shape_1_1=0.01))
-    told = ("--scene", "small.yaml", "--fix", "mass=1.0", "--initial-state", "turn=10deg,shape=1cm", "--starts", 1)
+    write_episode(work / "askew.npz", clouds_of(small_lift(), stretching=0.7, density=1.0, turn=0.2, shape_1_1=0.01))
+    told = ("--scene", "small.yaml", "--fix", "density=0.2", "--initial-state", "turn=10deg,shape=1cm", "--starts", 1)
     run("fit", *told, "--out", "fits", "askew.npz", cwd=work)
     record = read_fit(work / "fits" / "fit.json")
     assert sum(record.nuisance[name].value for name in ("turn", "yaw")) == pytest.approx(0.2, abs=0.05)
@@ -105,14 +106,14 @@ def test_a_cloth_that_lies_askew_is_replayed_as_it_lay(work):
 
 def test_options_add_to_what_the_parameters_file_gives(work):
     (work / "params.yaml").write_text(
-        "fit: {fixed: {bending: 2.0, mass: 3.0}, bounds: {stretch: [0.2, 5.0], mass: [0.5, 2]}, "
+        "fit: {fixed: {bending: 8.0e-6, density: 0.6}, bounds: {stretching: [1.0, 20.0], density: [0.1, 0.4]}, "
         "solver: {starts: 2, model_error: false}}"
     )
     told = ("--scene", "small.yaml", "--params", "params.yaml", "--max-steps", 1, "--out", "fits", "e1.npz")
-    run("fit", *told, "--fix", "mass=1.0", "--bound", "mass=0.9:1.1", cwd=work)
+    run("fit", *told, "--fix", "density=0.2", "--bound", "density=0.18:0.22", cwd=work)
     record = read_fit(work / "fits" / "fit.json")
-    assert (record.values["bending"], record.values["mass"]) == (2.0, 1.0)
-    assert record.parameters["stretch"].bounds == (0.2, 5.0)
+    assert (record.parameters["bending"].value, record.parameters["density"].value) == pytest.approx((8e-6, 0.2))
+    assert record.parameters["stretching"].bounds == pytest.approx((1.0, 20.0))
     settings = {"starts": 2, "model_error": False, "max_steps": 1}
     assert settings.items() <= record.settings.items()
     other = run("fit", *told, "--solver", "adam", cwd=work).errors
@@ -123,10 +124,10 @@ def test_options_add_to_what_the_parameters_file_gives(work):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--fix", "mass=heavy"), "--fix mass: Input should be a number"),
-        (("--fix", "mass"), "--fix takes NAME=VALUE, got 'mass'"),
-        (("--bound", "mass=3:1"), "bounds.mass must be in order"),
-        (("--bound", "mass=low:2"), "--bound mass.0: Input should be a number"),
+        (("--fix", "density=heavy"), "--fix density: Input should be a number"),
+        (("--fix", "density"), "--fix takes NAME=VALUE, got 'density'"),
+        (("--bound", "density=3:1"), "bounds.density must be in order"),
+        (("--bound", "density=low:2"), "--bound density.0: Input should be a number"),
         (("--level", 2), "--level: Input should be less than or equal to 0.999"),
         (("--max-steps", 0), "--max-steps: Input should be greater than or equal to 1"),
         (("--solver", "lbfgs"), "--solver: unknown solver 'lbfgs'; allowed are likelihood, adam"),
@@ -141,19 +142,19 @@ def test_an_option_that_cannot_be_is_named(work, options, message):
 
 def test_fit_then_replay_and_measure(work):
     done = run(
-        "fit", "--scene", "small.yaml", "--out", "fits", "--max-steps", 3, "--starts", 2, "--fix", "mass=1.0",
+        "fit", "--scene", "small.yaml", "--out", "fits", "--max-steps", 3, "--starts", 2, "--fix", "density=0.2",
         "--initial-state", "none", "e1.npz", cwd=work,
     )  # fmt: skip
     summary = json.loads((work / "fits" / "fit.json").read_text())
     assert done.result["rms_mm"] == summary["rms_mm"]
     assert {"loss", "loss_start", "iterations", "stop_reason", "parameters"} <= set(summary)
     assert not {"seconds", "versions"} & set(summary)  # they differ from run to run and lie beside it
-    assert {"value", "unit"} <= set(summary["parameters"]["stretch"])
-    values = {name: entry["value"] for name, entry in summary["parameters"].items()}
-    assert values.keys() > {"stretch", "mass", "bending"}  # what is not known exactly was fitted too
+    assert {"value", "unit"} <= set(summary["parameters"]["stretching"])
+    values = {name: entry["multiplier"] for name, entry in summary["parameters"].items()}
+    assert values.keys() > {"stretching", "density", "bending"}  # what is not known exactly was fitted too
     again = measured(work / "small.yaml", work / "e1.npz", values)
     assert again == pytest.approx(summary["loss"], rel=1e-9)  # same metric, same points
-    assert measured(work / "small.yaml", work / "e1.npz", {**values, "mass": 2.0}) > again
+    assert measured(work / "small.yaml", work / "e1.npz", {**values, "density": 2.0}) > again
     run("simulate", "fits/fit.json", "--track", "e1.npz", "--out", "r.npz", cwd=work)
     with np.load(work / "r.npz") as replay, np.load(work / "fits" / "fit.npz") as fitted:
         np.testing.assert_allclose(replay["nodes"], fitted["nodes"], atol=1e-12)
@@ -163,19 +164,19 @@ def test_fit_then_replay_and_measure(work):
 def test_a_fit_by_a_search(work, solver):
     (work / "params.yaml").write_text(yaml.safe_dump({"fit": {"solver": {"name": solver, "max_simulations": 12}}}))
     command = ("fit", "--scene", "small.yaml", "--out", "fits", "--params", "params.yaml")
-    done = run(*command, "--init", "stretch=2,mass=1", "e1.npz", cwd=work)
+    done = run(*command, "--init", "stretching=8,density=0.2", "e1.npz", cwd=work)
     summary = json.loads((work / "fits" / "fit.json").read_text())
     assert (summary["solver"], summary["simulations"], summary["stop_reason"]) == (solver, 12, "simulations")
-    assert summary["start"] == {"stretch": 2.0, "mass": 1.0}
+    assert summary["start"] == {"stretching": 2.0, "density": 1.0}
     assert summary["loss"] <= summary["loss_start"]
-    assert f"There are no intervals: the solver {solver} knows no uncertainty" in done.errors
+    assert f"There are no intervals: the solver {solver} gives none" in done.errors
     assert not (work / "fits" / "intervals.json").exists()
     for options in (("--starts", 2), ("--max-steps", 3)):
         assert options[0] in run(*command, *options, "e1.npz", cwd=work, code=1).errors
 
 
 def test_each_recording_alone(work):
-    write_episode(work / "e2.npz", clouds_of(small_lift(), stretch=1.4, mass=1.0))
+    write_episode(work / "e2.npz", clouds_of(small_lift(), stretching=1.4, density=1.0))
     command = ("fit", "--scene", "small.yaml", "--out", "fits", "--max-steps", 1, "--starts", 1)
     done = run(*command, "--separate", "e1.npz", "e2.npz", cwd=work)
     assert set(done.result) == {"e1", "e2"}
@@ -202,12 +203,12 @@ class TestJointFitOverMotions:
     def motions(self, work):
         told = yaml.safe_load((work / "small.yaml").read_text())
         (work / "side.yaml").write_text(yaml.safe_dump({**told, "path": [[0, 0, 0, 0], [0.5, 0.1, 0, 0.1]]}))
-        write_episode(work / "s1.npz", clouds_of(load_scenario(str(work / "side.yaml")), stretch=1.4, mass=1.0))
+        write_episode(work / "s1.npz", clouds_of(load_scenario(str(work / "side.yaml")), stretching=1.4, density=1.0))
         return work
 
     def test_each_recording_has_its_own_pose_and_loss(self, motions):
         pairs = ("small.yaml=e1.npz", "side.yaml=s1.npz")
-        done = run("fit", *pairs, "--out", "fits", "--max-steps", 2, "--fix", "mass=1", cwd=motions)
+        done = run("fit", *pairs, "--out", "fits", "--max-steps", 2, "--fix", "density=0.2", cwd=motions)
         joint = json.loads((motions / "fits" / "fit.json").read_text())
         assert [(one["scenario"], one["name"]) for one in joint["episodes"]] == [("small", "e1"), ("side", "s1")]
         losses = [one["loss"] for one in joint["episodes"]]
@@ -215,7 +216,7 @@ class TestJointFitOverMotions:
         for one in joint["episodes"]:
             assert set(one["nuisance"]) == {*NUISANCE, "turn"} - {"scale"}
             assert one["left_out"]["loss"] >= 0.5 * one["loss"]
-        assert "when a recording is left out of the fit" in done.errors
+        assert "left out of the fit, a recording has at most" in done.errors
         assert done.result["episodes"].keys() == {"e1", "s1"}
         run("simulate", "fits/fit.json", "--track", "s1.npz", "--out", "r.npz", cwd=motions)
         with np.load(motions / "r.npz") as replay, np.load(motions / "fits" / "fit.npz") as fitted:
@@ -273,7 +274,7 @@ FIT = ("fit", "--params", "params.yaml", "--out", "fits", "episodes")
 
 
 def told(folder: Path, **fit: object) -> None:
-    (folder / "params.yaml").write_text(yaml.safe_dump({"scenarios": ["small"], "fit": fit}))
+    (folder / "params.yaml").write_text(yaml.safe_dump({"scenes": ["small"], "fit": fit}))
 
 
 def fit_of(folder: Path, name: str) -> dict:
@@ -291,7 +292,7 @@ def test_interrupted_fit_leaves_the_best_so_far_and_goes_on(tree, monkeypatch):
 
     evaluated = Objective.__call__
     monkeypatch.setattr(Objective, "__call__", evaluate)
-    write_episode(tree / "episodes" / "small" / "e2.npz", clouds_of(small_lift(), stretch=1.7, mass=1.0))
+    write_episode(tree / "episodes" / "small" / "e2.npz", clouds_of(small_lift(), stretching=1.7, density=1.0))
     adam = {"name": "adam", "max_steps": 10}  # as many steps whatever the loss does
     told(tree, solver=adam)
     done = staged(*FIT, cwd=tree, code=130)
@@ -331,7 +332,7 @@ def test_a_ctrl_c_after_the_last_step_does_not_cost_the_fit(tree, monkeypatch):
 
 @pytest.mark.slow
 def test_processes_give_the_same_fits(tree):
-    write_episode(tree / "episodes" / "small" / "e2.npz", clouds_of(small_lift(), stretch=1.7, mass=1.0))
+    write_episode(tree / "episodes" / "small" / "e2.npz", clouds_of(small_lift(), stretching=1.7, density=1.0))
     told(tree, solver={"max_steps": 2})
     found = {}
     for workers in (1, 2):
@@ -345,8 +346,10 @@ def test_processes_give_the_same_fits(tree):
 def test_ctrl_c_stops_fits_in_processes_and_keeps_their_best(tree):
     folder = tree / "episodes" / "small"
     (folder / "e1.npz").unlink()
-    write_episode(folder / "easy.npz", clouds_of(small_lift(), stretch=5.05, mass=5.05))  # below the threshold at once
-    moved = clouds_of(small_lift(), stretch=1.7, mass=1.0)
+    write_episode(
+        folder / "easy.npz", clouds_of(small_lift(), stretching=5.05, density=5.05)
+    )  # below the threshold at once
+    moved = clouds_of(small_lift(), stretching=1.7, density=1.0)
     write_episode(folder / "far.npz", replace(moved, points=moved.points + 0.03))  # out of reach
     told(tree, solver={"name": "adam", "max_steps": 1_000_000, "threshold": 5e-5})
     command = [sys.executable, "-m", "pipeline.fit", *FIT[1:], "--workers", "2"]
@@ -377,7 +380,7 @@ if __name__ == "__main__":
 def test_a_scheduler_that_dies_loses_no_finished_fit(tree, tmp_path_factory):
     for number in range(2, 6):
         name = tree / "episodes" / "small" / f"e{number}.npz"
-        write_episode(name, clouds_of(small_lift(), stretch=0.5 * number, mass=1.0))
+        write_episode(name, clouds_of(small_lift(), stretching=0.5 * number, density=1.0))
     told(tree, solver={"name": "adam", "max_steps": 20})
     (tree / "cluster.py").write_text(CLUSTER)
     elsewhere = tmp_path_factory.mktemp("elsewhere")  # where workers start; what they write is relative to the command
@@ -428,13 +431,13 @@ def test_stages_run_in_a_row_and_the_page_is_whole(work):
     (work / "raw" / "scenes").mkdir(parents=True)
     (work / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump(SMALL))
     params = {
-        "scenarios": ["small"],
-        "episodes": {"per_scenario": 1},
+        "scenes": ["small"],
+        "synthesize": {"per_scenario": 1},
         "fit": {"solver": {"max_steps": 2}},
         "evaluate": {"draws": 1},
     }
     (work / "params.yaml").write_text(yaml.safe_dump(params))
-    staged("episodes", "--params", "params.yaml", "--out", "data/recorded", cwd=work)
+    staged("synthesize", "--params", "params.yaml", "--out", "data/recorded", cwd=work)
     staged("preprocess", "--params", "params.yaml", "--out", "data/episodes", "data/recorded", cwd=work)
     staged("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes", cwd=work)
     staged("evaluate", "--params", "params.yaml", cwd=work)
@@ -468,7 +471,7 @@ def test_two_grippers_from_csv_to_report(work):
     still = {**two, "path": [[0, 0, 0, 0], [0.5, 0, 0, 0.001]], "grippers": {"left": {"grasped": ["left_top"]}}}
     still["grippers"]["right"] = {"grasped": ["right_top"]}
     (work / "raw" / "scenes" / "still.yaml").write_text(yaml.safe_dump(still))
-    run("simulate", "raw/scenes/two.yaml", "--set", "stretch=0.6", "--out", "true.npz", cwd=work)
+    run("simulate", "raw/scenes/two.yaml", "--set", "stretching=2.4", "--out", "true.npz", cwd=work)
     with np.load(work / "true.npz") as true:
         nodes, faces, times = true["nodes"], true["faces"], true["times"]
     (work / "clouds").mkdir()
@@ -480,7 +483,7 @@ def test_two_grippers_from_csv_to_report(work):
     (work / "tracks.csv").write_text("\n".join(rows))
     episode = "data/episodes/still/own.npz"
     run("data", "import", "clouds", "--gripper", "tracks.csv", "--out", episode, cwd=work)
-    run("simulate", "still", "--track", episode, "--set", "stretch=0.6", "--out", "again.npz", cwd=work)
+    run("simulate", "still", "--track", episode, "--set", "stretching=2.4", "--out", "again.npz", cwd=work)
     with np.load(work / "again.npz") as again:
         np.testing.assert_allclose(again["nodes"][:, [20, 24]], nodes[:, [20, 24]], atol=1e-6)
         np.testing.assert_allclose(again["nodes"], nodes, atol=5e-3)
@@ -491,7 +494,7 @@ def test_two_grippers_from_csv_to_report(work):
     assert f"--frames {len(times) - 1} covers all" in done.errors
     assert "of the recording's" not in run(*short, "--frames", len(times) - 1, cwd=work).errors
     (work / "params.yaml").write_text(
-        yaml.safe_dump({"scenarios": ["still"], "fit": {"solver": {"max_steps": 2}}, "evaluate": {"draws": 1}})
+        yaml.safe_dump({"scenes": ["still"], "fit": {"solver": {"max_steps": 2}}, "evaluate": {"draws": 1}})
     )
     staged("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes", cwd=work)
     staged("evaluate", "--params", "params.yaml", cwd=work)
@@ -509,8 +512,6 @@ def test_two_grippers_from_csv_to_report(work):
 
 
 def built_in_mesh(name):
-    from diffcloud.scene.scenarios import load_scenario
-
     return load_scenario(name).scene.mesh
 
 
@@ -518,8 +519,8 @@ def test_simulated_targets_are_whole_uniform_and_left_as_they_are(work):
     """The hidden parameters are recoverable in principle: at the truth only the sampling of the surface is left."""
     (work / "raw" / "scenes").mkdir(parents=True)
     (work / "raw" / "scenes" / "v.yaml").write_text("base: vest_hang\nframes: 3\nloss_frames: [2]\npoints: 900\n")
-    (work / "p.yaml").write_text(yaml.safe_dump({"scenarios": ["v"], "episodes": {"per_scenario": 3}}))
-    staged("episodes", "--params", "p.yaml", "--out", "recorded", cwd=work)
+    (work / "p.yaml").write_text(yaml.safe_dump({"scenes": ["v"], "synthesize": {"per_scenario": 3}}))
+    staged("synthesize", "--params", "p.yaml", "--out", "recorded", cwd=work)
     staged("preprocess", "--params", "p.yaml", "--out", "episodes", "recorded", cwd=work)
     for number in (1, 2, 3):
         recorded, kept = (
@@ -549,7 +550,8 @@ def test_rollouts_of_scene_files_carry_what_moves(work):
     data["obstacles"].append({"mesh": "meshes/ball.obj", "transform": {"translate": [0, 0, 0.08]}})
     data |= {"frame_steps": 2, "gravity": [0, 0, -1]}
     path = write_file(write_files(work), data)
-    command = ("simulate", path, "--frames", 3, "--set", "body_mass=2", "--out")
+    heavy = 2 * scene_named(str(path)).nominal("body_mass")
+    command = ("simulate", path, "--frames", 3, "--set", f"body_mass={heavy}", "--out")
     run(*command, "r.npz", cwd=work)
     for kind in ("obj", "ply"):
         run(*command, kind, "--format", kind, cwd=work)
@@ -571,9 +573,9 @@ def test_rollouts_of_scene_files_carry_what_moves(work):
 def test_synthetic_episodes_are_the_same_bytes_for_the_same_seed(work):
     (work / "raw" / "scenes").mkdir(parents=True)
     (work / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump(SMALL))
-    (work / "p.yaml").write_text(yaml.safe_dump({"scenarios": ["small"], "episodes": {"per_scenario": 1}}))
+    (work / "p.yaml").write_text(yaml.safe_dump({"scenes": ["small"], "synthesize": {"per_scenario": 1}}))
     for out in ("a", "b"):
-        staged("episodes", "--params", "p.yaml", "--out", out, cwd=work)
+        staged("synthesize", "--params", "p.yaml", "--out", out, cwd=work)
     first, second = (
         {path.relative_to(work / out): path.read_bytes() for path in (work / out).rglob("*") if path.is_file()}
         for out in ("a", "b")
@@ -587,17 +589,16 @@ class TestBadInput:
         ("params", "message"),
         [
             ({"fit": {"iteration": 3}}, "fit.iteration: unknown or unsupported field"),
-            ({"fit": {"bounds": {"stretch": [5, 1]}}}, "must be in order (low < high), got [5.0, 1.0]"),
-            ({"episodes": {"hidden_range": [3, 1]}}, "hidden_range must be in order"),
+            ({"fit": {"bounds": {"stretching": [5, 1]}}}, "must be in order (low < high), got [5.0, 1.0]"),
+            ({"synthesize": {"true_range": [3, 1]}}, "true_range must be in order"),
             ({"fits": {}}, "fits: unknown or unsupported field"),
             ({"fit": {"solver": "lbfgs"}}, "fit.solver"),
             ({"fit": {"solver": {"smoothing": 0.5}}}, "smoothing: unknown or unsupported field"),
             ({"fit": {"solver": {"max_simulations": 9}}}, "max_simulations: unknown or unsupported field"),
             ({"fit": {"uncertain": "bend=2x"}}, "Unknown parameter 'bend'"),
-            ({"fit": {"uncertain": "stretch=2x"}}, "stretch is fitted"),
-            ({"fit": {"uncertain": "drag=2x", "loss": "paper"}}, "the rest of the material is known"),
+            ({"fit": {"uncertain": "stretching=2x"}}, "stretching is fitted"),
+            ({"fit": {"uncertain": "air_density=2x", "loss": "paper"}}, "the rest of the material is known"),
             ({"fit": {"loss": "paper"}}, "the paper's loss has no likelihood"),
-            ({"evaluate": {"level": 0.8}}, "evaluate.level: now `fit.level`"),
         ],
     )
     def test_parameter_files(self, work, params, message):
@@ -623,9 +624,9 @@ class TestBadInput:
         for arguments, message in (
             (("lfit",), "Unknown scenario 'lfit'"),
             (("small.yaml", "--set", "weight=3"), "Unknown parameter 'weight'"),
-            (("small.yaml", "--set", "mass=heavy"), "takes NAME=NUMBER"),
-            (("small.yaml", "--set", "mass=nan"), "finite"),
-            (("small.yaml", "--set", "stretch=-1e9"), "--set stretch is a multiplier: above 0, got -1e+09"),
+            (("small.yaml", "--set", "density=heavy"), "takes NAME=NUMBER"),
+            (("small.yaml", "--set", "density=nan"), "finite"),
+            (("small.yaml", "--set", "stretching=-1e9"), "--set stretching must be above 0, got -1e+09"),
             (("small.yaml", "--set", "body_mass=2"), "body_mass has no effect in small"),
             (("none.json",), "No such file"),
         ):
@@ -634,10 +635,12 @@ class TestBadInput:
             assert not (work / "r.npz").exists()
 
     def test_a_diverged_rollout_names_step_and_parameters(self, work):
-        explodes = ("--set", "bending=1e6", "--set", "mass=1e-6", "--frames", 2)
+        own = load_scenario("vest_hang")
+        bending, density = 9e5 * own.nominal("bending"), 2e-6 * own.nominal("density")
+        explodes = ("--set", f"bending={bending:g}", "--set", f"density={density:g}", "--frames", 2)
         done = run("simulate", "vest_hang", *explodes, "--out", "r.npz", cwd=work, code=1)
         assert "diverged at step" in done.errors
-        assert "bending=1e+06, mass=1e-06" in done.errors
+        assert f"bending={bending:g}, density={density:g}" in done.errors
         assert not (work / "r.npz").exists()
 
     def test_a_disk_that_cannot_be_written(self, work):

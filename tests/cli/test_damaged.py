@@ -143,9 +143,8 @@ def test_clouds_in_millimetres_are_refused(work, rng):
 @pytest.mark.parametrize(
     "command",
     [
-        ("network", "generate", "--seed", "-3", "--scene", "small.yaml", "--out", "f"),
-        ("network", "train", "--seed", "-3", "--scene", "lift", "--out", "f", "d"),
         ("simulate", "small.yaml", "--frames", str(10**9), "--out", "r.npz"),
+        ("view", "e.npz", "--points", "-3", "--out", "v.html"),
     ],
 )
 def test_numbers_out_of_range_are_refused_by_name(work, command):
@@ -155,11 +154,11 @@ def test_numbers_out_of_range_are_refused_by_name(work, command):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("stretch=0", "is a multiplier: above 0, got 0"),
-        ("drag=-100", "is a multiplier: above 0, got -100"),
-        ("body_mass=-1", "is a multiplier: above 0, got -1"),
-        ("mass=1e300", "values from 1e-06 to 1e+06 are simulated"),
-        ("mass=1e-300", "values from 1e-06 to 1e+06 are simulated"),
+        ("stretching=0", "must be above 0, got 0; the lowest usual value is 0.4"),
+        ("air_density=-100", "must be above 0, got -100"),
+        ("body_mass=-1", "body_mass has no effect in small"),
+        ("density=1e300", "values from 2e-07 to 200000 are simulated"),
+        ("density=1e-300", "values from 2e-07 to 200000 are simulated"),
         ("damping=1e30", "values from 1e-06 to 1e+06 are simulated"),
     ],
 )
@@ -224,7 +223,7 @@ def test_joints_of_another_arm_are_pointed_out(work):
     assert (found.severity, found.message[:29]) == ("fault", "It has 3 joints, the Gen3 7: ")
     with as_file(files("diffcloud.sensing") / "gen3_robotiq_2f_85.urdf") as urdf:
         invoke("data", "check", folder, "--urdf", urdf, code=1)
-    (work / "params.yaml").write_text("scenarios: [lift]\n")
+    (work / "params.yaml").write_text("scenes: [lift]\n")
     assert "joints" in invoke("data", "preprocess", folder, "--params", "params.yaml", "--out", "cleaned", code=1).errors
 
 

@@ -42,7 +42,7 @@ def project(tmp_path) -> Path:
     stage = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"]["preprocess"]
     stage["deps"] = [name for name in stage["deps"] if not name.startswith(("diffcloud", "pipeline"))]
     (tmp_path / "dvc.yaml").write_text(yaml.safe_dump({"stages": {"preprocess": stage}}))
-    (tmp_path / "params.yaml").write_text(yaml.safe_dump({"scenarios": ["lift"], "preprocess": {"points": 50}}))
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump({"scenes": ["lift"], "preprocess": {"points": 50}}))
     clouds(tmp_path / "data/recorded/lift/hidden1.npz", 1)
     told(tmp_path, "git", "init", "--quiet")
     return tmp_path

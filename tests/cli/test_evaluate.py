@@ -26,18 +26,18 @@ from tests.estimation.test_fit import clouds_of
 
 ROOT = Path(__file__).parents[2]
 PARAMS = {
-    "scenarios": ["small"],
-    "train": {"scenarios": ["other"], "models": ["mlp"]},
+    "scenes": ["small"],
+    "train": {"scenes": ["other"], "models": ["mlp"]},
     "fit": {"solver": {"max_steps": 3, "starts": 2}},
     "evaluate": {"draws": 2, "landscapes": ["*/tan1"], "landscape_size": 3},
-    "report": {"overlay_points": 50},
+    "report": {"cloud_points": 50},
 }
 
 
 def recording(repeat, *, stretch=0.7):
     """As of a real fabric: its parameters are not told."""
     told = {"fabric": "tan", "category": "medium", "repeat": repeat}
-    return replace(clouds_of(small_lift(), seed=repeat, stretch=stretch, mass=1.0), meta=told)
+    return replace(clouds_of(small_lift(), seed=repeat, stretching=stretch, density=1.0), meta=told)
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_tables_hold_methods_repeats_and_transfer(work):
     methods = tables["methods"][tables["methods"]["status"] == "ok"]
     assert set(methods["method"]) == {"diffcloud", "single_start", "middle", "random_search", "cma_es"}
     assert tables["transfer"][["source", "target"]].to_numpy().tolist() == [["tan2", "tan1"], ["tan1", "tan2"]]
-    assert set(tables["repeatability"]["parameter"]) == {"stretch", "mass", "ratio"}
+    assert set(tables["repeatability"]["parameter"]) == {"stretching", "density", "ratio"}
     assert len(tables["intervals"]) == 4
     metrics = json.loads((work / "reports" / "metrics.json").read_text())["small"]
     means = tables["means"].set_index("method")["rms_mm"]
@@ -128,7 +128,7 @@ def test_recordings_of_a_joint_fit_are_compared_each_as_it_lay(work):
     for one, other in zip(fit.episodes, fit.episodes[::-1], strict=True):
         own = json.loads((work / "reports" / "episodes" / "small" / f"{one.name}.json").read_text())["record"]
         (transfer,) = own["transfers"]  # of the other's own fit, not of the joint one, which has seen this recording
-        assert transfer["clipped"]["stretch"] == pytest.approx(alone[other.name].values["stretch"])
+        assert transfer["clipped"]["stretching"] == pytest.approx(alone[other.name].values["stretching"])
         kept = work / "reports" / "episodes" / "small" / f"joint-{one.name}.json"
         record = json.loads(kept.read_text())["record"]
         row = next(row for row in record["methods"] if row["method"] == "diffcloud")
@@ -160,7 +160,7 @@ def test_two_processes_give_what_one_gives(work):
 
 
 def test_a_missing_network_is_a_labelled_gap(work):
-    (work / "params.yaml").write_text(yaml.safe_dump(PARAMS | {"train": {"scenarios": ["small"], "models": ["mlp"]}}))
+    (work / "params.yaml").write_text(yaml.safe_dump(PARAMS | {"train": {"scenes": ["small"], "models": ["mlp"]}}))
     failed = stage("evaluate", "--params", "params.yaml", code=1)
     assert "small/tan1: mlp: no checkpoint data/regressors/small/mlp.safetensors" in failed.errors
     table = pd.read_csv(work / "reports/tables/methods.csv")
@@ -177,7 +177,7 @@ def test_a_missing_network_is_a_labelled_gap(work):
 def test_a_fit_that_cannot_be_simulated_is_told_and_the_others_go_on(work):
     path = work / "data/fits/small/tan1.json"
     fit = json.loads(path.read_text())
-    fit["parameters"]["mass"] |= {"value": 1e-9, "bounds": [1e-10, 10]}
+    fit["parameters"]["density"] |= {"multiplier": 1e-9, "bounds": [1e-10, 10]}
     path.write_text(json.dumps(fit))
     failed = stage("evaluate", "--params", "params.yaml", code=1)
     told = failed.errors.rpartition("└")[2]  # after progress and tables
@@ -191,15 +191,17 @@ def test_episodes_may_be_called_by_numbers_and_a_bound_be_zero(tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     (tmp_path / "small.yaml").write_text(yaml.safe_dump(SMALL))
     changes = {
-        "scenarios": ["small.yaml"],
-        "fit": {"parameters": ["stretch", "damping"], "solver": {"starts": 1, "max_steps": 1}},
+        "scenes": ["small.yaml"],
+        "fit": {"parameters": ["stretching", "damping"], "solver": {"starts": 1, "max_steps": 1}},
     }
-    changes["evaluate"] = PARAMS["evaluate"] | {"landscapes": ["small/001"], "rivals": ["middle"]}
-    (tmp_path / "params.yaml").write_text(yaml.safe_dump(PARAMS | changes | {"scenarios": ["small"]}))
+    changes["evaluate"] = PARAMS["evaluate"] | {"landscapes": ["small/001"], "baselines": ["middle"]}
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump(PARAMS | changes | {"scenes": ["small"]}))
     (tmp_path / "raw" / "scenes").mkdir(parents=True)
     (tmp_path / "small.yaml").rename(tmp_path / "raw" / "scenes" / "small.yaml")
-    hidden = clouds_of(small_lift(), seed=1, stretch=0.7, mass=1.0)
-    write_episode(tmp_path / "data/episodes/small/001.npz", replace(hidden, meta={"truth": {"stretch": 0.7, "mass": 1.0}}))
+    hidden = clouds_of(small_lift(), seed=1, stretching=0.7, density=1.0)
+    write_episode(
+        tmp_path / "data/episodes/small/001.npz", replace(hidden, meta={"truth": {"stretching": 0.7, "density": 1.0}})
+    )
     stage("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
     stage("evaluate", "--params", "params.yaml")
     stage("report", "--params", "params.yaml")
@@ -220,9 +222,9 @@ def test_profiles_are_whole_parameter_files():
 
     root = Path(__file__).parents[2]
     assert load_config(root / "pipeline" / "profiles" / "release.yaml").fit.solver.starts == 9
-    assert load_config(root / "pipeline" / "profiles" / "simulated.yaml").episodes.per_scenario == 10
+    assert load_config(root / "pipeline" / "profiles" / "simulated.yaml").synthesize.per_scenario == 10
     paper = load_config(root / "pipeline" / "profiles" / "paper.yaml")
-    assert (paper.simulate.train, paper.simulate.test, paper.episodes.per_scenario) == (1500, 375, 10)
+    assert (paper.generate.train, paper.generate.test, paper.synthesize.per_scenario) == (1500, 375, 10)
 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -24,22 +24,22 @@ MATERIAL = {"density_kg_m2": 0.2, "stretching_n_m": 50.0, "bending_n_m": 1e-5, "
 def fitted(tmp_path_factory):
     """A joint fit beside its scenario, as `fit` leaves it, and intervals of it."""
     root = tmp_path_factory.mktemp("fitted")
-    (root / "scenarios").mkdir()
-    (root / "scenarios" / "small.yaml").write_text(yaml.safe_dump({**SMALL, "material": MATERIAL}))
+    (root / "scenes").mkdir()
+    (root / "scenes" / "small.yaml").write_text(yaml.safe_dump({**SMALL, "material": MATERIAL}))
     for name, stretch in (("e1", 0.7), ("e2", 0.8)):
-        write_episode(root / f"{name}.npz", clouds_of(small_lift(), stretch=stretch, mass=1.0))
+        write_episode(root / f"{name}.npz", clouds_of(small_lift(), stretching=stretch, density=1.0))
     with contextlib.chdir(root):
-        options = ("--scene", "scenarios/small.yaml", "--parameters", "stretch,bending", "--out", ".")
+        options = ("--scene", "scenes/small.yaml", "--parameters", "stretching,bending", "--out", ".")
         invoke("fit", *options, "--max-steps", 1, "e1.npz", "e2.npz")
     told = {
         "level": 0.9, "within": 1.5, "ratio": None, "best": None, "worst": None, "sources": {},
-        "covariance": [[0.04, 0.0], [0.0, 0.01]], "explains": True, "reason": "",
+        "covariance": [[0.04, 0.0], [0.0, 0.01]], "fits_to_noise": True, "reason": "",
         "parameters": {
             name: {
-                "value": 1.0, "low": 0.5, "high": 2.0, "physical": 1.0, "physical_low": 0.5,
-                "physical_high": 2.0, "physical_unit": "", "factor": 2.0, "at_bounds": [], "verdict": "identified",
+                "value": nominal, "low": 0.5 * nominal, "high": 2 * nominal, "unit": unit, "nominal": nominal,
+                "factor": 2.0, "at_bounds": [], "status": "identified",
             }
-            for name in ("stretch", "bending")
+            for name, nominal, unit in (("stretching", 50.0, "N/m"), ("bending", 1e-5, "N·m"))
         },
     }  # fmt: skip
     (root / "intervals.json").write_text(json.dumps(told))
@@ -60,7 +60,7 @@ def test_a_fit_finds_its_scenario_and_says_what_it_leaves_out(work):
     record = json.loads((work / "fit.json").read_text())
     assert told["recording"] == "e2"
     assert told["material"] == record["material"]
-    assert told["isotropic_sheet"]["stretching_n_m"] == pytest.approx(record["parameters"]["stretch"]["physical"])
+    assert told["isotropic_sheet"]["stretching_n_m"] == pytest.approx(record["parameters"]["stretching"]["value"])
     assert told["left_out"] == done.result["left_out"]
     assert "There is no air" in done.errors
     assert len(done.result["simplified_rms_mm"]) == 6
@@ -74,12 +74,12 @@ def test_the_first_recording_is_the_default_and_said(work):
 def test_samples_spread_as_the_intervals_do(work):
     done = invoke("export", "fit.json", "--to", "obj", "--samples", 200, "--seed", 3, "--out", "out")
     assert len(list((work / "out").glob("sample_*/cloth.json"))) == 200
-    logs = np.log([[drawn["stretch"], drawn["bending"]] for drawn in done.result["samples"]])
+    logs = np.log([[drawn["stretching"] / 50, drawn["bending"] / 1e-5] for drawn in done.result["samples"]])
     np.testing.assert_allclose(logs.std(axis=0), [0.2, 0.1], rtol=0.2)
     np.testing.assert_allclose(logs.mean(axis=0), 0.0, atol=0.06)
     last = json.loads((work / "out" / "sample_0199" / "cloth.json").read_text())
-    assert last["parameters"]["stretch"] == done.result["samples"][-1]["stretch"]
-    assert last["isotropic_sheet"]["stretching_n_m"] == pytest.approx(50 * last["parameters"]["stretch"])
+    assert last["parameters"]["stretching"] == done.result["samples"][-1]["stretching"]
+    assert last["isotropic_sheet"]["stretching_n_m"] == pytest.approx(last["parameters"]["stretching"])
     again = invoke("export", "fit.json", "--to", "obj", "--samples", 3, "--seed", 3, "--out", "again")
     assert again.result["samples"] == done.result["samples"][:3]
 
@@ -109,7 +109,7 @@ class TestRefusals:
         assert not (work / "out").exists() or not any((work / "out").iterdir())
 
     def test_a_scenario_that_is_not_there(self, work):
-        shutil.rmtree(work / "scenarios")
+        shutil.rmtree(work / "scenes")
         assert "Put its YAML file into" in invoke("export", "fit.json", "--to", "obj", "--out", "o", code=1).errors
 
     def test_a_missing_motion(self, work):
@@ -132,7 +132,7 @@ class TestRefusals:
         assert "holds no intervals" in invoke(*command, code=1).errors
         del told["parameters"]["bending"]
         (work / "intervals.json").write_text(json.dumps(told))
-        assert "holds intervals of stretch; the fit is of stretch, bending" in invoke(*command, code=1).errors
+        assert "holds intervals of stretching; the fit is of stretching, bending" in invoke(*command, code=1).errors
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -143,8 +143,8 @@ def test_the_export_runs_and_moves_as_fitted(target, tmp_path, monkeypatch):
     """A lift of two and a half seconds. After 1.2 s the cloth buckles, one way or the other."""
     pytest.importorskip(target)
     monkeypatch.chdir(tmp_path)
-    write_episode(tmp_path / "lift.npz", clouds_of(load_scenario("lift"), stretch=1.2, mass=0.45))
-    quick = ("--starts", 1, "--max-steps", 1, "--init", "stretch=1.2,mass=0.45")
+    write_episode(tmp_path / "lift.npz", clouds_of(load_scenario("lift"), stretching=1.2, density=0.45))
+    quick = ("--starts", 1, "--max-steps", 1, "--init", "stretching=4.8,density=0.09")
     invoke("fit", "--scene", "lift", "--out", ".", *quick, "lift.npz")
     done = invoke("export", "fit.json", "--to", target, "--check", "--out", "out")
     assert done.result["strip_error"] < 0.05

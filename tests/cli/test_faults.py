@@ -63,7 +63,7 @@ def work(tmp_path, monkeypatch):
     (tmp_path / "raw" / "scenes").mkdir(parents=True)
     (tmp_path / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump(SMALL))
     params = {
-        "scenarios": ["small"],
+        "scenes": ["small"],
         "preprocess": {"outlier_neighbours": 5},
         "train": {"profile": "quick", "epochs": 2, "points": 24},
         "fit": {"solver": {"max_steps": 1}},
@@ -71,7 +71,7 @@ def work(tmp_path, monkeypatch):
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(params))
     (tmp_path / "joint.yaml").write_text(yaml.safe_dump({**params, "fit": {**params["fit"], "joint": True}}))
     for number in (1, 2):
-        episode = clouds_of(small_lift(), stretch=0.7 * number, mass=1.0)
+        episode = clouds_of(small_lift(), stretching=0.7 * number, density=1.0)
         write_episode(tmp_path / "data" / "episodes" / "small" / f"e{number}.npz", episode)
     (tmp_path / "clouds").mkdir()
     for index in range(episode.frame_count):

@@ -39,7 +39,12 @@ def work(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def whole(work) -> Path:
     said = run_process(*SET, "--workers", 0, "--out", "whole", cwd=work)
-    assert (said["train"], said["test"], said["resumed"], said["parameters"]) == (2 * CHUNK + 8, 18, 0, ["stretch", "mass"])
+    assert (said["train"], said["test"], said["resumed"], said["parameters"]) == (
+        2 * CHUNK + 8,
+        18,
+        0,
+        ["stretching", "density"],
+    )
     assert said["replaced"] == {"train": 0, "test": 0}
     return work / "whole"
 
@@ -95,20 +100,20 @@ def test_settings_come_from_the_parameter_file_and_options_win(work):
         "train": 2,
         "test": 5,
         "distribution": "sobol",
-        "parameters": ["mass", "bending"],
-        "scenarios": ["small.yaml"],
+        "parameters": ["density", "bending"],
+        "scenes": ["small.yaml"],
     }
-    (work / "params.yaml").write_text(yaml.safe_dump({"simulate": section}))
+    (work / "params.yaml").write_text(yaml.safe_dump({"generate": section}))
     done = run_process(
         "network", "generate", "--params", "params.yaml", "--scene", "small.yaml", "--test", 0, "--export-clouds",
-        "--uncertain", "drag=1.3x", "--out", "few", cwd=work,
+        "--uncertain", "air_density=1.3x", "--out", "few", cwd=work,
     )  # fmt: skip
-    assert json.loads((work / "few" / "set.json").read_text())["uncertain"] == {"drag": 1.3}
+    assert json.loads((work / "few" / "set.json").read_text())["uncertain"] == {"air_density": 1.3}
     assert {key: done[key] for key in ("train", "test", "draws", "parameters")} == {
-        "train": 2, "test": 0, "draws": "sobol", "parameters": ["mass", "bending"],
+        "train": 2, "test": 0, "draws": "sobol", "parameters": ["density", "bending"],
     }  # fmt: skip
     assert np.load(work / "few" / "clouds" / "train" / "1" / "005.npy").shape == (200, 3)
-    assert SimulatedSet.read(work / "few", "train").names == ("mass", "bending")
+    assert SimulatedSet.read(work / "few", "train").names == ("density", "bending")
 
 
 @pytest.mark.parametrize(
@@ -117,8 +122,8 @@ def test_settings_come_from_the_parameter_file_and_options_win(work):
         (("--parameters", "weight"), "Unknown parameter 'weight'"),
         (("--distribution", "gauss"), "distribution: Input should be 'uniform', 'sobol', 'logarithmic' or 'modes'"),
         (("--distribution", "modes"), "not for 'small'"),
-        (("--uncertain", "stretch=1.5x"), "leave out stretch"),
-        (("--uncertain", "drag=0.5x"), "drag takes the factor within which it is known"),
+        (("--uncertain", "stretching=1.5x"), "leave out stretching"),
+        (("--uncertain", "air_density=0.5x"), "air_density takes the factor within which it is known"),
         (("--train", "-1"), "train: "),
         (("--train", "0", "--test", "0"), "at least one run"),
         (("--out", "."), "holds something else than a simulated set"),

@@ -16,7 +16,7 @@ from diffcloud.scene.scenarios import SCENARIO_NAMES
 
 LEAVES = [[name] for name in COMMANDS if name not in ("data", "network")]
 LEAVES += [["data", name] for name in DATA] + [["network", name] for name in NETWORK]
-STAGES = ("episodes", "preprocess", "simulate", "fit", "train", "evaluate", "report")
+STAGES = ("synthesize", "preprocess", "generate", "fit", "train", "evaluate", "report")
 HEAVY = {"torch", "numba", "open3d", "pandas", "scipy"}
 
 

@@ -17,7 +17,7 @@ from diffcloud.scene.scenarios import load_scenario
 from tests.cli.invoke import invoke
 from tests.estimation.test_fit import clouds_of
 
-TRUTH = {"stretch": 0.6, "mass": 1.7}
+TRUTH = {"stretching": 0.6, "density": 1.7}
 SCENARIO = {
     "base": "lift",
     "nodes": [5, 5],
@@ -29,7 +29,7 @@ SCENARIO = {
     "path": [[0, 0, 0, 0], [0.8, 0, -0.1, 0.25]],
 }
 OPTIONS = (
-    "--scene", "small.yaml", "--parameters", "stretch", "--fix", "mass=1.7", "--uncertain", "bending=1.5x",
+    "--scene", "small.yaml", "--parameters", "stretching", "--fix", "density=0.34", "--uncertain", "bending=1.5x",
 )  # fmt: skip
 
 
@@ -55,35 +55,35 @@ def test_the_record_has_what_the_fit_knows():
     record = read_fit(Path("fits/fit.json"))
     told = record.estimate
     assert record.solver == "likelihood"
-    assert set(told.mean) == {"stretch"}
+    assert set(told.mean) == {"stretching"}
     assert {"recording", "prior", "bending", "turn", "pose", "mesh", "time step", "starts"} == set(told.sources)
     assert sum(told.weights) == pytest.approx(1.0)
-    assert [len(one.misfits) for one in told.recordings] == [len(one.frames) for one in record.episodes]
+    assert [len(one.chi_squares) for one in told.recordings] == [len(one.frames) for one in record.episodes]
     assert all(one.left_out.rms_mm < 1.5 * one.rms_mm for one in record.episodes)
 
 
 def test_intervals_are_those_of_the_record():
     told = json.loads(Path("fits/intervals.json").read_text())
     record = read_fit(Path("fits/fit.json"))
-    entry, variance = told["parameters"]["stretch"], sum(part[0][0] for part in record.estimate.sources.values())
-    assert entry["value"] == pytest.approx(record.estimate.mean["stretch"])
+    entry, variance = told["parameters"]["stretching"], sum(part[0][0] for part in record.estimate.sources.values())
+    assert entry["value"] == pytest.approx(record.estimate.mean["stretching"] * entry["nominal"])
     assert entry["high"] / entry["value"] == pytest.approx(entry["value"] / entry["low"])
     assert entry["high"] / entry["value"] == pytest.approx(2.718281828 ** (1.6448536 * variance**0.5), rel=1e-4)
-    assert entry["low"] < TRUTH["stretch"] < entry["high"]
-    assert told["explains"]
+    assert entry["low"] < TRUTH["stretching"] * entry["nominal"] < entry["high"]
+    assert told["fits_to_noise"]
 
 
 def test_a_recording_that_the_model_does_not_follow_is_told(tmp_path):
     data = json.loads(Path("fits/fit.json").read_text())
     for one in data["estimate"]["recordings"]:
-        one["misfits"] = [25.0] * len(one["misfits"])
+        one["chi_squares"] = [25.0] * len(one["chi_squares"])
     path = tmp_path / "fit.json"
     path.write_text(json.dumps(data))
     record = read_fit(path)
     told = intervals_of(record, space_of(record), load_scenario("small.yaml"))
-    assert not told.explains
+    assert not told.fits_to_noise
     assert "in one the cloth is 5.0 times as far from the recording" in told.reason
-    assert told.parameters["stretch"].verdict == "the model does not explain the recording"
+    assert told.parameters["stretching"].status == "model_error"
 
 
 @pytest.mark.parametrize(

@@ -142,7 +142,7 @@ class Process:
 
 @pytest.mark.parametrize(
     ("section", "name"),
-    [*((one, "workers") for one in ("episodes", "preprocess", "fit", "train", "evaluate")), ("train", "loaders")],
+    [*((one, "workers") for one in ("synthesize", "preprocess", "fit", "train", "evaluate")), ("train", "loaders")],
 )
 def test_a_number_of_workers_is_no_parameter(tmp_path, section, name):
     """It would make a stage stale, and change nothing but the time."""

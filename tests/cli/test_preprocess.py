@@ -21,8 +21,8 @@ from tests.sensing.test_validation import edit_json
 @pytest.fixture
 def params(tmp_path) -> Path:
     path = tmp_path / "params.yaml"
-    raw = {"flying_m": SETTINGS["flying_m"], "workspace_m": [list(corner) for corner in SETTINGS["workspace_m"]]}
-    settings = {"scenarios": ["lift"], "preprocess": {"raw": raw, "points": 800, "thinning": "voxel", "radius_m": 0.03}}
+    raw = {"depth_jump_m": SETTINGS["depth_jump_m"], "workspace_m": [list(corner) for corner in SETTINGS["workspace_m"]]}
+    settings = {"scenes": ["lift"], "preprocess": {"raw": raw, "points": 800, "downsampling": "voxel", "radius_m": 0.03}}
     path.write_text(yaml.safe_dump(settings), encoding="utf-8")
     return path
 
@@ -106,7 +106,7 @@ def test_bad_robots_and_places(tmp_path, params):
 def several(tmp_path) -> Path:
     """params.yaml of both scenarios that have depth cameras."""
     path = tmp_path / "several.yaml"
-    path.write_text(yaml.safe_dump({"scenarios": ["lift", "fold"], "preprocess": {"points": 100}}), encoding="utf-8")
+    path.write_text(yaml.safe_dump({"scenes": ["lift", "fold"], "preprocess": {"points": 100}}), encoding="utf-8")
     return path
 
 
@@ -143,7 +143,7 @@ def test_recordings_are_found_where_raw_says(tmp_path, several, params):
     clouds(tmp_path / "recorded/lift/hidden1.npz")
     board = write_cloth_episode(raw / "episodes/board", frames=1).folder
     edit_json(board / "episode.json", scenario=None)
-    settings = {**yaml.safe_load(params.read_text()), "scenarios": ["lift", "fold"]}
+    settings = {**yaml.safe_load(params.read_text()), "scenes": ["lift", "fold"]}
     params.write_text(yaml.safe_dump(settings))
     done = invoke("data", "preprocess", tmp_path / "recorded", raw, "--out", tmp_path / "out", "--params", params)
     assert set(done.result["points"]) == {"lift/hidden1", "lift/tan1", "lift/tan2", "fold/tan3"}
@@ -196,7 +196,7 @@ def two_views(tmp_path_factory) -> Path:
 
 
 def _align(work, cameras, **settings) -> Path:
-    text = yaml.safe_dump({"scenarios": ["lift"], "preprocess": {"align_cameras": list(cameras), **settings}})
+    text = yaml.safe_dump({"scenes": ["lift"], "preprocess": {"align_cameras": list(cameras), **settings}})
     (work / "params.yaml").write_text(text, encoding="utf-8")
     return work / "params.yaml"
 
@@ -220,7 +220,7 @@ def test_two_cameras_are_aligned_and_the_meta_says_so(two_views):
 
 
 def test_without_the_setting_points_stay(two_views, tmp_path):
-    (tmp_path / "params.yaml").write_text("scenarios: [lift]\npreprocess: {points: null, outlier_neighbours: 0}\n")
+    (tmp_path / "params.yaml").write_text("scenes: [lift]\npreprocess: {points: null, outlier_neighbours: 0}\n")
     invoke("data", "preprocess", two_views / "raw", "--params", tmp_path / "params.yaml", "--out", tmp_path / "out")
     episode, before = read_episode(tmp_path / "out" / "lift" / "one.npz"), recording(noise_m=0.0005, frames=12)
     np.testing.assert_array_equal(episode.points, before.points)

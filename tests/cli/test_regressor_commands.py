@@ -83,14 +83,14 @@ def work(tmp_path, monkeypatch):
     (tmp_path / "raw" / "scenes").mkdir(parents=True)
     (tmp_path / "raw" / "scenes" / "small.yaml").write_text(yaml.safe_dump(SMALL))
     params = {
-        "scenarios": ["small"],
+        "scenes": ["small"],
         "train": {"profile": "quick", "epochs": 2, "points": 24},
         "fit": {"solver": {"max_steps": 1}},
         "evaluate": {"draws": 1},
     }
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(params))
     for number in (1, 2):
-        clouds = clouds_of(small_lift(), stretch=0.7 * number, mass=1.0)
+        clouds = clouds_of(small_lift(), stretching=0.7 * number, density=1.0)
         write_episode(tmp_path / "data" / "episodes" / "small" / f"e{number}.npz", clouds)
     sets = {"train": sagging_sheet(24, scenario="small"), "test": sagging_sheet(10, seed=1, scenario="small")}
     write_simulated(tmp_path / "sim", sets, about={}, replaced="")
@@ -114,7 +114,7 @@ def test_trainings_that_cannot_be(work, monkeypatch, settings, message):
 def test_train_then_predict(work):
     trained = result(run(*TRAIN, "--seed", 5, "--json"))["models"]["mlp"]
     assert trained["epochs"] == 2
-    assert set(trained["held_out"]["parameters"]) == {"stretch", "mass"}
+    assert set(trained["held_out"]["parameters"]) == {"stretching", "density"}
     summary = json.loads((work / "data/regressors/small/mlp/training.json").read_text())
     assert summary["history"] == trained["history"]
     assert Regressor.read(work / CHECKPOINT).description.training["settings"]["seed"] == 5
@@ -122,10 +122,10 @@ def test_train_then_predict(work):
     found = result(done)
     assert set(found) == {"e1", "e2"}
     for values in found.values():
-        low, high = values["interval"]["mass"]
-        assert low < values["mass"] < high
-        assert 0.1 <= values["clipped"]["stretch"] <= 10
-        assert values["outside"] == [name for name in ("stretch", "mass") if not 0.1 <= values[name] <= 10]
+        low, high = values["interval"]["density"]
+        assert low < values["density"] < high
+        assert 0.1 <= values["clipped"]["stretching"] <= 10
+        assert values["outside"] == [name for name in ("stretching", "density") if not 0.1 <= values[name] <= 10]
 
 
 def test_clouds_show_what_the_cameras_of_a_recording_see(work, monkeypatch):
@@ -156,9 +156,9 @@ def test_values_outside_the_bounds_are_shown_and_told(work):
     beyond.write(work / CHECKPOINT)
     done = run("network", "predict", "--checkpoint", CHECKPOINT, "--json", "data/episodes/small/e1.npz")
     values = result(done)["e1"]
-    assert values["stretch"] > 10
-    assert values["clipped"] == {"stretch": 10, "mass": 10}
-    assert values["outside"] == ["stretch", "mass"]
+    assert values["stretching"] > 10
+    assert values["clipped"] == {"stretching": 10, "density": 10}
+    assert values["outside"] == ["stretching", "density"]
     assert "Outside the bounds" in done.stderr
 
 
@@ -190,7 +190,9 @@ def test_a_fit_starts_from_a_prediction_and_the_report_shows_both(work):
     done = run("pipeline.evaluate", "--params", "params.yaml", "--json")
     table = pd.read_csv(work / "reports/tables/predictions.csv")
     assert table[["episode", "model"]].to_numpy().tolist() == [["e1", "mlp"], ["e2", "mlp"]]
-    assert table["predicted_mass"].tolist() == pytest.approx([values["mass"] for values in predicted.values()], rel=1e-5)
+    assert table["predicted_density"].tolist() == pytest.approx(
+        [values["density"] for values in predicted.values()], rel=1e-5
+    )
     fits = pd.read_csv(work / "reports/tables/fits.csv")
     assert table["loss"].tolist() == pytest.approx(fits["loss_start"].tolist(), rel=1e-4)  # the same simulation
     assert result(done)["metrics"]["regressors"]["small"]["mlp"]["loss"] == pytest.approx(table["loss"].mean())
@@ -242,13 +244,13 @@ def test_without_a_scenario_those_of_the_parameters_are_trained(work):
     write_simulated(work / "sims" / "other", sets, about={}, replaced="")
     (work / "sim").rename(work / "sims" / "small")
     params = yaml.safe_load((work / "params.yaml").read_text())
-    params["train"] |= {"scenarios": ["small", "other"], "models": ["mlp"], "epochs": 1}
+    params["train"] |= {"scenes": ["small", "other"], "models": ["mlp"], "epochs": 1}
     (work / "params.yaml").write_text(yaml.safe_dump(params))
     train = ("network", "train", "--params", "params.yaml", "--data", "sims", "--out", "data/regressors", "--json")
     assert list(result(run(*train))["models"]) == ["small/mlp", "other/mlp"]
     assert Regressor.read(work / "data/regressors/other/mlp.safetensors").description.scenario == "other"
     (work / "data/regressors/other/notes.txt").write_text("mine")
-    params["train"]["scenarios"] = ["small"]
+    params["train"]["scenes"] = ["small"]
     (work / "params.yaml").write_text(yaml.safe_dump(params))
     run(*train)  # leaves what training these alone would leave, and what it did not write
     assert [path.name for path in (work / "data/regressors/other").rglob("*")] == ["notes.txt"]
@@ -258,7 +260,7 @@ def test_without_a_scenario_those_of_the_parameters_are_trained(work):
 def test_without_a_scenario_those_of_the_parameters_are_fitted(work):
     options = yaml.safe_load((work / "raw/scenes/small.yaml").read_text())
     (work / "raw/scenes/other.yaml").write_text(yaml.safe_dump(options))
-    params = yaml.safe_load((work / "params.yaml").read_text()) | {"scenarios": ["small", "other"]}
+    params = yaml.safe_load((work / "params.yaml").read_text()) | {"scenes": ["small", "other"]}
     (work / "params.yaml").write_text(yaml.safe_dump(params))
     fit = ("pipeline.fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
     done = run(*fit, "--json")

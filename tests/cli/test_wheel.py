@@ -64,10 +64,12 @@ def test_it_is_the_installed_one(installed, tmp_path):
 def test_it_checks_itself_and_fits(installed, tmp_path):
     (tmp_path / "small.yaml").write_text(yaml.safe_dump(SCENARIO))
     write_episode(
-        tmp_path / "e1.npz", clouds_of(load_scenario(tmp_path / "small.yaml"), points=2000, stretch=0.7, mass=1.0)
+        tmp_path / "e1.npz", clouds_of(load_scenario(tmp_path / "small.yaml"), points=2000, stretching=0.7, density=1.0)
     )
     assert json.loads(run(installed, tmp_path, "-m", "diffcloud", "doctor", "--json").splitlines()[-1])
-    options = ["--scene", "small.yaml", "--parameters", "stretch", "--fix", "mass=1", "--starts", "1", "--out", "fits"]
-    told = json.loads(run(installed, tmp_path, "-m", "diffcloud", "fit", *options, "e1.npz", "--json").splitlines()[-1])
-    assert 0.3 < told["parameters"]["stretch"]["value"] < 1.5
+    options = ["--scene", "small.yaml", "--parameters", "stretching", "--fix", "density=0.2", "--starts", "1"]
+    told = json.loads(
+        run(installed, tmp_path, "-m", "diffcloud", "fit", *options, "--out", "fits", "e1.npz", "--json").splitlines()[-1]
+    )
+    assert 1.2 < told["parameters"]["stretching"]["value"] < 6
     assert (tmp_path / "fits" / "fit.json").is_file()

@@ -10,7 +10,7 @@ import pytest
 from diffcloud.datasets.draws import MODES, ParameterBox, ParameterDraws
 from diffcloud.errors import ConfigError
 
-BOX = ParameterBox.build(["stretch", "mass"])
+BOX = ParameterBox.build(["stretching", "density"])
 
 
 def draws(kind, scenario="band_stretch", *, box=BOX, seed=0) -> ParameterDraws:
@@ -40,7 +40,7 @@ def test_logarithmic_draws_fill_every_factor_alike():
 
 
 def test_logarithmic_draws_are_uniform_where_the_bounds_begin_at_zero():
-    box = ParameterBox.build(["mass", "damping"], {"mass": (0.1, 10.0), "damping": (0.0, 3.0)})
+    box = ParameterBox.build(["density", "damping"], {"density": (0.1, 10.0), "damping": (0.0, 3.0)})
     halves = (draws("logarithmic", box=box).first("train", 1024) > [1.0, 1.5]) @ [1, 2]
     assert np.bincount(halves) == pytest.approx([256] * 4, abs=60)
 
@@ -66,7 +66,7 @@ def test_modes_of_the_band_are_as_likely_as_published():
 
 
 def test_columns_follow_the_names():
-    swapped = draws("modes", box=ParameterBox.build(["mass", "stretch"])).first("train", 50)
+    swapped = draws("modes", box=ParameterBox.build(["density", "stretching"])).first("train", 50)
     np.testing.assert_array_equal(swapped[:, ::-1], draws("modes").first("train", 50))
 
 
@@ -81,7 +81,7 @@ def test_a_replacement_depends_on_run_and_attempt(kind):
 
 
 def test_other_material_is_off_by_its_factor_whatever_else_is_drawn():
-    plain, varied = draws("uniform"), replace(draws("uniform"), uncertain={"bending": 1.5, "drag": 1.1})
+    plain, varied = draws("uniform"), replace(draws("uniform"), uncertain={"bending": 1.5, "air_density": 1.1})
     np.testing.assert_array_equal(plain.first("train", 50), varied.first("train", 50))
     assert plain.uncertain_factors("train", 0, 0) == {}
     found = np.log([list(varied.uncertain_factors("train", run, 0).values()) for run in range(800)])
@@ -95,7 +95,7 @@ def test_other_material_is_off_by_its_factor_whatever_else_is_drawn():
 
 
 def test_bounds_of_a_scenario_count():
-    box = ParameterBox.build(["mass"], {"mass": (2.0, 3.0), "stretch": (0.0, 1.0)})
+    box = ParameterBox.build(["density"], {"density": (2.0, 3.0), "stretching": (0.0, 1.0)})
     drawn = draws("uniform", box=box).first("test", 100)
     assert 2 <= drawn.min() < drawn.max() <= 3
 
@@ -105,11 +105,11 @@ def test_bounds_of_a_scenario_count():
     [
         (lambda: ParameterBox.build(["weight"]), "Unknown parameter 'weight'"),
         (lambda: ParameterBox.build([]), "at least one"),
-        (lambda: ParameterBox.build(["mass", "mass"]), "listed twice"),
+        (lambda: ParameterBox.build(["density", "density"]), "listed twice"),
         (lambda: draws("modes", "towel"), "not for 'towel'; use --distribution"),
-        (lambda: draws("modes", box=ParameterBox.build(["mass", "bending"])), "draw stretch and mass, not mass, bending"),
-        (lambda: ParameterDraws(BOX, "uniform", "lift", 0, {"mass": 1.5}), "leave out mass"),
-        (lambda: draws("modes", box=ParameterBox.build(BOX.names, {"stretch": (0.01, 0.02)})).first("train", 3), "hardly"),
+        (lambda: draws("modes", box=ParameterBox.build(["density", "bending"])), "draw stretching and density"),
+        (lambda: ParameterDraws(BOX, "uniform", "lift", 0, {"density": 1.5}), "leave out density"),
+        (lambda: draws("modes", box=ParameterBox.build(BOX.names, {"stretching": (1e-2, 2e-2)})).first("train", 3), "hard"),
     ],
 )  # fmt: skip
 def test_bad_draws_are_refused(make, message):

@@ -20,7 +20,7 @@ from diffcloud.sim.simulate import rollout
 from diffcloud.sim.threads import use_threads
 from tests.conftest import small_lift
 
-BOX = ParameterBox.build(["stretch", "mass"])
+BOX = ParameterBox.build(["stretching", "density"])
 
 
 def plan(*, train=CHUNK + 4, test=3, seed=0, scenario=None) -> SimulationPlan:
@@ -67,18 +67,18 @@ def test_runs_are_those_of_a_plain_rollout(whole):
 
 
 def test_uncertain_material_of_a_run_is_simulated():
-    uncertain = {"bending": 2.0, "friction_obstacle": 1.5, "body_mass": 1.5}
+    uncertain = {"bending": 2.0, "friction": 1.5, "body_mass": 1.5}
     scenario = small_lift()
     assert scenario.value("bending") == 1.0
-    assert scenario.value("friction_obstacle") > 0
+    assert scenario.value("friction") > 0
     assert scenario.value("body_mass") == 0.0  # there are none, and nothing is drawn
-    draws = ParameterDraws(ParameterBox.build(["stretch", "mass"]), "uniform", scenario.name, 0, uncertain)
+    draws = ParameterDraws(ParameterBox.build(["stretching", "density"]), "uniform", scenario.name, 0, uncertain)
     (chunk,) = chunks.chunks_of(draws, "test", 3)
     found = chunks.simulate_chunk(scenario, draws, chunk)
     system, _ = scenario.scene.build()
     factors = [draws.uncertain_factors("test", run, 0) for run in range(3)]
-    values = dict(zip(("stretch", "mass"), torch.as_tensor(found.parameters.T), strict=True))
-    for name in ("bending", "friction_obstacle"):
+    values = dict(zip(("stretching", "density"), torch.as_tensor(found.parameters.T), strict=True))
+    for name in ("bending", "friction"):
         values[name] = torch.tensor([scenario.value(name) * one[name] for one in factors], dtype=torch.float64)
     run = rollout(system, scenario.steps, properties=scenario.properties(system, values))
     expected = run.positions[:, :: scenario.scene.frame_steps].to(torch.float32)
@@ -198,7 +198,7 @@ def test_diverged_draws_are_recorded_and_replaced(whole, tmp_path, monkeypatch):
     assert table[["split", "run", "attempt", "step", "reason"]].to_numpy().tolist() == [
         ["train", 2, 0, 3, "on purpose"], ["train", 2, 1, 3, "on purpose"], ["train", CHUNK + 1, 0, 3, "on purpose"],
     ]  # fmt: skip
-    np.testing.assert_allclose(table["stretch"], doomed, rtol=1e-12)
+    np.testing.assert_allclose(table["stretching"], doomed, rtol=1e-12)
     expected = first.copy()
     expected[2], expected[CHUNK + 1] = draws.again("train", 2, 2), draws.again("train", CHUNK + 1, 1)
     train = SimulatedSet.read(tmp_path / "a", "train")  # which refuses NaN

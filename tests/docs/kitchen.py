@@ -25,12 +25,12 @@ from tests.sensing.table_scene import SERIALS, poses, write_table_episode
 from tests.sensing.test_calibration import write_board_episode
 
 PARAMS = {
-    "scenarios": ["lift"],
-    "episodes": {"per_scenario": 1, "image_size": [106, 60]},
-    "preprocess": {"raw": {"refine": False, "flying_m": 0.1}, "points": 300},
+    "scenes": ["lift"],
+    "synthesize": {"per_scenario": 1, "image_size": [106, 60]},
+    "preprocess": {"raw": {"refine": False, "depth_jump_m": 0.1}, "points": 300},
     "fit": {"solver": {"max_steps": 1, "starts": 1}, "points": 200},
-    "train": {"scenarios": ["fold"]},
-    "evaluate": {"draws": 1, "rivals": ["middle"]},
+    "train": {"scenes": ["fold"]},
+    "evaluate": {"draws": 1, "baselines": ["middle"]},
 }
 """In place of params.yaml and the profiles."""
 QUICK = {"base": "lift", "nodes": [5, 5], "frames": 5, "steps_per_frame": 1, "recorder": "whole_surface", "points": 200}
@@ -66,7 +66,7 @@ def lift_episode(folder: Path) -> None:
 def motions(folder: Path) -> None:
     """Two lifts and a fold of one cloth."""
     for name, scenario, seed in (("a", "lift", 1), ("b", "lift", 2), ("c", "fold", 3)):
-        write_episode(folder / f"{name}.npz", clouds_of(load_scenario(scenario), stretch=0.7, seed=seed))
+        write_episode(folder / f"{name}.npz", clouds_of(load_scenario(scenario), stretching=0.7, seed=seed))
 
 
 def board(folder: Path) -> None:
@@ -110,7 +110,7 @@ def lab(folder: Path) -> None:
 def fitted(folder: Path) -> None:
     """Episodes and fits of the pipeline, of a lift that takes a moment."""
     quick(folder)
-    stage("episodes", "--params", "params.yaml", "--out", "data/recorded")
+    stage("synthesize", "--params", "params.yaml", "--out", "data/recorded")
     invoke("data", "preprocess", "--params", "params.yaml", "--out", "data/episodes", "data/recorded")
     stage("fit", "--params", "params.yaml", "--out", "data/fits", "data/episodes")
     params(folder, "pipeline/profiles/release.yaml")
@@ -119,8 +119,8 @@ def fitted(folder: Path) -> None:
 def towel(folder: Path) -> None:
     """towel.npz and its fit, of a lift that takes a moment."""
     (folder / "towel.yaml").write_text(yaml.safe_dump(QUICK))
-    write_episode(folder / "towel.npz", clouds_of(load_scenario(folder / "towel.yaml"), stretch=0.7))
-    invoke("fit", "--scene", "towel.yaml", "--parameters", "stretch", "--out", "fits", "towel.npz")
+    write_episode(folder / "towel.npz", clouds_of(load_scenario(folder / "towel.yaml"), stretching=0.7))
+    invoke("fit", "--scene", "towel.yaml", "--parameters", "stretching", "--out", "fits", "towel.npz")
 
 
 def write(example: Example, folder: Path) -> None:
@@ -135,11 +135,19 @@ def quick(folder: Path) -> None:
     """Settings, and a lift that takes a moment."""
     (folder / "raw/scenes").mkdir(parents=True)
     (folder / "raw/scenes/quick.yaml").write_text(yaml.safe_dump(QUICK))
-    (folder / "params.yaml").write_text(yaml.safe_dump({**PARAMS, "scenarios": ["quick"]}))
+    (folder / "params.yaml").write_text(yaml.safe_dump({**PARAMS, "scenes": ["quick"]}))
+
+
+def example(folder: Path) -> None:
+    """examples/towel.npz, a shorter lift of a towel of the same size."""
+    towel = {"base": "lift", "size_m": [0.395, 0.244], "nodes": [9, 6], "frames": 8, "rate_hz": 10, "steps_per_frame": 4}
+    (folder / "towel.yaml").write_text(yaml.safe_dump({**towel, "path": [[0, 0, 0, 0], [0.8, 0.0, -0.1, 0.25]]}))
+    made = clouds_of(load_scenario(folder / "towel.yaml"), points=1000, stretching=4.0, density=1.2)
+    write_episode(folder / "examples" / "towel.npz", made)
 
 
 PREPARED = {
-    "README.md": own_clouds,
+    "README.md": example,
     "docs/library.md": own_clouds,
     "docs/calibration.md": board,
     "docs/concepts.md": motions,

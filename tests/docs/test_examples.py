@@ -32,8 +32,9 @@ DATA = "PATH/pysim"
 SMALLER = {
     "network generate": "--train 4 --test 5",
     "network train": "--epochs 1",
-    "fit": "--starts 1 --max-steps 1 --parameters stretch",
+    "fit": "--starts 1 --max-steps 1 --parameters stretching",
     "fit my_clouds": "--max-steps 2",
+    "fit examples": "--max-steps 2",
     "published": "--only release_lift/lift_tan --allow-missing --workers 1",
     "bench": "--repeats 1",
     "export fits/fit.json --to mujoco --samples": "--samples 2",

@@ -26,7 +26,8 @@ def recording_of(name: str = "e", **changes: Any) -> RecordingFit:
 
 
 def parameter_of(**changes: Any) -> FittedParameter:
-    told = {"value": 1.5, "unit": "x basis", "physical": 60.0, "physical_unit": "N/m", "meaning": "", "bounds": (0.1, 10.0)}
+    told = {"value": 60.0, "unit": "N/m", "meaning": "", "nominal": 40.0, "multiplier": 1.5}
+    told |= {"bounds": (4.0, 400.0), "centre": 40.0}
     return FittedParameter.model_validate(told | changes)
 
 
@@ -36,10 +37,10 @@ def record_of(*recordings: RecordingFit, **changes: Any) -> FitRecord:
         "episodes": list(recordings or [recording_of()]),
         "nuisance": {},
         "solver": "adam",
-        "parameters": {"stretch": parameter_of()},
+        "parameters": {"stretching": parameter_of()},
         "material": {
             "density": 0.2, "stretching": 6.0, "poisson": 0.0, "shear": 1.5, "compression": 1.0, "bending": 4e-6,
-            "damping": 0.005, "friction_obstacle": 0.3, "friction_cloth": 0.6, "air_density": 1.2,
+            "damping": 0.005, "friction": 0.3, "self_friction": 0.6, "air_density": 1.2,
             "added_mass": 0.0, "linear_drag": 0.0,
         },
         "loss": 1e-4,
@@ -51,11 +52,11 @@ def record_of(*recordings: RecordingFit, **changes: Any) -> FitRecord:
         "simulations": 3,
         "seconds": 1.5,
         "stop_reason": "iterations",
-        "start": {"stretch": 1.0},
+        "start": {"stretching": 1.0},
         "best_start": 0,
         "measure": Measure(paper=False, nuisance={}, frames=None, points=None, seed=0),
         "settings": {"smoothing": 0.0, "resample": False},
-        "history": History(names=["stretch"], loss=[[0.2], [0.1]], values=[[[1.0]], [[1.5]]], gradient_norm=[]),
+        "history": History(names=["stretching"], loss=[[0.2], [0.1]], values=[[[1.0]], [[1.5]]], gradient_norm=[]),
         "failures": [],
     }  # fmt: skip
     return FitRecord.model_validate(told | changes)

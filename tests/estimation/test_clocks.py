@@ -85,7 +85,7 @@ class TestFits:
         """Its stretching is wrong for its mass, and the misfit shows it."""
         common, recording = fitted(scenario, replace(episode, meta={}), lag=0.002)
         assert list(recording["nuisance"])[-1] == "lag"
-        off = common["stretch"] / common["mass"] / (TRUTH["stretch"] / TRUTH["mass"]) - 1
+        off = common["stretching"] / common["density"] / (TRUTH["stretching"] / TRUTH["density"]) - 1
         assert abs(off) > 0.1  # with both clocks, less than a per cent
         assert recording["rms_mm"] > 2.0
 
@@ -151,8 +151,8 @@ class TestDerivatives:
 
 def test_a_fit_tells_how_well_it_knows_each_clock(scenario, episode):
     """Better than was known before it."""
-    space, objective = FitSpace.build(["stretch"]), Objective(scenario, episode)
-    settings = LikelihoodSettings(starts=1, model_error=False, init={"stretch": 0.6})
+    space, objective = FitSpace.build(["stretching"]), Objective(scenario, episode)
+    settings = LikelihoodSettings(starts=1, model_error=False, init={"stretching": 0.6})
     found = fit_likelihood(objective, space, settings).estimate
     assert bool(torch.isfinite(found.covariance).all())
     variances = dict(zip((*space.names, *objective.pose_space.names), found.covariance.diagonal().tolist(), strict=True))

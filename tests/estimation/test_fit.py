@@ -53,43 +53,49 @@ GENTLE = {"frames": 12, "steps_per_frame": 3, "path": [(0, 0, 0, 0), (1.2, 0, -0
 class TestSpace:
     @pytest.mark.parametrize("logarithmic", [False, True])
     def test_values_and_unbounded_are_inverse(self, logarithmic):
-        space = FitSpace.build(["stretch", "damping"])
+        space = FitSpace.build(["stretching", "damping"])
         scale = torch.tensor([logarithmic] * 3)
         values = torch.tensor([[0.2, 0.01], [5.05, 0.05], [9.0, 0.09]], dtype=torch.float64)
         torch.testing.assert_close(space.values(space.unbounded(values, scale), scale), values)
 
     def test_zero_is_the_middle_of_the_papers_scale(self):
-        space = FitSpace.build(["stretch", "mass"])
+        space = FitSpace.build(["stretching", "density"])
         starts, logarithmic = space.starts(1, seed=0)
         assert starts.tolist() == [[5.05, 5.05]]
         assert space.unbounded(starts, logarithmic).abs().max() < 1e-12
 
     def test_extra_starts_spread_logarithmically_inside_the_box(self):
-        starts, logarithmic = FitSpace.build(["stretch", "mass"]).starts(33, seed=0)
+        starts, logarithmic = FitSpace.build(["stretching", "density"]).starts(33, seed=0)
         assert logarithmic.tolist() == [False] + [True] * 32
         assert ((starts >= 0.1) & (starts <= 10)).all()
         assert 13 <= int((starts[1:, 0] < 1.0).sum()) <= 19  # half of them below the geometric middle
 
     def test_fixed_and_first_values(self):
-        space = FitSpace.build(["stretch", "mass"], fixed={"mass": 1.2})
-        assert space.names == ("stretch",)
+        space = FitSpace.build(["stretching", "density"], fixed={"density": 1.2})
+        assert space.names == ("stretching",)
         parameters = space.parameters(torch.tensor([[3.0]]).double())
-        assert parameters["mass"].tolist() == [1.2]
-        assert space.starts(1, seed=0, first={"stretch": 2.0})[0].tolist() == [[2.0]]
+        assert parameters["density"].tolist() == [1.2]
+        assert space.starts(1, seed=0, first={"stretching": 2.0})[0].tolist() == [[2.0]]
 
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"names": ["strech"]}, "Unknown parameter 'strech'. Did you mean 'stretch'?. Allowed: .*stretch"),
-            ({"names": ["stretch", "stretch"]}, "twice"),
-            ({"names": ["stretch"], "bounds": {"stretch": (2.0, 1.0)}}, r"in order \(low < high\), got \[2.0, 1.0\]"),
-            ({"names": ["mass"], "fixed": {"mass": 1.0}}, "Nothing is left"),
+            ({"names": ["strech"]}, "Unknown parameter 'strech'. Did you mean 'stretching'?. Allowed: .*stretching"),
+            ({"names": ["stretching", "stretching"]}, "twice"),
+            ({"names": ["stretching"], "bounds": {"stretching": (2.0, 1.0)}}, r"in order \(low < high\), got \[2.0, 1.0\]"),
+            ({"names": ["density"], "fixed": {"density": 1.0}}, "Nothing is left"),
             (
-                {"names": ["stretch"], "bounds": {"stretch": (-1.0, 1.0)}},
-                r"A bound of stretch, \[-1.0, 1.0\], is a multiplier",
+                {"names": ["stretching"], "bounds": {"stretching": (-1.0, 1.0)}},
+                r"A bound of stretching, \[-1.0, 1.0\], must be above 0",
             ),
-            ({"names": ["stretch"], "bounds": {"mas": (0.5, 1.0)}}, "Unknown parameter 'mas'. Did you mean 'mass'"),
-            ({"names": ["stretch"], "fixed": {"mass": 0.0}}, "The fixed value of mass is a multiplier: above 0, got 0"),
+            (
+                {"names": ["stretching"], "bounds": {"densty": (0.5, 1.0)}},
+                "Unknown parameter 'densty'. Did you mean 'density'",
+            ),
+            (
+                {"names": ["stretching"], "fixed": {"density": 0.0}},
+                "The fixed value of density must be above 0, got 0",
+            ),
         ],
     )
     def test_bad_spaces(self, options, message):
@@ -99,47 +105,50 @@ class TestSpace:
     @pytest.mark.parametrize(
         ("first", "message"),
         [
-            ({"strech": 0.3}, "--init: Unknown fitted parameter 'strech'. Did you mean 'stretch'"),
-            ({"mass": 0.0}, r"--init mass=0 is outside of its bounds \[0.1, 10\]; the nearest allowed value is 0.1"),
-            ({"mass": 1e9}, r"--init mass=1e\+09 is outside of its bounds \[0.1, 10\]; the nearest allowed value is 10"),
-            ({"mass": float("nan")}, "--init mass=nan is outside"),
+            ({"strech": 0.3}, "--init: Unknown fitted parameter 'strech'. Did you mean 'stretching'"),
+            ({"density": 0.0}, r"--init density=0 is outside of its bounds \[0.1, 10\]; the nearest allowed value is 0.1"),
+            (
+                {"density": 1e9},
+                r"--init density=1e\+09 is outside of its bounds \[0.1, 10\]; the nearest allowed value is 10",
+            ),
+            ({"density": float("nan")}, "--init density=nan is outside"),
             ({"bending": 1.0}, "--init: Unknown fitted parameter 'bending'"),
         ],
     )
     def test_starts_that_are_typed_wrongly(self, first, message):
         with pytest.raises(ConfigError, match=message):
-            FitSpace.build(["stretch", "mass"]).check_start(first)
+            FitSpace.build(["stretching", "density"]).check_start(first)
 
     def test_predicted_starts_are_brought_inside(self):
-        space = FitSpace.build(["stretch", "mass"])
-        assert space.nearest({"stretch": 12.0, "mass": 0.01, "bending": 1.0}) == {"stretch": 10.0, "mass": 0.1}
+        space = FitSpace.build(["stretching", "density"])
+        assert space.nearest({"stretching": 12.0, "density": 0.01, "bending": 1.0}) == {"stretching": 10.0, "density": 0.1}
 
 
 class TestRecovery:
     def test_the_ratio_is_recovered_from_a_start_far_away(self):
         scenario = small_lift(**GENTLE)
-        episode = clouds_of(scenario, stretch=0.8, mass=1.5)
-        space = FitSpace.build(["stretch"], fixed={"mass": 1.5})
+        episode = clouds_of(scenario, stretching=0.8, density=1.5)
+        space = FitSpace.build(["stretching"], fixed={"density": 1.5})
         outcome = fit_adam(paper_objective(scenario, episode), space, AdamSettings(max_steps=40))
         assert outcome.loss < 0.25 * outcome.loss_start
-        assert outcome.values["stretch"] == pytest.approx(0.8, rel=0.1)
+        assert outcome.values["stretching"] == pytest.approx(0.8, rel=0.1)
 
     def test_a_known_mass_in_other_units_fixes_the_scale(self):
         """Halving the given mass halves the fitted stretch: the clouds only know the ratio."""
         scenario = small_lift(**GENTLE, air_density=0.0)
-        episode = clouds_of(scenario, stretch=0.8, mass=1.5)
+        episode = clouds_of(scenario, stretching=0.8, density=1.5)
         found = []
         for mass in (1.5, 0.75):
-            space = FitSpace.build(["stretch"], fixed={"mass": mass})
-            settings = AdamSettings(max_steps=25, init={"stretch": mass})
-            found.append(fit_adam(paper_objective(scenario, episode), space, settings).values["stretch"])
+            space = FitSpace.build(["stretching"], fixed={"density": mass})
+            settings = AdamSettings(max_steps=25, init={"stretching": mass})
+            found.append(fit_adam(paper_objective(scenario, episode), space, settings).values["stretching"])
         assert found[0] / found[1] == pytest.approx(2.0, rel=0.15)
 
     def test_truth_has_the_lowest_loss(self):
         scenario = small_lift(points=4000, path=[(0, 0, 0, 0), (0.5, 0, -0.05, 0.3)])
-        objective = paper_objective(scenario, clouds_of(scenario, stretch=1.0, mass=1.0))
+        objective = paper_objective(scenario, clouds_of(scenario, stretching=1.0, density=1.0))
         stretch = torch.tensor([0.5, 0.8, 1.0, 1.25, 2.0]).double()
-        assert int(objective({"stretch": stretch}).argmin()) == 2
+        assert int(objective({"stretching": stretch}).argmin()) == 2
 
 
 class TestRun:
@@ -149,10 +158,10 @@ class TestRun:
 
     @pytest.fixture
     def objective(self, scenario):
-        return paper_objective(scenario, clouds_of(scenario, stretch=0.6, mass=1.0))
+        return paper_objective(scenario, clouds_of(scenario, stretching=0.6, density=1.0))
 
     def test_same_seed_same_result_and_best_iterate_kept(self, scenario, objective):
-        space = FitSpace.build(["stretch", "mass"])
+        space = FitSpace.build(["stretching", "density"])
         settings = AdamSettings(max_steps=6, smoothing=0.3, starts=2)
         first, second = (fit_adam(objective, space, settings) for _ in range(2))
         assert first.values == second.values
@@ -162,7 +171,7 @@ class TestRun:
 
     def test_losses_and_gradients_that_grow_beyond_a_record_are_none_in_it(self, objective):
         """A rough loss may well have a gradient that no file need hold."""
-        space, settings = FitSpace.build(["stretch"]), AdamSettings(max_steps=1)
+        space, settings = FitSpace.build(["stretching"]), AdamSettings(max_steps=1)
         outcome = fit_adam(objective, space, settings)
         outcome.history.gradients[0][...] = 1e20
         outcome.history.losses[-1][...] = math.inf
@@ -172,7 +181,7 @@ class TestRun:
         assert told.loss[0][0] > 0
 
     def test_threshold_stops(self, objective):
-        outcome = fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings(threshold=1.0))
+        outcome = fit_adam(objective, FitSpace.build(["stretching"]), AdamSettings(threshold=1.0))
         assert outcome.stop_reason == "threshold"
         assert outcome.iterations == 0
 
@@ -181,7 +190,7 @@ class TestRun:
             if progress.iteration == 2:
                 raise KeyboardInterrupt
 
-        outcome = fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings(), progress=interrupt)
+        outcome = fit_adam(objective, FitSpace.build(["stretching"]), AdamSettings(), progress=interrupt)
         assert outcome.stop_reason == "interrupted"
         assert outcome.iterations == 2
         assert np.isfinite(outcome.loss)
@@ -190,26 +199,26 @@ class TestRun:
         real = Objective.__call__
 
         def fragile(self, parameters):
-            bad = (parameters["stretch"] > 5.0).nonzero().flatten().tolist()
+            bad = (parameters["stretching"] > 5.0).nonzero().flatten().tolist()
             if bad:
                 raise DivergedError(3, bad, "test")
             return real(self, parameters)
 
         monkeypatch.setattr(Objective, "__call__", fragile)
-        space, settings = FitSpace.build(["stretch"]), AdamSettings(starts=4, max_steps=3, smoothing=0.3)
+        space, settings = FitSpace.build(["stretching"]), AdamSettings(starts=4, max_steps=3, smoothing=0.3)
         outcome = fit_adam(objective, space, settings)
-        assert outcome.values["stretch"] <= 5.0
-        assert outcome.start["stretch"] <= 5.0
+        assert outcome.values["stretching"] <= 5.0
+        assert outcome.start["stretching"] <= 5.0
         path = write_fit(tmp_path, "e", describe_fit(objective, space, settings, outcome, episodes=["e"]))
         assert read_fit(path).failures
-        assert any("start 0 (stretch=5.05)" in failure for failure in outcome.failures)
-        with pytest.raises(DivergedError, match=r"stretch=5\.05"):
-            fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings())
+        assert any("start 0 (stretching=5.05)" in failure for failure in outcome.failures)
+        with pytest.raises(DivergedError, match=r"stretching=5\.05"):
+            fit_adam(objective, FitSpace.build(["stretching"]), AdamSettings())
 
     def test_a_motion_that_diverges_after_the_compared_frames_is_recorded_as_far_as_it_goes(self, monkeypatch, tmp_path):
         scenario = small_lift(**GENTLE)
-        objective = Objective(scenario, clouds_of(scenario, stretch=2.0), frames=range(5), nuisance={})
-        space, settings = FitSpace.build(["stretch"]), AdamSettings(max_steps=2)
+        objective = Objective(scenario, clouds_of(scenario, stretching=2.0), frames=range(5), nuisance={})
+        space, settings = FitSpace.build(["stretching"]), AdamSettings(max_steps=2)
         outcome = fit_adam(objective, space, settings)
         whole = describe_fit(objective, space, settings, outcome, episodes=["e"])
         assert not whole.record.failures
@@ -217,26 +226,26 @@ class TestRun:
 
         def simulate(self, parameters, *, steps=None):
             last = (self.scenario.steps if steps is None else steps) // scenario.scene.frame_steps
-            if last > reached and float(parameters["stretch"]) in fragile:
+            if last > reached and float(parameters["stretching"]) in fragile:
                 raise DivergedError(reached * scenario.scene.frame_steps + 2, [0], "test")
             return real(self, parameters, steps=steps)
 
         monkeypatch.setattr(Objective, "simulate", simulate)
         for values in (outcome.values, outcome.start):
-            fragile = {values["stretch"]}
+            fragile = {values["stretching"]}
             told = describe_fit(objective, space, settings, outcome, episodes=["e"])
             assert told.record.loss == whole.record.loss
             assert "e: the motion is recorded up to" in told.record.failures[0]
             np.testing.assert_array_equal(told.motions[0].nodes, whole.motions[0].nodes[: reached + 1])
             read_motion(write_fit(tmp_path, "e", told).with_suffix(".npz"))
         # first values that do not even reach the compared frames cut nothing off
-        reached, fragile = 3, {outcome.start["stretch"]}
+        reached, fragile = 3, {outcome.start["stretching"]}
         told = describe_fit(objective, space, settings, outcome, episodes=["e"])
         np.testing.assert_array_equal(told.motions[0].start_nodes, told.motions[0].nodes)
         np.testing.assert_array_equal(told.motions[0].nodes, whole.motions[0].nodes)
         assert not told.record.failures
         assert told.record.loss == whole.record.loss
-        fragile = {outcome.values["stretch"]}
+        fragile = {outcome.values["stretching"]}
         with pytest.raises(DivergedError):
             describe_fit(objective, space, settings, outcome, episodes=["e"])
 
@@ -244,27 +253,27 @@ class TestRun:
         real = Objective.__call__
 
         def fragile(self, parameters):
-            bad = (parameters["stretch"] > 5.5).nonzero().flatten().tolist()
+            bad = (parameters["stretching"] > 5.5).nonzero().flatten().tolist()
             if bad:
                 raise DivergedError(3, bad, "test")
             return real(self, parameters)
 
         monkeypatch.setattr(Objective, "__call__", fragile)
-        outcome = fit_adam(objective, FitSpace.build(["stretch"]), AdamSettings(max_steps=1, smoothing=0.5))
-        assert outcome.start["stretch"] == pytest.approx(5.05)
+        outcome = fit_adam(objective, FitSpace.build(["stretching"]), AdamSettings(max_steps=1, smoothing=0.5))
+        assert outcome.start["stretching"] == pytest.approx(5.05)
         assert not outcome.failures
 
     def test_divergence_beyond_the_first_chunk_names_the_right_entry(self, objective):
         stretch = torch.ones(25, dtype=torch.float64)
         stretch[23] = float("nan")
         with pytest.raises(DivergedError) as caught:
-            objective({"stretch": stretch})
+            objective({"stretching": stretch})
         assert caught.value.entries == [23]
 
     def test_the_loss_with_fresh_points_is_the_objectives_own(self, scenario):
-        episodes = [clouds_of(scenario, stretch=stretch, mass=1.0, shift=(0.0, 0.0, 0.002)) for stretch in (0.7, 1.4)]
+        episodes = [clouds_of(scenario, stretching=stretch, density=1.0, shift=(0.0, 0.0, 0.002)) for stretch in (0.7, 1.4)]
         objective = JointObjective([Objective(scenario, episode) for episode in episodes])
-        space = FitSpace.build(["stretch"])
+        space = FitSpace.build(["stretching"])
         settings = AdamSettings(max_steps=2, seed=3)
         outcome = fit_adam(objective, space, settings)
         told = describe_fit(objective, space, settings, outcome, episodes=["a", "b"], resampled_seeds=2).record
@@ -283,29 +292,29 @@ class TestRun:
         assert told.loss_resampled == pytest.approx(np.mean(losses), rel=1e-9)
 
     def test_result_files(self, scenario, objective, tmp_path):
-        space = FitSpace.build(["stretch"], fixed={"mass": 1.2})
+        space = FitSpace.build(["stretching"], fixed={"density": 1.2})
         settings = AdamSettings(max_steps=2)
         outcome = fit_adam(objective, space, settings)
         path = write_fit(tmp_path, "e", describe_fit(objective, space, settings, outcome, episodes=["e"]))
         found = read_fit(path)
-        stretch = found.parameters["stretch"]
-        assert stretch.physical == pytest.approx(4.0 * stretch.value)
-        assert stretch.physical_unit == "N/m"
-        mass = found.parameters["mass"]
-        assert mass.physical == pytest.approx(0.24)
-        assert mass.model_copy(update={"meaning": "", "physical": 0.24}) == FittedParameter(
-            value=1.2, unit="x basis", physical=0.24, physical_unit="kg/m²", meaning="", fixed=True
+        stretch = found.parameters["stretching"]
+        assert stretch.value == pytest.approx(4.0 * stretch.multiplier)
+        assert stretch.unit == "N/m"
+        mass = found.parameters["density"]
+        assert mass.value == pytest.approx(0.24)
+        assert mass.model_copy(update={"meaning": "", "value": 0.24}) == FittedParameter(
+            value=0.24, unit="kg/m²", meaning="", nominal=0.2, multiplier=1.2, fixed=True
         )
         with np.load(tmp_path / "e.npz") as run:
             assert run["nodes"].shape == (scenario.frames + 1, 25, 3)
 
     def test_frames_that_the_episode_lacks(self, scenario):
-        episode = clouds_of(scenario, stretch=1.0)
+        episode = clouds_of(scenario, stretching=1.0)
         with pytest.raises(EpisodeError, match="Frame 24 is missing"):
             paper_objective(scenario, episode, frames=[24])
 
     def test_frames_after_the_end_of_the_simulation(self, scenario):
-        late = clouds_of(small_lift(frames=9), stretch=1.0)
+        late = clouds_of(small_lift(frames=9), stretching=1.0)
         with pytest.raises(EpisodeError, match="simulates only"):
             paper_objective(scenario, late)
 
@@ -313,9 +322,9 @@ class TestRun:
 def test_a_track_drives_the_handle_as_the_scenes_motion_does():
     """With and without the recorded track the same episode gives nearly the same motion."""
     scenario = small_lift()
-    values = {"stretch": torch.tensor([0.7]).double()}
-    with_track = paper_objective(scenario, clouds_of(scenario, stretch=0.7)).simulate(values)
-    without = paper_objective(scenario, clouds_of(scenario, stretch=0.7, gripper=False)).simulate(values)
+    values = {"stretching": torch.tensor([0.7]).double()}
+    with_track = paper_objective(scenario, clouds_of(scenario, stretching=0.7)).simulate(values)
+    without = paper_objective(scenario, clouds_of(scenario, stretching=0.7, gripper=False)).simulate(values)
     assert (with_track.positions - without.positions).abs().max() < 3e-3
     assert (with_track.positions - without.positions).abs().max() > 0
 
@@ -352,17 +361,19 @@ def test_what_shows_is_that_of_the_recorded_motion():
     """Under the track of its own motion a scenario shows what it does by itself; under a gripper that rests, how deep
     the cloth sinks into the repulsion of the table."""
     scenario = small_lift(frames=20, rate_hz=40.0, steps_per_frame=1)
-    episode = clouds_of(scenario, stretch=1.0, mass=1.0)
+    episode = clouds_of(scenario, stretching=1.0, density=1.0)
     own, moved = (visibility_map(scenario, episode=one, size=3) for one in (None, episode))
-    assert 0.2 < np.median(moved.along_stretch_mm / own.along_stretch_mm) < 1  # over all frames, not at the last alone
+    assert (
+        0.2 < np.median(moved.along_stretching_mm / own.along_stretching_mm) < 1
+    )  # over all frames, not at the last alone
     still = replace(episode, gripper=np.repeat(episode.gripper[:1], len(episode.times), axis=0))
     assert visibility_map(scenario, episode=still, size=3).visible_fraction(2.0) == 0 < moved.visible_fraction(2.0)
     first = [episode.frame(index) for index in range(3)]
     short = Episode.from_frames(first, episode.times[:3], gripper=episode.gripper[:3])
     early = visibility_map(scenario, episode=short, size=3)
-    assert early.along_mass_mm.max() < moved.along_mass_mm.max()
+    assert early.along_density_mm.max() < moved.along_density_mm.max()
     with pytest.raises(EpisodeError, match="no gripper track"):
-        visibility_map(scenario, episode=clouds_of(scenario, gripper=False, stretch=1.0, mass=1.0), size=2)
+        visibility_map(scenario, episode=clouds_of(scenario, gripper=False, stretching=1.0, density=1.0), size=2)
 
 
 class Rough:
@@ -371,13 +382,13 @@ class Rough:
     members = (None,)
 
     def __call__(self, parameters):
-        away = torch.stack([(parameters["stretch"] / 0.13).log(), (parameters["mass"] / 7.0).log()])
+        away = torch.stack([(parameters["stretching"] / 0.13).log(), (parameters["density"] / 7.0).log()])
         return (away.square() + 1 - (40 * away).cos()).sum(0)
 
 
 def test_smoothed_gradients_find_the_valley_of_a_rough_loss():
     """Where ripples are as steep as ten valleys, the exact gradient goes nowhere."""
-    space = FitSpace.build(["stretch", "mass"])
+    space = FitSpace.build(["stretching", "density"])
     exact = fit_adam(Rough(), space, AdamSettings(max_steps=60))
     found = [fit_adam(Rough(), space, AdamSettings(max_steps=60, smoothing=0.5, seed=seed)) for seed in range(4)]
     assert max(one.loss for one in found) < 0.1 * exact.loss

@@ -27,7 +27,7 @@ from tests.estimation.test_fit import GENTLE, clouds_of
 LINEAR = Sheet(density_kg_m2=0.15, stretching_n_m=80.0, bending_n_m=2e-5, damping_s=0.01)
 SCENARIO = small_lift(**{**GENTLE, "integrator": "implicit", "material": LINEAR})
 LARGER = 0.08
-ASKED = FitSpace.build(["stretch"], fixed={"mass": 1.7})
+ASKED = FitSpace.build(["stretching"], fixed={"density": 1.7})
 
 
 def scaled(scenario, part):
@@ -60,7 +60,7 @@ class TestSize:
         scene = SCENARIO.scene
         around = replace(scene.surrounding, obstacles=(), self_contact=False, air_drag=0.05)
         hanging = replace(SCENARIO, scene=replace(scene, surrounding=around))
-        given = {"stretch": 0.7, "mass": 1.3, "bending": 2.0, "drag": 3.0}
+        given = {"stretching": 0.7, "density": 1.3, "bending": 2.0, "air_density": 3.0}
         alike = motion(hanging, **given, size=math.log(1 + LARGER))
         larger = motion(scaled(hanging, LARGER), **given)
         height = np.array([0.0, 0.0, hanging.scene.mesh.nodes[0, 2]])
@@ -140,23 +140,23 @@ class TestTrack:
 
 def test_rates_are_those_of_the_motion():
     space = with_initial_state(ASKED, [{"turn": 0.1, "shape": 0.01, "size": 0.05, "track": 0.05}], [SCENARIO])
-    objective = Objective(SCENARIO, clouds_of(SCENARIO, points=2000, stretch=0.6, mass=1.7, size=0.05), nuisance={})
+    objective = Objective(SCENARIO, clouds_of(SCENARIO, points=2000, stretching=0.6, density=1.7, size=0.05), nuisance={})
     places = torch.randn(1, len(space.names), generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 0.3
     check_rates(objective, space, places, rtol=1e-6, atol=1e-12)
 
 
 def test_the_size_of_a_cloth_is_found():
     """The recording is of a larger mesh; the way of its gripper is stated 5 % too short."""
-    recorded = clouds_of(scaled(SCENARIO, LARGER), points=3000, stretch=0.6, mass=1.7)
+    recorded = clouds_of(scaled(SCENARIO, LARGER), points=3000, stretching=0.6, density=1.7)
     assert recorded.gripper is not None
     short = recorded.gripper[:1] + (recorded.gripper - recorded.gripper[:1]) / 1.05
     objective = Objective(SCENARIO, replace(recorded, gripper=short), nuisance={})
-    settings = LikelihoodSettings(starts=1, model_error=False, init={"stretch": 1.0})
+    settings = LikelihoodSettings(starts=1, model_error=False, init={"stretching": 1.0})
     space = with_initial_state(ASKED, [{"size": 0.1, "track": 0.1}], [SCENARIO])
     plain, sized = (fit_likelihood(objective, one, settings) for one in (ASKED, space))
     assert sized.values["size"] == pytest.approx(math.log(1 + LARGER), abs=0.005)
     assert sized.values["track"] == pytest.approx(math.log(1.05), abs=0.01)
-    off = [abs(math.log(one.values["stretch"] / 0.6)) for one in (plain, sized)]
+    off = [abs(math.log(one.values["stretching"] / 0.6)) for one in (plain, sized)]
     assert off[1] < 0.1
     assert off[1] < 0.3 * off[0]
     assert sized.loss < 0.1 * plain.loss
@@ -165,17 +165,17 @@ def test_the_size_of_a_cloth_is_found():
 def test_depths_that_are_too_large_are_no_property_of_the_cloth():
     """Clouds 4 % too large about a camera, while the gripper's track, known from the joints, is right: with the scale free,
     the fit is that of right clouds. (Of 3,000 points a frame, a scale of 2.6 % has the lowest loss.)"""
-    right = clouds_of(SCENARIO, points=12_000, stretch=0.6, mass=1.7)
+    right = clouds_of(SCENARIO, points=12_000, stretching=0.6, density=1.7)
     camera = np.array([1.2, 0.1, 0.9])
     large = replace(right, points=(camera + 1.04 * (right.points - camera)).astype(np.float32))
     shifts = {"x": 0.1, "y": 0.1, "z": 0.1}
-    settings = LikelihoodSettings(starts=1, model_error=False, init={"stretch": 1.0})
+    settings = LikelihoodSettings(starts=1, model_error=False, init={"stretching": 1.0})
 
     def found(recorded, nuisance):
         objective = Objective(SCENARIO, recorded, nuisance=nuisance)
         values = fit_likelihood(objective, ASKED, settings).values
-        pose = objective.pose(objective.simulate_to_loss(one_set({"stretch": values["stretch"], "mass": 1.7})))
-        return math.log(values["stretch"] / 0.6), float(pose[0, -1])
+        pose = objective.pose(objective.simulate_to_loss(one_set({"stretching": values["stretching"], "density": 1.7})))
+        return math.log(values["stretching"] / 0.6), float(pose[0, -1])
 
     expected, scale = found(right, {**shifts, "scale": 0.2})
     stretch, larger = found(large, {**shifts, "scale": 0.2})

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from diffcloud.errors import ConfigError, DivergedError
-from diffcloud.estimation.initial_state import laid_nodes, with_initial_state
+from diffcloud.estimation.initial_state import initial_nodes, with_initial_state
 from diffcloud.estimation.joint import JointObjective, mean_loss
 from diffcloud.estimation.left_out import leave_each_out
 from diffcloud.estimation.objective import Objective
@@ -30,8 +30,8 @@ from tests.conftest import paper_objective, small_lift
 from tests.estimation.rates import check_rates
 from tests.estimation.test_fit import GENTLE, clouds_of
 
-TRUTH = {"stretch": 0.6, "mass": 1.7}
-SPACE = FitSpace.build(["stretch", "mass"])
+TRUTH = {"stretching": 0.6, "density": 1.7}
+SPACE = FitSpace.build(["stretching", "density"])
 OWN = LikelihoodSettings(model_error=False)
 """For recordings that this simulator made on the same mesh."""
 SIDEWAYS = [(0.0, 0.0, 0.0, 0.0), (0.6, 0.12, 0.0, 0.1)]
@@ -59,7 +59,7 @@ class TestLaid:
         *_, ((_, flat), (_, found)) = askew
         assert [found.values[f"turn@{number}"] for number in (0, 1)] == pytest.approx([0.15, -0.1], abs=0.01)
         assert {name: found.values[name] for name in TRUTH} == pytest.approx(TRUTH, rel=0.05)
-        assert abs(np.log(flat.values["stretch"] / TRUTH["stretch"])) > 0.5
+        assert abs(np.log(flat.values["stretching"] / TRUTH["stretching"])) > 0.5
         assert found.loss < 0.1 * flat.loss
 
     def test_of_the_one_left_out_it_is_found_anew(self, askew):
@@ -81,7 +81,7 @@ class TestLaid:
         with torch.no_grad():
             assert float(joint(one_set(record.simulated))) == pytest.approx(record.loss, rel=1e-9)
         for number, (scenario, motion) in enumerate(zip(motions(), result.motions, strict=True)):
-            (lies,) = laid_nodes(scenario.scene.mesh, one_set(record.initial_state_in(record.episodes[number])))
+            (lies,) = initial_nodes(scenario.scene.mesh, one_set(record.initial_state_in(record.episodes[number])))
             np.testing.assert_allclose(motion.nodes[0], lies, atol=1e-15)
 
     def test_the_uncertainty_does_not_depend_on_the_order(self, askew):
@@ -104,8 +104,10 @@ class TestLaid:
 class TestMean:
     def test_in_the_papers_measure_losses_are_averaged(self):
         scenario = small_lift()
-        values = {"stretch": torch.tensor([1.0, 3.0]).double()}
-        members = [paper_objective(scenario, clouds_of(scenario, stretch=s, mass=1.0), frames=[2, 5]) for s in (0.5, 2.0)]
+        values = {"stretching": torch.tensor([1.0, 3.0]).double()}
+        members = [
+            paper_objective(scenario, clouds_of(scenario, stretching=s, density=1.0), frames=[2, 5]) for s in (0.5, 2.0)
+        ]
         alone = torch.stack([member(values) for member in members])
         torch.testing.assert_close(JointObjective(members)(values), alone.mean(0))
 
@@ -133,28 +135,32 @@ class TestFit:
         left = leave_each_out(joint, SPACE, found.values, OWN)
         for one, member in zip(left, members, strict=True):
             # a single motion tells the ratio; how heavy the cloth is, it hardly tells
-            ratio = one.parameters["stretch"] / one.parameters["mass"]
-            assert ratio == pytest.approx(TRUTH["stretch"] / TRUTH["mass"], rel=0.1)
+            ratio = one.parameters["stretching"] / one.parameters["density"]
+            assert ratio == pytest.approx(TRUTH["stretching"] / TRUTH["density"], rel=0.1)
             assert one.loss == pytest.approx(float(member(one_set(one.parameters))), rel=1e-9)
 
     def test_what_is_left_out_has_no_say(self):
         """Recordings of two cloths: each is predicted with the parameters of the other."""
         first, second = motions()
         members = [
-            Objective(first, clouds_of(first, points=6000, stretch=0.4, mass=1.0), nuisance={}),
-            Objective(second, clouds_of(second, points=6000, stretch=2.5, mass=1.0), nuisance={}),
+            Objective(first, clouds_of(first, points=6000, stretching=0.4, density=1.0), nuisance={}),
+            Objective(second, clouds_of(second, points=6000, stretching=2.5, density=1.0), nuisance={}),
         ]
-        space = FitSpace.build(["stretch"], fixed={"mass": 1.0})
-        one, other = leave_each_out(JointObjective(members), space, {"stretch": 1.0}, OWN)
-        assert one.parameters["stretch"] == pytest.approx(2.5, rel=0.1)  # stiff cloth hardly stretches
-        assert other.parameters["stretch"] == pytest.approx(0.4, rel=0.05)
+        space = FitSpace.build(["stretching"], fixed={"density": 1.0})
+        one, other = leave_each_out(JointObjective(members), space, {"stretching": 1.0}, OWN)
+        assert one.parameters["stretching"] == pytest.approx(2.5, rel=0.1)  # stiff cloth hardly stretches
+        assert other.parameters["stretching"] == pytest.approx(0.4, rel=0.05)
 
     def test_it_does_not_matter_which_points_a_solver_drew_last(self):
         members = [Objective(one, clouds_of(one, points=1000, **TRUTH), nuisance={}) for one in motions()]
-        joint, space, told = JointObjective(members), FitSpace.build(["stretch"], fixed={"mass": TRUTH["mass"]}), []
+        joint, space, told = (
+            JointObjective(members),
+            FitSpace.build(["stretching"], fixed={"density": TRUTH["density"]}),
+            [],
+        )
         for drawn in (0, 7):
             joint.reseed(drawn)
-            told.append(leave_each_out(joint, space, {"stretch": TRUTH["stretch"]}, OWN))
+            told.append(leave_each_out(joint, space, {"stretching": TRUTH["stretching"]}, OWN))
         assert told[0] == told[1]
 
     def test_the_misfit_of_what_is_left_out_has_no_prior_of_a_pose(self):
@@ -164,8 +170,8 @@ class TestFit:
             episode = clouds_of(scenario, points=6000, **TRUTH)
             higher = replace(episode, points=episode.points + np.array([0.0, 0.0, 0.003], dtype=np.float32))
             members.append(Objective(scenario, higher, nuisance={"z": 1e-3}))
-        space = FitSpace.build(["stretch"], fixed={"mass": 1.0})
-        left = leave_each_out(JointObjective(members), space, {"stretch": TRUTH["stretch"]}, OWN)
+        space = FitSpace.build(["stretching"], fixed={"density": 1.0})
+        left = leave_each_out(JointObjective(members), space, {"stretching": TRUTH["stretching"]}, OWN)
         for one, member in zip(left, members, strict=True):
             told = describe_recording(member, member.simulate_to_loss(one_set(one.parameters)), "one")
             assert one.rms_mm == pytest.approx(told.rms_mm, rel=1e-9)
@@ -179,7 +185,7 @@ class TestFit:
             )
         ]
         space, settings = (
-            FitSpace.build(["stretch"], fixed={"mass": 1.0}),
+            FitSpace.build(["stretching"], fixed={"density": 1.0}),
             LikelihoodSettings(starts=1, model_error=False, max_steps=2),
         )
         joint = JointObjective(members)
@@ -201,7 +207,7 @@ class TestFit:
             moving[number, columns] += 1
             check_rates(member, own, places[:, columns], rtol=1e-6, atol=1e-12)
         both = [name for name, count in zip(space.names, moving.sum(0).tolist(), strict=True) if count == 2]
-        assert both == ["stretch", "mass", "size"]
+        assert both == ["stretching", "density", "size"]
         assert moving[:, [space.names.index(f"turn@{number}") for number in (0, 1)]].tolist() == [[1, 0], [0, 1]]
 
     def test_threads_change_nothing(self):
@@ -215,7 +221,7 @@ class TestFit:
                 joint = JointObjective(objectives)
                 wanted = {name: value.requires_grad_() for name, value in SPACE.parameters(places.exp()).items()}
                 loss = joint(wanted)
-                slope = torch.autograd.grad(loss.sum(), wanted["stretch"])[0]
+                slope = torch.autograd.grad(loss.sum(), wanted["stretching"])[0]
                 with torch.no_grad():
                     assert not joint(wanted).requires_grad
                 fit = fit_likelihood(joint, SPACE, LikelihoodSettings(starts=1, max_steps=2, model_error=False))
@@ -258,12 +264,12 @@ class TestOneCloth:
     def test_scenarios_of_different_materials_are_refused(self):
         first = small_lift()
         other = small_lift(material="denim")
-        members = [Objective(s, clouds_of(s, stretch=1.0)) for s in (first, other)]
+        members = [Objective(s, clouds_of(s, stretching=1.0)) for s in (first, other)]
         with pytest.raises(ConfigError, match=r"one cloth, whose \w+ = 1 means \S+ N/m in lift and"):
             JointObjective(members)
 
     def test_measures_are_not_mixed(self):
         scenario = small_lift()
-        episode = clouds_of(scenario, stretch=1.0)
+        episode = clouds_of(scenario, stretching=1.0)
         with pytest.raises(ConfigError, match="one measure"):
             JointObjective([Objective(scenario, episode), paper_objective(scenario, episode)])

@@ -25,11 +25,12 @@ from diffcloud.scene.scenarios.grid import LIFT, GridScenario, grid_scenario
 from tests.conftest import small_lift
 from tests.estimation.test_fit import GENTLE, clouds_of
 
-TRUTH = {"stretch": 0.6, "mass": 1.7}
+TRUTH = {"stretching": 0.6, "density": 1.7}
 SCENARIO = small_lift(**{**GENTLE, "integrator": "implicit", "points": 2000})
 POSE = {"x": 0.01, "yaw": 0.05}
 SPACE = FitSpace(
-    (Variable("stretch", 0.03, 30.0, 10.0), Variable("bending", 0.1, 10.0, 1.5, role="material")), {"mass": TRUTH["mass"]}
+    (Variable("stretching", 0.03, 30.0, 10.0), Variable("bending", 0.1, 10.0, 1.5, role="material")),
+    {"density": TRUTH["density"]},
 )
 
 
@@ -59,7 +60,7 @@ def frames(squares, variances, variables=1):
 class TestFrames:
     def test_a_frame_within_its_variance_counts_by_its_squares(self):
         one = frames([[0.2], [0.4]], [[1.0], [1.0]])
-        assert one.misfits.tolist() == pytest.approx([0.3])
+        assert one.chi_squares.tolist() == pytest.approx([0.3])
         assert one.energy() == pytest.approx(0.3)
 
     def test_a_frame_beyond_it_has_a_variance_of_its_own(self):
@@ -87,7 +88,7 @@ class TestRecording:
 
     def test_slopes_are_those_of_the_squares(self, member):
         """By material and pose, forth and back, in all frames but those in which points begin to count."""
-        place = member.start({"stretch": 0.8}, 0.0)
+        place = member.start({"stretching": 0.8}, 0.0)
         place[2:] = torch.tensor([0.3, -0.2], dtype=torch.float64)
         here, step = self.at(member, place), 2e-3
         for variable in range(len(place)):
@@ -101,7 +102,7 @@ class TestRecording:
         """Where the cloth lies as it was recorded, from recorded points to the surface."""
         episode = clouds_of(SCENARIO, points=2000, **TRUTH)
         member = Likelihood([Objective(SCENARIO, episode, nuisance=POSE)], SPACE, LikelihoodSettings())
-        place = member.start({"stretch": TRUTH["stretch"]}, 0.0)
+        place = member.start({"stretching": TRUTH["stretching"]}, 0.0)
         lying = self.at(member, place)
         up = torch.zeros(1, lying.squares.shape[1], len(SCENARIO.scene.mesh.nodes), 3).double()
         up[..., 2] = 0.0002
@@ -120,7 +121,7 @@ class TestRecording:
 class TestGrasp:
     def scenario(self, size, within=1.5):
         options = {"nodes": (7, 7), "size_m": (0.3, 0.3), "frames": 10, "steps_per_frame": 8, "air": "none"}
-        options |= {"grip_m": size, "grip_known_within": within, "laid_turn_deg": 0.0}
+        options |= {"grip_m": size, "grip_known_within": within, "initial_state": "none"}
         return grid_scenario(GridScenario.model_validate({**LIFT.model_dump(), **options}))
 
     def test_what_it_changes_is_that_of_the_simulated_ones(self, generator):
@@ -163,9 +164,9 @@ class TestGrasp:
     @pytest.mark.slow
     def test_a_grasp_that_was_stated_too_small_is_found(self):
         """Stretching would make up for it."""
-        truth = {"stretch": 5.0, "mass": 1.0}
+        truth = {"stretching": 5.0, "density": 1.0}
         episode = clouds_of(self.scenario(0.024, 1.0).finer(), points=2000, **truth)
-        space = FitSpace((Variable("stretch", 0.03, 300.0, 10.0, 1.0),), {"mass": 1.0})
+        space = FitSpace((Variable("stretching", 0.03, 300.0, 10.0, 1.0),), {"density": 1.0})
         believed, found = (
             fit_likelihood(
                 Objective(self.scenario(0.016, within), episode, nuisance={}), space, LikelihoodSettings()
@@ -173,7 +174,7 @@ class TestGrasp:
             for within in (1.0, 1.5)
         )
         assert 0.4 < found.grip < 1.3  # the truth is one deviation larger
-        off, believed_off = (math.log(one.values["stretch"] / truth["stretch"]) for one in (found, believed))
+        off, believed_off = (math.log(one.values["stretching"] / truth["stretching"]) for one in (found, believed))
         assert believed_off > 0.5
         assert abs(off) < 0.4 * believed_off
         assert {"grasp"} == {*found.sources} - {*believed.sources}
@@ -208,9 +209,9 @@ class TestFits:
         told = found.estimate
         deviation = float(told.covariance[0, 0].sqrt())
         assert found.stop_reason == "converged"
-        assert abs(float(told.mean[0]) - math.log(TRUTH["stretch"])) < 1.645 * deviation
+        assert abs(float(told.mean[0]) - math.log(TRUTH["stretching"])) < 1.645 * deviation
         assert 0.005 < deviation < 0.5
-        assert np.median(told.best.misfits[0]) < 1.5
+        assert np.median(told.best.chi_squares[0]) < 1.5
         assert told.simulations == found.simulations < 60
 
     def test_the_sources_add_up_to_the_covariance(self, found):
@@ -266,7 +267,7 @@ class TestFits:
         assert all(float(told.best.sources[name].abs().max()) == 0 for name in ("mesh", "time step"))
         assert len(told.members[0].frames) == len(one.frames)
         deviation = float(told.covariance[0, 0].sqrt())
-        assert abs(float(told.mean[0]) - math.log(TRUTH["stretch"])) < 1.645 * deviation
+        assert abs(float(told.mean[0]) - math.log(TRUTH["stretching"])) < 1.645 * deviation
         assert deviation < 0.05
 
     def test_a_descent_over_all_frames_that_does_not_arrive_counts_too(self):
@@ -284,6 +285,6 @@ class TestFits:
         assert len(scenario.scene.bodies.faces)
         episode = clouds_of(scenario, points=300)
         one = Objective(scenario, episode, nuisance={"lag": 0.01}, points=100)
-        space = FitSpace((Variable("stretch", 0.1, 10.0, 3.0),), {})
+        space = FitSpace((Variable("stretching", 0.1, 10.0, 3.0),), {})
         told = fit_likelihood(one, space, LikelihoodSettings(starts=1, max_steps=1))
         assert np.isfinite(told.loss)

@@ -28,8 +28,8 @@ from diffcloud.sim.properties import one_set
 from tests.conftest import small_lift
 from tests.estimation.test_fit import GENTLE, clouds_of
 
-TRUTH = {"stretch": 0.6, "mass": 1.7}
-SPACE = FitSpace.build(["stretch", "mass"])
+TRUTH = {"stretching": 0.6, "density": 1.7}
+SPACE = FitSpace.build(["stretching", "density"])
 
 
 def scenario_of(**changes):
@@ -62,7 +62,7 @@ class TestPose:
     def test_the_loss_does_not_know_where_the_recording_lies(self, scenario, episode):
         """x, y and yaw are symmetries: of a recording turned and shifted, every parameter set has the same loss."""
         beside = moved(episode, shift=(0.03, -0.02, 0.0), yaw=0.15)
-        values = {"stretch": torch.tensor([0.3, 0.6, 2.0]).double(), "mass": torch.tensor([1.7, 1.7, 0.8]).double()}
+        values = {"stretching": torch.tensor([0.3, 0.6, 2.0]).double(), "density": torch.tensor([1.7, 1.7, 0.8]).double()}
         with torch.no_grad():
             here, there = (Objective(scenario, one)(values) for one in (episode, beside))
         torch.testing.assert_close(there, here, rtol=0.02, atol=1e-7)
@@ -159,7 +159,7 @@ class TestWhatCounts:
         assert early.frames == whole.frames[:6]
         assert early.loss_steps < whole.loss_steps
         with torch.no_grad():
-            part, full = (one.frame_losses(one.simulate_to_loss(one_set({"stretch": 2.0}))) for one in (early, whole))
+            part, full = (one.frame_losses(one.simulate_to_loss(one_set({"stretching": 2.0}))) for one in (early, whole))
         torch.testing.assert_close(part, full[:, :6])
         assert whole.earliest([12]).frames == whole.frames
         backwards = Objective(scenario, episode, nuisance={}, frames=[-1, 5, 4, 3, 2, 1]).earliest([5])
@@ -182,9 +182,9 @@ class TestWhatCounts:
             scraps = frame[: len(frame) // 10] + np.float32([0.5, 0.2, 0.3])
             frames.append(np.concatenate([frame, scraps]))
         dirty = Episode.from_frames(frames, episode.times, gripper=episode.gripper)
-        space = FitSpace.build(["stretch"], fixed={"mass": TRUTH["mass"]})
+        space = FitSpace.build(["stretching"], fixed={"density": TRUTH["density"]})
         found = fit_likelihood(Objective(scenario, dirty), space, LikelihoodSettings(model_error=False))
-        assert found.values["stretch"] == pytest.approx(TRUTH["stretch"], rel=0.05)
+        assert found.values["stretching"] == pytest.approx(TRUTH["stretching"], rel=0.05)
 
     def test_what_no_camera_could_see_does_not_count(self, scenario, episode):
         """Seen from one side alone, and recorded so: a part of the cloth has no points. The truth is then twice as near to
@@ -330,7 +330,7 @@ class TestWhatCounts:
         band = load_scenario("band_stretch")
         objective = Objective(band, clouds_of(band), nuisance={}, frames=[12])
         with torch.no_grad():
-            run = objective.simulate_to_loss({"stretch": torch.ones(1, dtype=torch.float64)})
+            run = objective.simulate_to_loss({"stretching": torch.ones(1, dtype=torch.float64)})
         nodes = run.at(objective.times)[0].numpy()
         recorded = sample_surface(
             nodes, band.scene.mesh.faces, objective.times.numpy(), band.scene.bodies, points=3000, seed=1, meta={}
@@ -360,7 +360,7 @@ def test_with_a_lag_the_loss_does_not_depend_on_how_far_is_simulated(scenario, e
 
 
 def test_a_basis_that_diverges_costs_no_parameter_set(scenario, episode, monkeypatch):
-    """The first pose is looked for with the basis material; without its motion, steps begin at zero."""
+    """The first pose is looked for with the nominal material; without its motion, steps begin at zero."""
     objective = Objective(scenario, episode)
     real = Objective.simulate
 
@@ -376,12 +376,12 @@ def test_a_basis_that_diverges_costs_no_parameter_set(scenario, episode, monkeyp
 
 def test_millimetres_are_those_of_distances_whatever_the_loss(scenario, episode, monkeypatch):
     """A loss in metres, as CONTRIBUTING tells to write one, changes no `rms_mm`."""
-    values = {"stretch": torch.tensor([1.0]), "mass": torch.tensor([1.0])}
+    values = {"stretching": torch.tensor([1.0]), "density": torch.tensor([1.0])}
     objective = Objective(scenario, episode, nuisance={})
-    expected = found_at(objective, {"stretch": 1.0, "mass": 1.0})
+    expected = found_at(objective, {"stretching": 1.0, "density": 1.0})
     assert expected["rms_mm"] == pytest.approx(1e3 * expected["loss"] ** 0.5)
     monkeypatch.setattr(Pairs, "losses", lambda self, moved, cap: self.squares(moved, cap).sqrt())
-    other = found_at(objective, {"stretch": 1.0, "mass": 1.0})
+    other = found_at(objective, {"stretching": 1.0, "density": 1.0})
     assert other["loss"] != pytest.approx(expected["loss"], rel=0.1)
     for name in ("rms_mm", "frame_rms_mm", "rms_to_recording_mm", "rms_to_cloth_mm"):
         assert other[name] == expected[name]

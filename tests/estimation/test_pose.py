@@ -114,7 +114,7 @@ class TestText:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("jaw=30deg", "Unknown nuisance variable 'jaw'. Did you mean 'yaw'"),
+            ("jaw=30deg", "Unknown alignment variable 'jaw'. Did you mean 'yaw'"),
             ("x", "x takes how far it may well be off, a positive number in one of m, cm, mm, such as x=2cm"),
             ("yaw=30", "one of rad, deg, such as yaw=5deg"),
             ("x=30deg", "one of m, cm, mm"),
@@ -125,7 +125,7 @@ class TestText:
             ("x=0", "positive"),
             ("x=1e999", "positive"),
             ("x=1,x=2", "names x twice"),
-            ("", "Unknown nuisance variable ''"),
+            ("", "Unknown alignment variable ''"),
         ],
     )
     def test_typed_wrongly(self, text, message):

@@ -26,9 +26,9 @@ def test_material_of_a_record_has_the_air_that_moves_with_the_cloth():
     """Density is the cloth's own: weight per area. Added mass and linear drag are what the motion was simulated with."""
     scenario = small_lift(air="still")
     around, density = scenario.scene.surrounding, scenario.scene.material.density
-    told = whole_material(scenario, {"mass": 3.0, "added_mass": 2.0, "linear_drag": 0.5})
+    told = whole_material(scenario, {"density": 3.0, "added_mass": 2.0, "linear_drag": 0.5})
     assert told.density == pytest.approx(3 * density)
     assert told.added_mass == pytest.approx(2 * around.added_mass)
     assert told.linear_drag == pytest.approx(0.5 * around.linear_drag)
-    without = whole_material(small_lift(air="drag"), {"mass": 3.0})
+    without = whole_material(small_lift(air="drag"), {"density": 3.0})
     assert (without.added_mass, without.linear_drag) == (0.0, 0.0)

@@ -17,8 +17,8 @@ from tests.conftest import small_lift
 from tests.estimation.rates import check_rates
 from tests.estimation.test_fit import GENTLE, clouds_of
 
-TRUTH = {"stretch": 0.6, "mass": 1.7}
-SPACE = FitSpace.build(["stretch", "mass"])
+TRUTH = {"stretching": 0.6, "density": 1.7}
+SPACE = FitSpace.build(["stretching", "density"])
 
 
 def lifted(*, integrator="implicit", **measure):
@@ -68,7 +68,7 @@ def test_a_difference_that_diverges_names_its_place(monkeypatch):
     objective, real = lifted(integrator="arcsim"), Objective.simulate_to_loss
 
     def broken(self, parameters):
-        bad = (parameters["stretch"] > 9.0).nonzero().flatten().tolist()
+        bad = (parameters["stretching"] > 9.0).nonzero().flatten().tolist()
         if bad:
             raise DivergedError(3, bad, "test")
         return real(self, parameters)

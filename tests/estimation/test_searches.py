@@ -37,7 +37,7 @@ class TestSearch:
     def test_finds_the_minimum_of_a_bowl(self, settings):
         found = solve(Bowl(), SPACE, settings(max_simulations=400))
         assert found.loss < 0.01 * found.loss_start
-        assert found.values == pytest.approx({"stretch": 0.7, "mass": 2.0}, rel=0.2)
+        assert found.values == pytest.approx({"stretching": 0.7, "density": 2.0}, rel=0.2)
         assert float(Bowl()({name: torch.tensor([value]) for name, value in found.values.items()})) == pytest.approx(
             found.loss, rel=1e-6
         )
@@ -50,7 +50,7 @@ class TestSearch:
         assert found.stop_reason == "simulations"
 
     def test_begins_in_the_middle_or_where_it_is_told_and_stays_inside(self, settings):
-        for init, first in (({}, (5.05, 5.05)), ({"mass": 10.0}, (5.05, 10.0))):
+        for init, first in (({}, (5.05, 5.05)), ({"density": 10.0}, (5.05, 10.0))):
             bowl = Counted()
             found = solve(bowl, SPACE, settings(max_simulations=60, init=init))
             assert bowl.asked[0] == first
@@ -120,18 +120,18 @@ class TestSearch:
             solve(Stopped(), SPACE, settings())
 
     def test_one_variable_with_a_known_other(self, settings):
-        space = FitSpace.build(["stretch"], fixed={"mass": 2.0})
+        space = FitSpace.build(["stretching"], fixed={"density": 2.0})
         found = solve(Bowl(), space, settings(max_simulations=60))
-        assert found.values == pytest.approx({"stretch": 0.7}, rel=0.2)
+        assert found.values == pytest.approx({"stretching": 0.7}, rel=0.2)
 
     def test_a_range_from_zero_is_searched_linearly(self, settings):
         """Where a logarithm would never come near the bound."""
 
         class Line(Bowl):
             def __call__(self, parameters):
-                return (10 * parameters["damping"] - 0.2).square() + (parameters["mass"] / 2).log().square()
+                return (10 * parameters["damping"] - 0.2).square() + (parameters["density"] / 2).log().square()
 
-        space = FitSpace.build(["damping", "mass"], bounds={"damping": (0.0, 0.1)})
+        space = FitSpace.build(["damping", "density"], bounds={"damping": (0.0, 0.1)})
         found = solve(Line(), space, settings(max_simulations=300))
         assert found.values["damping"] == pytest.approx(0.02, abs=0.01)
 
@@ -141,7 +141,7 @@ class TestSearch:
 
     def test_files_tell_the_solver_and_its_settings(self, settings, tmp_path):
         scenario = small_lift()
-        objective = Objective(scenario, clouds_of(scenario, stretch=0.6, mass=1.0))
+        objective = Objective(scenario, clouds_of(scenario, stretching=0.6, density=1.0))
         chosen = settings(max_simulations=9, seed=2)
         found = solve(objective, SPACE, chosen)
         told = read_fit(write_fit(tmp_path, "e", describe_fit(objective, SPACE, chosen, found, episodes=["e"])))

@@ -10,14 +10,14 @@ import torch
 from diffcloud.errors import DivergedError
 from diffcloud.estimation.parameters import FitSpace
 
-SPACE = FitSpace.build(["stretch", "mass"])
+SPACE = FitSpace.build(["stretching", "density"])
 
 
 @dataclass
 class Bowl:
     """Loss: the squared logarithmic distance to a target; parameters above `diverges_above` diverge."""
 
-    target: dict[str, float] = field(default_factory=lambda: {"stretch": 0.7, "mass": 2.0})
+    target: dict[str, float] = field(default_factory=lambda: {"stretching": 0.7, "density": 2.0})
     diverges_above: float = float("inf")
     length_unit_m: float = 1.0
     members: tuple[SimpleNamespace, ...] = (SimpleNamespace(frames=(0,)),)

@@ -60,9 +60,9 @@ def records() -> list[dict[str, Any]]:
 
 
 def _row(method: str, loss: float, stretch: float, truth: dict[str, float] | None) -> dict[str, Any]:
-    values = {"stretch": stretch, "mass": 1.0}
+    values = {"stretching": stretch, "density": 1.0}
     row = {"method": method, "values": values, "clipped": values, "inside": True, "simulations": 4, "gradients": False}
-    known = {"success": loss < 6e-5, "error_stretch": 0.5} if truth else {}
+    known = {"success": loss < 6e-5, "error_stretching": 0.5} if truth else {}
     return row | _measured(loss) | known
 
 
@@ -79,37 +79,41 @@ def _measured(loss: float) -> dict[str, float]:
 
 def _intervals(stretch: float, reason: str) -> dict[str, Any]:
     def entry(value: float, scale: float, unit: str) -> dict[str, Any]:
-        low, high = value / 2, value * 2
         return {
-            "value": value, "low": low, "high": high, "physical": scale * value, "physical_low": scale * low,
-            "physical_high": scale * high, "physical_unit": unit, "factor": 2.0, "at_bounds": [],
-            "verdict": "only the ratio",
+            "value": scale * value, "low": scale * value / 2, "high": scale * value * 2, "unit": unit, "nominal": scale,
+            "factor": 2.0, "at_bounds": [], "status": "ratio_only",
         }  # fmt: skip
 
     return {
         "level": 0.9,
         "within": 1.5,
-        "parameters": {"stretch": entry(stretch, 4.0, "N/m"), "mass": entry(1.0, 0.2, "kg/m²")},
-        "ratio": {"value": stretch, "low": stretch / 1.07, "high": stretch * 1.07, "factor": 1.07},
-        "best": {"powers": {"stretch": 1.0, "mass": -1.0}, "factor": 1.07},
-        "worst": {"powers": {"stretch": 1.0, "mass": 1.0}, "factor": 2.0},
+        "parameters": {"stretching": entry(stretch, 4.0, "N/m"), "density": entry(1.0, 0.2, "kg/m²")},
+        "ratio": {
+            "value": 20 * stretch,
+            "low": 20 * stretch / 1.07,
+            "high": 21.4 * stretch,
+            "nominal": 20.0,
+            "factor": 1.07,
+        },
+        "best": {"powers": {"stretching": 1.0, "density": -1.0}, "factor": 1.07},
+        "worst": {"powers": {"stretching": 1.0, "density": 1.0}, "factor": 2.0},
         "sources": {
-            "friction_obstacle": {"stretch": 0.3, "mass": 0.3, "ratio": 0.03},
-            "noise": {"stretch": 0.1, "mass": 0.1, "ratio": 0.02},
+            "friction": {"stretching": 0.3, "density": 0.3, "ratio": 0.03},
+            "noise": {"stretching": 0.1, "density": 0.1, "ratio": 0.02},
         },
         "clusters": 16,
         "covariance": [[0.1, 0.098], [0.098, 0.1]],
         "arrived": True,
-        "explains": not reason,
+        "fits_to_noise": not reason,
         "reason": reason,
-        "remark": "" if reason else "the loss is 1.7 times what noise leaves",
+        "warning": "" if reason else "the loss is 1.7 times what noise leaves",
         "note": "",
     }
 
 
 def _landscape() -> dict[str, Any]:
     return {
-        "names": ["stretch", "mass"],
+        "names": ["stretching", "density"],
         "x": [0.1, 1.0, 10.0],
         "y": [0.1, 1.0, 10.0],
         "loss": [[0.01, 0.02, 0.03], [0.02, 0.001, 0.02], [0.03, None, 0.01]],

@@ -1,4 +1,4 @@
-"""Intervals and verdicts from known covariances."""
+"""Intervals and statuses from known covariances."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ from diffcloud.evaluation.summary import largest_sources
 from tests.conftest import small_lift
 from tests.estimation.records import record_of
 
-VALUES = {"stretch": 0.7, "mass": 1.0}
-SPACE = FitSpace.build(["stretch", "mass"], priors={"stretch": 10.0, "mass": 10.0})
+VALUES = {"stretching": 0.7, "density": 1.0}
+SPACE = FitSpace.build(["stretching", "density"], priors={"stretching": 10.0, "density": 10.0})
 SCENARIO = small_lift()
 
 
-def told(sources, *, space=SPACE, values=VALUES, scenario=SCENARIO, misfits=(1.0, 1.0, 9.0), stop="converged", **options):
+def told(
+    sources, *, space=SPACE, values=VALUES, scenario=SCENARIO, chi_squares=(1.0, 1.0, 9.0), stop="converged", **options
+):
     """Intervals of stated variances."""
     estimate = EstimateRecord(
         mean=values,
         sources={name: np.array(part, dtype=float).reshape([len(values)] * 2).tolist() for name, part in sources.items()},
         starts=[values],
         weights=[1.0],
-        recordings=[Followed(horizon_s=1.0, misfits=list(misfits), finer_mm=[0.1] * len(misfits))],
+        recordings=[Followed(horizon_s=1.0, chi_squares=list(chi_squares), finer_mm=[0.1] * len(chi_squares))],
     )
     record = record_of(solver="likelihood", estimate=estimate, stop_reason=stop)
     return intervals_of(record, space, scenario, **options)
@@ -43,86 +45,85 @@ def known_ratio(scale, ratio):
 class TestEnds:
     def test_they_are_as_far_as_all_variances_together_say(self):
         found = told({"recording": np.diag([0.03, 0.0]), "z": np.diag([0.01, 0.01])}, level=0.95)
-        entry = found.parameters["stretch"]
+        entry = found.parameters["stretching"]
         assert math.log(entry.high / entry.value) == pytest.approx(0.2 * norm.ppf(0.975), rel=1e-6)
         assert entry.low * entry.high == pytest.approx(entry.value**2)
-        assert (entry.physical, entry.physical_unit) == (pytest.approx(4.0 * 0.7), "N/m")
-        assert entry.physical_high == pytest.approx(4.0 * entry.high)
+        assert (entry.value, entry.unit) == (pytest.approx(4.0 * 0.7), "N/m")
 
     def test_they_stop_at_the_bounds(self):
-        entry = told({"recording": np.diag([25.0, 25.0])}).parameters["stretch"]
-        assert (entry.low, entry.high) == (0.1, 10.0)
-        assert entry.at_bounds == [0.1, 10.0]
+        entry = told({"recording": np.diag([25.0, 25.0])}).parameters["stretching"]
+        assert (entry.low, entry.high) == (0.4, 40.0)
+        assert entry.at_bounds == [0.4, 40.0]
 
     def test_a_linear_axis_has_a_linear_interval(self):
-        space = FitSpace.build(["friction_obstacle"])
-        found = told({"recording": [[0.01]]}, space=space, values={"friction_obstacle": 0.3})
-        entry = found.parameters["friction_obstacle"]
+        space = FitSpace.build(["friction"])
+        found = told({"recording": [[0.01]]}, space=space, values={"friction": 0.3})
+        entry = found.parameters["friction"]
         assert entry.high - entry.value == pytest.approx(0.1 * norm.ppf(0.95) * 1.5)  # a part of the range
         assert entry.value - entry.low == pytest.approx(entry.high - entry.value)
 
     def test_the_ratio_takes_both_along(self):
         found = told({"recording": known_ratio(1.0, 0.1)})
-        assert found.ratio.value == pytest.approx(0.7)
+        assert found.ratio.value == pytest.approx(0.7 * 4.0 / 0.2)
         assert math.log(found.ratio.factor) == pytest.approx(0.1 * norm.ppf(0.95), rel=1e-6)
         assert found.ratio.high / found.ratio.value == pytest.approx(found.ratio.value / found.ratio.low)
-        assert str(found.best) in ("stretch^+1.00 · mass^-1.00", "stretch^-1.00 · mass^+1.00")
+        assert str(found.best) in ("stretching^+1.00 · density^-1.00", "stretching^-1.00 · density^+1.00")
         assert found.worst.factor > found.best.factor
 
 
-class TestVerdicts:
+class TestStatus:
     @pytest.mark.parametrize(
-        ("sources", "verdict"),
+        ("sources", "status"),
         [
             ({"recording": np.diag([0.01, 0.01])}, "identified"),
-            ({"recording": known_ratio(1.0, 0.1)}, "only the ratio"),
-            ({"recording": np.diag([1.0, 1.0])}, "not identified"),
-            ({"recording": np.diag([0.1, 0.1]), "prior": np.diag([1.0, 1.0])}, "the prior speaks"),
+            ({"recording": known_ratio(1.0, 0.1)}, "ratio_only"),
+            ({"recording": np.diag([1.0, 1.0])}, "not_identified"),
+            ({"recording": np.diag([0.1, 0.1]), "prior": np.diag([1.0, 1.0])}, "prior_dominated"),
         ],
     )
-    def test_from_variances(self, sources, verdict):
-        assert told(sources).parameters["stretch"].verdict == verdict
+    def test_from_variances(self, sources, status):
+        assert told(sources).parameters["stretching"].status == status
 
     def test_of_other_pairs_only_a_combination_is_known(self):
-        space = FitSpace.build(["stretch", "bending"])
-        found = told({"recording": known_ratio(1.0, 0.1)}, space=space, values={"stretch": 1, "bending": 1})
-        assert found.parameters["bending"].verdict == "only a combination"
+        space = FitSpace.build(["stretching", "bending"])
+        found = told({"recording": known_ratio(1.0, 0.1)}, space=space, values={"stretching": 1, "bending": 1})
+        assert found.parameters["bending"].status == "combination_only"
         assert found.ratio is None
 
     @pytest.mark.parametrize(
         ("names", "covariance"),
         [
-            (["stretch"], [[0.01]]),  # at a bound, and one parameter is no combination
-            (["stretch", "friction_cloth"], known_ratio(1.0, 0.1)),  # which has no logarithm, as it may be zero
+            (["stretching"], [[0.01]]),  # at a bound, and one parameter is no combination
+            (["stretching", "self_friction"], known_ratio(1.0, 0.1)),  # which has no logarithm, as it may be zero
         ],
     )
     def test_what_is_no_product_of_several_is_no_combination(self, names, covariance):
-        space = FitSpace.build(names, bounds={"stretch": (0.1, 10.0), "friction_cloth": (0.0, 1.5)})
-        values = {"stretch": 0.1 if len(names) == 1 else 1.0, "friction_cloth": 0.5}
+        space = FitSpace.build(names, bounds={"stretching": (0.1, 10.0), "self_friction": (0.0, 1.5)})
+        values = {"stretching": 0.1 if len(names) == 1 else 1.0, "self_friction": 0.5}
         found = told({"recording": np.array(covariance)}, space=space, values={name: values[name] for name in names})
-        assert found.parameters["stretch"].verdict == "not identified"
+        assert found.parameters["stretching"].status == "not_identified"
 
     def test_a_named_factor_decides(self):
         sources = {"recording": np.diag([0.04, 0.04])}
-        assert told(sources, within=1.2).parameters["stretch"].verdict == "not identified"
-        assert told(sources, within=1.5).parameters["stretch"].verdict == "identified"
+        assert told(sources, within=1.2).parameters["stretching"].status == "not_identified"
+        assert told(sources, within=1.5).parameters["stretching"].status == "identified"
 
     def test_of_uncertain_material_there_is_none(self):
         uncertain = replace(FitSpace.build(["bending"], priors={"bending": 1.5}).variables[0], role="material")
         space = FitSpace((*SPACE.variables, uncertain), {})
-        assert set(told({"recording": np.diag([0.01, 0.01])}, space=space).parameters) == {"stretch", "mass"}
+        assert set(told({"recording": np.diag([0.01, 0.01])}, space=space).parameters) == {"stretching", "density"}
 
     def test_a_cloth_that_is_far_from_the_recording_most_of_the_time_says_nothing(self):
-        found = told({"recording": np.diag([0.01, 0.01])}, misfits=(1.0, 9.0, 9.0))
-        assert not found.explains
-        assert found.parameters["stretch"].verdict == "the model does not explain the recording"
+        found = told({"recording": np.diag([0.01, 0.01])}, chi_squares=(1.0, 9.0, 9.0))
+        assert not found.fits_to_noise
+        assert found.parameters["stretching"].status == "model_error"
         assert "3.0 times as far" in found.reason
         assert found.sentences[0].startswith("In e the cloth is 3.0 times")
 
     def test_a_descent_that_took_all_its_steps_is_remarked_on(self):
         right, cut = (told({"recording": np.diag([0.01, 0.01])}, stop=stop) for stop in ("converged", "iterations"))
         assert right.sentences == []
-        assert "--max-steps" in cut.remark
+        assert "--max-steps" in cut.warning
         assert cut.parameters == right.parameters
 
 
@@ -132,9 +133,9 @@ def test_fits_by_other_solvers_have_no_intervals():
 
 
 def test_what_to_improve_first():
-    sources = {"noise": {"stretch": 0.1}, "friction_obstacle": {"stretch": 0.3}, "z": {"stretch": 0.001}}
-    assert largest_sources(sources, "stretch") == "friction obstacle 90 %, noise 10 %"
-    assert largest_sources({"noise": {"stretch": 0.0}}, "stretch") == ""
+    sources = {"noise": {"stretching": 0.1}, "friction": {"stretching": 0.3}, "z": {"stretching": 0.001}}
+    assert largest_sources(sources, "stretching") == "friction 90 %, noise 10 %"
+    assert largest_sources({"noise": {"stretching": 0.0}}, "stretching") == ""
 
 
 @pytest.mark.parametrize(
@@ -153,5 +154,5 @@ def test_numbers_of_everyday_size_are_written_out():
 def test_a_note_where_mass_multiplies_a_part_of_the_cloth():
     sources = {"recording": np.diag([0.01, 0.01])}
     assert told(sources).sentences == []
-    (sentence,) = told(sources, scenario=replace(SCENARIO, node_sets={"mass": np.arange(5)})).sentences
+    (sentence,) = told(sources, scenario=replace(SCENARIO, node_sets={"density": np.arange(5)})).sentences
     assert f"5 of {len(SCENARIO.scene.mesh.nodes)} nodes" in sentence

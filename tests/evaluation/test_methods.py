@@ -65,19 +65,19 @@ def test_one_start_is_the_first_of_many():
     for change in ({"smoothing": 0.5}, {"resample": True}):
         assert first_start(summary.model_copy(update={"settings": summary.settings | change}), SPACE) is None
     assert first_start(summary.model_copy(update={"stop_reason": "threshold"}), SPACE) is None
-    elsewhere = fit_adam(Bowl(), SPACE, AdamSettings(max_steps=2, init={"mass": 1.0}))
+    elsewhere = fit_adam(Bowl(), SPACE, AdamSettings(max_steps=2, init={"density": 1.0}))
     assert first_start(summary_of(elsewhere), SPACE) is None
 
 
 @pytest.mark.parametrize(
-    "rival",
+    "baseline",
     [
         lambda bowl: single_start(bowl, SPACE, AdamSettings(max_steps=10)),
         lambda bowl: searched(bowl, SPACE, RandomSearchSettings()),
         lambda bowl: searched(bowl, SPACE, CmaEsSettings()),
     ],
 )
-def test_an_interrupted_rival_is_no_result(rival, monkeypatch):
+def test_an_interrupted_rival_is_no_result(baseline, monkeypatch):
     def interrupt(self, parameters):
         self.calls += 1
         if self.calls == 3:
@@ -87,7 +87,7 @@ def test_an_interrupted_rival_is_no_result(rival, monkeypatch):
     real = Bowl.__call__
     monkeypatch.setattr(Bowl, "__call__", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        rival(Bowl())
+        baseline(Bowl())
 
 
 @pytest.mark.parametrize(("solver", "gradients"), [("likelihood", True), ("adam", True), ("random_search", False)])
@@ -120,24 +120,24 @@ def test_every_lost_entry_has_its_own_message():
 class TestValues:
     SUMMARY = record_of(
         parameters={
-            "stretch": parameter_of(value=2.0, bounds=(0.5, 4.0), prior=3.0),
-            "mass": parameter_of(value=1.2, fixed=True, bounds=None),
+            "stretching": parameter_of(multiplier=2.0, bounds=(20.0, 160.0), prior=3.0),
+            "density": parameter_of(multiplier=1.2, fixed=True, bounds=None),
         }
     )
 
     def test_what_was_given_holds_for_all_methods(self):
         space = space_of(self.SUMMARY)
-        assert space.variables == (Variable("stretch", 0.5, 4.0, 3.0),)
+        assert space.variables == (Variable("stretching", 0.5, 4.0, 3.0),)
         parameters = space.parameters(torch.tensor([[2.0]]).double())
-        assert {name: float(value) for name, value in parameters.items()} == {"stretch": 2.0, "mass": 1.2}
+        assert {name: float(value) for name, value in parameters.items()} == {"stretching": 2.0, "density": 1.2}
 
-    @pytest.mark.parametrize(("told", "value"), [({"stretch": 9.0}, 4.0), ({"stretch": -3.0}, 0.5), ({}, 2.25)])
+    @pytest.mark.parametrize(("told", "value"), [({"stretching": 9.0}, 4.0), ({"stretching": -3.0}, 0.5), ({}, 2.25)])
     def test_clipped_to_the_bounds(self, told, value):
-        found = clipped({**told, "mass": 7.0}, space_of(self.SUMMARY))
-        assert found == {"stretch": value, "mass": 1.2}
+        found = clipped({**told, "density": 7.0}, space_of(self.SUMMARY))
+        assert found == {"stretching": value, "density": 1.2}
 
     def test_published_predictions(self):
-        told = published({"predictions": {"mlp": {"stretch": -1.0, "mass": 3.0}}})
-        assert [(one.method, one.values) for one in told] == [("published_mlp", {"stretch": -1.0, "mass": 3.0})]
+        told = published({"predictions": {"mlp": {"stretching": -1.0, "density": 3.0}}})
+        assert [(one.method, one.values) for one in told] == [("published_mlp", {"stretching": -1.0, "density": 3.0})]
         assert published({}) == []
-        assert math.isclose(middle(SPACE).values["mass"], 5.05)
+        assert math.isclose(middle(SPACE).values["density"], 5.05)

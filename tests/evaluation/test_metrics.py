@@ -22,8 +22,8 @@ from diffcloud.io.episodes import Episode
 from tests.conftest import paper_objective, small_lift
 from tests.estimation.test_fit import clouds_of
 
-TRUTH = {"stretch": 0.8, "mass": 1.5}
-OTHER = {"stretch": 4.0, "mass": 0.4}
+TRUTH = {"stretching": 0.8, "density": 1.5}
+OTHER = {"stretching": 4.0, "density": 0.4}
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +66,8 @@ class TestMeter:
         assert rows[1]["two_sided"] == pytest.approx(float(chamfer(points, [target])))
 
     def test_errors_vanish_at_the_truth(self, rows):
-        assert [rows[0][f"error_{name}"] for name in ("stretch", "mass", "ratio")] == pytest.approx([0, 0, 0])
-        assert rows[1]["error_stretch"] == pytest.approx(4.0)
+        assert [rows[0][f"error_{name}"] for name in ("stretching", "density", "ratio")] == pytest.approx([0, 0, 0])
+        assert rows[1]["error_stretching"] == pytest.approx(4.0)
         assert rows[1]["error_ratio"] == pytest.approx(10.0 / (0.8 / 1.5) - 1)
 
     def test_success_is_below_the_papers_threshold(self, scenario, rows):
@@ -80,7 +80,7 @@ class TestMeter:
 
         def until(self, parameters, *, steps=None):
             if steps is None or steps > self.loss_steps:
-                late = (parameters["stretch"] > 3).nonzero().flatten().tolist()
+                late = (parameters["stretching"] > 3).nonzero().flatten().tolist()
                 if late:
                     raise DivergedError(self.loss_steps + 1, late, "later")
             return simulate(self, parameters, steps=steps)
@@ -95,7 +95,7 @@ class TestMeter:
 
     def test_one_that_diverges_costs_only_itself(self, scenario, episode, rows):
         meter = EpisodeMeter(Objective(scenario, episode, frames=[-1], paper=True), draws=2, seed=7)
-        found = meter.measure([TRUTH, {"stretch": -1e9, "mass": 1.0}, OTHER])
+        found = meter.measure([TRUTH, {"stretching": -1e9, "density": 1.0}, OTHER])
         assert list(found.diverged) == [1]
         assert "diverged at step" in found.diverged[1]
         assert found.rows[1] == {}
@@ -110,23 +110,23 @@ class TestMeter:
 
 
 def test_landscape_is_the_loss_on_a_grid(scenario, episode):
-    objective, space = paper_objective(scenario, episode), FitSpace.build(["stretch", "mass"])
+    objective, space = paper_objective(scenario, episode), FitSpace.build(["stretching", "density"])
     waiting = [5.0, 5.0]  # of a start that nobody followed
     values = [[[1.0, 2.0], [None, None], waiting], [[1.1, 2.1], [3.0, 3.0], waiting]]
     losses = [[1.0, None, None], [0.9, 0.8, None]]
-    history = History(names=["stretch", "mass"], loss=losses, values=values, gradient_norm=[])
+    history = History(names=["stretching", "density"], loss=losses, values=values, gradient_norm=[])
     found = loss_landscape(objective, space, TRUTH, history, size=3)
     assert found["x"] == pytest.approx([0.1, 1.0, 10.0])
     with torch.no_grad():
-        expected = objective({"stretch": torch.tensor([10.0]).double(), "mass": torch.tensor([1.0]).double()})
+        expected = objective({"stretching": torch.tensor([10.0]).double(), "density": torch.tensor([1.0]).double()})
     assert found["loss"][1][2] == pytest.approx(float(expected), rel=1e-9)
     assert found["paths"] == [[[1.0, 2.0], [1.1, 2.1]], [[3.0, 3.0]]]
-    assert loss_landscape(objective, FitSpace.build(["mass"]), TRUTH, history, size=3) is None
+    assert loss_landscape(objective, FitSpace.build(["density"]), TRUTH, history, size=3) is None
 
 
 @pytest.fixture(scope="module")
 def summary(scenario, episode):
-    objective, space = paper_objective(scenario, episode), FitSpace.build(["stretch", "mass"])
+    objective, space = paper_objective(scenario, episode), FitSpace.build(["stretching", "density"])
     settings = AdamSettings(max_steps=3, starts=2)
     outcome = fit_adam(objective, space, settings)
     return describe_fit(objective, space, settings, outcome, episodes=["e"]).record
@@ -135,7 +135,7 @@ def summary(scenario, episode):
 @pytest.fixture(scope="module")
 def found(scenario, episode, summary):
     predictions = [
-        Estimate("mlp", {"stretch": 99.0, "mass": 1.0}, seconds={"inference": 0.1}),
+        Estimate("mlp", {"stretching": 99.0, "density": 1.0}, seconds={"inference": 0.1}),
         Gap("meteornet", "lost"),
     ]
     return compare_episode(
@@ -154,7 +154,7 @@ class TestEpisode:
         rows = {row["method"]: row for row in found.record["methods"]}
         assert list(rows) == ["diffcloud", "single_start", "middle", "random_search", "cma_es", "mlp"]
         assert [row["simulations"] for row in rows.values()] == [8, 4, 0, 4, 4, 0]
-        assert rows["mlp"]["clipped"] == {"stretch": 10.0, "mass": 1.0}
+        assert rows["mlp"]["clipped"] == {"stretching": 10.0, "density": 1.0}
         assert not rows["mlp"]["inside"]
         assert rows["diffcloud"]["clipped"] == summary.values
         assert found.record["gaps"] == [{"method": "meteornet", "reason": "lost", "expected": True}]
@@ -177,7 +177,7 @@ class TestEpisode:
         assert np.array(found.record["landscape"]["loss"]).shape == (3, 3)
 
     def test_a_fit_by_a_search_is_compared_as_others_are(self, scenario, episode):
-        objective, space = Objective(scenario, episode, seed=1000), FitSpace.build(["stretch", "mass"])
+        objective, space = Objective(scenario, episode, seed=1000), FitSpace.build(["stretching", "density"])
         settings = RandomSearchSettings(max_simulations=6, seed=1000)
         summary = describe_fit(objective, space, settings, solve(objective, space, settings), episodes=["e"]).record
         chosen = ComparisonSettings(draws=1, seed=1000, level=None, landscape_size=2)
@@ -192,10 +192,10 @@ class TestEpisode:
         real = Objective.__call__
 
         def fragile(self, parameters):
-            return real(self, {**parameters, "stretch": torch.full_like(parameters["stretch"], -1e9)})
+            return real(self, {**parameters, "stretching": torch.full_like(parameters["stretching"], -1e9)})
 
         monkeypatch.setattr(Objective, "__call__", fragile)
-        settings = ComparisonSettings(rivals=["random_search"], draws=1, level=None)
+        settings = ComparisonSettings(baselines=["random_search"], draws=1, level=None)
         record = compare_episode(scenario, episode, summary, name="e", settings=settings).record
         assert [row["method"] for row in record["methods"]] == ["diffcloud"]
         assert [gap["method"] for gap in record["gaps"]] == ["random_search"]

@@ -69,12 +69,12 @@ def test_metrics_are_plain_numbers(told):
     found = metrics(told)
     assert found["methods"]["lift"]["diffcloud"]["episodes"] == 2
     assert not any(isinstance(value, float) and math.isnan(value) for value in found["methods"]["lift"]["mlp"].values())
-    assert found["verdicts"]["lift"]["stretch"] == {"only the ratio": 2}
+    assert found["statuses"]["lift"]["stretching"] == {"ratio_only": 2}
 
 
 def test_the_headline_is_small_rounded_and_knows_no_time():
     """RMS in millimetres of losses 0.001 and 0.003 in m²; ratios of 1 and 2 where the truth is 0.5: factors 2 and 4."""
-    truth = {"stretch": 0.5, "mass": 1.0}
+    truth = {"stretching": 0.5, "density": 1.0}
     known = [
         record("lift", "a", methods={"diffcloud": 0.001, "middle": 0.01, "mlp": 0.02}, truth=truth),
         record("lift", "b", methods={"diffcloud": 0.003, "middle": 0.01}, truth=truth, stretch=2.0),
@@ -91,7 +91,7 @@ def test_the_headline_is_small_rounded_and_knows_no_time():
 
 
 def test_a_fit_has_a_row_with_what_its_start_and_its_end_are_worth():
-    truth = {"stretch": 0.5, "mass": 1.0}
+    truth = {"stretching": 0.5, "density": 1.0}
     told = [
         record("lift", "joint-a", fit="joint", methods={"diffcloud": 0.001}, truth=truth, start=0.02),
         record("lift", "joint-b", fit="joint", methods={"diffcloud": 0.003}, truth=truth, start=0.04),
@@ -112,9 +112,9 @@ def test_a_fit_has_a_row_with_what_its_start_and_its_end_are_worth():
 class TestRepeats:
     def test_repeatability_is_the_largest_over_the_smallest(self):
         table = repeatability(parameter_table(records())).set_index(["scenario", "parameter"])
-        assert table.loc[("lift", "stretch"), "factor"] == pytest.approx(2.0)
+        assert table.loc[("lift", "stretching"), "factor"] == pytest.approx(2.0)
         assert table.loc[("lift", "ratio"), "factor"] == pytest.approx(2.0)
-        assert ("fold", "stretch") not in table.index  # one recording has no spread
+        assert ("fold", "stretching") not in table.index  # one recording has no spread
 
     def test_recordings_of_a_joint_fit_agree_because_they_were_made_to(self):
         joint = [record("lift", f"joint-{name}", fit="joint") for name in ("tan1", "tan2")]
@@ -129,16 +129,19 @@ class TestRepeats:
 
     def test_consistency_compares_geometric_means(self):
         table = consistency(parameter_table(records())).set_index("parameter")
-        assert table.loc["stretch", "value_first"] == pytest.approx(math.sqrt(2.0))
-        assert table.loc["stretch", "factor"] == pytest.approx(8.0 / math.sqrt(2.0))
+        assert table.loc["stretching", "value_first"] == pytest.approx(math.sqrt(2.0))
+        assert table.loc["stretching", "factor"] == pytest.approx(8.0 / math.sqrt(2.0))
 
     def test_labels_of_simulated_targets_name_no_cloth(self):
-        simulated = [record("lift", "a", fabric="hidden1", truth={"stretch": 1.0}), record("fold", "b", fabric="hidden1")]
+        simulated = [
+            record("lift", "a", fabric="hidden1", truth={"stretching": 1.0}),
+            record("fold", "b", fabric="hidden1"),
+        ]
         assert consistency(parameter_table(simulated)).empty
 
     def test_other_repeats_are_of_the_same_fabric(self):
         metas = {"a": {"fabric": "tan"}, "b": {"fabric": "tan"}, "c": {"fabric": "navy"}, "d": {}, "e": {}}
-        fits = {name: {"stretch": 1.0} for name in metas}
+        fits = {name: {"stretching": 1.0} for name in metas}
         found = other_repeats(metas, fits)
         assert {name: list(others) for name, others in found.items()} == {"a": ["b"], "b": ["a"], "c": [], "d": [], "e": []}
 
@@ -148,35 +151,35 @@ class TestWords:
         said = sentences(told)
         assert "DiffCloud has the lowest mean loss over 2 episodes" in said["winners"][0]
         told_of = " ".join(said["intervals"])
-        assert "verdict on stretch: only the ratio in 2 of 2 episodes; 90% intervals end within a factor of 2" in told_of
-        assert "lift: stretch / mass is known within a factor of 1.07 (median)." in told_of
+        assert "status of stretching: ratio only in 2 of 2 episodes; 90% intervals end within a factor of 2" in told_of
+        assert "lift: stretching / density is known within a factor of 1.07 (median)." in told_of
         assert "lift / tan2: the misfit is 14.2 mm." in told_of
         assert "lift / tan1: the loss is 1.7 times what noise leaves." in told_of
-        assert any("by a factor of 2 in stretch" in line for line in said["repeats"])
+        assert any("by a factor of 2 in stretching" in line for line in said["repeats"])
 
     @pytest.mark.parametrize(("ends", "disagree"), [((3.0, 4.0), True), ((0.1, 0.2), True), ((0.1, 9.0), False)])
     def test_a_posterior_is_a_second_opinion(self, ends, disagree):
         one = record("lift", "tan1", methods={"diffcloud": 0.001, "posterior": 0.002})
-        one["methods"][1]["intervals"] = {"stretch": list(ends)}
+        one["methods"][1]["intervals"] = {"stretching": list(ends)}
         told = tables([one], {})
-        row = told["intervals"].set_index("parameter").loc["stretch"]
-        assert row["low"] < 1 < row["high"] < 3
-        assert (row["posterior_low"], row["posterior_high"]) == ends
+        row = told["intervals"].set_index("parameter").loc["stretching"]
+        assert row["low"] < 4 < row["high"] < 12
+        assert (row["posterior_low"], row["posterior_high"]) == (4 * ends[0], 4 * ends[1])
         said = [line for line in sentences(told)["intervals"] if "posterior" in line]
         assert len(said) == disagree
-        assert all("fit and posterior disagree on stretch by more than their widths" in line for line in said)
+        assert all("fit and posterior disagree on stretching by more than their widths" in line for line in said)
 
     def test_credibility_holds_one_recording_against_repeats_and_another_motion(self, told):
         said = sentences(told)["credibility"]
-        stretch = next(line for line in said if "stretch" in line)
+        stretch = next(line for line in said if "stretching" in line)
         assert "differ by a factor of 2, at most 2, another motion of it by a factor of 5.66, at most 5.66" in stretch
-        assert "no property of the fabric" in stretch
-        mass = next(line for line in said if "mass" in line)
+        assert "not for the fabric" in stretch
+        mass = next(line for line in said if "density" in line)
         assert "holds beyond its own recording" in mass
 
     def test_overview_has_a_row_per_scenario(self, told):
         row = overview(told).iloc[0]
-        assert (row["first"], row["second"], row["verdict_stretch"]) == ("DiffCloud", "MLP", "only the ratio (2/2)")
+        assert (row["first"], row["second"], row["status_stretching"]) == ("DiffCloud", "MLP", "ratio only (2/2)")
 
     def test_markdown_has_every_table_and_what_is_missing(self, told):
         page = comparison_page(told, ["lift/tan1: meteornet: no checkpoint"], "Tea towels")

@@ -20,7 +20,7 @@ def line(distance=0.2, seconds=2.0, keyframes=21, start=CORNER):
     return ToolTrajectory(s * seconds, start + along[:, None] * [1.0, 0.0, 0.0])
 
 
-def follow(trajectory, limits, *, lag_s=0.05, rate_hz=10.0, gain=4.0, offset=0.0):
+def follow(trajectory, limits, *, clock_offset_s=0.05, rate_hz=10.0, gain=4.0, offset=0.0):
     """Positions and commanded velocities of an arm with first-order lag, at every tick."""
     controller = VelocityController(trajectory, limits, period_s=1 / rate_hz, gain=gain)
     position, velocity = trajectory.positions[0] + [0.0, offset, 0.0], np.zeros(3)
@@ -31,7 +31,7 @@ def follow(trajectory, limits, *, lag_s=0.05, rate_hz=10.0, gain=4.0, offset=0.0
         positions.append(position)
         commands.append(command)
         for _ in range(fine):
-            velocity = velocity + (command - velocity) * (1 - np.exp(-1 / rate_hz / fine / lag_s))
+            velocity = velocity + (command - velocity) * (1 - np.exp(-1 / rate_hz / fine / clock_offset_s))
             position = position + velocity / rate_hz / fine
     return np.array(positions), np.array(commands)
 
@@ -58,7 +58,7 @@ def test_the_arm_follows_within_a_centimetre_and_ends_on_the_last_keyframe():
 
 def test_an_offset_fades_with_the_gain():
     path = ToolTrajectory(np.array([0.0, 2.0]), np.array([CORNER, CORNER]))
-    positions, _ = follow(path, Limits(), lag_s=1e-3, offset=0.02)
+    positions, _ = follow(path, Limits(), clock_offset_s=1e-3, offset=0.02)
     error = positions[:, 1] - CORNER[1]
     np.testing.assert_allclose(error[3:6] / error[2:5], 0.6, atol=0.02)  # 1 - gain * period
 
@@ -146,7 +146,7 @@ def test_published_trajectories_keep_the_limits_at_their_own_speed(release):
     folder = release.parent / "trajs"
     if not folder.is_dir():
         pytest.skip("the published trajectories (trajs/) are not beside DIFFCLOUD_RELEASE")
-    for name in ("lift", "fold", "stretch"):
+    for name in ("lift", "fold", "stretching"):
         path = read_trajectory(folder / f"{name}_traj.npy")
         check_trajectory(path, FAST)
         with pytest.raises(LimitError, match="time_scale"):

@@ -39,8 +39,8 @@ def test_release_layout(tmp_path):
     assert lift.meta["repeat"] == 2
     assert lift.meta["category"] == "highly deformable"
     assert lift.meta["category_assumed"] is True
-    assert lift.meta["predictions"] == {"mlp": {"stretch": 5.0, "mass": -1.0}}
-    assert band.meta["truth"] == {"stretch": 0.5, "mass": 5.0}
+    assert lift.meta["predictions"] == {"mlp": {"stretching": 5.0, "density": -1.0}}
+    assert band.meta["truth"] == {"stretching": 0.5, "density": 5.0}
 
 
 def test_missing_frames_and_folders(tmp_path):

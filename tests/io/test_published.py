@@ -251,7 +251,7 @@ class TestScenarios:
         assert scenario.length_unit_m == 1
         assert (scene.frame_time, scene.frame_steps) == (pytest.approx(0.1), 8)
         assert (scene.integrator, scene.surrounding.gravity) == ("implicit", (0, 0, -9.81))
-        assert scene.material.name == "basis-knit"
+        assert scene.material.name == "soft-knit"
         # the diagonal of the diamond lies along y, and the gripper's corner near the start of the track
         assert np.ptp(nodes, axis=0) == pytest.approx([0.2625 * np.sqrt(2)] * 2 + [0.0])
         assert np.abs(nodes[scenario.grasped[0], :2] - RECORDED_START_M[kind][:2]).max() < 0.02
@@ -285,7 +285,7 @@ def test_a_rollout_under_the_track_stays_near_the_recorded_tops(release, kind):
     episodes = [recorded_episode(kind, name, episode, track) for name, episode in found]
     objective = Objective(scenario, episodes[0], frames=scenario.loss_frames)
     with torch.no_grad():
-        run = objective.simulate({"stretch": torch.ones(1), "mass": torch.ones(1)})
+        run = objective.simulate({"stretching": torch.ones(1), "density": torch.ones(1)})
     corner = run.at(objective.times)[0, :, scenario.grasped[0]].numpy()
     gaps = []
     for episode in episodes:

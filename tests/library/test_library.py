@@ -22,8 +22,8 @@ from tests.cli.invoke import invoke
 from tests.cli.test_likelihood import SCENARIO
 from tests.estimation.test_fit import clouds_of
 
-TRUTH = {"stretch": 0.6, "mass": 1.7}
-SETTINGS = dc.FitSettings(parameters=["stretch"], fixed={"mass": 1.7}, solver={"starts": 1})
+TRUTH = {"stretching": 0.6, "density": 1.7}
+SETTINGS = dc.FitSettings(parameters=["stretching"], fixed={"density": 0.34}, solver={"starts": 1})
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +58,10 @@ class TestImport:
 class TestFit:
     def test_it_is_in_si_units(self, scene, found):
         stretching = found.parameters["stretching"]
-        basis = scene.scenario.scene.basis("stretching")
+        nominal = scene.scenario.scene.nominal("stretching")
         assert stretching.unit == "N/m"
-        assert stretching.interval[0] < TRUTH["stretch"] * basis < stretching.interval[1]
-        assert stretching.value == pytest.approx(found.record.estimate.mean["stretch"] * basis)
+        assert stretching.interval[0] < TRUTH["stretching"] * nominal < stretching.interval[1]
+        assert stretching.value == pytest.approx(found.record.estimate.mean["stretching"] * nominal)
         assert found.status == "fits_to_noise"
         assert 0 < found.residual < 0.01
         assert 0 < found.horizons["small"] <= 0.8
@@ -71,7 +71,7 @@ class TestFit:
         monkeypatch.chdir(tmp_path)
         Path("small.yaml").write_text(yaml.safe_dump(dict(scene.options)))
         write_episode(Path("small.npz"), recording)
-        options = ("--scene", "small.yaml", "--parameters", "stretch", "--fix", "mass=1.7", "--starts", 1)
+        options = ("--scene", "small.yaml", "--parameters", "stretching", "--fix", "density=0.34", "--starts", 1)
         invoke("fit", *options, "--out", "fits", "small.npz")
         record = read_fit(Path("fits/fit.json"))
         assert record.values == found.record.values
@@ -91,12 +91,12 @@ class TestFit:
     def test_it_is_exported(self, found, tmp_path):
         folder = dc.export(found, "arcsim", tmp_path / "out", samples=2)
         told = json.loads((folder / "sample_0001" / "cloth.json").read_text())
-        assert told["parameters"]["stretch"] != found.record.values["stretch"]
+        assert told["parameters"]["stretching"] != found.parameters["stretching"].value
         assert (folder / "cloth.json").is_file()
 
     def test_other_solvers_know_no_uncertainty(self, scene, recording):
         settings = dc.FitSettings(
-            parameters=["stretch"], fixed={"mass": 1.7}, solver={"name": "random_search", "max_simulations": 3}
+            parameters=["stretching"], fixed={"density": 0.34}, solver={"name": "random_search", "max_simulations": 3}
         )
         told = dc.fit([recording], [scene], settings)
         assert told.parameters["stretching"].interval is None
@@ -136,8 +136,8 @@ class TestScene:
         assert bool((slope != 0).all())
 
     def test_quantities_are_in_si_units(self, scene):
-        basis = scene.scenario.scene.basis("stretching")
-        stated = scene.simulate({"stretching": basis}, seconds=0.3)
+        nominal = scene.scenario.scene.nominal("stretching")
+        stated = scene.simulate({"stretching": nominal}, seconds=0.3)
         torch.testing.assert_close(stated.positions, scene.simulate(seconds=0.3).positions)
         with pytest.raises(dc.DiffCloudError, match="Unknown quantity 'stretch'"):
             scene.simulate({"stretch": 1.0})

@@ -181,9 +181,9 @@ def test_scale_degeneracy(factor):
         return rollout(system, scenario.steps, properties=scenario.properties(system, values)).positions
 
     with torch.no_grad():
-        base = run({"stretch": 1.0}, 1.0)
+        base = run({"stretching": 1.0}, 1.0)
         # damping is stiffness-proportional: its force scales with the stiffness by itself
-        scaled = run({"stretch": factor, "bending": factor, "density": factor}, factor)
+        scaled = run({"stretching": factor, "bending": factor, "density": factor}, factor)
         heavier = run({"density": 1.5}, 1.0)
     assert (scaled - base).abs().max() < 1e-9
     assert (heavier - base).abs().max() > 1e-3

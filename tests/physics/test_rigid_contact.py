@@ -50,7 +50,7 @@ def system_of(
         surrounding=Surrounding(
             gravity=gravity,
             air_density=0.0,
-            friction_obstacle=friction,
+            friction=friction,
             contact=contact or ContactSettings(1e6, 1e-3, 1e-4, sticking_speed=1e-4),
             obstacles=obstacles,
             bodies=tuple(bodies),
@@ -195,7 +195,7 @@ def test_a_band_around_a_pole_holds_as_the_capstan_says():
         surrounding=Surrounding(
             gravity=(0, 0, 0),
             air_density=0.0,
-            friction_obstacle=friction,
+            friction=friction,
             contact=ContactSettings(1e7, 2e-3, 2e-4, sticking_speed=1e-4),
             obstacles=(pole,),
             self_contact=False,

@@ -122,10 +122,10 @@ def test_a_stiff_cloth_bounces_off_a_moving_obstacle(folder):
 @pytest.mark.parametrize(
     ("data", "name"),
     [
-        (over_moving_box() | {"wind": {"density": 1.2}}, "mass"),
-        (over_moving_box() | {"wind": {"density": 1.2}}, "stretch"),
+        (over_moving_box() | {"wind": {"density": 1.2}}, "density"),
+        (over_moving_box() | {"wind": {"density": 1.2}}, "stretching"),
         (falling_box(), "body_mass"),
-        (falling_box(), "stretch"),
+        (falling_box(), "stretching"),
     ],
     ids=["moving-mass", "moving-stretch", "movable-body_mass", "movable-stretch"],
 )

@@ -19,7 +19,7 @@ def sagging_sheet(runs: int, *, seed: int = 0, frames: int = 6, scenario: str = 
     nodes[..., 0] *= 1 + 0.1 * stretch * phase
     return SimulatedSet(
         scenario=scenario,
-        names=("stretch", "mass"),
+        names=("stretching", "density"),
         bounds=np.array([[0.1, 10.0]] * 2),
         parameters=parameters,
         nodes=nodes.astype(np.float32),

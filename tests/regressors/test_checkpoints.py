@@ -21,7 +21,7 @@ def regressor(model="mlp", **changes):
         **{
             "model": model,
             "scenario": "lift",
-            "names": ("stretch", "mass"),
+            "names": ("stretching", "density"),
             "bounds": ((0.1, 10.0), (0.1, 10.0)),
             "times": (0.3, 0.4, 0.5) if frames_seen(model) == "all" else (0.5,),
             "frame_time": 0.1,
@@ -44,9 +44,9 @@ def episode(frames=6, points=50, seed=0):
 
 
 @pytest.mark.parametrize("model", MODEL_NAMES)
-@pytest.mark.parametrize("heteroscedastic", [False, True])
-def test_a_regressor_comes_back_as_it_was(tmp_path, model, heteroscedastic):
-    first = regressor(model, heteroscedastic=heteroscedastic and model != "posterior")
+@pytest.mark.parametrize("predict_variance", [False, True])
+def test_a_regressor_comes_back_as_it_was(tmp_path, model, predict_variance):
+    first = regressor(model, predict_variance=predict_variance and model != "posterior")
     first.write(tmp_path / "a.safetensors")
     second = Regressor.read(tmp_path / "a.safetensors")
     assert second.description == first.description
@@ -93,7 +93,7 @@ def test_clouds_of_any_size_are_taken():
 def test_values_outside_are_told_and_clipped_only_for_a_simulation():
     scale = OutputScale(torch.tensor([[0.1, 10.0], [1.0, 3.0]]), "linear")
     fractions = torch.tensor([[0.5, 1.25]])
-    found = Prediction(("stretch", "mass"), scale.values(fractions), fractions, torch.ones(1, 2), scale)
+    found = Prediction(("stretching", "density"), scale.values(fractions), fractions, torch.ones(1, 2), scale)
     torch.testing.assert_close(found.values, torch.tensor([[5.05, 3.5]]))
     assert found.inside.tolist() == [[True, False]]
     torch.testing.assert_close(found.clipped, torch.tensor([[5.05, 3.0]]))
@@ -133,9 +133,9 @@ def damaged(path, change):
         (lambda _, told: told.update(model="resnet"), "model: Input should be 'mlp'"),
         (lambda _, told: told.update(points=10**9), "points: Input should be less than or equal to 1000000"),
         (lambda _, told: told.update(spread=[1.0]), "2 names need as many bounds and spreads"),
-        (lambda _, told: told.update(bounds=[[1, 0], [0, 1]]), "bounds of stretch must be in order"),
+        (lambda _, told: told.update(bounds=[[1, 0], [0, 1]]), "bounds of stretching must be in order"),
         (lambda _, told: told.update(extra=1), "extra: Extra inputs are not permitted"),
-        (lambda _, told: told.update(model="posterior", heteroscedastic=True), "a posterior has widths of its own"),
+        (lambda _, told: told.update(model="posterior", predict_variance=True), "a posterior has widths of its own"),
     ],
 )  # fmt: skip
 def test_a_changed_file_is_refused_by_field(tmp_path, change, message):

@@ -14,7 +14,7 @@ from diffcloud.errors import CheckpointError, ConfigError
 from diffcloud.regressors import Regressor
 from diffcloud.regressors.posterior import Posterior
 from diffcloud.regressors.training import LEVELS, train_regressor
-from diffcloud.report.regressors import TrainingEntry, errors_table, training_data
+from diffcloud.reporting.regressors import TrainingEntry, errors_table, training_data
 from tests.cli.invoke import invoke
 from tests.regressors.simulated import sagging_sheet
 from tests.regressors.test_checkpoints import episode, regressor
@@ -89,11 +89,11 @@ class TestTraining:
     def test_the_report_shows_its_calibration(self, trained):
         entry = TrainingEntry("lift", "posterior", trained[0].summary)
         (told,) = training_data([entry])
-        assert list(told["coverage"]) == ["stretch", "mass", "all together"]
+        assert list(told["coverage"]) == ["stretching", "density", "all together"]
         rows = errors_table([entry]).rows
         assert [row[-1].note.startswith("ranks uniform: p = ") for row in rows] == [True, True]
 
-    @pytest.mark.parametrize("changes", [{"heteroscedastic": True}, {"loss": "raw"}])
+    @pytest.mark.parametrize("changes", [{"predict_variance": True}, {"loss": "raw"}])
     def test_what_belongs_to_other_models_is_refused(self, tmp_path, changes):
         sets = sagging_sheet(24), sagging_sheet(10, seed=1)
         with pytest.raises(ConfigError, match="a loss and widths of its own"):
@@ -127,9 +127,9 @@ class TestCommand:
         rows = np.genfromtxt(files / "s.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
         assert set(rows["episode"]) == {"e"}
         found = told.result["e"]
-        assert found["stretch"] == pytest.approx(float(np.median(rows["stretch"])), rel=1e-3)
-        low, high = found["interval"]["mass"]
-        assert np.mean((rows["mass"] >= low) & (rows["mass"] <= high)) == pytest.approx(0.9, abs=0.01)
+        assert found["stretching"] == pytest.approx(float(np.median(rows["stretching"])), rel=1e-3)
+        low, high = found["interval"]["density"]
+        assert np.mean((rows["density"] >= low) & (rows["density"] <= high)) == pytest.approx(0.9, abs=0.01)
 
     def test_other_models_have_none(self, files):
         told = invoke(

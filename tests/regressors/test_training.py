@@ -109,7 +109,7 @@ def test_a_patient_training_stops_early(tmp_path):
 
 
 def test_a_width_per_prediction_can_be_learned(tmp_path):
-    result = train(tmp_path, settings=replace(TINY, heteroscedastic=True, target="logarithmic", draws=16))
+    result = train(tmp_path, settings=replace(TINY, predict_variance=True, target="logarithmic", draws=16))
     found = result.regressor.predict(torch.rand(4, 1, 24, 3))
     assert found.width.shape == (4, 2)
     assert len(set(found.width[:, 0].tolist())) == 4
@@ -150,7 +150,7 @@ class TestBadInput:
             train_regressor("mlp", sagging_sheet(8), sagging_sheet(3), TINY, tmp_path / "m.safetensors")
 
     def test_widths_in_units_of_a_logarithmic_target(self, tmp_path):
-        settings = replace(TINY, heteroscedastic=True, loss="raw", target="logarithmic")
+        settings = replace(TINY, predict_variance=True, loss="raw", target="logarithmic")
         with pytest.raises(ConfigError, match="Use target: linear, or loss: normalised"):
             train(tmp_path, settings=settings)
 

@@ -55,7 +55,7 @@ COMMANDS = {
     "simulate a motion": Command.of("simulate small --format obj --out motion", "motion"),
     "export": Command.of("export data/fits/small/small_hidden1.json --to mujoco --out exported", "exported"),
     "fit one cloth": Command.of(
-        "fit data/episodes/small/small_hidden1.npz --out known --parameters stretch --density 0.2 --threads 1", "known"
+        "fit data/episodes/small/small_hidden1.npz --out known --parameters stretching --density 0.2 --threads 1", "known"
     ),
     "preprocess, two workers": Command.of(
         "data preprocess --params params.yaml --workers 2 --out twice/episodes twice/recorded",

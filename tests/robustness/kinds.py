@@ -44,18 +44,18 @@ SCENARIO = {
     "path": [[0.0, 0.0, 0.0, 0.0], [0.4, 0.0, -0.03, 0.09]],
 }  # fmt: skip
 PARAMS = {
-    "scenarios": ["small"],
-    "episodes": {"per_scenario": 1, "image_size": [106, 60]},
+    "scenes": ["small"],
+    "synthesize": {"per_scenario": 1, "image_size": [106, 60]},
     "preprocess": {"outlier_neighbours": 5, "points": 200},
-    "simulate": {"scenarios": ["small"], "train": 8, "test": 4},
+    "generate": {"scenes": ["small"], "train": 8, "test": 4},
     "fit": {"solver": {"max_steps": 2}},
-    "train": {"scenarios": ["small"], "models": ["mlp"], "profile": "quick", "epochs": 2, "points": 24},
-    "evaluate": {"draws": 1, "rivals": ["middle"], "landscapes": ["small/small_hidden1"], "landscape_size": 3},
+    "train": {"scenes": ["small"], "models": ["mlp"], "profile": "quick", "epochs": 2, "points": 24},
+    "evaluate": {"draws": 1, "baselines": ["middle"], "landscapes": ["small/small_hidden1"], "landscape_size": 3},
     "report": {},
 }
 _FITTED = "--params params.yaml --fits data/fits --episodes data/episodes --regressors data/regressors"
 STAGES = {
-    "episodes": ("pipeline.episodes --params params.yaml --out data/recorded", "data/recorded"),
+    "episodes": ("pipeline.synthesize --params params.yaml --out data/recorded", "data/recorded"),
     "preprocess": ("data preprocess --params params.yaml --out data/episodes data/recorded", "data/episodes"),
     "simulate": ("network generate --params params.yaml --scene small --out data/simulated/small", "data/simulated/small"),
     "fit": ("pipeline.fit --params params.yaml --out data/fits data/episodes", "data/fits"),
@@ -191,7 +191,7 @@ _IMPORT = "data import {} --gripper gripper.csv --out imported.npz"
 _CAPTURE = command("data capture --dry-run --trajectory path.csv --rig rig.yaml --out e")
 _REPORT = command(REPORT)
 _IMAGES = command("data import a=images --rate-hz 10 --out imported")
-_LOSS = command(f"fit {_EPISODE} --scene small --parameters stretch --solver random_search --out fitted --threads 1")
+_LOSS = command(f"fit {_EPISODE} --scene small --parameters stretching --solver random_search --out fitted --threads 1")
 _OF_FIT = command(f"simulate {_FIT}.json --track {_EPISODE} --frames 1 --out m.npz")
 _PREDICT = command(f"network predict {_EPISODE} --checkpoint {_NETWORK}.safetensors")
 KINDS = (
@@ -255,5 +255,5 @@ def warm_up() -> None:
     torch.set_num_threads(1)
     for integrator in ("arcsim", "implicit"):
         scenario = small_lift(integrator=integrator)
-        parameters = {"stretch": torch.ones(1, dtype=torch.float64)}
-        Objective(scenario, clouds_of(scenario, stretch=1.0))(parameters)
+        parameters = {"stretching": torch.ones(1, dtype=torch.float64)}
+        Objective(scenario, clouds_of(scenario, stretching=1.0))(parameters)

@@ -39,16 +39,18 @@ def triangles(mesh: ClothMesh) -> set[tuple]:
 
 
 @pytest.mark.parametrize("nodes", [(4, 5), (7, 7), (13, 10), (49, 37)])
-@pytest.mark.parametrize("halvings", [0, 1, 2])
-def test_a_pad_is_as_large_on_every_mesh(nodes, halvings):
-    scenario = lift(size_m=(0.4, 0.3), nodes=nodes, grip_m=0.02).halved(halvings if max(nodes) < 20 else 0)
+@pytest.mark.parametrize("refinements", [0, 1, 2])
+def test_a_pad_is_as_large_on_every_mesh(nodes, refinements):
+    scenario = lift(size_m=(0.4, 0.3), nodes=nodes, grip_m=0.02)
+    for _ in range(refinements if max(nodes) < 20 else 0):
+        scenario = scenario.finer()
     mesh = scenario.scene.mesh
     assert mesh.face_area.sum() == pytest.approx(0.12)
     np.testing.assert_allclose([held(scenario).min(0), held(scenario).max(0)], [[0.38, 0.28], [0.4, 0.3]])
     under = (mesh.verts >= np.array([0.38, 0.28]) - 1e-9).all(1)
     assert sorted(scenario.grasped) == np.flatnonzero(under).tolist()
     assert len({handle.motion for handle in scenario.scene.handles.handles}) == 1
-    if halvings == 0:
+    if refinements == 0:
         assert len(mesh.nodes) == nodes[0] * nodes[1]
         free = np.diff(np.unique(mesh.verts[:, 0].round(9)))[: nodes[0] // 2]
         np.testing.assert_allclose(free, free[0], rtol=1e-6)
@@ -97,7 +99,7 @@ def test_pads_lie_around_their_places_and_neighbours_are_one():
 
 
 def test_two_pads_of_one_gripper_stay_two_on_finer_meshes():
-    scenario = lift(size_m=(0.1, 0.3), nodes=(4, 5), grasped=["left_top", "right_top"]).halved(1)
+    scenario = lift(size_m=(0.1, 0.3), nodes=(4, 5), grasped=["left_top", "right_top"]).finer()
     assert sorted(np.unique(held(scenario)[:, 0].round(9))) == pytest.approx([0.0, 0.01, 0.02, 0.08, 0.09, 0.1])
 
 
@@ -141,7 +143,7 @@ def test_what_cannot_be_held_is_refused(changes, message):
         lift(**changes)
 
 
-@pytest.mark.parametrize("material", ["basis-knit", "silk", "denim"])
+@pytest.mark.parametrize("material", ["soft-knit", "silk", "denim"])
 @pytest.mark.parametrize("integrator", ["implicit", "arcsim"])
 def test_a_cloth_rests_where_it_starts(material, integrator):
     still = [[0, 0, 0, 0], [1, 0, 0, 0]]

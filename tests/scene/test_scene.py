@@ -195,7 +195,7 @@ class TestScenarios:
             ("{}", "none of them"),
             ("{stretching_n_m: -1, bending_n_m: 1, density_kg_m2: 1}", "stretching_n_m: Input should be greater than 0"),
             ("{stretching_n_m: 1, bending_n_m: 1, density_kg_m2: 1, poisson: 1}", "poisson: Input should be less than 1"),
-            ("{stretch: 1}", "unknown or unsupported field"),
+            ("{stretching: 1}", "unknown or unsupported field"),
             ("3", "material"),
         ],
     )
@@ -252,10 +252,10 @@ def test_what_lies_between_held_nodes_is_held():
 def test_a_finer_scenario_acts_on_what_lies_between_its_nodes():
     scenario = load_scenario("lift")
     corner = np.array([0, 1, 7, 8])  # a cell of 7 by 7 nodes
-    scenario = replace(scenario, node_sets={"mass": corner}, loss_faces=np.array([3]))
+    scenario = replace(scenario, node_sets={"density": corner}, loss_faces=np.array([3]))
     finer = scenario.finer()
     system, _ = finer.scene.build()
-    heavy = finer.properties(system, {"mass": torch.full((1,), 2.0, dtype=torch.float64)})
+    heavy = finer.properties(system, {"density": torch.full((1,), 2.0, dtype=torch.float64)})
     usual = finer.properties(system, {})
     factor = (heavy.node_mass / usual.node_mass)[0].numpy()
     ends = scenario.scene.mesh.nodes[corner]

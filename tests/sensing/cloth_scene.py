@@ -22,7 +22,7 @@ TOOL_M = np.array([0.60, 0.05, 0.12])
 STEP_M = np.array([0.0, -0.02, 0.02])
 """Motion of the tool from frame to frame."""
 PLACES = {"overhead": (1.05, 0.02, 0.75), "side": (0.62, -0.70, 0.40)}
-SETTINGS = {"flying_m": 0.05, "workspace_m": ((0.35, -0.35, -0.05), (0.85, 0.35, 0.5))}
+SETTINGS = {"depth_jump_m": 0.05, "workspace_m": ((0.35, -0.35, -0.05), (0.85, 0.35, 0.5))}
 """Of small images: neighbouring pixels are four times as far apart as in the camera's own."""
 
 
@@ -71,7 +71,7 @@ def write_cloth_episode(
         shift_m: error of the second camera's stated place, along x.
     """
     robot, rng = gen3(), np.random.default_rng(0)
-    solid = RobotMask(robot, inflation_m=0.003)  # the real arm is a little larger than its description
+    solid = RobotMask(robot, robot_margin_m=0.003)  # the real arm is a little larger than its description
     seen = views()
     down = np.diag([1.0, -1.0, -1.0])
     joints = robot.inverse_kinematics(TOOL_M + np.arange(frames)[:, None] * STEP_M, rotations=down)

@@ -13,7 +13,7 @@ from diffcloud.sensing.recorder import ClothMotion, RecorderSettings, record
 from diffcloud.sim.motion import Keyframe, Motion
 
 FRAMES = 4
-META = {"scenario": "lift", "fabric": "blue", "repeat": 1, "truth": {"stretch": 1.0, "mass": 2.0}}
+META = {"scenario": "lift", "fabric": "blue", "repeat": 1, "truth": {"stretching": 1.0, "density": 2.0}}
 
 
 LIFT = ((0.0, 0.0, 0.0), (0.0, -0.14, 0.40))

@@ -15,12 +15,12 @@ from diffcloud.io.images import write_depth
 from diffcloud.io.raw_episodes import ScenePlacement, read_raw_episode
 from diffcloud.sensing.cameras import inverse, project, rays, transform
 from diffcloud.sensing.depth_camera import DepthNoise, published_cameras
-from diffcloud.sensing.evaluation import evaluate_clouds
 from diffcloud.sensing.filters import clean_frame, thin
 from diffcloud.sensing.fusion import FusionSettings, _ideal_pixels, fit_table, fuse
 from diffcloud.sensing.masking import RobotMask
 from diffcloud.sensing.recorder import RecorderSettings, read_truth, record
 from diffcloud.sensing.robot import gen3
+from studies.cloud_quality import evaluate_clouds
 from tests.sensing.cloth_scene import (
     CLOTH,
     INTRINSICS,
@@ -199,19 +199,19 @@ def test_no_plane_where_there_is_none(rng):
     assert fit_table([(np.zeros((3, 3)), None)]) is None
 
 
-@pytest.mark.parametrize("thinning", ["random", "voxel", "farthest"])
-def test_thinning_keeps_no_point_twice(rng, thinning):
+@pytest.mark.parametrize("downsampling", ["random", "voxel", "farthest"])
+def test_thinning_keeps_no_point_twice(rng, downsampling):
     points = rng.normal(size=(2000, 3)).astype(np.float32)
-    kept = thin(points, 300, thinning, rng)
+    kept = thin(points, 300, downsampling, rng)
     assert len(np.unique(kept)) == len(kept)
     assert 250 <= len(kept) <= 300
 
 
-@pytest.mark.parametrize("thinning", ["voxel", "farthest"])
-def test_even_thinning_evens(rng, thinning):
+@pytest.mark.parametrize("downsampling", ["voxel", "farthest"])
+def test_even_thinning_evens(rng, downsampling):
     dense = rng.uniform(0, 0.1, (4000, 3)) * [1, 1, 0]
     sparse = rng.uniform(0.2, 0.3, (400, 3)) * [1, 1, 0]
-    kept = thin(np.concatenate([dense, sparse]).astype(np.float32), 200, thinning, rng)
+    kept = thin(np.concatenate([dense, sparse]).astype(np.float32), 200, downsampling, rng)
     assert 0.35 < (kept < 4000).mean() < 0.65  # both squares are of one size
 
 

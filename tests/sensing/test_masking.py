@@ -59,7 +59,7 @@ def test_the_arm_is_where_brute_force_sees_it(distortion, inflation):
         solid = inflate(mesh, inflation)
         here = transform(inverse(view.T_world_camera) @ placed[robot.links.index(name)], solid.vertices)
         expected = np.minimum(expected, brute_force_depth(here, solid.faces, view.directions))
-    found = RobotMask(robot, inflation_m=inflation).surface(view, placed)
+    found = RobotMask(robot, robot_margin_m=inflation).surface(view, placed)
     differing = np.isfinite(found) != np.isfinite(expected)
     assert np.isfinite(expected).mean() > 0.05
     assert differing.sum() <= 1  # float32 rays may pass an edge on its other side
@@ -85,7 +85,7 @@ def test_a_box_shrinks_by_a_negative_margin_and_each_link_by_its_own():
     np.testing.assert_allclose(solid.vertices.min(axis=0), [-0.07, -0.17, 0.53], atol=1e-9)
     np.testing.assert_allclose(solid.vertices.max(axis=0), [0.27, 0.17, 0.87], atol=1e-9)
     for margins, expected in (({"base": -0.03}, 0.53), ({"base": 0.03}, 0.47), ({}, 0.5)):
-        depth = RobotMask(robot, inflation_m=margins).surface(AHEAD, poses(robot))
+        depth = RobotMask(robot, robot_margin_m=margins).surface(AHEAD, poses(robot))
         np.testing.assert_allclose(depth[15, 20], expected, atol=1e-6)
 
 
@@ -94,7 +94,7 @@ def test_rays_that_pass_within_the_margin_are_masked(rng):
     placed = robot.forward_kinematics(robot.configuration(GEN3_HOME_RAD))
     place = looking_at((1.4, -0.6, 0.9), (0.3, 0.0, 0.4))
     view = View(Intrinsics(160, 120, 150.0, 150.0, 79.5, 59.5), place)
-    masked = np.isfinite(RobotMask(robot, inflation_m=0.02).surface(view, placed))
+    masked = np.isfinite(RobotMask(robot, robot_margin_m=0.02).surface(view, placed))
     near = []
     for name, mesh in robot.description.meshes.items():
         shifted = mesh.vertices + rng.normal(size=mesh.vertices.shape) * 0.005
@@ -107,9 +107,9 @@ def test_rays_that_pass_within_the_margin_are_masked(rng):
 
 def test_cloth_before_the_robot_stays_and_behind_it_goes():
     robot = one_box((-0.1, -0.1, 0.8), (0.1, 0.1, 0.9))
-    mask = RobotMask(robot, inflation_m=0.01)
+    mask = RobotMask(robot, robot_margin_m=0.01)
     for depth, gone in ((0.7, False), (0.795, True), (0.85, True), (1.5, True)):
-        found = spoilt_pixels(np.full((30, 40), depth), AHEAD, mask, poses(robot), eyes_m=())
+        found = spoilt_pixels(np.full((30, 40), depth), AHEAD, mask, poses(robot), imager_offsets_m=())
         assert found.robot[15, 20] == gone
         assert not found.robot[0, 0]
         assert not found.flying.any()
@@ -117,8 +117,8 @@ def test_cloth_before_the_robot_stays_and_behind_it_goes():
 
 def test_shadow_is_what_the_second_eye_cannot_see():
     robot = one_box((-0.1, -0.4, 0.5), (0.1, 0.4, 0.52))
-    mask = RobotMask(robot, inflation_m=0.0)
-    found = spoilt_pixels(np.full((30, 40), 1.0), AHEAD, mask, poses(robot), eyes_m=(0.05,))
+    mask = RobotMask(robot, robot_margin_m=0.0)
+    found = spoilt_pixels(np.full((30, 40), 1.0), AHEAD, mask, poses(robot), imager_offsets_m=(0.05,))
     x = AHEAD.directions[15, :, 0]  # on the wall at 1 m
     # the eye at 0.05 m sees the wall left of where its ray past the box's left edge ends
     np.testing.assert_array_equal(found.shadow[15], (x >= 0.05 + (-0.1 - 0.05) / 0.5) & (x < -0.1 / 0.5))
@@ -160,7 +160,7 @@ def test_joints_between_rows_and_across_the_turn():
     joints, gripper = joints_at(rows, np.array([0.05, 0.15, 0.35]))
     np.testing.assert_allclose(joints[:, 0], [6.24, 6.32, 6.44], atol=1e-12)
     np.testing.assert_allclose(gripper, [0.25, 0.75, 1.0])
-    late, _ = joints_at(rows, np.array([0.05]), lag_s=0.05)
+    late, _ = joints_at(rows, np.array([0.05]), clock_offset_s=0.05)
     np.testing.assert_allclose(late, [[6.28]])
 
 

@@ -14,21 +14,21 @@ from diffcloud.io.raw_episodes import read_raw_episode
 from diffcloud.io.urdf import Joint, LinkMesh, RobotDescription
 from diffcloud.sensing.arm_body import cable, lookalike
 from diffcloud.sensing.cameras import inverse, transform
-from diffcloud.sensing.evaluation import evaluate_clouds, visible_clouds
 from diffcloud.sensing.fusion import FusionSettings, fuse
 from diffcloud.sensing.masking import RobotMask, joints_at
 from diffcloud.sensing.recorder import CLOTH, ROBOT, TABLE, read_truth
 from diffcloud.sensing.robot import GEN3_HOME_RAD, Robot, gen3
 from diffcloud.sensing.validation.episode import validate_raw_episode
+from studies.cloud_quality import evaluate_clouds, visible_clouds
 from tests.sensing.recorded_scene import FRAMES, LIFT, motion, smooth_motion, write_recorded_episode
 
-SETTINGS = FusionSettings(flying_m=0.03)
+SETTINGS = FusionSettings(depth_jump_m=0.03)
 ERROR = (5.0, 0.5)
 
 
 @pytest.fixture(scope="module")
 def mask() -> RobotMask:
-    return RobotMask(gen3(), inflation_m=0.007)
+    return RobotMask(gen3(), robot_margin_m=0.007)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ class TestRecording:
         held = truth.nodes[:, motion().grasped[0]]
         times = raw.cameras["overhead"].times
         stated, corrected = (
-            gen3().tool_pose(joints_at(raw.robot, times, lag_s=lag)[0])[:, :3, 3] - held for lag in (0.0, 0.02)
+            gen3().tool_pose(joints_at(raw.robot, times, clock_offset_s=lag)[0])[:, :3, 3] - held for lag in (0.0, 0.02)
         )
         np.testing.assert_allclose(
             corrected, np.tile([0, 0, 0.071], (FRAMES, 1)), atol=1e-3
@@ -114,7 +114,7 @@ class TestRecording:
     def test_where_it_cannot_point_down_the_gripper_leans(self, height, leans, tmp_path):
         high = smooth_motion(((0.0, 0.0, 0.0), (0.0, -0.14, height)))
         raw = read_raw_episode(write_recorded_episode(tmp_path / "lift", seen=high, size=(64, 48)))
-        tool = gen3().tool_pose(joints_at(raw.robot, high.times, lag_s=0.02)[0])
+        tool = gen3().tool_pose(joints_at(raw.robot, high.times, clock_offset_s=0.02)[0])
         held = raw.placement.to_world(high.nodes[:, high.grasped[0]])
         np.testing.assert_allclose(tool[:, :3, 3] + 0.071 * tool[:, :3, 2], held, atol=1e-3)
         lean = np.arctan2(np.linalg.norm(tool[:, :2, 2], axis=1), -tool[:, 2, 2])
@@ -130,12 +130,12 @@ class TestRecording:
         coarse, fine = (smooth_motion(LIFT, frames=frames) for frames in (26, 101))
         raw = read_raw_episode(write_recorded_episode(tmp_path / "lift", seen=coarse, size=(64, 48)))
         held = raw.placement.to_world(fine.nodes[:, fine.grasped[0]])
-        logged = gen3().tool_pose(joints_at(raw.robot, fine.times, lag_s=0.02)[0])[:, :3, 3]
+        logged = gen3().tool_pose(joints_at(raw.robot, fine.times, clock_offset_s=0.02)[0])[:, :3, 3]
         off = np.linalg.norm(logged - held - [0, 0, 0.071], axis=1)
         assert off.max() < 1.5e-4  # straight from image to image it would be 0.5 mm off
 
     def test_a_scene_beside_its_stated_place_is_turned_and_shifted_there(self, folder, tmp_path):
-        beside = write_recorded_episode(tmp_path / "beside", beside=(30.0, 10.0))
+        beside = write_recorded_episode(tmp_path / "beside", placement_error=(30.0, 10.0))
         home, truth = read_truth(folder), read_truth(beside)
         assert read_raw_episode(beside).placement == read_raw_episode(folder).placement == home.placement
         (tmp_path / "old" / "truth").mkdir(parents=True)
@@ -192,7 +192,7 @@ class TestFoundBack:
 
     def test_cameras_moved_together_are_found_by_the_arm(self, tmp_path, mask):
         seen = smooth_motion(LIFT, frames=6)
-        folder = write_recorded_episode(tmp_path / "moved", seen=seen, cameras_moved=(20.0, 2.0))
+        folder = write_recorded_episode(tmp_path / "moved", seen=seen, rig_error=(20.0, 2.0))
         raw, truth = read_raw_episode(folder), read_truth(folder)
         stated = {name: camera.info.T_world_camera for name, camera in raw.cameras.items()}
         assert min(off_by(truth, stated[name], name) for name in stated) > 0.02
@@ -200,12 +200,14 @@ class TestFoundBack:
         np.testing.assert_allclose(*between, atol=1e-12)
         found = fuse(raw, mask, SETTINGS).meta["quality"]["refinement"]
         assert max(off_by(truth, np.array(pose), name) for name, pose in found["T_world_camera"].items()) < 0.005
-        assert found["lag_s"] == pytest.approx(0.02, abs=0.004)
-        assert abs(found["lag_s"] - 0.02) < 3 * found["lag_sigma_s"] < 0.01
+        assert found["clock_offset_s"] == pytest.approx(0.02, abs=0.004)
+        assert abs(found["clock_offset_s"] - 0.02) < 3 * found["lag_sigma_s"] < 0.01
 
     def test_right_extrinsics_are_not_made_worse(self, folder, mask):
         raw, truth = read_raw_episode(folder), read_truth(folder)
-        refined, plain = (fuse(raw, mask, replace(SETTINGS, refine=refine, lag_s=0.02)) for refine in (True, False))
+        refined, plain = (
+            fuse(raw, mask, replace(SETTINGS, refine=refine, clock_offset_s=0.02)) for refine in (True, False)
+        )
         found = refined.meta["quality"]["refinement"]
         assert off_by(truth, np.array(found["T_world_camera"]["side"]), "side") < 0.0015
         assert 0 < found["skin_m"] < 0.003  # drawn from 0 to 3 mm

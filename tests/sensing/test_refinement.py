@@ -19,13 +19,13 @@ WAYS = {"lift": LIFT, "fold": FOLD}
 
 @pytest.fixture(scope="module")
 def mask() -> RobotMask:
-    return RobotMask(gen3(), inflation_m=0.007)
+    return RobotMask(gen3(), robot_margin_m=0.007)
 
 
 def found_lag(folder: Path, mask: RobotMask) -> tuple[float, float]:
     """And the deviation that is stated of it."""
-    found = fuse(read_raw_episode(folder), mask, FusionSettings(flying_m=0.03)).meta["quality"]["refinement"]
-    return float(found["lag_s"]), float(found["lag_sigma_s"])
+    found = fuse(read_raw_episode(folder), mask, FusionSettings(depth_jump_m=0.03)).meta["quality"]["refinement"]
+    return float(found["clock_offset_s"]), float(found["lag_sigma_s"])
 
 
 @pytest.mark.slow
@@ -44,7 +44,7 @@ def test_cameras_that_are_millimetres_off_do_not_look_late(tmp_path, mask):
     off = []
     for seed, (name, way) in product(range(2), WAYS.items()):
         seen, folder = smooth_motion(way), tmp_path / f"{name}_{seed}"
-        write_recorded_episode(folder, seed=seed, seen=seen, size=(212, 120), cameras_moved=(3.0, 0.25))
+        write_recorded_episode(folder, seed=seed, seen=seen, size=(212, 120), rig_error=(3.0, 0.25))
         off.append(found_lag(folder, mask)[0] - 0.02)
     assert np.abs(off).max() < 0.0025
 
@@ -54,11 +54,13 @@ def test_the_lag_is_found_without_bias(tmp_path, mask):
     """Eight lifts and eight folds, of four lags and speeds; and no worse than is said."""
     off, stated = [], []
     cases = product(range(2), [(0.02, 1.0), (0.0, 1.0), (0.035, 1.0), (0.02, 2.0)], WAYS.items())
-    for number, (seed, (lag_s, speed), (name, way)) in enumerate(cases):
+    for number, (seed, (clock_offset_s, speed), (name, way)) in enumerate(cases):
         seen = smooth_motion(way, speed=speed)
-        folder = write_recorded_episode(tmp_path / f"{name}_{number}", seed=20 + seed, seen=seen, lag_s=lag_s)
+        folder = write_recorded_episode(
+            tmp_path / f"{name}_{number}", seed=20 + seed, seen=seen, clock_offset_s=clock_offset_s
+        )
         found, sigma = found_lag(folder, mask)
-        off.append(found - lag_s)
+        off.append(found - clock_offset_s)
         stated.append(sigma)
     assert np.sqrt(np.mean(np.square(np.divide(off, stated)))) <= 1.2
     off = np.reshape(off, (2, 4, 2))

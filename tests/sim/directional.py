@@ -14,7 +14,7 @@ from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim import Properties, State, init, rollout, rollout_tangents
 from diffcloud.sim.system import System
 
-SCALARS = ("stretch", "shear", "mass", "density", "bending", "damping", "drag", "friction_obstacle")
+SCALARS = ("stretching", "shear", "density", "bending", "damping", "air_density", "friction")
 STILL_AIR = ("added_mass", "linear_drag")
 STEPS = tuple(10.0**-k for k in range(2, 9))
 
@@ -63,14 +63,13 @@ class Episode:
         nodes = middle + (nodes - middle) * 1.02 + 1e-4 * noise
         one = torch.ones(1, dtype=torch.float64)
         return {
-            "stretch": 1.3 * one,
+            "stretching": 1.3 * one,
             "shear": 0.7 * one,
-            "mass": 0.8 * one,
-            "density": 1.1 * one,
+            "density": 0.8 * one,
             "bending": 1.2 * one,
             "damping": 0.004 * one,
-            "drag": 0.9 * one,
-            "friction_obstacle": 0.4 * one,
+            "air_density": 0.9 * one,
+            "friction": 0.4 * one,
             **{name: 1.4 * one for name in STILL_AIR if name in self.scalars},
             "positions": nodes[None].clone(),
             "velocities": torch.zeros_like(nodes)[None],

@@ -23,7 +23,7 @@ from tests.sim.twins.rigid import rotation
 
 STEPS = 25
 FABRIC = isotropic("test", density=0.3, stretching=60.0, bending=1e-4, shear=15.0)
-NAMES = ("stretch", "mass", "bending", "drag", "damping", "friction_obstacle", "friction_cloth", "body_mass")
+NAMES = ("stretching", "density", "bending", "air_density", "damping", "friction", "self_friction", "body_mass")
 
 
 def two_layers(lower: ClothMesh, upper: ClothMesh, gap: float) -> ClothMesh:
@@ -60,7 +60,7 @@ def build():
 def inputs(system) -> dict[str, Tensor]:
     one = torch.ones(1, dtype=torch.float64)
     found = {name: one.clone() for name in NAMES}
-    found |= {"friction_obstacle": 0.3 * one, "friction_cloth": 0.5 * one, "damping": 2e-3 * one}
+    found |= {"friction": 0.3 * one, "self_friction": 0.5 * one, "damping": 2e-3 * one}
     start = init(system)
     times = torch.arange(1, STEPS + 1, dtype=torch.float64)[None, :, None, None] * 0.01
     found |= {
@@ -74,7 +74,7 @@ def inputs(system) -> dict[str, Tensor]:
 
 
 def start_of(system, values: dict[str, Tensor]) -> State:
-    state = init(system, len(values["stretch"]))
+    state = init(system, len(values["stretching"]))
     bodies = BodyState(
         values["centre"], rotation(values["turn"]) @ state.bodies.orientation, values["velocity"], values["spin"]
     )

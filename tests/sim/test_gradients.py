@@ -40,7 +40,7 @@ def compare(episode: Episode, chosen: dict, steps: tuple[float, ...] = STEPS) ->
 def test_without_contact():
     episode = lift_episode(FREE_FALL_GAP)
     found = compare(episode, directions(episode))
-    value, _, _ = found.pop("friction_obstacle")
+    value, _, _ = found.pop("friction")
     assert value == 0.0  # nothing is touched, so friction cannot matter
     for name, (value, forward, central) in found.items():
         assert value != 0.0, name
@@ -70,7 +70,7 @@ def test_short_episodes(gap, compression):
         plate = Episode.build(small_lift(gap_m=gap, air=air), 10)
         assert not torch.equal(plate.run(plate.base()), episode.run(episode.base()))
     if gap == FREE_FALL_GAP:
-        assert found.pop("friction_obstacle")[0] == 0.0
+        assert found.pop("friction")[0] == 0.0
     for name, (value, forward, central) in found.items():
         assert value != 0.0, name
         assert forward <= 1e-10, name
@@ -94,8 +94,8 @@ def test_tracks_of_two_grippers(integrator):
 def test_one_step():
     episode = Episode.build(small_lift(), 1)
     found = compare(episode, directions(episode, per_field=1))
-    assert abs(found.pop("friction_obstacle")[0]) < 1e-10  # nothing slides
-    assert found.pop("drag")[0] == 0.0  # nothing has moved yet
+    assert abs(found.pop("friction")[0]) < 1e-10  # nothing slides
+    assert found.pop("air_density")[0] == 0.0  # nothing has moved yet
     for name, (_, forward, central) in found.items():
         assert forward <= 1e-11, name
         assert central <= 1e-6, name
@@ -105,7 +105,7 @@ def test_converged_newton_steps():
     """The exact Jacobian has no symmetry, and the step is solved by Newton's method."""
     episode = Episode.build(small_lift(gap_m=FREE_FALL_GAP, nodes=(4, 4), integrator="implicit", air="still"), 3)
     found = compare(episode, directions(episode, per_field=1), steps=STEPS[2:])
-    del found["friction_obstacle"]
+    del found["friction"]
     for name, (value, forward, central) in found.items():
         assert value != 0.0, name
         assert forward <= 1e-9, name
@@ -115,13 +115,13 @@ def test_converged_newton_steps():
 def test_soft_handles():
     episode = Episode.build(small_lift(soft_handles=True), 6)
     found = compare(episode, directions(episode, per_field=1))
-    del found["friction_obstacle"]  # nothing slides
+    del found["friction"]  # nothing slides
     for name, (_, forward, central) in found.items():
         assert forward <= 1e-10, name
         assert central <= 1e-5, name
 
 
-@pytest.mark.parametrize("parameter", ["stretch", "mass"])
+@pytest.mark.parametrize("parameter", ["stretching", "density"])
 def test_node_sets(parameter):
     """A multiplier on some nodes has the gradient that a central difference finds."""
     from dataclasses import replace
@@ -162,4 +162,4 @@ def test_scalars_cover_every_parameter():
 
     # these act only in scenes with contact of the cloth with itself, with bodies (test_contact_gradients), and with cloth
     # that gives way to compression (test_implicit)
-    assert set(SCALARS) | set(STILL_AIR) | {"friction_cloth", "body_mass", "compression"} == set(PARAMETERS)
+    assert set(SCALARS) | set(STILL_AIR) | {"self_friction", "body_mass", "compression"} == set(PARAMETERS)

@@ -24,6 +24,8 @@ class Falling:
     name = "falling"
     terms = ()
     contacts = ()
+    smooth = True
+    meshes = True
 
     def check(self, surrounding):
         if surrounding.obstacles:

@@ -131,7 +131,7 @@ def test_an_explosion_inside_the_bounds_is_a_named_error():
     scenario = load_scenario("vest_hang")
     lagged = replace(scenario.scene.surrounding, lagged_air=True)
     system, _ = replace(scenario.scene, surrounding=lagged, frame_steps=3).stepped("arcsim").build()
-    values = {"drag": [1.0, 6.9], "mass": [1.0, 0.1]}
+    values = {"air_density": [1.0, 6.9], "density": [1.0, 0.1]}
     tensors = {name: torch.tensor(pair, dtype=torch.float64) for name, pair in values.items()}
     properties = scenario.properties(system, tensors)
     with pytest.raises(DivergedError, match=r"batch entries \[1\]: .*(kinetic energy|from everything that held)"):

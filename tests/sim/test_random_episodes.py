@@ -9,14 +9,14 @@ from diffcloud.scene.scenarios import load_scenario
 from diffcloud.sim.simulate import rollout
 
 RANGES = {
-    "stretch": (0.1, 10.0),
-    "mass": (0.1, 10.0),
+    "stretching": (0.1, 10.0),
+    "density": (0.1, 10.0),
     "shear": (0.1, 3.0),
     "bending": (0.3, 3.0),
-    "drag": (0.3, 3.0),
+    "air_density": (0.3, 3.0),
     "damping": (0.01, 0.1),
-    "friction_obstacle": (0.05, 1.0),
-    "friction_cloth": (0.05, 1.0),
+    "friction": (0.05, 1.0),
+    "self_friction": (0.05, 1.0),
 }
 BATCH = 25
 

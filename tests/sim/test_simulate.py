@@ -38,7 +38,7 @@ def cloth_system(
         gravity=options.pop("gravity", (0.0, 0.0, -G)),
         air_density=air,
         obstacles=obstacles,
-        friction_obstacle=friction,
+        friction=friction,
         contact=ContactSettings(1e5, 2e-3, 2e-4),
     )
     return build_system(
@@ -110,7 +110,7 @@ def test_the_step_solves_its_equation(rng):
 def test_a_batch_is_as_its_entries_alone():
     scenario = small_lift()
     system, _ = scenario.scene.build()
-    values = {"stretch": torch.tensor([0.5, 1.0, 4.0]).double(), "mass": torch.tensor([2.0, 1.0, 0.3]).double()}
+    values = {"stretching": torch.tensor([0.5, 1.0, 4.0]).double(), "density": torch.tensor([2.0, 1.0, 0.3]).double()}
     together = rollout(system, 8, properties=scenario.properties(system, values)).positions
     for entry in range(3):
         one = {name: value[entry : entry + 1] for name, value in values.items()}
@@ -125,7 +125,7 @@ def test_a_batch_is_bit_for_bit_the_same_for_any_threads_and_company():
 
     def run(values: torch.Tensor) -> torch.Tensor:
         values = values.clone().requires_grad_()
-        found = rollout(system, 8, properties=scenario.properties(system, {"stretch": values}))
+        found = rollout(system, 8, properties=scenario.properties(system, {"stretching": values}))
         (gradient,) = torch.autograd.grad(found.positions[:, -1].square().sum(), values)
         return torch.cat([found.positions.detach().flatten(1), gradient[:, None]], dim=1)
 
@@ -146,7 +146,7 @@ def test_factors_that_are_made_again_change_nothing(monkeypatch):
 
     def gradient() -> torch.Tensor:
         stretch = torch.tensor([0.5, 4.0]).double().requires_grad_()
-        run = rollout(system, 8, properties=scenario.properties(system, {"stretch": stretch}))
+        run = rollout(system, 8, properties=scenario.properties(system, {"stretching": stretch}))
         return torch.autograd.grad(run.positions[:, -1].square().sum(), stretch)[0]
 
     kept = gradient()
@@ -165,7 +165,7 @@ def test_progress_and_ctrl_c_reach_a_batch_that_runs():
         told.append(steps)
         raise KeyboardInterrupt
 
-    properties = scenario.properties(system, {"stretch": torch.ones(64).double()})
+    properties = scenario.properties(system, {"stretching": torch.ones(64).double()})
     began = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         rollout(system, 10_000, properties=properties, progress=progress)
@@ -310,7 +310,7 @@ class TestDivergence:
         system, _ = scenario.scene.build()
         stretch = torch.tensor([1.0, float("nan"), 1.0]).double()
         with pytest.raises(DivergedError, match=r"step 1, batch entries \[1\].*smaller time step") as caught:
-            rollout(system, 3, properties=scenario.properties(system, {"stretch": stretch}))
+            rollout(system, 3, properties=scenario.properties(system, {"stretching": stretch}))
         assert caught.value.entries == [1]
 
     def test_positions_that_leave_the_numbers(self):
@@ -330,14 +330,14 @@ class TestDivergence:
         track[:, :, 0, 2] = torch.arange(1.0, 6.0)[:, None] * torch.linspace(0.001, 0.004, 4)
         track[1, 1:] = torch.nan
         run = rollout(
-            system, 4, properties=scenario.properties(system, {"stretch": stretch}), track=track, drop_diverged=True
+            system, 4, properties=scenario.properties(system, {"stretching": stretch}), track=track, drop_diverged=True
         )
         assert {entry: error.step for entry, error in run.diverged.items()} == {2: 1, 1: 2}
         assert [error.entries for error in run.diverged.values()] == [[1], [2]]
         finite = run.positions.isfinite().flatten(2).all(-1)
         assert finite.tolist() == [[True] * 5, [True] * 2 + [False] * 3, [True] + [False] * 4, [True] * 5, [True] * 5]
         rest = [0, 3, 4]
-        alone = rollout(system, 4, properties=scenario.properties(system, {"stretch": stretch[rest]}), track=track[rest])
+        alone = rollout(system, 4, properties=scenario.properties(system, {"stretching": stretch[rest]}), track=track[rest])
         torch.testing.assert_close(run.positions[rest], alone.positions, rtol=1e-9, atol=1e-11)
         assert not alone.diverged
 
@@ -352,7 +352,7 @@ class TestDivergence:
             shared = track.clone().requires_grad_(True)
             stretch = torch.tensor(values).double().requires_grad_(True)
             run = rollout(
-                system, 4, properties=scenario.properties(system, {"stretch": stretch}), track=shared, drop_diverged=True
+                system, 4, properties=scenario.properties(system, {"stretching": stretch}), track=shared, drop_diverged=True
             )
             run.positions[0, -1].square().sum().backward()
             assert len(run.diverged) == int(math.isnan(values[1]))
@@ -380,7 +380,7 @@ class TestDivergence:
     def test_all_may_fail(self):
         scenario = small_lift()
         system, _ = scenario.scene.build()
-        properties = scenario.properties(system, {"stretch": torch.full((2,), float("nan")).double()})
+        properties = scenario.properties(system, {"stretching": torch.full((2,), float("nan")).double()})
         run = rollout(system, 3, properties=properties, drop_diverged=True)
         assert sorted(run.diverged) == [0, 1]
         assert run.positions.shape[:2] == (2, 4)

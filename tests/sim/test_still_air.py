@@ -20,7 +20,7 @@ from diffcloud.sim.surrounding import Surrounding
 from tests.conftest import small_lift
 
 G = 9.81
-MATERIAL = preset("basis-knit")
+MATERIAL = preset("soft-knit")
 
 
 def cloth(mesh=None, handles=(), integrator="implicit", **air):
@@ -94,7 +94,7 @@ def test_a_scenario_says_which_air_it_has():
 
 
 def test_mass_of_cloth_and_of_air_are_apart():
-    """`mass` multiplies the cloth's alone, `added_mass` the air's."""
+    """`density` multiplies the cloth's alone, `added_mass` the air's."""
     scenario = small_lift(air="still")
     system = scenario.scene.build()[0]
 
@@ -102,7 +102,7 @@ def test_mass_of_cloth_and_of_air_are_apart():
         given = {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
         return scenario.properties(system, given)
 
-    base, heavy, airy = of(), of(mass=2.0), of(added_mass=3.0)
+    base, heavy, airy = of(), of(density=2.0), of(added_mass=3.0)
     air = base.node_mass - base.weight
     assert (air > 0).all()
     torch.testing.assert_close(heavy.weight, 2 * base.weight)

@@ -22,14 +22,15 @@ from diffcloud.sim.properties import one_set
 from diffcloud.sim.simulate import rollout
 from diffcloud.simulators import mujoco
 from diffcloud.simulators.export.cloth import fitted_cloth, isotropic_sheet, start_strain
-from diffcloud.simulators.export.write import TARGETS, write_export
+from diffcloud.simulators.export.targets import TARGETS
+from diffcloud.simulators.export.write import write_export
 from diffcloud.simulators.problem import Sheet
 from diffcloud.simulators.problems import cantilever, strip
 from tests.conftest import small_lift
 from tests.estimation.records import recording_of
 
 ISOTROPIC = {"density_kg_m2": 0.2, "stretching_n_m": 50.0, "bending_n_m": 1e-5, "poisson": 0.3}
-VALUES = {"stretch": 0.7, "mass": 1.3, "bending": 2.0, "damping": 0.01, "drag": 0.5, "friction_obstacle": 0.4}
+VALUES = {"stretching": 0.7, "density": 1.3, "bending": 2.0, "damping": 0.01, "air_density": 0.5, "friction": 0.4}
 
 
 def towel(**changes):
@@ -83,11 +84,11 @@ class TestFittedScene:
         np.testing.assert_allclose(found, expected, atol=1e-9)
 
     def test_refuses_parameters_that_no_material_has(self):
-        scenario = replace(small_lift(), node_sets={"mass": np.array([0])})
-        with pytest.raises(ConfigError, match="mass acts on a part of the nodes"):
-            scenario.fitted_scene({"mass": 2.0})
+        scenario = replace(small_lift(), node_sets={"density": np.array([0])})
+        with pytest.raises(ConfigError, match="density acts on a part of the nodes"):
+            scenario.fitted_scene({"density": 2.0})
         with pytest.raises(ConfigError, match="above 0"):
-            small_lift().fitted_scene({"stretch": 0.0})
+            small_lift().fitted_scene({"stretching": 0.0})
 
 
 class TestIsotropicSheet:
@@ -122,11 +123,11 @@ class TestIsotropicSheet:
             assert alike(strain) == pytest.approx(mean, rel=1e-12)
 
     def test_says_what_a_sheet_cannot(self):
-        told = " ".join(isotropic_sheet(preset("basis-knit"))[1])
+        told = " ".join(isotropic_sheet(preset("soft-knit"))[1])
         assert "at 45°" in told
         assert "3 times that at rest. The exported stiffness is the one at rest." in told
         assert "wrinkles" not in told
-        wrinkling = replace(preset("basis-knit"), compression=0.25)
+        wrinkling = replace(preset("soft-knit"), compression=0.25)
         assert "wrinkles finer than its mesh instead, and 25.0% of the stiffness stays" in " ".join(
             isotropic_sheet(wrinkling)[1]
         )
@@ -164,7 +165,7 @@ class TestProblem:
         np.testing.assert_allclose(cloth.problem.held_at(cloth.problem.times), cloth.motion[:, held], atol=1e-9)
 
     def test_moves_alike_where_nothing_is_left_out(self):
-        still_air = {**VALUES, "drag": 1e-6}
+        still_air = {**VALUES, "air_density": 1e-6}
         cloth = exported(values=still_air)
         assert cloth.simplified_m.max() < 0.1e-3
         assert np.ptp(cloth.motion[:, -1], axis=0).max() > 0.05
@@ -200,7 +201,7 @@ class TestFiles:
         names, left_out = write_export(exported(), target, tmp_path, {"fit": "e1.json"})
         there = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
         assert there == set(names)
-        assert any("air" in sentence for sentence in left_out) == (target in ("mujoco", "newton", "isaac"))
+        assert any("air" in sentence for sentence in left_out) == TARGETS[target].simplified
 
     def test_mujoco_has_masses_elements_and_the_step(self, tmp_path):
         cloth = exported()
@@ -219,7 +220,7 @@ class TestFiles:
         assert frame == pytest.approx(round(frame), abs=1e-6)
 
     def test_arcsim_is_read_back_and_moves_as_fitted(self, tmp_path):
-        cloth = exported(values={**VALUES, "drag": 1.0})
+        cloth = exported(values={**VALUES, "air_density": 1.0})
         write_export(cloth, "arcsim", tmp_path, {})
         scene = load_scene(tmp_path / "conf" / "cloth.json")
         system, _ = scene.build()
@@ -289,7 +290,7 @@ class TestWhatATargetLacks:
         assert strained.simplified == cloth.simplified
         _, left_out = write_export(strained, target, tmp_path, {})
         told = any("unstrained at the start" in sentence for sentence in left_out)
-        assert told == (target in ("mujoco", "newton", "isaac"))
+        assert told == TARGETS[target].simplified
 
 
 def test_the_script_finds_the_cloth_in_a_model_with_other_things():

@@ -15,7 +15,8 @@ from diffcloud.errors import ConfigError
 from diffcloud.mesh.shapes import grid_cloth
 from diffcloud.simulators import explicit, mujoco, newton, ours, problem
 from diffcloud.simulators.problem import Problem, Sheet, Track, distances
-from diffcloud.simulators.problems import cantilever, elastica, fold, lift, strip, swing
+from diffcloud.simulators.problems import cantilever, elastica, strip
+from studies.towel_problems import fold, lift, swing
 
 NOISY = pytest.mark.filterwarnings("ignore")
 """The other simulators' own warnings."""

@@ -10,8 +10,8 @@ from tests.conftest import small_lift
 
 def test_nine_pairs_are_the_middles_of_the_bounds_parts():
     found = pairs(small_lift())
-    np.testing.assert_allclose(found["stretch"].unique(), 10 ** np.array([-2 / 3, 0, 2 / 3]), rtol=1e-6)
-    assert len({*zip(found["stretch"].tolist(), found["mass"].tolist(), strict=True)}) == 9
+    np.testing.assert_allclose(found["stretching"].unique(), 10 ** np.array([-2 / 3, 0, 2 / 3]), rtol=1e-6)
+    assert len({*zip(found["stretching"].tolist(), found["density"].tolist(), strict=True)}) == 9
 
 
 def test_smaller_steps_are_nearer_to_still_smaller_ones():

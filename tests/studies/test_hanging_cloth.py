@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from diffcloud.errors import EpisodeError
 from studies import hanging_cloth as study
 
-VALUES = {"added_mass": 0.4, "linear_drag": 0.8, "drag": 0.6}
+VALUES = {"added_mass": 0.4, "linear_drag": 0.8, "air_density": 0.6}
 
 
 def bar(times):
@@ -63,15 +63,15 @@ def test_a_damped_oscillation_has_its_period_and_decay(period, decay):
 
 def test_the_cloth_swings_as_a_hanging_chain_and_slower_with_air():
     """The first period of a chain is 4 π / 2.4048 sqrt(L / g) (Bernoulli); inertia without weight stretches it."""
-    still = study.simulated_swing({"added_mass": 1e-6, "linear_drag": 1e-6, "drag": 1e-6})[0]
+    still = study.simulated_swing({"added_mass": 1e-6, "linear_drag": 1e-6, "air_density": 1e-6})[0]
     assert still == pytest.approx(4 * math.pi / 2.4048 * math.sqrt(0.3 / 9.81), rel=0.02)
-    airy = study.simulated_swing({"added_mass": 0.44, "linear_drag": 1e-6, "drag": 1e-6})[0]
+    airy = study.simulated_swing({"added_mass": 0.44, "linear_drag": 1e-6, "air_density": 1e-6})[0]
     assert airy / still == pytest.approx(1.2, rel=0.01)
 
 
 def test_derivatives_of_distances_are_those_of_differences():
     made = recording()
-    free = ("added_mass", "drag")
+    free = ("added_mass", "air_density")
     pose = np.array([0.004, 0.006, -0.003, 0.02, -0.03, 0.05, 0.004])
     values = VALUES | {"added_mass": 0.7}
     _, slopes = study.residuals(made, *study.simulate(made.track, values, free), pose)
@@ -94,7 +94,7 @@ def test_derivatives_of_distances_are_those_of_differences():
 
 def test_a_fit_finds_the_air_of_a_simulated_recording():
     made = recording()
-    found = study.fit([made], {"added_mass": 0.7, "linear_drag": 0.4, "drag": 1.0}, tuple(VALUES))
+    found = study.fit([made], {"added_mass": 0.7, "linear_drag": 0.4, "air_density": 1.0}, tuple(VALUES))
     assert found["added_mass"] == pytest.approx(0.4, abs=0.02)
     pose, rms = study.find_pose(made, study.simulate(made.track, found)[0])
     assert rms < 0.001
@@ -154,10 +154,10 @@ class TestFiles:
 
 
 def test_a_page_says_what_was_found():
-    models = ("drag alone", "added mass by the free swing", "added mass by the clouds")
+    models = ("air_density alone", "added density by the free swing", "added density by the clouds")
     rms = dict.fromkeys(study.FITTED, 12.0) | {"other": 11.0, "another": 13.0}
     rows = [study.Row(model, VALUES, rms, 1.1, 0.7) for model in models]
     page = study._page(rows, dict.fromkeys(rms, (1.09, 0.8)), "x.png")
     assert "period of 1.090 s (median of 5" in page
-    assert "| drag alone | 12.0 | 12.0 | 12.0 | 12.0 | 1.100 | 0.70 | 0.40 | 0.80 | 3.60 |" in page
+    assert "| air_density alone | 12.0 | 12.0 | 12.0 | 12.0 | 1.100 | 0.70 | 0.40 | 0.80 | 3.60 |" in page
     assert "{" not in page

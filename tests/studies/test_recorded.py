@@ -14,11 +14,11 @@ def fit(name, stretch, rms=8.0, **changes):
     x = {"value": 0.03, "prior": 0.1, "unit": "m", "of": "pose"}
     scenario = "recorded_lift" if name.startswith("lift") else "recorded_fold"
     parameters = {
-        "stretch": parameter_of(physical=stretch, **changes),
-        "mass": parameter_of(physical=0.2),
-        "bending": parameter_of(physical=4e-6),
-        "compression": parameter_of(value=0.12),
-        "shear": parameter_of(value=0.9),
+        "stretching": parameter_of(value=stretch, **changes),
+        "density": parameter_of(value=0.2),
+        "bending": parameter_of(value=4e-6),
+        "compression": parameter_of(multiplier=0.12),
+        "shear": parameter_of(multiplier=0.9),
     }
     one = recording_of(name, scenario=scenario, nuisance={"yaw": yaw, "x": x}, frames=[16, 17], frame_rms_mm=[1.0, 1.0],
                        counted=[0.5, 0.5])  # fmt: skip

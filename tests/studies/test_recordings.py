@@ -25,9 +25,9 @@ SMALL = {
     "path": [[0, 0, 0, 0], [0.3, 0, -0.05, 0.15]],
 }
 PARAMS = {
-    "scenarios": ["small"],
-    "episodes": {"per_scenario": 1},
-    "preprocess": {"raw": {"flying_m": 0.03}, "outlier_deviations": 5},
+    "scenes": ["small"],
+    "synthesize": {"per_scenario": 1},
+    "preprocess": {"raw": {"depth_jump_m": 0.03}, "outlier_std": 5},
     "fit": {"solver": {"max_steps": 1}},
     "evaluate": {"draws": 1},
 }
@@ -41,7 +41,7 @@ def place(tmp_path_factory) -> Path:
     (folder / "params.yaml").write_text(yaml.safe_dump(PARAMS), encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        stage("episodes", "--params", "params.yaml", "--out", "recorded")
+        stage("synthesize", "--params", "params.yaml", "--out", "recorded")
         invoke("data", "preprocess", "--params", "params.yaml", "--out", "episodes", "recorded")
     return folder
 
@@ -57,7 +57,7 @@ def test_recordings_are_raw_and_become_clouds_with_pictures(work):
     episode = read_episode(work / "episodes" / "small" / "small_hidden1.npz")
     assert episode.frame_count == 4
     assert np.diff(episode.offsets).min() >= 1500
-    assert episode.meta["truth"].keys() == {"stretch", "mass"}
+    assert episode.meta["truth"].keys() == {"stretching", "density"}
     assert np.abs(episode.points[:, :2]).max() < 0.25  # in the scene's frame, not the arm's
     truth = read_truth(work / "recorded" / "small" / "small_hidden1")
     lifted = truth.nodes[..., 2].max(axis=1)
@@ -90,7 +90,7 @@ def test_a_look_at_the_raw_recording_its_clouds_and_a_fit(work):
     done = invoke("view", raw, "--params", "params.yaml", "--out", "raw.html", "--scene", "small")
     assert done.result["episodes"] == 1
     page = (work / "raw.html").read_text(encoding="utf-8")
-    assert page.count('"name":"recorded, overhead"') == page.count('"name":"cloth, basis material"') == 1
+    assert page.count('"name":"recorded, overhead"') == page.count('"name":"cloth, nominal material"') == 1
     assert len(re.findall(r'"/9j/[A-Za-z0-9+/=]{1000,}"', page)) == 4  # a JPEG a frame
     invoke("fit", episode, "--scene", "small", "--params", "params.yaml", "--out", "seen")
     invoke("view", episode, "--fit", "seen/fit.json", "--out", "fitted")
@@ -136,20 +136,18 @@ def test_a_look_at_an_episode_whose_meta_is_damaged(work, meta, says):
 
 
 def test_again_replaces_only_what_is_synthetic(work):
-    stage("episodes", "--params", "params.yaml", "--out", "recorded")
+    stage("synthesize", "--params", "params.yaml", "--out", "recorded")
     own = work / "own" / "small" / "small_hidden1"
     own.mkdir(parents=True)
     (own / "notes.txt").write_text("mine", encoding="utf-8")
-    assert "no synthetic recording" in stage("episodes", "--params", "params.yaml", "--out", "own", code=1).errors
+    assert "no synthetic recording" in stage("synthesize", "--params", "params.yaml", "--out", "own", code=1).errors
     assert (own / "notes.txt").is_file()
 
 
 def test_none_are_made_where_only_own_ones_are_wanted(work):
-    (work / "own.yaml").write_text(yaml.safe_dump({**PARAMS, "episodes": {"per_scenario": 0}}), encoding="utf-8")
-    assert stage("episodes", "--params", "own.yaml", "--out", "no_others").result["episodes"] == {}
+    (work / "own.yaml").write_text(yaml.safe_dump({**PARAMS, "synthesize": {"per_scenario": 0}}), encoding="utf-8")
+    assert stage("synthesize", "--params", "own.yaml", "--out", "no_others").result["episodes"] == {}
     assert [path.name for path in (work / "no_others").iterdir()] == ["manifest.json"]
-    (work / "own.yaml").write_text(yaml.safe_dump({**PARAMS, "episodes": {"source": "raw/episodes"}}), encoding="utf-8")
-    assert "recordings in raw/ are always used" in stage("episodes", "--params", "own.yaml", "--out", "o", code=1).errors
 
 
 def test_a_truncated_image_and_one_without_depth_are_named(work):
@@ -192,18 +190,18 @@ def test_poses_found_are_held_against_the_true_ones(work, tmp_path):
 def test_the_pose_of_a_heavy_displaced_cloth_is_the_true_one(tmp_path, monkeypatch):
     """With the mass that fits are given: with the scenario's, the motion would lie elsewhere."""
     monkeypatch.chdir(tmp_path)
-    heavy = {"per_scenario": 1, "hidden_range": [2.8, 3.0], "beside": [30, 0]}
+    heavy = {"per_scenario": 1, "true_range": [2.8, 3.0], "placement_error": [30, 0]}
     scene = {**SMALL, "frames": 10, "path": [[0, 0, 0, 0], [1.0, 0, -0.1, 0.3]]}
     settings = {
-        "scenarios": ["small"],
-        "episodes": heavy,
+        "scenes": ["small"],
+        "synthesize": heavy,
         "preprocess": PARAMS["preprocess"],
         "fit": {"solver": {"model_error": False}},
     }
     Path("raw/scenes").mkdir(parents=True)
     Path("raw/scenes/small.yaml").write_text(yaml.safe_dump(scene), encoding="utf-8")
     Path("params.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
-    stage("episodes", "--params", "params.yaml", "--out", "recorded")
+    stage("synthesize", "--params", "params.yaml", "--out", "recorded")
     invoke("data", "preprocess", "--params", "params.yaml", "--out", "episodes", "recorded")
     told = study(
         "recordings", "--recorded", "recorded", "--episodes", "episodes", "--params", "params.yaml", "--out", "poses.md",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from diffcloud.simulators.study import THIS, WHOLE_STIFFNESS, Answer, Derivative, Pair
+from studies.simulator_motions import THIS, WHOLE_STIFFNESS, Answer, Derivative, Pair
 from studies.simulators import _page
 
 

@@ -80,7 +80,7 @@ def nearest_pairs(surface: SurfaceBox, near: Neighbours, repulsion: Repulsion, p
 
 @kernel
 def pairs_at(surface: Surface, repulsion: Repulsion, points: Floats) -> tuple[Ints, Floats]:
-    """The same, to be called from outside of kernels."""
+    """Return `nearest_pairs`, for callers outside of kernels."""
     box = boxed(surface)
     return nearest_pairs(box, no_neighbours(box, repulsion.thickness), repulsion, points)
 
@@ -173,7 +173,8 @@ def _spanned(edges: int, x: Floats) -> float:
 
 @kernel
 def _set_slots(surface: SurfaceBox, pairs: Ints, c: int, place: Floats, around: Floats) -> None:
-    """The slot that a pair takes of each of its primitives."""
+    """Write the slot that pair `c` takes at each of its two primitives to columns 7 and 8 of `pairs`. Each primitive has
+    one slot for each of its two sides."""
     normal = (place[4], place[5], place[6])
     points, faces = len(surface.points), len(surface.faces)
     if pairs[c, 0] > 0:

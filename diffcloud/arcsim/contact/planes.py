@@ -37,7 +37,7 @@ def force(node: Element) -> Sequence[Vector]:
     violation = maximum(thickness + node.constant("offset") - dot(node.positions[0], normal), 0.0)
     stiffness = violation * (node.constant("stiffness") / thickness)
     pushing = 0.5 * stiffness * violation
-    limit = node.parameter("friction_obstacle") * pushing
+    limit = node.parameter("friction") * pushing
     before, after = node.before[0], node.after[0]
     speed = norm(before - dot(before, normal) * normal)
     sticking = limit * node.time_step / node.parameter("node_mass") + _TINY
@@ -70,7 +70,7 @@ PLANES = Term(
     force=force,
     build=build,
     constants={"normal": (3,), "offset": (), "stiffness": (), "thickness": ()},
-    parameters={"node_mass": "corner", "friction_obstacle": "episode"},
+    parameters={"node_mass": "corner", "friction": "episode"},
 )
 """Constants: unit normal towards the cloth; offset [m]; k_c times the node's area [N/m]; τ [m]."""
 

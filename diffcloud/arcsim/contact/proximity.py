@@ -36,7 +36,7 @@ def force(kind: Kind, pair: Element) -> Sequence[Vector]:
     before, after = along(pair.before), along(pair.after)
     mobility = sum((w * w * pair.parameter("inverse_mass", k) for k, w in enumerate(weights)), weights[0].of(0.0))
     with_obstacle = pair.constant("with_obstacle") > 0.0
-    limit = where(with_obstacle, pair.parameter("friction_obstacle"), pair.parameter("friction_cloth")) * pushing
+    limit = where(with_obstacle, pair.parameter("friction"), pair.parameter("self_friction")) * pushing
     speed = norm(before - dot(normal, before) * normal)
     gamma = limit / larger(speed, limit * pair.time_step * mobility + _TINY)
     pressure = pushing - stiffness * dot(normal, pair.ahead * after) + gamma * dot(normal, after)
@@ -50,7 +50,7 @@ def _term(kind: Kind) -> Term:
         corners=4,
         force=partial(force, kind),
         constants=dict.fromkeys(("sign", "count", "stiffness", "with_obstacle", "thickness"), ()),
-        parameters={"inverse_mass": "corner", "friction_obstacle": "episode", "friction_cloth": "episode"},
+        parameters={"inverse_mass": "corner", "friction": "episode", "self_friction": "episode"},
     )
 
 

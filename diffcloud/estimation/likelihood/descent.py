@@ -27,7 +27,7 @@ _FEWEST_STEPS = 3
 """Of a descent."""
 _RISE = 0.02
 """By which Φ may rise, for each independent residual."""
-_HALVINGS = 3
+_BACKTRACKS = 3
 _REFRESH = 1.0
 """Standard deviations after which the finer mesh is simulated anew."""
 _NARROW = 0.05
@@ -50,7 +50,7 @@ class Answer:
     energy: float
     """Φ"""
     converged: bool
-    misfits: tuple[list[float], ...]
+    chi_squares: tuple[list[float], ...]
     """Of each recording, c of its frames."""
     apart_m: tuple[list[float], ...]
     """Of each recording, how far the finer mesh is in its frames, RMS over the nodes."""
@@ -105,7 +105,7 @@ class Descent:
             terms = self._terms(linear, place)
             if best is not None and terms.energy > best.energy + allowed:
                 tried += 1
-                if tried > _HALVINGS:
+                if tried > _BACKTRACKS:
                     break
                 place, radius = 0.5 * (place + best.place), max(0.5 * radius, _NARROW)
                 continue
@@ -190,7 +190,7 @@ class Descent:
         if not of.knows_grip:
             sources["grasp"] = torch.outer(covariance[-1], covariance[-1])
         sources |= {name: torch.zeros_like(covariance) for name in ("mesh", "time step")}
-        misfits, apart = [], []
+        chi_squares, apart = [], []
         for one, known in zip(self.reached.linear, self.of.changes, strict=True):
             recording, shift = one.recording, known.finer
             changes = dict[str, Tensor | None]()
@@ -204,10 +204,10 @@ class Descent:
                     pulled = torch.einsum("wl,wlk->k", weights, one.frames(place, known, change).shifted)
                     moved = covariance[:, recording.columns] @ pulled
                     sources[name] = sources[name] + torch.outer(moved, moved)
-            misfits.append(frames.misfits.tolist())
-            away = torch.zeros(len(frames.misfits)).double() if shift is None else squared(shift).sqrt()
+            chi_squares.append(frames.chi_squares.tolist())
+            away = torch.zeros(len(frames.chi_squares)).double() if shift is None else squared(shift).sqrt()
             apart.append((away * recording.objective.length_unit_m).tolist())
         total = torch.stack([*sources.values()]).sum(0)
         return Answer(
-            place, total, sources, self.reached.energy, converged, tuple(misfits), tuple(apart), tuple(self._trace)
+            place, total, sources, self.reached.energy, converged, tuple(chi_squares), tuple(apart), tuple(self._trace)
         )

@@ -23,23 +23,23 @@ class Frames:
     curvatures: Tensor
     """[2, L, k + d, k + d] half of their Gauss–Newton matrices."""
     shifted: Tensor
-    """[2, L, k + d] by which half of the slopes change if the nodes move by what was asked for."""
+    """[2, L, k + d] by which half of the slopes change if the nodes move by the requested shifts."""
     variances: Tensor
     """[2, L] that are known."""
 
     @property
-    def misfits(self) -> Tensor:
+    def chi_squares(self) -> Tensor:
         """[L] mean squares over known variances, c."""
         return (self.squares / self.variances).mean(0)
 
     @property
     def weights(self) -> Tensor:
         """[2, L] slope of Φ by the mean squares, for one independent residual."""
-        return 0.5 / (self.variances * self.misfits.clamp(min=1.0))
+        return 0.5 / (self.variances * self.chi_squares.clamp(min=1.0))
 
     def energy(self) -> float:
         """Φ for one independent residual a frame, but for a constant."""
-        c = self.misfits
+        c = self.chi_squares
         return float((self.variances.log().mean(0) + torch.where(c < 1, c, 1 + c.clamp(min=1e-9).log())).sum())
 
 

@@ -14,8 +14,11 @@ from diffcloud.scene.scenarios import Scenario
 
 
 def regripped(scenario: Scenario) -> list[Scenario]:
-    """With a smaller grasp and, where its pad fits and holds the same nodes, a larger one; none where its size is known, or
-    no smaller pad fits on the mesh."""
+    """Return variants of a scenario whose grasp is one standard deviation smaller and, if possible, one larger.
+
+    The larger grasp is left out unless its pad fits on the cloth and holds the same nodes. The list is empty if the size
+    of the grasp is known, or if the smaller pad does not fit on the mesh.
+    """
     if scenario.regrip is None:
         return []
     found = list[Scenario]()
@@ -28,7 +31,12 @@ def regripped(scenario: Scenario) -> list[Scenario]:
 
 
 def in_powers(grips: Sequence[Tensor | None]) -> tuple[Tensor, Tensor] | None:
-    """What a smaller grasp changes, and maybe a larger one, in powers of its size."""
+    """Return the (linear, quadratic) coefficients of the change that the size of the grasp causes; None if not known.
+
+    Args:
+        grips: changes of the nodes by a grasp one standard deviation smaller and, if there is one, one larger. None stands
+            for a variant that diverged.
+    """
     known = [one for one in grips if one is not None]
     if not grips or len(known) < len(grips):
         return None
@@ -39,12 +47,18 @@ def in_powers(grips: Sequence[Tensor | None]) -> tuple[Tensor, Tensor] | None:
 
 
 def gripped(members: Sequence[Objective], grip: float) -> Sequence[Objective]:
-    """With a grasp so many deviations larger than stated, where its size is not known."""
+    """Return the objectives with a grasp `grip` standard deviations larger than stated, unless its size is known."""
     return [one.of(one.scenario.regrip(grip)) if grip and one.scenario.regrip else one for one in members]
 
 
 def that_fits(members: Sequence[Objective], grip: float) -> float:
-    """So much of a change of the grasp that its pad fits on the cloth and on the mesh."""
+    """Return the largest part of a change in grasp size with which the gripper pad fits on the cloth and the mesh.
+
+    The parts are 1, 3/4, 1/2, 1/4 and, if none of these fits, 0.
+
+    Args:
+        grip: the change, in standard deviations.
+    """
     for part in (1.0, 0.75, 0.5, 0.25):
         try:
             for one in members:
@@ -57,5 +71,5 @@ def that_fits(members: Sequence[Objective], grip: float) -> float:
 
 
 def known(objective: Objective) -> Objective:
-    """With the grasp as its scenario has it."""
+    """Return the objective with the size of its grasp fixed at that of its scenario."""
     return objective.of(replace(objective.scenario, regrip=None))

@@ -8,15 +8,16 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class LikelihoodSettings:
-    """Of one fit."""
+    """Settings of one fit with the solver `likelihood`."""
 
     max_steps: int = 12
-    """Places that each start compares at most, the first one included."""
+    """Maximum number of iterates per start, the first one included."""
     starts: int = 3
-    """Descents: from the centres of the priors, then with the first variable, the stretching, above and below."""
+    """Number of starts. The first is at the centres of the priors; the others shift the first variable, the stretching, up
+    and down."""
     seed: int = 0
-    """Of the points that are drawn."""
+    """Seed of the sampled points."""
     model_error: bool = True
-    """Whether the cloth may move otherwise than this simulator on this mesh can make it move; False for its own motions."""
+    """Whether the fit allows for errors of the simulator and its mesh. Use False for motions that this simulator made."""
     init: Mapping[str, float] = field(default_factory=dict)
     """Values of the first start."""

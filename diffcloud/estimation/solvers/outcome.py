@@ -27,12 +27,12 @@ class Progress:
     values: Mapping[str, float]
     """Of the best so far."""
     simulations: int | None = None
-    """So far; of a search, whose budget they are."""
+    """Simulations so far, which count towards the budget of a search; None for other solvers."""
 
 
 @dataclass
 class FitHistory:
-    """What happened; N iterations, B starts (1 of a search: its lowest so far), k variables."""
+    """Losses, values and gradients of N iterations, B starts and k variables. A search has B = 1, its best so far."""
 
     names: tuple[str, ...]
     losses: list[Tensor] = field(default_factory=list)
@@ -58,13 +58,13 @@ class FitOutcome:
     failures: tuple[str, ...] = ()
     """Messages of starts that diverged."""
     estimate: Estimate | None = None
-    """Of the solver `likelihood`, which knows its uncertainty."""
+    """The estimate with its uncertainty; None unless the solver is `likelihood`."""
 
     def uninterrupted(self) -> FitOutcome:
-        """This fit, for who has no use for one that Ctrl-C has cut short.
+        """Return self, or raise KeyboardInterrupt if the fit was interrupted.
 
         Raises:
-            KeyboardInterrupt: Ctrl-C ended it.
+            KeyboardInterrupt: Ctrl-C ended the fit.
         """
         if self.stop_reason == "interrupted":
             raise KeyboardInterrupt
@@ -77,12 +77,13 @@ class FitOutcome:
 
     @property
     def start(self) -> dict[str, float]:
-        """Initial values of the first start that did not diverge at once, or the best of a search's first batch."""
+        """Initial values of the first start whose initial loss is finite. For a search, the best values of the first batch
+        with a finite loss."""
         return dict(zip(self.history.names, self.history.values[0][self._first].tolist(), strict=True))
 
     @property
     def loss_start(self) -> float:
-        """Its loss before the first update."""
+        """Loss at `start`, before the first update."""
         return float(self.history.losses[0][self._first])
 
     @property

@@ -1,4 +1,4 @@
-"""Random search: independent draws, uniform on the axis of `residuals.Axis`; what any other method must be better than."""
+"""Random search, the baseline for all other solvers: independent samples, uniform on the scale of `residuals.Axis`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BATCH = 16
 
 @dataclass(frozen=True)
 class RandomSearchSettings(SearchSettings):
-    """Of one random search."""
+    """Settings of one random search."""
 
 
 def fit_random_search(
@@ -29,19 +29,20 @@ def fit_random_search(
     *,
     progress: Callable[[Progress], None] | None = None,
 ) -> FitOutcome:
-    """The best of the first parameter set and of draws, which are log-uniform where the lower bound is positive.
+    """Return the best of the initial values and of random samples.
 
-    Ctrl-C ends the fit and keeps the best so far. A larger budget begins with the draws of a smaller one.
+    Samples are log-uniform where the lower bound is positive. A larger budget begins with the samples of a smaller one.
+    Ctrl-C ends the fit and keeps the best so far.
 
     Raises:
-        DivergedError: every draw diverged.
+        DivergedError: every sample diverged.
         KeyboardInterrupt: interrupted before the first loss.
     """
     return search(objective, space, settings, lambda first: _Draws(len(first), settings.seed), progress=progress)
 
 
 class _Draws:
-    """Independent of the losses."""
+    """Uniform samples in the unit box, independent of the losses."""
 
     converged = False
 

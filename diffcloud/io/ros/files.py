@@ -84,7 +84,7 @@ def refuse_lone_parts(paths: Sequence[Path]) -> tuple[str, ...]:
                     f"{path.parent} to import all of it."
                 )
             continue
-        parts, doubtful = _adjoining(path)
+        parts, unsure = _adjoining(path)
         if {part.resolve() for part in parts} - given:
             raise EpisodeError(
                 f"{path} is one of the {len(parts)} parts of a split recording, whose times adjoin: give all of them, "
@@ -92,7 +92,7 @@ def refuse_lone_parts(paths: Sequence[Path]) -> tuple[str, ...]:
             )
         warnings += [
             f"{other} cannot be read; if it is a part of the same recording as {path.name}, that part is missing."
-            for other in doubtful
+            for other in unsure
         ]
     return tuple(dict.fromkeys(warnings))
 
@@ -121,19 +121,19 @@ def _adjoining(path: Path) -> tuple[list[Path], list[Path]]:
         and (found := _NUMBERED.fullmatch(other.stem)) is not None
         and _DATE.sub("", found.group(1)) == _DATE.sub("", match.group(1))
     }
-    parts, doubtful = [path], []
+    parts, unsure = [path], []
     for step in (-1, 1):
         last, next_number = _extent(path), number + step
         while last is not None and next_number in beside:
             following = _extent(beside[next_number])
             if following is None:
-                doubtful.append(beside[next_number])
+                unsure.append(beside[next_number])
             elif last.adjoins(following):
                 parts.insert(0 if step < 0 else len(parts), beside[next_number])
             if following is None or not last.adjoins(following):
                 break
             last, next_number = following, next_number + step
-    return parts, doubtful
+    return parts, unsure
 
 
 @dataclass(frozen=True)

@@ -70,21 +70,21 @@ def of_one_driver(
         EpisodeError: several publishers send the same joints, and none or several are named; lists them.
     """
     publishers = _publishers(messages, frozenset(needed))
-    rivals = {
+    candidates = {
         index
         for pair in combinations(range(len(publishers)), 2)
         if publishers[pair[0]].contradicts(publishers[pair[1]])
         for index in pair
     }
-    labels = _labels(publishers, sorted(rivals))
+    labels = _labels(publishers, sorted(candidates))
     plain = {name.partition("#")[0] for name in named if "#" not in name}
-    asked = {index for index in rivals if labels[index] in named}
+    asked = {index for index in candidates if labels[index] in named}
     numbered = {name for name in named if "#" in name}
     if unknown := sorted(numbered - set(labels.values())):
         raise EpisodeError(_candidates(where, publishers, labels, f"There is no {unknown[0]}. "))
-    kept = rivals
+    kept = candidates
     if asked:
-        kept = asked | {index for index in rivals if publishers[index].topic in plain}
+        kept = asked | {index for index in candidates if publishers[index].topic in plain}
     moving = {index for index in kept if publishers[index].moves}
     if named and len({publishers[index].topic for index in kept}) == 1 and len(moving) == 1:
         kept = moving  # the topic is named, and all else on it stands still
@@ -92,11 +92,13 @@ def of_one_driver(
         raise EpisodeError(_candidates(where, publishers, labels, ""))
     warnings = [
         f"{labels[index]}: {len(publishers[index].messages)} joint states of another publisher were left out."
-        for index in sorted(rivals - kept)
+        for index in sorted(candidates - kept)
     ]
-    if not rivals:
+    if not candidates:
         return list(messages), warnings
-    held = {id(message) for index, one in enumerate(publishers) if index not in rivals - kept for message in one.messages}
+    held = {
+        id(message) for index, one in enumerate(publishers) if index not in candidates - kept for message in one.messages
+    }
     return [message for message in messages if id(message) in held], warnings
 
 
@@ -148,11 +150,11 @@ def _apart(difference: Floats) -> Floats:
     return np.asarray(np.abs((difference + np.pi) % (2 * np.pi) - np.pi).max(axis=-1))
 
 
-def _labels(publishers: Sequence[_Publisher], rivals: Sequence[int]) -> dict[int, str]:
+def _labels(publishers: Sequence[_Publisher], candidates: Sequence[int]) -> dict[int, str]:
     """What the user may name: the topic, with a number where several on it contradict each other."""
     labels: dict[int, str] = {}
-    for topic in {publishers[index].topic for index in rivals}:
-        own = [index for index in rivals if publishers[index].topic == topic]
+    for topic in {publishers[index].topic for index in candidates}:
+        own = [index for index in candidates if publishers[index].topic == topic]
         labels |= dict.fromkeys(own, topic)
         within = {
             index for pair in combinations(own, 2) if publishers[pair[0]].contradicts(publishers[pair[1]]) for index in pair

@@ -49,7 +49,7 @@ from diffcloud.io.ros.topics import (
     refuse_unknown,
     same_camera,
 )
-from diffcloud.io.ros.transforms import TransformTree, refuse_rivals
+from diffcloud.io.ros.transforms import TransformTree, refuse_conflicts
 from diffcloud.io.urdf import RobotDescription
 
 _JOINTS = "sensor_msgs/msg/JointState"
@@ -218,7 +218,7 @@ def _scan(paths: Sequence[Path], shown: str, named: Sequence[str]) -> _Scan:
                     f"{message.header.frame_id!r}. Record each camera on a topic of its own."
                 )
             own.append((stamp_s(message), 1e-9 * arrival))
-    refuse_rivals([(topic, item) for topic, _, item in transforms], shown)
+    refuse_conflicts([(topic, item) for topic, _, item in transforms], shown)
     static = {topic for topic in stamps if topic.endswith("tf_static")}
     times, warnings = message_times({topic: held for topic, held in stamps.items() if topic not in static})
     times |= {topic: np.array([stamp for stamp, _ in stamps[topic]]) for topic in static}  # holds for good

@@ -44,7 +44,7 @@ class _Edge:
         return self.matrices[nearest]
 
 
-def refuse_rivals(transforms: Sequence[tuple[str, Any]], where: str) -> None:
+def refuse_conflicts(transforms: Sequence[tuple[str, Any]], where: str) -> None:
     """
     Args:
         transforms: (topic, geometry_msgs/TransformStamped).

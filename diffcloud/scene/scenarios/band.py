@@ -19,13 +19,12 @@ from diffcloud.scene.scenarios.sheet import Sheet
 
 
 class BandScenario(ScenarioOptions):
-    """A band laid around a level pole and a gripper in front (at -y) without slack: a belt on edge, its strands one above
-    the other.
+    """An elastic band that runs without slack around a level pole and a gripper in front of the pole (at -y).
 
-    Everything here may change in a YAML file.
+    The band lies like a belt around two level pulleys: one strand above the other. A YAML file may set every field.
     """
 
-    material: str | Sheet = "basis-soft-foam"
+    material: str | Sheet = "soft-foam"
     contact_thickness_m: Length = 0.008
     contact_stiffness: NonNegative = 1e6
     circumference_m: Length = 1.75

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -10,12 +9,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from diffcloud.errors import SceneError, unknown_name
+from diffcloud.errors import ConfigError, SceneError, unknown_name
 from diffcloud.io.schema import Checked, NonNegative
 from diffcloud.mesh.shapes import lined_cloth, rectangle_surface
 from diffcloud.mesh.topology import ClothMesh
+from diffcloud.scene.scenarios.initial_state import parse_initial_state
 from diffcloud.scene.scenarios.options import Coordinate, Keyframes, Length, ScenarioOptions, assemble, chosen_material
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.sim.grasp import GRIP_M, Grasp, Grip, inside, turned_up, window
@@ -63,15 +63,19 @@ class GridScenario(ScenarioOptions):
     grip_known_within: Annotated[float, Field(ge=1, le=3)] = 1.0
     """The factor within which `grip_m` is known, one standard deviation; 1: exactly. Fits by `likelihood` allow for it."""
     loss_surface: Literal["all", "grasped_half"] = "all"
-    laid_turn_deg: Annotated[float, Field(ge=0, le=45)] = 10.0
-    """How far askew the cloth may lie at the start, one standard deviation; 0: not at all. Fits find it. A hand seldom lays
-    a cloth down more exactly, and one that lies askew under a gripper moves in another way."""
-    laid_shape_m: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """How uneven: one standard deviation of the height of each of nine waves."""
-    laid_size: Annotated[float, Field(ge=0, le=0.2)] = 0.0
-    """By what fraction the cloth may be larger or smaller than `size_m`, one standard deviation."""
-    laid_track: Annotated[float, Field(ge=0, le=0.2)] = 0.0
-    """By what fraction the gripper's path may be longer or shorter than recorded, one standard deviation."""
+    initial_state: Annotated[str, Field(max_length=200)] = "turn=10deg"
+    """Standard deviations of how the cloth may lie otherwise at the start, which fits find: `turn` about its middle,
+    `shape` (height of each of nine waves), `size` of the cloth, and `track` (length of the gripper's path), such as
+    turn=5deg,shape=5mm,size=2%,track=2%; or none. A hand seldom puts a cloth down more exactly than within 10 degrees."""
+
+    @field_validator("initial_state")
+    @classmethod
+    def _states_deviations(cls, text: str) -> str:
+        try:
+            parse_initial_state(text)
+        except ConfigError as error:
+            raise ValueError(str(error)) from error
+        return text
 
     @model_validator(mode="after")
     def _is_grasped_once(self) -> GridScenario:
@@ -163,15 +167,8 @@ def grid_scenario(options: GridScenario) -> Scenario:
         turned=turned,
         loss_faces=_half(mesh, grasped) if options.loss_surface == "grasped_half" else None,
     )
-    laid = {
-        "turn": math.radians(options.laid_turn_deg),
-        "shape": options.laid_shape_m,
-        "size": options.laid_size,
-        "track": options.laid_track,
-    }
-    laid = {name: deviation for name, deviation in laid.items() if deviation}
     regrip = _Regrip(options) if options.grip_known_within > 1 else None
-    return replace(scenario, laid=laid, regrip=regrip)
+    return replace(scenario, initial_state=parse_initial_state(options.initial_state), regrip=regrip)
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ _NODES = (5, 13)
 _GAP_M: float = GridScenario.model_fields["gap_m"].default
 """Of the cloth over the table at the start."""
 _FEW_POINTS = 100
-FIELDS = ("center_m", "yaw_deg", "laid_turn_deg", "table_height_m", "grasped", "rate_hz", "frames", "path")
+FIELDS = ("center_m", "yaw_deg", "initial_state", "table_height_m", "grasped", "rate_hz", "frames", "path")
 """Of a scenario, those that `find_layout` finds."""
 
 
@@ -146,7 +146,7 @@ def find_layout(episode: Episode, size: tuple[float, float], pad: float = GRIP_M
     found = {
         "center_m": Found([round(float(part), 4) for part in centre], "middle of the rectangle around the first frame"),
         "yaw_deg": Found(round(math.degrees(yaw) % 360, 2), "turn at which that rectangle is smallest"),
-        "laid_turn_deg": Found(0.0, "the first frame shows the turn; above 0, a fit finds how far it is off"),
+        "initial_state": Found("none", "the first frame shows the turn; with turn=5deg, a fit finds how far it is off"),
         "table_height_m": Found(round(table, 5), f"{1e3 * _GAP_M:.1g} mm below the middle height of the first frame"),
         "grasped": Found(
             [corners.get(node, node)],

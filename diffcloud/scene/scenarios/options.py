@@ -43,7 +43,7 @@ class ScenarioOptions(Checked):
     name: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^./\\\s][^/\\]*$")]
     """Folders and files are named after it. A recording may have any name that one of these can have, and `fit` names
     its scenario so."""
-    material: str | Sheet = "basis-knit"
+    material: str | Sheet = "soft-knit"
     """A preset, the path of an ARCSim material JSON, or an isotropic sheet in SI units."""
     compression: Annotated[float, Field(ge=0, le=1)] = 1.0
     """The part of its stretching stiffness with which the cloth resists compression in its plane. Fabric wrinkles instead,
@@ -77,8 +77,8 @@ class ScenarioOptions(Checked):
     air that moves along with the cloth, which makes it swing slower, and linear drag (`sim.still_air`)."""
     air_density: NonNegative = AIR_DENSITY
     """Of air that is there [kg/m³]."""
-    friction_obstacle: Friction = Surrounding.friction_obstacle
-    friction_cloth: Friction = Surrounding.friction_cloth
+    friction: Friction = Surrounding.friction
+    self_friction: Friction = Surrounding.self_friction
     mesh_contact: bool = True
     """For the arcsim integrator: whether contact is with all meshes and the cloth itself, or with planes only."""
     self_contact: bool = Surrounding.self_contact
@@ -164,8 +164,8 @@ def assemble(
         air_density=0.0 if options.air == "none" else options.air_density,
         added_mass=moving.added_mass,
         linear_drag=moving.linear_drag,
-        friction_obstacle=options.friction_obstacle,
-        friction_cloth=options.friction_cloth,
+        friction=options.friction,
+        self_friction=options.self_friction,
         self_contact=options.self_contact,
         contact=ContactSettings(options.contact_stiffness, thickness, 0.1 * thickness),
         obstacles=obstacles,

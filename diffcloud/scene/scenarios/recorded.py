@@ -14,7 +14,7 @@ _COMPRESSION = 0.1
 _UNCERTAIN = {"shear": 3.0, "bending": 3.0}
 """One standard deviation, as a factor. The five fabrics have not been measured; woven ones shear at least ten times as
 easily as they stretch, and in bending fabrics differ as much."""
-_SHAPE_M = 0.01
+_INITIAL_STATE = "turn=10deg,shape=10mm"
 """The first frames show cloths with rims that stand up by 2 to 4 cm."""
 _GAP_M = 0.002
 """Of the cloth over the table, with which the tables' heights were found."""
@@ -43,7 +43,7 @@ RECORDED_LIFT = LIFT.model_copy(
         "frames": 24,
         "steps_per_frame": 8,
         "loss_frames": (16, 20, 24),
-        "laid_shape_m": _SHAPE_M,
+        "initial_state": _INITIAL_STATE,
     }
 )
 RECORDED_FOLD = FOLD.model_copy(
@@ -70,7 +70,7 @@ RECORDED_FOLD = FOLD.model_copy(
         "steps_per_frame": 8,
         "loss_frames": (10, 13, 16),
         "loss_surface": "all",
-        "laid_shape_m": _SHAPE_M,
+        "initial_state": _INITIAL_STATE,
     }
 )
 RECORDED: tuple[GridScenario, ...] = (RECORDED_LIFT, RECORDED_FOLD)

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloud.errors import ConfigError
+from diffcloud.errors import ConfigError, unknown_name
 from diffcloud.mesh.refinement import refined
 from diffcloud.scene.description import Scene
 from diffcloud.sim.properties import PARAMETERS, Properties, check_values, scaled_properties
@@ -54,7 +54,7 @@ class Scenario:
     recorder: Recorder = "depth_cameras"
     uncertain: Mapping[str, float] = field(default_factory=dict)
     """Material -> factor of one deviation, where it is known less well, or better, than usual (`estimation.uncertain`)."""
-    laid: Mapping[str, float] = field(default_factory=dict)
+    initial_state: Mapping[str, float] = field(default_factory=dict)
     """How far the cloth's start, its size and the gripper's path may be off, which fits find: `turn` [rad], `shape` [m],
     `size` and `track` [1] (`estimation.initial_state`) -> standard deviation."""
     regrip: Callable[[float], Scenario] | None = None
@@ -68,13 +68,6 @@ class Scenario:
     def grasped(self) -> list[int]:
         """Nodes that a moving handle holds."""
         return [handle.node for handle in self.scene.handles.handles if handle.motion is not None]
-
-    def halved(self, times: int) -> Scenario:
-        """The same experiment with half the edge length (`finer`) and half the step, so many times."""
-        found = self
-        for _ in range(times):
-            found = found.finer().with_steps(2)
-        return found
 
     def with_steps(self, times: int) -> Scenario:
         """The same experiment with so many times the steps."""
@@ -105,6 +98,45 @@ class Scenario:
                 "the scenario a compression below 1."
             )
 
+    def nominal(self, name: str) -> float:
+        """Return the value of a parameter in the scenario's own material, in the parameter's unit: what a multiplier of 1
+        stands for. 1 of parameters that are no multipliers."""
+        quantity = PARAMETERS[name].quantity
+        return 1.0 if quantity is None else self.scene.nominal(quantity)
+
+    def multipliers(self, values: Mapping[str, float], option: str) -> dict[str, float]:
+        """Convert values in SI units to those of the simulator and the fits: multipliers on the scenario's own material.
+
+        Args:
+            option: where the values were stated, for messages.
+
+        Raises:
+            ConfigError: an unknown parameter, a value that it cannot have, or a parameter that the scene has nothing of.
+        """
+        found = {}
+        for name, value in values.items():
+            if name not in PARAMETERS:
+                raise ConfigError(f"{option}: {unknown_name('parameter', name, PARAMETERS)}")
+            nominal = self.nominal(name)
+            if not nominal > _NO_MATERIAL:
+                raise ConfigError(f"{option}: {name} has no effect in {self.name}, whose own is 0; leave it out.")
+            PARAMETERS[name].check(value, f"{option} {name}", nominal)
+            found[name] = value / nominal
+        return found
+
+    def search_range(self, stated: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+        """Return bounds of multipliers: the scenario's own, and in their place those that are stated in SI units.
+
+        Raises:
+            ConfigError: as of `multipliers`.
+        """
+        low, high = (self.multipliers({name: pair[end] for name, pair in stated.items()}, "bounds") for end in (0, 1))
+        return {**self.bounds, **{name: (low[name], high[name]) for name in stated}}
+
+    def in_si(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Convert multipliers to values in SI units, the inverse of `multipliers`."""
+        return {name: value * self.nominal(name) for name, value in values.items()}
+
     def fitted_scene(self, values: Mapping[str, float]) -> Scene:
         """The scene with parameters written into its material, its air, its friction and its bodies.
 
@@ -120,10 +152,10 @@ class Scenario:
                 "scenario without node sets."
             )
         scene, around = self.scene, self.scene.surrounding
-        weight, air = values.get("mass", 1.0) * values.get("density", 1.0), values.get("drag", 1.0)
+        weight, air = values.get("density", 1.0), values.get("air_density", 1.0)
         material = scene.material.scaled(
             density=weight,
-            stretching=values.get("stretch", 1.0),
+            stretching=values.get("stretching", 1.0),
             shear=values.get("shear", 1.0),
             bending=values.get("bending", 1.0),
         )
@@ -138,8 +170,8 @@ class Scenario:
             air_drag=around.air_drag * air,
             added_mass=around.added_mass * values.get("added_mass", 1.0),
             linear_drag=around.linear_drag * values.get("linear_drag", 1.0),
-            friction_obstacle=values.get("friction_obstacle", around.friction_obstacle),
-            friction_cloth=values.get("friction_cloth", around.friction_cloth),
+            friction=values.get("friction", around.friction),
+            self_friction=values.get("self_friction", around.self_friction),
             bodies=bodies,
         )
         return replace(
@@ -155,9 +187,9 @@ class Scenario:
 
     def value(self, name: str) -> float:
         """Of a parameter in this scenario, 1 where it is a factor; zero where the scene has nothing that it acts on."""
-        basis = PARAMETERS[name].basis
-        if basis is not None:
-            return 1.0 if self.scene.basis(basis) > _NO_MATERIAL else 0.0
+        quantity = PARAMETERS[name].quantity
+        if quantity is not None:
+            return 1.0 if self.scene.nominal(quantity) > _NO_MATERIAL else 0.0
         if name == "compression" and not self.scene.material.wrinkles:
             return 0.0
         system, _ = self.scene.build()

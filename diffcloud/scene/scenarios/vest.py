@@ -27,7 +27,7 @@ class VestScenario(ScenarioOptions):
     vest, and ends under that shoulder's neck end. Everything here may change in a YAML file.
     """
 
-    material: str | Sheet = "basis-foam"
+    material: str | Sheet = "foam"
     shaped: bool = True
     contact_thickness_m: Length = 0.008
     contact_stiffness: NonNegative = 3e6

@@ -68,7 +68,7 @@ def register_checkerboard(camera_points: Floats, robot_points: Floats) -> Regist
 
 
 def checkerboard_evidence(found: Registration, camera_points: Floats, robot_points: Floats) -> CheckerboardEvidence:
-    """What speaks for and against a registration, from the points it was made of."""
+    """Evidence for and against a registration, from the points it was made of."""
     held_out = held_out_errors(camera_points, robot_points)
     apart = np.linalg.norm(robot_points[:, None] - robot_points, axis=-1) + np.diag(np.full(len(robot_points), np.inf))
     return CheckerboardEvidence(

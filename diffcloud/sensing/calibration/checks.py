@@ -29,7 +29,7 @@ from diffcloud.sensing.calibration.charuco import CameraViews, board_in_camera
 from diffcloud.sensing.tool_poses import unreachable
 
 Floats = NDArray[np.float64]
-Remark = tuple[Literal["warning", "objection"], str]
+Note = tuple[Literal["warning", "objection"], str]
 
 FEWEST_POSES = 5
 """Fewer cannot be solved for."""
@@ -141,16 +141,16 @@ def check_orientations(cameras: Mapping[str, CameraViews], T_world_gripper: Floa
 def judge_hand_eye(
     cameras: Mapping[str, CameraEvidence], board_size: Estimate, *, square_m: float
 ) -> tuple[list[str], list[str]]:
-    """(warnings, objections) about a calibration with a board on the gripper.
+    """Return (warnings, objections) about a calibration with a board on the gripper.
 
     Args:
-        board_size: by the arm, over the entered one.
-        square_m: as entered.
+        board_size: size of the board as estimated from the arm's motion, divided by the entered size.
+        square_m: entered side length of the board's squares [m].
     """
-    remarks = [*_size_remarks(cameras, board_size, square_m)]
+    notes = [*_size_notes(cameras, board_size, square_m)]
     for name, camera in cameras.items():
         if camera.held_out_poses < HELD_OUT_POSES:
-            remarks.append(
+            notes.append(
                 (
                     "objection",
                     f"Camera {name} has {camera.held_out_poses} poses that could be held out; a held-out error from fewer "
@@ -158,26 +158,26 @@ def judge_hand_eye(
                 )
             )
         if camera.poses < ADVISED_POSES:
-            remarks.append(
+            notes.append(
                 ("warning", f"Camera {name} saw the board at {camera.poses} poses; {ADVISED_POSES} or more are advised.")
             )
-    remarks += _too_far_off({name: camera.rms_mm for name, camera in cameras.items()}, "poses")
-    return _parted(remarks)
+    notes += _too_far_off({name: camera.rms_mm for name, camera in cameras.items()}, "poses")
+    return _parted(notes)
 
 
 def judge_checkerboard(cameras: Mapping[str, CheckerboardEvidence]) -> tuple[list[str], list[str]]:
     """(warnings, objections) about registrations by a checkerboard that the robot knows."""
-    remarks: list[Remark] = []
+    notes: list[Note] = []
     for name, camera in cameras.items():
         if camera.held_out_mm is None:
-            remarks.append(
+            notes.append(
                 (
                     "objection",
                     f"Camera {name} has {camera.corners} corners, too few to hold any out: its error is not known. Record "
                     "a board of 3 x 3 corners or more.",
                 )
             )
-    remarks += _too_far_off({name: camera.held_out_mm for name, camera in cameras.items()}, "corners")
+    notes += _too_far_off({name: camera.held_out_mm for name, camera in cameras.items()}, "corners")
     off = {name: float(np.log(camera.size_ratio)) for name, camera in cameras.items()}
     common = _common(list(off.values()))
     for name, camera in cameras.items():
@@ -191,17 +191,17 @@ def judge_checkerboard(cameras: Mapping[str, CheckerboardEvidence]) -> tuple[lis
                 f"the board's squares, as all cameras see them alike: {seen:.1f} mm where the robot's corners are "
                 f"{1000 * camera.pitch_m:.1f} mm apart; then a depth scale that is wrong in all of them"
             )
-        remarks.append(
+        notes.append(
             (
                 "objection" if abs(off[name]) > _CHECKERBOARD_WRONG else "warning",
                 f"Camera {name} sees the board {abs(100 * (camera.size_ratio - 1)):.1f} % too "
                 f"{'large' if off[name] > 0 else 'small'}, which a rigid motion cannot absorb. Suspected are {suspects}.",
             )
         )
-    return _parted(remarks)
+    return _parted(notes)
 
 
-def _size_remarks(cameras: Mapping[str, CameraEvidence], board: Estimate, square_m: float) -> Iterator[Remark]:
+def _size_notes(cameras: Mapping[str, CameraEvidence], board: Estimate, square_m: float) -> Iterator[Note]:
     """What arm, board and depth say of each other's lengths (the table above)."""
     size, size_deviation = float(np.log(board.value)), board.deviation / board.value
     depth = {name: float(np.log(held.depth_ratio)) for name, held in cameras.items() if held.depth_ratio is not None}
@@ -232,10 +232,10 @@ def _size_remarks(cameras: Mapping[str, CameraEvidence], board: Estimate, square
         off = depth[name] - explained if name in depth else 0.0
         # of two cameras the other would have seen a wrong board too
         board_too = len(depth) == 1 and not explained and abs(off - size) < _SURE * size_deviation
-        yield from _camera_remarks(name, held, off, board_too=board_too)
+        yield from _camera_notes(name, held, off, board_too=board_too)
 
 
-def _camera_remarks(name: str, camera: CameraEvidence, off: float, *, board_too: bool) -> Iterator[Remark]:
+def _camera_notes(name: str, camera: CameraEvidence, off: float, *, board_too: bool) -> Iterator[Note]:
     """About one camera whose depth is `off` (logarithm of the ratio) the board's, beyond what the board explains."""
     focal = float(np.log(camera.focal.value))
     deviation = max(camera.focal.deviation / camera.focal.value, _SMALLEST_DEVIATION)
@@ -284,7 +284,7 @@ def _turn_mismatch_deg(board: Rotation, arm: Rotation) -> float:
     return float(np.rad2deg(np.median(np.linalg.norm(seen - held.apply(told), axis=1))))
 
 
-def _too_far_off(held_out_mm: Mapping[str, float | None], of: str) -> Iterator[Remark]:
+def _too_far_off(held_out_mm: Mapping[str, float | None], of: str) -> Iterator[Note]:
     far = {name: error for name, error in held_out_mm.items() if error is not None and error > LARGEST_ERROR_MM}
     if far:
         errors = ", ".join(f"{error:.1f} mm (camera {name})" for name, error in far.items())
@@ -299,5 +299,5 @@ def _percent(log_ratio: float) -> str:
     return f"{100 * (np.exp(log_ratio) - 1):+.1f} %"
 
 
-def _parted(remarks: list[Remark]) -> tuple[list[str], list[str]]:
-    return [text for kind, text in remarks if kind == "warning"], [text for kind, text in remarks if kind == "objection"]
+def _parted(notes: list[Note]) -> tuple[list[str], list[str]]:
+    return [text for kind, text in notes if kind == "warning"], [text for kind, text in notes if kind == "objection"]

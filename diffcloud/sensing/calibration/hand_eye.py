@@ -90,7 +90,7 @@ def find_views(
 def _detected(
     cameras: Mapping[str, RawCamera], robot: RobotLog, board: CharucoBoard
 ) -> tuple[dict[str, CameraViews], Floats]:
-    """`find_views` of a board in one pattern."""
+    """Detect the board as `find_views` does, but in one pattern only: that of `board`."""
     found: dict[str, CameraViews] = {}
     poses: list[Floats] = []
     for name, camera in cameras.items():

@@ -14,7 +14,7 @@ from diffcloud.io.raw_episodes import CameraInfo
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong, or doubtful."""
+    """One thing that is wrong, or may be."""
 
     severity: Literal["fault", "warning"]
     """A fault makes what follows wrong; a warning is worth a look."""

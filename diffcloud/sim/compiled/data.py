@@ -37,9 +37,9 @@ class Parameters(NamedTuple):
     """[1] of the linear tangential drag [kg/(m²·s)]."""
     linear_drag: Floats
     """[1] of the linear drag in all directions [kg/(m²·s)]."""
-    friction_obstacle: Floats
+    friction: Floats
     """[1] Coulomb coefficient between cloth and obstacles [-]."""
-    friction_cloth: Floats
+    self_friction: Floats
     """[1] Coulomb coefficient between cloths [-]."""
     body_mass: Floats
     """[B] of the rigid bodies [kg]."""

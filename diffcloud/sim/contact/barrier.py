@@ -84,7 +84,7 @@ def _between(pair: Element, weights: list[Scalar], share: Scalar) -> tuple[list[
     """Of a place between points of meshes."""
     gap = total(weight * corner for weight, corner in zip(weights, pair.positions, strict=True))
     mixed = pair.constant("mixed") > 0.0
-    return weights, gap, share, where(mixed, pair.parameter("friction_obstacle"), pair.parameter("friction_cloth"))
+    return weights, gap, share, where(mixed, pair.parameter("friction"), pair.parameter("self_friction"))
 
 
 def _point_point(pair: Element) -> tuple[list[Scalar], Vector, Scalar, Scalar]:
@@ -127,7 +127,7 @@ def _edge_edge(pair: Element) -> tuple[list[Scalar], Vector, Scalar, Scalar]:
 def _plane(node: Element) -> Sequence[Vector]:
     """Barrier and friction of a half-space n · x >= offset."""
     pressing, sliding = _at_plane(node)
-    rubbing = node.parameter("friction_obstacle") * pressing * _per_speed(node, norm(sliding))
+    rubbing = node.parameter("friction") * pressing * _per_speed(node, norm(sliding))
     return [pressing * node.vector("normal") - rubbing * sliding]
 
 
@@ -145,7 +145,7 @@ def _term(name: str, corners: int, place: Place, *more: str) -> Term:
         force=lambda pair: _force(place, pair),
         constants=dict.fromkeys(("share", "mixed", *more), ()),
         tables={"law": 2},
-        parameters={"friction_obstacle": "episode", "friction_cloth": "episode"},
+        parameters={"friction": "episode", "self_friction": "episode"},
     )
 
 
@@ -162,6 +162,6 @@ BARRIER_PLANE = Term(
     force=_plane,
     constants={"share": (), "normal": (3,), "offset": ()},
     tables={"law": 2},
-    parameters={"friction_obstacle": "episode"},
+    parameters={"friction": "episode"},
 )
 """Constants: area [m²]; unit normal; offset [m]."""

@@ -212,7 +212,7 @@ def _in_cells(pool: _Pool, first: Floats, second: Floats) -> Ints:
 
 
 class Cells(NamedTuple):
-    """Boxes by the cell of a grid that their low corner lies in."""
+    """A grid whose cells list boxes. Each box belongs to the cell that contains its low corner."""
 
     origin: Floats
     """[3] low corner of the grid [m]."""

@@ -1,4 +1,4 @@
-"""Closest places of a point and a triangle and of two segments, as weights, region by region.
+"""Compute the closest points of a point and a triangle, and of two segments, as weights of the four given points.
 
 The weights are differentiable within a region (interior, edge, corner). The distance itself is continuously
 differentiable across regions wherever it is not zero, except for parallel segments.
@@ -13,15 +13,16 @@ from diffcloud.sim.compiled.data import Floats
 
 _TINY = 1e-300
 _CROSSING = 1e-14
-"""Squared sine of the angle above which two segments have one closest place."""
+"""Squared sine of the angle between two segments above which their closest points are unique."""
 
 
 @kernel
 def closest(edges: int, x: Floats, found: Floats) -> float:
-    """Distance of the primitives of four points x [4, 3]: a point and a face, or two edges [m].
+    """Return the distance of a point and a face, or of two edges (`edges` > 0), given by four points x [4, 3] [m].
 
-    `found` [6] takes the weights, then where the place is: of a point and a face, 0 for its interior, 1..3 for its
-    edges 01, 12, 20 and 4..6 for its corners; of two edges, where along each (0 or 1, below zero: between its ends).
+    `found` [6] receives the four weights and the region of the closest points. For a point and a face, the region is one
+    number: 0 for the interior, 1..3 for the edges 01, 12, 20, and 4..6 for the corners. For two edges, the region is one
+    number per edge: 0 or 1 for an end, and below zero for a point between the ends.
     """
     if edges > 0:
         _edge_edge(x, found)
@@ -36,7 +37,11 @@ def closest(edges: int, x: Floats, found: Floats) -> float:
 
 @kernel
 def on_segment(x: Floats, p: int, a: int, b: int) -> tuple[float, float, float]:
-    """(fraction along a b of the place that is closest to p; the same, not kept between the ends; squared distance)."""
+    """Find the point on segment ab that is closest to p.
+
+    Returns:
+        (its fraction along ab, clamped to [0, 1]; the same fraction without clamping; its squared distance from p [m²]).
+    """
     along = arm = 0.0
     for axis in range(3):
         side = x[b, axis] - x[a, axis]

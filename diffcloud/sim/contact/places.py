@@ -1,8 +1,8 @@
-"""Which places of near pairs touch, as elements of the barrier's terms.
+"""Find the contacts of near pairs, as elements of the barrier's terms.
 
-A point and a face meet at up to seven places: the face, its edges, its corners (inclusion and exclusion, see
-`barrier`). What falls on the same point, edge or face is one place with the sum of the shares, which vanishes for
-most of them.
+A point and a face can have up to seven contacts: with the face, its three edges and its three corners (inclusion and
+exclusion, see `barrier`). Contacts of a point with the same point, edge or face are merged, and their shares of the area
+are added. Most of these sums vanish.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ class Planes(NamedTuple):
 
 
 class TouchingType(BoxType):  # type: ignore[misc]
-    """Of `Touching`."""
+    """Numba type of `Touching`."""
 
 
 class Touching(Box):  # type: ignore[misc]
-    """The places that touch, as elements."""
+    """The active contacts, as one set of elements for each kind of contact."""
 
 
 define(Touching, TouchingType, ["point_point", "point_edge", "point_face", "edge_edge", "plane"])
@@ -136,7 +136,7 @@ def gap_of(planes: Planes, w: int, points: Floats, i: int) -> float:
 def _point_face(  # type: ignore[no-untyped-def]
     surface, pairs, c, area, mixed, thickness, x, region, listed, numbers, last, previous, count
 ):
-    """Add the places of a point and a face; gives how many there are now."""
+    """Append the contacts of a point and a face to the list. Return the new number of contacts."""
     point, face = pairs[c, 1], pairs[c, 6]
     for place in range(7):
         if place == 0:

@@ -69,7 +69,7 @@ class Surface(NamedTuple):
 
 
 class SurfaceBoxType(BoxType):  # type: ignore[misc]
-    """Of `SurfaceBox`."""
+    """Numba type of `SurfaceBox`."""
 
 
 class SurfaceBox(Box):  # type: ignore[misc]
@@ -187,7 +187,10 @@ def _spread(edge_faces: NDArray[np.int64], face_area: NDArray[np.float64]) -> ND
 
 
 def _shares(faces: NDArray[np.int64], point_count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """([F, 3], [F, 3]): a half at inner edges, and one over the number of faces at inner points, else zero."""
+    """Return (`Surface.edge_share` [F, 3], `Surface.corner_share` [F, 3]) of a mesh.
+
+    The share is 1/2 at an inner edge, 1 / (number of faces around the point) at an inner point, and zero at the boundary.
+    """
     half = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
     edges, inverse, count = np.unique(half, axis=0, return_inverse=True, return_counts=True)
     inner_edge = (count == 2)[inverse.ravel()].reshape(-1, 3)

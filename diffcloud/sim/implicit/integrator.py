@@ -27,6 +27,8 @@ class Implicit:
     name = "implicit"
     terms = TERMS
     contacts = CONTACTS
+    smooth = True
+    meshes = True
 
     def check(self, surrounding: Surrounding) -> None:
         if surrounding.reference_contact is not None:

@@ -120,8 +120,8 @@ def _cautious(p: Parameters) -> Parameters:
         air_density=none,
         air_drag=none,
         linear_drag=none,
-        friction_obstacle=p.friction_obstacle,
-        friction_cloth=p.friction_cloth,
+        friction=p.friction,
+        self_friction=p.self_friction,
         body_mass=p.body_mass,
         hold=p.hold,
         target=p.target,
@@ -227,7 +227,7 @@ def _add_resistance(
 ) -> None:
     """The cautious blocks of what touches."""
     parameters, motion, planes, law, dt = work.parameters, work.motion, work.planes, work.law, work.time_step
-    friction = (parameters.friction_obstacle[0], parameters.friction_cloth[0])
+    friction = (parameters.friction[0], parameters.self_friction[0])
     x, weights, local, blocks = np.empty((4, 3)), np.empty(6), np.empty(18), np.empty((16, 9))
     for e in range(len(listed)):
         if resistance(planes, law, friction, motion.positions, motion.after, listed, numbers, e, x, weights, local):

@@ -20,13 +20,13 @@ geometric series with the ratio of the last two has left."""
 _ROUNDING = 1e-7
 """Below this relative change a step that no longer shrinks has reached the arithmetic's precision."""
 _ITERATIONS = 30
-_HALVINGS = 8
+_BACKTRACKS = 8
 _SLOWEST = 1e-1
 """Velocities below this are at rest for the tolerance [m/s]."""
 _LEAST_CAUTION = 0.05
-"""Of the step after one that the exact matrix led astray."""
+"""Of the step after one that overshot with the exact matrix."""
 _ROUGH = 1e-4
-"""Relative changes above this are checked, and shortened where they lead astray."""
+"""Relative changes above this are checked, and shortened where they overshoot."""
 _REUSE = 5e-1
 """Below this relative change a matrix serves once more, be it that of the part before, and then as long as changes shrink:
 a new one costs as much as five to ten steps with an old one, which Broyden's updates correct."""
@@ -241,7 +241,7 @@ def _search(
     for i in range(len(direction)):
         for axis in range(3):
             most = max(most, abs(direction[i, axis]))
-    for _ in range(_HALVINGS):
+    for _ in range(_BACKTRACKS):
         trial = _towards(work, here, direction, alpha, room)
         residual(work, trial.velocity, trial.points, trial.turned, trial.touching, found)
         uphill = gone = 0.0
@@ -263,7 +263,7 @@ def _search(
 def _towards(work: Work, here: Place, direction: Floats, alpha: float, room: Room) -> Place:
     """`here` + α direction with the longest α up to the given one that has no collision on the way."""
     old, began, final = here.velocity, here.scenery, work.final_scenery
-    for halving in range(_HALVINGS + 2):
+    for attempt in range(_BACKTRACKS + 2):
         velocity, scenery = np.empty((len(direction), 3)), np.empty((len(final), 3))
         for i in range(len(direction)):
             for axis in range(3):
@@ -285,5 +285,5 @@ def _towards(work: Work, here: Place, direction: Floats, alpha: float, room: Roo
         if fraction > _WHOLE:
             return _place(work, room, velocity, scenery, points, turned)
         # what is straight in velocities is not quite straight in space where bodies turn: look again at the shorter step
-        alpha *= 0.0 if halving >= _HALVINGS else (fraction * 0.9 if halving > 0 else fraction)
+        alpha *= 0.0 if attempt >= _BACKTRACKS else (fraction * 0.9 if attempt > 0 else fraction)
     return here  # no step this way is free of collisions

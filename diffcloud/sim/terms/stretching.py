@@ -88,23 +88,23 @@ def along_material(face: Element, field: Sequence[Vector]) -> tuple[Vector, Vect
 
 
 def strain(xu: Vector, xv: Vector) -> Symmetric:
-    """E"""
+    """Strain E of a face, from the derivatives of its positions along u and v."""
     return 0.5 * (dot(xu, xu) - 1), 0.5 * (dot(xv, xv) - 1), 0.5 * dot(xu, xv)
 
 
 def strain_change(xu: Vector, xv: Vector, du: Vector, dv: Vector) -> Symmetric:
-    """Of E by a displacement with these derivatives, to first order."""
+    """First-order change of the strain E caused by a displacement with derivatives du and dv along u and v."""
     return dot(xu, du), dot(xv, dv), 0.5 * (dot(xu, dv) + dot(xv, du))
 
 
 def stress(stiffness: Sequence[Scalar], by: Symmetric) -> Symmetric:
-    """C : by, of an orthotropic C."""
+    """Stress C : by [N/m] of a strain `by`, with the orthotropic stiffness C = (k0, k1, k2, k3) [N/m]."""
     (k0, k1, k2, k3), (along_u, along_v, across) = stiffness, by
     return k0 * along_u + k1 * along_v, k1 * along_u + k2 * along_v, k3 * across
 
 
 def on_corners(face: Element, row_u: Vector, row_v: Vector) -> Sequence[Vector]:
-    """Forces [N] on the three corners of what pulls along u and v in the face [N/m]."""
+    """Forces [N] on the three corners, from the stress vectors row_u and row_v [N/m] along u and v in the face."""
     area = face.constant("area")
     pulls = [
         -area * (face.constant("inverse_rest", side, 0) * row_u + face.constant("inverse_rest", side, 1) * row_v)

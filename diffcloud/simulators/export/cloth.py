@@ -85,7 +85,7 @@ def fitted_cloth(
     if motion.nodes.shape[1] != len(scene.mesh.nodes) or not np.array_equal(motion.faces, scene.mesh.faces):
         raise ConfigError(
             f"The fit's mesh ({motion.nodes.shape[1]} nodes) is not that of the scenario {scenario.name} "
-            f"({len(scene.mesh.nodes)} nodes). Put the fitted scene's YAML file into scenarios/ beside the fit."
+            f"({len(scene.mesh.nodes)} nodes). Put the fitted scene's YAML file into scenes/ beside the fit."
         )
     size = recording.nuisance.get("size")
     if size is not None:
@@ -112,8 +112,8 @@ def _cloth(recording: RecordingFit, motion: FittedMotion, scene: Scene, strained
         seconds=float(motion.times[-1]),
         held=held,
         table=float(tables[0].nodes[:, 2].mean()) + shift if tables else None,
-        friction=around.friction_obstacle,
-        self_friction=around.friction_cloth,
+        friction=around.friction,
+        self_friction=around.self_friction,
         self_contact=around.self_contact,
         bodies=(bodies,) if len(bodies.faces) else (),
         shaped=scene.shaped,
@@ -241,7 +241,7 @@ def _held(scene: Scene, motion: FittedMotion, paths: NDArray[np.float64]) -> tup
     if absent:
         raise ConfigError(
             f"The fit's motion holds the nodes {sorted(rows)}, its scenario's handles are at {sorted(absent)}, too: they "
-            "do not belong together. Put the fitted scene's YAML file into scenarios/ beside the fit, or fit again."
+            "do not belong together. Put the fitted scene's YAML file into scenes/ beside the fit, or fit again."
         )
     held: dict[int, Motion | None] = {}
     loose = set()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 
@@ -22,17 +22,9 @@ from diffcloud.simulators import mujoco
 from diffcloud.simulators.explicit import neo_hookean_gain
 from diffcloud.simulators.export.cloth import WORTH_SAYING, ExportedCloth, fitted_cloth, start_strain
 from diffcloud.simulators.export.isaac import layer
+from diffcloud.simulators.export.targets import TARGETS, target_named
 from diffcloud.simulators.problem import Problem
 
-Target = Literal["mujoco", "newton", "isaac", "arcsim", "obj"]
-TARGETS: tuple[Target, ...] = get_args(Target)
-WRITTEN_FOR: dict[Target, str] = {
-    "mujoco": "MuJoCo 4.0.0",
-    "newton": "Newton 1.8.0 with Warp 1.19.0",
-    "isaac": "Isaac Sim 5 (Omni Physics 107 or later)",
-    "arcsim": "ARCSim 0.2 and DiffSim",
-    "obj": "Wavefront OBJ and CSV",
-}
 _MOST_POISSON = 0.49
 """MuJoCo and Isaac Sim make a membrane of a solid, whose ratio is below 0.5; a sheet's may be larger."""
 
@@ -42,12 +34,12 @@ def described(one: RecordingFit, scenario: Scenario, values: Mapping[str, float]
 
     Args:
         one: the recording whose motion is exported.
-        values: of all parameters.
+        values: multipliers of all parameters.
     """
     return {
         "recording": one.name,
         "rms_mm": one.rms_mm,
-        "parameters": dict(values),
+        "parameters": scenario.in_si(values),
         "pose": {name: entry.model_dump() for name, entry in one.nuisance.items()},
         "material": whole_material(scenario, values).model_dump(),
     }
@@ -58,14 +50,14 @@ def write_samples(
     motion: FittedMotion,
     scenario: Scenario,
     drawn: Sequence[Mapping[str, float]],
-    target: Target,
+    target: str,
     folder: Path,
     about: Mapping[str, Any],
 ) -> set[str]:
     """The same cloth with other parameters, each in a folder `sample_0000` and so on.
 
     Args:
-        drawn: values of all parameters, for each sample.
+        drawn: multipliers of all parameters, for each sample.
         about: what else each `cloth.json` shall hold.
 
     Returns:
@@ -82,9 +74,7 @@ def write_samples(
     return written
 
 
-def write_export(
-    cloth: ExportedCloth, target: Target, folder: Path, about: Mapping[str, Any]
-) -> tuple[list[str], list[str]]:
+def write_export(cloth: ExportedCloth, target: str, folder: Path, about: Mapping[str, Any]) -> tuple[list[str], list[str]]:
     """Write the target's files, and `cloth.json`, which says what they are.
 
     Args:
@@ -94,16 +84,18 @@ def write_export(
         Names of the files, and what of the cloth they leave out.
 
     Raises:
+        ConfigError: no such target.
         SceneError: what ARCSim's files cannot say.
     """
-    left_out = [*cloth.left_out, *(cloth.simplified if target in ("mujoco", "newton", "isaac") else ())]
+    chosen = target_named(target)
+    left_out = [*cloth.left_out, *(cloth.simplified if chosen.simplified else ())]
     problem = cloth.problem
     with together():
-        names, more = _WRITERS[target](cloth, folder, left_out)
+        names, more = chosen.write(cloth, folder, left_out)
         left_out += more
         told = {
             "made_by": f"diffcloud {__version__}",
-            "written_for": WRITTEN_FOR[target],
+            "written_for": chosen.about,
             "units": "m, kg, s; z points up",
             **about,
             "isotropic_sheet": {
@@ -143,7 +135,7 @@ def for_mujoco(problem: Problem) -> tuple[Problem, mujoco.Settings]:
     return replace(problem, sheet=sheet), settings
 
 
-def _mujoco(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
+def mujoco_files(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
     problem, settings = for_mujoco(cloth.problem)
     more = []
     if problem.sheet.damping < 0.99 * cloth.problem.sheet.damping:
@@ -156,12 +148,12 @@ def _mujoco(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[li
     if problem.shaped:
         more.append("The exported hinges are flat at rest; in the fit, they rest in the shape in which the cloth starts.")
     more += [*_less_contraction(cloth.problem), *_unstrained(cloth.problem)]
-    remark = f"{_head(cloth, 'mujoco')} {' '.join([*left_out, *more])}".replace("--", "-")
-    write_text(folder / "cloth.xml", mujoco.model_file(problem, settings, remark=remark))
+    header = f"{_head(cloth, 'mujoco')} {' '.join([*left_out, *more])}".replace("--", "-")
+    write_text(folder / "cloth.xml", mujoco.model_file(problem, settings, header=header))
     return ["cloth.xml", *_script("run_mujoco.py", problem, folder)], more
 
 
-def _newton(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
+def newton_files(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
     gain = neo_hookean_gain(cloth.problem, cloth.motion)
     more = [
         "Newton's membrane is neo-Hookean and too soft at large strains. To compensate, the stretching stiffness is "
@@ -202,7 +194,7 @@ def _script(name: str, problem: Problem, folder: Path, **changes: float) -> list
     return ["cloth.npz", name]
 
 
-def _isaac(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
+def isaac_files(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
     more = [
         *_one_friction(cloth.problem),
         *_less_contraction(cloth.problem),
@@ -214,14 +206,14 @@ def _isaac(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[lis
     return ["cloth.usda"], more
 
 
-def _arcsim(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
+def arcsim_files(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
     path = write_scene(cloth.scene, folder, "cloth")
     obstacles = [f"meshes/cloth/obstacle{number}.obj" for number in range(len(cloth.scene.surrounding.obstacles))]
     more = ["Firmly held nodes, smooth contact and second-order steps are diffcloud's own; ARCSim uses its own methods."]
     return [path.relative_to(folder).as_posix(), "meshes/cloth/cloth.obj", "materials/cloth.json", *obstacles], more
 
 
-def _obj(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
+def obj_files(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[str], list[str]]:
     problem = cloth.problem
     write_cloth(folder / "cloth.obj", problem.mesh, problem.mesh.nodes)
     names = ["cloth.obj"]
@@ -235,17 +227,8 @@ def _obj(cloth: ExportedCloth, folder: Path, left_out: list[str]) -> tuple[list[
     return [*names, "held.csv"], []
 
 
-_WRITERS: dict[Target, Callable[[ExportedCloth, Path, list[str]], tuple[list[str], list[str]]]] = {
-    "mujoco": _mujoco,
-    "newton": _newton,
-    "isaac": _isaac,
-    "arcsim": _arcsim,
-    "obj": _obj,
-}
-
-
-def _head(cloth: ExportedCloth, target: Target) -> str:
+def _head(cloth: ExportedCloth, target: str) -> str:
     return (
         f"{cloth.problem.name}: a cloth fitted to a recording, written by diffcloud {__version__} for "
-        f"{WRITTEN_FOR[target]}. Units: m, kg, s; z points up."
+        f"{TARGETS[target].about}. Units: m, kg, s; z points up."
     )

@@ -26,11 +26,12 @@ STICKING_SPEED = 1e-3
 
 
 def add_cloth(builder, cloth, explicit=False):
-    """The cloth, its table, and the bodies that it meets.
+    """Add the cloth, its table and the meshes of its obstacles to a model builder.
 
     Args:
-        cloth: what cloth.npz holds.
-        explicit: for the explicit solver, whose elasticity has other constants than that of VBD.
+        builder: the `newton.ModelBuilder`.
+        cloth: arrays of cloth.npz.
+        explicit: whether the explicit solver will run the model. Its elastic constants differ from those of VBD.
     """
     shear, lateral, damping = (float(cloth[name]) for name in ("shear", "lateral", "damping"))
     gain = float(cloth["membrane_gain"])  # makes up for a membrane that is too soft at large strains
@@ -67,7 +68,7 @@ def add_cloth(builder, cloth, explicit=False):
 
 
 def finish_cloth(model, cloth, explicit=False):
-    """What a builder does not take: friction of the cloth, and bending stiffness and angle at rest of each of its edges.
+    """Set what a builder does not take: the cloth's friction, and the bending stiffness and rest angle of each edge.
 
     An edge's energy is K θ²/2: VBD has k l θ²/2, so k = K/l; the explicit solver pushes with k l² θ where the gradient of θ
     asks for K θ/height, so k = K/(l (a0 + a1)) where both faces have one size.

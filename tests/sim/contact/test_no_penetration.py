@@ -44,11 +44,13 @@ def assert_no_penetration(scenario: Scenario, parameters: Sequence[tuple[float, 
     system, _ = scenario.scene.build()
     stretch, mass = (torch.tensor(values, dtype=torch.float64) for values in zip(*parameters, strict=True))
     with torch.no_grad():
-        run = rollout(system, scenario.steps, properties=scenario.properties(system, {"stretch": stretch, "mass": mass}))
+        run = rollout(
+            system, scenario.steps, properties=scenario.properties(system, {"stretching": stretch, "density": mass})
+        )
     positions = run.positions.numpy()
     for pair, trajectory in zip(parameters, positions, strict=True):
         found = find_penetrations(trajectory, system.mesh, system.obstacles)
-        assert not found, f"stretch, mass = {pair}: {len(found)} penetrations, the first is {found[0]}"
+        assert not found, f"stretching, density = {pair}: {len(found)} penetrations, the first is {found[0]}"
     return positions
 
 
@@ -58,7 +60,7 @@ def dropped(
     """A cloth in free fall onto obstacles."""
     scene = Scene(
         mesh=mesh,
-        material=preset("basis-knit"),
+        material=preset("soft-knit"),
         handles=Handles(handles, hard=True),
         frame_time=STEP,
         surrounding=Surrounding(air_density=1.2, obstacles=obstacles, reference_contact=ReferenceContact()),

@@ -141,7 +141,7 @@ def test_what_is_near_at_rest_repels_only_when_it_is_squeezed(squeezed):
     """A flat cloth whose half diagonals are below the thickness: no force at rest, nor at three fifths of its size. Below
     half, the thickness of near pairs, there is one."""
     mesh = grid_cloth(6, 6, 0.02, 0.02)
-    cloth = Forces(mesh, preset("basis-knit"), Surrounding(contact=ContactSettings(1e4, 0.003, 3e-4)))
+    cloth = Forces(mesh, preset("soft-knit"), Surrounding(contact=ContactSettings(1e4, 0.003, 3e-4)))
     scene = build_scene(cloth.system.setup, 0.0125)
     assert scene.law[1, 1] == pytest.approx(0.5 * 0.004 / 2**0.5)
     touching = _touching_at(scene, cloth.parameters, np.ascontiguousarray(squeezed * mesh.nodes))

@@ -69,7 +69,7 @@ def plane_force(distance: float, velocity: np.ndarray, friction: float) -> np.nd
         np.zeros(1),
         np.array([[SCALE, THICKNESS, STICKING]]),
     )
-    fields = dict.fromkeys(Parameters._fields, one) | {"friction_obstacle": np.array([friction]), "target": nothing}
+    fields = dict.fromkeys(Parameters._fields, one) | {"friction": np.array([friction]), "target": nothing}
     motion = Moving(np.array([[0.0, 0.0, distance]]), velocity[None], velocity[None], nothing)
     force = np.zeros((1, 3))
     kernels.barrier_plane_force(term, Parameters(**fields), motion, Timing(0.01, 0.0), force)
@@ -106,8 +106,8 @@ def contact_forces(system: System, friction: float = 0.0, velocities: torch.Tens
         damping=zero(given.damping),
         air_density=zero(given.air_density),
         air_drag=zero(given.air_drag),
-        friction_obstacle=friction + zero(given.friction_obstacle),
-        friction_cloth=friction + zero(given.friction_cloth),
+        friction=friction + zero(given.friction),
+        self_friction=friction + zero(given.self_friction),
     )
     run = rollout(system, 1, properties=properties, state=init(system, velocities=velocities))
     change = run.velocities[0, 1] - run.velocities[0, 0]

@@ -174,7 +174,7 @@ def planes(constants: Numbers, parameters: Numbers, motion: SimpleNamespace) -> 
     normal, thickness = constants["normal"], constants["thickness"]
     violation = (thickness + constants["offset"] - motion.positions @ normal).clamp(min=0)
     pushing = constants["stiffness"] * violation.square() / (2 * thickness)
-    limit = parameters["friction_obstacle"] * pushing
+    limit = parameters["friction"] * pushing
     across = torch.eye(3, dtype=normal.dtype) - torch.outer(normal, normal)
     speed = norm(motion.before @ across)
     sticking = limit * motion.time_step / parameters["node_mass"] + 1e-12

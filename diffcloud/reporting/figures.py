@@ -17,13 +17,13 @@ import pandas as pd
 
 from diffcloud.estimation.record import History
 from diffcloud.evaluation.summary import Tables, label, percent
-from diffcloud.report.overlay import states_at
+from diffcloud.reporting.overlay import states_at
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
-    from diffcloud.report.page import EpisodeEntry
+    from diffcloud.reporting.page import EpisodeEntry
 
 INK = "#5b6676"
 """Text and axes: readable on white and on black; the page puts its own colour in its place."""
@@ -96,7 +96,7 @@ def _losses(told: Tables) -> Figure | None:
 
 def _parameters(told: Tables) -> Figure | None:
     fits = told["parameters"]
-    if fits.empty or not {"stretch", "mass"} <= set(fits.columns):
+    if fits.empty or not {"stretching", "density"} <= set(fits.columns):
         return None
     scenarios = _ordered(fits, "scenario")
     canvas, axes = new_canvas(len(scenarios), height=3.2)
@@ -104,10 +104,14 @@ def _parameters(told: Tables) -> Figure | None:
         group = fits[fits["scenario"] == scenario]
         for category, colour in _categories(group).items():
             part = group[group["category"].fillna("") == category]
-            axis.scatter(part["stretch"], part["mass"], s=22, color=colour, alpha=0.6, linewidths=0, label=category or None)
+            axis.scatter(
+                part["stretching"], part["density"], s=22, color=colour, alpha=0.6, linewidths=0, label=category or None
+            )
             if category:
-                axis.scatter(part["stretch"].median(), part["mass"].median(), s=110, color=colour, marker="D", alpha=0.9)
-        _log_axes(axis, "stretch", "mass")
+                axis.scatter(
+                    part["stretching"].median(), part["density"].median(), s=110, color=colour, marker="D", alpha=0.9
+                )
+        _log_axes(axis, "stretching", "density")
         axis.set_title(scenario)
         if group["category"].notna().any():
             axis.legend(fontsize=7, frameon=False, labelcolor=INK)
@@ -115,8 +119,8 @@ def _parameters(told: Tables) -> Figure | None:
         canvas,
         "parameters",
         "Fitted parameters per category",
-        "Multipliers of the basis material, one dot per episode, a diamond at the median of a category. Dots on the frame "
-        "lie at a bound.",
+        "Multipliers of the nominal material, one dot per episode, a diamond at the median of a category. Dots on the "
+        "frame lie at a bound.",
         "tables/parameters.csv",
     )
 
@@ -299,7 +303,7 @@ def svg_of(canvas: Canvas, name: str) -> str:
 
     svg = io.StringIO()
     engine = canvas.get_layout_engine()
-    if engine is not None:  # laid out once: that takes longer than drawing, and each savefig would do both twice
+    if engine is not None:  # placed once: that takes longer than drawing, and each savefig would do both twice
         engine.execute(canvas)
         canvas.set_layout_engine(None)
     with matplotlib.rc_context({"svg.hashsalt": name, "svg.fonttype": "none"}):
@@ -335,5 +339,5 @@ def _log_axes(axis: Axes, first: str, second: str) -> None:
     axis.set_yscale("log")
     axis.set_xlim(0.09, 11)
     axis.set_ylim(0.09, 11)
-    axis.set_xlabel(f"{first} [× basis]")
-    axis.set_ylabel(f"{second} [× basis]")
+    axis.set_xlabel(f"{first} [× nominal]")
+    axis.set_ylabel(f"{second} [× nominal]")

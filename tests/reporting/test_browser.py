@@ -14,11 +14,11 @@ import pytest
 from diffcloud.evaluation.summary import tables
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter
-from diffcloud.report import ComparisonEntry, comparison_figures
-from diffcloud.report.overlay import Overlay, recorded_layers
-from diffcloud.report.view import build_view
+from diffcloud.reporting import ComparisonEntry, comparison_figures
+from diffcloud.reporting.overlay import Overlay, recorded_layers
+from diffcloud.reporting.view import build_view
 from tests.evaluation.records import records
-from tests.report.pages import entry, page_of
+from tests.reporting.pages import entry, page_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = [

@@ -13,20 +13,20 @@ from diffcloud.estimation.result import FittedMotion
 from diffcloud.evaluation.intervals import Intervals
 from diffcloud.evaluation.summary import percent
 from diffcloud.io.episodes import Episode
-from diffcloud.report.comparison import (
+from diffcloud.reporting.comparison import (
     ComparisonEntry,
     comparison_failures,
     comparison_overview,
     comparison_pictures,
     comparison_sections,
 )
-from diffcloud.report.overlay import Overlay, fitted_layers, recorded_layers
-from diffcloud.report.poses import poses_table
-from diffcloud.report.recordings import recordings_pictures, recordings_table
-from diffcloud.report.regressors import TrainingEntry, errors_table, predictions_table, training_data
-from diffcloud.report.rendering import render
-from diffcloud.report.tables import Cell, Table, number, table
-from diffcloud.report.uncertainty import intervals_table
+from diffcloud.reporting.overlay import Overlay, fitted_layers, recorded_layers
+from diffcloud.reporting.poses import poses_table
+from diffcloud.reporting.recordings import recordings_pictures, recordings_table
+from diffcloud.reporting.regressors import TrainingEntry, errors_table, predictions_table, training_data
+from diffcloud.reporting.rendering import render
+from diffcloud.reporting.tables import Cell, Table, number, table
+from diffcloud.reporting.uncertainty import intervals_table
 
 _CLEARLY = 1.05
 """Factor by which uncertain material is off what was known of it."""
@@ -69,7 +69,7 @@ def build_page(
     entries: Sequence[EpisodeEntry],
     *,
     title: str,
-    overlay_points: int,
+    cloud_points: int,
     environment: Mapping[str, str],
     predictions: Sequence[Mapping[str, Any]] = (),
     trainings: Sequence[TrainingEntry] = (),
@@ -81,7 +81,7 @@ def build_page(
     """The page as HTML text.
 
     Args:
-        overlay_points: points of the recorded cloud shown per frame.
+        cloud_points: points of the recorded cloud shown per frame.
         environment: name -> value lines for the last section.
         predictions: rows of the table of predictions.
         comparison: of all methods; left out if not given.
@@ -110,7 +110,7 @@ def build_page(
         recordings=recordings_table(entries),
         photographs=recordings_pictures(entries),
         environment=environment,
-        overlays=[_overlay(entry, overlay_points, rng).data() for entry in entries],
+        overlays=[_overlay(entry, cloud_points, rng).data() for entry in entries],
         episodes=[_losses(entry) for entry in entries],
         trainings=training_data(trainings),
     )
@@ -125,7 +125,7 @@ class _Summary:
     """None where no start could be simulated."""
     final_mm: float
     known: int
-    """Episodes whose hidden ratio of stretch to mass is known."""
+    """Episodes whose hidden ratio of stretching to density is known."""
     ratio_error: str
     """Median factor by which the fits miss it, less one, as a percentage."""
 
@@ -163,7 +163,7 @@ def _fits_table(entries: Sequence[EpisodeEntry]) -> Table:
     for entry in entries:
         names |= dict.fromkeys(name for name, one in entry.fit.parameters.items() if one.role == "requested")
     heads = ("episode", "scenario", "fabric", "start mm", "fitted mm", "other frames mm", *names)
-    heads = (*heads, "stretch / mass", "also fitted", "iterations", "simulations")
+    heads = (*heads, "stretching / density", "also fitted", "iterations", "simulations")
     return table(heads, (_fit_row(index, entry, list(names)) for index, entry in enumerate(entries)))
 
 
@@ -186,8 +186,8 @@ def _fit_row(index: int, entry: EpisodeEntry, names: Sequence[str]) -> list[Cell
 
 
 def _along_cell(fit: FitRecord) -> Cell:
-    """Doubtful material, where it is clearly off what was known of it, as a multiple of that."""
-    parts = {name: one.value / one.centre for name, one in fit.parameters.items() if one.role != "requested"}
+    """Nuisance material that is clearly off the centre of its prior, as a multiple of it."""
+    parts = {name: one.value / one.centre for name, one in fit.parameters.items() if one.role != "requested" and one.centre}
     off = [f"{name.replace('_', ' ')} × {part:.2f}" for name, part in parts.items() if not 1 / _CLEARLY < part < _CLEARLY]
     return Cell(", ".join(off) or ("as known" if parts else ""))
 
@@ -195,8 +195,7 @@ def _along_cell(fit: FitRecord) -> Cell:
 def _parameter_cell(fitted: FittedParameter | None, true: float | None) -> Cell:
     if fitted is None:
         return Cell("")
-    notes = [f"{fitted.physical:.3g} {fitted.physical_unit}"]
-    notes += [f"true {true:.2f}"] if true is not None else []
+    notes = [] if true is None else [f"true {true * fitted.nominal:.3g}"]
     notes += ["at its bound"] if fitted.at_bound else []
     notes += ["given"] if fitted.fixed else []
-    return number(fitted.value, 2, note=" · ".join(notes))
+    return Cell(f"{fitted.value:.3g} {fitted.unit}", sort=fitted.value, note=" · ".join(notes))

@@ -22,7 +22,7 @@ def render(template: str, **told: Any) -> str:
     from plotly.offline import get_plotlyjs  # slow to import
 
     engine = Environment(
-        loader=PackageLoader("diffcloud.report"),
+        loader=PackageLoader("diffcloud.reporting"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

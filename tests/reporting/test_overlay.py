@@ -15,12 +15,12 @@ from matplotlib.axes import Axes
 from diffcloud.estimation.pose import PoseSpace
 from diffcloud.estimation.result import recorded_pose
 from diffcloud.io.episodes import Episode
-from diffcloud.report import overlay_figure
-from diffcloud.report.overlay import Layer, Overlay, held_layers, recorded_layers, states_at
-from diffcloud.report.view import build_view, scene_layers, unposed_layer
+from diffcloud.reporting import overlay_figure
+from diffcloud.reporting.overlay import Layer, Overlay, held_layers, recorded_layers, states_at
+from diffcloud.reporting.view import build_view, scene_layers, unposed_layer
 from diffcloud.scene.scenarios import load_scenario
 from tests.estimation.records import recording_of
-from tests.report.pages import entry, overlays_of, page_of
+from tests.reporting.pages import entry, overlays_of, page_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 NASTY = "<!--<script>alert(1)</script>"
@@ -75,7 +75,7 @@ def test_the_cloth_follows_the_recorded_gripper():
     episode = Episode.from_frames([np.zeros((1, 3))] * 3, times, gripper=gripper)
     layers = scene_layers(scenario, episode, times)
     named = {layer.name: layer for layer in layers}
-    cloth = np.asarray(named["cloth, basis material"].frames)
+    cloth = np.asarray(named["cloth, nominal material"].frames)
     held = cloth[:, scenario.scene.handles.nodes]
     np.testing.assert_allclose(held[..., 2] - held[0, :, 2], [[0.0] * 4, [0.05] * 4, [0.1] * 4], atol=1e-3)  # of a pad
     paths = [layer.frames[0] for layer in layers if (layer.name, layer.kind) == ("held nodes", "line")]

@@ -11,8 +11,8 @@ import pandas as pd
 from markupsafe import Markup
 
 from diffcloud.evaluation.summary import Tables, against, label, overview, percent, sentences
-from diffcloud.report.figures import INK, Figure
-from diffcloud.report.tables import UNKNOWN, Cell, Table, table
+from diffcloud.reporting.figures import INK, Figure
+from diffcloud.reporting.tables import UNKNOWN, Cell, Table, table
 
 _OVERVIEW = {
     "scenario": "scenario",
@@ -43,11 +43,10 @@ _INTERVALS = {
     "scenario": "scenario",
     "episode": "episode",
     "parameter": "parameter",
-    "verdict": "verdict",
+    "status": "status",
     "value": "fitted",
     "interval": "interval",
     "factor": "within a factor of",
-    "physical_interval": "physical interval",
     "ratio_factor": "ratio within",
     "combination": "seen best",
     "sources": "improve first",
@@ -90,8 +89,8 @@ _EPISODES = {
     "reference_loss": "reference simulator",
     "two_sided": "two-sided",
     "success": "success",
-    "value_stretch": "stretch",
-    "value_mass": "mass",
+    "value_stretching": "stretching, × nominal",
+    "value_density": "density, × nominal",
     "simulations": "simulations",
     "status": "status",
 }
@@ -117,8 +116,8 @@ class Overview:
     gaps: int
     """Things that are missing."""
     apart: float | None
-    """Largest factor between recordings or motions of one fabric: a verdict looks at one recording, and this belongs beside
-    it. None where there is no verdict, or nothing to hold it against."""
+    """Largest factor between recordings or motions of one fabric: a status looks at one recording, and this belongs beside
+    it. None where there is no status, or nothing to hold it against."""
 
 
 @dataclass(frozen=True)
@@ -149,11 +148,11 @@ def comparison_overview(entry: ComparisonEntry) -> Overview:
     """For the top of the page."""
     rows = overview(entry.told)
     names = [str(name) for name in rows]
-    verdicts = {name: f"verdict on {name.removeprefix('verdict_')}" for name in names if name.startswith("verdict_")}
+    statuses = {name: f"status of {name.removeprefix('status_')}" for name in names if name.startswith("status_")}
     told = entry.told
     apart = [told[name]["factor"].max() for name in ("repeatability", "consistency") if len(told[name])]
     compared = bool(apart) and not told["intervals"].empty and not told["repeatability"].empty
-    drawn = _table(rows, {**_OVERVIEW, **verdicts, **_OVERVIEW_END})
+    drawn = _table(rows, {**_OVERVIEW, **statuses, **_OVERVIEW_END})
     return Overview(drawn, len(comparison_failures(entry)), float(max(apart)) if compared else None)
 
 
@@ -208,17 +207,13 @@ def comparison_sections(entry: ComparisonEntry) -> list[Section]:
 
 
 def _with_intervals(found: pd.DataFrame) -> pd.DataFrame:
-    """The table of intervals with both ends of an interval in one column."""
+    """The table of intervals with both ends of an interval and the unit in one column."""
     if found.empty:
         return found
-    columns = {"interval": ("low", "high"), "physical_interval": ("physical_low", "physical_high", "physical_unit")}
-    joined = found.copy()
-    for name, taken in columns.items():
-        joined[name] = [
-            None if pd.isna(low) or pd.isna(high) else " ".join([f"{low:.4g} to {high:.4g}", *unit])
-            for low, high, *unit in found[[*taken]].itertuples(index=False)
-        ]
-    return joined
+    ends = found[["low", "high", "unit"]].itertuples(index=False)
+    return found.assign(
+        interval=["" if pd.isna(low) or pd.isna(high) else f"{low:.4g} to {high:.4g} {unit}" for low, high, unit in ends]
+    )
 
 
 def comparison_failures(entry: ComparisonEntry) -> list[str]:

@@ -1,4 +1,4 @@
-"""The stage `simulate`: the sets that networks are trained on."""
+"""The stage `generate`: the sets that networks are trained on."""
 
 from diffcloud.cli.app import stage
 from diffcloud.cli.generate import generate

@@ -20,7 +20,7 @@ from diffcloud.io.manifests import remove_files, write_manifest
 from diffcloud.io.raw_episodes import raw_episode_files, read_description
 from diffcloud.jobs.pool import Tell, run_all
 from diffcloud.jobs.scenarios import choose_scenario
-from diffcloud.jobs.settings import Config, EpisodesConfig
+from diffcloud.jobs.settings import Config, SynthesizeConfig
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sensing.depth_camera import DepthNoise, published_cameras
 from diffcloud.sensing.recorder import ClothMotion, record
@@ -29,7 +29,7 @@ from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import rollout
 from diffcloud.sim.system import System
 
-_HIDDEN = ("stretch", "mass")
+_HIDDEN = ("stretching", "density")
 
 
 def make_episodes(config: Config, out: Path, workers: int | None, scheduler: str | None = None) -> dict[str, list[str]]:
@@ -38,8 +38,8 @@ def make_episodes(config: Config, out: Path, workers: int | None, scheduler: str
     Returns:
         Scenario -> names.
     """
-    settings = config.episodes
-    jobs = [EpisodesJob(name, index, settings, out / name) for index, name in enumerate(config.scenarios)]
+    settings = config.synthesize
+    jobs = [EpisodesJob(name, index, settings, out / name) for index, name in enumerate(config.scenes)]
     if not settings.per_scenario:
         jobs = []
         write_manifest(out, [])
@@ -59,7 +59,7 @@ class EpisodesJob:
     scenario: str
     index: int
     """Of the scenario among all; its random numbers depend on it."""
-    settings: EpisodesConfig
+    settings: SynthesizeConfig
     out: Path
 
     @property
@@ -73,7 +73,7 @@ class EpisodesJob:
 
 
 def _synthetic(
-    scenario: Scenario, config: EpisodesConfig, index: int, out: Path, tell: Callable[[int, str], None]
+    scenario: Scenario, config: SynthesizeConfig, index: int, out: Path, tell: Callable[[int, str], None]
 ) -> list[str]:
     """Simulate cloths of hidden parameters and record them: by depth cameras as raw episodes, or by their whole surface."""
     rng = np.random.default_rng([config.seed, index])
@@ -116,7 +116,7 @@ def record_motion(
     times: NDArray[np.float64],
     out: Path,
     name: str,
-    config: EpisodesConfig,
+    config: SynthesizeConfig,
     *,
     seed: int,
     meta: Mapping[str, Any],
@@ -179,7 +179,7 @@ def _clear(folder: Path, source: str) -> None:
 
 
 def hidden_parameters(
-    scenario: Scenario, config: EpisodesConfig, rng: np.random.Generator
+    scenario: Scenario, config: SynthesizeConfig, rng: np.random.Generator
 ) -> dict[str, NDArray[np.float64]]:
     """Hidden multipliers, name -> [episodes]: as the paper draws them for its simulated targets (uniform over the fit's
     bounds), or log-uniform over the configured range for recordings by cameras."""
@@ -187,5 +187,5 @@ def hidden_parameters(
         low, high = np.transpose([scenario.bounds.get(name, PARAMETERS[name].bounds) for name in _HIDDEN])
         drawn = rng.uniform(low, high, (config.per_scenario, len(_HIDDEN)))  # more episodes leave the first as they are
         return dict(zip(_HIDDEN, drawn.T, strict=True))
-    low, high = np.log(config.hidden_range)
+    low, high = np.log(config.true_range)
     return {name: np.exp(rng.uniform(low, high, config.per_scenario)) for name in _HIDDEN}

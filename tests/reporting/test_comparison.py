@@ -10,10 +10,10 @@ import pytest
 
 from diffcloud.estimation.record import History
 from diffcloud.evaluation.summary import tables
-from diffcloud.report import ComparisonEntry, comparison_figures
-from diffcloud.report.comparison import comparison_failures, comparison_overview
+from diffcloud.reporting import ComparisonEntry, comparison_figures
+from diffcloud.reporting.comparison import comparison_failures, comparison_overview
 from tests.evaluation.records import record, records
-from tests.report.pages import main_of, page_of
+from tests.reporting.pages import main_of, page_of
 
 SECONDS = {
     ("lift", "tan1"): {
@@ -28,7 +28,7 @@ HISTORIES = {("lift", "tan1"): _HISTORY}
 
 @pytest.fixture(scope="module")
 def told():
-    simulated = record("band", "0", truth={"stretch": 1.0, "mass": 1.0}, methods={"diffcloud": 3e-5, "middle": 0.1})
+    simulated = record("band", "0", truth={"stretching": 1.0, "density": 1.0}, methods={"diffcloud": 3e-5, "middle": 0.1})
     return tables([*records(), simulated], SECONDS)
 
 
@@ -91,7 +91,7 @@ def test_the_page_is_well_formed(page):
 def test_the_summary_tells_winner_verdict_and_gaps(told, page):
     summary = page[: page.index("Methods on equal terms")]
     assert "DiffCloud" in summary
-    assert "only the ratio (2/2)" in summary
+    assert "ratio only (2/2)" in summary
     assert "2 things are missing" in summary
     assert comparison_failures(ComparisonEntry(told, records(), ["a"])) == ["a", "lift/tan1: MeteorNet: no checkpoint"]
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from diffcloud.simulators import explicit, mujoco, newton, ours
 from diffcloud.simulators.problem import Problem, Track, distances
-from diffcloud.simulators.problems import cantilever, fold, lift, strip, swing
+from diffcloud.simulators.problems import cantilever, strip
+from studies.towel_problems import fold, lift, swing
 
 THIS = "this simulator"
 WHOLE_STIFFNESS = "damping of the whole stiffness, as in ARCSim"

@@ -10,7 +10,7 @@ import numpy as np
 from diffcloud.estimation.result import FittedMotion
 from diffcloud.io.episodes import Episode
 from diffcloud.mesh.topology import SurfaceMesh
-from diffcloud.report import EpisodeEntry, build_page
+from diffcloud.reporting import EpisodeEntry, build_page
 from tests.estimation.records import record_of, recording_of
 
 _TRIANGLE = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 2)
@@ -51,9 +51,7 @@ def entry(name="tan1", *, scenario="lift", fabric="tan", failures=()):
 
 
 def page_of(*entries, comparison=None, title="Report"):
-    return build_page(
-        entries or [entry()], title=title, overlay_points=4, environment={"torch": "2"}, comparison=comparison
-    )
+    return build_page(entries or [entry()], title=title, cloud_points=4, environment={"torch": "2"}, comparison=comparison)
 
 
 def overlays_of(page):

@@ -9,7 +9,7 @@ import numpy as np
 
 from diffcloud.estimation.initial_state import asked_as
 from diffcloud.estimation.record import FitRecord, RecordingFit
-from diffcloud.report.tables import UNKNOWN, Cell, Table, number, part, table
+from diffcloud.reporting.tables import UNKNOWN, Cell, Table, number, part, table
 
 _SHOWN = {"m": (1e3, "mm", 1), "rad": (180 / math.pi, "°", 1), "s": (1e3, "ms", 1), "1": (1e2, "%", 1)}
 """Unit -> factor, unit shown, digits."""

@@ -13,8 +13,8 @@ from diffcloud.estimation.result import FittedMotion, recorded_pose
 from diffcloud.estimation.targets import track_displacement
 from diffcloud.io.episodes import Episode
 from diffcloud.mesh.shapes import rectangle_surface
-from diffcloud.report.overlay import Layer, Overlay, body_layers, held_layers, states_at
-from diffcloud.report.rendering import render
+from diffcloud.reporting.overlay import Layer, Overlay, body_layers, held_layers, states_at
+from diffcloud.reporting.rendering import render
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import rollout
 
@@ -53,7 +53,7 @@ def scene_layers(scenario: Scenario, episode: Episode, times: NDArray[np.float64
     nodes = run.positions[0].numpy()[states]
     known = np.isfinite(nodes).all(axis=(1, 2))
     shown = [frame if fine else scenario.scene.mesh.nodes for frame, fine in zip(nodes, known, strict=True)]
-    cloth = Layer("cloth, basis material", "mesh", shown, "fitted", system.mesh.faces)
+    cloth = Layer("cloth, nominal material", "mesh", shown, "fitted", system.mesh.faces)
     held = held_layers(np.stack(shown), np.unique(scenario.scene.handles.nodes).astype(np.int64))
     return [cloth, *held, *table_layers(scenario, np.concatenate(shown)), *body_layers(scenario.scene.bodies)]
 

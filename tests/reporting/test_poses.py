@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from diffcloud.estimation.record import LeftOut, NuisanceValue
-from diffcloud.report.poses import poses_table
-from tests.report.pages import entry
+from diffcloud.reporting.poses import poses_table
+from tests.reporting.pages import entry
 
 
 def test_poses_are_shown_in_millimetres_and_degrees_and_pointed_out_beyond_their_priors():

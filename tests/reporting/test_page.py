@@ -10,7 +10,7 @@ import subprocess
 import pytest
 
 from diffcloud.estimation.record import FittedParameter
-from tests.report.pages import entry, main_of, page_of
+from tests.reporting.pages import entry, main_of, page_of
 
 NASTY = "<!--<script>alert(1)</script>&amp;\u2028'\""
 
@@ -45,11 +45,11 @@ def test_the_scripts_data_are_what_was_put_in():
 
 def test_material_that_was_fitted_along_is_no_column_but_is_told_where_it_is_off():
     one = entry()
-    along = {"unit": "x basis", "physical": 1.0, "physical_unit": "N·m", "meaning": "", "role": "material"}
+    along = {"multiplier": 1.0, "unit": "N·m", "meaning": "", "role": "material"}
     one.fit.parameters["bending"] = FittedParameter(value=1.95, centre=2.0, **along)
-    one.fit.parameters["friction_cloth"] = FittedParameter(value=0.9, centre=0.6, **along)
-    assert "<td>friction cloth × 1.50</td>" in main_of(page_of(one))
-    one.fit.parameters["friction_cloth"].value = 0.6
+    one.fit.parameters["self_friction"] = FittedParameter(value=0.9, centre=0.6, **along)
+    assert "<td>self friction × 1.50</td>" in main_of(page_of(one))
+    one.fit.parameters["self_friction"].value = 0.6
     one.fit.parameters["bending"].value = 2.0
     page = main_of(page_of(one))
     assert "<td>as known</td>" in page

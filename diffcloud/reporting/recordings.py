@@ -11,7 +11,7 @@ import numpy as np
 
 from diffcloud.evaluation.summary import percent
 from diffcloud.io.episodes import Episode
-from diffcloud.report.tables import UNKNOWN, Cell, Table, number, table
+from diffcloud.reporting.tables import UNKNOWN, Cell, Table, number, table
 
 _HEADS = ("Episode", "Points per view", "Masked", "Overlap mm", "Cameras moved mm", "Arm thicker mm", "Log late ms")
 
@@ -68,7 +68,7 @@ def _row(entry: RecordedEntry) -> list[Cell]:
         number(_mean(overlap), 1, factor=1e3),
         Cell(moved) if moved else UNKNOWN,
         number(refined.get("skin_m"), 1, factor=1e3),
-        number(refined.get("lag_s"), 0, factor=1e3),
+        number(refined.get("clock_offset_s"), 0, factor=1e3),
     ]
 
 

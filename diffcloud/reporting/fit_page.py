@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,16 +15,16 @@ import diffcloud
 from diffcloud.estimation.joint import AnyObjective, JointObjective
 from diffcloud.estimation.objective import Objective
 from diffcloud.estimation.record import FitRecord
-from diffcloud.estimation.result import physical_values, read_motion
-from diffcloud.evaluation.intervals import FOLLOWS, Intervals, significant
+from diffcloud.estimation.result import FittedMotion
+from diffcloud.evaluation.intervals import FOLLOWS, Intervals, significant, stated_parameters
 from diffcloud.evaluation.methods import space_of
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.io.episodes import Episode
-from diffcloud.report import EpisodeEntry, build_page
+from diffcloud.reporting.page import EpisodeEntry, build_page
 from diffcloud.sim.properties import one_set
 
 _TRANSFERS, _GAIN = 1.25, 0.5
-_NO_TIME = "there was no time for it"
+_NO_TIME = "the time was over before they were computed"
 
 
 class Status(StrEnum):
@@ -48,28 +47,28 @@ class Told:
 
 
 def _validation(record: FitRecord, objective: AnyObjective) -> str:
-    """Whether parameters fitted without a given recording still explain it."""
+    """Whether parameters that were fitted without a recording predict it."""
     if not isinstance(objective, JointObjective):
-        return "One recording: whether its parameters carry over to another is not known."
+        return "Not tested: whether the parameters predict another recording. Fit two recordings to see."
     if record.estimate is None:
-        return "Only the solver likelihood predicts each recording from the others."
+        return "Not tested: whether the parameters predict another recording. The solver likelihood tests it."
     held, gains = [], []
     weighed = space_of(record).fixed
     for member, episode in zip(objective.members, record.episodes, strict=True):
         if episode.left_out is None and record.stop_reason == "interrupted":
-            return f"Whether parameters carry over from one recording to another is not known: {_NO_TIME}."
+            return "Not tested: whether the parameters predict another recording. The fit ended before."
         if episode.left_out is None:
-            return "Leaving one recording out failed: whether parameters carry over is not known."
+            return "Not tested: whether the parameters predict another recording. Leaving a recording out failed."
         with torch.no_grad():
             run = member.simulate_to_loss(one_set({**weighed, **record.initial_state_in(episode)}))
             middle = float(member.frame_losses(run).mean())  # as the others, without the prior of the pose
         held.append(episode.left_out.rms_mm / episode.rms_mm)
         gains.append((middle - episode.left_out.loss) / max(middle - episode.loss, 1e-300))
-    told = f"when a recording is left out of the fit, its misfit is at most {max(held):.2f} times that in the joint fit"
+    told = f"left out of the fit, a recording has at most {max(held):.2f} times its residual in the joint fit"
     motions = len({_motion_of(member) for member in objective.members})
     if max(held) <= _TRANSFERS and min(gains) >= _GAIN:
-        return f"Transfers{'' if motions > 1 else ' within this motion'}: {told}."
-    return f"Explains its own recordings only: {told}."
+        return f"The parameters predict other recordings{'' if motions > 1 else ' of this motion'}: {told}."
+    return f"The parameters do not predict other recordings: {told}."
 
 
 def _motion_of(objective: Objective) -> str:
@@ -82,23 +81,23 @@ def _motion_of(objective: Objective) -> str:
 
 
 def follows(record: FitRecord) -> list[str]:
-    """Of each recording, until when the model follows it, for people."""
+    """Return one sentence for each recording: until when the simulation follows it."""
     lines = []
     for one, told in zip(record.episodes, record.estimate.recordings if record.estimate else (), strict=False):
-        gone = np.flatnonzero(np.array(told.misfits) > FOLLOWS)
+        gone = np.flatnonzero(np.array(told.chi_squares) > FOLLOWS)
         rate = told.horizon_s / max(one.frames[-1], 1)
         if len(gone) == 0:
-            told_so = f"follows {one.name} to within noise and mesh up to {told.horizon_s:.1f} s, where frames end to count"
+            told_so = f"follows {one.name} to within noise and mesh error up to the horizon, {told.horizon_s:.1f} s"
         elif gone[0] == 0:
             told_so = f"does not follow {one.name} from the first frame on"
         else:
-            told_so = f"follows {one.name} to within noise and mesh until {rate * one.frames[gone[0]]:.1f} s, then departs"
-        lines.append(f"The model {told_so}.")
+            told_so = f"follows {one.name} to within noise and mesh error until {rate * one.frames[gone[0]]:.1f} s only"
+        lines.append(f"The simulation {told_so}.")
     return lines
 
 
 def findings_of(told: Told) -> list[str]:
-    """The report's first lines: does the model explain the recordings, do parameters carry over, what are they."""
+    """Return the report's first lines: fit to the recordings, prediction of others, parameters."""
     record, found, lines = told.record, told.intervals, list[str]()
     if told.status != Status.finished:
         why, again = (
@@ -109,54 +108,30 @@ def findings_of(told: Told) -> list[str]:
         lines.append(f"Unfinished: {why}. These are the best parameters so far. Run the same command{again} to finish.")
     if found is None:
         known = record.estimate is not None or told.status != Status.finished
-        why = _NO_TIME if known else f"the solver {record.solver} knows no uncertainty"
+        why = _NO_TIME if known else f"the solver {record.solver} gives none"
         lines.append(f"The residual is {record.rms_mm:.1f} mm RMS. There are no intervals: {why}.")
-    elif not found.explains:
-        lines.append(f"The model does not explain the recordings: {found.reason}.")
+    elif not found.fits_to_noise:
+        lines.append(f"The simulation does not fit the recordings to within the noise: {found.reason}.")
     lines += follows(record)
     lines.append(_validation(record, told.objective))
-    if found is not None and found.explains:
+    if found is not None and found.fits_to_noise:
         lines += found.sentences
     for name, entry in _parameters(told).items():
         digits = significant(entry["low"], entry["high"])
-        ends, verdict, improve = "", "unfinished", ""
+        ends, status, improve = "", "unfinished", ""
         if found is not None:
-            interval, verdict = found.parameters[name], entry["verdict"]
+            interval, status = found.parameters[name], entry["status"]
             first = largest_sources(found.sources, name, 2)
-            ends = f", {found.level:.0%} interval {digits(interval.physical_low)} to {digits(interval.physical_high)}"
+            ends = f", {found.level:.0%} interval {digits(interval.low)} to {digits(interval.high)}"
             improve = f" (improve first: {first})" if first else ""
-        lines.append(f"{name}: {digits(entry['physical'])} {entry['physical_unit']}{ends}: {verdict}{improve}.")
+        lines.append(f"{name}: {digits(entry['value'])} {entry['unit']}{ends}: {status.replace('_', ' ')}{improve}.")
     if record.estimate is not None and record.estimate.grip_m is not None:
         lines.append(f"The grasp is {1e3 * record.estimate.grip_m:.0f} mm wide, as the fit found it.")
     return lines
 
 
 def _parameters(told: Told) -> dict[str, dict[str, Any]]:
-    """Of each parameter its value and, if there are intervals, these."""
-    record = told.record
-    if told.intervals is not None:
-        return {
-            name: {
-                "value": entry.value,
-                "physical": entry.physical,
-                "physical_unit": entry.physical_unit,
-                "low": entry.physical_low,
-                "high": entry.physical_high,
-                "verdict": entry.verdict,
-            }
-            for name, entry in told.intervals.parameters.items()
-        }
-    values = {name: record.free[name] for name in space_of(record).asked.names}
-    nothing = {"low": None, "high": None, "verdict": None}
-    return {
-        name: {
-            "value": one.value,
-            "physical": one.physical,
-            "physical_unit": one.physical_unit,
-            **nothing,
-        }
-        for name, one in physical_values(told.objective.members[0].scenario, values).items()
-    }
+    return stated_parameters(told.record, told.intervals, told.objective.members[0].scenario)
 
 
 def result_of(told: Told, findings: Sequence[str]) -> dict[str, Any]:
@@ -168,9 +143,9 @@ def result_of(told: Told, findings: Sequence[str]) -> dict[str, Any]:
         "stop_reason": record.stop_reason,
         "parameters": _parameters(told),
         "rms_mm": record.rms_mm,
-        "explains": None if found is None else found.explains,
+        "fits_to_noise": None if found is None else found.fits_to_noise,
         "reason": "" if found is None else found.reason,
-        "remark": "" if found is None else found.remark,
+        "warning": "" if found is None else found.warning,
         "horizons_s": {
             one.name: frames.horizon_s
             for one, frames in zip(record.episodes, record.estimate.recordings if record.estimate else (), strict=False)
@@ -180,11 +155,11 @@ def result_of(told: Told, findings: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def page_of(told: Told, findings: Sequence[str], episodes: Mapping[str, Episode], motions: Path) -> str:
+def page_of(told: Told, findings: Sequence[str], episodes: Mapping[str, Episode], motions: Sequence[FittedMotion]) -> str:
     """
     Args:
         episodes: recording -> episode.
-        motions: of the fit, NPZ.
+        motions: of the fit, one for each recording.
     """
     record, entries = told.record, list[EpisodeEntry]()
     for index, recording in enumerate(record.episodes):
@@ -201,13 +176,13 @@ def page_of(told: Told, findings: Sequence[str], episodes: Mapping[str, Episode]
                 fit=_with_one(record, index),
                 recording=recording,
                 episode=episodes[recording.name],
-                motion=read_motion(motions, index),
+                motion=motions[index],
             )
         )
     return build_page(
         entries,
         title="A cloth from its recordings",
-        overlay_points=1200,
+        cloud_points=1200,
         environment={"command": "diffcloud fit", "diffcloud": diffcloud.__version__},
         findings=findings,
         intervals=told.intervals,

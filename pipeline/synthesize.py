@@ -1,4 +1,4 @@
-"""The stage `episodes`: make synthetic recordings of every scenario. A person's own recordings lie in raw/."""
+"""The stage `synthesize`: make synthetic recordings of every scenario. A person's own recordings lie in raw/."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from diffcloud.console import finish, writes
 
 
 @writes()
-def episodes(
+def synthesize(
     out: Annotated[Path, typer.Option(help="Folder; episodes go to OUT/<scenario>/<episode>, raw or .npz.")],
     params: StageParams = None,
     workers: Workers = None,
@@ -21,11 +21,11 @@ def episodes(
     json: JsonFlag = False,
 ) -> None:
     """Make synthetic recordings of every scenario."""
-    from diffcloud.jobs.episodes import make_episodes
     from diffcloud.jobs.settings import load_config
+    from diffcloud.jobs.synthesize import make_episodes
 
     finish({"out": str(out), "episodes": make_episodes(load_config(params), out, workers, scheduler)}, json)
 
 
 if __name__ == "__main__":
-    stage(episodes, "diffcloud.jobs.episodes")
+    stage(synthesize, "diffcloud.jobs.synthesize")

@@ -9,7 +9,7 @@ from typing import Any
 
 from diffcloud.errors import ConfigError
 from diffcloud.io.files import read_json
-from diffcloud.report.tables import Cell, Table, number, part, table
+from diffcloud.reporting.tables import Cell, Table, number, part, table
 
 
 @dataclass(frozen=True)

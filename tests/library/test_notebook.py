@@ -1,0 +1,32 @@
+"""The notebook of examples/ runs as it stands, and finds the stiffness that MuJoCo was given."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from typing import Any
+
+import pytest
+
+from tests.docs.examples import ROOT
+
+TRUE_STRETCHING = 18.255
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_and_holds_the_truth(tmp_path, monkeypatch):
+    shutil.copy(ROOT / "examples" / "towel.npz", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    notebook = json.loads((ROOT / "examples" / "towel.ipynb").read_text(encoding="utf-8"))
+    names: dict[str, Any] = {}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    found = names["fit"].parameters["stretching"]
+    assert names["fit"].status == "fits_to_noise"
+    assert found.interval[0] < TRUE_STRETCHING < found.interval[1]
+    assert found.status == "identified"
+    assert (tmp_path / "out" / "report.html").stat().st_size > 100_000
+    assert (tmp_path / "out" / "mujoco" / "sample_0001" / "cloth.json").is_file()
+    assert 0 < names["height"].item() < 0.3
+    assert names["stiffness"].grad is not None
