@@ -77,7 +77,10 @@ class TestLaid:
         record = read_fit(write_fit(tmp_path, "joint", result))
         assert [one.nuisance["turn"].value for one in record.episodes] == [found.values[f"turn@{n}"] for n in (0, 1)]
         assert not record.nuisance
-        assert space_of(record) == space
+        for known, fitted in zip(space_of(record).variables, space.variables, strict=True):
+            assert replace(known, low=fitted.low, high=fitted.high) == fitted
+            # the record has them in SI units
+            assert (known.low, known.high) == pytest.approx((fitted.low, fitted.high), rel=1e-15)
         with torch.no_grad():
             assert float(joint(one_set(record.simulated))) == pytest.approx(record.loss, rel=1e-9)
         for number, (scenario, motion) in enumerate(zip(motions(), result.motions, strict=True)):
