@@ -65,7 +65,7 @@ class Episode:
         return {
             "stretching": 1.3 * one,
             "shear": 0.7 * one,
-            "density": 0.8 * one,
+            "density": 0.88 * one,
             "bending": 1.2 * one,
             "damping": 0.004 * one,
             "air_density": 0.9 * one,
